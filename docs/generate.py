@@ -43,7 +43,7 @@ from lavender.lab.report.curves import work_precision
 from lavender.lab.report.draw import looks, matplotlib_panels
 from lavender.lab.report.findings import Report
 from lavender.lab.report.page import page as report_page
-from lavender.lab.report.tables.cases import NOISE, RESIDUAL_NOISE
+from lavender.lab.report.tables import NOISE, RESIDUAL_NOISE
 from lavender.lab.report.text import residual
 from lavender.problem import LAWS
 from lavender.problem.ordering import ORDERS

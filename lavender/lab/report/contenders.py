@@ -12,10 +12,10 @@ from lavender.lab.bench.running.finals import finals
 from lavender.lab.bench.running.plan import UNLIMITED, Plan
 from lavender.lab.bench.running.timing import Ask
 from lavender.lab.bench.store import Records
-from lavender.lab.report import tables
+from lavender.lab.report import choices, tables
+from lavender.lab.report.choices import Advice
+from lavender.lab.report.finals import Final, in_time, lines
 from lavender.lab.report.moved import working
-from lavender.lab.report.tables import Advice
-from lavender.lab.report.tables.finals import Final, in_time, lines
 from lavender.solvers.registry import specs
 
 NEAR = 1.6  # times the best's, within which a rerun may put another first
@@ -38,17 +38,19 @@ def subjects(records: Records, times: Sequence[float] = ()) -> list[Subject]:
     """Single cases, then sequences, each where there are any."""
     levels = tables.levels_of(records)
     level = levels[len(levels) // 2]
-    times = tuple(times) or tables.time_budgets(records)
+    times = tuple(times) or choices.time_budgets(records)
     found = []
     cases = tuple(dict.fromkeys(r.case for r in records if r.step < 0))
     if cases:
-        quick = tuple(tables.within(records, "all", cases, t) for t in times)
-        found.append(Subject(cases, "call", tables.to_level(records, "all", cases, level), quick))
-    sequences = tables.steps_of(records)
+        quick = tuple(choices.within(records, "all", cases, t) for t in times)
+        found.append(Subject(cases, "call", choices.to_level(records, "all", cases, level), quick))
+    sequences = choices.steps_of(records)
     if sequences:
         steps = [step for some in sequences.values() for step in some]
-        quick = tuple(tables.within(records, "all", steps, t) for t in times)
-        found.append(Subject(tuple(sequences), "steps", tables.to_level(records, "all", steps, level), quick))
+        quick = tuple(choices.within(records, "all", steps, t) for t in times)
+        found.append(
+            Subject(tuple(sequences), "steps", choices.to_level(records, "all", steps, level), quick)
+        )
     return found
 
 

@@ -13,12 +13,12 @@ from dataclasses import dataclass, replace
 from lavender.base.deadline import seconds
 from lavender.lab.bench.record import Record, Skip, file_name, level_name, printable
 from lavender.lab.bench.store import Records
-from lavender.lab.report import tables
+from lavender.lab.report import choices, tables
+from lavender.lab.report.choices import Advice, Line
 from lavender.lab.report.engine import Contestant
 from lavender.lab.report.findings import Report
 from lavender.lab.report.moved import idle, speed_name
 from lavender.lab.report.table import WORDS, Cell, Table
-from lavender.lab.report.tables import Advice, Line
 from lavender.lab.report.text import NONE, count, percent, residual, share, times, who, without
 
 Rows = list[Sequence[str | Cell]]
@@ -182,7 +182,7 @@ def speed_table(report: Report) -> Table:
     heads = [f"to {speed_name(x)}" for x in report.speeds]
     rows: Rows = [
         [line.name, *(advised(a, False) for a in line.by_level.values())]
-        for line in tables.advice(report.by_speed)
+        for line in choices.advice(report.by_speed)
         if not line.sequence
     ]
     return Table(["structure", *heads], rows, folds=True)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from statistics import fmean
 
 from lavender.lab.bench.store import Records
-from lavender.lab.report import tables
+from lavender.lab.report import choices, tables
 from lavender.lab.report.engine import Contestant
 from lavender.lab.report.moved import by_speed, speed_levels, working
 from lavender.lab.report.text import count
@@ -26,7 +26,7 @@ class Report:
     old : Records, optional
         An earlier run to compare with.
     asked : s, optional
-        Time budgets of the recommendation; those of the plan, or `tables.time_budgets`, if none are given.
+        Time budgets of the recommendation; those of the plan, or `choices.time_budgets`, if none are given.
     sweeps : int, optional
         Budgets of sweeps with which a solver is to be named; those of the plan if none are given.
     engines : sequence of Contestant
@@ -92,7 +92,7 @@ class Report:
     @cached_property
     def times(self) -> tuple[float, ...]:
         """Times [s] in which a solver is recommended."""
-        return tuple(self.asked) or tables.time_budgets(self.records)
+        return tuple(self.asked) or choices.time_budgets(self.records)
 
     @cached_property
     def verdict(self) -> Verdict:
@@ -100,6 +100,6 @@ class Report:
         return verdict(self.records, tuple(self.asked), tuple(self.sweeps))
 
     @cached_property
-    def lines(self) -> list[tables.Line]:
+    def lines(self) -> list[choices.Line]:
         """Recommendations by structure and sequence; none of a campaign."""
-        return [] if self.is_campaign else tables.advice(self.records, self.times)
+        return [] if self.is_campaign else choices.advice(self.records, self.times)

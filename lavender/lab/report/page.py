@@ -10,11 +10,11 @@ from typing import Any
 from lavender.base.deadline import seconds
 from lavender.lab.bench.record import file_name, level_name
 from lavender.lab.bench.store import Records
-from lavender.lab.report import contents, tables
+from lavender.lab.report import choices, contents, tables
 from lavender.lab.report.curves import Figures
 from lavender.lab.report.findings import Report
 from lavender.lab.report.svg import svg
-from lavender.lab.report.tables.cases import NOISE, RESIDUAL_NOISE
+from lavender.lab.report.tables import NOISE, RESIDUAL_NOISE
 from lavender.lab.report.text import count, left_out, residual, suspicions, without
 from lavender.lab.report.verdict import Verdict
 
@@ -105,7 +105,7 @@ def _cases(report: Report) -> dict[str, Any]:
     }
 
 
-def _links(lines: Sequence[tables.Line]) -> dict[str, str]:
+def _links(lines: Sequence[choices.Line]) -> dict[str, str]:
     """Where on the page more is said of a structure or sequence."""
     parts = {line.name: "sequence" if line.sequence else "family" for line in lines}
     return {name: f"{part}-{file_name(name)}" for name, part in parts.items()}

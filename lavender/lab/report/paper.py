@@ -28,7 +28,7 @@ from lavender.lab.report.curves import LINES, Figure, Group, figures, overall_fi
 from lavender.lab.report.draw import looks, matplotlib_figure
 from lavender.lab.report.findings import Report
 from lavender.lab.report.table import Cell, Table, latex, tex
-from lavender.lab.report.tables.cases import NOISE
+from lavender.lab.report.tables import NOISE
 from lavender.lab.report.text import count, without
 
 INCH = (5.5, 3.4)  # of a figure: a page's width of text

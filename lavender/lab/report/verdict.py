@@ -12,13 +12,12 @@ from lavender.io.stored import SUFFIXES
 from lavender.lab.bench.record import Record, level_name
 from lavender.lab.bench.store import Records
 from lavender.lab.report import tables
+from lavender.lab.report.choices import QUANTILE, Choice
 from lavender.lab.report.contenders import QUICKER, Subject, subjects
+from lavender.lab.report.finals import STARTS, Final, Race, in_time, lines, serves_in
+from lavender.lab.report.finals import to_level as race_to_level
 from lavender.lab.report.moved import by_speed, speed_levels, speed_name
-from lavender.lab.report.tables import Choice
-from lavender.lab.report.tables.advice import QUANTILE
-from lavender.lab.report.tables.cases import SHAPES
-from lavender.lab.report.tables.finals import STARTS, Final, Race, in_time, lines, serves_in
-from lavender.lab.report.tables.finals import to_level as race_to_level
+from lavender.lab.report.tables import SHAPES
 from lavender.lab.report.text import count, residual, without
 from lavender.lab.report.text import times as times_of
 from lavender.lab.suite import FAMILIES

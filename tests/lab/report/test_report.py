@@ -16,7 +16,7 @@ import lavender as lv
 from lavender import bench, report
 from lavender.base.deadline import seconds
 from lavender.lab.bench.record import CaseInfo, Record, Run
-from lavender.lab.report import curves, tables
+from lavender.lab.report import choices, curves, tables
 from lavender.lab.report.curves import overall_figure
 from lavender.lab.report.engine import contestants
 from lavender.lab.report.findings import Report
@@ -167,7 +167,7 @@ def test_those_within_noise_are_ties_and_a_rerun_keeps_the_recommendation():
     by = {a.target: a for a in by_level(first)}
     assert by[1e-6].best.solver == "edge"
     assert {by[1e-6].best.solver, *by[1e-6].ties} == {"edge"}
-    level = tables.to_level(
+    level = choices.to_level(
         records_of(*(r for r in first if r.solver != "edge")), "all", [f"case {i}" for i in range(4)], 1e-6
     )
     assert (level.best.solver, level.ties) == ("auto", ("beta", "zeta"))

@@ -9,8 +9,8 @@ import pytest
 from lavender import bench, report
 from lavender.base.deadline import seconds
 from lavender.lab.report import tables
+from lavender.lab.report.finals import in_time, lines, to_level
 from lavender.lab.report.findings import Report
-from lavender.lab.report.tables.finals import in_time, lines, to_level
 from lavender.lab.report.verdict import verdict
 from tests.lab.report.test_report import record, records_of, shown
 

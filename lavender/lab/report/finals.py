@@ -17,8 +17,8 @@ from lavender.base.arrays import FloatArray
 from lavender.lab.bench.line import code_of
 from lavender.lab.bench.record import Record
 from lavender.lab.bench.store import Records
-from lavender.lab.report.tables.advice import FIRST, HALF, QUANTILE, Choice, counts_sweeps
-from lavender.lab.report.tables.many import SHIFT, limit_of
+from lavender.lab.report.choices import FIRST, HALF, QUANTILE, Choice, counts_sweeps
+from lavender.lab.report.tables import SHIFT, limit_of
 
 SAMPLES = 500
 AT_ONCE = 1_000_000  # numbers of a few samples

@@ -11,8 +11,18 @@ from typing import Any
 
 from lavender.lab.bench.record import Record
 from lavender.lab.bench.store import Records
-from lavender.lab.report.tables.cases import NOISE, RESIDUAL_NOISE, families, levels_of
-from lavender.lab.report.tables.many import SHIFT, by_sequence, geometric_mean, limit_of, quantile, times_to
+from lavender.lab.report.tables import (
+    NOISE,
+    RESIDUAL_NOISE,
+    SHIFT,
+    by_sequence,
+    families,
+    geometric_mean,
+    levels_of,
+    limit_of,
+    quantile,
+    times_to,
+)
 
 HALF = 0.5  # of the start's residual: a case is served where at most that is left
 QUANTILE = 0.9  # of the residuals in a time or with sweeps, over the cases: misses cannot be averaged away
