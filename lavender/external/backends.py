@@ -7,15 +7,15 @@
     l_n >= 0,  |l_t| <= mu l_n,  |l_s| <= mu r l_n,  or the dual cone w_n >= a |w_t| + a_s |w_s|
 
 Backends of which qpsolvers passes on the iterate but not what happened (iterations, exit flag,
-certificates, warm start) are called by their own interface (`native/`), the others through it (`backend.py`).
+certificates, warm start) are called by their own interface (`native.py`), the others through it (`backend.py`).
 """
 
 from __future__ import annotations
 
 from functools import partial
 
+from lavender.external import native
 from lavender.external.backend import Backend
-from lavender.external.native import clarabel, daqp, highs, osqp, qpalm
 from lavender.external.qp_solver import OPTIONS, QPSolver, refusal
 from lavender.solvers.registry import SolverSpec
 
@@ -50,19 +50,19 @@ QPAX = {"solver_tol": "eps"}
 ADMM = "Stellato et al. 2020, OSQP: an operator splitting solver for quadratic programs"
 BACKENDS: tuple[Backend, ...] = (
     Backend("osqp", ("osqp",), "osqp", "operator splitting with polishing", ADMM,
-            call=osqp.call, max_iter=100_000, warm=True, stoppable=True),
+            call=native.call_osqp, max_iter=100_000, warm=True, stoppable=True),
     Backend("clarabel", ("clarabel",), "clarabel", "interior point, homogeneous embedding",
-            "Goulart, Chen 2024, Clarabel", call=clarabel.call, max_iter=200, stoppable=True),
+            "Goulart, Chen 2024, Clarabel", call=native.call_clarabel, max_iter=200, stoppable=True),
     Backend("piqp", ("qpsolvers", "piqp"), "piqp", "proximal interior point",
             "Schwan, Jiang, Kuhn, Jones 2023, PIQP", settings=PROXIMAL, max_iter=250),
     Backend("proxqp", ("qpsolvers", "proxsuite"), "proxsuite", "proximal augmented Lagrangian",
             "Bambade et al. 2022, ProxQP", settings=PROXIMAL, warm=True),
     Backend("qpalm", ("qpalm",), "qpalm", "proximal augmented Lagrangian, semismooth Newton",
-            "Hermans, Themelis, Patrinos 2022, QPALM", call=qpalm.call, warm=True, stoppable=True),
+            "Hermans, Themelis, Patrinos 2022, QPALM", call=native.call_qpalm, warm=True, stoppable=True),
     Backend("daqp", ("daqp",), "daqp", "dual active set", "Arnström, Bemporad, Axehill 2022, DAQP",
-            call=daqp.call, dense=True, warm=True, stoppable=True),
+            call=native.call_daqp, dense=True, warm=True, stoppable=True),
     Backend("highs", ("highspy",), "highspy", "null-space active set", "Huangfu, Hall 2018, HiGHS",
-            call=highs.call, max_iter=100_000, stoppable=True, noisy=True),
+            call=native.call_highs, max_iter=100_000, stoppable=True, noisy=True),
     Backend("scs", ("qpsolvers", "scs"), "scs", "operator splitting, homogeneous embedding",
             "O'Donoghue 2021, SCS 3", settings=SCS, max_iter=100_000, warm=True, stoppable=True),
     Backend("quadprog", ("qpsolvers", "quadprog"), "quadprog", "dual active set, positive definite A",
@@ -100,7 +100,7 @@ BACKENDS: tuple[Backend, ...] = (
     Backend("clarabel_cone", ("clarabel",), "clarabel",
             "interior point on the convex relaxation of friction, second-order cones",
             "Goulart, Chen 2024, Clarabel; Tasora, Anitescu 2011 for the relaxation",
-            call=clarabel.call, max_iter=200, stoppable=True, cones=True),
+            call=native.call_clarabel, max_iter=200, stoppable=True, cones=True),
 )  # fmt: skip
 
 
