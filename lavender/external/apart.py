@@ -21,7 +21,7 @@ from lavender.external.backend import Backend
 from lavender.external.running import Answer, Failed, Limits
 from lavender.judge.solution import Status
 
-SERVED = "lavender.external._served"
+SERVED = "lavender.external.backends"  # the other side: its `serve`
 ARRAYS = ("x", "zeta", "xi", "direction", "contradiction")  # of an answer, in the order they are sent
 WORDS = 500  # characters of what a backend said
 GRACE = 2.0  # limits after which a backend that was told its own is ended

@@ -13,10 +13,14 @@ certificates, warm start) are called by their own interface (`native.py`), the o
 from __future__ import annotations
 
 from functools import partial
+from typing import Any
 
+from lavender.base.apart import served
 from lavender.external import native
+from lavender.external.apart import ARRAYS, WORDS
 from lavender.external.backend import Backend
 from lavender.external.qp_solver import OPTIONS, QPSolver, refusal
+from lavender.external.running import quiet
 from lavender.solvers.registry import SolverSpec
 
 #: Settings of those that go through qpsolvers, by their names there: a word is a field of `Limits`, all else is fixed.
@@ -127,3 +131,23 @@ def _spec(backend: Backend) -> SolverSpec:
 
 
 SPECS: tuple[SolverSpec, ...] = tuple(map(_spec, BACKENDS))
+
+
+def serve(lifeline: int) -> None:
+    """In a process of its own: answer the calls of `apart.call`, until they end."""
+    served.serve(lifeline, _runner)
+
+
+def _runner() -> served.Handler:
+    by_name = {backend.name: backend for backend in BACKENDS}
+
+    def run(message: Any) -> tuple[dict[str, Any], list[Any]]:
+        name, qp, impulse, limit, settings = message
+        with quiet(by_name[name].noisy) as said:
+            found = by_name[name].run(qp, impulse, limit, settings)
+        work = {str(kind): int(count) for kind, count in found.work.items()}
+        words = str(found.words or "; ".join(said))[:WORDS]
+        arrays = [getattr(found, name) for name in ARRAYS]
+        return {"status": found.status.name, "words": words, "work": work}, arrays
+
+    return run

@@ -4,7 +4,7 @@
 and `engine_image`, a simulation as `lav_engine_open` reads it.
 """
 
-from lavender.out.engine import engine_image
 from lavender.out.library import HEADER, source, write
+from lavender.out.view import engine_image
 
 __all__ = ["HEADER", "engine_image", "source", "write"]

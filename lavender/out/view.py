@@ -1,4 +1,4 @@
-"""A problem of the package as `lav_problem` has it: counts, arrays by name, and settings by number."""
+"""What the library reads: a problem as `lav_problem` has it, settings by number, a simulation as bytes."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from lavender.base.errors import InputError
 from lavender.out.header import constants, struct_fields
 from lavender.out.library import HEADER
 from lavender.problem import Problem
+from lavender.sim.engine.simulation import Simulation
 from lavender.solvers import registry
 
 _HEADER = HEADER.read_text(encoding="utf-8")
@@ -31,11 +32,10 @@ METHODS = {
 OTHER_BITS = ("admm", "auto")
 ORDERS = {"given": 0, "symmetric": 1, "random": 2, "reverse": 3}
 SWEEPS = {None: 0, "pgs": 1, "blocks": 2}
-
-
 #: Forms (1 a matrix, 2 bodies, 3 J and M) of those that do not take all of them.
 FORMS = {"sequential_impulses": (2,), "pgs": (1, 3), "direct": (1, 2), "lemke": (1, 2), "admm": (1, 2)}
 FORMS |= dict.fromkeys(("sor", "gauss_seidel", "jacobi"), (1,))
+MAGIC = b"LAVIMG1\0"  # of what `lav_engine_open` reads and `lav_engine_image` writes
 
 
 class NotTaken(InputError):
@@ -125,3 +125,31 @@ def choices(solver: str, options: Mapping[str, Any]) -> tuple[tuple[int, ...], f
         what = ", ".join(left) or (f"order={order!r}" if order not in ORDERS else solver)
         raise NotTaken(f"{what}: not in the library")
     return (ORDERS[order], *numbers), float(omega)
+
+
+def engine_image(simulation: Simulation) -> bytes:
+    """The next substep's state: a magic word, a hash, sizes (10) int32, then reals, int32 padded to 8 bytes, keys.
+
+    Parameters
+    ----------
+    simulation : Simulation
+        Of any scene; its stepper, sweeps and orders go with it.
+
+    Returns
+    -------
+    bytes
+    """
+    state = simulation.snapshot()
+    index = state.index.astype("<i4").tobytes()
+    body = (
+        state.size.astype("<i4").tobytes()
+        + state.real.astype("<f8").tobytes()
+        + index
+        + bytes(-len(index) % 8)
+    )
+    body += state.keys.astype("<u8").tobytes()
+    h, full = 0, 2**64 - 1
+    for word in np.frombuffer(body, "<u8").tolist():
+        h = ((h ^ word) * 0x9E3779B97F4A7C15) & full
+        h ^= h >> 29
+    return MAGIC + (h ^ h >> 32).to_bytes(8, "little") + body

@@ -18,10 +18,9 @@ from lavender.base.arrays import flag as checked
 from lavender.base.errors import InputError, LavenderError, SolveFailed
 from lavender.judge.solution import Solution, uninterrupted
 from lavender.problem import Problem
-from lavender.sim.engine.export import problem_of
 from lavender.sim.engine.film import Film
-from lavender.sim.engine.judge import judged, moved
 from lavender.sim.engine.layout import HEAD, SIZE
+from lavender.sim.engine.problem import judged, moved, problem_of
 from lavender.sim.engine.state import State
 from lavender.sim.scene import Scene
 from lavender.sim.scene.steppers import get_stepper
