@@ -46,14 +46,12 @@ def mujoco(models: tuple[Path, ...], steps: int, every: int, warm: int, out: Pat
     one_thread()
     if out is not None:
         writable(out)
-    try:
-        import mujoco as mj
-    except ImportError:
-        raise click.UsageError("mujoco cannot be imported: pip install mujoco") from None
+    from lavender.io.mujoco import package
     from lavender.lab.bench.machine import cpu_name, versions
     from lavender.lab.bench.simulators import Step, WarmStep, measure, measure_warm
     from lavender.lab.report.simulators import table, warm_table
 
+    mj = package()
     found: list[Step] = []
     consecutive: list[WarmStep] = []
     lost: list[str] = []

@@ -205,7 +205,7 @@ def _mujoco(model: Any, data: Any) -> tuple[_Model, int, int, Any]:
         seen = _SEEN.get(model)
     except TypeError:  # of no model: nothing that has weak references
         seen = None
-    mj = _module() if seen is None else seen.mj
+    mj = package() if seen is None else seen.mj
     if (seen is None and not isinstance(model, mj.MjModel)) or not isinstance(data, mj.MjData):
         raise InputError(
             f"got a {type(model).__name__} and a {type(data).__name__}; a mujoco.MjModel and its mujoco.MjData "
@@ -226,8 +226,8 @@ def _mujoco(model: Any, data: Any) -> tuple[_Model, int, int, Any]:
     return seen, m, contacts, smooth
 
 
-def _module() -> Any:
-    # The module, which whoever holds a model has.
+def package() -> Any:
+    """MuJoCo, which whoever holds a model has; InputError where it is not there, or too old."""
     try:
         import mujoco
     except ImportError:

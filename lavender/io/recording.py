@@ -201,11 +201,7 @@ def model_of(path: str | os.PathLike[str]) -> tuple[Any, Any]:
     InputError
         MuJoCo is not installed, or cannot read the file.
     """
-    try:
-        import mujoco as mj
-    except ImportError:
-        raise InputError("mujoco cannot be imported: pip install mujoco") from None
-    path = str(as_path(path))
+    mj, path = adapter.package(), str(as_path(path))
     try:
         return mj, mj.MjModel.from_xml_path(path)
     except ValueError as error:  # MuJoCo's word about a file that it cannot read
