@@ -160,6 +160,7 @@ def from_mujoco_many(model: Any, states: Any, *, threads: int = 1, errors: str =
     -------
     Imported
         `batch[i]` is the problem that `from_mujoco` makes of state i, to rounding, each row of an equality a block.
+        After `noslip_iterations` `impulse` is no solution of it.
 
     Raises
     ------
