@@ -108,4 +108,5 @@ def states_of(problem: Problem, impulse: FloatArray, found: Residual) -> States:
         hidden = found.floor * np.minimum(
             found.energy_start / np.sqrt(metric.d), found.velocity_start / metric.weight
         )
-    return States(problem, linear_of(problem, impulse), np.abs(found.error) + np.nan_to_num(hidden))
+        within = np.abs(found.error) + np.nan_to_num(hidden)
+    return States(problem, linear_of(problem, impulse), within)

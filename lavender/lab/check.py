@@ -18,13 +18,13 @@ from typing import Any
 
 import numpy as np
 
-from lavender.base.errors import InputError, LavenderError
+from lavender.base.errors import InputError, LavenderError, last_words
 from lavender.base.later import load
 from lavender.judge.residuals import FLOOR_MOST, WRONG
 from lavender.judge.solution import Solution, Status, uninterrupted
 from lavender.problem import Problem, check_problem
 from lavender.solvers.registry import available, get, known, specs
-from lavender.solving.solve import solve
+from lavender.solving.solve import check_budget, seconds_of, solve
 
 REFERENCES = ("osqp", "clarabel", "piqp", "direct")
 CONE_REFERENCES = ("clarabel_cone", "block_gauss_seidel")  # of relaxed friction, which is no QP
@@ -185,6 +185,8 @@ def cross_check(
         Wrong `tol` or limits.
     """
     check_problem(problem)
+    check_budget(specs()["auto"], tol, max_iter)
+    seconds_of(time_limit)
     if problem.guess is not None:  # solvers are compared by what they do, not by where they begin
         problem = replace(problem, guess=None, copy=False)
     names = (
@@ -206,15 +208,13 @@ def cross_check(
         try:
             load(*get(run).requires)  # what the time of a first solve would hold besides
             solution = uninterrupted(solve(problem, run, tol=tol, max_iter=max_iter, time_limit=time_limit))
-        except InputError:
-            raise
-        except LavenderError as error:  # refused only after a look at the numbers
-            rows.append(CrossCheckRow(name, REFUSED, note=str(error)))
-            continue
-        except Exception as error:  # a plug-in may raise anything: it costs its own row
-            if get(run).own:
+        except Exception as error:
+            if isinstance(error, LavenderError) and not isinstance(error, InputError):
+                rows.append(CrossCheckRow(name, REFUSED, note=str(error)))  # only after a look at the numbers
+            elif get(run).own:
                 raise
-            rows.append(CrossCheckRow(name, NOT_SOLVED, note=f"{type(error).__name__}: {error}"))
+            else:  # a plug-in may raise anything: it costs its own row
+                rows.append(CrossCheckRow(name, NOT_SOLVED, note=last_words(error)))
             continue
         rows.append(replace(compare(problem, name, solution, optimum), ran="" if other is None else run))
     if optimum is not None or any(row.verdict == AGREES_UNCOMPARED for row in rows):
@@ -240,14 +240,16 @@ def _reference(
         if reason is not None:
             failed.append(f"{name} {reason}")
             continue
+        spec = get(name)
         try:
-            spec = get(name)
             budget = 100 * spec.max_iter if spec.resumable else None  # a reference may take its time
             solution = uninterrupted(
                 solve(problem, name, tol=0.1 * REFERENCE_TOL, max_iter=budget, time_limit=time_limit)
             )
-        except LavenderError as error:
-            failed.append(f"{name}: {error}")
+        except Exception as error:
+            if spec.own and not isinstance(error, LavenderError):
+                raise
+            failed.append(f"{name}: {last_words(error)}")
             continue
         r = solution.residual
         needed = max(REFERENCE_TOL, min(10.0 * r.floor, FLOOR_MOST))
@@ -273,13 +275,14 @@ def compare(problem: Problem, name: str, solution: Solution, optimum: Solution |
     }
     verdict, breached = AGREES_UNCOMPARED, False
     if optimum is not None and np.isfinite(solution.impulse).all():
-        apart, allowed = distance(problem, solution, optimum)
-        shared |= {
-            "distance": apart,
-            "allowed": allowed,
-            "slack": float(np.abs(r.slack - optimum.slack).max(initial=0.0)),
-            "objective": _objective(problem, solution) - _objective(problem, optimum),
-        }
+        with np.errstate(over="ignore", invalid="ignore"):  # impulses whose squares are no numbers
+            apart, allowed = distance(problem, solution, optimum)
+            shared |= {
+                "distance": apart,
+                "allowed": allowed,
+                "slack": float(np.abs(r.slack - optimum.slack).max(initial=0.0)),
+                "objective": _objective(problem, solution) - _objective(problem, optimum),
+            }
         verdict, breached = AGREES, apart > allowed
     if breached:
         verdict = BREACH

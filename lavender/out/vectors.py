@@ -159,7 +159,8 @@ def _chosen(records: Records, solver: str | None) -> list[Record]:
     if solver not in names:
         have = ", ".join(names) or "none"
         raise InputError(
-            f"{solver or 'what is recommended'} is not in the C library; of these records are: {have} (--solver)"
+            f"{solver or 'what is recommended'} is not in the C library or reached no level in these records; of both "
+            f"are: {have} (--solver)"
         )
     mine, levels = [r for r in solved if r.solver == solver], tables.levels_of(records)
     level = levels[len(levels) // 2]

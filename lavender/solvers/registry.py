@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from functools import cache
 from typing import Any, Protocol
 
-from lavender.base.arrays import FloatArray, whole_number
+from lavender.base.arrays import FloatArray, flag, whole_number
 from lavender.base.deadline import Deadline
 from lavender.base.errors import InputError, SolverUnavailable, UnknownName, last_words
 from lavender.base.later import imported, loading
@@ -129,7 +129,7 @@ class SolverSpec:
     ------
     InputError
         A law or operator that does not exist, none at all, an empty name, options that are no table, requires that
-        is no tuple of names, or a max_iter that is no whole number.
+        is no tuple of names, a capability that is neither True nor False, or a max_iter that is no whole number.
     """
 
     name: str
@@ -193,6 +193,10 @@ class SolverSpec:
                 f"options of solver {self.name!r} are {self.options!r:.80}; a table of names, with a line on each, "
                 "is needed"
             )
+        for name, kind in self.__dataclass_fields__.items():
+            value = getattr(self, name)
+            if kind.type == "bool" and not isinstance(value, bool):  # as __future__ leaves annotations
+                flag(f"{name} of solver {self.name!r}", value)
         object.__setattr__(self, "max_iter", whole_number(f"max_iter of solver {self.name!r}", self.max_iter))
         if not self.resumable:
             object.__setattr__(self, "callback", False)

@@ -94,15 +94,27 @@ def test_a_liar_is_contradicted(plug_in):
     assert "says CONVERGED" in table["liar"].note
 
 
-def test_what_a_plug_in_raises_costs_its_own_row(plug_in):
+@pytest.mark.parametrize("kind", [RuntimeError, lv.InputError])
+def test_what_a_plug_in_raises_costs_its_own_row_and_as_reference_its_turn(plug_in, kind):
     def broken(problem, impulse):
-        raise RuntimeError("boom")
+        raise kind("boom")
 
     plug_in(broken, "broken")
-    table = cross_check(bounded_problem(2), ["broken", "direct"])
-    assert table["broken"].verdict == check.NOT_SOLVED and table["broken"].note == "RuntimeError: boom"
+    table = cross_check(bounded_problem(2), ["broken", "direct"], "broken")
+    words = f"{kind.__name__}: boom"
+    assert table["broken"].verdict == check.NOT_SOLVED and table["broken"].note == words
     assert table["direct"] in table.agreed and not table.ok
+    assert table.reference != "broken" and f"broken: {words}" in table.reference_note
     assert table["direct"].verdict == "agrees"
+
+
+def test_an_impulse_whose_energy_is_no_number_is_judged_without_a_warning(plug_in):
+    def huge(problem, impulse):
+        impulse[:] = 1e300
+        return lv.Claim(lv.Status.MAX_ITERATIONS, 1)
+
+    table = cross_check(bounded_problem(2), [plug_in(huge)])
+    assert table["plug-in"].verdict == check.NOT_SOLVED and table["plug-in"].relative == np.inf
 
 
 def test_a_budget_that_is_too_small_is_no_lie():

@@ -1,6 +1,7 @@
 """What is written builds: as C11 and C++17 without a warning, by CMake, and in JavaScript, with one hash."""
 
 import os
+import platform
 import re
 import shutil
 import subprocess
@@ -63,14 +64,25 @@ def test_no_python_header_and_nothing_but_sqrt_and_moves_of_memory(folder, share
     }
 
 
-def test_fast_math_does_not_compile(folder, compiler):
+@pytest.mark.parametrize(
+    "flag, sign",
+    [
+        ("-ffast-math", "ffast-math"),
+        pytest.param(
+            "-mfpmath=387",
+            "-mfpmath=sse",
+            marks=pytest.mark.skipif(platform.machine() != "x86_64", reason="registers of x86"),
+        ),
+    ],
+)
+def test_what_computes_otherwise_does_not_compile_and_says_why(folder, compiler, flag, sign):
     done = subprocess.run(
-        [compiler, "-ffast-math", "-fsyntax-only", folder / "lavender.c"],
+        [compiler, flag, "-fsyntax-only", folder / "lavender.c"],
         capture_output=True,
         text=True,
         check=False,
     )
-    assert done.returncode and "ffast-math" in done.stderr
+    assert done.returncode and sign in done.stderr
 
 
 def test_checksums_are_of_the_files(folder):
@@ -183,7 +195,7 @@ def test_vectors_are_of_what_the_report_of_these_records_recommends(tmp_path):
     for repeats, solver in ((1, "direct"), (2, "nncg")):  # two runs: the page is of the newest
         bench.run([problem], [solver], bench.Plan(levels=(1e-6,), budgets=(), repeats=repeats), records)
     assert "LAV_NNCG" in vectors.made(records, None, 1)["chosen.h"]
-    with pytest.raises(lv.InputError, match="of these records are: nncg"):
+    with pytest.raises(lv.InputError, match="reached no level in these records; of both are: nncg"):
         vectors.made(records, "direct", 1)
 
 

@@ -298,6 +298,7 @@ def test_javascript_reads_nothing_behind_an_array_and_ignores_nothing(javascript
         ({"lower": True}, {}, "an array of numbers is needed"),
         ({"b": [1, None, 3]}, {}, "b holds what is no number"),  # NaN on its way through JSON
         ({"b": [1, "2", 3]}, {}, "b holds what is no number"),
+        ({"key": [1, 2, 3]}, {}, "key holds what is no BigInt"),
         ({"n_rows": 2.5}, {}, "n_rows is 2.5"),
         ({"rows": 3}, {}, "there is no rows"),
         ({}, {"max_iter": 5}, "there is no max_iter"),

@@ -157,6 +157,9 @@ export class Solver {
     if (kind === 'double*' && !ArrayBuffer.isView(values) && Array.prototype.some.call(values, (x) => typeof x !== 'number')) {
       throw new TypeError(`${key} holds what is no number, which would count as 0, for one null: JSON has it for NaN and infinity`);
     }
+    if (kind === 'uint64_t*' && Array.prototype.some.call(values, (x) => typeof x !== 'bigint')) {
+      throw new TypeError(`${key} holds what is no BigInt: 7n or BigInt(7) is needed`);
+    }
     const bytes = values.length * ARRAYS[kind].BYTES_PER_ELEMENT;
     let held = this.arrays.get(key);
     if (!held || held.bytes < bytes) this.arrays.set(key, (held = { at: this.library.take(2 * bytes + 8), bytes: 2 * bytes }));

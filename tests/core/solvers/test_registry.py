@@ -40,6 +40,8 @@ def named(name, **more):
         {"options": ["omega"]},
         {"max_iter": -1},
         {"max_iter": "7"},
+        {"resumable": "no"},
+        {"threads": 2},
     ],
     ids=lambda wrong: next(iter(wrong)),
 )

@@ -143,6 +143,28 @@ def test_a_solver_that_raises_costs_its_own_record(plug_in):
     assert sum(r.solver == "fake_raise" for r in records) == 2  # one each: no level after it can be better
 
 
+def test_a_solver_that_is_registered_here_alone_is_measured_here_whatever_it_requires(plug_in):
+    name = plug_in(lambda problem, impulse: lv.Claim(lv.Status.CONVERGED, 1), requires=("numpy",))
+    assert {r.status for r in bench.run([stack(4)], [name], QUICK)} == {"CONVERGED"}
+
+
+def test_a_plug_in_that_tests_nothing_is_timed_with_its_own_budget(register):
+    class Untested:
+        def prepare(self, problem):
+            return lv.prepare(problem, "pgs")
+
+        def run(self, state, impulse, n, tol, time_limit=None):
+            assert n < 1000, "it would never end"
+            impulse[:] = state.solve(impulse=impulse, tol=0.0, max_iter=n).impulse
+            return lv.Claim(lv.Status.MAX_ITERATIONS, n)
+
+    laws = {"coulomb", "lcp", "linear", "cone"}
+    register(lv.SolverSpec("untested", Untested, laws=laws, summary="of a test", max_iter=200))
+    (record,) = bench.run([stack(2)], ["untested"], dataclasses.replace(QUICK, levels=(1e-3,), budgets=()))
+    assert (record.status, record.iterations) == ("CONVERGED", 200) and record.times
+    assert code_of(record) == ('lv.solve(problem, "untested", tol=1e-3)',)
+
+
 def test_a_refused_case_and_a_file_that_does_not_load_are_named(tmp_path):
     (tmp_path / "bad.npz").write_bytes(b"not an archive")
     records = bench.run([tmp_path, stack(4)], ["sor"], QUICK)

@@ -76,6 +76,15 @@ def test_problems_and_files_travel_too(tmp_path):
     assert ["did not load" in s.reason for s in records.skips] == [True]
 
 
+def test_a_solver_that_is_registered_here_alone_travels_even_under_a_name_of_ours(plug_in):
+    mine = lv.Status.MAX_ITERATIONS
+    for name in ("here alone", "pgs"):
+        plug_in(lambda problem, impulse: lv.Claim(mine, 1, {"mine": 1}), name)
+    plan = bench.CampaignPlan(levels=(1e-6,), budgets=(), orders=())
+    records = bench.campaign(["toy_stack"], ["here alone", "pgs"], plan, workers=2)
+    assert [dict(r.work) for r in records] == 2 * [{"mine": 1}]
+
+
 @pytest.mark.parametrize(
     ("backend", "sign"),
     [

@@ -72,6 +72,7 @@ class Order:
     plan: CampaignPlan
     run: Run
     memory: int | None  # bytes of each backend's process; a share of the machine it runs on if None
+    registered: tuple[SolverSpec, ...] = ()  # those that no worker finds by itself
 
 
 def seeds(words: Iterable[str], n: int, first: int = 0) -> list[str]:
@@ -153,6 +154,7 @@ def campaign(
         for i, item in enumerate(items)
         for j, name in enumerate(names)
     ]
+    here = tuple(specs[n] for n in names if not (specs[n].own or specs[n].plugged))
     out = Records()
     name, cluster = connected(backend)
     with cluster, opened(store) as kept:
@@ -170,7 +172,7 @@ def campaign(
                     f"{len(left)} of {len(pairs)} pairs are not done: workers were lost {ATTEMPTS} times; "
                     "run the same command again, with fewer workers if memory is short"
                 )
-            for index, entries in _hand_out(left, Order(plan, this, memory), workers, name):
+            for index, entries in _hand_out(left, Order(plan, this, memory, here), workers, name):
                 done[index], pair = entries, pairs[index]
                 _keep(kept, [*entries, Done(this.run, pair.case, pair.solver)])
                 if watch is not None:
@@ -347,6 +349,8 @@ _worker: Worker | None = None  # one for each process, kept between pairs
 
 def work(pair: Pair, order: Order) -> tuple[int, list[Any]]:
     """All entries of one pair; runs in a worker, on one thread: the pairs are what runs side by side."""
+    for spec in order.registered:
+        registry.register(spec, replace=True)
     with one_thread(pair.solver):
         return _work(pair, order)
 

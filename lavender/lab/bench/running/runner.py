@@ -92,13 +92,8 @@ def with_answer(record: Record, problem: Problem, impulse: FloatArray) -> Record
 
 
 def is_foreign(spec: SolverSpec) -> bool:
-    """Code that other packages brought, which a process of its own can import."""
-    return (
-        spec.external
-        or spec.plugged
-        or bool(spec.requires)
-        or (isinstance(spec.factory, str) and not spec.factory.startswith("lavender."))
-    )
+    """Code that other packages brought, which a process of its own finds: what `register` alone knows is not there."""
+    return spec.plugged or (spec.own and (spec.external or bool(spec.requires)))
 
 
 def solver_names(names: str | Sequence[str] | None) -> list[str]:

@@ -189,7 +189,11 @@ def attempt(problem: Problem, task: Task, impulse: Any = None) -> Outcome | str:
         with _undisturbed(task.solver):
             begun = perf_counter()
             if task.way and task.guarded:
-                guard = uninterrupted(_parts(problem, task, impulse))
+                # A plug-in may test nothing: then its own budget ends its line, and a larger one never would.
+                tests = registry.get(task.solver).own or task.mode != "tol"
+                guard = uninterrupted(_parts(problem, task if tests else replace(task, max_iter=0), impulse))
+                if not tests and _cut_short(guard, task):
+                    guard = uninterrupted(_parts(problem, task, impulse))
             left = max(1, task.repeats - (guard is not None))
             while left and (guard is None or guard.status is not Status.TIME_LIMIT):
                 paces.append(pace())
