@@ -279,7 +279,8 @@ const library = await lav.load(readFileSync(`${folder}/liblavender.wasm`)), solv
 const value = [2, 0, 0, 0, 2, 0, 0, 0, 2];
 const whole = { form: 1, n_blocks: 3, n_rows: 3, n_entries: 9, value, b: [1, 2, 3], lower: [0, 0, 0] };
 const fails = (call) => { try { return call(library.solver(lav.LAV_PGS)); } catch (error) { return error.message; } };
-const early = [(s) => s.run(), (s) => s.impulse(), (s) => s.velocity(), (s) => s.set()].map(fails);
+const named = () => library.solver('pgs');
+const early = [(s) => s.run(), (s) => s.impulse(), (s) => s.velocity(), (s) => s.set(), named].map(fails);
 const said = given.map(([problem, budget]) => {
   try { solver.set({ ...whole, ...problem }); solver.run(budget); return [...solver.impulse()]; }
   catch (error) { return error.message; }
@@ -312,6 +313,7 @@ def test_javascript_reads_nothing_behind_an_array_and_ignores_nothing(javascript
     assert done.returncode == 0, done.stderr
     early, first, *said, last = json.loads(done.stdout)
     assert all("no problem is set" in text for text in early[:3]) and "no table of fields" in early[3]
+    assert "method is pgs" in early[4]
     assert (first, last) == ([0.5, 1.0, 1.5], [1.5, 1.0, 0.5])  # whole ones, before and after
     for (_, _, sign), text in zip(mistakes, said, strict=True):
         assert isinstance(text, str) and sign in text

@@ -112,6 +112,7 @@ function needsFields(given) {
 /** One solver; its memory at least doubles where a problem asks for more, and impulses move with it. */
 export class Solver {
   constructor(library, method, options) {
+    if (!Number.isInteger(method)) throw new TypeError(`method is ${method}; a number is needed, LAV_NEWTON for one`);
     Object.assign(this, { library, c: library.c, at: 0, bytes: 0, rows: 0, speeds: 0 });
     for (const name of ['options', 'budget', 'result', 'problem']) this[name] = library.struct(`lav_${name}`);
     library.check(this.c.lav_default_options(method, this.options.at));
