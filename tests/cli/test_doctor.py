@@ -83,4 +83,4 @@ def test_a_refusal_of_git_is_no_error_in_whatever_letters(tmp_path, monkeypatch)
     (tmp_path / "git").write_bytes(b"#!/bin/sh\necho 'dubious ownership in \xff' >&2\nexit 128\n")
     (tmp_path / "git").chmod(0o755)
     monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
-    assert machine._commit(tmp_path) == ""
+    assert machine.commit_of(tmp_path) == ""

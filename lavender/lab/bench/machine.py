@@ -129,7 +129,7 @@ def build_facts() -> dict[str, str]:
 
     package = Path(__file__).resolve().parents[2]
     library = Path(str(serial.__file__))
-    found = {"commit": commit} if (commit := _commit(package.parent)) else {}
+    found = {"commit": commit} if (commit := commit_of(package.parent)) else {}
     kernels = hashlib.sha256()
     for path in sorted(library.parents[1].rglob(f"*{library.suffix}")):
         kernels.update(path.read_bytes())
@@ -143,7 +143,7 @@ def build_facts() -> dict[str, str]:
     return found | {"blas": ", ".join(sorted(set(blas)))}
 
 
-def _commit(root: Path) -> str:
+def commit_of(root: Path) -> str:
     """Of a checkout, with a mark where files differ from it; empty elsewhere."""
     if not (root / ".git").exists():
         return ""
