@@ -66,9 +66,11 @@ else:
         INLINE = ["-finline-limit=2000", "--param=inline-unit-growth=70"]
         LIMITS = ["-finline-limit=600", "--param=inline-unit-growth=40"]
     COMPILE_ARGS += [*OPTIONS["COMPILE_FLAGS"], "-Wno-unused-function"]
+    LINK_ARGS += OPTIONS["LINK_FLAGS"]
     if MODE == "asan":
-        LINK_ARGS = ["-fsanitize=address,undefined", "-fno-sanitize-recover=undefined"]
-        COMPILE_ARGS += [*LINK_ARGS, "-fno-omit-frame-pointer"]
+        sanitizers = ["-fsanitize=address,undefined", "-fno-sanitize-recover=undefined"]
+        LINK_ARGS += sanitizers
+        COMPILE_ARGS += [*sanitizers, "-fno-omit-frame-pointer"]
 
 
 class BuildKernels(build_ext):

@@ -6,10 +6,15 @@ Directives stand here alone, not at the head of a .pyx file, so that the debug b
 
 from typing import Any
 
-__all__ = ["COMPILE_FLAGS", "directives"]
+__all__ = ["COMPILE_FLAGS", "LINK_FLAGS", "directives"]
 
-#: Flags for gcc and clang that fix the bits (no fused multiply-add) and the meaning of a cast pointer.
-COMPILE_FLAGS = ["-ffp-contract=off", "-fno-strict-aliasing"]
+#: Flags for gcc and clang that fix the bits (no fused multiply-add) and the meaning of a cast pointer. The first takes
+#: back a -ffast-math of CFLAGS, and stands first, since clang's resets -ffp-contract too.
+COMPILE_FLAGS = ["-fno-fast-math", "-ffp-contract=off", "-fno-strict-aliasing"]
+
+#: CFLAGS reach the linker, too. For fast math, also that of -Ofast, which -O3 takes back, gcc's adds code that makes
+#: the whole process, NumPy as well, round subnormal numbers to zero from the import on.
+LINK_FLAGS = ["-O3", "-fno-fast-math", "-fno-unsafe-math-optimizations"]
 
 
 def directives(*, debug: bool = False) -> dict[str, Any]:

@@ -307,7 +307,20 @@ def test_debug_build_differs_in_checks_alone():
     differ = {name for name, value in directives(debug=True).items() if value != directives()[name]}
     assert differ == {"boundscheck", "initializedcheck"}
     assert "-ffp-contract=off" in COMPILE_FLAGS
-    assert not any("march" in flag or "fast-math" in flag for flag in COMPILE_FLAGS)
+    assert not any("march" in flag for flag in COMPILE_FLAGS)
+
+
+@pytest.mark.skipif(sys.platform == "win32" or not shutil.which("cc"), reason="needs a C compiler")
+@pytest.mark.parametrize("fast", ["-ffast-math", "-Ofast", "-funsafe-math-optimizations"])
+def test_cflags_do_not_change_how_numbers_are_rounded(fast, tmp_path):
+    """They stand before our own flags, where a module is compiled and where it is linked."""
+    from lavender_ext.build_options import COMPILE_FLAGS, LINK_FLAGS
+
+    (tmp_path / "x.c").write_text("#ifdef __FAST_MATH__\n#error fast\n#endif\n")
+    for step in (["-c", "x.c", "-O3", *COMPILE_FLAGS], ["-###", "-shared", "x.o", "-o", "x.so", *LINK_FLAGS]):
+        done = subprocess.run(["cc", fast, *step], cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert "-o x.so" in done.stderr.replace('"', "")
+    assert "crtfastmath" not in done.stderr
 
 
 def test_what_is_being_written_is_in_no_distribution(tmp_path):
