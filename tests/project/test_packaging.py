@@ -82,6 +82,8 @@ def test_no_text_offers_the_package_of_someone_else():
 
 
 def test_links_of_the_metadata_stand_below_an_address_that_is_known_and_nowhere_else(tmp_path):
+    pytest.importorskip("Cython", reason="setup.py imports it (extra: test)")
+
     def metadata(**env):
         python("setup.py", "-q", "egg_info", "--egg-base", tmp_path, env={**os.environ, **env})
         (info,) = tmp_path.glob("*/PKG-INFO")
