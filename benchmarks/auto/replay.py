@@ -144,7 +144,9 @@ def fit(cases: Iterable[tuple[Problem, Curves]]) -> dict[str, Any]:
             if name in curves and n > 0.0 and not compiled and not linear and not who(problem):
                 counts[kind].append(n)  # inf: never; without these the median would be of the easy ones
             if math.isfinite(time) and problem.m > 20:
-                newton.append((state.count, 1.0 if linear else kind if compiled else max(n, 1.0), 1e9 * time))
+                newton.append(
+                    (state.count, 1.0 if linear else "rows" if compiled else max(n, 1.0), 1e9 * time)
+                )
     # What no record is of keeps its count.
     count: dict[Any, float] = {
         kind: float(np.median(found or costs.RATES["count"][kind])) for kind, found in counts.items()

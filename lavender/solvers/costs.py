@@ -44,12 +44,10 @@ class Count:
 
 
 def factorisations(law: str, form: str = "") -> float:
-    """How many Newton's method is counted for; linear is one, Coulomb's law over velocities what bounded rows are."""
-    rows = RATES["count"]["rows"]
-    count = (
-        RATES["count"] | {"linear": 1.0, "lcp": rows} | ({"coulomb": rows} if form == "velocities" else {})
-    )
-    return float(count[law])
+    """How many Newton's method is counted for; linear is one, every other law over velocities what bounded rows are."""
+    if law == "linear":
+        return 1.0
+    return float(RATES["count"]["rows" if law == "lcp" or form == "velocities" else law])
 
 
 def newton_cost(count: Count, law: str) -> float:

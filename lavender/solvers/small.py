@@ -52,11 +52,10 @@ def limits(sweeps: float, most: float = MOST, steps: float = NEWTON_STEPS) -> Li
     """Of the compiled calls over generalised velocities: they may cost as much as so many sweeps, and `most` [ns], and
     take so many steps.
     """
-    count = (factorisations(law, "velocities") for law in ("lcp", "coulomb", "cone"))
     sweep = TREE, RATES["sweep row"], RATES["sweep cone"], sweeps
-    step = RATES["entry"], RATES["work"]["velocities"]
+    step = RATES["entry"], RATES["work"]["velocities"], factorisations("lcp")
     rows = SMALL_ROWS, DENSE_ROWS, SHARED, COLUMNS
-    return Limits(np.array([*step, *count, STEPS, SOFT, *sweep, general.ROOM, most, *rows, steps]))
+    return Limits(np.array([*step, STEPS, SOFT, *sweep, general.ROOM, most, *rows, steps]))
 
 
 def call_ends_within(problem: Problem, seconds: float | None) -> bool:

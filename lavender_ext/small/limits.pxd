@@ -2,7 +2,7 @@
 
     count (entry (2 Y + 4 m) + work w)                                                                     (1)
 
-Y entries, m rows, w multiply-adds of a factor of each island; count by law (`lavender/solvers/costs.py`).
+Y entries, m rows, w multiply-adds of a factor of each island; count as in `lavender/solvers/costs.py`.
 """
 from libc.math cimport INFINITY
 from libc.stdint cimport int32_t
@@ -14,9 +14,7 @@ from lavender_ext.core.parts cimport COULOMB, blocks_t, has_friction, is_rows
 cdef struct limits_t:           # ns, as in lavender/solvers/costs.py
     double entry                # each multiply-add of a sweep, and
     double work                 # of a factor,
-    double bounded              # factorisations by law,
-    double coulomb
-    double cone
+    double count                # factorisations where not all rows are free,
     double rigid                # times as many, but of bounded rows, with a rigid row,
     double soft                 # and where none is, but of free ones
     double start                # what a solve beside this call takes at least,
@@ -49,15 +47,11 @@ cdef inline bint is_linear(const blocks_t* p) noexcept nogil:
 
 cdef inline double cost_of(const blocks_t* p, const generalized_t* g, const limits_t* l, double work, bint soft) noexcept nogil:
     """What Newton's method is counted to cost [ns]: the one gate, for one problem and for many. soft: as `is_soft`."""
-    cdef double count = l.bounded
-    cdef bint linear = is_linear(p), rubs = has_friction(p)
-    if linear:
-        count = 1.0
-    elif rubs:
-        count = l.coulomb if p.law == COULOMB else l.cone
+    cdef bint linear = is_linear(p)
+    cdef double count = 1.0 if linear else l.count
     if soft and not linear:
         count *= l.soft
-    elif not soft and (linear or rubs):
+    elif not soft and (linear or has_friction(p)):
         count *= l.rigid
     return count * step_cost(p, g, l, work)
 

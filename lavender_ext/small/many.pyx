@@ -107,7 +107,7 @@ cdef void remember(job_t* j, Data p):
 
 
 cdef class Limits:
-    """Of the numbers of a `limits_t` (18,)."""
+    """Of the numbers of a `limits_t` (16,)."""
     cdef limits_t at
 
     def __init__(self, const double[::1] numbers):
