@@ -38,6 +38,7 @@ ASYMMETRY = 1e-12  # -, of sqrt(M_ii M_jj): above any rounding of sums over bodi
 ASYMMETRY32 = 2.0**-16  # the same of an M in float32, of which the lower triangle is taken
 MESH = 400  # velocities from which on the order of trees is looked for: below, a factor costs less than the search
 FACTORS = 20  # of a matrix like M that the solves of a problem take: what an order that fills in costs
+FULL = 50_000_000  # entries of a factor in the order given, beyond which it is not looked at
 MET = 100  # trees that meet a tree, in the mean, beyond which no order keeps J^T J sparse
 Compressed = tuple[IntArray, IntArray, FloatArray]
 ANY = (None,)  # the shape of an array of any length
@@ -134,7 +135,7 @@ class Generalized:
         made = object.__new__(Generalized)
         operator = kernels.Operator(*self.operator.jac, indptr, indices, data)
         made.__dict__.update(v_free=self.v_free, names=self.names, order=self.order, operator=operator)
-        made._check_definite()
+        made._factor()
         return made
 
     def _fill(
@@ -149,21 +150,25 @@ class Generalized:
         n = len(v_free)
         names = None if names is None else words_for("velocities", names, n)
         put["v_free"], put["names"], put["order"] = v_free, names, None
-        operator = kernels.Operator(*jac, *mass, like)
-        if operator.fill > 0 and operator.failed < 0 and _worth_ordering(operator.work, len(mass[1]), n):
+        try:
+            operator = kernels.Operator(*jac, *mass, like, FULL)
+        except MemoryError:
+            operator = None
+        if operator is None or (operator.fill > 0 and _worth_ordering(operator.work, len(mass[1]), n)):
             order = _order(mass, n)
             other = kernels.Operator(*_permuted_columns(jac, order), *_permuted_lower(mass, order))
-            if other.fill < operator.fill:
+            if operator is None or other.fill < operator.fill:
                 put["order"], operator = read_only(order), other
-        if n >= MESH and put["order"] is None and operator.failed < 0:
+        if n >= MESH and put["order"] is None:
             apart = _apart(jac, operator.parents)
             if apart is not None:
                 put["order"] = read_only(apart)
                 operator = kernels.Operator(*_permuted_columns(jac, apart), *_permuted_lower(mass, apart))
         put["operator"] = operator
-        self._check_definite()
+        self._factor()
 
-    def _check_definite(self) -> None:
+    def _factor(self) -> None:
+        self.operator.factor()
         at = self.operator.failed
         if at >= 0:
             at = at if self.order is None else int(self.order[at])

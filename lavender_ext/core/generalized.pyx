@@ -1,6 +1,6 @@
 """J and M of generalised coordinates for Python: M's factor, kept, and what the judge and the solvers read of it."""
 from libc.math cimport fabs, sqrt
-from libc.stdint cimport int32_t
+from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memcmp, memset
 
 import numpy as np
@@ -12,6 +12,8 @@ from lavender_ext.core.tree cimport tree_factor, tree_pattern
 
 cdef object new = np.empty, I4 = np.dtype(np.int32)
 
+cdef int64_t MOST = 2**31 - 1   # entries of L that 32-bit indices reach
+
 
 cdef public int32_t lav_tree_factor(int32_t n, const int32_t* mptr, const int32_t* midx, const double* mval,
                                     const int32_t* lptr, const int32_t* lidx, double* lval, double* pivot,
@@ -20,32 +22,37 @@ cdef public int32_t lav_tree_factor(int32_t n, const int32_t* mptr, const int32_
     return tree_factor(n, mptr, midx, mval, lptr, lidx, lval, pivot, inv_pivot)
 
 
-cdef object pattern_of(int32_t n, const int32_t* mptr, const int32_t* midx):
+cdef object pattern_of(int32_t n, const int32_t* mptr, const int32_t* midx, int64_t most=MOST):
     """L's columns by the elimination of M, in one array: lptr (n + 1), parent (n), scratch (3 n), then lidx."""
-    cdef int32_t count = -1, room = mptr[n] + 1
+    cdef int64_t room = mptr[n] + 1
+    cdef int32_t count = -1
     cdef int32_t[::1] whole
-    while count < 0:                                    # again where M's pattern is no tree's: L has more entries
-        marks = new(5 * n + 1 + room, I4)
+    most = min(<int64_t>n * n // 2 + 1, most)
+    while True:                                         # again where M's pattern is no tree's: L has more entries
+        marks = new(5 * <int64_t>n + 1 + room, I4)
         whole = marks
-        count = tree_pattern(n, mptr, midx, room, &whole[0], &whole[5 * n + 1], &whole[n + 1], &whole[2 * n + 1],
-                             &whole[3 * n + 1], &whole[4 * n + 1])
-        room = min(2 * room, n * n // 2 + 1)
-    return marks
+        count = tree_pattern(n, mptr, midx, <int32_t>room, &whole[0], &whole[5 * n + 1], &whole[n + 1],
+                             &whole[2 * n + 1], &whole[3 * n + 1], &whole[4 * n + 1])
+        if count >= 0:
+            return marks
+        if room >= most:
+            raise MemoryError(f"the factor of M ({n}, {n}) has more than {most} entries")
+        room = min(2 * room, most)
 
 
 cdef class Operator:
     """J in compressed rows and M by its lower triangle, diagonal included, with M = L^T D L.
 
-    The caller passes checked int32 and float64 arrays with ascending columns; they are kept alive here. `failed`
-    is the row of M whose pivot is not positive, -1 where M is positive definite. `like` is another operator, whose
-    pattern of L is shared where its M has entries in the same places.
+    The caller passes checked int32 and float64 arrays with ascending columns; they are kept alive here. `like` is another
+    operator, whose pattern of L is shared where its M has entries in the same places; MemoryError, if L has more than
+    `most`. L has no numbers before `factor`, which finds in `failed` the row of M whose pivot is not positive, -1 where M
+    is positive definite.
     """
 
-    def __init__(self, jptr_, jidx_, jval_, mptr_, midx_, mval_, Operator like=None):
-        cdef int32_t m = <int32_t>len(jptr_) - 1, n = <int32_t>len(mptr_) - 1, i
+    def __init__(self, jptr_, jidx_, jval_, mptr_, midx_, mval_, Operator like=None, int64_t most=MOST):
+        cdef int32_t m = <int32_t>len(jptr_) - 1, n = <int32_t>len(mptr_) - 1
         cdef const int32_t* mptr = ints(mptr_, n + 1)
         cdef const int32_t* midx = ints(midx_, len(midx_))
-        cdef double* numbers
         self.jac = (jptr_, jidx_, jval_)
         self.mass = (mptr_, midx_, mval_)
         self.mptr, self.midx = mptr, midx
@@ -60,20 +67,26 @@ cdef class Operator:
             self.g.lidx = like.g.lidx
             self.g.parent = like.g.parent
         else:
-            marks = pattern_of(n, mptr, midx)
+            marks = pattern_of(n, mptr, midx, most)
             self.g.lptr = ints(marks, len(marks))
             self.g.parent = self.g.lptr + n + 1
             self.g.lidx = self.g.parent + 4 * n
-        factor = new(2 * n + self.g.lptr[n] + 1)
-        numbers = doubles(factor, 2 * n + self.g.lptr[n] + 1)
-        self.keep = [marks, factor]
+        self.keep, self.failed = [marks], -1
+
+    def factor(self):
+        """L and D."""
+        cdef int32_t n = self.g.n, i
+        cdef int64_t size = 2 * <int64_t>n + self.g.lptr[n] + 1
+        cdef double* numbers
+        factor = new(size)
+        numbers = doubles(factor, size)
+        self.keep.append(factor)
         self.g.lval = numbers + 2 * n
         self.g.inv_pivot = numbers
         self.g.root = numbers + n                       # the factor's pivots, until it is there
-        self.failed = -1
         if n:
-            self.failed = lav_tree_factor(n, mptr, midx, doubles(mval_, len(mval_)), self.g.lptr, self.g.lidx,
-                                          numbers + 2 * n, numbers + n, numbers)
+            self.failed = lav_tree_factor(n, self.mptr, self.midx, doubles(self.mass[2], len(self.mass[2])), self.g.lptr,
+                                          self.g.lidx, numbers + 2 * n, numbers + n, numbers)
         for i in range(n):
             numbers[n + i] = sqrt(numbers[i])
 

@@ -10,11 +10,9 @@ from lavender_ext.core.bits cimport highest, lowest
 from lavender_ext.core.door cimport least
 
 
-cdef inline void take_from(double* x, const double* l, double z, int32_t n) noexcept nogil:
-    cdef int32_t i
-    if z != 0.0:
-        for i in range(n):
-            x[i] -= l[i] * z
+cdef enum:
+    WIDE = 8                    # rows of a chain that are eliminated together
+    LONG = 16                   # columns from which on four of them are at once
 
 
 cdef inline int32_t few_pattern(int32_t n, const int32_t* mptr, const int32_t* midx, int32_t room, int32_t* lptr,
@@ -111,13 +109,11 @@ cdef inline int32_t tree_factor(int32_t n, const int32_t* mptr, const int32_t* m
                                 double* inv_pivot) noexcept nogil:
     """L and 1 / D of (1); -1, or the row whose pivot is no more than rounding of M_kk, or below the door's least.
 
-    Two rows of a chain, whose columns are the same but for the upper one's own place, are eliminated together: with the
-    bits of one after the other, and half of what is read and written.
+    Rows of a chain, whose columns are the same but for their own places, are eliminated together: with the bits of one
+    after the other, and a part of what is read and written.
     """
-    cdef int32_t k, q, a, j, first, count, at
-    cdef double f, g
-    cdef double* l
-    cdef double* u
+    cdef int32_t k, q, a, j, first, count, at, s, t
+    cdef double* row[WIDE]
     for k in range(n):
         at = lptr[k]
         first = mptr[k]
@@ -139,42 +135,18 @@ cdef inline int32_t tree_factor(int32_t n, const int32_t* mptr, const int32_t* m
                 lval[at] = mval[q]
     k = n - 1
     while k >= 0:
-        if not has_reciprocal(pivot, inv_pivot, k):
-            return k
-        first = lptr[k]
-        count = lptr[k + 1] - first
-        l = lval + first
-        if count == 0 or lidx[first + count - 1] != k - 1 or first - lptr[k - 1] != count - 1:
-            for a in range(count - 1, -1, -1):
-                j = lidx[first + a]
-                f = l[a] * inv_pivot[k]
-                pivot[j] -= f * l[a]
-                take_row(lptr, lidx, lval, j, first, a, f, l)
-                l[a] = f
-            k -= 1
-            continue
-        count -= 1                                          # of row k - 1, which row k leaves first
-        u = lval + lptr[k - 1]
-        f = l[count] * inv_pivot[k]
-        pivot[k - 1] -= f * l[count]
-        take_from(u, l, f, count)
-        l[count] = f
-        k -= 1
-        if not has_reciprocal(pivot, inv_pivot, k):
-            return k
-        for a in range(count - 1, -1, -1):
-            j = lidx[first + a]
-            f = l[a] * inv_pivot[k + 1]
-            g = u[a] * inv_pivot[k]
-            pivot[j] = (pivot[j] - f * l[a]) - g * u[a]
-            if lptr[j + 1] - lptr[j] == a:                  # the same columns
-                take_two(lval + lptr[j], l, f, u, g, a)
-            else:
-                take_row(lptr, lidx, lval, j, first, a, f, l)
-                take_row(lptr, lidx, lval, j, first, a, g, u)
-            l[a] = f
-            u[a] = g
-        k -= 1
+        first, count, s = lptr[k], lptr[k + 1] - lptr[k], 1
+        while s < WIDE and s <= count and lidx[first + count - s] == k - s and lptr[k - s + 1] - lptr[k - s] == count - s:
+            s += 1
+        for t in range(s):
+            row[t] = lval + lptr[k - t]
+        for t in range(s):
+            take_rows(lptr, lidx, lval, pivot, inv_pivot, k, k - t, count - t, row, t)
+            if not has_reciprocal(pivot, inv_pivot, k - t):
+                return k - t
+        for a in range(count - s, -1, -1):
+            take_rows(lptr, lidx, lval, pivot, inv_pivot, k, lidx[first + a], a, row, s)
+        k -= s
     return -1
 
 
@@ -186,24 +158,61 @@ cdef inline bint has_reciprocal(const double* pivot, double* inv_pivot, int32_t 
     return True
 
 
-cdef inline void take_row(const int32_t* lptr, const int32_t* lidx, double* lval, int32_t j, int32_t first,
-                          int32_t count, double f, const double* l) noexcept nogil:
-    """Row j loses f l (count), which stands on the columns from place `first`."""
-    cdef int32_t b, i, at = lptr[j]
+cdef inline void take_rows(const int32_t* lptr, const int32_t* lidx, double* lval, double* pivot, const double* inv_pivot,
+                           int32_t k, int32_t j, int32_t count, double** row, int32_t s) noexcept nogil:
+    """Rows k, k - 1 ... (s) of a chain leave row j, their column at `count`; the `count` before it are runs of row j."""
+    cdef int32_t b = 0, n, t, at = lptr[j], first = lptr[k]
+    cdef double z[WIDE]
+    for t in range(s):
+        z[t] = row[t][count] * inv_pivot[k - t]
+        pivot[j] -= z[t] * row[t][count]
     if lptr[j + 1] - at == count:                           # the same columns
-        take_from(lval + at, l, f, count)
-        return
-    for b in range(count):
-        i = lidx[first + b]
-        while lidx[at] != i:
+        take_run(lval + at, row, z, s, 0, count)
+        b = count
+    while b < count:
+        while lidx[at] != lidx[first + b]:
             at += 1
-        lval[at] -= f * l[b]
+        n = 1
+        while b + n < count and lidx[at + n] == lidx[first + b + n]:
+            n += 1
+        take_run(lval + at, row, z, s, b, n)
+        at += n
+        b += n
+    for t in range(s):
+        row[t][count] = z[t]
+
+
+cdef inline void take_run(double* x, double** row, const double* z, int32_t s, int32_t b, int32_t n) noexcept nogil:
+    """x <- x - z_0 row_0 - z_1 row_1 ... on n columns from place b."""
+    cdef int32_t t = 0
+    while t + 4 <= s and n >= LONG:
+        take_four(x, row[t] + b, z[t], row[t + 1] + b, z[t + 1], row[t + 2] + b, z[t + 2], row[t + 3] + b, z[t + 3], n)
+        t += 4
+    while t + 2 <= s:
+        take_two(x, row[t] + b, z[t], row[t + 1] + b, z[t + 1], n)
+        t += 2
+    if t < s:
+        take_from(x, row[t] + b, z[t], n)
+
+
+cdef inline void take_from(double* x, const double* l, double f, int32_t n) noexcept nogil:
+    cdef int32_t i
+    if f != 0.0:
+        for i in range(n):
+            x[i] -= f * l[i]
 
 
 cdef inline void take_two(double* x, const double* l, double f, const double* u, double g, int32_t n) noexcept nogil:
     cdef int32_t i
     for i in range(n):
         x[i] = (x[i] - f * l[i]) - g * u[i]
+
+
+cdef inline void take_four(double* x, const double* l, double f, const double* u, double g, const double* v, double h,
+                           const double* w, double k, int32_t n) noexcept nogil:
+    cdef int32_t i
+    for i in range(n):
+        x[i] = (((x[i] - f * l[i]) - g * u[i]) - h * v[i]) - k * w[i]
 
 
 cdef inline void ldl_solve(int32_t n, const int32_t* lptr, const int32_t* lidx, const double* lval,
