@@ -22,18 +22,18 @@ def prove(files: tuple[str, ...], solver: str, tol: float) -> None:
     be read.
     """
     from lavender.lab.bench.cases import resolve
+    from lavender.lab.bench.running.worker import Worker, solved
     from lavender.lab.proof import prove as enclose
     from lavender.lab.proof import require
     from lavender.solvers.registry import get
-    from lavender.solving.solve import solve
 
     one_thread()
     get(solver)  # refused before anything is read, as is a missing package
     require()
     unmet, reading = False, Reading()
     for item in resolve(list(files)):
-        with reading(item):
-            solution = solve(item.problem, solver, tol=tol)
+        with reading(item), Worker() as worker:
+            solution = solved(worker, item.problem, solver, tol=tol)
             found = enclose(item.problem, solution)
             short = "" if solution.success else f"; {solver}: {solution.status.name}"
             say(f"{item.name}: {found}{short}")

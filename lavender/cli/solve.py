@@ -46,11 +46,9 @@ def solve(
     Exit code 0: the judge accepts the answer (within tol, or at the floor of float64; with --tol 0 always).
     1: it does not. 3: the problem is infeasible, with a certificate that the judge confirms.
     """
-    from lavender.base.later import load
     from lavender.judge.residuals import WRONG
     from lavender.lab import bench
-    from lavender.solvers import registry
-    from lavender.solving.solve import solve as solve_problem
+    from lavender.lab.bench.running.worker import Worker, solved
 
     one_thread()
     if output is not None:
@@ -61,10 +59,10 @@ def solve(
     if output is not None and output.exists() and Path(item.source).exists() and output.samefile(item.source):
         raise InputError(f"--output {output} is the problem itself, which would be lost: give another file")
     options: dict[str, Any] = {k: v for k, v in (("order", order), ("seed", seed)) if v is not None}
-    load(*registry.get(solver).requires)  # else the printed time would hold it
-    solution = solve_problem(
-        item.problem, solver, tol=tol, max_iter=max_iter, time_limit=time_limit, **options
-    )
+    with Worker() as worker:
+        solution = solved(
+            worker, item.problem, solver, tol=tol, max_iter=max_iter, time_limit=time_limit, **options
+        )
     if output is not None:
         import numpy as np
 

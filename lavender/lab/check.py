@@ -1,30 +1,27 @@
 """Do solvers agree? Each against the judge, and against the optimum that a QP backend found.
 
-For symmetric positive semidefinite A and a convex set of impulses (bounds, the cones of relaxed
-friction) any two impulses, with Delta = l1 - l2, eps = e1 - e2 (the judge's errors) and D = diag(d), obey
-
-    |Delta|_A^2 <= |Delta|_A |eps|_A + |eps|_D |Delta|_D                                          (1)
-
-Both p = l - e are projections of l - w/d in the metric of D, so (w1 - w2 - D eps).(Delta - eps) <= 0; expand and use
-Cauchy-Schwarz. A breach means that a residual is computed wrongly. |Delta|_A [sqrt J] is the energy of
-the difference of velocities, which is unique where impulses are not.
+Where the problem is convex, two answers are no further from each other than their residuals allow
+(`lavender.lab.motion.bound`, inequality (3)). A breach means that a residual is computed wrongly. |Delta|_A [sqrt J] is
+the energy of the difference of velocities, which is unique where impulses are not.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from lavender.base.errors import InputError, LavenderError, last_words
-from lavender.base.later import load
 from lavender.judge.residuals import FLOOR_MOST, WRONG
 from lavender.judge.solution import Solution, Status, uninterrupted
+from lavender.lab.bench.running.worker import Lost, Worker, solved
+from lavender.lab.motion.bound import separation
 from lavender.problem import Problem, check_problem
 from lavender.solvers.registry import available, get, known, specs
-from lavender.solving.solve import check_budget, seconds_of, solve
+from lavender.solving.solve import check_budget, seconds_of
 
 REFERENCES = ("osqp", "clarabel", "piqp", "direct")
 CONE_REFERENCES = ("clarabel_cone", "block_gauss_seidel")  # of relaxed friction, which is no QP
@@ -52,7 +49,7 @@ class CrossCheckRow:
     relative: float | None = None  # -, the judge's
     floor: float | None = None  # -
     distance: float | None = None  # sqrt J, |Delta|_A to the reference
-    allowed: float | None = None  # sqrt J, largest distance that (1) allows
+    allowed: float | None = None  # sqrt J, largest distance that (3) allows
     slack: float | None = None  # m/s, largest difference of slack
     objective: float | None = None  # J, 1/2 l.A l - b.l minus that of the reference
     time: float | None = None  # s, set-up and solve
@@ -62,7 +59,7 @@ class CrossCheckRow:
 
     @property
     def contradicted(self) -> bool:
-        """The solver claims what the judge does not find, or inequality (1) is broken."""
+        """The solver claims what the judge does not find, or inequality (3) is broken."""
         return self.verdict in (CONTRADICTED, BREACH)
 
 
@@ -196,34 +193,39 @@ def cross_check(
     for name in (reference, *names):
         if name not in reasons:
             get(name)  # raises UnknownName with the nearest names
-    optimum, chosen, note = _reference(problem, reference, reasons, time_limit)
-    rows = []
-    for name in names:
-        reason = reasons[name]
-        other = None if reason is None else specs()[name].standing_in(problem)
-        if reason is not None and other is None:
-            rows.append(CrossCheckRow(name, REFUSED, note=reason))
-            continue
-        run = name if other is None else other.name
-        try:
-            load(*get(run).requires)  # what the time of a first solve would hold besides
-            solution = uninterrupted(solve(problem, run, tol=tol, max_iter=max_iter, time_limit=time_limit))
-        except Exception as error:
-            if isinstance(error, LavenderError) and not isinstance(error, InputError):
-                rows.append(CrossCheckRow(name, REFUSED, note=str(error)))  # only after a look at the numbers
-            elif get(run).own:
-                raise
-            else:  # a plug-in may raise anything: it costs its own row
-                rows.append(CrossCheckRow(name, NOT_SOLVED, note=last_words(error)))
-            continue
-        rows.append(replace(compare(problem, name, solution, optimum), ran="" if other is None else run))
+    with Worker() as worker:
+        solver = partial(solved, worker, problem, time_limit=time_limit)
+        optimum, chosen, note = _reference(problem, reference, reasons, solver)
+        solver = partial(solver, tol=tol, max_iter=max_iter)
+        rows = [_row(problem, name, reasons[name], optimum, solver) for name in names]
     if optimum is not None or any(row.verdict == AGREES_UNCOMPARED for row in rows):
         rows = [replace(r, verdict=INEXACT) if r.verdict in (PROVED, NEAR_NONE) else r for r in rows]
     return CrossCheck(problem, tol, chosen, note, tuple(rows))
 
 
+def _row(
+    problem: Problem, name: str, reason: str | None, optimum: Solution | None, solver: Callable[..., Solution]
+) -> CrossCheckRow:
+    other = None if reason is None else specs()[name].standing_in(problem)
+    if reason is not None and other is None:
+        return CrossCheckRow(name, REFUSED, note=reason)
+    run = name if other is None else other.name
+    try:
+        solution = uninterrupted(solver(run))
+    except Exception as error:
+        if isinstance(error, Lost):
+            return CrossCheckRow(name, NOT_SOLVED, error.status, note=error.text)
+        if isinstance(error, LavenderError) and not isinstance(error, InputError):
+            return CrossCheckRow(name, REFUSED, note=str(error))  # only after a look at the numbers
+        if get(run).own:
+            raise
+        # a plug-in may raise anything: it costs its own row
+        return CrossCheckRow(name, NOT_SOLVED, note=last_words(error))
+    return replace(compare(problem, name, solution, optimum), ran="" if other is None else run)
+
+
 def _reference(
-    problem: Problem, first: str, reasons: dict[str, str | None], time_limit: float | None
+    problem: Problem, first: str, reasons: dict[str, str | None], solver: Callable[..., Solution]
 ) -> tuple[Solution | None, str | None, str]:
     """(solution, solver, how good) of the first that passes, or (None, None, why none does)."""
     if problem.law == "coulomb":
@@ -243,9 +245,7 @@ def _reference(
         spec = get(name)
         try:
             budget = 100 * spec.max_iter if spec.resumable else None  # a reference may take its time
-            solution = uninterrupted(
-                solve(problem, name, tol=0.1 * REFERENCE_TOL, max_iter=budget, time_limit=time_limit)
-            )
+            solution = uninterrupted(solver(name, tol=0.1 * REFERENCE_TOL, max_iter=budget))
         except Exception as error:
             if spec.own and not isinstance(error, LavenderError):
                 raise
@@ -276,7 +276,7 @@ def compare(problem: Problem, name: str, solution: Solution, optimum: Solution |
     verdict, breached = AGREES_UNCOMPARED, False
     if optimum is not None and np.isfinite(solution.impulse).all():
         with np.errstate(over="ignore", invalid="ignore"):  # impulses whose squares are no numbers
-            apart, allowed = distance(problem, solution, optimum)
+            apart, allowed = separation(problem, solution, optimum)
             shared |= {
                 "distance": apart,
                 "allowed": allowed,
@@ -296,39 +296,6 @@ def compare(problem: Problem, name: str, solution: Solution, optimum: Solution |
     elif not (solution.success or r.at_floor):
         verdict = NOT_SOLVED
     return CrossCheckRow(name, verdict, note=note, **shared)
-
-
-def distance(problem: Problem, one: Any, two: Any) -> tuple[float, float]:
-    """|Delta|_A of two judged answers and the largest value of it that (1) allows, rounding included [sqrt J]."""
-    delta = problem.on_disk(one.impulse - two.impulse)
-    eps = problem.on_disk(one.residual.error - two.residual.error)
-    problem = problem.disk
-    d: Any = problem.d
-    a_delta, a_eps = _apply(problem, delta), _apply(problem, eps)
-    apart = float(np.sqrt(max(delta @ a_delta, 0.0)))
-    # The errors e themselves are known to the floor of both residuals, in the norm of D.
-    fuzz = float(sum(s.residual.floor * s.residual.energy_start for s in (one, two)))
-    root = 1.0 / np.sqrt(d)
-    stiff = float(np.sqrt(np.max(root * _apply(problem, root, abs), initial=0.0)))
-    eps_d = float(np.sqrt(np.sum(d * eps * eps))) + fuzz
-    eps_a = float(np.sqrt(max(eps @ a_eps, 0.0))) + stiff * fuzz
-    delta_d = float(np.sqrt(np.sum(d * delta * delta)))
-    # x^2 <= x eps_a + eps_d delta_d bounds x by the larger root. Rounding of Delta.A Delta itself:
-    rounding = 2.0**-50 * stiff * delta_d
-    allowed = 0.5 * (eps_a + np.sqrt(eps_a * eps_a + 4.0 * eps_d * delta_d))
-    return apart, float(allowed * (1.0 + 1e-9) + np.sqrt(rounding * stiff * delta_d))
-
-
-def _apply(problem: Problem, x: Any, part: Callable[[Any], Any] = lambda a: a) -> Any:
-    """A x (m,), without forming A where J and M are known; with `abs` a bound of abs(A) x for x >= 0."""
-    if problem.generalized is not None:
-        y = part(problem.whitened)
-        return y @ (y.T @ x) + problem.compliance * x
-    if problem.rows is None:
-        return part(problem.csr) @ x
-    assert problem.compliance is not None
-    jac = part(problem.jacobian)
-    return jac @ (part(problem.rows.inverse_mass_matrix()) @ (jac.T @ x)) + problem.compliance * x
 
 
 def _objective(problem: Problem, solution: Solution) -> float:

@@ -57,7 +57,7 @@ def serve(lifeline: int, make: Callable[[], Handler], memory: int = 0) -> None:
 
 def limit_cpu(more: float) -> None:
     """Have the system end this process after so much more CPU time [s], should nobody be left who could."""
-    with contextlib.suppress(ImportError, ValueError, OSError):
+    with contextlib.suppress(ImportError, ValueError, OSError, OverflowError):  # the last for inf: no limit
         import resource
 
         hard = resource.getrlimit(resource.RLIMIT_CPU)[1]

@@ -28,11 +28,20 @@ sums of this kind meet where nobody's arithmetic can: at a witness at the floor 
 
 A bound by the duality gap, |x - y*|_A^2 <= 2 gap, needs no metric but is a square root: a gap known to
 1e-16 says 1e-8. (2) is linear in e.
+
+Between two answers l1, l2 with errors e1, e2, and Delta = l1 - l2, eps = e1 - e2:
+
+    |Delta|_A^2 <= |Delta|_A |eps|_A + |eps|_D |Delta|_D                                          (3)
+
+Both p = l - e are projections of l - w/d in the metric of D, so (w1 - w2 - D eps).(Delta - eps) <= 0; expand and use
+Cauchy-Schwarz.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -90,3 +99,36 @@ def _rounding_of_projection(problem: Problem, y: FloatArray, w: FloatArray) -> F
                 whole = top * np.sqrt(energy[block] / d)
         fuzz[together] = (64.0 * U * whole)[together]
     return fuzz
+
+
+def separation(problem: Problem, one: Any, two: Any) -> tuple[float, float]:
+    """|Delta|_A of two judged answers and the largest value of it that (3) allows, rounding included [sqrt J]."""
+    delta = problem.on_disk(one.impulse - two.impulse)
+    eps = problem.on_disk(one.residual.error - two.residual.error)
+    problem = problem.disk
+    d: Any = problem.d
+    a_delta, a_eps = _apply(problem, delta), _apply(problem, eps)
+    apart = float(np.sqrt(max(delta @ a_delta, 0.0)))
+    # The errors e themselves are known to the floor of both residuals, in the norm of D.
+    fuzz = float(sum(s.residual.floor * s.residual.energy_start for s in (one, two)))
+    root = 1.0 / np.sqrt(d)
+    stiff = float(np.sqrt(np.max(root * _apply(problem, root, abs), initial=0.0)))
+    eps_d = float(np.sqrt(np.sum(d * eps * eps))) + fuzz
+    eps_a = float(np.sqrt(max(eps @ a_eps, 0.0))) + stiff * fuzz
+    delta_d = float(np.sqrt(np.sum(d * delta * delta)))
+    # x^2 <= x eps_a + eps_d delta_d bounds x by the larger root. Rounding of Delta.A Delta itself:
+    rounding = 2.0**-50 * stiff * delta_d
+    allowed = 0.5 * (eps_a + np.sqrt(eps_a * eps_a + 4.0 * eps_d * delta_d))
+    return apart, float(allowed * (1.0 + 1e-9) + np.sqrt(rounding * stiff * delta_d))
+
+
+def _apply(problem: Problem, x: Any, part: Callable[[Any], Any] = lambda a: a) -> Any:
+    """A x (m,), without forming A where J and M are known; with `abs` a bound of abs(A) x for x >= 0."""
+    if problem.generalized is not None:
+        y = part(problem.whitened)
+        return y @ (y.T @ x) + problem.compliance * x
+    if problem.rows is None:
+        return part(problem.csr) @ x
+    assert problem.compliance is not None
+    jac = part(problem.jacobian)
+    return jac @ (part(problem.rows.inverse_mass_matrix()) @ (jac.T @ x)) + problem.compliance * x

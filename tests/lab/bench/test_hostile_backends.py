@@ -15,12 +15,12 @@ import pytest
 from stacks import stack
 
 import lavender as lv
-from lavender import bench, registry
+from lavender import bench, cli, registry
 from lavender.base.apart.process import opened
 from lavender.lab.bench import cases as bench_cases
 from lavender.lab.bench import machine
 from lavender.lab.bench.running import timing
-from lavender.lab.bench.running.worker import Worker, outcome_in
+from lavender.lab.bench.running.worker import DIED, Worker, outcome_in
 
 POSIX = pytest.mark.skipif(os.name != "posix", reason="processes and file names of POSIX")
 BACKENDS = """
@@ -240,6 +240,22 @@ def test_a_whole_run_survives_its_backends(hostile, watchdog, monkeypatch):
     assert said == ["CONVERGED", "KILLED", "CRASHED (SIGSEGV)", "CRASHED (exit status 3)", "CONVERGED"]
     assert records.records[0].contradicted  # its diagonal step does not solve a stack, and it says so
     assert int(records.records[0].message) != os.getpid()
+
+
+def test_a_check_and_a_solve_survive_what_ends_its_process(hostile, watchdog, tmp_path, monkeypatch, capsys):
+    died = ["CRASHED (exit status 3)", "CRASHED (SIGSEGV)", "CONVERGED"]
+    table = lv.cross_check(stack(4), ["x_leave", "x_segfault", "pgs"], "x_leave")
+    assert [row.status for row in table] == died
+    assert table["x_leave"].note == DIED and table.reference_note.endswith(
+        f"(x_leave: Lost: {died[0]}: {DIED})"
+    )
+    monkeypatch.setattr("lavender.lab.bench.running.worker.GRACE", 0.5)
+    (row,) = lv.cross_check(stack(4), "x_hang", time_limit=0.1)
+    assert row.status == "KILLED"
+    stack(4).save(tmp_path / "stack.npz")
+    with pytest.raises(SystemExit) as end:
+        cli.main(["solve", str(tmp_path / "stack.npz"), "--solver", "x_leave"])
+    assert end.value.code == cli.EXIT_BAD_INPUT and died[0] in capsys.readouterr().err
 
 
 def test_memory_is_limited_without_asking(hostile, watchdog):

@@ -22,8 +22,8 @@ from lavender.lab.bench.running.plan import Plan, passes
 from lavender.lab.bench.running.timing import Ask, Task, measure, one_thread
 from lavender.lab.bench.running.worker import Worker
 from lavender.lab.bench.store import Records, Store, opened
-from lavender.lab.check import distance
 from lavender.lab.motion import load_reference
+from lavender.lab.motion.bound import separation
 from lavender.lab.motion.reference import as_reference
 from lavender.lab.proof import enclosed
 from lavender.problem import Problem
@@ -75,7 +75,7 @@ def with_motion(record: Record, problem: Problem, impulse: Any) -> Record:
         and reference.enclosed
         and reference.witness is not None
     ):
-        apart, allowed = distance(problem, as_reference(problem, impulse), reference)
+        apart, allowed = separation(problem, as_reference(problem, impulse), reference)
         if apart > allowed:
             words = (
                 f"says {record.status}, {apart:.1e} sqrt(J) from the exact solution, {allowed:.1e} allowed"

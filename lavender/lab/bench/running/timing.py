@@ -290,6 +290,13 @@ def judged(problem: Problem, task: Task, found: Outcome | str) -> tuple[Record, 
     """The record of an outcome, judged here on `problem`, and the impulses (m,) [N s] if they are numbers."""
     if isinstance(found, str):
         return task.record(status=ERROR, message=found[:500]), None
+    solution = solution_of(problem, task, found)
+    impulse = solution.impulse if np.isfinite(solution.impulse).all() else None
+    return record_of(task, solution, found), impulse
+
+
+def solution_of(problem: Problem, task: Task, found: Outcome) -> Solution:
+    """What an outcome says, judged here on `problem`."""
     claim = Claim(
         Status[found.status],
         found.iterations,
@@ -298,7 +305,7 @@ def judged(problem: Problem, task: Task, found: Outcome | str) -> tuple[Record, 
         found.form,
         certificate=found.certificate,
     )
-    solution = finish(
+    return finish(
         problem,
         registry.get(task.solver),
         dict(task.options),
@@ -309,8 +316,6 @@ def judged(problem: Problem, task: Task, found: Outcome | str) -> tuple[Record, 
         found.solves[-1],
         None,
     )
-    impulse = solution.impulse if np.isfinite(solution.impulse).all() else None
-    return record_of(task, solution, found), impulse
 
 
 def _parts(problem: Problem, task: Task, impulse: Any) -> Solution:

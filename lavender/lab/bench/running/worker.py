@@ -17,16 +17,30 @@ from typing import Any
 from lavender.base.apart import served
 from lavender.base.apart.process import Ended, Process, Raised
 from lavender.base.arrays import FloatArray
-from lavender.judge.solution import Status
+from lavender.base.errors import LavenderError
+from lavender.base.later import load
+from lavender.judge.solution import Solution, Status
+from lavender.lab.bench.cases import fingerprint
 from lavender.lab.bench.machine import memory_share
-from lavender.lab.bench.record import CRASHED, KILLED, Record, plain, values_in
-from lavender.lab.bench.running.timing import Outcome, Task, attempt, judged
+from lavender.lab.bench.record import CRASHED, ERROR, KILLED, Record, plain, values_in
+from lavender.lab.bench.running.timing import Outcome, Task, attempt, judged, solution_of
 from lavender.problem import Problem
+from lavender.solvers import registry
+from lavender.solving.solve import Prepared, seconds_of, solve
 
 _ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 ORPHAN = 60.0  # s of CPU, beyond what any task may take
 ARRAYS = ("impulse", "certificate")  # of an outcome
+DIED = "its code ended the process that it ran in; tell its authors, and leave it out (--solvers)"
 GRACE = 2.0  # s, beyond the repeats' own limits, for set-up and judging
+
+
+class Lost(LavenderError):
+    """A task brought no solution back; `status` is what its record says, the text why."""
+
+    def __init__(self, status: str, text: str) -> None:
+        super().__init__(f"{status}: {text}")
+        self.status, self.text = status, text
 
 
 class Worker:
@@ -48,13 +62,31 @@ class Worker:
 
     def measure(self, problem: Problem, task: Task, impulse: Any = None) -> tuple[Record, FloatArray | None]:
         """As `lavender.lab.bench.running.timing.measure`, in the worker."""
+        try:
+            return judged(problem, task, self._outcome(problem, task, impulse))
+        except Lost as lost:
+            return task.record(status=lost.status, message=lost.text), None
+
+    def solve(self, problem: Problem, task: Task) -> Solution:
+        """The solution of a task, judged here.
+
+        Raises
+        ------
+        Lost
+            The solver raised something, or did not end, or ended the worker.
+        """
+        found = self._outcome(problem, task, None)
+        if isinstance(found, str):
+            raise Lost(ERROR, found)
+        return solution_of(problem, task, found)
+
+    def _outcome(self, problem: Problem, task: Task, impulse: Any) -> Outcome | str:
         process = self._process
         if not process.alive:
             self._holds = ""
             cause = process.start()
             if cause:
-                message = f"the worker process ended: {cause}"
-                return task.record(status=f"{CRASHED} (did not start)", message=message), None
+                raise Lost(f"{CRASHED} (did not start)", f"the worker process ended: {cause}")
         # Repeats end once they took the limit together, so at most two can take it; backends look at the clock
         # now and then.
         limit = 3.0 * task.time_limit + self.grace
@@ -65,19 +97,17 @@ class Worker:
         self._holds = task.sha
         try:
             said, arrays = process.ask(messages, limit, 16 * problem.m)
-            found = outcome_in(said, arrays, problem.m, time.monotonic() - begun)
+            return outcome_in(said, arrays, problem.m, time.monotonic() - begun)
         except TimeoutError:
-            text = f"did not stop; its process was killed after {limit:.3g} s"
-            return task.record(status=KILLED, message=text), None
+            raise Lost(KILLED, f"did not stop; its process was killed after {limit:.3g} s") from None
         except Ended as end:
-            return task.record(status=f"{CRASHED} ({end})", message="the process of the backend died"), None
+            raise Lost(f"{CRASHED} ({end})", DIED) from None
         except Raised as error:
-            return judged(problem, task, str(error))
+            return str(error)
         except ValueError as error:
             process.end()
             text = f"the process of the backend sent what is no answer ({error}); it was killed"
-            return task.record(status=f"{CRASHED} (no answer)", message=text), None
-        return judged(problem, task, found)
+            raise Lost(f"{CRASHED} (no answer)", text) from None
 
     def close(self) -> None:
         """End the process and what it started."""
@@ -88,6 +118,43 @@ class Worker:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def solved(
+    worker: Worker,
+    problem: Problem,
+    name: str,
+    *,
+    tol: float,
+    max_iter: int | None = None,
+    time_limit: float | None = None,
+    **options: Any,
+) -> Solution:
+    """As `lv.solve`; a solver that another process finds by its entry point is run by the worker.
+
+    Raises
+    ------
+    Lost
+        It raised something, did not end, or ended the worker.
+    """
+    spec = registry.get(name)
+    if not spec.plugged or max_iter == 0:  # which is none; of a task it is the solver's own
+        load(*spec.requires)  # what the time of a first solve would hold besides
+        return solve(problem, name, tol=tol, max_iter=max_iter, time_limit=time_limit, **options)
+    Prepared(problem, spec, options, begin=False)  # what is refused, is refused here
+    task = Task(
+        run="",
+        case=problem.name,
+        sha=fingerprint(problem),
+        solver=name,
+        mode="tol",
+        tol=tol,
+        max_iter=max_iter or 0,
+        time_limit=seconds_of(time_limit),
+        start="warm",
+        options=options,
+    )
+    return worker.solve(problem, task)
 
 
 def serve(memory: int, lifeline: int) -> None:
