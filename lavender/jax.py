@@ -9,7 +9,7 @@ velocity, impulse = solve(J, M, v_free, mu)      # arrays of float64; jit, grad 
 
 from __future__ import annotations
 
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any
 
 from lavender.base.errors import InputError, SolverUnavailable
@@ -36,18 +36,28 @@ def _solve(made: Step, *arrays: Any) -> Any:
     return _call(made.forward, like, arrays)
 
 
-def _forward(made: Step, *arrays: Any) -> Any:
+def _forward(made: Step, *given: Any) -> Any:
+    arrays = tuple(x.value for x in given)
     found = _solve(made, *arrays)
-    return found, (arrays, found[1])
+    # An array kept is traced: what is needed stands in the structure, where jit compiles for it.
+    return found, (arrays, found[1], tuple(() if x.perturbed else None for x in given))
 
 
 def _backward(made: Step, kept: Any, cotangents: Any) -> Any:
-    arrays, impulse = kept
+    arrays, impulse, perturbed = kept
+    needed = tuple(x is not None for x in perturbed)
     like = tuple(jax.ShapeDtypeStruct(x.shape, jnp.float64) for x in arrays)
-    return _call(made.backward, like, (*arrays, impulse, *cotangents))
+    zero = jax.custom_derivatives.SymbolicZero
+    given = (jnp.zeros(x.shape, x.dtype) if isinstance(x, zero) else x for x in cotangents)
+    return _call(_back_of(made, needed), like, (*arrays, impulse, *given))
 
 
-_solve.defvjp(_forward, _backward)
+@lru_cache(maxsize=256)  # of one object JAX keeps what it compiled
+def _back_of(made: Step, needed: tuple[bool, ...]) -> Any:
+    return partial(made.backward, needed)
+
+
+_solve.defvjp(_forward, _backward, symbolic_zeros=True)
 
 
 def solve(

@@ -40,7 +40,7 @@ class _Solve(torch.autograd.Function):  # type: ignore[misc]
     @staticmethod
     def backward(ctx: Any, *cotangents: Any) -> Any:
         """Gradients by all arrays."""
-        return None, *_Back.apply(ctx.made, *ctx.saved_tensors, *cotangents)
+        return None, *_Back.apply(ctx.made, ctx.needs_input_grad[1:], *ctx.saved_tensors, *cotangents)
 
     @staticmethod
     def vmap(info: Any, in_dims: Any, made: Step, *arrays: Any) -> Any:
@@ -52,9 +52,9 @@ class _Back(torch.autograd.Function):  # type: ignore[misc]
     """The adjoint, which has no derivative of its own."""
 
     @staticmethod
-    def forward(made: Step, *arrays: Any) -> Any:
+    def forward(made: Step, needed: Any, *arrays: Any) -> Any:
         """Gradients by all arrays."""
-        return tuple(map(torch.from_numpy, made.backward(*(x.detach().numpy() for x in arrays))))
+        return tuple(map(torch.from_numpy, made.backward(needed, *(x.detach().numpy() for x in arrays))))
 
     @staticmethod
     def setup_context(ctx: Any, inputs: Any, output: Any) -> None:
@@ -66,10 +66,10 @@ class _Back(torch.autograd.Function):  # type: ignore[misc]
         raise NotImplementedError("lavender.torch has first derivatives alone: no gradient of a gradient")
 
     @staticmethod
-    def vmap(info: Any, in_dims: Any, made: Step, *arrays: Any) -> Any:
+    def vmap(info: Any, in_dims: Any, made: Step, needed: Any, *arrays: Any) -> Any:
         """One more leading axis."""
         sizes = (*SIZES, 1, 1, 1)
-        return _Back.apply(made, *_leading(info, in_dims[1:], arrays, sizes)), (0,) * len(NAMES)
+        return _Back.apply(made, needed, *_leading(info, in_dims[2:], arrays, sizes)), (0,) * len(NAMES)
 
 
 def _leading(info: Any, dims: Any, arrays: Any, sizes: Any) -> list[Any]:
@@ -126,7 +126,8 @@ def solve(
     SolveFailed
         A member of the batch was not solved to `tol` or its floor.
     CapabilityError
-        In the backward pass, where impulses that are not unique are differentiated.
+        In the backward pass, where impulses that are not unique are differentiated, or where by a tensor that requires
+        a gradient there is none (rows that share a load, by J).
     """
     given = [J, M, v_free, mu, target, compliance]
     for i, (name, x) in enumerate(zip(NAMES, given, strict=True)):

@@ -12,7 +12,7 @@ from lavender.base.arrays import FloatArray, as_array, as_csr
 from lavender.base.errors import CapabilityError, InputError
 from lavender.base.later import above, issparse
 from lavender.gradient.chains import Bodies, Parts
-from lavender.gradient.result import BODIES, INPUTS, MATRICES, Gradient
+from lavender.gradient.result import BODIES, INPUTS, MATRICES, REACHES, Gradient
 from lavender.gradient.system import SMALL, System, prepared
 from lavender.judge.residuals import at_floor, residual
 from lavender.judge.states import States, linear_of
@@ -217,14 +217,18 @@ class Derivative:
 
     def _solve(self, r: FloatArray, exactly: bool = False) -> FloatArray:
         """G x = r of all rows; `exactly`: or an error where there is no x."""
+        out, right = self._known(r)
+        if exactly and self._system.singular and self._contradicts(right):
+            self._refuse_alone("no derivative along this change exists")
+        out[self._places] = self._system.solve(right)
+        return out
+
+    def _known(self, r: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """x of G x = r where G is the identity, 0 elsewhere; and what it leaves of r on the other rows."""
         out, at = r.copy(), self._places
         out[at] = 0.0
         known = self._linear.times(self._a(out / self._root) / self._root) if out.any() else 0.0
-        right = (r - known)[at]
-        if exactly and self._system.singular and self._contradicts(right):
-            self._refuse_alone("no derivative along this change exists")
-        out[at] = self._system.solve(right)
-        return out
+        return out, (r - known)[at]
 
     def _contradicts(self, right: FloatArray) -> bool:
         """Whether G x = r has no solution."""
@@ -240,9 +244,18 @@ class Derivative:
             some = ", ".join(self.problem.row_name(int(i)) for i in off[:3])
             raise CapabilityError(
                 f"{words}: {some}{', ...' if len(off) > 3 else ''} share a load with other rows and cannot change "
-                "alone, where one of them would open. By v_free, mu and masses there is one; with a compliance on "
-                "these rows by all data"
+                "alone, where one of them would open. By v_free and masses there is one, under Coulomb's law by mu; "
+                "with a compliance on these rows by all data"
             )
+
+    def _refuse_reach(self, name: str) -> None:
+        """Of a coefficient: under the cone law w_n = mu |w_t| + mu r |w_s| + mu_r |w_r|, a target that it moves."""
+        if self.problem.law != "cone" or not self._system.singular:
+            return
+        for one in np.eye(self.problem.n_blocks)[self.problem.cones.is_contact]:
+            de = self._parts.reaches(*(one if name == key else None for key in REACHES))
+            if self._contradicts(self._known(self._by_reach(de))[1]):
+                self._refuse_alone(f"no derivative by {name} of one contact exists here (jvp: of several)")
 
     # -- both ways -------------------------------------------------------------------------------
 
@@ -333,7 +346,7 @@ class Derivative:
             push -= given.get(name, 0.0)
         for name, acts in zip(("lower", "upper"), self._acting, strict=True):
             r += acts * self._root * given.get(name, 0.0)
-        wanted = [given.get(name) for name in ("mu", "patch_radius", "rolling")]
+        wanted = [given.get(name) for name in REACHES]
         if any(x is not None for x in wanted):
             r += self._by_reach(self._parts.reaches(*wanted))
         dv: Any = None if p.matrix is not None else np.zeros(self._velocity.shape)
@@ -391,7 +404,7 @@ class Derivative:
                     raise InputError(f"{name} has shape {out[name].shape}; {like.shape} is needed")
                 if name == "M" and abs(out[name] - out[name].T).max() > 1e-12 * abs(out[name]).max():
                     raise InputError("the change of M is not symmetric; M is: give both triangles")
-            elif name in ("mu", "patch_radius", "rolling"):
+            elif name in REACHES:
                 shape: tuple[int, ...] = (p.n_blocks,)
                 out[name] = as_array(
                     name, value, (*shape, 2) if name == "mu" and np.ndim(value) == 2 else shape

@@ -57,8 +57,11 @@ class Step:
         velocity = [p.velocity(s.impulse) for p, s in zip(problems, found, strict=True)]
         return np.array(velocity).reshape(*batch, flat[0].shape[-1]), impulse
 
-    def backward(self, *arrays: Any) -> tuple[FloatArray, ...]:
-        """Gradients by the arrays of `forward`, of these, impulses, and cotangents of velocities and impulses."""
+    def backward(self, needed: Any, *arrays: Any) -> tuple[FloatArray, ...]:
+        """Gradients by the arrays of `forward`, of these, impulses, and cotangents of velocities and impulses.
+
+        Zeros where `needed` is false: what is not asked for need not exist.
+        """
         given = arrays[: len(NAMES)]
         flat, batch = _flat(given)
         found: list[list[FloatArray]] = [[] for _ in NAMES]
@@ -68,9 +71,13 @@ class Step:
         ]
         problems, (impulses, y, c) = list(self.problems(flat)), others
         for p, g in zip(problems, derivatives(problems, impulses).vjp(velocity=y, impulse=c), strict=True):
-            whole = (g.full("J"), g.full("M"), g.v_free, g.mu[p.cones.is_contact], g.target, g.compliance)
-            for to, value in zip(found, whole, strict=True):
-                to.append(value)
+            for to, name, need, like in zip(found, NAMES, needed, flat, strict=True):
+                if not need:
+                    to.append(np.zeros(like.shape[1:]))
+                elif name == "mu":
+                    to.append(g.mu[p.cones.is_contact])
+                else:
+                    to.append(g.full(name) if name in ("J", "M") else getattr(g, name))
         made = (np.array(x).reshape(*batch, *like.shape[1:]) for x, like in zip(found, flat, strict=True))
         return tuple(_summed(x, np.shape(like)) for x, like in zip(made, given, strict=True))
 

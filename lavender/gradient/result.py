@@ -25,6 +25,7 @@ INPUTS = {
 }
 
 
+REACHES = ("mu", "patch_radius", "rolling")
 # A change of these at one of several rows that share a load contradicts the others.
 ALONE = ("b", "target", "compliance", "A", "J", "jac", "normal", "tangent", "arm_a", "arm_b")
 
@@ -47,6 +48,8 @@ class _Input:
             )
         if self.alone and not of._plain:
             of._refuse_alone(f"no derivative by {name} exists here")
+        if name in (*REACHES, "coefficients") and not of._plain:
+            of._refuse_reach("mu" if name == "coefficients" else name)
         if self.work_out is None:
             gradient.__dict__.update(of._bodies.back(gradient))
             return gradient.__dict__[name]
@@ -59,7 +62,8 @@ class Gradient:
 
     Each is worked out when first asked for, and has the shape of the data; its unit is the scalar's over the data's.
     What a problem has no data of is refused (CapabilityError), and where rows share a load in many ways
-    (`Derivative.unique.target`) what changes one of them alone: targets, J, arms, compliance.
+    (`Derivative.unique.target`) what changes one of them alone: targets, J, arms, compliance; under the cone law, in
+    which a contact slides off at mu times its speed, coefficients of those that slide.
 
         b, target            (m,): by b as it is given; by the target of a problem with J and M, the same
         v_free               (nv,) or (n, 6): by v*, b = target - J v* following

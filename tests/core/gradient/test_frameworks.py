@@ -30,6 +30,7 @@ def is_smooth(given):
 
 GIVEN = [given for given in map(arrays, range(12)) if is_smooth(given)][:3]
 assert len(GIVEN) == 3
+EVERY = (True,) * 6
 
 
 def test_the_adjoint_is_summed_over_what_was_repeated():
@@ -38,9 +39,9 @@ def test_the_adjoint_is_summed_over_what_was_repeated():
     frees = np.stack([free, free + 1e-3])
     velocity, impulse = made.forward(jac, mass, frees, mu, target, soft)
     assert velocity.shape == (2, 5) and impulse.shape == (2, 6)
-    both = made.backward(jac, mass, frees, mu, target, soft, impulse, np.ones((2, 5)), np.ones((2, 6)))
+    both = made.backward(EVERY, jac, mass, frees, mu, target, soft, impulse, np.ones((2, 5)), np.ones((2, 6)))
     alone = [
-        made.backward(jac, mass, frees[i], mu, target, soft, impulse[i], np.ones(5), np.ones(6))
+        made.backward(EVERY, jac, mass, frees[i], mu, target, soft, impulse[i], np.ones(5), np.ones(6))
         for i in (0, 1)
     ]
     for i, (x, y, z) in enumerate(zip(both, *alone, strict=True)):
@@ -56,9 +57,32 @@ def test_a_step_without_contacts_is_free_and_its_gradient_goes_to_the_free_veloc
     made = step(given, None, "coulomb", "auto", 1e-12)
     velocity, impulse = made.forward(*given)
     assert np.array_equal(velocity, given[2]) and impulse.shape == (*lead, 0)
-    found = made.backward(*given, impulse, 7.0 * np.ones_like(velocity), impulse)
+    found = made.backward(EVERY, *given, impulse, 7.0 * np.ones_like(velocity), impulse)
     assert [x.shape for x in found] == [x.shape for x in given]
     assert (found[2] == 7.0).all() and not found[1].any()
+
+
+def twice(by_mu):
+    """A contact given twice: there is a gradient by the friction that both have, none by their J."""
+    jac = np.concatenate([np.eye(3)[[2, 0, 1]]] * 2)
+    assert by_mu(jac, 2.0 * np.eye(3), np.array([2.0, 0.0, -1.0]), np.array([0.4, 0.4])) == pytest.approx(
+        -1.0
+    )
+
+
+def test_what_is_not_asked_for_need_not_exist():
+    def by_mu(*given):
+        given = (*given, np.zeros(6), np.zeros(6))
+        made = step(given, None, "coulomb", "auto", 1e-12)
+        _, impulse = made.forward(*given)
+        needed = [len(x) == 2 for x in given]
+        by_jac, *_, mu, _, _ = made.backward(needed, *given, impulse, np.eye(3)[0], np.zeros(6))
+        assert not by_jac.any()
+        with pytest.raises(lv.CapabilityError, match="no derivative by J exists"):
+            made.backward(EVERY, *given, impulse, np.eye(3)[0], np.zeros(6))
+        return mu.sum()
+
+    twice(by_mu)
 
 
 def test_a_step_made_again_is_the_same_object_for_which_jax_keeps_what_it_compiled():
@@ -104,6 +128,18 @@ def test_gradcheck_of_torch(given):
         return solve(J, M, v_free, mu, target=target, compliance=compliance, tol=1e-14)
 
     assert torch.autograd.gradcheck(function, tensors, eps=1e-6, atol=1e-6)
+
+
+def test_torch_asks_for_what_requires_a_gradient():
+    torch, solve = torch_and_solve()
+
+    def by_mu(*given):
+        *fixed, mu = map(torch.tensor, given)
+        mu.requires_grad_()
+        solve(*fixed, mu)[0][0].backward()
+        return float(mu.grad.sum())
+
+    twice(by_mu)
 
 
 def test_batches_of_torch():
@@ -178,6 +214,18 @@ def test_check_grads_of_jax(given):
     check_grads(
         function, tuple(map(jax.numpy.asarray, given)), order=1, modes=["rev"], eps=1e-6, atol=1e-5, rtol=1e-5
     )
+
+
+def test_jax_asks_for_what_is_differentiated():
+    jax, solve = jax_and_solve()
+
+    def by_mu(*given):
+        loss = jax.grad(lambda mu: solve(*given[:3], mu)[0][0])
+        mapped = jax.vmap(loss)(np.stack([given[3]] * 2))
+        assert np.array_equal(mapped, [jax.jit(loss)(given[3])] * 2)
+        return mapped[0].sum()
+
+    twice(by_mu)
 
 
 def test_batches_and_jit_of_jax():

@@ -400,3 +400,10 @@ def test_what_changes_one_of_several_rows_that_share_a_load_is_refused():
     assert np.sum(g.mu * change["mu"]) == pytest.approx(found["mu"])
     # It is lifted by 1 m/s more: 1 N s of normal impulse more, which slows it down along w_t by half of that.
     assert found["target"] == pytest.approx(-0.5 * 1.0 / np.hypot(1.0, 0.3))
+    # Under the cone law it slides off at mu |w_t|: of one corner alone that is a target, too.
+    p = p.relaxed("cone")
+    d = lv.derivative(p, lv.solve(p, tol=1e-13))
+    for refused in (lambda: d.vjp(velocity=np.eye(6)[0]).mu, lambda: d.jvp(mu=[1.0, 0.0, 0.0, 0.0])):
+        with pytest.raises(lv.CapabilityError, match="share a load"):
+            refused()
+    assert d.jvp(mu=np.ones(4)).velocity[0] < 0.0
