@@ -10,10 +10,11 @@ from __future__ import annotations
 import atexit
 import os
 import pickle
+from contextlib import suppress
 from threading import Lock
 from typing import Any
 
-from lavender.base.apart.process import Ended, NoAnswer, Process, Raised
+from lavender.base.apart.process import START_TIME, Ended, NoAnswer, Process, Raised
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import InputError
 from lavender.external.as_qp import QP
@@ -33,10 +34,15 @@ idle: list[Process] = []  # started, and not asked anything
 _owner = 0  # id of the process that started them: a fork's copies are not its own
 
 
-def ready() -> None:
-    """Have a process ready, started outside the clock; where the system starts none, the backend runs here."""
+def ready(name: str) -> None:
+    """Have a process ready that solved by the backend of that name before, outside the clock.
+
+    Where the system starts none, the backend runs here.
+    """
     process = _take() or Process(SERVED)
     if not process.start():
+        with suppress(TimeoutError, Ended, NoAnswer, Raised):  # the call itself will tell
+            process.ask([name], START_TIME, 0)
         _keep(process)
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray, flag
 from lavender.base.errors import CapabilityError, InputError
+from lavender.base.later import load
 from lavender.external import apart
 from lavender.external.as_qp import QP, impulse_form, pick_form, velocity_form
 from lavender.external.backend import Backend
@@ -95,9 +96,11 @@ class QPSolver(Solver):
         return replace(claim, message=f"{claim.message}; takes no time limit and ran {where}")
 
     def ready(self, qp: QP, time_limit: float) -> None:
-        """A time limit was given, and its clock has not begun: have that process ready."""
+        """A time limit was given, and its clock has not begun: have the backend imported, in that process or here."""
         if self.isolate:
-            apart.ready()
+            apart.ready(self.backend.name)
+        else:
+            load(*self.backend.modules)
 
 
 def refusal(problem: Problem) -> str | None:

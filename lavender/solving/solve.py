@@ -84,9 +84,9 @@ def solve(
     time_limit : float, optional, s
         Limit of the whole call on the wall clock: set-up, iterations and the judge. What cannot be stopped, such as a
         set-up or a factorisation, is begun only if its counted time fits in what is left. The result is no worse than
-        the start. Solvers of other packages run in a separate process, which is started before the clock of the first
-        limit, kept for later solves, and killed at the limit (at twice the limit if the package has a time limit of its
-        own); `isolate=False` runs them in this process.
+        the start. Solvers of other packages, and plug-ins, are imported before the clock of the first limit. The
+        former run in a separate process, which is kept for later solves and killed at the limit (at twice the limit if
+        the package has a time limit of its own); `isolate=False` runs them in this process.
     history : bool
         Record iterations, time and residual at fixed numbers of iterations.
     callback : callable (iterations, impulse, residual), optional
@@ -118,7 +118,7 @@ def solve(
         made = solve_small(problem, spec, impulse, tol, limit)
         if made is not None:
             return made
-    deadline = NEVER if limit == math.inf else Deadline(limit, begun)
+    deadline = _deadline(spec, limit, begun)
     return Prepared(problem, spec, options, False)._solve(
         None, impulse, tol, max_iter, deadline, history, callback
     )
@@ -233,8 +233,7 @@ class Prepared:
         InUse
             Another call of this object's `solve` has not returned yet.
         """
-        limit = seconds_of(time_limit)
-        deadline = NEVER if limit == math.inf else Deadline(limit)
+        deadline = _deadline(self.spec, seconds_of(time_limit))
         return self._solve(problem, impulse, tol, max_iter, deadline, history, callback)
 
     def _solve(
@@ -560,6 +559,17 @@ def seconds_of(time_limit: Any) -> float:
     if time_limit is None or (isinstance(time_limit, np.floating) and time_limit == np.inf):
         return math.inf
     return number("time_limit", time_limit, above=0.0)
+
+
+def _deadline(spec: SolverSpec, limit: float, begun: float | None = None) -> Deadline:
+    """Of a call with that limit [s]; code of others, and what it needs of SciPy, is imported before its clock."""
+    if limit == math.inf:
+        return NEVER
+    if spec.external or not spec.own:
+        spec.load()
+        load(*(() if spec.external else spec.requires))
+        begun = None
+    return Deadline(limit, begun)
 
 
 def check_budget(spec: SolverSpec, tol: float, max_iter: int | None) -> tuple[float, int]:

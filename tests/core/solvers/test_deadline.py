@@ -1,5 +1,6 @@
 """A time limit is the caller's clock: played here by counted work, so that nothing hangs on the machine."""
 
+import os
 import sys
 
 import numpy as np
@@ -210,6 +211,49 @@ problem = lv.Problem.lcp(half @ half.T, half[:, 0])
 print(*(lv.solve(problem, {name!r}, time_limit=0.2).success for _ in range(3)))
 """
     assert "True" in python("-c", code).stdout
+
+
+SLOW = """
+import sys, time
+
+class Slow:  # to import, once in a process
+    def find_spec(self, name, path=None, target=None):
+        if name in ("osqp", "slow_plug_in"):
+            sys.meta_path.remove(self)
+            time.sleep(1.5)
+
+sys.meta_path.insert(0, Slow())
+"""
+PLUG_IN = """
+import lavender as lv
+
+class Copied:
+    def prepare(self, problem): return lv.prepare(problem, "pgs")
+    def run(self, state, impulse, n, tol, time_limit=None):
+        impulse[:] = state.solve(tol=tol).impulse
+        return lv.Claim(lv.Status.CONVERGED, 1)
+
+SPEC = lv.SolverSpec("slow_plug_in", "slow_plug_in:Copied", laws={"lcp"}, summary="test", resumable=False)
+"""
+
+
+@pytest.mark.parametrize("name", ["osqp", "slow_plug_in"])
+def test_code_of_others_is_imported_before_the_clock_of_its_first_limit(name, tmp_path):
+    """A plug-in's first solve was late; a backend's process was ended in its import, at every call."""
+    if name == "osqp":
+        pytest.importorskip("osqp")
+    (tmp_path / "sitecustomize.py").write_text(SLOW)
+    (tmp_path / "slow_plug_in.py").write_text(PLUG_IN)
+    (tmp_path / "slow-1.dist-info").mkdir()
+    (tmp_path / "slow-1.dist-info/METADATA").write_text("Metadata-Version: 2.1\nName: slow\nVersion: 1\n")
+    points = "[lavender.solvers]\nslow_plug_in = slow_plug_in:SPEC\n"
+    (tmp_path / "slow-1.dist-info/entry_points.txt").write_text(points)
+    solve = (
+        f"lv.solve(lv.Problem.lcp([[2.0]], [1.0]), {name!r}, time_limit=0.5)"  # [s], 20 times what it takes
+    )
+    paths = os.pathsep.join([str(tmp_path), *filter(None, sys.path)])
+    done = python("-c", f"import lavender as lv; print({solve})", env={**os.environ, "PYTHONPATH": paths})
+    assert f"{name}: CONVERGED" in done.stdout
 
 
 def test_auto_says_what_it_went_without():
