@@ -153,6 +153,7 @@ class Done(_Texts):
     run: str
     case: str
     solver: str
+    sha: str = ""  # of the case's numbers; "": it did not load
 
 
 @dataclass(frozen=True)

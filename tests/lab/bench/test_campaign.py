@@ -64,6 +64,23 @@ def test_a_campaign_goes_on_where_it_was_killed(tmp_path):
     assert 0 < len(events) < 2 * len(NAMES)
 
 
+def test_a_file_that_has_changed_is_run_again(tmp_path):
+    plan, file = bench.CampaignPlan(levels=(1e-6,), budgets=(), orders=()), tmp_path / "file.npz"
+
+    def shas():
+        out = bench.campaign([file], ["pgs", "direct"], plan, tmp_path / "records.jsonl", workers=1)
+        return {(r.solver, r.sha) for r in out}, len(out.skips)
+
+    lv.Problem.lcp(np.eye(2), np.ones(2)).save(file)
+    first = shas()
+    assert shas() == first and len(first[0]) == 2 and not first[1]
+    file.write_bytes(b"broken")
+    assert shas() == (set(), 1)
+    lv.Problem.lcp(2.0 * np.eye(2), np.ones(2)).save(file)
+    second = shas()
+    assert len(second[0] - first[0]) == 2 == len(second[0]) and not second[1]
+
+
 def test_problems_and_files_travel_too(tmp_path):
     from lavender import io
 

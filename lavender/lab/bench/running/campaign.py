@@ -23,7 +23,7 @@ from typing import Any
 
 from lavender.base.errors import InputError
 from lavender.lab.bench import machine
-from lavender.lab.bench.cases import Item, Source, describe, is_path, resolve
+from lavender.lab.bench.cases import Item, Source, describe, fingerprint, is_path, resolve
 from lavender.lab.bench.record import CaseInfo, Done, Record, Run, Skip
 from lavender.lab.bench.running.plan import Plan
 from lavender.lab.bench.running.runner import Event, Runner, Watch, is_foreign, not_loaded, solver_names
@@ -158,7 +158,7 @@ def campaign(
     out = Records()
     name, cluster = connected(backend)
     with cluster, opened(store) as kept:
-        known = {} if kept is None else _finished(kept.records, this.run)
+        known = {} if kept is None else _finished(kept.records, this.run, items)
         out.source = str(kept.path) if kept is not None else ""
         done = {p.index: known[p.case, p.solver] for p in pairs if (p.case, p.solver) in known}
         out.add(this)
@@ -174,7 +174,8 @@ def campaign(
                 )
             for index, entries in _hand_out(left, Order(plan, this, memory, here), workers, name):
                 done[index], pair = entries, pairs[index]
-                _keep(kept, [*entries, Done(this.run, pair.case, pair.solver)])
+                sha = next((e.sha for e in entries if isinstance(e, CaseInfo)), "")
+                _keep(kept, [*entries, Done(this.run, pair.case, pair.solver, sha)])
                 if watch is not None:
                     watch(Event(len(done), len(pairs), pair.case, pair.solver))
     for index in sorted(done):
@@ -198,9 +199,20 @@ def check_workers(workers: Any) -> None:
         )
 
 
-def _finished(records: Records, run: str) -> dict[tuple[str, str], list[Any]]:
-    """Entries of the pairs that the file holds whole, by (case, solver)."""
-    closed = {(case, solver) for r, case, solver in records.done if r == run}
+def _finished(records: Records, run: str, items: Iterable[Item]) -> dict[tuple[str, str], list[Any]]:
+    """Entries of the pairs that the file holds whole, by (case, solver); not those of problems that have changed."""
+    of: dict[str, dict[str, str]] = {}
+    for (r, case, solver), done in records.done.items():
+        if r == run:
+            of.setdefault(case, {})[solver] = done.sha
+    closed = {}
+    for item in items:
+        pairs = of.get(item.name, {})
+        now = _sha(item) if pairs else None
+        same = not now or (item.name in records.cases and records.cases[item.name].sha == now)
+        closed.update(
+            {(item.name, s): sha for s, sha in pairs.items() if now is None or (same and sha == now)}
+        )
     found: dict[tuple[str, str], dict[Any, Any]] = {key: {} for key in closed}
     for case, solver in closed:
         if case in records.cases:
@@ -210,9 +222,21 @@ def _finished(records: Records, run: str) -> dict[tuple[str, str], list[Any]]:
             if skip.run == run and key in closed and key[0] == skip.case:
                 found[key]["skip"] = skip
     for r in records.records:
-        if r.run == run and (r.case, r.solver) in closed:
+        if r.run == run and closed.get((r.case, r.solver)) == r.sha:
             found[r.case, r.solver][r.key] = r  # written again after a kill: the later one
     return {key: list(entries.values()) for key, entries in found.items()}
+
+
+def _sha(item: Item) -> str | None:
+    """What a file or a problem in memory is now, "" where it does not load; None of the suite: a run names its code."""
+    if item.given is None and not is_path(item.source):
+        return None
+    try:
+        return fingerprint(item.problem)
+    except Exception:  # a file may make a reader raise anything
+        return ""
+    finally:
+        item.forget()
 
 
 def _hand_out(pairs: list[Pair], order: Order, workers: int, backend: str) -> Iterator[tuple[int, list[Any]]]:
