@@ -45,6 +45,7 @@ def test_an_honest_submission_agrees_and_is_left_as_it_was(submitted):
     ("solver", "change", "said"),
     [
         ("pgs", SHORT, "solved there, FLOOR here"),
+        ("pgs", {"success": True}, "solved there, FLOOR here"),
         ("newton", {"relative": 0.5, "success": False, "status": "STALLED"}, "not solved there, solved here"),
     ],
 )
@@ -71,6 +72,23 @@ def test_a_residual_of_a_budget_that_was_changed_is_found(submitted):
     records.records = [replace(r, relative=0.1 * r.relative) if r.mode == "budget" else r for r in records]
     found = bench.verify(records, solvers=["pgs"], isolate=False)
     assert {v.record.mode for v in found.disagreements} == {"budget"}
+
+
+def test_what_was_left_out_is_missing(submitted):
+    def told(keep):
+        records = bench.read(submitted)
+        records.records = [r for r in records if keep(r)]
+        found = bench.verify(records, solvers=["pgs"], isolate=False)
+        assert found.ok == (not found.missing) and str(found).count("MISSING: pgs on") == len(found.missing)
+        return {
+            (r.case, r.tol if r.mode == "tol" else r.max_iter) for r in found.missing if r.order == "given"
+        }
+
+    chain = CASES[1]
+    assert told(lambda r: True) == set()
+    assert told(lambda r: (r.case, r.max_iter) != (chain, 4)) == {(chain, 4)}
+    assert told(lambda r: (r.case, r.tol) != (chain, 1e-20)) == {(chain, 1e-20)}
+    assert told(lambda r: r.case != chain) == {(chain, 4), (chain, 16), (chain, 1e-3), (chain, 1e-20)}
 
 
 def test_a_problem_that_differs_is_told_and_the_others_are_verified(tmp_path):

@@ -16,7 +16,7 @@ from typing import Any
 from lavender.base.errors import InputError, LavenderError
 from lavender.lab.bench.cases import Item, Source, fingerprint, resolve
 from lavender.lab.bench.machine import cpu_name
-from lavender.lab.bench.record import Record, Run
+from lavender.lab.bench.record import CaseInfo, Record, Run
 from lavender.lab.bench.running.plan import Plan
 from lavender.lab.bench.running.runner import run
 from lavender.lab.bench.store import Records
@@ -43,6 +43,7 @@ class Submission:
     run: Run  # the machine and versions of those who submit
     lines: tuple[Verified, ...]
     others: tuple[str, ...]  # cases whose problem is another one here, or none
+    missing: tuple[Record, ...] = ()  # made here by the plan of the submission, which does not hold them
 
     @property
     def disagreements(self) -> tuple[Verified, ...]:
@@ -57,8 +58,8 @@ class Submission:
 
     @property
     def ok(self) -> bool:
-        """Something of each solver was verified, all of that agrees, every problem is the one that was submitted."""
-        return bool(self.lines) and not (self.disagreements or self.others or self.unverified)
+        """Something of each solver was verified, all of that agrees, nothing is missing, every problem is the same."""
+        return bool(self.lines) and not (self.disagreements or self.missing or self.others or self.unverified)
 
     def __str__(self) -> str:
         theirs = f"{self.run.cpu}, lavender {self.run.lavender}"
@@ -74,6 +75,7 @@ class Submission:
             out.append(" | ".join([solver, *map(str, numbers), *times]))
         for v in self.disagreements:
             out.append(f"DISAGREES: {v.record.solver} on {v.record.case}, {v.record.asked}: {v.note}")
+        out += [f"MISSING: {r.solver} on {r.case}, {r.asked}: {verdict_of(r)} here" for r in self.missing]
         out += [f"NOT VERIFIED: {text}" for text in (*self.others, *self.unverified)]
         notes = [v.note for v in self.lines if v.agrees is None]
         out += [f"not verified, {notes.count(note)}: {note}" for note in dict.fromkeys(notes)]
@@ -113,21 +115,20 @@ def verify(
     InputError
         No measurement in it; a plan that no report has; solvers that it does not hold.
     """
-    records = records.latest()
+    described, records = records.cases, records.latest()
     if not records.records:
         raise InputError(f"{records.source or 'the records'}: no measurement to verify")
     theirs = records.runs[records.records[-1].run]
+    described = {name: info for name, info in described.items() if info.run == theirs.run}
     plan = _plan(theirs)
     held = list(dict.fromkeys(r.solver for r in records))
     missing = [name for name in solvers or () if name not in held]
     if missing:
         raise InputError(f"the submission has no records of {', '.join(missing)}; it has {', '.join(held)}")
     # A file of those who submit need not be here; a name of the suite is one everywhere.
-    sources = (
-        Path(info.source) if Path(info.source).suffix else info.source for info in records.cases.values()
-    )
+    sources = (Path(info.source) if Path(info.source).suffix else info.source for info in described.values())
     words = list(cases) or list(dict.fromkeys(sources))
-    items, others = _same(records, words)
+    items, others = _same(described, words)
     asked = [r for r in records if solvers is None or r.solver in solvers]
     names = [name for name in held if solvers is None or name in solvers]
     installed = known()
@@ -136,10 +137,21 @@ def verify(
     own = run(items, names, plan, **more) if items and names else Records()
     found = {r.key: r for r in own}
     lines = tuple(_compared(r, found, reasons, {item.name for item in items}) for r in asked)
-    return Submission(theirs, lines, tuple(others))
+    return Submission(theirs, lines, tuple(others), _missing(asked, own))
 
 
-def _same(records: Records, words: Sequence[Source]) -> tuple[list[Item], list[str]]:
+def _missing(asked: Sequence[Record], own: Records) -> tuple[Record, ...]:
+    """What was made here and left out there; after a level that was missed tighter ones are not asked."""
+    keys = {r.key for r in asked}
+    short = {(r.case, r.solver, r.start) for r in asked if r.mode == "tol" and not r.success}
+    return tuple(
+        r
+        for r in own
+        if r.key not in keys and r.step < 0 and (r.mode != "tol" or (r.case, r.solver, r.start) not in short)
+    )
+
+
+def _same(described: dict[str, CaseInfo], words: Sequence[Source]) -> tuple[list[Item], list[str]]:
     """Items whose problems have the submitted numbers, and what is to be told of the others."""
     found: dict[str, Item] = {}
     others: list[str] = []
@@ -149,7 +161,7 @@ def _same(records: Records, words: Sequence[Source]) -> tuple[list[Item], list[s
         except LavenderError as error:
             others.append(str(error))
     same = []
-    for name, info in records.cases.items():
+    for name, info in described.items():
         item = found.get(name)
         if item is None:
             others.append(f"{name}: no such problem here; name its file, folder or case of the suite")
@@ -200,7 +212,8 @@ def _compared(
             r, here, agrees, "" if agrees else f"residual {r.relative:.2e} there, {here.relative:.2e} here"
         )
     one, two = verdict_of(r), verdict_of(here)
-    # Just above a tolerance that rounding decides, both are right.
+    # Just above a tolerance that rounding decides, both are right; so is another word for what neither has solved.
     near = math.isclose(r.relative, here.relative, rel_tol=1e-3) and "contradicted" not in one + two
+    near = near and ("solved" not in (one, two) or math.isclose(here.relative, here.tol, rel_tol=1e-2))
     agrees = one == two or near
     return Verified(r, here, agrees, "" if agrees else f"{one} there, {two} here")

@@ -202,8 +202,8 @@ def check_workers(workers: Any) -> None:
 def _finished(records: Records, run: str, items: Iterable[Item]) -> dict[tuple[str, str], list[Any]]:
     """Entries of the pairs that the file holds whole, by (case, solver); not those of problems that have changed."""
     of: dict[str, dict[str, str]] = {}
-    for (r, case, solver), done in records.done.items():
-        if r == run:
+    for (begun, case, solver), done in records.done.items():
+        if begun == run:
             of.setdefault(case, {})[solver] = done.sha
     closed = {}
     for item in items:
