@@ -135,7 +135,10 @@ def places(i: Any, n: int) -> int | list[int]:
         if not -n <= i < n:
             raise IndexError(f"world {i}; there are {n}")
         return range(n)[i]
-    chosen: list[int] = np.arange(n)[list(i)].tolist()
+    at = np.array(several("an index of worlds", i, "whole numbers, or a mask,"))
+    if at.dtype.kind not in "biu" and at.size:
+        raise InputError(f"an index of worlds is {i!r:.60}; whole numbers, or a mask, are needed")
+    chosen: list[int] = np.arange(n)[at if at.size else []].tolist()
     return chosen
 
 
@@ -279,6 +282,13 @@ def check_not_negative(what: str, array: np.ndarray) -> None:
         raise InputError(f"{what} must not be negative; entry [{i}] is {array[i]}")
 
 
+def several(what: str, given: Any, things: str) -> list[Any]:
+    """A list of what is given, or InputError for a text and what is none."""
+    if isinstance(given, (str, bytes)) or not isinstance(given, Iterable):
+        raise InputError(f"{what}: {given!r:.60}; a sequence of {things} is needed")
+    return list(given)
+
+
 def one_of(name: str, given: Any, known: Sequence[str]) -> str:
     """A word of those that are known.
 
@@ -294,9 +304,7 @@ def one_of(name: str, given: Any, known: Sequence[str]) -> str:
 
 def words_for(what: str, given: Any, count: int) -> tuple[str, ...]:
     """A word for each of `count` things that `what` names."""
-    if isinstance(given, str) or not isinstance(given, Iterable):
-        raise InputError(f"names of {what} are {given!r}; a sequence of {count} words is needed")
-    words = tuple(map(str, given))
+    words = tuple(map(str, several(f"names of {what}", given, f"{count} words")))
     if len(words) != count:
         raise InputError(f"{len(words)} names for {count} {what}; one for each is needed")
     return words

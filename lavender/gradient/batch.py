@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray, IntArray, places
+from lavender.base.arrays import FloatArray, IntArray, places, several
 from lavender.base.errors import InputError
 from lavender.gradient.derivative import ACCEPTED, Derivative, derivative
 from lavender.gradient.result import INPUTS, MATRICES, Gradient
@@ -140,9 +140,13 @@ def derivatives(problems: Iterable[Problem], solutions: Iterable[Any]) -> Deriva
     """
     if isinstance(problems, Problem):
         raise InputError("problems is one Problem; a list of them is needed, or `derivative`")
-    given = list(problems)
+    given = several("problems", problems, "Problems")
     many = isinstance(solutions, Solutions) and not solutions.faults
-    answers: Any = solutions if many else [getattr(x, "impulse", x) for x in solutions]
+    answers: Any = (
+        solutions
+        if many
+        else [getattr(x, "impulse", x) for x in several("solutions", solutions, "Solutions")]
+    )
     if len(given) != len(answers):
         raise InputError(f"{len(answers)} solutions for {len(given)} problems; one for each is needed")
     linears = Linears([_data(p) for p in given], answers.placed if many else answers, SMALL)

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from lavender.base.arrays import several
 from lavender.base.errors import InputError, LavenderError, last_words
 from lavender.judge.residuals import FLOOR_MOST, WRONG
 from lavender.judge.solution import Solution, Status, uninterrupted
@@ -186,12 +187,12 @@ def cross_check(
     seconds_of(time_limit)
     if problem.guess is not None:  # solvers are compared by what they do, not by where they begin
         problem = replace(problem, guess=None, copy=False)
-    names = (
-        available(problem) if solvers is None else [solvers] if isinstance(solvers, str) else list(solvers)
-    )
+    if isinstance(solvers, str):
+        solvers = [solvers]
+    names = available(problem) if solvers is None else several("solvers", solvers, "names")
     reasons = known(problem)
     for name in (reference, *names):
-        if name not in reasons:
+        if not isinstance(name, str) or name not in reasons:
             get(name)  # raises UnknownName with the nearest names
     with Worker() as worker:
         solver = partial(solved, worker, problem, time_limit=time_limit)

@@ -199,6 +199,8 @@ class Batch(Sequence[Problem]):
         """
         known = {"inv_mass": 1, "inv_inertia": 3, "v_free": 2, "jac": 2, "joint_ptr": 1, "joint_body": 2, "normal": 2,
                  "tangent": 2, "arm_a": 2, "arm_b": 2, "contact_body": 2}  # fmt: skip
+        if not isinstance(fields, Mapping):
+            raise InputError(f"fields is {fields!r:.60}; a mapping of arrays of Rows is needed")
         unknown = set(fields) - set(known)
         if unknown:
             raise InputError(f"fields has {sorted(unknown)}; the arrays of Rows are {', '.join(known)}")

@@ -235,7 +235,23 @@ FLAGS = {
 }  # fmt: skip
 
 
+LISTS = {
+    "cross_check: solvers": (lambda x: lv.cross_check(LCP, x, "direct"), ["pgs"]),
+    "bench: solvers": (bench.solver_names, ["pgs"]),
+    "bench: cases": (bench.resolve, [LCP]),
+    "bench: case": (lambda x: bench.resolve([x]), LCP),
+    **{f"bench: {name}": (lambda x, name=name: bench.Plan(**{name: x}), []) for name in ("levels", "orders", "times")},
+    "suite: case": (suite.case, "stack"),
+    "derivatives: problems": (lambda x: lv.derivatives(x, []), []),
+    "batch: fields": (
+        lv.Batch.of_bodies, {k: np.array([v] * 2) if k == "v_free" else v for k, v in PARTS.items() if v is not None}
+    ),
+    "many: index": (lambda x: lv.solve_many([LCP] * 2)[x], [0, -1]),
+}  # fmt: skip
+
+
 KINDS = {
+    "list": (LISTS, {"object": object(), "ellipsis": ..., "bytes": b"x"}),
     "number": (NUMBERS, WRONG_NUMBERS),
     "whole number": (COUNTS, WRONG_COUNTS),
     "true or false": (FLAGS, WRONG_FLAGS),

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lavender.base.arrays import FloatArray
+from lavender.base.arrays import FloatArray, several
 from lavender.base.errors import InputError, SolverUnavailable
 from lavender.io.stored import ENGINE, SUFFIXES, whole_file
 from lavender.judge.residuals import ENOUGH, Residual, nothing_to_do, residual
@@ -102,7 +102,9 @@ def resolve(words: Source | Iterable[Source], sequences: bool | None = None) -> 
     """
     items: list[Item] = []
     read: set[Path] = set()  # folders, which a link in one of them may lead back to
-    words = [words] if isinstance(words, Source) else list(words)
+    words = (
+        [words] if isinstance(words, Source) else several("cases", words, "files, folders, names or problems")
+    )
     if not words:
         from lavender.lab import suite
 
@@ -115,6 +117,8 @@ def resolve(words: Source | Iterable[Source], sequences: bool | None = None) -> 
             items.append(word)
         elif isinstance(word, Case):
             items.append(_from_case(word, word.name))
+        elif not (isinstance(word, str) or hasattr(word, "__fspath__")):
+            raise InputError(f"case {word!r:.60} is neither a file nor a name of the suite, nor a problem")
         elif sequences or (sequences is None and _holds_steps(Path(word))):
             steps = _another(steps_in(word), items)
             name, lost = steps[0].sequence, map(_from_file, _left_out(Path(word)))

@@ -178,6 +178,8 @@ def names(text: str) -> tuple[str, ...]:
     UnknownName
         No such set.
     """
+    if not isinstance(text, str):
+        raise UnknownName("set of cases", text, SETS)
     name = text.removeprefix("@")
     if text.startswith("@") and name not in SETS:
         raise UnknownName("set of cases", name, SETS)

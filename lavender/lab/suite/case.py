@@ -182,6 +182,8 @@ def parse(text: str) -> tuple[str, dict[str, Any]]:
     problem = InputError(
         f"{text!r} is not a case; write a name with parameters, such as pyramid(k=10, mass_ratio=1e6)"
     )
+    if not isinstance(text, str):
+        raise problem
     try:
         node = ast.parse(text.strip(), mode="eval").body
     except (SyntaxError, ValueError, RecursionError, MemoryError):

@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Any
 
-from lavender.base.arrays import flag, number, whole_number
+from lavender.base.arrays import flag, number, several, whole_number
 from lavender.base.errors import InputError, UnknownName
 from lavender.lab.bench.record import CaseInfo, Record
 from lavender.lab.bench.running.timing import Ask, Task
@@ -69,6 +69,8 @@ class Plan:
     sweeps: Sequence[int] = ()
 
     def __post_init__(self) -> None:
+        for name in ("levels", "budgets", "orders", "speed_levels", "times", "sweeps"):
+            several(name, getattr(self, name), "words" if name == "orders" else "numbers")
         for name, values in (
             ("level", self.levels),
             ("speed level", self.speed_levels),
@@ -84,7 +86,7 @@ class Plan:
         for name in ("warm", "campaign", "motion", "prove"):
             flag(name, getattr(self, name))
         for word in self.orders:
-            name, _, seed = word.partition(":")
+            name, _, seed = str(word).partition(":")
             if name not in ORDERS:
                 raise UnknownName("order", name, ORDERS)
             if seed and not (name == "random" and seed.isdecimal()):

@@ -10,7 +10,7 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-from lavender.base.arrays import FloatArray
+from lavender.base.arrays import FloatArray, several
 from lavender.base.errors import LavenderError
 from lavender.judge.residuals import residual
 from lavender.judge.states import states_of
@@ -104,7 +104,7 @@ def solver_names(names: str | Sequence[str] | None) -> list[str]:
     UnknownName, SolverUnavailable
     """
     if names:
-        names = [names] if isinstance(names, str) else names
+        names = [names] if isinstance(names, str) else several("solvers", names, "names")
         for name in names:
             registry.get(name)
         return list(dict.fromkeys(names))
