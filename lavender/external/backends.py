@@ -70,7 +70,7 @@ BACKENDS: tuple[Backend, ...] = (
     Backend("daqp", ("daqp",), "daqp", "dual active set", "Arnström, Bemporad, Axehill 2022, DAQP",
             call=native.call_daqp, dense=True, warm=True, stoppable=True),
     Backend("highs", ("highspy",), "highspy", "null-space active set", "Huangfu, Hall 2018, HiGHS",
-            call=native.call_highs, max_iter=100_000, stoppable=True, noisy=True),
+            call=native.call_highs, max_iter=100_000, stoppable=True),
     Backend("scs", ("qpsolvers", "scs"), "scs", "operator splitting, homogeneous embedding",
             "O'Donoghue 2021, SCS 3", settings=SCS, max_iter=100_000, warm=True, stoppable=True),
     Backend("quadprog", ("qpsolvers", "quadprog"), "quadprog", "dual active set, positive definite A",

@@ -14,7 +14,7 @@ from lavender.base.arrays import FloatArray
 from lavender.base.errors import InputError
 from lavender.base.later import sparse as sp
 from lavender.external.as_qp import QP, bound_rows, two_sided
-from lavender.external.running import Answer, Limits, at_least, certificate, proof, set_all
+from lavender.external.running import Answer, Limits, at_least, certificate, proof, quiet, set_all
 from lavender.judge.solution import Status
 
 
@@ -130,6 +130,15 @@ def call_daqp(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, Any])
     )
 
 
+@cache
+def _greeted() -> None:
+    """The first HiGHS of a process greets on standard output where it is made, whatever it is told; no other does."""
+    import highspy
+
+    with quiet(noisy=True):
+        highspy.Highs()  # type: ignore[no-untyped-call]
+
+
 def call_highs(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, Any]) -> Answer:
     """HiGHS: null-space active set (Huangfu, Hall 2018)."""
     import highspy
@@ -153,6 +162,7 @@ def call_highs(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, Any]
         lp.a_matrix_.start_, lp.a_matrix_.index_, lp.a_matrix_.value_ = rows.indptr, rows.indices, rows.data
         lp.a_matrix_.num_row_, lp.a_matrix_.num_col_ = rows.shape
         lp.row_lower_, lp.row_upper_ = low, high
+    _greeted()
     solver: Any = highspy.Highs()  # type: ignore[no-untyped-call]
     settings: dict[str, Any] = {
         "output_flag": False,

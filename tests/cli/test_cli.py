@@ -5,10 +5,12 @@ import os
 import re
 import signal
 import subprocess
+from multiprocessing import resource_tracker
 
 import numpy as np
 import pytest
 from calls import robot
+from joblib.externals.loky.backend import resource_tracker as lokys
 from stacks import stack
 from worked import python
 
@@ -364,6 +366,11 @@ def test_a_format_that_nobody_writes_is_refused_before_the_work(lavender, monkey
 
 @pytest.mark.parametrize("words", ["--workers 2", "--workers 1", "--solvers pgs --budgets 2 --no-figures"])
 def test_a_working_directory_that_is_gone_is_said(lavender, path, tmp_path, words):
+    for tracker in (
+        resource_tracker,
+        lokys,
+    ):  # they outlive this test, and CPython 3.13.0 starts none in such a folder
+        tracker.ensure_running()
     os.rmdir(os.getcwd())
     words = words if "--solvers" in words else f"--campaign --solvers pgs --no-figures {words}"
     code, _, err = lavender("report", path, *words.split(), "--out", tmp_path / "out")

@@ -60,6 +60,16 @@ def test_nothing_is_printed(name, capfd):
     assert capfd.readouterr() == ("", "")
 
 
+def test_highs_takes_standard_output_from_the_process_for_its_greeting_alone(monkeypatch):
+    """At every solve what other threads printed meanwhile was lost."""
+    problem = lv.Problem.lcp(*spd(4))
+    lv.solve(problem, "highs")
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "dup2", None)
+        again = lv.solve(problem, "highs")
+    assert again.success, again
+
+
 def test_what_threads_print_and_warn_of_is_as_before_after_backends_ran_in_several(capfd):
     """The second enters while the first is inside, and leaves last: each hears itself, and a third is not silenced."""
     before = sys.stdout, sys.stderr, warnings.filters.copy(), warnings.showwarning
