@@ -180,6 +180,15 @@ def test_an_unbounded_program_has_a_ray(hessian, q, rows, tol):
     assert rows.get("lb") is None or d.min() >= -1e-6
 
 
+def test_a_step_that_converged_is_not_said_of_a_program_that_is_not_solved():
+    problem = lv.Problem.from_qp(np.diag([1.0, 0.0]), [1.0, 1.0], lb=[-4e6, -4e6])
+    step = lv.solve(problem, "pgs", tol=0.5)  # of M = P + D, relative to v* of 1e9
+    assert step.status is lv.Status.CONVERGED
+    assert str(problem.qp.solution(step, 1e-9)).startswith(
+        "not solved to 1e-09: the last step CONVERGED, error 4"
+    )
+
+
 @pytest.mark.parametrize("solver", ["auto", "newton", "pgs", "nncg", "admm", "osqp"])
 @pytest.mark.parametrize("tol", [1e-3, 1e-9])
 def test_no_solver_calls_a_program_unbounded_that_has_no_feasible_point(solver, tol):
