@@ -15,9 +15,10 @@
    pass from stick to slip.
 
 Problems in generalised coordinates are first solved over their velocities (`newton_systems/general.py`), without
-forming A. If that fails, 1 to 4 follow over the rows of A, unless form="velocity". Where velocities stand for bodies,
-of which two at most meet in every block (free bodies of an engine), 1 to 4 are over these bodies, at once under
-Coulomb's law and where many contacts are rigid (`SmallCall.may_cost`).
+forming A, unless a full A is counted to cost less than a tenth of that (few rows of a soft body). If that fails, 1 to 4
+follow over the rows of A, unless form="velocity". Where velocities stand for bodies, of which two at most meet in every
+block (free bodies of an engine), 1 to 4 are over these bodies, at once under Coulomb's law and where many contacts are
+rigid (`SmallCall.may_cost`).
 
 1 to 4 are compiled (`lavender_ext/newton/plan.pxd`) and run one factorisation at a time; in between, Python checks the
 clock, Ctrl-C and certificates. `newton_systems/` makes their linear systems. Form "velocity" factors I + K^T V K over
@@ -27,6 +28,7 @@ the bodies and does not square J; "impulse" factors over the rows.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import inf
 from typing import Any
 
 import numpy as np
@@ -44,6 +46,7 @@ from lavender.solvers.newton_systems.systems import System, bodies_of, is_dense,
 from lavender.solvers.registry import Solver, SolverSpec
 from lavender.solvers.setup_times import (
     analysed,
+    dense_work,
     formed_once,
     over_bodies,
     over_rows,
@@ -55,6 +58,8 @@ from lavender_ext.core.method import OUTCOMES
 from lavender_ext.newton.solve import COUNTED
 
 FORMS = ("auto", "velocity", "impulse")
+CHEAPER = 10.0  # times what rows of A cost, from which on velocities are left for them
+ONE = Count("velocities", 1.0, 0.0, 0.0, steps=SOFT)  # a multiply-add of theirs, at least
 ROWS = 3000  # up to which A is formed where velocities did not end it
 WATCHED = 0.05  # s between two looks at Ctrl-C, as factors are counted
 TIME_SHARE = 0.5  # of the time left that one turn may take
@@ -117,7 +122,7 @@ class Newton(Solver):
     ----------
     form : {"auto", "velocity", "impulse"}
         Unknowns of the factorisation: velocities (needs J and M) or the rows of A. "auto": velocities where
-        they are known.
+        they are known, but for J and M whose rows of A are counted to cost less than a tenth of them.
     """
 
     form: str = "auto"
@@ -151,7 +156,10 @@ class Newton(Solver):
         bodies = kernel = None
         over_velocities = problem.generalized is not None and self.form != "impulse"
         if over_velocities:
-            kernel = general.prepare(problem)
+            most = CHEAPER * _rows_of_j(problem) if self.form == "auto" else inf
+            kernel = general.prepare(problem, most / newton_cost(ONE, problem.law))
+            if kernel is not None and NewtonState(problem, None, kernel).cost > most:
+                kernel = None
         if self.form != "impulse" and (kernel is None or NEWTON.may_cost(problem, kernel) == 0.0):
             bodies = bodies_of(problem)  # interior points are the shorter way
         if bodies is None and kernel is not None:
@@ -277,6 +285,15 @@ class Newton(Solver):
         )
         work = {"factorisations": factorisations} | ({"sweeps": sweeps} if sweeps else {})
         return Claim(status, factorisations, work, message, form=system.form, certificate=certificate)
+
+
+def _rows_of_j(problem: Problem) -> float:
+    """What Newton's method over a full A of J and M is counted to take [ns]; inf where it does not take that."""
+    m = float(problem.m)
+    if m > ROWS or problem.cones.has_round:
+        return inf
+    rows = Count("dense", dense_work(problem.m), m * m, m, 1e9 * formed_once(problem))
+    return newton_cost(rows, problem.law)
 
 
 def _turns(

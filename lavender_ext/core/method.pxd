@@ -40,6 +40,7 @@ cdef struct options_t:
     double e0                   # error of doing nothing, as the judge has it: sqrt J
     double v0                   # m/s
     double most                 # doubles of one factor, above which the method does not take the problem
+    double work                 # multiply-adds of one, above which it need not be laid out; 0: however many
 
 
 cdef struct room_t:

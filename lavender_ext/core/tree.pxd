@@ -3,7 +3,7 @@
     M = L^T D L, L unit lower triangular: row k is eliminated into rows before it, k = nv - 1 ... 0, so that a leaf
     of a kinematic tree comes before its ancestors and nothing fills in (Featherstone 2008, section 6.5)     (1)
 """
-from libc.stdint cimport int32_t, uint64_t
+from libc.stdint cimport int32_t, int64_t, uint64_t
 from libc.string cimport memcpy
 
 from lavender_ext.core.bits cimport highest, lowest
@@ -44,6 +44,33 @@ cdef inline int32_t few_pattern(int32_t n, const int32_t* mptr, const int32_t* m
     return at
 
 
+cdef inline void put_in_order(int32_t k, const int32_t* mark, int32_t count, int32_t* cols) noexcept nogil:
+    """The columns of row k, all those below k whose mark is k, ascending: by insertion, or by their marks where that reads less."""
+    cdef int32_t i = 1, j, x, first
+    while i < count and cols[i - 1] < cols[i]:              # those of a tree come so
+        i += 1
+    if i >= count:
+        return
+    first = cols[0]
+    for j in range(i, count):
+        first = min(first, cols[j])
+    if <int64_t>count * count > 4 * <int64_t>(k - first):   # what insertion moves of a row in no order
+        i = 0
+        for j in range(first, k):
+            if mark[j] == k:
+                cols[i] = j
+                i += 1
+        return
+    while i < count:
+        x = cols[i]
+        j = i - 1
+        while j >= 0 and cols[j] > x:
+            cols[j + 1] = cols[j]
+            j -= 1
+        cols[j + 1] = x
+        i += 1
+
+
 cdef inline int32_t tree_pattern(int32_t n, const int32_t* mptr, const int32_t* midx, int32_t room, int32_t* lptr,
                                  int32_t* lidx, int32_t* parent, int32_t* mark, int32_t* next_child,
                                  int32_t* first_child) noexcept nogil:
@@ -52,7 +79,7 @@ cdef inline int32_t tree_pattern(int32_t n, const int32_t* mptr, const int32_t* 
     Rows are found from the last: row k has the entries of M and those that rows below it, whose last column is k,
     leave there. They are written from the end of `lidx` backwards; `lptr` counts from the front afterwards.
     """
-    cdef int32_t k, q, c, j, at = room, start, end, i, x
+    cdef int32_t k, q, c, j, at = room, start, end
     if n <= 64:
         return few_pattern(n, mptr, midx, room, lptr, lidx, parent)
     for k in range(n):
@@ -81,13 +108,7 @@ cdef inline int32_t tree_pattern(int32_t n, const int32_t* mptr, const int32_t* 
                     lidx[at] = j
             c = next_child[c]
         start = at
-        for i in range(start + 1, end):                     # rows of a tree come sorted
-            x = lidx[i]
-            j = i - 1
-            while j >= start and lidx[j] > x:
-                lidx[j + 1] = lidx[j]
-                j -= 1
-            lidx[j + 1] = x
+        put_in_order(k, mark, end - start, lidx + start)
         lptr[k] = start
         parent[k] = end - start
         if end > start:

@@ -44,14 +44,16 @@ cdef class Driver(Method):
     """A method of the table on a problem, in arrays that are made when they are known; `start` as often as wanted.
 
     `fits`: it takes the problem. Of J and M `work` are multiply-adds of N and a factor of each of the `islands`, `soft`
-    says that no row needs a proximal term, and an island whose N has more than `most` values does not fit.
+    says that no row needs a proximal term. An island whose N has more than `most` values does not fit, and need not where
+    its factor takes more than `work`.
     """
     cdef Room index, real
     cdef readonly bint fits
 
-    def __init__(self, Data data, double most=INFINITY):
+    def __init__(self, Data data, double most=INFINITY, double work=INFINITY):
         self.data, self.view = data, data.view()
         self.options.method, self.options.wide, self.options.most = NEWTON, has_wide(), most
+        self.options.work = work
         self.own = row_of(&self.view)
         self.fits = lav_room(&self.view, &self.options, &self.space) and self.lay() == ROOM
 

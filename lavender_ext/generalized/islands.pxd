@@ -154,6 +154,7 @@ cdef struct need_t:             # what the islands of a problem ask for
     double values               # of N, of the island that has most; its factor has as many
     double formed               # of A and Y^T, of the island that has most
     double work                 # multiply-adds of N and of its factors, of all islands
+    double idle                 # entries of L of those that are few, which nobody factors, at most
 
 
 cdef inline bint count_few(const flow_t* f, int32_t island, need_t* need) noexcept nogil:
@@ -178,6 +179,7 @@ cdef inline bint count_few(const flow_t* f, int32_t island, need_t* need) noexce
         need.work += added
         return False
     need.work += formed
+    need.idle += 0.5 * size * size
     rows += 3.0
     if rows * rows > need.values:
         need.values = rows * rows
@@ -235,7 +237,7 @@ cdef inline void settle(flow_t* f, const blocks_t* p, const generalized_t* g, in
             f.plain = False
             break
     f.sparse = False
-    need.values = need.work = need.formed = 0.0
+    need.values = need.work = need.formed = need.idle = 0.0
     need.crowded = need.rows = 0
     for i in range(f.n_islands):
         few[i] = count_few(f, i, need)

@@ -25,6 +25,15 @@ cdef inline int32_t general_room(const view_t* v, const options_t* o, room_t* r)
     return 1
 
 
+cdef inline bint is_past(const options_t* o, const need_t* need, double entries, double n) noexcept nogil:
+    """Is a factor of more entries than these in n rows too large, or too much work?
+
+    One of c_i entries in row i takes sum c_i^2 / 2 multiply-adds, at least as many as where all rows have the same.
+    """
+    cdef double factored = max(entries - need.idle, 0.0)
+    return entries > o.most or 0.0 < o.work < 0.5 * factored * factored / n
+
+
 cdef inline int32_t general_start(const view_t* v, const options_t* o, room_t* r, const double* lam) noexcept nogil:
     cdef state_t* s = <state_t*>r.index
     cdef need_t* need = &s.need
@@ -38,7 +47,7 @@ cdef inline int32_t general_start(const view_t* v, const options_t* o, room_t* r
         settle(&s.f, &v.p, v.g, per, r.index + sizeof(state_t) // sizeof(int32_t), need)
         r.laid = not need.crowded
         r.work, r.islands = need.work, s.f.n_islands
-        if (need.crowded and <double>per * v.g.n > o.most) or (r.laid and max(need.values, need.formed) > o.most):
+        if (need.crowded and is_past(o, need, <double>per * v.g.n, v.g.n)) or (r.laid and max(need.values, need.formed) > o.most):
             return UNFIT
         least.tries = r.tries = r.tries + (1 - r.laid)  # L has more entries than that in a row
     if not grant(r, r.n_index, numbers_of(&s.f, need)):

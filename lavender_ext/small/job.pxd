@@ -24,7 +24,7 @@ from lavender_ext.judge.measure cimport do_nothing, general_floor, general_slack
 from lavender_ext.judge.score cimport relative, score_rows, score_t
 from lavender_ext.small.call cimport (COUNTS, ENDED, KEPT, are_bounded, few_rules_t, few_t, has_call, lay_few, rooms_t,
                                       run_few)
-from lavender_ext.small.limits cimport allowed, cost_of, limits_t, step_cost
+from lavender_ext.small.limits cimport allowed, cost_of, limits_t, step_cost, work_within
 from lavender_ext.small.room cimport has_room
 from lavender_ext.small.world cimport BESIDE, LEFT, READY, STARTED, TRIED, rows_of
 
@@ -146,7 +146,7 @@ cdef inline bint has_numbers(job_t* j) noexcept nogil:
 
 cdef inline void solve_job(job_t* j, room_t* room, const limits_t* limits, double tol) noexcept nogil:
     cdef view_t v
-    cdef options_t o = options_t(NEWTON, STEPS, 0, 0, has_wide(), tol, 0.0, 0.0, limits.values)
+    cdef options_t o = options_t(NEWTON, STEPS, 0, 0, has_wide(), tol, 0.0, 0.0, limits.values, 0.0)
     cdef room_t r
     cdef int32_t m = j.p.n_rows, code = ROOM
     cdef bint soft
@@ -158,13 +158,16 @@ cdef inline void solve_job(job_t* j, room_t* room, const limits_t* limits, doubl
     if j.begin[0] < 0.0:
         begin(j, room.real)
     v = view_t(j.p, NULL, NULL, &j.g)
+    soft = is_soft(&j.p, &j.g)
+    o.work = work_within(&j.p, &j.g, limits, soft)
+    if not o.work > 0.0:
+        return
     lav_room(&v, &o, &r)
     while code == ROOM and not r.laid:
         if not has_room(room, r.n_index, 0):
             return
         r.index = room.index
         code = lav_start(&v, &o, &r, j.lam)
-    soft = is_soft(&j.p, &j.g)
     if code != ROOM or cost_of(&j.p, &j.g, limits, r.work, soft) > allowed(&j.p, &j.g, limits, r.islands, soft):
         return
     if not has_room(room, 0, r.n_real):

@@ -75,3 +75,9 @@ cdef inline double allowed(const blocks_t* p, const generalized_t* g, const limi
     if rubs and islands * most < p.n_rows < l.dense * g.n and are_short(g, l.columns):
         return 0.0
     return l.most if soft else min(l.most, l.start + l.sweeps * sweep)
+
+
+cdef inline double work_within(const blocks_t* p, const generalized_t* g, const limits_t* l, bint soft) noexcept nogil:
+    """Multiply-adds of a factor of each island that it may have at most, into however many islands it falls."""
+    cdef double read = cost_of(p, g, l, 0.0, soft)
+    return (allowed(p, g, l, p.n_rows, soft) - read) / (cost_of(p, g, l, 1.0, soft) - read)

@@ -113,7 +113,7 @@ cdef inline int32_t newton_substep(const blocks_t* p, const rows_t* r, warm_t* s
     if not scratch[1]:
         return UNDECIDED
     problem = view_t(p[0], NULL, r, NULL)
-    o = options_t(0, BUDGET, 0, 0, 0, tol, e0, v0, 1.0 / 0.0)
+    o = options_t(0, BUDGET, 0, 0, 0, tol, e0, v0, 1.0 / 0.0, 0.0)
     n = room_t(scratch[1], MOST, scratch + HEAD, room, 1, 0, 0, 0.0)    # the pattern stands from `lav_newton_plan`
     return solve_in_turns(&problem, &o, &n, s, lam, v)
 

@@ -5,6 +5,7 @@ One compiled call solves every island of trees; here stand the clock and the wor
 
 from __future__ import annotations
 
+from math import inf
 from typing import Any
 
 from lavender.base.arrays import FloatArray
@@ -37,10 +38,10 @@ NO_END = 2**31 - 1  # steps: who leads them counts them
 _WORDS = ("factorisations", "Coulomb rounds", "line evaluations")
 
 
-def prepare(problem: Problem) -> Driver | None:
-    """Islands and room for them; None where N of one is too large to be kept."""
+def prepare(problem: Problem, work: float = inf) -> Driver | None:
+    """Islands and room for them; None where N of one is too large to be kept, or seen to need more multiply-adds."""
     reference(problem)
-    kernel = Driver(problem.metric, ROOM)
+    kernel = Driver(problem.metric, ROOM, work)
     return kernel if kernel.fits else None
 
 
