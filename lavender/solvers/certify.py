@@ -148,9 +148,13 @@ def least_violation(log: SolveLog) -> None:
     mass[mass == 0.0] = 1.0  # of what no row moves
     d = squares @ (1.0 / mass)
     y = lam = np.zeros(of.m)
-    rigid = Problem.from_jacobian(of.jac, sp.diags_array(mass), v, target=problem.b, cones=cones, friction="cone")
+    rigid = Problem.from_jacobian(
+        of.jac, sp.diags_array(mass), v, target=problem.b, cones=cones, friction="cone"
+    )
     for share in NEARLY_RIGID:
-        soft = replace(rigid, compliance=np.where(share * d < LEAST, 0.0, share * d))  # rows of dust are empty
+        soft = replace(
+            rigid, compliance=np.where(share * d < LEAST, 0.0, share * d)
+        )  # rows of dust are empty
         kernel = general.prepare(soft)
         if kernel is None or log.ends_late(LINEAR_PROGRAM):
             return
