@@ -75,13 +75,15 @@ def solve(
 ) -> tuple[Any, Any]:
     """Velocities after a step and its impulses, with gradients by all arrays.
 
-    Parameters, results and errors are those of `lavender.torch.solve`, of arrays of JAX. The solve itself runs on the
+    Parameters and results are those of `lavender.torch.solve`, of arrays of JAX. The solve itself runs on the
     CPU, outside of what JAX compiles.
 
     Raises
     ------
     InputError
-        Also where 64-bit numbers are not switched on.
+        Types and shapes that do not fit; also where 64-bit numbers are not switched on.
+    RuntimeError
+        JAX's own, with the words of the error in it: what only numbers tell, such as a negative mu or no solution.
     """
     given = [jnp.asarray(x) for x in (J, M, v_free, mu)]
     none = jnp.zeros(given[0].shape[-2:-1], given[0].dtype)

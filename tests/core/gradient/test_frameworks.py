@@ -254,6 +254,8 @@ def test_what_jax_refuses():
     jac, mass, free, mu, *_ = GIVEN[0]
     with pytest.raises(lv.InputError, match=r"J is float32; float64 is needed: jax.config.update"):
         solve(jax.numpy.asarray(jac, "float32"), mass, free, mu)
+    with pytest.raises(RuntimeError, match="mu must not be negative"):
+        solve(jac, mass, free, -mu)
 
 
 def test_vmap_of_jax_is_before_a_batch_inside():
