@@ -89,9 +89,10 @@ class QPSolution:
     def __str__(self) -> str:
         if self.ray is not None:
             return f"unbounded: the objective falls for ever along ray; at x it is {self.objective:.6g}"
-        how = "" if self.solution is None else f"{self.solution.status.name}, "
-        if how == "CONVERGED, " and not self.found:
-            how = "the last step CONVERGED, "  # on its own problem, of M = P + D
+        # The solution's status is that of its own problem, with an M for P: no verdict on the program.
+        how = "" if self.solution is None or self.found else f"{self.solution.status.name}, "
+        if how == "CONVERGED, ":
+            how = "the last step CONVERGED, "
         words = "solved" if self.found else f"not solved to {self.tol:g}"
         wrong = "" if self.solution is None else self.solution.contradicted
         wrong = f"; CONTRADICTED: {wrong}" if wrong else ""

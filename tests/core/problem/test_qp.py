@@ -180,13 +180,17 @@ def test_an_unbounded_program_has_a_ray(hessian, q, rows, tol):
     assert rows.get("lb") is None or d.min() >= -1e-6
 
 
-def test_a_step_that_converged_is_not_said_of_a_program_that_is_not_solved():
+def test_how_a_step_ended_is_not_said_of_the_program():
     problem = lv.Problem.from_qp(np.diag([1.0, 0.0]), [1.0, 1.0], lb=[-4e6, -4e6])
     step = lv.solve(problem, "pgs", tol=0.5)  # of M = P + D, relative to v* of 1e9
     assert step.status is lv.Status.CONVERGED
     assert str(problem.qp.solution(step, 1e-9)).startswith(
         "not solved to 1e-09: the last step CONVERGED, error 4"
     )
+    problem = lv.Problem.from_qp(np.eye(3) + 0.5, [-1.0, -2.0, 3.0], [[1.0, 1.0, 1.0]], [0.5], lb=[0.1] * 3)
+    step = lv.solve(problem, "pgs", tol=1e-12, max_iter=3)
+    assert step.status is lv.Status.MAX_ITERATIONS
+    assert str(problem.qp.solution(step, 0.5)).startswith("solved: error")
 
 
 @pytest.mark.parametrize("solver", ["auto", "newton", "pgs", "nncg", "admm", "osqp"])
