@@ -18,7 +18,10 @@ import multiprocessing
 import os
 import re
 import runpy
+import shlex
+import shutil
 import sys
+import sysconfig
 import tarfile
 from pathlib import Path
 
@@ -28,6 +31,7 @@ from setuptools import Command, Extension, setup
 from setuptools.command.build import build
 from setuptools.command.build_ext import build_ext
 from setuptools.command.sdist import sdist
+from setuptools.errors import CompileError
 
 # The time of every file in an archive [s]: of no meaning, but the same on every machine. Wheels read it, too.
 os.environ.setdefault("SOURCE_DATE_EPOCH", "1580601600")  # 2020-02-02, as hatchling has it
@@ -84,6 +88,7 @@ class BuildKernels(build_ext):
 
     def run(self):
         """Translate, then compile; everything anew when flags or directives are others than last time."""
+        check_compiler()
         out = Path("build", "cython")
         stamp = out / "how.json"
         how = json.dumps(
@@ -128,6 +133,24 @@ class BuildKernels(build_ext):
         self.extensions.sort(key=lambda module: -os.path.getsize(module.sources[0]))
         self.parallel = self.parallel or workers
         super().run()
+
+
+def check_compiler():
+    """A C compiler and Python's headers are there: without them minutes of translation end in words of the system."""
+    command = shlex.split(
+        os.environ.get("CC") or sysconfig.get_config_var("CC") or ""
+    )  # as setuptools takes it
+    if command and not shutil.which(command[0]):
+        raise CompileError(
+            f"the kernels are C, and no compiler {command[0]!r} is found: install one (Debian and Ubuntu: "
+            "apt install build-essential; macOS: xcode-select --install), or name yours, as CC=clang"
+        )
+    headers = Path(sysconfig.get_path("include"))
+    if not (headers / "Python.h").is_file():
+        raise CompileError(
+            f"the kernels need Python's headers, and {headers} has none: install them (Debian and Ubuntu: "
+            "apt install python3-dev; Fedora: dnf install python3-devel)"
+        )
 
 
 class BuildWasm(Command):

@@ -325,6 +325,22 @@ def test_cflags_do_not_change_how_numbers_are_rounded(fast, tmp_path):
     assert "crtfastmath" not in done.stderr
 
 
+def test_without_a_compiler_nothing_is_translated_first(tmp_path):
+    """Two minutes of it ended in "[Errno 2] No such file or directory"."""
+    pytest.importorskip("Cython", reason="setup.py imports it (extra: test)")
+    words = ("setup.py", "-q", "build_ext", "--build-lib", tmp_path, "--build-temp", tmp_path)
+    env = {**os.environ, "CC": str(tmp_path / "cc")}
+    assert "install one (Debian" in python(*words, status=1, env=env, timeout=60.0).stderr
+    code = f"""if True:
+        import runpy, sys, sysconfig
+
+        sysconfig.get_path = lambda name, *_: {str(tmp_path)!r}
+        sys.argv = {list(map(str, words))}
+        runpy.run_path("setup.py", run_name="__main__")"""
+    env["CC"] = sys.executable
+    assert "apt install python3-dev" in python("-c", code, status=1, env=env, timeout=60.0).stderr
+
+
 def test_what_is_being_written_is_in_no_distribution(tmp_path):
     # The names that both writers use, beside files of the package.
     names = []
@@ -368,7 +384,8 @@ def test_a_build_that_is_killed_leaves_no_word_that_its_files_are_current(tmp_pa
         sys.argv = ["setup.py", "-q", "build_ext"]
         runpy.run_path("setup.py", run_name="__main__")"""
     stamp.write_text("as it is asked for now")
-    python("-c", code, cwd=tmp_path, status=-signal.SIGKILL)
+    env = {**os.environ, "CC": sys.executable}  # which is never called
+    python("-c", code, cwd=tmp_path, status=-signal.SIGKILL, env=env)
     assert not stamp.exists()
 
 
