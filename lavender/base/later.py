@@ -13,7 +13,7 @@ from importlib import import_module
 from threading import RLock
 from typing import TYPE_CHECKING, Any
 
-__all__ = ["above", "imported", "issparse", "lapack", "load", "loading", "sparse"]
+__all__ = ["above", "imported", "issparse", "lapack", "load", "loading", "sparse", "spatial"]
 
 _lock = RLock()
 
@@ -60,10 +60,10 @@ class _Later:
 
 
 if TYPE_CHECKING:
-    from scipy import sparse
+    from scipy import sparse, spatial
     from scipy.linalg import lapack
 else:
-    sparse, lapack = _Later("scipy.sparse"), _Later("scipy.linalg.lapack")
+    sparse, spatial, lapack = map(_Later, ("scipy.sparse", "scipy.spatial", "scipy.linalg.lapack"))
 
 
 def above(name: str) -> Any:

@@ -16,10 +16,10 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-import scipy.sparse as sp
-from scipy.spatial import cKDTree
 
 from lavender.base.errors import UnknownName
+from lavender.base.later import sparse as sp
+from lavender.base.later import spatial
 from lavender.lab.suite.build import Bodies, Contacts, each, sideways, tenfold
 from lavender.lab.suite.case import Draft, family
 from lavender.lab.suite.families import BOX, SPHERE, at_least
@@ -74,7 +74,7 @@ def packing(rng: np.random.Generator, rows: int) -> World:
     side = n ** (1 / 3)
     position = rng.uniform(0.0, side, (n, 3))
     position += 0.3 * (np.round(position) - position)
-    near = cKDTree(position).query(position, k=min(n, int(rng.integers(6, 11))))[1][:, 1:]
+    near = spatial.cKDTree(position).query(position, k=min(n, int(rng.integers(6, 11))))[1][:, 1:]
     pairs = np.sort(np.stack([np.repeat(np.arange(n), near.shape[1]), near.ravel()], 1), axis=1)
     low = position[:, 2] <= np.quantile(position[:, 2], 0.15)
     return (
@@ -100,7 +100,7 @@ def cloth(rng: np.random.Generator, rows: int) -> World:
     off = (grid - 0.5 * (side - 1)) / (0.5 * side)
     height = 2.0 - (off**2).sum(axis=1)
     position = np.stack([grid[:, 0], grid[:, 1], height], 1) + 0.01 * rng.standard_normal((side * side, 3))
-    pairs = cKDTree(grid).query_pairs(1.01, output_type="ndarray")
+    pairs = spatial.cKDTree(grid).query_pairs(1.01, output_type="ndarray")
     pairs = pairs[np.lexsort(pairs.T[::-1])]
     world = World(position, 0.0).add(between(position, pairs))
     under = np.flatnonzero((off**2).sum(axis=1) < 0.6)
@@ -114,7 +114,7 @@ def jelly(rng: np.random.Generator, rows: int) -> World:
     side = max(2, round((rows / 9.0) ** (1 / 3)))
     grid = np.stack(np.meshgrid(*3 * [np.arange(side)], indexing="ij"), -1).reshape(-1, 3)
     position = grid + 0.05 * rng.standard_normal(grid.shape)
-    pairs = cKDTree(grid).query_pairs(1.01, output_type="ndarray")
+    pairs = spatial.cKDTree(grid).query_pairs(1.01, output_type="ndarray")
     pairs = pairs[np.lexsort(pairs.T[::-1])]
     anchor = 0.5 * (position[pairs[:, 0]] + position[pairs[:, 1]])
     world = World(position, SPHERE, joint=pairs, anchor=anchor)
@@ -145,7 +145,7 @@ def pegs(rng: np.random.Generator, rows: int) -> World:
     normal[:, 2] = np.abs(normal[:, 2])
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     held = Contacts(np.stack([np.full(len(ball), -1), ball], 1), position[ball] - 0.5 * normal, normal)
-    pairs = cKDTree(position).query_pairs(1.2, output_type="ndarray")
+    pairs = spatial.cKDTree(position).query_pairs(1.2, output_type="ndarray")
     some = pairs[np.lexsort(pairs.T[::-1])][: n // 2] if len(pairs) else pairs
     return World(position, SPHERE).add(held).add(between(position, some))
 
@@ -158,7 +158,7 @@ def silo(rng: np.random.Generator, rows: int) -> World:
         :, ::-1
     ]
     position = grid + [0.0, 0.0, 0.5] + 0.05 * rng.standard_normal(grid.shape)
-    pairs = cKDTree(grid).query_pairs(1.01, output_type="ndarray")
+    pairs = spatial.cKDTree(grid).query_pairs(1.01, output_type="ndarray")
     world = World(position, SPHERE).add(between(position, pairs[np.lexsort(pairs.T[::-1])]))
     world.add(on_floor(position, grid[:, 2] == 0))
     for axis in (0, 1):

@@ -19,10 +19,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
-import scipy.sparse as sp
-from scipy.spatial import cKDTree
 
 from lavender.base.arrays import FloatArray
+from lavender.base.later import sparse as sp
+from lavender.base.later import spatial
 from lavender.lab.suite.build import Bodies, Contacts, each, manifold, sideways, static_loads, tenfold
 from lavender.lab.suite.case import Draft, family
 from lavender.lab.suite.families import BOX, ROD, SPHERE, at_least, ball_joints
@@ -69,7 +69,7 @@ def lattice(rng: np.random.Generator, rows: int) -> World:
     if rng.random() < 0.5:
         grid = grid[rng.random(len(grid)) < 0.9]
     position = grid + np.array([0.0, 0.0, 0.5]) + rng.choice([0.0, 0.02]) * rng.standard_normal(grid.shape)
-    pairs = cKDTree(grid).query_pairs(1.01, output_type="ndarray")
+    pairs = spatial.cKDTree(grid).query_pairs(1.01, output_type="ndarray")
     return World(position, SPHERE).add(between(position, pairs)).add(on_floor(position, grid[:, 2] == 0))
 
 
@@ -79,7 +79,7 @@ def heap(rng: np.random.Generator, rows: int) -> World:
     side = max(1.0, n ** (1 / 3))
     position = rng.uniform(0.0, side, (n, 3))
     reach = side * (9.0 / (4.0 * n)) ** (1 / 3)  # some five neighbours
-    pairs = cKDTree(position).query_pairs(reach, output_type="ndarray")
+    pairs = spatial.cKDTree(position).query_pairs(reach, output_type="ndarray")
     contacts = between(position, pairs[np.lexsort(pairs.T[::-1])] if len(pairs) else pairs)
     contacts.normal += 0.2 * rng.standard_normal(contacts.normal.shape)
     contacts.normal /= np.linalg.norm(contacts.normal, axis=1, keepdims=True)
@@ -147,7 +147,7 @@ def net(rng: np.random.Generator, rows: int) -> World:
     grid = np.stack(np.meshgrid(np.arange(side), np.arange(side), indexing="ij"), -1).reshape(-1, 2)
     sag = 0.3 * each(math.sin, np.pi * grid / (side - 1)).prod(axis=1)
     position = np.stack([grid[:, 0], grid[:, 1], 1.0 - sag], 1) + 1e-3 * rng.standard_normal((side * side, 3))
-    pairs = cKDTree(grid).query_pairs(1.01, output_type="ndarray")
+    pairs = spatial.cKDTree(grid).query_pairs(1.01, output_type="ndarray")
     pairs = pairs[np.lexsort(pairs.T[::-1])]
     corner = np.array([0, side - 1, side * (side - 1), side * side - 1])
     joint = np.concatenate([np.stack([np.full(4, -1), corner], 1), pairs])
