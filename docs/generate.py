@@ -439,10 +439,14 @@ def example_page(site, cache):
             continue
         if hasattr(module, "PANELS"):
             module.numbers = functools.cache(module.numbers)
-        figure = site.path(f"figures/example-{path.stem}.svg")
+        files = [f"figures/{path.stem}/{panel}.svg" for panel in getattr(module, "PANELS", ())]
+        files = files or [f"figures/example-{path.stem}.svg"]
+        figure = site.path(files[0])
         printed = io.StringIO()
         with contextlib.redirect_stdout(printed):
             module.main(str(figure))
+        for file in files[1:]:
+            save(module.PANELS, module.numbers(), str(site.path(file)))
         first, _, rest = inspect.cleandoc(module.__doc__).partition("\n")
         rest = re.sub(r"\n+ +python examples/\S+ .*", "", rest)
         output = "\n".join(line for line in printed.getvalue().splitlines() if str(figure) not in line)
@@ -451,19 +455,11 @@ def example_page(site, cache):
             f"## {path.stem}",
             f"**{first}**",
             docstrings.markdown(rest),
-            *panels(site, path.stem, module, first),
+            *(image(file, first) for file in files),
             f"```text\n{output}\n```",
             f"Source: `examples/{path.name}`.",
         ]
     site.write("examples.md", "\n\n".join(p for p in parts if p))
-
-
-def panels(site, name, module, text):
-    """The figure of an example in markdown, panel by panel where it has any."""
-    files = [f"figures/{name}/{panel}.svg" for panel in getattr(module, "PANELS", ())]
-    for file in files:
-        save(module.PANELS, module.numbers(), str(site.path(file)))
-    return [image(file, text) for file in files or [f"figures/example-{name}.svg"]]
 
 
 def _signature(function, leave=()):

@@ -157,14 +157,6 @@ def test_every_failure_has_a_command_that_shows_it():
         assert numbers & claimed({command: CLAIMS[command]}), row
 
 
-def test_a_redundant_loop_locks_where_sweeps_let_it_swing():
-    """What is left of its speed hangs on the last bits of LAPACK: 0.006 to 0.054 m/s for 3.8."""
-    command = "python -m benchmarks gallery four_bar --solvers sequential_impulses,newton --seconds 5"
-    rows = [[cell.strip() for cell in row.split("|")] for row in printed(command).splitlines()]
-    speed = {row[2]: float(row[9]) for row in rows if row[1:2] == ["four_bar"]}
-    assert 0.0 < speed["newton"] < 0.1 * speed["sequential_impulses"]
-
-
 @pytest.mark.parametrize(
     ("number", "shown"),
     [("5e-4", "8.0e-04"), ("15", "7.4"), ("45.4", "45.6"), ("0.40", "0.4060"), ("<1e-9", "1.1e-09")],
