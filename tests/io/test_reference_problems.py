@@ -114,6 +114,7 @@ def newton_without(problem, *phases):
         return lv.solve(problem, "newton", tol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("step", [150, 180])
 def test_piles_that_creep_are_solved_along_a_path_through_its_folds(step, problem_dir):
     """126 balls in a box, between stick and slip: rounds end at 1e-5, interior points at 7e-3."""

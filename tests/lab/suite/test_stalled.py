@@ -72,6 +72,7 @@ def stalled(problems):
     return found
 
 
+@pytest.mark.slow
 def test_less_than_two_of_a_hundred_that_stalled_would_have_got_on(stalled):
     wrong = [claim for claim in stalled if claim[4] < 0.5 * claim[3]]
     assert len(stalled) >= 50, "hardly anything stalls: nothing is tested"
