@@ -65,10 +65,11 @@ def first_solve(sweeps, order):
 def run(sweeps, order, warm):
     """Of each of the steps that are looked at six columns."""
     scene = lv.Scene("stack", solver_iterations=sweeps, order=order, warm_start=warm)
-    sim = lv.Simulation(scene, report_residual=True)
+    sim = lv.Simulation(scene)
     start = sim.reset()[0]["positions"]
     rows = []
-    for _ in range(TRAIL if order in COMPARED and not warm else STARTS[-1][-1]):
+    for step in range(TRAIL if order in COMPARED and not warm else STARTS[-1][-1]):
+        sim.report_residual = any(a <= step < b for a, b in TAILS)  # costs as much as ten steps
         observation, *_, info = sim.step()
         values = dict(zip(lv.SOLVER_FIELDS, observation["solver"], strict=True))
         rows.append(
@@ -76,7 +77,7 @@ def run(sweeps, order, warm):
                 values["residual_initial"],  # N s, before the first sweep
                 values["residual_final"],  # N s
                 values["violation_final"],  # m/s
-                info["residual"]["relative"],  # -, of all rows
+                info["residual"]["relative"] if sim.report_residual else np.nan,  # -, of all rows
                 observation["contacts"]["depth"].max(),  # m
                 np.abs(observation["positions"] - start).max(),  # m, how far a box has moved
             )
