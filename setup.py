@@ -27,6 +27,7 @@ from pathlib import Path
 
 import Cython
 from Cython.Build import cythonize
+from Cython.Build.Dependencies import DependencyTree
 from setuptools import Command, Extension, setup
 from setuptools.command.build import build
 from setuptools.command.build_ext import build_ext
@@ -75,6 +76,14 @@ else:
         sanitizers = ["-fsanitize=address,undefined", "-fno-sanitize-recover=undefined"]
         LINK_ARGS += sanitizers
         COMPILE_ARGS += [*sanitizers, "-fno-omit-frame-pointer"]
+
+
+def changed_at(_, path):
+    """When a source was changed; Cython's own never: a version's are the same, whenever pip unpacked them."""
+    return 0.0 if Path(path).is_relative_to(Path(Cython.__file__).parent) else os.path.getmtime(path)
+
+
+DependencyTree.timestamp = changed_at
 
 
 class BuildKernels(build_ext):

@@ -389,6 +389,24 @@ def test_a_build_that_is_killed_leaves_no_word_that_its_files_are_current(tmp_pa
     assert not stamp.exists()
 
 
+def test_only_our_own_sources_make_a_translation_old():
+    """pip unpacks Cython anew for each build, later than whatever was translated with the same before."""
+    pytest.importorskip("Cython", reason="the build translates the kernels (extra: test)")
+    code = """if True:
+        import runpy, sys
+        from Cython.Build.Dependencies import create_dependency_tree
+
+        sys.argv = ["setup.py", "-q", "--name"]
+        runpy.run_path("setup.py")
+        tree = create_dependency_tree()
+        for path in tree.all_dependencies("lavender_ext/core/order.pyx"):
+            print(tree.timestamp(path), path)"""
+    times = [line.partition(" ")[::2] for line in python("-c", code).stdout.splitlines()[1:]]
+    never = {path for time, path in times if float(time) == 0.0}
+    assert never == {path for _, path in times if "Includes" in path}
+    assert 0 < len(never) < len(times)
+
+
 def test_a_build_of_the_package_ships_the_modules(tmp_path, module, newton_module):
     pytest.importorskip("Cython", reason="the build translates the kernels (extra: test)")
     # As `pip wheel --no-build-isolation` runs it: built, or taken from the checkout where it is of these sources.
