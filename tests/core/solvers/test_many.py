@@ -277,9 +277,11 @@ def test_worlds_are_chosen_as_entries_of_an_array_are():
         assert [one.relative for one in found[which]] == found.relative[[0, 3]].tolist()
         assert batch[which] == [batch[0], batch[3]]
     assert many[np.int64(3)] is many[3] and many[[]] == []
-    for wrong in (5, -6, mask[:4], [5], "a"):
+    for wrong in (5, -6, mask[:4], [5]):
         with pytest.raises(IndexError):
             many[wrong]
+    with pytest.raises(lv.InputError, match="a sequence of whole numbers, or a mask"):
+        many["a"]
     with pytest.raises(IndexError, match="world 5; there are 5"):
         batch[5]
 
