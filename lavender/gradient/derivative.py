@@ -217,18 +217,14 @@ class Derivative:
 
     def _solve(self, r: FloatArray, exactly: bool = False) -> FloatArray:
         """G x = r of all rows; `exactly`: or an error where there is no x."""
-        out, right = self._known(r)
-        if exactly and self._system.singular and self._contradicts(right):
-            self._refuse_alone("no derivative along this change exists")
-        out[self._places] = self._system.solve(right)
-        return out
-
-    def _known(self, r: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """x of G x = r where G is the identity, 0 elsewhere; and what it leaves of r on the other rows."""
         out, at = r.copy(), self._places
         out[at] = 0.0
         known = self._linear.times(self._a(out / self._root) / self._root) if out.any() else 0.0
-        return out, (r - known)[at]
+        right = (r - known)[at]
+        if exactly and self._system.singular and self._contradicts(right):
+            self._refuse_alone("no derivative along this change exists")
+        out[at] = self._system.solve(right)
+        return out
 
     def _contradicts(self, right: FloatArray) -> bool:
         """Whether G x = r has no solution."""
@@ -252,9 +248,15 @@ class Derivative:
         """Of a coefficient: under the cone law w_n = mu |w_t| + mu r |w_s| + mu_r |w_r|, a target that it moves."""
         if self.problem.law != "cone" or not self._system.singular:
             return
-        for one in np.eye(self.problem.n_blocks)[self.problem.cones.is_contact]:
-            de = self._parts.reaches(*(one if name == key else None for key in REACHES))
-            if self._contradicts(self._known(self._by_reach(de))[1]):
+        cones, at = self.problem.cones, self._places
+        all_at_once = np.ones(cones.n_blocks)
+        r = self._by_reach(self._parts.reaches(*(all_at_once if name == key else None for key in REACHES)))[
+            at
+        ]
+        block = np.repeat(np.arange(cones.n_blocks), np.diff(cones.ptr))[at]  # r is of each block's own reach
+        size = CONTRADICTS * np.sqrt(np.bincount(block, r * r))
+        for q in self._system.probes(True):
+            if (np.abs(np.bincount(block, q * r)) > size * float(np.linalg.norm(q))).any():
                 self._refuse_alone(f"no derivative by {name} of one contact exists here (jvp: of several)")
 
     # -- both ways -------------------------------------------------------------------------------
