@@ -136,10 +136,11 @@ def least_violation(log: SolveLog) -> None:
         min 1/2 (v' - v).C (v' - v) + 1/2 |violation|^2 / (eps d)
 
     grow as y / eps + a constant where some violation is left, and then J^T y = 0, b.y > 0. A difference of two is a y
-    to many digits, and the judge polishes it. Under Coulomb's law the same without friction.
+    to many digits, and the judge polishes it. Rows of a compliance may be violated, so eps is 1 there and y 0. Under
+    Coulomb's law the same without friction.
     """
     problem, of = log.problem, log.problem.generalized
-    assert of is not None
+    assert of is not None and problem.compliance is not None
     v, cones = np.clip(of.change(log.impulse), -MOST, MOST), problem.cones
     if problem.law == "coulomb":
         cones = replace(cones, mu=0.0 * cones.mu, rolling=0.0 * cones.rolling)
@@ -148,13 +149,13 @@ def least_violation(log: SolveLog) -> None:
     mass[mass == 0.0] = 1.0  # of what no row moves
     d = squares @ (1.0 / mass)
     y = lam = np.zeros(of.m)
+    yields = problem.compliance > 0.0
     rigid = Problem.from_jacobian(
         of.jac, sp.diags_array(mass), v, target=problem.b, cones=cones, friction="cone"
     )
     for share in NEARLY_RIGID:
-        soft = replace(
-            rigid, compliance=np.where(share * d < LEAST, 0.0, share * d)
-        )  # rows of dust are empty
+        eps = np.where(yields, 1.0, share) * d
+        soft = replace(rigid, compliance=np.where(eps < LEAST, 0.0, eps))  # rows of dust are empty
         kernel = general.prepare(soft)
         if kernel is None or log.ends_late(LINEAR_PROGRAM):
             return
@@ -163,8 +164,10 @@ def least_violation(log: SolveLog) -> None:
         if general.run(soft, kernel, lam, steps, CLOSE, log.time_left).status is Status.INTERRUPTED:
             raise KeyboardInterrupt
         y = lam - before
-        y[(np.isfinite(cones.upper) & (y > 0.0)) | (np.isfinite(cones.lower) & (y < 0.0))] = 0.0
+        y[yields] = 0.0
         y = without_dust(y, d)
+        if np.any((np.isfinite(cones.upper) & (y > 0.0)) | (np.isfinite(cones.lower) & (y < 0.0))):
+            y = without_dust(np.where(yields, 0.0, lam), d)  # rows that pushed more under the eps before
         if not prove(problem, y, log.tol).reason:
             break
     log.note("least violation", Claim(Status.STALLED, 0, {"certificates": 1}, certificate=y), log.best)
@@ -269,6 +272,8 @@ def find_direction(problem: Problem, deadline: Deadline) -> FloatArray | None:
     level = sp.hstack([at[free], rim[free]]).tocsr()
     low = np.concatenate([np.where(free, -1.0, 0.0), np.zeros(rim.shape[1])])
     high = np.concatenate([np.where(tangent, 0.0, 1.0), np.full(rim.shape[1], np.inf)])
+    if problem.compliance is not None:  # y.A y = 0 has none of these
+        low[: problem.m][problem.compliance > 0.0] = high[: problem.m][problem.compliance > 0.0] = 0.0
     gain = np.concatenate([scale * problem.b, np.zeros(rim.shape[1])])
     options: dict[str, Any] = {"maxiter": CERTIFICATE_STEPS * problem.m}
     if deadline.is_set:

@@ -5,6 +5,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 from random_problems import FORMS, as_matrix, general, random_contact_problem, touching
+from scipy.optimize import linprog
 
 import lavender as lv
 from lavender import registry
@@ -87,6 +88,32 @@ def test_softness_is_told_apart_from_what_is_rigid(law, form):
             if solution.status is lv.Status.INFEASIBLE:
                 assert solution.impulse_bound == np.inf and "no solution, proved" in solution.message
     assert lv.solve(held(law, 0.0, form)).status is lv.Status.INFEASIBLE
+
+
+@pytest.mark.parametrize("form", ["rows", "J and M"])
+@pytest.mark.parametrize("seed", [0, 1, 5, 6, 21, 30])
+def test_rigid_rows_that_contradict_each_other_are_found_among_those_that_yield(seed, form):
+    """Masses on a line, held two by two; a linear program of the velocities tells which rows can be met at once."""
+    rng = np.random.default_rng(seed)
+    n, m = int(rng.integers(60, 90)), int(rng.integers(69, 96))
+    pair = np.array([rng.choice(n, 2, replace=False) for _ in range(m)], np.int32)
+    target, lower = rng.normal(0.0, 0.1, m), np.where(rng.random(m) < 0.5, -np.inf, 0.0)
+    soft = np.where(rng.random(m) < 0.3, 1e-6, 0.0)  # 1e-9 of d
+    jac = np.zeros((m, 12))
+    jac[:, 0], jac[:, 6] = 1.0, -1.0
+    bodies = np.full(n, 1e3), np.tile(1e3 * np.eye(3), (n, 1, 1)), np.zeros((n, 6))
+    rows = lv.Rows(*bodies, jac=jac, joint_ptr=np.arange(m + 1, dtype=np.int32), joint_body=pair)
+    problem = lv.Problem.from_rows(rows, target=target, lower=lower, upper=np.inf, compliance=soft, mu=0.0)
+    solution = lv.solve(FORMS[form](problem))
+
+    j = np.zeros((m, n))
+    j[np.arange(m), pair[:, 0]], j[np.arange(m), pair[:, 1]] = 1.0, -1.0
+    free, rigid = lower < 0.0, soft == 0.0
+    one, below = rigid & free, rigid & ~free
+    met = linprog(
+        np.zeros(n), A_ub=-j[below], b_ub=-target[below], A_eq=j[one], b_eq=target[one], bounds=(None, None)
+    )
+    assert solution.status is (lv.Status.CONVERGED if met.success else lv.Status.INFEASIBLE), str(solution)
 
 
 @pytest.mark.parametrize("form", FORMS)
