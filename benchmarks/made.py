@@ -44,7 +44,7 @@ def forms(problem: Problem) -> dict[str, Problem]:
     blocks = np.zeros((rows.n_bodies, 6, 6))
     blocks[:, :3, :3] = np.eye(3) / rows.inv_mass[:, None, None]
     blocks[:, 3:, 3:] = inertia
-    mass = sp.block_diag(list(blocks), format="csr")
+    mass = sp.block_diag(list(map(sp.coo_array, blocks)), format="csr")
     general = lv.Generalized(rows.jacobian(problem.cones), mass, rows.v_free.ravel())
     return {
         "bodies": problem,

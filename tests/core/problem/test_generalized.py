@@ -126,7 +126,7 @@ def test_m_is_refused_where_it_is_no_mass_matrix():
 def test_every_way_to_give_j_and_m_is_one_problem():
     rng = np.random.default_rng(3)
     blocks = [tree_mass(rng, [-1, 0, 1]), tree_mass(rng, [-1, 0])]
-    mass = sp.block_diag(blocks).toarray()
+    mass = sp.block_diag(list(map(sp.coo_array, blocks))).toarray()
     jac = rng.normal(size=(3, 5)) * (rng.random((3, 5)) < 0.7)
     v = rng.normal(size=5)
     problems = [

@@ -36,7 +36,9 @@ def test_joints_that_meet_nothing_are_solved_to_rounding_by_one_sweep(rows):
     reach, zero = rng.uniform(0.0, 0.5, (2, n * rows)), np.zeros(n)
     low, high = np.where(rng.random((2, n * rows)) < 0.3, np.inf, reach) * [[-1.0], [1.0]]
     cones = lv.Cones(rows * np.arange(n + 1), np.zeros(n, int), low, high, zero, zero)
-    problem = lv.Problem(rng.standard_normal(n * rows), cones, sp.block_diag(w, format="csr"))
+    problem = lv.Problem(
+        rng.standard_normal(n * rows), cones, sp.block_diag(list(map(sp.coo_array, w)), format="csr")
+    )
     found = lv.solve(problem, "block_gauss_seidel", tol=0.0, max_iter=1)
     assert found.work["fallbacks"] == 0
     assert found.residual.relative <= 1e-12  # condition 1e3 of W, a few roundings

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from random_problems import as_matrix, random_contact_problem, random_lcp, seeds, side_by_side
 from random_trees import random_general
-from scipy.sparse import block_diag
+from scipy.sparse import block_diag, coo_array
 
 import lavender as lv
 from benchmarks.made import forms, fresh, stacks
@@ -251,7 +251,9 @@ def test_one_problem_in_two_threads_has_the_same_bits(form):
     rng = np.random.default_rng(4)
     if form == "islands":
         parts = [g @ g.T for g in rng.normal(size=(12, 9, 6))]
-        problem = lv.Problem.contact(block_diag(parts), rng.normal(size=108), np.full(36, 0.3))
+        problem = lv.Problem.contact(
+            block_diag(list(map(coo_array, parts))), rng.normal(size=108), np.full(36, 0.3)
+        )
     elif form == "cone":
         g = rng.normal(size=(60, 63))
         problem = lv.Problem.contact(g @ g.T, rng.normal(size=60), mu=0.5, friction="cone")
@@ -268,7 +270,7 @@ def test_many_islands_that_each_take_a_few_factors_are_one_call():
     rng = np.random.default_rng(0)
     turned = [np.linalg.qr(g)[0] for g in rng.normal(size=(70, 150, 150))]
     parts = [(q * np.logspace(0.0, -6.0, 150)) @ q.T for q in turned]
-    whole = block_diag(parts, format="csr")
+    whole = block_diag(list(map(coo_array, parts)), format="csr")
     problem = lv.Problem.contact(whole, rng.normal(size=whole.shape[0]), np.full(whole.shape[0] // 3, 0.5))
     solution = lv.solve(problem)
     assert solution.message.startswith("anderson on 70 islands") and solution.work["factorisations"] > 140
@@ -278,7 +280,9 @@ def test_ctrl_c_in_the_one_call_of_islands_is_a_result():
     """Somebody looks for it between two of them."""
     rng = np.random.default_rng(0)
     parts = [g @ g.T + 1e-3 * np.eye(90) for g in rng.normal(size=(100, 90, 40))]
-    problem = lv.Problem.contact(block_diag(parts, format="csr"), rng.normal(size=9000), np.full(3000, 0.5))
+    problem = lv.Problem.contact(
+        block_diag(list(map(coo_array, parts)), format="csr"), rng.normal(size=9000), np.full(3000, 0.5)
+    )
     assert lv.explain(problem).small == who(problem) != ""
     main = threading.get_ident()
 

@@ -67,7 +67,7 @@ def test_our_solvers_are_held_to_the_floor_of_float64_whatever_the_data_were():
 def test_an_asymmetry_is_seen_beside_lighter_bodies(light):
     """Entries of heavy bodies are rounding beside those of light ones; they are none beside each other."""
     heavy = [[1.0, 0.9], [-0.9, 1.0]]
-    problem = lv.Problem.lcp(sp.block_diag([[[light]], heavy]).toarray(), [1.0, 1.0, -0.5])
+    problem = lv.Problem.lcp(sp.block_diag([sp.coo_array([[light]]), heavy]).toarray(), [1.0, 1.0, -0.5])
     assert not problem.is_symmetric and not problem.is_semidefinite
     assert problem.asymmetry == pytest.approx(1.8)
     assert "osqp" not in lv.available(problem)
