@@ -49,7 +49,7 @@ from lavender.problem.derived import cached_property
 from lavender.solvers import costs
 from lavender.solvers.certify import LINEAR_PROGRAM, certify, least_violation, linear_programs
 from lavender.solvers.islands import pairs
-from lavender.solvers.newton import NewtonState
+from lavender.solvers.newton import WARM, NewtonState
 from lavender.solvers.registry import SMALL_ROWS, Solver, SolverSpec, get
 from lavender.solvers.setup_times import factored, forming, over_rows, sweeping
 from lavender.solvers.small import AUTO, NO_TIME, QUARTER, call_ends_within
@@ -221,7 +221,9 @@ class Tree:
                 share = min(1.0, self.left / stage.cost)
                 self.left -= share * stage.cost
                 yield replace(stage, iterations=share * stage.iterations, cost=share * stage.cost)
-            if k > 0 and self.best > GAIN * before and not self.add_rows(self.left):
+            # From near a solution rows take a few of their factorisations.
+            more = MOST if self.best <= WARM else 1.0
+            if k > 0 and self.best > GAIN * before and not self.add_rows(more * self.left):
                 return
 
     def factorisations(self, times: float) -> Iterator[Stage]:
