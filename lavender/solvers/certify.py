@@ -163,11 +163,12 @@ def least_violation(log: SolveLog) -> None:
         steps = SOFT_STEPS * max(1, kernel.islands)
         if general.run(soft, kernel, lam, steps, CLOSE, log.time_left).status is Status.INTERRUPTED:
             raise KeyboardInterrupt
-        y = lam - before
-        y[yields] = 0.0
-        y = without_dust(y, d)
-        if np.any((np.isfinite(cones.upper) & (y > 0.0)) | (np.isfinite(cones.lower) & (y < 0.0))):
-            y = without_dust(np.where(yields, 0.0, lam), d)  # rows that pushed more under the eps before
+        for y in (lam - before, lam):  # the second where rows pushed more under the eps before
+            y = without_dust(np.where(yields, 0.0, y), d)
+            outside = (np.isfinite(cones.upper) & (y > 0.0)) | (np.isfinite(cones.lower) & (y < 0.0))
+            if not outside.any():
+                break
+        y[outside] = 0.0
         if not prove(problem, y, log.tol).reason:
             break
     log.note("least violation", Claim(Status.STALLED, 0, {"certificates": 1}, certificate=y), log.best)
