@@ -85,13 +85,12 @@ class Generalized:
         v_free: Any,
         names: Sequence[str] | None = None,
         like: kernels.Operator | None = None,
-        momentum: bool = False,
     ) -> Generalized:
         """From (indptr, indices, data) of J and of M's lower triangle with its diagonal, columns ascending.
 
         The quick way for adapters, whose engines hold these arrays: int32 and float64, adopted as they are. Only
         finiteness and definiteness are checked. `like` is the operator of a problem before, whose pattern of M's factor
-        serves again where M's entries stand in the same places. With `momentum`, M v* is given as `v_free`.
+        serves again where M's entries stand in the same places.
         """
         made = object.__new__(cls)
         n = len(mass[0]) - 1
@@ -102,10 +101,14 @@ class Generalized:
         if free is None:
             free = as_array("v_free", v_free, (n,), unit="m/s, rad/s", copy=False)
         made._fill(jac, mass, free, names, like)
-        if momentum:
-            v = free.copy() if made.order is None else free[made.order]
-            made.operator.solve(v)
-            made.__dict__["v_free"] = read_only(made._given(v))
+        return made
+
+    @classmethod
+    def laid_out(cls, jac: Compressed, mass: Compressed) -> Generalized:
+        """As `compressed`, from arrays that were checked, without M's factor and v*: `shifted` has them."""
+        made = object.__new__(cls)
+        made._lay_out(jac, mass, len(mass[0]) - 1)
+        made.__dict__["names"] = None
         return made
 
     def with_jacobian(self, jac: Any = None, v_free: Any = None) -> Generalized:
@@ -126,16 +129,17 @@ class Generalized:
         made._fill(_rows(jac, self.nv), self.operator.mass, velocity, self.names)
         return made
 
-    def shifted(self, d: FloatArray) -> Generalized:
-        """The same J and v*, M + diag(d) with d (nv,)."""
+    def shifted(self, d: FloatArray, momentum: FloatArray | None = None) -> Generalized:
+        """The same J, M + diag(d) with d (nv,) in the same order, and the same v* or that with this M v* (nv,)."""
         indptr, indices, data = self.operator.mass
         data = data.copy()
         data[indptr[1:] - 1] += d if self.order is None else d[self.order]
         as_array("M", data, ANY, copy=False)
         made = object.__new__(Generalized)
-        operator = kernels.Operator(*self.operator.jac, indptr, indices, data)
-        made.__dict__.update(v_free=self.v_free, names=self.names, order=self.order, operator=operator)
+        operator = kernels.Operator(*self.operator.jac, indptr, indices, data, self.operator)
+        made.__dict__.update(names=self.names, order=self.order, operator=operator)
         made._factor()
+        made.__dict__["v_free"] = self.v_free if momentum is None else read_only(made.solve(momentum))
         return made
 
     def _fill(
@@ -146,10 +150,18 @@ class Generalized:
         names: Sequence[str] | None,
         like: kernels.Operator | None = None,
     ) -> None:
-        put = self.__dict__
         n = len(v_free)
-        names = None if names is None else words_for("velocities", names, n)
-        put["v_free"], put["names"], put["order"] = v_free, names, None
+        self.__dict__["v_free"] = v_free
+        self.__dict__["names"] = None if names is None else words_for("velocities", names, n)
+        self._lay_out(jac, mass, n, like)
+        self._factor()
+
+    def _lay_out(
+        self, jac: Compressed, mass: Compressed, n: int, like: kernels.Operator | None = None
+    ) -> None:
+        """J and M in an order in which M's factor has few entries."""
+        put = self.__dict__
+        put["order"] = None
         try:
             operator = kernels.Operator(*jac, *mass, like, FULL)
         except MemoryError:
@@ -165,7 +177,6 @@ class Generalized:
                 put["order"] = read_only(apart)
                 operator = kernels.Operator(*_permuted_columns(jac, apart), *_permuted_lower(mass, apart))
         put["operator"] = operator
-        self._factor()
 
     def _factor(self) -> None:
         self.operator.factor()
@@ -192,7 +203,7 @@ class Generalized:
     @property
     def nv(self) -> int:
         """Generalised velocities."""
-        return len(self.v_free)
+        return int(self.operator.n)
 
     def velocity_name(self, i: int) -> str:
         """Name of velocity i."""
@@ -433,18 +444,12 @@ def _apart(jac: Compressed, parent: IntArray) -> IntArray | None:
         return None
     met = sp.csr_array(on.T @ on)
     first = _eliminated(met)
+    lower = sp.csr_array(sp.tril(met, -1) + sp.eye_array(len(roots)))
+    pattern = lower.indptr.astype(np.int32), lower.indices.astype(np.int32)
+    better = _permuted_lower((*pattern, lower.data), first)
+    if kernels.pattern_fill(*better[:2]) >= kernels.pattern_fill(*pattern):
+        return None
     place = np.empty(len(roots), np.int64)
     place[first] = np.arange(len(roots))
-    order = np.argsort(place[tree], kind="stable").astype(np.int32)
-    fills = [
-        kernels.pattern_fill(*_lower_of(met, way)) for way in (np.arange(len(roots), dtype=np.int32), first)
-    ]
-    return order if fills[1] < fills[0] else None
-
-
-def _lower_of(graph: sp.csr_array, order: IntArray) -> tuple[IntArray, IntArray]:
-    """Lower triangle with its diagonal of a graph's pattern in this order: pointers and columns."""
-    n = len(order)
-    lower = sp.csr_array(sp.tril(graph[order][:, order], -1) + sp.eye_array(n, dtype=graph.dtype))
-    lower.sort_indices()
-    return lower.indptr.astype(np.int32), lower.indices.astype(np.int32)
+    order: IntArray = np.argsort(place[tree], kind="stable").astype(np.int32)
+    return order

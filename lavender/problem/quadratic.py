@@ -449,20 +449,20 @@ def _definite(
     lower: Compressed, jac: Compressed, q: FloatArray, target: FloatArray
 ) -> tuple[Generalized, FloatArray | None, FloatArray | None]:
     """J, M = P + D, D and the units of variables, None where P is positive definite."""
-    momentum = -q
-    plain = _shifted(lower, jac, None, momentum)
+    momentum, laid = -q, Generalized.laid_out(jac, lower)
+    plain = _shifted(laid, np.zeros(len(q)), momentum)
     if plain is not None and plain.operator.least_pivot > SINGULAR:
         return plain, None, None
     diagonal = lower[2][lower[0][1:] - 1]
     zero = diagonal == 0.0
     unit = _units(jac, diagonal) if zero.any() else diagonal
     d = np.where(zero, PROXIMAL * unit, 0.0)
-    made = _shifted(lower, jac, d, momentum) if zero.any() and _rows_are_empty(lower, zero) else None
+    made = _shifted(laid, d, momentum) if zero.any() and _rows_are_empty(lower, zero) else None
     if made is None:
-        if _shifted(lower, jac, SHIFT * unit, momentum) is None:
+        if _shifted(laid, SHIFT * unit, momentum) is None:
             raise InputError(f"P is not positive semidefinite: {_least(lower, diagonal)}")
         d = PROXIMAL * unit
-        made = _shifted(lower, jac, d, momentum)
+        made = _shifted(laid, d, momentum)
         assert made is not None  # as with less
     root = np.sqrt(unit)
     size = _largest_of_rows(jac, root)
@@ -471,7 +471,7 @@ def _definite(
     )
     far = np.abs(root * made.v_free).max(initial=0.0) / (FAR * expected) if expected > 0.0 else 0.0
     if far > 1.0:
-        further = _shifted(lower, jac, far * d, momentum)
+        further = _shifted(laid, far * d, momentum)
         if further is not None:  # D within the numbers that M may have
             made, d = further, far * d
     return made, read_only(d), read_only(unit)
@@ -505,16 +505,10 @@ def _largest_of_rows(jac: Compressed, root: FloatArray) -> FloatArray:
     return most
 
 
-def _shifted(
-    lower: Compressed, jac: Compressed, d: FloatArray | None, momentum: FloatArray
-) -> Generalized | None:
+def _shifted(laid: Generalized, d: FloatArray, momentum: FloatArray) -> Generalized | None:
     """With P + diag(d); None where that is not positive definite."""
-    ptr, idx, val = lower
-    if d is not None:
-        val = val.copy()
-        val[ptr[1:] - 1] += d
     try:
-        return Generalized.compressed(jac, (ptr, idx, val), momentum, momentum=True)
+        return laid.shifted(d, momentum)
     except InputError:
         return None
 
