@@ -28,6 +28,9 @@ from lavender.cli.options import (
     "--reference", default="osqp", show_default=True, help="Solver whose answer the others are compared with."
 )
 @click.option("--tol", type=float, default=1e-6, show_default=True, help="Relative residual to reach.")
+@click.option(
+    "--time-limit", type=float, metavar="S", help="Limit of the time of each solver, as of `solve`."
+)
 @precision_option
 @threshold_option
 @click.pass_context
@@ -37,6 +40,7 @@ def check(
     solvers: tuple[str, ...] | None,
     reference: str,
     tol: float,
+    time_limit: float | None,
     precision: str | None,
     threshold: float,
 ) -> None:
@@ -61,9 +65,8 @@ def check(
 
     one_thread()
     if files and files[0].endswith(".jsonl"):
-        refuse_unused(
-            context, ["reference", "tol", "precision", "threshold"], "with a records.jsonl, which has its own"
-        )
+        unused = ["reference", "tol", "time_limit", "precision", "threshold"]
+        refuse_unused(context, unused, "with a records.jsonl, which has its own")
         submission = bench.verify(bench.read(files[0]), files[1:], solvers)
         say(str(submission))
         raise click.exceptions.Exit(0 if submission.ok else EXIT_UNMET)
@@ -75,7 +78,9 @@ def check(
     number("threshold", threshold, low=0.0)
     for item in bench.resolve(files):
         with reading(item):
-            found = cross_check(item.problem, solvers=solvers, reference=reference, tol=tol)
+            found = cross_check(
+                item.problem, solvers=solvers, reference=reference, tol=tol, time_limit=time_limit
+            )
             stored = item.judged(precision, threshold)
             say(item.name, style="bold")
             say(str(found))

@@ -33,6 +33,12 @@ def test_a_contradicted_claim_is_marked(lavender, path, plug_in):
     assert "claim contradicted" in out and "1 claims are contradicted" in out
 
 
+def test_check_ends_each_solver_at_its_time_limit(lavender):
+    code, out, _ = lavender("check", "granularF(n=12)", "--solvers", "pgs", "newton", "--time-limit", "1e-9")
+    assert code == 0
+    assert out.count("TIME_LIMIT") == 2
+
+
 def test_a_problem_that_none_of_the_solvers_takes_is_not_checked(lavender):
     code, out, _ = lavender("check", "granularF(n=3)", "--solvers", "sor")
     assert code == cli.EXIT_UNMET and "1 problems are taken by none of these solvers" in out
@@ -112,6 +118,7 @@ def test_solvers_lists_all_with_reasons(lavender):
         (("report", "a.xml", "--seed", "3", "--controls", "zero"), "without --controls random"),
         (("report", "stack(n=4)", "--seed", "3"), "--seed has no effect without a MODEL.xml"),
         (("check", ""), "an empty argument"),
+        (("check", "a.jsonl", "--time-limit", "3"), "--time-limit has no effect with a records.jsonl"),
         (("report", "stack(n=4)", "--out", ""), "an empty argument"),
         (("check", "stack(n=4)", "--reference", "nobody"), "unknown solver 'nobody'"),
         (("run", "stac"), "did you mean 'stack'"),
