@@ -37,6 +37,7 @@ from typing import Any
 import numpy as np
 
 from lavender.base.arrays import FloatArray
+from lavender.base.deadline import NEVER, Deadline, TooLate
 from lavender.judge.residuals import reference, relative_of
 from lavender.problem import Problem
 
@@ -50,7 +51,8 @@ NEAR = 1e-6  # what z may reach, beside its terms, for a solver's rounding
 SIMPLE = 16  # rows of a certificate up to which numbers are looked for that make A^T y zero exactly
 TAKES_PART = 1e-6  # of the largest y in the metric of D: below, a row is not named
 NAMED = 6  # blocks of a kind that are named
-POLISHED = 1000  # rows of a certificate up to which it is polished, by dense least squares
+POLISHED = 1000  # rows of a certificate up to which it is polished, by dense least squares,
+LEAST_SQUARES = 6e-10  # s for each row, column, and once more the fewer of both
 
 
 @dataclass(frozen=True)
@@ -61,6 +63,7 @@ class Proof:
     impulse_bound: float  # N s, (2): of every solution; inf where none exists, 0 where y says nothing
     reason: str = ""  # why y is no proof that nothing meets the tolerance; empty where it is one
     fighting: str = ""  # blocks of y, by name, where it is a proof
+    skipped: float = 0.0  # s that polishing it would have taken, where they were not left
 
     @property
     def words(self) -> str:
@@ -80,27 +83,34 @@ def rounded_down(bound: float) -> str:
     return f"{float(f'{digits[0]}e{power}'):.1g}"
 
 
-def check_certificate(problem: Problem, y: Any, tol: float = 0.0) -> str | None:
+def check_certificate(
+    problem: Problem, y: Any, tol: float = 0.0, deadline: Deadline | None = None
+) -> str | None:
     """Why y (m,) does not prove that nothing meets `tol`; None where it does."""
-    return prove(problem, y, tol).reason or None
+    return prove(problem, y, tol, deadline).reason or None
 
 
-def prove(problem: Problem, y: Any, tol: float = 0.0) -> Proof:
+def prove(problem: Problem, y: Any, tol: float = 0.0, deadline: Deadline | None = None) -> Proof:
     """What y (m,) proves: no solution, or a least impulse of every solution.
 
-    Where y is off by rounding of a solver, the nearest direction on the same rows with A^T y = 0 takes its place. The
-    last answer is kept with the problem: a solver, and whoever checks its claim, ask the same.
+    Where y is off by rounding of a solver, the nearest direction on the same rows with A^T y = 0 takes its place, if
+    it is found before the deadline. The last answer is kept with the problem: a solver, and whoever checks its claim,
+    ask the same; one with a deadline asks anew what another had no time for.
     """
     y = np.array(y, float)
     y.setflags(write=False)
     asked = tol, y.shape, y.tobytes()
     last: tuple[Any, Proof] | None = problem.derived.proof
-    if last is None or last[0] != asked:
-        last = problem.derived.proof = asked, _prove(problem, y, tol)
-    return last[1]
+    if last is not None and last[0] == asked:
+        skipped = last[1].skipped
+        if not skipped or deadline is None or deadline.passed(skipped):
+            return last[1]
+    found = _prove(problem, y, tol, deadline or NEVER)
+    problem.derived.proof = asked, found
+    return found
 
 
-def _prove(problem: Problem, y: FloatArray, tol: float) -> Proof:
+def _prove(problem: Problem, y: FloatArray, tol: float, deadline: Deadline) -> Proof:
     with np.errstate(all="ignore"):  # what overflows proves nothing
         inner = problem.disk
         if y.shape != (problem.m,) or not np.isfinite(y).all() or not np.any(y):
@@ -108,11 +118,14 @@ def _prove(problem: Problem, y: FloatArray, tol: float) -> Proof:
             return Proof(y, 0.0, reason)
         found = _proof(inner, problem.on_disk(y), tol)
         if 0.0 < found.impulse_bound < math.inf and (found.reason or np.count_nonzero(y) <= SIMPLE):
-            for nearer in _polished(inner, found.y):
-                again = _proof(inner, nearer, tol)
-                if not again.reason and (found.reason or again.impulse_bound == math.inf):
-                    found = again
-                    break
+            try:
+                for nearer in _polished(inner, found.y, deadline):
+                    again = _proof(inner, nearer, tol)
+                    if not again.reason and (found.reason or again.impulse_bound == math.inf):
+                        found = again
+                        break
+            except TooLate as late:
+                found = replace(found, skipped=late.args[0])
         if inner is not problem:
             found = replace(found, y=problem.cones.stretch * found.y)
         return found if found.reason else replace(found, fighting=_told(problem, found.y))
@@ -280,7 +293,7 @@ def _energy(data: Any, w: FloatArray) -> Any:
     return np.sqrt(np.sum(w * w / data.d))
 
 
-def _polished(problem: Problem, y: FloatArray) -> Iterator[FloatArray]:
+def _polished(problem: Problem, y: FloatArray, deadline: Deadline) -> Iterator[FloatArray]:
     """The nearest direction in the metric of D, on the rows of y, with A^T y = 0 where that is nearly so.
 
     First to 26 bits: sums of halves and thirds of simple numbers may be 0 then.
@@ -304,6 +317,9 @@ def _polished(problem: Problem, y: FloatArray) -> Iterator[FloatArray]:
         near = np.flatnonzero((z != 0.0) & (np.abs(z) <= NEAR * size))
         if np.any(np.abs(z[own]) > NEAR * size) or len(near) * len(rows) > POLISHED**2:
             return
+        seconds = LEAST_SQUARES * len(near) * len(rows) * min(len(near), len(rows))
+        if deadline.passed(seconds):
+            raise TooLate(seconds)
         system = (a[:, near].toarray() / length[rows][:, None] * weight[near]).T
         y[rows] -= np.linalg.lstsq(system, z[near], rcond=1e-9)[0] / length[rows]
     unit = 2.0**-25 * _power(y)

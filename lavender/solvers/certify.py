@@ -76,7 +76,7 @@ def conflict_of(problem: Problem, tol: float, deadline: Deadline | None = None) 
     claim = _newton(inner, RELAXATION_STEPS, tol, deadline)[1]
     if claim is None or claim.certificate is None:
         return None
-    proof = prove(inner, claim.certificate, tol)
+    proof = prove(inner, claim.certificate, tol, deadline)
     if proof.reason:
         return None
     joints, contacts = fighting(problem, proof.y)
@@ -169,7 +169,7 @@ def least_violation(log: SolveLog) -> None:
             if not outside.any():
                 break
         y[outside] = 0.0
-        if not prove(problem, y, log.tol).reason:
+        if not prove(problem, y, log.tol, log.deadline).reason:
             break
     log.note("least violation", Claim(Status.STALLED, 0, {"certificates": 1}, certificate=y), log.best)
 

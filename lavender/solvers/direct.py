@@ -361,7 +361,7 @@ class _Run:
         pull = self.problem.csr @ y if self.problem.is_symmetric else np.zeros(1)
         if np.any(np.sign(y) * pull > NEAR * (length @ np.abs(y)) * length):
             return None  # an impulse without an end meets b.y there, beyond what a solver rounds
-        if check_certificate(self.problem, y, self.tol) is not None:
+        if check_certificate(self.problem, y, self.tol, self.deadline) is not None:
             return None
         self.notes.append("no impulse meets every row: certificate found")
         return self.claim(Status.INFEASIBLE, certificate=y)

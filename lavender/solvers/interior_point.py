@@ -32,8 +32,8 @@ from lavender_ext.factor.sparse import FullCholesky
 from lavender_ext.newton.program import Iterate, balanced, entries, scaled
 
 NAME = "interior point"  # in turns and messages
-STEPS = 50
-IDLE = 8  # steps in a row that leave no smaller error, after which none follows
+STEPS = 100
+IDLE = 8  # steps in a row that leave neither a smaller error nor smaller forces, after which none follows
 PROXIMAL = 1e-8  # rho and delta, of balanced rows
 REFINED = 10  # solves with one factor of (1)
 EXACT = 1e-14  # of the right-hand side, that refinement leaves,
@@ -112,7 +112,8 @@ class InteriorPoint:
         self._factor()
         at.begin(self._solved())
         best: tuple[FloatArray, FloatArray] | None = None
-        least, nearest, idle = np.inf, np.inf, 0
+        least = nearest = lightest = np.inf
+        asked, idle = FARKAS, 0
         for _ in range(STEPS):
             x, lam = self.far * self.column * at.x, self._impulse()
             if not (largest(lam) <= MOST and largest(x) <= MOST):
@@ -125,15 +126,20 @@ class InteriorPoint:
                 # All forces may vanish, and dual and gap with them: the judge knows beside what.
                 error = max(rows, self._answer(x, lam, 0.0).error)
             self.error = error
-            idle = 0 if error < 0.9 * least or left < 0.9 * nearest else idle + 1
+            # While lambda grows (an unstable plant) forces come down long before the gap does.
+            gains = error < 0.9 * least or left < 0.9 * nearest or forces < 0.9 * lightest
+            idle = 0 if gains else idle + 1
             if error < least:
                 best = x, lam
-            least, nearest = min(least, error), min(nearest, left)
+            least, nearest, lightest = min(least, error), min(nearest, left), min(lightest, forces)
             if error <= CLOSER * tol:
                 answer = self._answer(x, lam, tol)
                 if answer.found:
                     return answer, None
-            found = proof(lam) if proves <= FARKAS else None
+            found = None
+            if proves <= asked:
+                asked = 0.5 * proves
+                found = proof(lam)
             if found is not None:
                 return self._answer(x, lam, tol), found
             self.late = deadline.passed(watch.seconds / max(1, self.factorisations))

@@ -98,7 +98,10 @@ class Lemke(Solver):
             if code == RAY:
                 message = "ended on a secondary ray"
                 certificate = _direction(paths.ray)
-            if certificate is not None and check_certificate(state.problem, certificate, tol) is None:
+            if (
+                certificate is not None
+                and check_certificate(state.problem, certificate, tol, deadline) is None
+            ):
                 status, message = Status.INFEASIBLE, f"{message}: no impulse meets every row"
             elif code == DONE and rows.relative <= tol:
                 status, message = Status.CONVERGED, ""

@@ -339,7 +339,7 @@ def _turns(
                 system.took(watch.seconds / (solve.done - before))
             if end == OUTCOMES["certificate"]:
                 certificate = solve.direction
-                proven = check_certificate(problem, certificate, tol) is None
+                proven = check_certificate(problem, certificate, tol, deadline) is None
                 if proven:
                     solve.prove()
             elif end != OUTCOMES["more"] or (more and solve.done >= last):

@@ -54,7 +54,7 @@ class SolveLog:
             self.work[kind] = self.work.get(kind, 0) + count
         self.turns.append(Turn(name, dict(claim.work), before, self.best))
         if claim.certificate is not None:
-            if check_certificate(self.problem, claim.certificate, self.tol) is None:
+            if check_certificate(self.problem, claim.certificate, self.tol, self.deadline) is None:
                 self.certificate = claim.certificate
             else:
                 self.direction = claim.certificate

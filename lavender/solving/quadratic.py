@@ -189,7 +189,7 @@ def _by_interior_point(
     entries = 2 * len(of.mass[1]) + len(of.jac[1])
     if not deadline.passed(loading("scipy.sparse") + SET_UP + LAID_OUT * entries):
         point = InteriorPoint(qp)
-        answer, proof = point.run(tol, deadline, lambda lam: _proof(problem, lam, tol))
+        answer, proof = point.run(tol, deadline, lambda lam: _proof(problem, lam, tol, deadline))
     if answer is None or not (
         answer.found or proof is not None or point.late or qp.ray(answer.x, UNBOUNDED) is not None
     ):
@@ -215,9 +215,9 @@ def _by_interior_point(
     return Solution.late(lam, status, tol, watch.seconds, rest), answer.x
 
 
-def _proof(problem: Problem, impulse: FloatArray, tol: float) -> FloatArray | None:
+def _proof(problem: Problem, impulse: FloatArray, tol: float, deadline: Deadline) -> FloatArray | None:
     """What impulses (m,) that grow without end prove, by the rows that take part."""
-    found = prove(problem, without_dust(impulse, problem.d), tol)
+    found = prove(problem, without_dust(impulse, problem.d), tol, deadline)
     return None if found.reason else found.y
 
 

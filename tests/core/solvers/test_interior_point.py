@@ -73,6 +73,44 @@ def test_linear_programs_of_many_variables_reach_their_optimum(seed, n):
     assert abs(answer.objective - optimum) <= 1e-7 * (1.0 + abs(optimum))
 
 
+def steered(seed, steps=40, states=8, inputs=3):
+    """A plant that runs away, one state kept below 1 at a price: inputs do not reach, so multipliers are large."""
+    rng = np.random.default_rng(seed)
+    grows = np.eye(states) + 0.1 * rng.normal(size=(states, states)) / np.sqrt(states)
+    moves = 0.1 * rng.normal(size=(states, inputs))
+    start = 2.0 * np.random.default_rng(seed + 50).normal(size=states)
+    n, m, each = steps * states, steps * inputs, sp.eye_array(steps)
+    cost = np.concatenate([np.tile(np.arange(states) < states // 2, steps), np.full(m, 0.1), [1e3]])
+    motion = sp.kron(sp.eye_array(steps, k=-1), grows) - sp.eye_array(n)
+    b = np.zeros(n)
+    b[:states] = -grows @ start
+    free = np.full(n, np.inf)
+    return {
+        "P": sp.diags_array(cost),
+        "q": np.zeros(n + m + 1),
+        "G": sp.hstack([sp.kron(each, np.eye(1, states)), sp.csr_array((steps, m)), -np.ones((steps, 1))]),
+        "h": np.ones(steps),
+        "A": sp.hstack([motion, sp.kron(each, moves), sp.csr_array((n, 1))]),
+        "b": b,
+        "lb": np.concatenate([-free, np.full(m, -0.5), [0.0]]),
+        "ub": np.concatenate([free, np.full(m, 0.5), [np.inf]]),
+    }
+
+
+@pytest.mark.parametrize(("seed", "steps", "states"), [(3, 40, 8), (5, 80, 6)])
+def test_a_plant_that_runs_away_is_steered_by_the_interior_point(seed, steps, states):
+    """Its multipliers grow for thirty steps, and only then does the gap close."""
+    program = steered(seed, steps, states)
+    answer = lv.solve_qp(lv.Problem.from_qp(**program))
+    assert answer.found and [turn.solver for turn in answer.solution.turns] == ["interior point"]
+    x, size = answer.x, np.abs(answer.x).max()
+    assert np.abs(program["A"] @ x - program["b"]).max() <= 1e-8 * size
+    assert (program["G"] @ x - program["h"]).max() <= 1e-8 * size
+    forces = program["P"] @ x + program["A"].T @ answer.y + program["G"].T @ answer.z + answer.z_box
+    assert np.abs(forces).max() <= 1e-8 * np.abs(answer.y).max()
+    assert answer.duality_gap <= 1e-8 * abs(answer.objective)
+
+
 @pytest.mark.parametrize("seed", range(6))
 def test_full_and_sparse_factors_of_the_interior_point_lead_to_one_answer(seed, monkeypatch):
     """And where neither may be made, velocities do."""
