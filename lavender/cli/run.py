@@ -4,21 +4,15 @@ from __future__ import annotations
 
 import contextlib
 import sys
+from pathlib import Path
+from time import perf_counter, sleep
 from typing import Any
 
 import click
 
 from lavender.base.errors import InputError
 from lavender.cli.options import PATH, going_on, parameters_of, refuse_unused, say
-
-FILES = ("trace", "plot", "film", "record")  # options that leave them
-OF_THE_SCENE = (
-    "solver_iterations",
-    "warm_start",
-    "order",
-    "solver",
-    "stepper",
-)  # options that `--set` has, too
+from lavender.io.stored import check_figure, writable
 
 
 @click.command()
@@ -66,39 +60,76 @@ def run(
     scene: str,
     steps: int,
     parameters: tuple[str, ...],
-    **asked: Any,
+    residual: bool,
+    plot: Path | None,
+    trace: Path | None,
+    record: Path | None,
+    replace: bool,
+    view: bool,
+    film: Path | None,
+    **of_the_scene: Any,
 ) -> None:
     """Simulate a scene of the gallery; optionally record its steps as a sequence for `lavender report`.
 
     SCENE is stack, pyramid, card_house, pile, chain, bridge, heavy_on_light, table, ramp, spinner,
     newtons_cradle or four_bar.
     """
-    from lavender.sim.engine import run_scene
+    from lavender.sim.engine import Simulation
+    from lavender.sim.engine import run as stepped
+    from lavender.sim.engine.picture import PICTURES, picture_suffix, save_picture
+    from lavender.sim.engine.run import line
+    from lavender.sim.scene import Scene
 
-    record = asked["record"]
     if record is None:
         refuse_unused(context, ["replace"], "without --record")
-
-    live, files = sys.stdout.isatty(), any(asked[name] is not None for name in FILES)
+    for path in (trace, plot, film):
+        if path is not None:
+            writable(path)
+    if plot is not None:
+        check_figure(plot)
+    drawn = film is not None and film.suffix.lower() in PICTURES
+    if film is not None and drawn:
+        picture_suffix(film)
+    live, files = sys.stdout.isatty(), any(path is not None for path in (trace, plot, film, record))
 
     def show(text: str) -> None:
         # on a terminal each line takes the place of the one before
         with going_on() if files else contextlib.nullcontext():
             click.echo(f"\r{text}\x1b[K" if live else text, nl=not live)
 
-    found = run_scene(
-        scene,
-        steps=steps,
-        parameters=_parameters(parameters, {name: asked.pop(name) for name in OF_THE_SCENE}),
-        every=1 if live else max(1, steps // 20),
-        show=show,
-        **asked,
-    )
+    simulation = Simulation(Scene(scene, **_parameters(parameters, of_the_scene)), report_residual=residual)
+    every = 1 if live else max(1, steps // 20)
+    with simulation.view() if view else contextlib.nullcontext() as viewer:
+        taken = viewer.film if viewer is not None else simulation.start_film() if film is not None else None
+        if viewer is not None:
+            show(f"{viewer.address}   Ctrl-C ends")
+        begun = perf_counter()
+
+        def watch(step: int, observation: dict[str, Any], info: dict[str, Any]) -> None:
+            if step % every == 0 or step == steps or "lost_body" in info:
+                show(line(step, observation, info))
+            if viewer is not None:  # no faster than it would go
+                sleep(max(0.0, info["time"] - (perf_counter() - begun)))
+
+        found = stepped(simulation, steps, record=record, replace=replace, watch=watch)
+        if found.lost_body:
+            show(f"stopped: the state of {found.lost_body!r} is not finite")
+        if trace is not None:
+            found.save(trace)
+        if plot is not None:
+            found.plot(plot)
+        if film is not None and taken is not None:
+            if drawn:
+                save_picture(taken, film)
+            else:
+                taken.save(film)
+        if viewer is not None:
+            viewer.wait()
     if live:
         click.echo()
-    for name, option in (("trace", "trace"), ("figure", "plot"), ("film", "film")):
-        if asked[option] is not None:
-            say(f"{name}: {asked[option]}")
+    for name, path in (("trace", trace), ("figure", plot), ("film", film)):
+        if path is not None:
+            say(f"{name}: {path}")
     if record is not None:
         say(f"{found.recorded} problems in {record}: lavender report {record}")
     best = 1e3 * found.cost.min()

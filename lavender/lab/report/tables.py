@@ -81,12 +81,9 @@ class Reach:
     start: str
     times: Mapping[float, float]  # s to each level, inf where it was not reached
     best: float  # smallest relative residual of any run
-    best_time: float  # s, of that run
     floor: float  # of that run
     status: str  # of the run to the tightest level asked for
     contradicted: str
-    message: str
-    worst_name: str
     form: str
     motion: float  # -, relative motion error of the best run; nan where there is none
     bound: float  # sqrt J, proved bound of it; nan where nothing is proved
@@ -121,11 +118,6 @@ class Claims:
     reached: int  # runs to a level that the judge confirms
     asked: int
     crashed: int  # ERROR, KILLED, CRASHED
-
-    @property
-    def rate(self) -> float:
-        """Share of claims that the judge confirms; nan without claims."""
-        return 1.0 - self.wrong / self.claims if self.claims else math.nan
 
 
 @dataclass(frozen=True)
@@ -164,12 +156,9 @@ def reaches(records: Records, levels: Sequence[float] | None = None) -> list[Rea
                     for level in levels
                 },
                 best=best.relative if best else math.inf,
-                best_time=best.time_min if best else math.nan,
                 floor=best.floor if best else math.nan,
                 status=last.status,
                 contradicted=next((r.contradicted for r in group if r.contradicted), ""),
-                message=last.message,
-                worst_name=last.worst_name,
                 form=last.form,
                 motion=math.nan if best is None or best.motion is None else best.motion,
                 bound=math.nan if best is None or best.bound is None else best.bound,
@@ -531,7 +520,6 @@ class Pass:
     times: Mapping[str, tuple[float, ...]]  # start -> s of each step
     iterations: Mapping[str, int]
     residuals: Mapping[str, tuple[float, ...]]  # start -> of each step
-    wrong: Mapping[str, int]  # start -> steps with a claim that does not hold
 
     @property
     def asked(self) -> str:
@@ -580,7 +568,6 @@ def passes(records: Records) -> list[Pass]:
                 times={s: tuple(_step_time(r) for r in g) for s, g in by_start.items()},
                 iterations={s: sum(r.iterations for r in g) for s, g in by_start.items()},
                 residuals={s: tuple(r.relative for r in g) for s, g in by_start.items()},
-                wrong={s: sum(bool(r.contradicted) for r in g) for s, g in by_start.items()},
             )
         )
     return out

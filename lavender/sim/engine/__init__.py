@@ -1,9 +1,9 @@
 """LavenderSim (not PyPI's `lavendersim`): the step loop over the compiled substep, and the problems inside it."""
 
 from lavender.sim.engine.film import Film
-from lavender.sim.engine.run import Trace, run, run_scene
+from lavender.sim.engine.run import Trace, run
 from lavender.sim.engine.simulation import Simulation
 from lavender.sim.engine.snapshot import Snapshot
 from lavender.sim.engine.stepping import SOLVER_FIELDS
 
-__all__ = ["SOLVER_FIELDS", "Film", "Simulation", "Snapshot", "Trace", "run", "run_scene"]
+__all__ = ["SOLVER_FIELDS", "Film", "Simulation", "Snapshot", "Trace", "run"]

@@ -1,4 +1,4 @@
-"""Run a scene and keep what it says of its solver: the body of `lavender run`."""
+"""Run a scene and keep what it says of its solver."""
 
 from __future__ import annotations
 
@@ -6,18 +6,15 @@ from collections.abc import Callable, Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass
 from os import PathLike
-from pathlib import Path
-from time import perf_counter, sleep
+from time import perf_counter
 from typing import Any
 
 import numpy as np
 
 from lavender.base.arrays import FloatArray, whole_number
-from lavender.io.stored import check_figure, folder_for_steps, writable, write_figure, write_text
-from lavender.sim.engine.picture import PICTURES, picture_suffix, save_picture
+from lavender.io.stored import folder_for_steps, write_figure, write_text
 from lavender.sim.engine.simulation import Simulation
 from lavender.sim.engine.stepping import SOLVER_FIELDS
-from lavender.sim.scene import Scene
 from lavender.solvers.registry import get
 
 
@@ -141,67 +138,3 @@ def line(step: int, observation: Mapping[str, Any], info: Mapping[str, Any]) -> 
         else ""
     )
     return text + failed + rest
-
-
-def run_scene(
-    name: str,
-    *,
-    steps: int = 240,
-    parameters: Mapping[str, Any] | None = None,
-    residual: bool = False,
-    trace: str | PathLike[str] | None = None,
-    plot: str | PathLike[str] | None = None,
-    record: str | PathLike[str] | None = None,
-    replace: bool = False,
-    film: str | PathLike[str] | None = None,
-    view: bool = False,
-    every: int = 1,
-    show: Callable[[str], Any] = print,
-) -> Trace:
-    """`lavender run NAME`: a gallery scene, a line of every `every`-th step for `show`, and files on request.
-
-    `film`: `.gif`, `.mp4`, `.png`, `.svg` or `.pdf` are pictures, anything else is for `lavender view`. `view` shows
-    the run in a page, no faster than it would go, and after it until Ctrl-C.
-    """
-    every = whole_number("every", every, 1)
-    for path in (trace, plot, film):
-        if path is not None:
-            writable(path)
-    if plot is not None:
-        check_figure(plot)
-    drawn = film is not None and Path(film).suffix.lower() in PICTURES
-    if film is not None and drawn:
-        picture_suffix(film)
-    simulation = Simulation(Scene(name, **(parameters or {})), report_residual=residual)
-
-    viewer = simulation.view() if view else None
-    taken = viewer.film if viewer is not None else simulation.start_film() if film is not None else None
-    begun = perf_counter()
-    if viewer is not None:
-        show(f"{viewer.address}   Ctrl-C ends")
-
-    def watch(step: int, observation: dict[str, Any], info: dict[str, Any]) -> None:
-        if step % every == 0 or step == steps or "lost_body" in info:
-            show(line(step, observation, info))
-        if viewer is not None:
-            sleep(max(0.0, info["time"] - (perf_counter() - begun)))
-
-    try:
-        found = run(simulation, steps, record=record, replace=replace, watch=watch)
-        if found.lost_body:
-            show(f"stopped: the state of {found.lost_body!r} is not finite")
-        if trace is not None:
-            found.save(trace)
-        if plot is not None:
-            found.plot(plot)
-        if film is not None and taken is not None:
-            if drawn:
-                save_picture(taken, film)
-            else:
-                taken.save(film)
-        if viewer is not None:
-            viewer.wait()
-    finally:
-        if viewer is not None:
-            viewer.close()
-    return found

@@ -20,6 +20,7 @@ from lavender.base.apart.process import opened
 from lavender.lab.bench import cases as bench_cases
 from lavender.lab.bench import machine
 from lavender.lab.bench.running import timing
+from lavender.lab.bench.running import worker as bench_worker
 from lavender.lab.bench.running.worker import DIED, Worker, outcome_in
 
 POSIX = pytest.mark.skipif(os.name != "posix", reason="processes and file names of POSIX")
@@ -152,10 +153,11 @@ PROC = pytest.mark.skipif(not os.path.exists("/proc/self/stat"), reason="process
 @pytest.mark.slow
 @PROC
 @pytest.mark.parametrize("how", ["fork", "escape"])
-def test_a_backend_that_forks_and_hangs_keeps_nobody_waiting(hostile, watchdog, how):
+def test_a_backend_that_forks_and_hangs_keeps_nobody_waiting(hostile, watchdog, monkeypatch, how):
     """Its child ends with it, or has left the group and keeps the pipe."""
+    monkeypatch.setattr(bench_worker, "GRACE", 0.5)
     p = stack()
-    with Worker(grace=0.5) as worker:
+    with Worker() as worker:
         assert worker.measure(p, task(p, f"x_{how}", time_limit=1.5))[0].status == "KILLED"
         pids = list(map(int, hostile.read_text().split()))
         assert how == "escape" or (len(pids) == 2 and wait_until(lambda: not any(map(runs, pids))))
@@ -274,9 +276,10 @@ def test_memory_is_limited_without_asking(hostile, watchdog):
 
 @POSIX
 @pytest.mark.parametrize("how", ["forge", "flood"])
-def test_what_a_backend_writes_into_the_pipe_is_data_and_bounded(hostile, watchdog, how):
+def test_what_a_backend_writes_into_the_pipe_is_data_and_bounded(hostile, watchdog, monkeypatch, how):
+    monkeypatch.setattr(bench_worker, "GRACE", 1.0)
     p = stack()
-    with Worker(grace=1.0) as worker:
+    with Worker() as worker:
         record, _ = worker.measure(p, task(p, f"x_{how}"))
         assert record.status in ("CRASHED (no answer)", "KILLED")
         assert worker.measure(p, task(p, "pgs"))[0].status == "CONVERGED"

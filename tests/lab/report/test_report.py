@@ -94,9 +94,9 @@ def test_time_to_a_level_is_that_of_the_cheapest_run_that_reached_it():
     )
     x, y = report.reaches(found)
     assert dict(x.times) == {1e-3: 1.0, 1e-6: 9.0}
-    assert (x.best, x.best_time, x.status) == (1e-8, 9.0, "CONVERGED")
+    assert (x.best, x.status) == (1e-8, "CONVERGED")
     assert dict(y.times) == {1e-3: math.inf, 1e-6: math.inf}
-    assert (y.best, y.best_time, y.contradicted) == (2e-3, 2.0, "says CONVERGED")
+    assert (y.best, y.contradicted) == (2e-3, "says CONVERGED")
 
 
 def test_profiles_count_misses_and_refusals_at_infinity():
@@ -297,9 +297,8 @@ def test_claims_failures_and_spreads():
           for o, r in (("given", 1e-2), ("reverse", 4e-2))),
     )  # fmt: skip
     by = {c.solver: c for c in report.claims(found)}
-    assert (by["x"].claims, by["x"].wrong, by["x"].rate) == (2, 1, 0.5)
+    assert (by["x"].claims, by["x"].wrong) == (2, 1)
     assert (by["y"].crashed, by["y"].asked, by["y"].reached) == (1, 1, 0)
-    assert math.isnan(by["y"].rate)
     # Of what was run again in turns the first run counts; a run to a limit of time is in turns alone.
     for mode, wrong in (("tol", 1), ("time", 2)):
         more = records_of(

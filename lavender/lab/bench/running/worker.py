@@ -32,7 +32,7 @@ _ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THR
 ORPHAN = 60.0  # s of CPU, beyond what any task may take
 ARRAYS = ("impulse", "certificate")  # of an outcome
 DIED = "its code ended the process that it ran in; tell its authors, and leave it out (--solvers)"
-GRACE = 2.0  # s, beyond the repeats' own limits, for set-up and judging
+GRACE = 2.0  # s, beyond the repeats' own limits, for set-up and judging, before the worker is killed
 
 
 class Lost(LavenderError):
@@ -50,13 +50,10 @@ class Worker:
     ----------
     memory : int, optional, bytes
         Limit of the worker's address space, where the system has one; `machine.memory_share()` if None.
-    grace : s, optional
-        Beyond the time limits of a task, before the worker is killed.
     """
 
-    def __init__(self, memory: int | None = None, grace: float | None = None) -> None:
+    def __init__(self, memory: int | None = None) -> None:
         self.memory = memory_share() if memory is None else memory
-        self.grace = GRACE if grace is None else grace
         self._process = Process(__name__, self.memory or 0, environment=_ONE_THREAD)
         self._holds = ""
 
@@ -89,7 +86,7 @@ class Worker:
                 raise Lost(f"{CRASHED} (did not start)", f"the worker process ended: {cause}")
         # Repeats end once they took the limit together, so at most two can take it; backends look at the clock
         # now and then.
-        limit = 3.0 * task.time_limit + self.grace
+        limit = 3.0 * task.time_limit + GRACE
         begun = time.monotonic()
         messages: list[Any] = [("task", task, impulse)]
         if self._holds != task.sha:
