@@ -9,8 +9,8 @@ import click
 from lavender.base.errors import InputError
 from lavender.cli.options import (
     EXIT_UNMET,
+    Listed,
     ManyValues,
-    Names,
     Reading,
     one_thread,
     precision_option,
@@ -23,7 +23,7 @@ from lavender.cli.options import (
 
 @click.command(cls=ManyValues)
 @click.argument("files", nargs=-1, metavar="[FILES | FOLDERS | NAMES]...")
-@click.option("--solvers", type=Names(), help="Solvers by name; default: all that accept the problem.")
+@click.option("--solvers", type=Listed(str), help="Solvers by name; default: all that accept the problem.")
 @click.option(
     "--reference", default="osqp", show_default=True, help="Solver whose answer the others are compared with."
 )

@@ -91,18 +91,17 @@ class ManyValues(click.Command):
         return super().parse_args(ctx, folded)
 
 
-class Numbers(_ParamType):
-    """Numbers with commas or blanks between them."""
+class Listed(_ParamType):
+    """Numbers, or words, with commas or blanks between them."""
 
-    name = "x,x,..."
-
-    def __init__(self, kind: type = float) -> None:
+    def __init__(self, kind: type) -> None:
         self.kind = kind
+        self.name = "a,b,..." if kind is str else "x,x,..."
 
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> tuple[Any, ...]:
-        """A tuple of numbers."""
+        """A tuple of them."""
         if not isinstance(value, str):
             return tuple(value)
         try:
@@ -111,18 +110,6 @@ class Numbers(_ParamType):
             return self.fail(
                 f"{value!r} is not a list of {'whole ' if self.kind is int else ''}numbers", param, ctx
             )
-
-
-class Names(_ParamType):
-    """Words with commas or blanks between them."""
-
-    name = "a,b,..."
-
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> tuple[str, ...]:
-        """A tuple of words."""
-        return tuple(value.replace(",", " ").split()) if isinstance(value, str) else tuple(value)
 
 
 class Seeds(_ParamType):
@@ -265,18 +252,18 @@ recording_options = adding([THRESHOLD, *RECORDING_OPTIONS], show_default=True)
 
 #: Of what is measured.
 PLAN_OPTIONS: tuple[tuple[str, dict[str, Any]], ...] = (
-    ("--solvers", {"type": Names(), "help": "Solvers by name; default: all that are installed."}),
-    ("--levels", {"type": Numbers(), "default": "1e-3,1e-6,1e-9", "show_default": True,
+    ("--solvers", {"type": Listed(str), "help": "Solvers by name; default: all that are installed."}),
+    ("--levels", {"type": Listed(float), "default": "1e-3,1e-6,1e-9", "show_default": True,
                   "help": "Relative residuals to reach."}),
     ("--motion", {"is_flag": True, "help": "Also measure the motion error: how wrong the velocities of the bodies are, "
                   "relative to a reference that is solved once for each case."}),
     ("--prove", {"is_flag": True, "help": "Measure the motion error from an exact solution that is enclosed with "
                  "proof, where one is (extra `proof`); implies --motion."}),
-    ("--speed-levels", {"type": Numbers(), "default": (), "metavar": "M/S,M/S,...",
+    ("--speed-levels", {"type": Listed(float), "default": (), "metavar": "M/S,M/S,...",
                         "help": "Motion errors to reach, in metres per second; implies --motion."}),
-    ("--budgets", {"type": Numbers(int), "default": "4,8,16,32,64", "show_default": True,
+    ("--budgets", {"type": Listed(int), "default": "4,8,16,32,64", "show_default": True,
                    "help": "Numbers of iterations to run exactly."}),
-    ("--orders", {"type": Names(), "default": None,
+    ("--orders", {"type": Listed(str), "default": None,
                   "help": "Sweep orders to compare with 'given', at the middle budget; random:3 uses seed 3."}),
     ("--repeats", {"type": int, "default": 3, "show_default": True,
                    "help": "Repetitions of each solve; minimum and median are kept."}),

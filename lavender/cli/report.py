@@ -18,8 +18,8 @@ from lavender.cli.options import (
     EXIT_UNMET,
     PATH,
     RECORDING,
+    Listed,
     ManyValues,
-    Numbers,
     Seeds,
     console,
     plan_options,
@@ -65,7 +65,7 @@ from lavender.lab.bench.record import file_name
 @click.option("--compare", type=PATH, help="Compare with earlier records (.jsonl, or their folder).")
 @click.option(
     "--time-budgets",
-    type=Numbers(),
+    type=Listed(float),
     default=(),
     metavar="S,S,...",
     help="Time budgets in seconds, each with a recommended solver; default: three decades around the fastest times.",

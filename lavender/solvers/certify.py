@@ -91,15 +91,15 @@ def conflict_of(problem: Problem, tol: float, deadline: Deadline | None = None) 
             more = np.zeros(problem.m)
             more[rows] = share * problem.d[rows]
             try:
-                softened = _softened(problem, more)
+                softer = softened(problem, more)
             except InputError:  # A or the compliance is at the most that the door lets in
                 continue
-            if _newton(softened, SOFT_STEPS, tol, deadline)[0] <= tol:
+            if _newton(softer, SOFT_STEPS, tol, deadline)[0] <= tol:
                 return Conflict(proof, joints + contacts, tuple(map(int, rows)), float(more.max()), told)
     return Conflict(proof, joints + contacts, (), 0.0, "")
 
 
-def _softened(problem: Problem, more: FloatArray) -> Problem:
+def softened(problem: Problem, more: FloatArray) -> Problem:
     """With so much compliance (m,) [1/kg] more."""
     if problem.matrix is None:
         assert problem.compliance is not None

@@ -10,16 +10,19 @@ import re
 from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lavender import io
 from lavender.base.arrays import FloatArray, several
 from lavender.base.errors import InputError, SolverUnavailable
 from lavender.io.stored import ENGINE, SUFFIXES, whole_file
 from lavender.judge.residuals import ENOUGH, Residual, nothing_to_do, residual
+from lavender.lab import suite
 from lavender.lab.bench.record import CaseInfo, file_name, printable
 from lavender.lab.suite import Case
 from lavender.lab.suspicions import diagnose
@@ -106,8 +109,6 @@ def resolve(words: Source | Iterable[Source], sequences: bool | None = None) -> 
         [words] if isinstance(words, Source) else several("cases", words, "files, folders, names or problems")
     )
     if not words:
-        from lavender.lab import suite
-
         items = [_from_case(case, case.name) for case in suite.default()]
     for word in words:
         if isinstance(word, Problem):
@@ -144,8 +145,6 @@ def resolve(words: Source | Iterable[Source], sequences: bool | None = None) -> 
                 f"{word}: no such file; give problem files ({', '.join(SUFFIXES)}), folders or suite names"
             )
         else:
-            from lavender.lab import suite
-
             chosen = [_from_name(name) for name in suite.names(str(word))]
             items += _as_steps(chosen) if str(word).removeprefix("@") == "sequences" else chosen
     return _unique_names(items)
@@ -266,8 +265,6 @@ def _from_case(case: Case, source: str) -> Item:
 
 def _from_name(name: str) -> Item:
     """A case of the suite; where it needs a package that is not there, one that does not load."""
-    from lavender.lab import suite
-
     try:
         return _from_case(suite.case(name), name)
     except SolverUnavailable as error:
@@ -293,8 +290,6 @@ def _raising(error: Exception) -> Callable[[], Problem]:
 
 def _from_file(path: Path) -> Item:
     def load() -> Problem:
-        from lavender import io
-
         if path.exists() and not path.is_file():
             # a pipe never ends
             raise InputError(f"{path} is no file; a problem ({', '.join(SUFFIXES)}) is needed")
@@ -302,12 +297,7 @@ def _from_file(path: Path) -> Item:
             raise InputError(f"{path}: left out of its recording: {why}")
         return io.load(path)
 
-    def stored() -> FloatArray | None:
-        from lavender import io
-
-        return io.load_solution(path)
-
-    return Item(path.stem, str(path), load, stored=stored)
+    return Item(path.stem, str(path), load, stored=partial(io.load_solution, path))
 
 
 def _unique_names(items: list[Item]) -> list[Item]:

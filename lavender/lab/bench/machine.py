@@ -19,6 +19,7 @@ from typing import Any
 
 from lavender._version import __version__
 from lavender.lab.bench.record import Run
+from lavender_ext.sweep import serial
 
 SHARE = 0.5  # of the machine's memory, which the processes of backends may take together
 LEAST = 2 * 2**30  # bytes: below that, packages of compiled code do not start
@@ -125,8 +126,6 @@ def clock() -> dict[str, str]:
 @cache
 def build_facts() -> dict[str, str]:
     """What was built, and of what: commit of a checkout or hash of a wheel's kernels, compiler, flags, BLAS."""
-    from lavender_ext.sweep import serial
-
     package = Path(__file__).resolve().parents[2]
     library = Path(str(serial.__file__))
     found = {"commit": commit} if (commit := commit_of(package.parent)) else {}

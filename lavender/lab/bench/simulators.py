@@ -29,6 +29,7 @@ import numpy as np
 from lavender.io import mujoco as adapter
 from lavender.io.recording import drive_of
 from lavender.judge.residuals import reference, residual
+from lavender.judge.solution import Solution
 from lavender.lab.bench.running.runner import carry
 from lavender.problem import Problem
 from lavender.solving.many import solve_many
@@ -98,23 +99,28 @@ def engine_time(mj: Any, model: Any, data: Any, problem: Problem) -> tuple[float
     return found[0], seconds, found[1]
 
 
-def our_times(problem: Problem) -> tuple[float, float, float]:
-    """(one call, each of many, residual), cold."""
-    one, found = np.inf, 0.0
+def one_call(problem: Problem, impulse: Any = None) -> tuple[float, Solution]:
+    """Least time of a solve [s], and its solution: the same every time."""
+    best = np.inf
     for _ in range(REPEATS):
         made = fresh(problem)
         begin = perf_counter()
-        solution = solve(made, tol=TARGET)
-        one = min(one, perf_counter() - begin)
-        found = max(found, solution.residual.relative)
-    many = np.inf
+        solution = solve(made, tol=TARGET, impulse=impulse)
+        best = min(best, perf_counter() - begin)
+    return float(best), solution
+
+
+def our_times(problem: Problem) -> tuple[float, float, float]:
+    """(one call, each of many, residual), cold."""
+    one, solution = one_call(problem)
+    many, found = np.inf, solution.residual.relative
     for _ in range(REPEATS):
         batch = [fresh(problem) for _ in range(MANY)]
         begin = thread_time()  # of the processor: milliseconds are long enough to be interrupted
         made_of = solve_many(batch, tol=TARGET)
         many = min(many, (thread_time() - begin) / MANY)
         found = max(found, *(solution.residual.relative for solution in made_of))
-    return float(one), float(many), float(found)
+    return one, float(many), float(found)
 
 
 def _problems(mj: Any, path: Path, model: Any, steps: int, every: int) -> Iterator[Any]:
@@ -179,12 +185,7 @@ def measure_warm(mj: Any, path: Path, steps: int) -> list[WarmStep]:
             continue
         engine = least(partial(mj.mj_fwdConstraint, model, data))
         start = problem.start() if before is None else carry(*before, problem)
-        ours = np.inf
-        for _ in range(REPEATS):
-            made = fresh(problem)
-            begin = perf_counter()
-            solution = solve(made, tol=TARGET, impulse=start)
-            ours = min(ours, perf_counter() - begin)
+        ours, solution = one_call(problem, start)
         before = problem, solution.impulse
         if reference(problem)[1] < 1e-9:
             continue
@@ -194,7 +195,7 @@ def measure_warm(mj: Any, path: Path, steps: int) -> list[WarmStep]:
                 step=step,
                 rows=problem.m,
                 engine=engine,
-                ours=float(ours),
+                ours=ours,
                 engine_residual=residual(problem, adapter.impulse(model, data)).relative,
                 residual=solution.residual.relative,
             )

@@ -36,19 +36,35 @@ class Size:
 
 
 class Operator:
-    """What every kind of operator offers; x (m,) [N s]. Here what a matrix can tell: nothing of velocities."""
+    """What every kind of operator offers; x (m,) [N s]. Here what a matrix A can tell: nothing of velocities."""
+
+    def __init__(self, problem: Problem) -> None:
+        self.b = problem.b
+        a = problem.csr
+        self.asymmetry = 0.0 if problem.is_symmetric else problem.asymmetry
+        self.a = a if problem.asymmetry == 0.0 else sp.csr_array(0.5 * (a + a.T))
+        self.size_of_a = abs(self.a)
+        self.of_slack = _gamma(int(np.diff(self.a.indptr).max(initial=0)) + 3)
+        self.semidefinite = problem.is_semidefinite
 
     def refusal(self) -> str | None:
         """Why (1) is no energy, or None where it is one."""
-        raise NotImplementedError
+        if self.asymmetry > 0.0:
+            return f"A is not symmetric (by {self.asymmetry:.1e})"
+        return None if self.semidefinite else "A is not positive semidefinite"
 
     def slack(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """w = A x - b (m,) [m/s] and a bound of its rounding."""
-        raise NotImplementedError
+        return self.a @ x - self.b, self.of_slack * (self.size_of_a @ np.abs(x) + np.abs(self.b))
 
     def size(self, x: FloatArray, fuzz: FloatArray) -> Size:
         """Energy norm of x, every entry known up to `fuzz` (m,)."""
-        raise NotImplementedError
+        y = np.abs(x)
+        square = max(float(x @ (self.a @ x)), 0.0)
+        rounding = (self.of_slack + _gamma(len(x) + 1)) * float(y @ (self.size_of_a @ y))
+        wrong = float(fuzz @ (self.size_of_a @ fuzz))
+        most = np.sqrt(0.5) * (np.sqrt(square + rounding) + np.sqrt(wrong)) * (1.0 + _gamma(len(x) + 64))
+        return Size(None, float(np.sqrt(0.5 * square)), float(most))
 
     def velocity(self, x: FloatArray, fuzz: FloatArray) -> tuple[FloatArray, FloatArray] | None:
         """M^-1 J^T x, (n, 6) or (nv,) [m/s, rad/s], and a bound of what is lost in it; None where M is not known."""
@@ -71,7 +87,7 @@ def make(problem: Problem) -> Operator:
     """The operator of a problem, with what its norms need; O(nnz), and M^-1 by trees in generalised coordinates."""
     if problem.rows is not None:
         return _Bodies(problem)
-    return _Matrix(problem) if problem.generalized is None else _Velocities(problem)
+    return Operator(problem) if problem.generalized is None else _Velocities(problem)
 
 
 class _Factored(Operator):
@@ -206,33 +222,6 @@ class _Velocities(_Factored):
     def reach(self, energy: float) -> tuple[float, float | None] | None:
         # v_i^2 <= (M^-1)_ii |v|_M^2
         return float(self.fast.max(initial=0.0)) * energy * (1.0 + 1e-9), None
-
-
-class _Matrix(Operator):
-    def __init__(self, problem: Problem) -> None:
-        self.b = problem.b
-        a = problem.csr
-        self.asymmetry = 0.0 if problem.is_symmetric else problem.asymmetry
-        self.a = a if problem.asymmetry == 0.0 else sp.csr_array(0.5 * (a + a.T))
-        self.size_of_a = abs(self.a)
-        self.of_slack = _gamma(int(np.diff(self.a.indptr).max(initial=0)) + 3)
-        self.semidefinite = problem.is_semidefinite
-
-    def refusal(self) -> str | None:
-        if self.asymmetry > 0.0:
-            return f"A is not symmetric (by {self.asymmetry:.1e})"
-        return None if self.semidefinite else "A is not positive semidefinite"
-
-    def slack(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        return self.a @ x - self.b, self.of_slack * (self.size_of_a @ np.abs(x) + np.abs(self.b))
-
-    def size(self, x: FloatArray, fuzz: FloatArray) -> Size:
-        y = np.abs(x)
-        square = max(float(x @ (self.a @ x)), 0.0)
-        rounding = (self.of_slack + _gamma(len(x) + 1)) * float(y @ (self.size_of_a @ y))
-        wrong = float(fuzz @ (self.size_of_a @ fuzz))
-        most = np.sqrt(0.5) * (np.sqrt(square + rounding) + np.sqrt(wrong)) * (1.0 + _gamma(len(x) + 64))
-        return Size(None, float(np.sqrt(0.5 * square)), float(most))
 
 
 def _gamma(n: int) -> float:

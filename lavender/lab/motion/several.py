@@ -16,7 +16,6 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray, flag, one_of, whole_number
 from lavender.base.errors import CapabilityError, InputError, LavenderError
-from lavender.base.later import sparse as sp
 from lavender.judge.residuals import residual
 from lavender.judge.solution import uninterrupted
 from lavender.lab.motion.bound import difference
@@ -27,6 +26,7 @@ from lavender.lab.motion.reference import reference as reference_of
 from lavender.lab.motion.unique import uniqueness
 from lavender.problem import Problem, check_problem
 from lavender.problem.cones import project
+from lavender.solvers.certify import softened
 from lavender.solvers.registry import available, get
 from lavender.solving.solve import solve
 
@@ -291,17 +291,11 @@ def compliant(problem: Problem) -> FloatArray:
     """Where softness that vanishes leads: compliance s d on every row, s from 1 to 1e-12, then none; (m,) [N s]."""
     x, s = problem.start(), SOFTEST
     while s >= HARDEST:
-        x = np.array(uninterrupted(solve(softened(problem, s), "auto", impulse=x, tol=1e-12)).impulse)
+        x = np.array(
+            uninterrupted(solve(softened(problem, s * problem.d), "auto", impulse=x, tol=1e-12)).impulse
+        )
         s *= STEP
     return np.array(uninterrupted(solve(problem, "auto", impulse=x, tol=1e-13)).impulse)
-
-
-def softened(problem: Problem, share: float) -> Problem:
-    """The problem with compliance `share` d [1/kg] added to every row."""
-    soft = share * problem.d
-    if problem.compliance is not None:
-        return replace(problem, compliance=problem.compliance + soft, guess=None, copy=False)
-    return replace(problem, matrix=sp.csr_array(problem.csr + sp.diags_array(soft)), guess=None, copy=False)
 
 
 def search(problem: Problem, own: Reference, n: int, seed: int) -> Iterator[tuple[str, FloatArray]]:

@@ -30,6 +30,7 @@ from lavender.lab.bench.running.runner import Event, Runner, Watch, is_foreign, 
 from lavender.lab.bench.running.timing import Task, one_thread
 from lavender.lab.bench.running.worker import Worker
 from lavender.lab.bench.store import Records, Store, opened
+from lavender.lab.suite.case import FAMILIES, parse
 from lavender.problem import Problem
 from lavender.solvers import registry
 from lavender.solvers.registry import SolverSpec
@@ -83,8 +84,6 @@ def seeds(words: Iterable[str], n: int, first: int = 0) -> list[str]:
     UnknownName, InputError
         A name that the suite does not have; more than a million seeds, each of which is a case with a name.
     """
-    from lavender.lab.suite.case import FAMILIES, parse
-
     if not 0 <= n <= MOST_SEEDS:
         raise InputError(
             f"{n} seeds are asked for; at most {MOST_SEEDS} in one run: give A:B, part after part"
@@ -139,6 +138,8 @@ def campaign(
         A backend that joblib does not have here, another number of workers than -1 or 1 to 4096, or workers that were
         lost again and again.
     """
+    import joblib
+
     check_workers(workers)
     plan = plan or CampaignPlan()
     items = resolve(cases)
@@ -157,6 +158,9 @@ def campaign(
     here = tuple(specs[n] for n in names if not (specs[n].own or specs[n].plugged))
     out = Records()
     name, cluster = connected(backend)
+    if name == "loky" and memory is None:
+        memory = machine.memory_share(joblib.effective_n_jobs(workers))
+    order = Order(plan, this, memory, here)
     with cluster, opened(store) as kept:
         known = {} if kept is None else _finished(kept.records, this.run, items)
         out.source = str(kept.path) if kept is not None else ""
@@ -172,7 +176,7 @@ def campaign(
                     f"{len(left)} of {len(pairs)} pairs are not done: workers were lost {ATTEMPTS} times; "
                     "run the same command again, with fewer workers if memory is short"
                 )
-            for index, entries in _hand_out(left, Order(plan, this, memory, here), workers, name):
+            for index, entries in hand_out(work, ((pair, order) for pair in left), workers, name):
                 done[index], pair = entries, pairs[index]
                 sha = next((e.sha for e in entries if isinstance(e, CaseInfo)), "")
                 _keep(kept, [*entries, Done(this.run, pair.case, pair.solver, sha)])
@@ -237,16 +241,6 @@ def _sha(item: Item) -> str | None:
         return ""
     finally:
         item.forget()
-
-
-def _hand_out(pairs: list[Pair], order: Order, workers: int, backend: str) -> Iterator[tuple[int, list[Any]]]:
-    """Results as they come; ends early, without an exception, when workers were lost."""
-    import joblib
-
-    if backend == "loky":
-        share = machine.memory_share(joblib.effective_n_jobs(workers))
-        order = replace(order, memory=order.memory or share)
-    yield from hand_out(work, ((pair, order) for pair in pairs), workers, backend)
 
 
 def hand_out(
