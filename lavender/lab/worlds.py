@@ -55,6 +55,7 @@ class Runs:
         for name in ("worlds", "steps"):
             whole_number(name, getattr(self, name), 1, None)
         object.__setattr__(self, "control", control_of(self.control))
+        whole_number("seed", self.seed, high=None)
         number("spread", self.spread, low=0.0)
 
     def load(self) -> tuple[Any, Any]:

@@ -170,6 +170,7 @@ def test_a_world_that_mujoco_begins_anew_ends_there(boxes, monkeypatch, tmp_path
     [
         ("", {"engine": "bullet"}, "engine"),
         ("", {"worlds": 0}, "worlds"),
+        ("", {"control": "zero", "seed": -1}, "seed"),
         ("", {"spread": -1.0}, "spread"),
         ("", {"precision": "float16"}, "precision"),
         ("", {"control": "sometimes"}, "controls sometimes"),

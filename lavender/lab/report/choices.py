@@ -132,15 +132,14 @@ def advice(records: Records, times: Sequence[float] = ()) -> list[Line]:
             left_out=len(lost.get(name, ())) if is_sequence else 0,
             by_level={x: to_level(records, name, cases, x, ways) for x in levels_of(records)},
             by_time={t: within(records, name, cases, t, ways) for t in times},
-            by_sweeps={float(n): _with_sweeps(records, name, cases, n, some) for n, some in swept.items()},
+            by_sweeps={
+                float(n): replace(within(records, name, cases, math.inf, some), target=float(n))
+                for n, some in swept.items()
+            },
         )
         for is_sequence, groups in ((False, families(records)), (True, steps_of(records)))
         for name, cases in groups.items()
     ]
-
-
-def _with_sweeps(records: Records, name: str, cases: Sequence[str], n: int, ways: Ways) -> Advice:
-    return replace(within(records, name, cases, math.inf, ways), target=float(n))
 
 
 def _swept(records: Records) -> dict[int, Ways]:
