@@ -65,8 +65,10 @@ class Redundancy:
     @property
     def block_names(self) -> tuple[str, ...]:
         """Names of those blocks."""
-        first = (self.problem.row_name(int(self.problem.cones.ptr[i])) for i in self.blocks)
-        return tuple(name.rsplit(", ", 1)[0] for name in first)
+        given, ptr = self.problem.names, self.problem.cones.ptr
+        if given is not None:
+            return tuple(given[i] for i in self.blocks)
+        return tuple(self.problem.row_name(int(ptr[i])).rsplit(", ", 1)[0] for i in self.blocks)
 
     @property
     def slack_is_unique(self) -> bool:

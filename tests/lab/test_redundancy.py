@@ -56,6 +56,16 @@ def test_the_second_of_two_equal_hinges_is_named():
     assert "spare hinge" in str(found)
 
 
+def test_blocks_of_one_row_keep_their_whole_name():
+    """Of the edges of a pyramid the last repeats the others, not the contact."""
+    edges = np.array([[1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 0.0, 1.0], [1.0, 0.0, -1.0]])
+    names = [f"contact 0 (floor, box), edge {k}" for k in range(4)]
+    problem = lv.Problem(
+        np.zeros(4), lv.Cones.bounded(np.zeros(4), np.full(4, np.inf)), matrix=edges @ edges.T, names=names
+    )
+    assert redundancy(problem).block_names == (names[3],)
+
+
 @pytest.mark.parametrize(
     ("a", "b", "rank"),
     [

@@ -8,8 +8,8 @@ from lavender.base.arrays import FloatArray
 from lavender.base.errors import CapabilityError
 from lavender.external.running import quiet
 from lavender.lab.phenomena.engines import Stepping
-from lavender.lab.phenomena.engines.tree import parents, relative, xyzw
-from lavender.sim.scene import Body, Box, Joint, Plane, Scene, Sphere
+from lavender.lab.phenomena.engines.tree import parents, relative, shape_of, xyzw
+from lavender.sim.scene import Body, Joint, Plane, Scene, Sphere
 from lavender.sim.scene.parts import rotation
 
 with quiet(noisy=True):  # it greets
@@ -57,17 +57,16 @@ class Engine(Stepping):
             self._tie(joint)
 
     def _shape(self, body: Body) -> int:
-        if isinstance(body.shape, Plane):
+        shape = shape_of(body, "pybullet")
+        if isinstance(shape, Plane):
             made = pybullet.createCollisionShape(
-                pybullet.GEOM_PLANE, planeNormal=list(body.shape.normal), **self.at
+                pybullet.GEOM_PLANE, planeNormal=list(shape.normal), **self.at
             )
-        elif isinstance(body.shape, Sphere):
-            made = pybullet.createCollisionShape(pybullet.GEOM_SPHERE, radius=body.shape.radius, **self.at)
-        elif isinstance(body.shape, Box):
-            half = [0.5 * x for x in body.shape.size]
-            made = pybullet.createCollisionShape(pybullet.GEOM_BOX, halfExtents=half, **self.at)
+        elif isinstance(shape, Sphere):
+            made = pybullet.createCollisionShape(pybullet.GEOM_SPHERE, radius=shape.radius, **self.at)
         else:
-            raise CapabilityError(f"{body.name} has no shape that pybullet could be given")
+            half = [0.5 * x for x in shape.size]
+            made = pybullet.createCollisionShape(pybullet.GEOM_BOX, halfExtents=half, **self.at)
         return int(made)
 
     def _single(self, i: int) -> None:

@@ -33,10 +33,9 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
 from lavender.base.arrays import FloatArray
-from lavender.base.errors import CapabilityError
 from lavender.lab.phenomena.engines import Stepping
-from lavender.lab.phenomena.engines.tree import parents, relative
-from lavender.sim.scene import Body, Box, Plane, Scene, Sphere
+from lavender.lab.phenomena.engines.tree import parents, relative, shape_of
+from lavender.sim.scene import Body, Plane, Scene, Sphere
 
 MODULUS = 1e8  # Pa, of compliant bodies
 DISSIPATION = 10.0  # s/m
@@ -88,15 +87,14 @@ class Engine(Stepping):
         return made
 
     def _add(self, i: int) -> Any:
-        body, shape = self.scene.bodies[i], self.scene.bodies[i].shape
+        body = self.scene.bodies[i]
+        shape = shape_of(body, "drake")
         if isinstance(shape, Plane):
             normal = _any(shape.normal)
             pose = HalfSpace.MakePose(normal, _any(shape.offset * normal))
             ground = self.plant.world_body()
             self.plant.RegisterCollisionGeometry(ground, pose, HalfSpace(), f"b{i}", self._material(True))
             return None
-        if not isinstance(shape, (Sphere, Box)) or body.is_static:
-            raise CapabilityError(f"{body.name} has no shape that drake could be given")
         about = np.diag(body.inertia) / body.mass
         unit = UnitInertia(*about)
         made = self.plant.AddRigidBody(f"b{i}", SpatialInertia(body.mass, _any(np.zeros(3)), unit))

@@ -6,10 +6,9 @@ import lavendersim
 import numpy as np
 
 from lavender.base.arrays import FloatArray
-from lavender.base.errors import CapabilityError
 from lavender.lab.phenomena.engines import Stepping
-from lavender.lab.phenomena.engines.tree import parents, xyzw
-from lavender.sim.scene import Box, Plane, Scene, Sphere
+from lavender.lab.phenomena.engines.tree import parents, shape_of, xyzw
+from lavender.sim.scene import Plane, Scene, Sphere
 from lavender.sim.scene.arithmetic import frame_quaternion
 from lavender.sim.scene.parts import rotation
 
@@ -62,10 +61,11 @@ class Engine(Stepping):
 
     def _add(self, made: lavendersim.Scene, i: int, jointed: bool) -> lavendersim.BodyRef:
         body = self.scene.bodies[i]
-        if isinstance(body.shape, Plane):
-            normal = self.frame @ np.asarray(body.shape.normal)
+        shape = shape_of(body, "lavendersim")
+        if isinstance(shape, Plane):
+            normal = self.frame @ np.asarray(shape.normal)
             turn = _frame(normal).T
-            place = (body.shape.offset - 0.5 * WIDE[1]) * normal
+            place = (shape.offset - 0.5 * WIDE[1]) * normal
             return made.box(
                 f"b{i}",
                 size=WIDE,
@@ -80,11 +80,9 @@ class Engine(Stepping):
             "linear_velocity": self.frame @ body.velocity, "collision": not jointed,
             "angular_velocity": self.frame @ body.angular_velocity, **self.material,
         }  # fmt: skip
-        if isinstance(body.shape, Sphere):
-            return made.sphere(f"b{i}", radius=body.shape.radius, **more)
-        if isinstance(body.shape, Box):
-            return made.box(f"b{i}", size=body.shape.size, **more)
-        raise CapabilityError(f"{body.name} has no shape that lavendersim could be given")
+        if isinstance(shape, Sphere):
+            return made.sphere(f"b{i}", radius=shape.radius, **more)
+        return made.box(f"b{i}", size=shape.size, **more)
 
     def state(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """See `Stepping.state`."""

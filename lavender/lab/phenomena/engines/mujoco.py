@@ -8,13 +8,12 @@ import mujoco
 import numpy as np
 
 from lavender.base.arrays import FloatArray
-from lavender.base.errors import CapabilityError
 from lavender.io.mujoco import from_mujoco, impulse
 from lavender.judge.residuals import residual
 from lavender.lab.phenomena.engines import Stepping
-from lavender.lab.phenomena.engines.tree import parents, relative
+from lavender.lab.phenomena.engines.tree import parents, relative, shape_of
 from lavender.problem import Problem
-from lavender.sim.scene import Box, Joint, Plane, Scene, Sphere
+from lavender.sim.scene import Joint, Plane, Scene, Sphere
 from lavender.sim.scene.parts import rotation
 
 
@@ -89,16 +88,14 @@ class Engine(Stepping):
 
     def _body(self, i: int) -> str:
         body, joint = self.scene.bodies[i], self.up.get(i)
-        shape = body.shape
+        shape = shape_of(body, "mujoco")
         if isinstance(shape, Plane):
             at = f'pos="{_text(shape.offset * np.asarray(shape.normal))}" zaxis="{_text(shape.normal)}"'
             return f'<body name="b{i}"><geom type="plane" size="0 0 1" {at}/></body>'
         if isinstance(shape, Sphere):
             geom = f'type="sphere" size="{shape.radius!r}"'
-        elif isinstance(shape, Box):
-            geom = f'type="box" size="{_text(0.5 * np.asarray(shape.size))}"'
         else:
-            raise CapabilityError(f"{body.name} has no shape that mujoco could be given")
+            geom = f'type="box" size="{_text(0.5 * np.asarray(shape.size))}"'
         above = None if joint is None or joint.a < 0 else self.scene.bodies[joint.a]
         place, turn = relative(above, body)
         tie = "" if body.is_static else "<freejoint/>"

@@ -7,10 +7,9 @@ import numpy as np
 import warp as wp
 
 from lavender.base.arrays import FloatArray
-from lavender.base.errors import CapabilityError
 from lavender.lab.phenomena.engines import Stepping
-from lavender.lab.phenomena.engines.tree import parents, relative, xyzw
-from lavender.sim.scene import Box, Plane, Scene, Sphere
+from lavender.lab.phenomena.engines.tree import parents, relative, shape_of, xyzw
+from lavender.sim.scene import Plane, Scene, Sphere
 
 SUBSTEPS = 4
 
@@ -42,14 +41,13 @@ class Engine(Stepping):
         self.contacts = self.pipeline.contacts()
 
     def _add(self, builder: newton.ModelBuilder, i: int, material: newton.ModelBuilder.ShapeConfig) -> int:
-        body, shape = self.scene.bodies[i], self.scene.bodies[i].shape
+        body = self.scene.bodies[i]
+        shape = shape_of(body, "newton")
         if isinstance(shape, Plane):
             builder.add_shape_plane(
                 (*map(float, shape.normal), -float(shape.offset)), width=0.0, length=0.0, cfg=material
             )
             return -1
-        if not isinstance(shape, (Sphere, Box)) or body.is_static:
-            raise CapabilityError(f"{body.name} has no shape that newton could be given")
         add = builder.add_link if i in self.up else builder.add_body
         made = add(
             xform=_place(body.position, body.quaternion), mass=body.mass, inertia=wp.mat33(body.inertia)

@@ -11,8 +11,8 @@ from lavender.base.apart.lines import Lines
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import CapabilityError, LavenderError
 from lavender.lab.phenomena.engines import PACKAGES_OF_NODE, Stepping, missing_in_node, node_folder
-from lavender.lab.phenomena.engines.tree import parents
-from lavender.sim.scene import Body, Box, Plane, Scene, Sphere
+from lavender.lab.phenomena.engines.tree import parents, shape_of
+from lavender.sim.scene import Body, Plane, Scene, Sphere
 
 SCRIPT = Path(__file__).with_name("served.mjs")
 
@@ -76,15 +76,13 @@ class Engine(Stepping):
 
 
 def _body(body: Body, engine: str) -> dict[str, Any]:
-    shape = body.shape
+    shape = shape_of(body, engine)
     if isinstance(shape, Plane):
         told: dict[str, Any] = {"kind": "plane", "normal": list(shape.normal), "offset": shape.offset}
-    elif isinstance(shape, Sphere) and body.mass:
+    elif isinstance(shape, Sphere):
         told = {"kind": "sphere", "radius": shape.radius}
-    elif isinstance(shape, Box) and body.mass:
-        told = {"kind": "box", "size": list(shape.size)}
     else:
-        raise CapabilityError(f"{body.name} has no shape that {engine} could be given")
+        told = {"kind": "box", "size": list(shape.size)}
     position, quaternion = body.position.tolist(), body.quaternion.tolist()
     return {
         "shape": told,

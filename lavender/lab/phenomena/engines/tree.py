@@ -6,8 +6,8 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import CapabilityError
-from lavender.sim.scene import Scene
-from lavender.sim.scene.parts import Body, Joint, rotation
+from lavender.sim.scene import Body, Box, Joint, Plane, Scene, Sphere
+from lavender.sim.scene.parts import rotation
 
 
 def parents(scene: Scene, engine: str) -> dict[int, Joint]:
@@ -28,6 +28,13 @@ def parents(scene: Scene, engine: str) -> dict[int, Joint]:
     if scene.parameters.restitution or any(b.friction is not None or b.restitution for b in scene.bodies):
         raise CapabilityError(f"{engine} takes one friction for all bodies, and no restitution")
     return found
+
+
+def shape_of(body: Body, engine: str) -> Plane | Sphere | Box:
+    """What a body is in contacts; CapabilityError where that is nothing."""
+    if body.shape is None:
+        raise CapabilityError(f"{body.name} has no shape that {engine} could be given")
+    return body.shape
 
 
 def relative(parent: Body | None, child: Body) -> tuple[FloatArray, FloatArray]:
