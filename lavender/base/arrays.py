@@ -150,7 +150,10 @@ def number(
         value, (int, float, np.integer, np.floating)
     ):
         raise InputError(f"{what} is {value!r}; a number is needed")
-    x = float(value)
+    try:
+        x = float(value)
+    except OverflowError:  # a whole number of more digits than a float has
+        x = np.inf if value > 0 else -np.inf
     if not np.isfinite(x):
         raise InputError(f"{what} is {x}; a finite number is needed")
     if abs(x) > MOST:
@@ -189,8 +192,8 @@ def as_csr(name: str, given: Any, *, copy: bool = True, unit: str = "", too_many
         raise InputError(f"{name} has {given.nnz} nonzeros, more than 32-bit indices reach{too_many}")
     if given.dtype.kind not in "buif":
         raise InputError(f"{name} has dtype {given.dtype}; real numbers are needed")
-    a = sp.csr_array(given, copy=copy)
     try:
+        a = sp.csr_array(given, copy=copy)
         a.check_format(full_check=True)  # kernels trust every index
     except ValueError as error:
         raise InputError(
@@ -199,7 +202,8 @@ def as_csr(name: str, given: Any, *, copy: bool = True, unit: str = "", too_many
     if not a.has_canonical_format:
         a = a if copy else a.copy()
         a.sum_duplicates()
-    as_array(name, a.data, (None,), unit=unit, copy=False)
+    data = as_array(name, a.data, (None,), finite=False, copy=False)
+    check_inside(name, data, unit, a)
     parts = ((a.data, np.float64), (a.indices, np.int32), (a.indptr, np.int32))
     return sp.csr_array(tuple(read_only(np.ascontiguousarray(x, kind)) for x, kind in parts), shape=a.shape)
 
@@ -221,26 +225,32 @@ def _narrowed(wide: np.ndarray) -> np.ndarray:
         return wide.astype(np.float64)
 
 
-def check_finite(what: str, array: np.ndarray) -> None:
-    """Raise InputError at the first NaN or infinity of `what`."""
+def check_finite(what: str, array: np.ndarray, csr: Any = None) -> None:
+    """Raise InputError at the first NaN or infinity of `what`, the data of `csr` where that is given."""
     if not all_finite(array.reshape(-1)):
         bad = np.argwhere(~np.isfinite(array))
-        where = ", ".join(map(str, bad[0]))
         raise InputError(
-            f"{what} must be finite; entry [{where}] is {array[tuple(bad[0])]}, {len(bad)} in all"
+            f"{what} must be finite; entry [{_place(bad[0], csr)}] is {array[tuple(bad[0])]}, {len(bad)} in all"
         )
 
 
-def check_inside(what: str, array: np.ndarray, unit: str = "") -> None:
+def _place(index: np.ndarray, csr: Any) -> str:
+    """An index, or the row and column of what has it in the data of compressed rows."""
+    if csr is not None:
+        row = np.searchsorted(csr.indptr, index[0], side="right") - 1
+        index = np.array([row, csr.indices[index[0]]])
+    return ", ".join(map(str, index))
+
+
+def check_inside(what: str, array: np.ndarray, unit: str = "", csr: Any = None) -> None:
     """Raise InputError at the first number of `what` that is not finite, or beyond MOST in size."""
     if checks.inside(array.reshape(-1)):
         return
-    check_finite(what, array)
+    check_finite(what, array, csr)
     bad = np.argwhere(np.abs(array) > MOST)
-    where = ", ".join(map(str, bad[0]))
     raise InputError(
-        f"{what} must be at most {MOST:g} in size; entry [{where}] is {array[tuple(bad[0])]:g}, {len(bad)} in all: "
-        f"{_advice(unit)}"
+        f"{what} must be at most {MOST:g} in size; entry [{_place(bad[0], csr)}] is {array[tuple(bad[0])]:g}, "
+        f"{len(bad)} in all: {_advice(unit)}"
     )
 
 

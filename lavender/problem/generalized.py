@@ -352,9 +352,10 @@ def lower_of(
     if worst > allowed:
         entries: Any = sp.csr_array(given) if sparse else given
         where = f"({i}, {j})" if names is None else f"({names[i]}, {names[j]})"
+        above, below = float(entries[i, j]), float(entries[j, i])
         raise InputError(
-            f"{name} is not symmetric: at {where} it is {entries[i, j]:.6g} above and {entries[j, i]:.6g} below the "
-            f"diagonal, or the other way round; {hint}"
+            f"{name} is not symmetric: at {where} it is {above} above and {below} below the diagonal, or the other way "
+            f"round; {hint}"
         )
     return lower
 

@@ -28,7 +28,15 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from lavender.base.arrays import FloatArray, as_array, borrowed, check_not_nan, read_only, shape_of
+from lavender.base.arrays import (
+    FloatArray,
+    as_array,
+    borrowed,
+    check_not_nan,
+    check_sizes,
+    read_only,
+    shape_of,
+)
 from lavender.base.errors import InputError
 from lavender.base.later import issparse
 from lavender.problem.cones import Cones
@@ -460,6 +468,7 @@ def _definite(
     made = _shifted(laid, d, momentum) if zero.any() and _rows_are_empty(lower, zero) else None
     if made is None:
         if _shifted(laid, SHIFT * unit, momentum) is None:
+            check_sizes("the diagonal of P", np.abs(diagonal))
             raise InputError(f"P is not positive semidefinite: {_least(lower, diagonal)}")
         d = PROXIMAL * unit
         made = _shifted(laid, d, momentum)

@@ -125,12 +125,28 @@ def test_one_mu_for_each_contact_and_a_scalar_for_all():
 NAN, INF = np.nan, np.inf
 ONE = sp.coo_array(np.ones(2))
 GAP = np.ma.array([1.0, 2.0], mask=[False, True])
+
+
+def shortened():
+    a = sp.csr_array(np.eye(2))
+    a.data = a.data[:1]
+    return a
+
+
 BAD_PROBLEMS = {
     "NaN in A": (
         lambda: lv.Problem.lcp([[NAN, 0], [0, 1]], [1, 1]),
         r"A \[1/kg\] must be finite; entry \[0, 0\] is nan",
     ),
     "inf in sparse A": (lambda: lv.Problem.lcp(sp.csr_array([[INF, 0], [0, 1.0]]), [1, 1]), "must be finite"),
+    "its place in sparse A": (
+        lambda: lv.Problem.lcp(sp.csr_array([[1.0, 0.0], [2.0, INF]]), [1, 1]),
+        r"entry \[1, 1\] is inf",
+    ),
+    "sparse A that has lost a number": (
+        lambda: lv.Problem.lcp(shortened(), [1, 1]),
+        "A is not a valid compressed matrix",
+    ),
     "not square": (lambda: lv.Problem.lcp(np.ones((2, 3)), [1, 1]), r"shape \(2, 3\); \(2, 2\) is needed"),
     "sparse, not square": (
         lambda: lv.Problem.lcp(sp.csr_array(np.ones((2, 3))), [1, 1]),

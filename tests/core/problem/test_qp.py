@@ -250,6 +250,8 @@ REFUSED = [
         {"P": np.array([[0.0, 1.0], [1.0, 5.0]])},
         r"P is not positive semidefinite: its least eigenvalue is -0\.19",
     ),
+    ({"P": 1e-70 * EYE}, r"the diagonal of P must be 0 or at least 1e-60; entry \[0\]"),
+    ({"P": np.array([[1.0, 0.5], [0.5 + 1e-9, 1.0]])}, r"not symmetric: at \(1, 0\) .*0\.500000001"),
     ({"P": np.eye(3)}, r"P has shape \(3, 3\); \(2, 2\) is needed"),
     ({"P": np.ones(2)}, r"P has shape \(2,\); \(2, 2\) is needed"),
     ({"P": np.array([[1.0, np.nan], [np.nan, 1.0]])}, r"P must be finite; entry \[0, 1\]"),

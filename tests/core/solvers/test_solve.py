@@ -23,6 +23,11 @@ REFUSED = {
     "no such solver": (lambda: lv.solve(TINY, "psg"), lv.UnknownName, "pgs"),
     "no such option": (lambda: lv.solve(TINY, "jacobi", omgea=1.0), lv.UnknownName, "omega"),
     "negative tol": (lambda: lv.solve(TINY, "pgs", tol=-1.0), lv.InputError, "tol"),
+    "a tol that no float holds": (
+        lambda: lv.solve(TINY, "pgs", tol=10**400),
+        lv.InputError,
+        "tol is inf; a finite number is needed",
+    ),
     "no time": (lambda: lv.solve(TINY, "pgs", time_limit=-1.0), lv.InputError, "time_limit"),
     "one start of many": (lambda: lv.solve_many([TINY], impulse=[0.0, 0.0]), lv.InputError, "impulses="),
     "a start too few": (
