@@ -3,7 +3,6 @@
 import ast
 import importlib.metadata
 import importlib.util
-import json
 import os
 import re
 import shutil
@@ -142,96 +141,6 @@ def test_kernel_is_compiled_from_source_that_ships(name):
     assert spec is not None
     assert spec.origin.endswith((".so", ".pyd"))
     assert (KERNELS / f"{name.replace('.', '/')}.pyx").exists()
-
-
-def test_import_is_light_small_problems_need_no_scipy_and_listing_loads_no_backend():
-    # What a user waits for, counted: Python, NumPy and what they load are 200 modules, lavender's own 100 with all that
-    # a first solve needs; SciPy's sparse arrays would add 150, its optimisers 300.
-    code = """
-import json, sys, lavender as lv
-first = list(sys.modules)
-problem = lv.Problem.contact([[2.0, 0.5], [0.5, 1.0]], [1.0, -2.0], [0.5])
-for solver in ("auto", "pgs"):
-    assert lv.solve(problem, solver).success
-solved = list(sys.modules)
-lv.known(), lv.available(law="lcp")
-print(json.dumps([first, solved, list(sys.modules)]))
-"""
-    first, solved, listed = map(set, json.loads(python("-c", code).stdout))
-    assert len(first) < 330
-    assert first & {"scipy", "importlib.metadata"} == set()
-    assert "scipy" not in solved
-    heavy = {
-        "matplotlib",
-        "h5py",
-        "qpsolvers",
-        "osqp",
-        "clarabel",
-        "piqp",
-        "daqp",
-        "quadprog",
-        "scs",
-        "pandas",
-    }
-    heavy |= {"proxsuite", "highspy", "qpalm", "qdldl", "rich", "click"}
-    assert listed & heavy == set()
-
-
-LATE = """
-import os, sys
-import numpy as np, lavender as lv
-from lavender.solvers.loop import Loop
-
-class Watch:
-    running = False
-    def find_spec(self, name, *_):
-        if self.running and name.partition(".")[0] == "scipy":
-            raise AssertionError(name)
-
-watch, call, rng = Watch(), Loop.call, np.random.default_rng(0)
-sys.meta_path.insert(0, watch)
-
-def watched(*given):
-    watch.running = True
-    try:
-        return call(*given)
-    finally:
-        watch.running = False
-
-Loop.call = watched
-m, b = 120, rng.normal(size=120)
-full, mu = rng.normal(size=(m, m + 20)), np.full(m // 3, 0.5)
-few = 8.0 * np.eye(m)
-few[np.arange(m), rng.permutation(m)] += 0.5
-jac, mass, v, cones = full[:, :60], np.eye(60), b[:60], lv.Cones.contacts(mu)
-problems = {
-    "linear": lambda: lv.Problem.linear(full @ full.T, b),
-    "lcp": lambda: lv.Problem.lcp(full @ full.T, b),
-    "few entries": lambda: lv.Problem.lcp(few + few.T, b),
-    "asymmetric": lambda: lv.Problem.lcp(few, b),
-    "singular": lambda: lv.Problem.lcp(jac @ jac.T, b),
-    "coulomb": lambda: lv.Problem.contact(full @ full.T, b, mu),
-    "cone": lambda: lv.Problem.contact(full @ full.T, b, mu, friction="cone"),
-    "generalised": lambda: lv.Problem.from_jacobian(jac, mass, v, cones=cones),
-}
-for solver, kind in (words.split(": ") for words in sys.argv[1:]):
-    child = os.fork()  # each in a process of its own, which has imported nothing else
-    if not child:
-        assert lv.solve(problems[kind](), solver, time_limit=10.0).work
-        os._exit(0)
-    assert os.waitpid(child, 0)[1] == 0, (solver, kind)
-"""
-
-
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs processes that fork")
-def test_the_clock_of_a_limit_holds_no_import_of_scipy():
-    solved = {  # `auto` counts what it has to load as a set-up, and does without where that is too long
-        "direct": ("linear", "few entries", "asymmetric", "singular"),
-        "lemke": ("lcp", "singular"),
-        "newton": ("coulomb", "generalised"),
-        "admm": ("cone", "generalised"),
-    }
-    python("-c", LATE, *(f"{solver}: {kind}" for solver, kinds in solved.items() for kind in kinds))
 
 
 def test_command_is_installed():

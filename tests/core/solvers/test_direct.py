@@ -263,19 +263,6 @@ def test_a_shifted_matrix_that_is_singular_is_found_to_be(m):
     assert (state.rows.n_rounds, state.rows.passes) == (2, 1)
 
 
-def test_a_factor_that_would_end_after_the_deadline_is_not_begun():
-    rng = np.random.default_rng(3)
-    y = rng.normal(size=(90, 100))
-    problem = lv.Problem.lcp(y @ y.T, rng.normal(size=90))  # more than the compiled factor takes
-    prepared = lv.prepare(problem, "direct")
-    pivot = prepared.state.pivot
-    pivot.outside.seconds = 1e9  # by which its first factor would be refused
-    refused = prepared.solve(time_limit=10.0)
-    assert refused.status is lv.Status.TIME_LIMIT
-    assert "factorisations" not in refused.work
-    assert prepared.solve(lv.Problem.lcp(y @ y.T, problem.b)).success
-
-
 @pytest.mark.parametrize("share", [0.3, 1.5, 2.5, 4.0, 20.0])
 def test_rounds_on_a_compiled_band_end_before_the_deadline(share, clock, monkeypatch):
     """All were one turn: 4.2 ms under a limit of 1 ms."""

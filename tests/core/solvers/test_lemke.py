@@ -75,21 +75,6 @@ def test_pivots_in_parts_are_those_of_one_call_to_the_bit(seed, m, cuts, singula
         assert claim.status is lv.Status.INFEASIBLE or impulse.tobytes() == ends[0][4]
 
 
-def test_a_factor_that_would_end_too_late_is_not_begun():
-    problem = random_lcp(3, 80)
-    solver, impulse = registry.get("lemke").load()(), problem.start()
-    rng = np.random.default_rng(0)
-    skew = rng.normal(size=(80, 80))
-    problem = lv.Problem.lcp(problem.dense() + skew - skew.T, problem.b)
-    state = PivotState(problem)
-    state.outside.seconds = 1e9
-    claim = solver.run(state, impulse, 10_000, 1e-9, time_limit=100.0)
-    assert claim.status is lv.Status.TIME_LIMIT
-    assert "factorisations" not in claim.work
-    state.outside.seconds = 0.0
-    assert solver.run(state, impulse, 10_000, 1e-9, time_limit=100.0).status is lv.Status.CONVERGED
-
-
 def test_a_dictionary_that_takes_longer_than_the_time_limit_is_not_formed():
     problem = random_lcp(3, 120)
     solution = lv.solve(problem, "lemke", time_limit=1e-5)
