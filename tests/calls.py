@@ -1,6 +1,7 @@
 """Ways into kernels, a clock that is played, and problems, which tests of several floors share."""
 
 import re
+from contextlib import contextmanager
 from dataclasses import fields, replace
 from unittest import mock
 
@@ -15,6 +16,7 @@ from lavender.judge.certificates import check_certificate
 from lavender.solvers.newton_systems import systems
 from lavender.solvers.newton_systems.systems import make_system
 from lavender_ext.driver.driver import Driver
+from lavender_ext.newton.solve import PHASES
 
 SHORT = ("auto", "direct", "newton")
 
@@ -70,12 +72,13 @@ def dense(m, law, seed=0):
     return lv.Problem.lcp(a, b) if law == "lcp" else lv.Problem.contact(a, b, 0.5, friction=law)
 
 
-def over_velocities(m, nv, seed=0):
+def over_velocities(m, nv, seed=0, cones=None, **more):
+    """Dense J and M: contacts, where no other cones of m rows are given."""
     rng = np.random.default_rng(seed)
     half = rng.normal(size=(nv, nv))
-    cones = lv.Cones.contacts(np.full(m // 3, 0.5), 2)
+    cones = lv.Cones.contacts(np.full(m // 3, 0.5), 2) if cones is None else cones
     mass = half @ half.T / nv + np.eye(nv)
-    return lv.Problem.from_jacobian(rng.normal(size=(m, nv)), mass, rng.normal(size=nv), cones=cones)
+    return lv.Problem.from_jacobian(rng.normal(size=(m, nv)), mass, rng.normal(size=nv), cones=cones, **more)
 
 
 def impulses(problem, packs=True, name="sequential_impulses", **options):
@@ -180,6 +183,19 @@ def system_in(problem, form):
         system = make_system(problem, "impulse")
     assert not system.dense
     return system
+
+
+@contextmanager
+def newton_without(*phases):
+    """Newton's method goes without these."""
+    given = systems.System.__init__
+
+    def begin(self, problem, solve):
+        given(self, problem, solve)
+        solve.without = sum(PHASES[name] for name in phases)
+
+    with mock.patch.object(systems.System, "__init__", begin):
+        yield
 
 
 #: QP backends of other packages that are here, and those of all that need a definite A.

@@ -258,7 +258,6 @@ for n in (60, 65_537):
 
 
 @pytest.mark.slow
-@pytest.mark.slow
 def test_coincident_spheres_touch_or_are_refused():
     # 65,537 of them are 2^31 and 32,768 pairs: what counts in 32 bits takes them for none
     pytest.importorskip("resource")

@@ -5,14 +5,13 @@ import itertools
 
 import numpy as np
 import pytest
+from calls import newton_without
 from random_problems import good
 from worked import after
 
 import lavender as lv
 from lavender import registry
 from lavender.solvers import newton
-from lavender.solvers.newton_systems.systems import System
-from lavender_ext.newton.solve import PHASES
 
 SCENES = [
     ("stack", {"n": 5}),
@@ -30,13 +29,8 @@ SCENES = [
 
 
 def impulses(sim, observation):
-    s = sim.state
-    return np.concatenate([observation["joint_impulses"], _contact_rows(s)])
-
-
-def _contact_rows(state):
-    first, rows = len(state.a["joint_impulse"]), int(state.head[1])
-    return state.a["impulse"][first : first + rows]
+    first, rows = len(sim.state.a["joint_impulse"]), int(sim.state.head[1])
+    return np.concatenate([observation["joint_impulses"], sim.state.a["impulse"][first : first + rows]])
 
 
 @pytest.mark.parametrize(("name", "more"), SCENES)
@@ -135,17 +129,6 @@ def test_another_newton_is_asked_itself(register):
     assert asked == [24, 24, 24]
 
 
-def without(monkeypatch, *phases):
-    """Newton's method goes without these."""
-    given = System.__init__
-
-    def begin(self, problem, solve):
-        given(self, problem, solve)
-        solve.without = sum(PHASES[name] for name in phases)
-
-    monkeypatch.setattr(System, "__init__", begin)
-
-
 #: One substep of 1/120 s in the order given: contacts on which rounds and polishes alone do not end.
 ONE = {"substeps": 1, "order": "given"}
 
@@ -167,12 +150,11 @@ def problem_in(scene, step, **parameters):
     ],
 )
 @pytest.mark.parametrize("walks", [False, True])
-def test_redundant_contacts_at_rest(scene, step, parameters, walks, monkeypatch):
+def test_redundant_contacts_at_rest(scene, step, parameters, walks):
     problem = problem_in(scene, step, **parameters)
     assert problem.law == "coulomb"
-    if not walks:
-        without(monkeypatch, "pursuit")
-    solution = lv.solve(problem, "newton", tol=1e-8)
+    with newton_without(*["pursuit"] * (not walks)):
+        solution = lv.solve(problem, "newton", tol=1e-8)
     assert good(solution, 1e-8), str(solution)
     assert walks or "De Saxce steps" in solution.message
     assert "sweeps" not in solution.work

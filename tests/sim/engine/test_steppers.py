@@ -6,15 +6,15 @@ from itertools import product
 
 import numpy as np
 import pytest
-from worked import after, energy
+from worked import after
 
 import lavender as lv
+from benchmarks.gallery import energy
 from lavender.sim.engine.layout import HEAD
 from lavender.sim.scene import SCENES
 from lavender.sim.scene.steppers import STEPPERS, get_stepper
 
 NAMES = tuple(STEPPERS)
-OTHERS = NAMES[1:]
 G = 9.81
 
 
@@ -250,25 +250,21 @@ def test_the_unit_of_mass_changes_no_bit_of_the_motion(name, scene):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_stages_one_by_one_are_the_substep(name):
-    sim = after(20, "pyramid", base=4, stepper=name, substeps=1, solver_iterations=8)
-    one, two = sim.state.copy(), sim.state.copy()
-    for _ in range(10):
-        assert one.kernel.substeps(1)[1] == 1
-        two.kernel.prepare()
-        two.kernel.solve()
-        two.kernel.finish()
-    for array in ("x", "q", "v", "impulse"):
-        assert one.a[array].tobytes() == two.a[array].tobytes(), array
-
-
-@pytest.mark.parametrize("name", NAMES)
 def test_the_eight_values_are_those_that_have_a_meaning(name):
-    sim, seen = run(lv.Scene("stack"), 10, stepper=name)
+    sim, seen = run(lv.Scene("stack", substeps=1), 10, stepper=name)
     spec, values = get_stepper(name), seen["solver"]
     assert list(values[:4]) == [16.0, 1.0, 24.0, 24.0]
     assert np.isfinite(values[4:]).all() == spec.residuals
     assert sim.scene.parameters.stepper == name
+    problem = sim.constraint_problem()  # soft contacts have a compliance
+    said = dict(zip(lv.SOLVER_FIELDS, sim.step()[0]["solver"], strict=True))
+    if spec.residuals:
+        judged, normal = lv.residual(problem, problem.guess), problem.cones.ptr[:-1]
+        # w is a difference of velocities near 0.1 m/s, so it carries their rounding, some 1e-16 m/s.
+        assert said["residual_initial"] == pytest.approx(
+            np.abs(judged.error[normal]).max(), rel=1e-9, abs=1e-14
+        )
+        assert said["violation_initial"] == pytest.approx(-judged.slack[normal].min(), rel=1e-9, abs=1e-14)
 
 
 @pytest.mark.parametrize("name", NAMES)
