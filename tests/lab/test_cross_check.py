@@ -19,9 +19,6 @@ def bounded_problem(seed, stiff=0.3, contacts=8):
     return lv.Problem(problem.b, problem.cones, rows=problem.rows, compliance=problem.compliance + stiff)
 
 
-# -- solvers against OSQP optima ------------------------------------------------------------------------
-
-
 # -- the inequality -------------------------------------------------------------------------------------
 
 

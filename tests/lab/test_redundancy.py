@@ -9,7 +9,6 @@ import scipy.sparse as sp
 from hypothesis import given, settings
 from kkt_truth import eliminate
 from random_problems import as_matrix, random_contact_problem, seeds, touching
-from random_trees import random_general
 
 import lavender as lv
 from lavender.lab.redundancy import redundancy
@@ -211,23 +210,6 @@ def test_an_island_is_decomposed_on_its_own_velocities(monkeypatch):
     )
     assert lv.redundancy(many).rank == 240
     assert max(seen)[0] <= 5
-
-
-def test_other_forms_know_the_operator():
-    problem = random_general(2, "coulomb", compliance=False)
-    assert problem.relaxed("cone").generalized is problem.generalized
-    boxed = problem.boxed(0.7)
-    assert boxed.law == "lcp"
-    assert boxed.generalized is problem.generalized
-    form = problem.velocity_form()
-    scale = np.outer(form.scale, form.scale)
-    np.testing.assert_allclose(
-        (form.jacobian @ form.jacobian.T).toarray(), problem.dense() * scale, atol=1e-13
-    )
-    found = lv.redundancy(problem)
-    assert found.rank == np.linalg.matrix_rank(problem.dense())
-    assert found.rank < problem.m
-    assert lv.solve(problem, "pgs", order="colored", max_iter=3, tol=0.0).iterations == 3
 
 
 def test_entries_of_a_are_counted_once(monkeypatch):

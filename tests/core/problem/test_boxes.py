@@ -109,6 +109,8 @@ def test_what_findex_cannot_hold_is_told():
         disk.to_findex()
     with pytest.raises(lv.InputError, match=r"relaxed\('coulomb'\)"):
         free(1, friction="cone").to_findex()
+    with pytest.raises(lv.InputError, match="bounds its tangents together"):
+        ellipses(0).to_findex()
 
 
 # -- solutions ---------------------------------------------------------------------------------------------------------

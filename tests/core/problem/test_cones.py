@@ -50,6 +50,38 @@ REFUSED = {
         lambda: lv.Cones([0, 4], [lv.CONTACT_ROLLING], np.zeros(4), np.ones(4), [0.5], [0.0], [0.1]),
         "5 rows or 6",
     ),
+    "an ellipse without a side": (
+        lambda: lv.Cones.contacts([(0.5, 0.0)]),
+        r"contact 0 is \[0.5, 0.0\].*two numbers above 0",
+    ),
+    "an ellipse that is a line to rounding": (
+        lambda: lv.Cones.contacts([(0.5, 0.5), (1e-30, 0.5)]),
+        "contact 1 is",
+    ),
+    "an ellipse of one tangent": (lambda: lv.Cones.contacts([(0.5, 0.1)], 1), "bounds no spin"),
+    "an ellipse that spins": (lambda: lv.Cones.contacts([(0.5, 0.1)], patch_radius=0.1), "bounds no spin"),
+    "an ellipse that spins, of a problem": (
+        lambda: lv.Problem.contact(np.eye(3), np.ones(3), [(0.5, 0.1)], 0.1),
+        "bounds no spin",
+    ),
+    "an ellipse that rolls": (lambda: lv.Cones.contacts([(0.5, 0.1)], rolling=0.1), "no rolling"),
+    "an ellipse of two rows": (
+        lambda: lv.Cones([0, 2], [lv.CONTACT_ELLIPSE], np.zeros(2), np.ones(2), [0.5], [1.0]),
+        "ellipse of 2 rows",
+    ),
+    "an ellipse whose sides have no ratio": (
+        lambda: lv.Cones([0, 3], [lv.CONTACT_ELLIPSE], np.zeros(3), np.ones(3), [0.5], [0.0]),
+        "mu_2 / mu_1 = 0",
+    ),
+    "an ellipse whose other side is beyond the door": (
+        lambda: lv.Cones([0, 3], [lv.CONTACT_ELLIPSE], np.zeros(3), np.ones(3), [1e50], [1e12]),
+        "mu_2.* must be at most 1e.60",
+    ),
+    "fewer rows than none": (lambda: lv.Cones.free(-1), "-1"),
+    "more rows than 32 bits count": (lambda: lv.Cones.free(2**40), str(2**40)),
+    "as many rows as 32 bits count": (lambda: lv.Cones.free(2**31 - 1), str(2**31 - 1)),
+    "more contacts than 32 bits count": (lambda: lv.Cones.contacts(0.5, count=2**40), str(2**40)),
+    "as many contacts as 32 bits count": (lambda: lv.Cones.contacts(0.5, count=2**31 - 1), str(2**31 - 1)),
     "rolling below zero": (
         lambda: lv.Cones([0, 5], [lv.CONTACT_ROLLING], np.zeros(5), np.ones(5), [0.5], [0.0], [-1.0]),
         "rolling.*-1",
@@ -97,11 +129,3 @@ def test_projection_is_feasible_keeps_what_is_and_is_a_projection(seed, size):
             assert t @ given_t >= 0.0
         if cones.kind[i] == lv.CONTACT_SPIN:
             assert abs(y[end - 1]) <= cones.mu[i] * cones.patch_radius[i] * y[j]  # the reach first
-
-
-@pytest.mark.parametrize("count", [-1, 2**31 - 1, 2**40])
-def test_counts_beyond_32_bits_are_refused(count):
-    with pytest.raises(lv.InputError, match=str(count)):
-        lv.Cones.free(count)
-    with pytest.raises(lv.InputError, match=str(count)):
-        lv.Cones.contacts(0.5, count=count)

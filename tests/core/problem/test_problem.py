@@ -9,6 +9,7 @@ import pytest
 import scipy.sparse as sp
 from hypothesis import given
 from random_problems import (
+    FORMS,
     arrays_of,
     as_matrix,
     random_contact_problem,
@@ -40,9 +41,10 @@ def test_the_class_follows_from_the_blocks():
     assert lv.Problem.contact(I2, [1, 1], [0.5], patch_radius=[0.1]).law == "coulomb"
 
 
+@pytest.mark.parametrize("given_by", ["rows", "J and M"])
 @given(seed=seeds)
-def test_velocity_form_is_the_same_problem(seed):
-    problem = random_contact_problem(seed)
+def test_velocity_form_is_the_same_problem(given_by, seed):
+    problem = FORMS[given_by](random_contact_problem(seed))
     form = problem.velocity_form()
     k, s = form.jacobian.toarray(), form.scale
     a = (k @ k.T + np.diag(form.theta)) / np.outer(s, s)
@@ -56,6 +58,9 @@ def test_relaxed_and_boxed_change_the_law_alone():
     problem = random_contact_problem(4, tangents=2, spin=True)
     cone = problem.relaxed("cone")
     assert (cone.law, cone.relaxed("coulomb")) == ("cone", problem)
+    coordinates = FORMS["J and M"](problem)
+    for other in (coordinates.relaxed("cone"), coordinates.boxed(0.7)):
+        assert other.generalized is coordinates.generalized
     c = problem.rows.n_contacts
     boxed = problem.boxed(np.full(c, 2.0))
     assert boxed.law == "lcp"
@@ -247,9 +252,6 @@ def test_problems_and_solutions_are_copied_and_pickled_after_use(again):
         np.testing.assert_array_equal(result.slack, solution.slack)
         assert str(result) == str(solution)
         assert result.work == solution.work
-
-
-# -- the registry --------------------------------------------------------------------------------------------
 
 
 def test_ctrl_c_from_a_real_signal():

@@ -242,6 +242,10 @@ def test_update_equals_a_fresh_solve_to_the_bit(name):
         assert first.impulse.tobytes() == again.impulse.tobytes()
         assert changed.impulse.tobytes() == fresh.impulse.tobytes()
         assert (changed.status, changed.iterations) == (fresh.status, fresh.iterations)
+        assert prepared.problem is other  # which stays, whichever way solves it
+        for more in ({}, {"max_iter": 500}, {"time_limit": 10.0}):
+            stays = prepared.solve(tol=1e-8, **more)
+            assert stays.residual.relative == lv.residual(other, stays.impulse).relative
         for unlike in examples(spec):  # of another law, form and structure
             fresh = lv.solve(unlike, name, **kwargs).impulse
             assert prepared.solve(unlike, **kwargs).impulse.tobytes() == fresh.tobytes()

@@ -83,7 +83,6 @@ def test_newton_system_is_the_derivative_and_is_solved(form, law, seed):
 
 
 @pytest.mark.slow
-@pytest.mark.slow
 def test_a_path_runs_through_its_folds():
     """Steps of a pile on which load passes from stick to slip, up to twelve times on one path."""
     paths = 0

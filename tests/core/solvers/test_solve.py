@@ -9,7 +9,7 @@ import time
 
 import numpy as np
 import pytest
-from random_problems import FORMS, random_contact_problem
+from random_problems import random_contact_problem
 
 import lavender as lv
 from lavender.judge import many as loop
@@ -74,20 +74,6 @@ def test_a_senseless_request_is_refused_with_its_reason(name):
     call, error, sign = REFUSED[name]
     with pytest.raises(error, match=sign):
         call()
-
-
-@pytest.mark.parametrize("budget", [{}, {"max_iter": 500}, {"time_limit": 10.0}])
-@pytest.mark.parametrize("name", ["auto", "newton", "pgs"])
-@pytest.mark.parametrize("form", FORMS)
-def test_a_problem_that_replaced_the_prepared_one_stays(form, name, budget):
-    """Whichever way solves it: `auto` has a call of its own for small problems."""
-    first = FORMS[form](random_contact_problem(1, tangents=2, spin=False))
-    second = dataclasses.replace(first, b=1.7 * first.b + 0.1)
-    prepared = lv.prepare(first, name)
-    prepared.solve(second, tol=1e-8)
-    assert prepared.problem is second
-    solution = prepared.solve(tol=1e-8, **budget)
-    assert solution.residual.relative == lv.residual(second, solution.impulse).relative
 
 
 @pytest.mark.parametrize("copied", [copy.copy, copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))])

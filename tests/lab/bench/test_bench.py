@@ -21,7 +21,7 @@ from lavender.lab.bench import cases as bench_cases
 from lavender.lab.bench import machine, store
 from lavender.lab.bench.line import code_of
 from lavender.lab.bench.record import Record, from_json, to_json
-from lavender.lab.bench.running import runner, timing
+from lavender.lab.bench.running import timing
 from lavender.lab.report.findings import Report
 from lavender.lab.report.terminal import print_report
 
@@ -211,25 +211,46 @@ def test_each_record_is_on_disk_when_it_is_made(tmp_path):
     assert bench.read(path).records == records.records
 
 
-def test_the_same_command_goes_on_where_it_was_killed(tmp_path, monkeypatch):
-    path = tmp_path / "records.jsonl"
-    problems = [stack(6), chain(7)]
-    whole = bench.run(problems, ["pgs", "direct"], QUICK, path)
-    lines = path.read_bytes().splitlines(keepends=True)
-    # Killed while line 8 was being written.
-    path.write_bytes(b"".join(lines[:7]) + lines[7][: len(lines[7]) // 2])
+COMMANDS = {
+    "problems": (bench.run, ([stack(6), chain(7)], ["pgs", "direct"], QUICK)),
+    "a sequence": (
+        bench.run,
+        (bench.sequence(moving_stack(5), "load"), ["pgs"], bench.Plan((), budgets=(6,), repeats=1)),
+    ),
+    "a campaign": (
+        bench.campaign,
+        (
+            bench.seeds(["granular(n=2)", "toy_stack"], 3),
+            ["pgs", "gauss_seidel"],
+            bench.CampaignPlan(levels=(1e-3,), budgets=(4,), orders=()),
+        ),
+    ),
+}
+
+
+@pytest.mark.parametrize(("run", "given"), COMMANDS.values(), ids=COMMANDS)
+def test_the_same_command_goes_on_where_it_was_killed(run, given, tmp_path):
+    """Cut in the middle of a line; impulses that are carried from step to step come back, too."""
+    path, events = tmp_path / "records.jsonl", []
+
+    def command():
+        """Records, and how many were made (of a campaign: pairs of case and solver)."""
+        events.clear()
+        records = run(*given, path, watch=events.append)
+        return records, sum(not e.reused and (e.record is not None or run is bench.campaign) for e in events)
+
+    whole, most = command()
+    content = path.read_bytes()
+    path.write_bytes(content[: content.rindex(b'"kind": "record"')])
     kept = len(bench.read(path))
-    made = []
-    monkeypatch.setattr(runner, "measure", lambda *args: made.append(args[1]) or timing.measure(*args))
-    again = bench.run(problems, ["pgs", "direct"], QUICK, path)
-    assert [r.key for r in again] == [r.key for r in whole]
-    assert len(made) == len(whole) - kept
-    assert 0 < kept < len(whole)
+    again, made = command()
+    assert [(r.key, r.relative) for r in again] == [(r.key, r.relative) for r in whole]
+    assert {(s.case, s.solver) for s in again.skips} == {(s.case, s.solver) for s in whole.skips}
+    assert 0 < kept < len(whole) == len(bench.read(path)) and 0 < made < most
     # And nothing is left to do the third time.
-    made.clear()
-    assert len(bench.run(problems, ["pgs", "direct"], QUICK, path)) == len(whole)
-    assert made == []
-    for line in path.read_text().splitlines():
+    again, made = command()
+    assert len(again) == len(whole) == len(bench.read(path)) and made == 0
+    for line in path.read_bytes().splitlines():
         json.loads(line)
 
 

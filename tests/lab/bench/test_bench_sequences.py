@@ -27,18 +27,6 @@ def test_a_sequence_carries_each_solvers_own_impulses():
     assert by["carried", "budget", 4].relative < 0.2 * by["cold", "budget", 4].relative
 
 
-def test_a_sequence_that_was_stopped_carries_on_with_the_same_bits(tmp_path):
-    items = bench.sequence(moving_stack(5), "load")
-    plan = bench.Plan(levels=(), budgets=(6,), repeats=1)
-    whole = bench.run(items, ["pgs"], plan, tmp_path / "a.jsonl")
-    lines = (tmp_path / "a.jsonl").read_bytes().splitlines(keepends=True)
-    assert b'"start": "carried"' in lines[-3]
-    (tmp_path / "b.jsonl").write_bytes(b"".join(lines[:-2]))
-    again = bench.run(items, ["pgs"], plan, tmp_path / "b.jsonl")
-    assert [(r.key, r.relative) for r in again] == [(r.key, r.relative) for r in whole]
-    assert len(bench.read(tmp_path / "b.jsonl")) == len(whole)  # only the missing two were made
-
-
 def test_a_pass_that_takes_too_long_ends_and_says_so(tmp_path, monkeypatch):
     items = bench.sequence(moving_stack(5), "load")
     # No solve takes less than a picosecond: each pass ends after its first step.

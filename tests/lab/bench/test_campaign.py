@@ -52,18 +52,6 @@ def test_the_same_bits_by_one_worker_and_by_two_and_no_times():
             assert again.residual.relative == r.relative
 
 
-def test_a_campaign_goes_on_where_it_was_killed(tmp_path):
-    path = tmp_path / "records.jsonl"
-    whole = bench.campaign(NAMES, ["pgs", "gauss_seidel"], PLAN, path, workers=1)
-    kept = path.read_bytes()[: int(0.6 * path.stat().st_size)]
-    path.write_bytes(kept)
-    events = []
-    again = bench.campaign(NAMES, ["pgs", "gauss_seidel"], PLAN, path, workers=1, watch=events.append)
-    assert lines(again) == lines(whole)
-    assert {(s.case, s.solver) for s in again.skips} == {(s.case, s.solver) for s in whole.skips}
-    assert 0 < len(events) < 2 * len(NAMES)
-
-
 def test_a_file_that_has_changed_is_run_again(tmp_path):
     plan, file = bench.CampaignPlan(levels=(1e-6,), budgets=(), orders=()), tmp_path / "file.npz"
 

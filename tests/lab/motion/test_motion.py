@@ -10,7 +10,7 @@ import scipy.sparse as sp
 from hypothesis import given, settings
 from kkt_truth import HAS_WIDE, Exact, Wide, matrix_in, solution_in
 from motion_truth import draw, truth
-from random_problems import as_matrix, random_contact_problem, random_lcp, seeds
+from random_problems import as_matrix, dragged, random_contact_problem, random_lcp, seeds
 from random_trees import random_general
 
 import lavender as lv
@@ -74,31 +74,35 @@ def test_a_bound_that_is_too_small_would_be_found():
     )
 
 
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("kind", [*LAWS, "J and M"])
 @pytest.mark.skipif(not HAS_WIDE, reason="no long double beyond float64 here")
-def test_public_bounds_hold_for_every_body(law):
+def test_public_bounds_hold_for_every_body(kind):
     rng = np.random.default_rng(3)
     checked = 0
     for seed in range(12):
-        p = problems(law, seed)
-        error = lv.motion_error(p, np.zeros(p.m))
-        a, _ = matrix_in(p, Wide)
-        shift = error.reference.witness.shift.astype(np.longdouble)
+        p = random_general(seed, spin=seed % 2 == 1) if kind == "J and M" else problems(kind, seed)
+        start = lv.motion_error(p, np.zeros(p.m))
+        reference = start.reference.impulse
+        a, moving = matrix_in(p, Wide)
+        shift = start.reference.witness.shift.astype(np.longdouble)
         truth = solution_in(p, a, p.b.astype(np.longdouble) + shift, Wide)
         if truth is None:
             continue
-        for scale in (1e-12, 1e-6, 1e-1):
-            x = error.reference.impulse * (1.0 + scale * rng.normal(size=p.m))
-            e = lv.motion_error(p, x)
-            delta = (x - truth[0]).astype(float)
-            v = p.velocity(delta) - p.rows.v_free
-            # 1e-13: the truth's own rounding where it becomes float64.
-            slack = 1e-13 * np.abs(p.velocity(error.reference.impulse)).max()
-            assert np.linalg.norm(v[:, :3], axis=1).max() <= e.bound_speed + slack
-            assert np.linalg.norm(v[:, 3:], axis=1).max() <= e.bound_spin + slack
+        for scale in (1e-13, 1e-12, 1e-7, 1e-6, 1e-1):
+            x = reference * (1.0 + scale * rng.normal(size=p.m))
+            e, delta = lv.motion_error(p, x), x - truth[0]
+            # 1e-14: the shift is stored in float64.
+            assert max(np.sqrt(delta @ of @ delta / 2) for of in (a, moving)) <= e.bound * (1 + 1e-14)
             assert e.energy <= e.bound
             checked += 1
-    assert checked >= 12
+            if p.generalized is not None:
+                continue
+            v = p.velocity(delta.astype(float)) - p.rows.v_free
+            # 1e-13: the truth's own rounding where it becomes float64.
+            slack = 1e-13 * np.abs(p.velocity(reference)).max()
+            assert np.linalg.norm(v[:, :3], axis=1).max() <= e.bound_speed + slack
+            assert np.linalg.norm(v[:, 3:], axis=1).max() <= e.bound_spin + slack
+    assert checked >= 20
 
 
 def test_a_good_reference_moves_targets_by_rounding_alone():
@@ -116,22 +120,31 @@ def test_a_good_reference_moves_targets_by_rounding_alone():
 # -- the estimate --------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("form", ["rows", "J and M"])
 @given(seed=seeds)
 @settings(max_examples=30)
-def test_kinetic_is_the_energy_of_the_velocities(seed):
-    p = random_contact_problem(seed, friction="cone")
+def test_kinetic_is_the_energy_of_the_velocities(form, seed):
+    p = random_contact_problem(seed, friction="cone") if form == "rows" else random_general(seed)
     x = np.random.default_rng(seed).normal(size=p.m)
     e = lv.motion_error(p, x)
     if not e.reference.accepted:
         return
-    dv = p.velocity(x) - p.velocity(e.reference.impulse)
-    mass = np.linalg.inv(p.rows.inverse_mass_matrix().toarray())
-    assert e.kinetic == pytest.approx(np.sqrt(0.5 * dv.ravel() @ mass @ dv.ravel()), rel=1e-9)
-    assert e.speed == pytest.approx(np.linalg.norm(dv[:, :3], axis=1).max(), rel=1e-9)
-    assert e.spin == pytest.approx(np.linalg.norm(dv[:, 3:], axis=1).max(), rel=1e-9)
-    assert e.rows == pytest.approx(np.abs(p.slack(x) - p.slack(e.reference.impulse)).max(), rel=1e-9)
-    assert e.body_name == f"body {np.linalg.norm(dv[:, :3], axis=1).argmax()}"
     delta = x - e.reference.impulse
+    if form == "rows":
+        dv = p.velocity(x) - p.velocity(e.reference.impulse)
+        mass, speeds = (
+            np.linalg.inv(p.rows.inverse_mass_matrix().toarray()),
+            np.linalg.norm(dv[:, :3], axis=1),
+        )
+        assert e.spin == pytest.approx(np.linalg.norm(dv[:, 3:], axis=1).max(), rel=1e-9)
+        assert e.body_name == f"body {speeds.argmax()}"
+    else:
+        dv, mass = p.generalized.change(delta), p.generalized.mass.toarray()
+        speeds = np.abs(dv)
+        assert e.spin is None and e.body_name == p.generalized.velocity_name(int(speeds.argmax()))
+    assert e.kinetic == pytest.approx(np.sqrt(0.5 * dv.ravel() @ mass @ dv.ravel()), rel=1e-9)
+    assert e.speed == pytest.approx(speeds.max(), rel=1e-9)
+    assert e.rows == pytest.approx(np.abs(p.slack(x) - p.slack(e.reference.impulse)).max(), rel=1e-9)
     assert e.energy == pytest.approx(np.sqrt(0.5 * delta @ p.dense() @ delta), rel=1e-9)
     assert e.kinetic <= e.energy * (1 + 1e-12)
 
@@ -228,35 +241,6 @@ def test_an_empty_problem_has_no_error():
     assert e.row_name == ""
 
 
-# -- generalised coordinates ---------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("seed", range(6))
-@pytest.mark.skipif(not HAS_WIDE, reason="no long double beyond float64 here")
-def test_in_generalised_coordinates_kinetic_is_by_m_itself_and_the_bound_holds(seed):
-    p = random_general(seed, spin=seed % 2 == 1)
-    rng = np.random.default_rng(seed)
-    start = lv.motion_error(p, np.zeros(p.m))
-    assert start.relative == pytest.approx(1.0)
-    a, moving = matrix_in(p, Wide)
-    y = start.reference.impulse
-    shift = start.reference.witness.shift.astype(np.longdouble)
-    truth = solution_in(p, a, p.b.astype(np.longdouble) + shift, Wide)
-    for scale in (1e-13, 1e-7, 1e-1):
-        x = y + scale * np.abs(y).max() * rng.normal(size=p.m)
-        e = lv.motion_error(p, x)
-        dv = p.generalized.change(x - y)
-        assert e.kinetic == pytest.approx(np.sqrt(0.5 * dv @ (p.generalized.mass @ dv)), rel=1e-6)
-        assert e.speed == pytest.approx(np.abs(dv).max(), rel=1e-9)
-        assert e.body_name == p.generalized.velocity_name(int(np.abs(dv).argmax()))
-        assert e.spin is None
-        if truth is not None:
-            delta = x - truth[0]
-            # 1e-14: the shift is stored in float64.
-            assert np.sqrt(delta @ a @ delta / 2) <= e.bound * (1 + 1e-14)
-            assert np.sqrt(delta @ moving @ delta / 2) <= e.bound * (1 + 1e-14)
-
-
 # -- several motions -----------------------------------------------------------------------------------
 
 
@@ -345,6 +329,8 @@ def test_choices_have_names_and_are_motions():
     assert found.select("compliant") in found
     with pytest.raises(lv.InputError, match="choice is"):
         found.select("best")
+    with pytest.raises(lv.LavenderError, match=r"problem\.disk"):
+        lv.motions(dragged(0, 3))  # ellipses
     picks = found.picks(["anderson", "admm", "jacobi"], max_iter=1000)
     assert picks["jacobi"] is None  # 1000 sweeps end before it gets there
     assert picks["anderson"].motion != picks["admm"].motion

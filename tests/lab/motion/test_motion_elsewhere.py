@@ -5,7 +5,6 @@ import dataclasses
 import numpy as np
 import pytest
 import scipy.sparse as sp
-from calls import free
 from worked import python
 
 import lavender as lv
@@ -18,35 +17,6 @@ def test_several_motions_are_told():
     found = lv.motions(p)
     d = lv.derivative(p, found[0].impulse)
     assert len(d.motions) == len(found) and d.motions.all == found.all
-
-
-@pytest.mark.parametrize(
-    ("make", "words"),
-    [
-        (lambda: lv.Cones.contacts([(0.5, 0.0)]), r"contact 0 is \[0.5, 0.0\].*two numbers above 0"),
-        (lambda: lv.Cones.contacts([(0.5, 0.5), (1e-30, 0.5)]), "contact 1 is"),
-        (lambda: lv.Cones.contacts([(0.5, -0.2)]), "mu"),
-        (lambda: lv.Cones.contacts([(0.5, np.nan)]), "mu"),
-        (lambda: lv.Cones.contacts([(0.5, np.inf)]), "mu"),
-        (lambda: lv.Cones.contacts([(0.5, 0.1, 0.2)]), "one for each tangent"),
-        (lambda: lv.Cones.contacts([(0.5, 0.1)], 1), "bounds no spin"),
-        (lambda: lv.Cones.contacts([(0.5, 0.1)], patch_radius=0.1), "bounds no spin"),
-        (lambda: lv.Cones.contacts([(0.5, 0.1)], rolling=0.1), "no rolling"),
-        (lambda: lv.Problem.contact(np.eye(3), np.ones(3), [(0.5, 0.1)], 0.1), "bounds no spin"),
-        (lambda: lv.Cones([0, 2], [7], np.zeros(2), np.ones(2), [0.5], [1.0]), "ellipse of 2 rows"),
-        (lambda: lv.Cones([0, 3], [7], np.zeros(3), np.ones(3), [0.5], [0.0]), "mu_2 / mu_1 = 0"),
-        (
-            lambda: lv.Cones([0, 3], [7], np.zeros(3), np.ones(3), [1e50], [1e12]),
-            "mu_2.* must be at most 1e.60",
-        ),
-        (lambda: lv.motions(free(0)), "problem.disk"),
-        (lambda: free(0).to_findex(), "bounds its tangents together"),
-        (lambda: free(0).save("x.hdf5"), "ellipses"),
-    ],
-)
-def test_what_is_no_ellipse_or_takes_none_is_told(make, words):
-    with pytest.raises(lv.LavenderError, match=words):
-        make()
 
 
 def test_our_solvers_are_held_to_the_floor_of_float64_whatever_the_data_were():

@@ -7,16 +7,15 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
-from calls import SHORT, SPENT, STUCK, check, driven, says
+from calls import SPENT, STUCK, driven, says
 from random_problems import CONTACTS, GIVEN, as_matrix
 from scipy.linalg import block_diag
 
 import lavender as lv
-from lavender import registry, suite
+from lavender import suite
 from lavender.lab.suite.families import granular
 from lavender.solvers.auto import Auto
 from lavender.solvers.jacobi import Jacobi
-from lavender.solvers.registry import SMALL_ROWS
 
 
 @pytest.mark.parametrize("form", GIVEN)
@@ -120,18 +119,6 @@ def test_a_sliding_pile_is_found_sooner_where_the_direction_is_kept():
         for restart in ("growth", "against")
     ]
     assert sweeps[1] < 0.7 * sweeps[0]
-
-
-@pytest.mark.parametrize("name", suite.families())
-def test_families_of_few_rows(name):
-    if missing := suite.missing(suite.package_of(name)):
-        pytest.skip(missing)
-    problem = suite.case(name).problem
-    if problem.m > SMALL_ROWS:
-        pytest.skip("many rows")
-    for solver in SHORT:
-        if registry.get(solver).refuses(problem) is None:
-            check(problem, solver)
 
 
 def test_what_a_callback_raises_comes_through():

@@ -105,9 +105,6 @@ def test_sets_and_families_are_listed():
             assert suite.case(name).problem.m > 0  # the listing is itself a valid name
 
 
-# -- geometry -------------------------------------------------------------------------------------
-
-
 # -- references -----------------------------------------------------------------------------------
 
 

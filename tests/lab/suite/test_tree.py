@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 import scipy.sparse as sp
+from calls import over_velocities
 from random_problems import as_matrix, general, random_lcp
 from random_trees import random_general
 
@@ -28,16 +29,6 @@ def rates(monkeypatch):
     monkeypatch.setattr(costs, "RATES", made | {"sweep row": 12.0, "sweep cone": 1.7})
 
 
-def over_velocities(friction, m=120, nv=60):
-    rng = np.random.default_rng(0)
-    half = rng.normal(size=(nv, nv))
-    cones = lv.Cones.contacts(np.full(m // 3, 0.5), 2) if friction else lv.Cones.free(m // 4)
-    jac = rng.normal(size=(m if friction else m // 4, nv))
-    mass = half @ half.T / nv + np.eye(nv)
-    more = {"friction": friction} if friction else {}
-    return lv.Problem.from_jacobian(jac, mass, rng.normal(size=nv), cones=cones, compliance=0.1, **more)
-
-
 def asymmetric():
     """The law of a matrix with a positive definite half, and a large other one."""
     half, other = np.random.default_rng(0).standard_normal((2, 80, 80))
@@ -49,8 +40,8 @@ LOOSE = ["anderson", "nncg", "anderson", "nncg", "newton"]
 FIRST = {
     "linear, a matrix": (lambda: as_matrix(suite.hang(n=24).problem), ["direct"]),
     "linear, bodies": (lambda: suite.hang(n=24).problem, ["newton"]),
-    "linear, J and M": (lambda: over_velocities(None), ["newton"]),
-    "J and M": (lambda: over_velocities("coulomb"), ["anderson", "newton"]),
+    "linear, J and M": (lambda: over_velocities(30, 60, cones=lv.Cones.free(30), compliance=0.1), ["newton"]),
+    "J and M": (lambda: over_velocities(120, 60, compliance=0.1), ["anderson", "newton"]),
     "bounded rows of a matrix": (lambda: as_matrix(suite.stack(n=200).problem), ["direct"]),
     "bounded rows of bodies": (
         lambda: suite.stack(n=200).problem,
