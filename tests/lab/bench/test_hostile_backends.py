@@ -68,6 +68,7 @@ class Backend:
             for fd in range(3, 20):
                 try: os.write(fd, struct.pack("<QQ", 2**60, 2**60) + b"x" * 1000)
                 except OSError: pass
+        if self.what == "quit": raise KeyboardInterrupt
         if self.what == "lie":
             import ctypes  # read-only or not: the problem that it holds is its own, and convinces nobody
             ctypes.memset(state.b.ctypes.data, 0, 8 * state.m)
@@ -87,7 +88,7 @@ for n in NAMES:
 """
 
 
-HARM = ("hang", "segfault", "leave", "talk", "fork", "escape", "eat", "forge", "flood", "lie")
+HARM = ("hang", "segfault", "leave", "talk", "fork", "escape", "eat", "forge", "flood", "lie", "quit")
 
 
 @pytest.fixture
@@ -175,6 +176,13 @@ from test_hostile_backends import stack, task
 p = stack()
 Worker().measure(p, task(p, "x_fork", time_limit=600.0))
 """
+
+
+def test_what_says_nothing_is_told_by_its_kind(hostile, watchdog):
+    p = stack()
+    with Worker() as worker:
+        record, _ = worker.measure(p, task(p, "x_quit"))
+    assert (record.status, record.message) == ("ERROR", "KeyboardInterrupt")
 
 
 @pytest.mark.slow

@@ -100,7 +100,7 @@ class Worker:
         except Ended as end:
             raise Lost(f"{CRASHED} ({end})", DIED) from None
         except Raised as error:
-            return str(error)
+            return f"{error.kind}: {error}".removesuffix(": ")
         except ValueError as error:
             process.end()
             text = f"the process of the backend sent what is no answer ({error}); it was killed"
