@@ -19,7 +19,7 @@ from benchmarks.auto.record import Record, records
 from benchmarks.auto.replay import RULES, fit, regrets, summary
 from benchmarks.output import out_option
 from lavender.base.errors import InputError
-from lavender.cli.options import Names, Seeds
+from lavender.cli.options import Listed, Seeds
 from lavender.io.stored import write_text
 from lavender.judge.residuals import reference
 from lavender.lab.bench import seeds as from_seeds
@@ -33,7 +33,7 @@ RECORDS = click.Path(path_type=Path, exists=True)
 
 @click.command("auto")
 @click.argument("names", nargs=-1)
-@click.option("--families", type=Names(), default="wild", show_default=True, help="Families with seeds.")
+@click.option("--families", type=Listed(str), default="wild", show_default=True, help="Families with seeds.")
 @click.option("--seeds", type=Seeds(), default="0:60", show_default=True, help="Of the families, B left out.")
 @click.option("--limit", default=1.0, show_default=True, metavar="S", help="CPU time of one curve.")
 @out_option("Record every solver and `auto` into this file.", "--record")
