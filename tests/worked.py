@@ -9,7 +9,9 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+from random_problems import rotation
 
 import lavender
 
@@ -43,6 +45,17 @@ def after(steps, scene, **parameters):
     for _ in range(steps):
         simulation.step()
     return simulation
+
+
+def energy(scene, observation):
+    """Kinetic and potential energy [J] of what moves."""
+    total, g = 0.0, np.array(scene.parameters.gravity)
+    seen = (observation[key] for key in ("positions", "quaternions", "velocities"))
+    for body, x, q, v in zip(scene.bodies, *seen, strict=True):
+        if not body.is_static:
+            omega = rotation(q).T @ v[3:]
+            total += 0.5 * body.mass * v[:3] @ v[:3] + 0.5 * omega @ body.inertia @ omega - body.mass * g @ x
+    return total
 
 
 def chromium():

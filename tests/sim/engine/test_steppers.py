@@ -6,10 +6,9 @@ from itertools import product
 
 import numpy as np
 import pytest
-from worked import after
+from worked import after, energy
 
 import lavender as lv
-from benchmarks.gallery import energy
 from lavender.sim.engine.layout import HEAD
 from lavender.sim.scene import SCENES
 from lavender.sim.scene.steppers import STEPPERS, get_stepper
