@@ -13,15 +13,9 @@ from lavender_ext.core.csr cimport by_columns
 from lavender_ext.core.door cimport is_number
 from lavender_ext.core.parts cimport blocks_t, n_directions, n_turns
 from lavender_ext.core.problem cimport Data
-from lavender_ext.core.rows cimport contact_jacobian, dot6, minv_times, rows_t
+from lavender_ext.core.rows cimport bodies_of, contact_jacobian, dot6, minv_times, rows_t
 
 cdef object F8 = np.dtype(np.float64), I4 = np.dtype(np.int32)
-
-
-cdef inline int32_t body_of(const rows_t* r, int32_t block, int32_t side) noexcept nogil:
-    if block < r.n_joints:
-        return r.joint_body[2 * block + side]
-    return r.contact_body[2 * (block - r.n_joints) + side]
 
 
 cdef public void lav_expand_rows(const blocks_t* p, const rows_t* r, double* jac, double* minv_jac) noexcept nogil:
@@ -30,8 +24,8 @@ cdef public void lav_expand_rows(const blocks_t* p, const rows_t* r, double* jac
     for i in range(p.n_blocks):
         j = p.ptr[i]
         end = p.ptr[i + 1]
-        a = body_of(r, i, 0)
-        b = body_of(r, i, 1)
+        a = bodies_of(r, i)[0]
+        b = bodies_of(r, i)[1]
         if i < r.n_joints:
             for k in range(12 * j, 12 * end):
                 jac[k] = r.jac[k]
@@ -54,7 +48,7 @@ cdef public void lav_body_blocks(const blocks_t* p, const rows_t* r, int32_t* st
         start[i] = 0
     for i in range(p.n_blocks):
         for s in range(2):
-            x = body_of(r, i, s)
+            x = bodies_of(r, i)[s]
             if x >= 0:
                 start[x] += 1
     for i in range(r.n_bodies + 1):
@@ -63,7 +57,7 @@ cdef public void lav_body_blocks(const blocks_t* p, const rows_t* r, int32_t* st
         sum_ += t
     for i in range(p.n_blocks):
         for s in range(2):
-            x = body_of(r, i, s)
+            x = bodies_of(r, i)[s]
             if x >= 0:
                 blocks[start[x]] = i
                 start[x] += 1
@@ -75,7 +69,7 @@ cdef public void lav_body_blocks(const blocks_t* p, const rows_t* r, int32_t* st
     bound[0] = 0
     for i in range(p.n_blocks):
         here = p.ptr[i + 1] - p.ptr[i]
-        t = (body_of(r, i, 0) >= 0) + (body_of(r, i, 1) >= 0)
+        t = (bodies_of(r, i)[0] >= 0) + (bodies_of(r, i)[1] >= 0)
         bound[0] += here if t == 0 else (1 - t) * here * here    # a block meets itself once, not at both bodies
     for i in range(r.n_bodies):
         here = 0
@@ -86,7 +80,7 @@ cdef public void lav_body_blocks(const blocks_t* p, const rows_t* r, int32_t* st
 
 cdef inline int32_t meet(const rows_t* r, int32_t i, const int32_t* start, const int32_t* blocks, int32_t* out) noexcept nogil:
     # Blocks that share a body with block i, increasing: the merge of two sorted lists; i itself always.
-    cdef int32_t a = body_of(r, i, 0), b = body_of(r, i, 1), x = 0, y = 0, xe = 0, ye = 0, n = 0, u, v
+    cdef int32_t a = bodies_of(r, i)[0], b = bodies_of(r, i)[1], x = 0, y = 0, xe = 0, ye = 0, n = 0, u, v
     if a >= 0:
         x = start[a]
         xe = start[a + 1]
@@ -110,9 +104,9 @@ cdef inline int32_t shared_sides(const rows_t* r, int32_t i, int32_t j) noexcept
     # Bit 2 s + t: side s of block i and side t of block j are the same moving body.
     cdef int32_t s, t, x, bits = 0
     for s in range(2):
-        x = body_of(r, i, s)
+        x = bodies_of(r, i)[s]
         for t in range(2):
-            if x >= 0 and x == body_of(r, j, t):
+            if x >= 0 and x == bodies_of(r, j)[t]:
                 bits |= 1 << (2 * s + t)
     return bits
 

@@ -8,20 +8,13 @@ cdef extern from *:
     #define LAVENDER_BITS
     #if defined(__GNUC__)
     #define lavender_lowest(x) __builtin_ctzll(x)
-    #define lavender_highest(x) (63 - __builtin_clzll(x))
     #else
     static int lavender_lowest(unsigned long long x) {
         int n = 0;
         while (!(x >> n & 1)) n++;
         return n;
     }
-    static int lavender_highest(unsigned long long x) {
-        int n = 63;
-        while (!(x >> n & 1)) n--;
-        return n;
-    }
     #endif
     #endif
     """
     int32_t lowest "lavender_lowest"(uint64_t x) noexcept nogil     # x is not empty
-    int32_t highest "lavender_highest"(uint64_t x) noexcept nogil

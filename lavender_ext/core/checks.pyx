@@ -2,12 +2,11 @@
 
 Nothing is said here of what is wrong: where a function says no, the long way checks again, decides, and finds the words.
 """
-from libc.math cimport fabs
 from libc.stdint cimport int32_t
 
+from lavender_ext.core cimport door
 from lavender_ext.core.arrays cimport DOUBLE, TOGETHER, doubles, is_of, ndarray
-from lavender_ext.core.door cimport first_unsized, is_definite, is_frame, is_size, least, most
-from lavender_ext.core.door cimport largest as greatest
+from lavender_ext.core.door cimport first_unsized, has_outside, is_definite, is_frame, is_size, least, most
 
 #: The largest and the least size that a number of a problem may have.
 MOST, LEAST = most(), least()
@@ -30,7 +29,7 @@ def plain(value, tuple shape, bint finite, bint copy):
         n *= held.dimensions[i]
         if wanted is not None and wanted != held.dimensions[i]:
             return None
-    if finite and not are_inside(<const double*>held.data, n):
+    if finite and has_outside(<const double*>held.data, n):
         return None
     made = value.copy() if copy else value
     made.setflags(False)
@@ -39,16 +38,7 @@ def plain(value, tuple shape, bint finite, bint copy):
 
 def inside(x):
     """Whether every number of an array of float64 is at most MOST in size, none NaN: (1) of core/door.pxd."""
-    return are_inside(doubles(x, x.size), x.size)
-
-
-cdef bint are_inside(const double* x, Py_ssize_t n) noexcept nogil:
-    cdef Py_ssize_t i
-    cdef double limit = most()
-    cdef int32_t out = 0
-    for i in range(n):                                  # to the end without a branch: nearly all are inside
-        out |= not fabs(x[i]) <= limit
-    return out == 0
+    return not has_outside(doubles(x, x.size), x.size)
 
 
 def unsized(const double[::1] x):
@@ -58,15 +48,7 @@ def unsized(const double[::1] x):
 
 def largest(numbers):
     """max |x_i| of float64: 0 without entries, NaN where one is."""
-    cdef Py_ssize_t i, n = numbers.size
-    cdef const double* x = doubles(numbers, n)
-    cdef double s = 0.0
-    for i in range(n):
-        if not fabs(x[i]) <= s:
-            s = fabs(x[i])
-            if s != s:
-                break
-    return s
+    return door.largest(doubles(numbers, numbers.size), numbers.size)
 
 
 def has_negative(const double[::1] x):
@@ -90,15 +72,8 @@ def counts_up(const int32_t[::1] ptr):
 
 
 def are_pairs(const int32_t[:, ::1] pair, int32_t n, bint moves):
-    """Whether (k, 2) names bodies from -1, static, to n - 1, none twice in a pair; `moves`: nor two static ones."""
-    cdef Py_ssize_t i
-    cdef int32_t a, b
-    for i in range(pair.shape[0]):
-        a = pair[i, 0]
-        b = pair[i, 1]
-        if not -1 <= a < n or not -1 <= b < n or a == b and (moves or a >= 0):
-            return False
-    return True
+    """`are_pairs` of core/door.pxd, (k, 2)."""
+    return pair.shape[0] == 0 or door.are_pairs(&pair[0, 0], pair.shape[0], n, moves)
 
 
 def are_frames(const double[:, ::1] normal, const double[:, ::1] tangent):
@@ -114,6 +89,6 @@ def are_definite(const double[:, :, ::1] tensor):
     """Whether every tensor (n, 3, 3) is zero, or symmetric to half of what is allowed with pivots well above 0."""
     cdef Py_ssize_t i
     for i in range(tensor.shape[0]):
-        if not (is_size(greatest(&tensor[i, 0, 0], 9)) and is_definite(&tensor[i, 0, 0], 5e-10, 0.0, 1e-6)):
+        if not (is_size(door.largest(&tensor[i, 0, 0], 9)) and is_definite(&tensor[i, 0, 0], 5e-10, 0.0, 1e-6)):
             return False
     return True

@@ -7,7 +7,7 @@ The same problem in other units has other numbers and the same answer, so no use
 numbers, and their squares, stay within float64. A row of A whose largest entry is below 1e-60 counts as empty.
 """
 from libc.math cimport fabs
-from libc.stdint cimport int64_t
+from libc.stdint cimport int32_t, int64_t
 
 
 cdef inline double most() noexcept nogil:
@@ -53,12 +53,31 @@ cdef inline bint is_beyond(const double* x, int64_t n, double bound) noexcept no
     return found
 
 
+cdef inline bint has_outside(const double* x, int64_t n) noexcept nogil:
+    """Whether (1) excludes any; to the end without a branch: nearly all are inside."""
+    cdef int64_t i
+    cdef double limit = most()
+    cdef int32_t out = 0
+    for i in range(n):
+        out |= not fabs(x[i]) <= limit
+    return out
+
+
+cdef inline double widest(double so_far, double x) noexcept nogil:
+    """The larger of |x| and what was largest so far; NaN stays."""
+    x = fabs(x)
+    return so_far if x <= so_far or so_far != so_far else x
+
+
 cdef inline double largest(const double* x, int64_t n) noexcept nogil:
-    """max |x_i| of numbers; 0 of none."""
+    """max |x_i|: 0 of none, NaN where one is."""
     cdef int64_t i
     cdef double s = 0.0
     for i in range(n):
-        s = fabs(x[i]) if fabs(x[i]) > s else s
+        if not fabs(x[i]) <= s:
+            s = fabs(x[i])
+            if s != s:
+                break
     return s
 
 
@@ -76,6 +95,17 @@ cdef inline bint all_finite(const double* x, int64_t n) noexcept nogil:
         s += 0.0 * x[i]
         i += 1
     return (s + t) + (u + v) == 0.0
+
+
+cdef inline bint are_pairs(const int32_t* pair, int64_t k, int32_t n, bint moves) noexcept nogil:
+    """Whether (k, 2) names bodies from -1, static, to n - 1, none twice in a pair; `moves`: nor two static ones."""
+    cdef int64_t i
+    cdef int32_t a, b
+    for i in range(k):
+        a, b = pair[2 * i], pair[2 * i + 1]
+        if not -1 <= a < n or not -1 <= b < n or a == b and (moves or a >= 0):
+            return False
+    return True
 
 
 cdef inline bint is_frame(const double* n, const double* t, double off) noexcept nogil:

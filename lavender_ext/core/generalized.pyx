@@ -15,13 +15,6 @@ cdef object new = np.empty, I4 = np.dtype(np.int32)
 cdef int64_t MOST = 2**31 - 1   # entries of L that 32-bit indices reach
 
 
-cdef public int32_t lav_tree_factor(int32_t n, const int32_t* mptr, const int32_t* midx, const double* mval,
-                                    const int32_t* lptr, const int32_t* lidx, double* lval, double* pivot,
-                                    double* inv_pivot) noexcept nogil:
-    """L and 1 / D; -1, or the row that shows M to be no positive definite matrix."""
-    return tree_factor(n, mptr, midx, mval, lptr, lidx, lval, pivot, inv_pivot)
-
-
 cdef object pattern_of(int32_t n, const int32_t* mptr, const int32_t* midx, int64_t most=MOST):
     """L's columns by the elimination of M, in one array: lptr (n + 1), parent (n), scratch (3 n), then lidx."""
     cdef int64_t room = mptr[n] + 1
@@ -85,8 +78,8 @@ cdef class Operator:
         self.g.inv_pivot = numbers
         self.g.root = numbers + n                       # the factor's pivots, until it is there
         if n:
-            self.failed = lav_tree_factor(n, self.mptr, self.midx, doubles(self.mass[2], len(self.mass[2])), self.g.lptr,
-                                          self.g.lidx, numbers + 2 * n, numbers + n, numbers)
+            self.failed = tree_factor(n, self.mptr, self.midx, doubles(self.mass[2], len(self.mass[2])), self.g.lptr,
+                                      self.g.lidx, numbers + 2 * n, numbers + n, numbers)
         for i in range(n):
             numbers[n + i] = sqrt(numbers[i])
 
@@ -133,20 +126,6 @@ cdef class Operator:
         for i in range(self.g.n):
             c = self.g.lptr[i + 1] - self.g.lptr[i]
             out += 0.5 * c * (c + 1.0)
-        return out
-
-    @property
-    def reach(self):
-        """Entries that J has at least when it is whitened: of each row the path from its last velocity to the root."""
-        cdef int32_t i, last
-        cdef double out = 0.0
-        cdef int32_t[::1] depth = np.empty(self.g.n, np.int32)
-        for i in range(self.g.n):                       # parents stand before their children
-            depth[i] = 1 + (depth[self.g.parent[i]] if self.g.parent[i] >= 0 else 0)
-        for i in range(self.g.m):
-            last = self.g.jptr[i + 1] - 1
-            if last >= self.g.jptr[i]:
-                out += depth[self.g.jidx[last]]
         return out
 
     @property

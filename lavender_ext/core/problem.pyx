@@ -451,18 +451,6 @@ cdef class Data:
         return first_outside(self.blocks.d, self.blocks.n_rows)
 
     @property
-    def n_rows(self):
-        return self.blocks.n_rows
-
-    @property
-    def n_blocks(self):
-        return self.blocks.n_blocks
-
-    @property
-    def n_bodies(self):
-        return self.rows.n_bodies
-
-    @property
     def work(self):
         """Rough number of multiply-adds of one sweep; the front door sizes its chunks by it."""
         if self.is_general:

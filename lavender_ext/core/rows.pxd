@@ -42,6 +42,11 @@ cdef struct rows_t:
     const double* compliance    # (m) 1/kg
 
 
+cdef inline const int32_t* bodies_of(const rows_t* r, int32_t i) noexcept nogil:
+    """The two of block i."""
+    return r.joint_body + 2 * i if i < r.n_joints else r.contact_body + 2 * (i - r.n_joints)
+
+
 cdef inline double dot3(const double* a, const double* b) noexcept nogil:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 

@@ -3,45 +3,15 @@
     M = L^T D L, L unit lower triangular: row k is eliminated into rows before it, k = nv - 1 ... 0, so that a leaf
     of a kinematic tree comes before its ancestors and nothing fills in (Featherstone 2008, section 6.5)     (1)
 """
-from libc.stdint cimport int32_t, int64_t, uint64_t
+from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memcpy
 
-from lavender_ext.core.bits cimport highest, lowest
 from lavender_ext.core.door cimport least
 
 
 cdef enum:
     WIDE = 8                    # rows of a chain that are eliminated together
     LONG = 16                   # columns from which on four of them are at once
-
-
-cdef inline int32_t few_pattern(int32_t n, const int32_t* mptr, const int32_t* midx, int32_t room, int32_t* lptr,
-                                int32_t* lidx, int32_t* parent) noexcept nogil:
-    """`tree_pattern` of at most 64 rows, whose columns are bits."""
-    cdef uint64_t rows[64]
-    cdef uint64_t one = 1, left
-    cdef int32_t k, q, at = 0
-    for k in range(n):
-        left = 0
-        for q in range(mptr[k], mptr[k + 1]):
-            left |= one << midx[q]
-        rows[k] = left & ((one << k) - 1)
-    for k in range(n - 1, -1, -1):
-        parent[k] = -1
-        if rows[k]:
-            parent[k] = highest(rows[k])
-            rows[parent[k]] |= rows[k] ^ one << parent[k]
-    for k in range(n):
-        lptr[k] = at
-        left = rows[k]
-        while left:
-            if at == room:
-                return -1
-            lidx[at] = lowest(left)
-            at += 1
-            left &= left - 1
-    lptr[n] = at
-    return at
 
 
 cdef inline void put_in_order(int32_t k, const int32_t* mark, int32_t count, int32_t* cols) noexcept nogil:
@@ -80,8 +50,6 @@ cdef inline int32_t tree_pattern(int32_t n, const int32_t* mptr, const int32_t* 
     leave there. They are written from the end of `lidx` backwards; `lptr` counts from the front afterwards.
     """
     cdef int32_t k, q, c, j, at = room, start, end
-    if n <= 64:
-        return few_pattern(n, mptr, midx, room, lptr, lidx, parent)
     for k in range(n):
         mark[k] = -1
         first_child[k] = -1
@@ -187,13 +155,10 @@ cdef inline void take_rows(const int32_t* lptr, const int32_t* lidx, double* lva
     for t in range(s):
         z[t] = row[t][count] * inv_pivot[k - t]
         pivot[j] -= z[t] * row[t][count]
-    if lptr[j + 1] - at == count:                           # the same columns
-        take_run(lval + at, row, z, s, 0, count)
-        b = count
     while b < count:
         while lidx[at] != lidx[first + b]:
             at += 1
-        n = 1
+        n = count - b if lptr[j + 1] - at == count - b else 1       # the same columns to the end
         while b + n < count and lidx[at + n] == lidx[first + b + n]:
             n += 1
         take_run(lval + at, row, z, s, b, n)

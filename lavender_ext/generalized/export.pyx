@@ -13,7 +13,7 @@ import numpy as np
 
 from lavender_ext.core.arrays cimport DOUBLE, INT, doubles, frozen, ints, ndarray, spread
 from lavender_ext.core.blocks cimport Blocks, room_of
-from lavender_ext.core.door cimport is_number, is_size
+from lavender_ext.core.door cimport is_number, is_size, widest
 from lavender_ext.core.parts cimport ROW, blocks_t, contact_kind, spell_bounds
 from lavender_ext.core.problem cimport Room, room_for
 
@@ -514,9 +514,3 @@ cdef inline double larger(double so_far, double x) noexcept nogil:
     """The larger of |x| and what was largest so far, which never was NaN: one is left out."""
     x = fabs(x)
     return x if x > so_far else so_far
-
-
-cdef inline double widest(double so_far, double x) noexcept nogil:
-    """The larger of |x| and what was largest so far; NaN stays."""
-    x = fabs(x)
-    return so_far if x <= so_far or so_far != so_far else x

@@ -6,6 +6,7 @@ from libc.math cimport sqrt
 from libc.stdint cimport int32_t
 
 from lavender_ext.core.generalized cimport generalized_t
+from lavender_ext.core.order cimport sort_by_level
 from lavender_ext.core.parts cimport CONE, COULOMB, blocks_t, has_friction, is_rows
 from lavender_ext.factor.graph cimport root_of
 from lavender_ext.generalized.flow cimport flow_t, row_end, row_from
@@ -86,21 +87,8 @@ cdef inline int32_t find_islands(const blocks_t* p, const generalized_t* g, int3
             local[r] = n
             n += 1
         label[b] = local[r]
-    if n == 1:                                          # as most robots are
-        iptr[0], iptr[1], run[0], run[1], cptr[0], at = 0, 1, 0, panels, 0, 0
-        for i in range(g.n):
-            local[i] = -1
-        for q in range(g.pcol[panels]):
-            local[cols[q]] = 0
-        for i in range(g.n):
-            if local[i] == 0:
-                icols[at], local[i] = i, at
-                at += 1
-        cptr[1] = most[0] = at
-        return 1
     for i in range(n + 1):
         iptr[i] = 0
-        cptr[i] = 0
     for b in range(panels):                             # a run begins where the panel before is of another island
         if b == 0 or label[b] != label[b - 1]:
             iptr[label[b] + 1] += 1
@@ -122,19 +110,7 @@ cdef inline int32_t find_islands(const blocks_t* p, const generalized_t* g, int3
         end = g.pcol[b + 1]
         for q in range(g.pcol[b], end):
             local[cols[q]] = label[b]
-    for i in range(g.n):
-        if local[i] >= 0:
-            cptr[local[i] + 1] += 1
-    for b in range(n):
-        cptr[b + 1] += cptr[b]
-    for i in range(g.n):
-        r = local[i]
-        if r >= 0:
-            icols[cptr[r]] = i
-            cptr[r] += 1
-    for b in range(n, 0, -1):
-        cptr[b] = cptr[b - 1]
-    cptr[0] = 0
+    sort_by_level(g.n, local, n, cptr, icols)
     for b in range(n):
         if cptr[b + 1] - cptr[b] > most[0]:
             most[0] = cptr[b + 1] - cptr[b]

@@ -16,7 +16,7 @@ from lavender_ext.core.csr cimport csr_dot, csr_t
 from lavender_ext.core.generalized cimport generalized_t, whitened_dot, whitened_push
 from lavender_ext.core.parts cimport (CONE, blocks_t, is_box, is_disk, is_round, is_rows, n_directions, n_turns,
                                       parts_of, parts_t)
-from lavender_ext.core.rows cimport (cross, dot3, joint_push, joint_velocity, push_bodies, relative_velocity,
+from lavender_ext.core.rows cimport (contact_slack, cross, dot3, joint_push, joint_velocity, push_bodies, relative_velocity,
                                      relax_joint, rows_t, swing_body)
 from lavender_ext.core.view cimport view_t
 from lavender_ext.local.box cimport box3_from
@@ -254,14 +254,12 @@ cdef inline int32_t solve_rows_block(const blocks_t* p, const rows_t* r, int32_t
     cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, c = i - r.n_joints, k, a, b, nt, turns, roll, found
     cdef double w[MAX_ROWS]
     cdef double old[MAX_ROWS]
-    cdef double u[3]
-    cdef double omega[3]
     cdef double t2[3]
     cdef double impulse[3]
     cdef double twist[3]
     cdef const double* normal
     cdef const double* t1
-    w[0] = t2[0] = t2[1] = t2[2] = 0.0
+    t2[0] = t2[1] = t2[2] = 0.0
     if c >= 0 and is_plain3(p, i) and p.law != CONE:
         return solve_sliding_contact(p, r, i, g, lam + j, v)
     if c < 0:
@@ -284,18 +282,7 @@ cdef inline int32_t solve_rows_block(const blocks_t* p, const rows_t* r, int32_t
     roll = 1 + nt + (turns & 1)
     normal = r.normal + 3 * c
     t1 = r.tangent + 3 * c
-    relative_velocity(v, a, b, r.arm_a + 3 * c, r.arm_b + 3 * c, u, omega)
-    w[0] = dot3(normal, u)
-    if nt > 0:
-        w[1] = dot3(t1, u)
-    if nt > 1:
-        cross(normal, t1, t2)
-        w[2] = dot3(t2, u)
-    if turns & 1:
-        w[1 + nt] = dot3(normal, omega)
-    if turns & 2:
-        w[roll] = dot3(t1, omega)
-        w[roll + 1] = dot3(t2, omega)
+    contact_slack(r, c, nt, turns, v, w)
     for k in range(n):
         w[k] += r.compliance[j + k] * lam[j + k] - p.b[j + k]
         old[k] = lam[j + k]
@@ -309,6 +296,7 @@ cdef inline int32_t solve_rows_block(const blocks_t* p, const rows_t* r, int32_t
         for k in range(3):
             impulse[k] += w[1] * t1[k]
     if nt > 1:
+        cross(normal, t1, t2)
         for k in range(3):
             impulse[k] += w[2] * t2[k]
     if turns & 1:

@@ -10,7 +10,7 @@ from libc.string cimport memset
 
 from lavender_ext.core.generalized cimport generalized_t
 from lavender_ext.core.parts cimport blocks_t
-from lavender_ext.core.rows cimport rows_t
+from lavender_ext.core.rows cimport bodies_of, rows_t
 from lavender_ext.core.view cimport view_t
 from lavender_ext.factor.blocks cimport factor_t, sparse_t
 from lavender_ext.factor.graph cimport eliminate_bodies, pattern_room
@@ -108,12 +108,11 @@ cdef inline int64_t order_bodies(pattern_t* a) noexcept nogil:
 
 cdef inline void make_pattern(const scaled_t* s, pattern_t* a, const rows_t* r) noexcept nogil:
     """An elimination order of the bodies, the blocks of N and of its factor, of elements that were found."""
-    cdef int32_t i, c
+    cdef int32_t i
     cdef const int32_t* body
     a.k = s.e.n
     for i in range(a.k):
-        c = s.block[i] - r.n_joints
-        body = r.joint_body + 2 * s.block[i] if c < 0 else r.contact_body + 2 * c
+        body = bodies_of(r, s.block[i])
         a.body[2 * i] = body[0]
         a.body[2 * i + 1] = body[1]
     order_bodies(a)

@@ -3,7 +3,7 @@ from libc.math cimport sqrt
 from libc.stdint cimport int32_t, int64_t
 
 from lavender_ext.core.parts cimport blocks_t, n_directions, n_turns
-from lavender_ext.core.rows cimport contact_jacobian, rows_t
+from lavender_ext.core.rows cimport bodies_of, contact_jacobian, rows_t
 from lavender_ext.newton.elements cimport elements_t
 
 
@@ -121,7 +121,7 @@ cdef inline void inertia_root(int32_t n, const double* inv_inertia, double* root
 cdef inline void fill_panel(const blocks_t* p, const rows_t* r, const double* root, const double* root_mass,
                             double* panel) noexcept nogil:
     """K (m, 12): D^-1/2 J M^-1/2, columns of body a then b."""
-    cdef int32_t i, j, q, c, k, h, a, b, body
+    cdef int32_t i, j, q, c, k, h, body
     cdef double jac[72]
     cdef double x
     cdef const double *row
@@ -131,19 +131,15 @@ cdef inline void fill_panel(const blocks_t* p, const rows_t* r, const double* ro
         j = p.ptr[i]
         c = i - r.n_joints
         if c < 0:
-            a = r.joint_body[2 * i]
-            b = r.joint_body[2 * i + 1]
             row = r.jac + 12 * j
         else:
-            a = r.contact_body[2 * c]
-            b = r.contact_body[2 * c + 1]
             contact_jacobian(r, c, n_directions(p, i), n_turns(p, i), jac)
             row = jac
         for q in range(j, p.ptr[i + 1]):
             out = panel + 12 * <int64_t>q
             x = 1.0 / sqrt(p.d[q])
             for h in range(2):
-                body = a if h == 0 else b
+                body = bodies_of(r, i)[h]
                 for k in range(6):
                     out[6 * h + k] = 0.0
                 if body >= 0:

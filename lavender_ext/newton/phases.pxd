@@ -18,7 +18,7 @@ from libc.math cimport fabs
 from libc.stdint cimport int32_t
 from libc.string cimport memset
 
-from lavender_ext.core.door cimport all_finite
+from lavender_ext.core.door cimport all_finite, largest
 from lavender_ext.core.parts cimport CONE
 from lavender_ext.judge.score cimport relative
 from lavender_ext.newton.cones cimport cone_gap, cone_size, gather, is_high, is_low
@@ -30,8 +30,8 @@ from lavender_ext.newton.run cimport (APPROACH, EXCHANGES, INNER, INTERIOR, N_AU
                                       leave, progress_t, newton_t, polish_t, proximal_t, pursuit_t, relative_at, score,
                                       spent, take, with_products)
 from lavender_ext.newton.steps cimport interior_step
-from lavender_ext.newton.system cimport (OF_BARRIER, OF_NATURAL, largest, solve_natural, solve_refined, system_factor,
-                                         system_natural, system_solve, system_t, system_times)
+from lavender_ext.newton.system cimport (OF_BARRIER, OF_NATURAL, solve_natural, solve_refined, system_factor, system_natural,
+                                         system_solve, system_t, system_times)
 
 
 cdef enum:

@@ -13,6 +13,7 @@ from libc.stdint cimport int32_t
 import numpy as np
 
 from lavender_ext.core.csr cimport csr_dot, csr_dot_size, csr_t
+from lavender_ext.core.door cimport widest
 
 
 cdef double FLOOR = 1e-10       # of what is pushed inside,
@@ -31,11 +32,6 @@ cdef csr_t rows_of(matrix):
     return a
 
 
-cdef inline double most(double top, double x) noexcept nogil:
-    """max(top, |x|), NaN where one is."""
-    return top if fabs(x) <= top or top != top else fabs(x)
-
-
 def balanced(p, j, int passes):
     """Factors of columns (n,) and rows (m,) with which the largest entry of each in (1) comes near 1 (Ruiz 2001)."""
     cdef csr_t a = rows_of(p), b = rows_of(j)
@@ -47,14 +43,14 @@ def balanced(p, j, int passes):
         for i in range(n):
             x = 0.0
             for q in range(a.indptr[i], a.indptr[i + 1]):
-                x = most(x, a.data[q] * column[a.indices[q]])
+                x = widest(x, a.data[q] * column[a.indices[q]])
             high[i] = x
         for i in range(m):
             x = 0.0
             for q in range(b.indptr[i], b.indptr[i + 1]):
                 k = b.indices[q]
-                x = most(x, b.data[q] * column[k])
-                high[k] = most(high[k], b.data[q] * row[i])
+                x = widest(x, b.data[q] * column[k])
+                high[k] = widest(high[k], b.data[q] * row[i])
             beside[i] = x
         for i in range(n):
             if column[i] * high[i] > 0.0:
@@ -177,8 +173,8 @@ cdef class Iterate:
             for i in range(self.m):
                 self._rest[n + i] = self._right[n + i] - (csr_dot(&self.j, i, &u[0]) - self._theta[i] * u[n + i])
             for i in range(n + self.m):
-                size = most(size, self._right[i])
-                left = most(left, self._rest[i])
+                size = widest(size, self._right[i])
+                left = widest(left, self._rest[i])
         return left / size if size > 0.0 else left
 
     def begin(self, const double[::1] u):
@@ -232,29 +228,29 @@ cdef class Iterate:
                 pull = csr_dot_size(&self.jt, i, &self._lam[0], &sums)
                 x = self._dual[i] = force + self.q[i] - pull
                 self._right[i] = -x
-                dual = most(dual, x)
-                forces = most(most(most(forces, force), self.q[i]), pull)
-                pulled = most(pulled, pull)
-                terms = most(terms, sums)
+                dual = widest(dual, x)
+                forces = widest(widest(widest(forces, force), self.q[i]), pull)
+                pulled = widest(pulled, pull)
+                terms = widest(terms, sums)
                 curved += self._x[i] * force
                 steep += self._x[i] * self.q[i]
             for i in range(m):
                 along = csr_dot(&self.j, i, &self._x[0])
                 x = self._primal[i] = along - self.target[i] - self._w[i]
                 self._right[n + i] = -x - self._w[i]
-                primal = most(primal, x)
-                rows = most(most(rows, along), self.target[i])
+                primal = widest(primal, x)
+                rows = widest(widest(rows, along), self.target[i])
                 given += self.target[i] * self._lam[i]
                 if i >= self.free:
-                    short = most(short, min(self._w[i], self._lam[i]))
+                    short = widest(short, min(self._w[i], self._lam[i]))
                     mean += self._w[i] * self._lam[i] / m
                     self._theta[i] = self._w[i] / self._lam[i]
-        gap = most(most(fabs(curved), steep), given)
+        gap = widest(widest(fabs(curved), steep), given)
         return (
-            most(short, primal) / (rows if rows > 0.0 else 1.0),
+            widest(short, primal) / (rows if rows > 0.0 else 1.0),
             dual / (forces if forces > 0.0 else 1.0),
             fabs(curved + steep - given) / (gap if gap > 0.0 else 1.0),
-            most(most(dual, primal), mean),
+            widest(widest(dual, primal), mean),
             INFINITY if not given > 0.0 else pulled / terms if terms > 0.0 else 0.0,
         )
 

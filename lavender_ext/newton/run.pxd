@@ -193,7 +193,6 @@ cdef struct newton_t:           # may not move once it is furnished
     problem_t problem
     double tol
     int32_t budget              # factorisations
-    int32_t most                # of this turn
     int32_t stop                # the caller has no more time
     int32_t asked               # whether `direction` proves that there is no solution
     int32_t proven              # it does

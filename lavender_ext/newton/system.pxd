@@ -13,6 +13,7 @@ from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memcpy, memset
 
 from lavender_ext.core.csr cimport csr_dot, csr_t
+from lavender_ext.core.door cimport largest
 from lavender_ext.core.generalized cimport dot
 from lavender_ext.core.parts cimport CONE
 from lavender_ext.factor.blocks cimport factor_t
@@ -348,15 +349,6 @@ cdef inline void natural_times(system_t* s, const double* dz, double* out) noexc
     element_times(s.e, s.p, s.q, out, False)
     for j in range(s.e.m):
         out[j] += dz[j]
-
-
-cdef inline double largest(const double* x, int32_t n) noexcept nogil:
-    cdef int32_t j
-    cdef double big = 0.0
-    for j in range(n):
-        if not fabs(x[j]) <= big:                       # what is no number is kept
-            big = fabs(x[j])
-    return big
 
 
 cdef inline void solve_refined(system_t* s, const double* rhs, double* x, double* r, double* dx) noexcept nogil:

@@ -29,6 +29,7 @@ from libc.string cimport memcpy
 
 import numpy as np
 
+from lavender_ext.core.door cimport largest
 from lavender_ext.core.order cimport next_random
 from lavender_ext.core.parts cimport blocks_t
 from lavender_ext.judge.score cimport is_at_floor
@@ -261,23 +262,13 @@ cdef inline void swap_columns(dictionary_t* d, int32_t i, int32_t j) noexcept no
     swap(d.t + i, d.t + j, d.rows, d.width)
 
 
-cdef inline double largest(const dictionary_t* d, int32_t i) noexcept nogil:
-    # of row i of M
-    cdef int32_t j
-    cdef double size = 0.0
-    for j in range(d.n):
-        if fabs(d.t[i * d.width + j]) > size:
-            size = fabs(d.t[i * d.width + j])
-    return size
-
-
 cdef inline int32_t free_pivot(const lemke_t* l, int32_t end, int32_t* one, int32_t* two) noexcept nogil:
     """Free row `one` and free variable `two` before `end` whose entry is largest beside the row; 0 where there is none."""
     cdef const dictionary_t* d = &l.d
     cdef int32_t i, j, first = l.bounded + l.caps
     cdef double size, most = 1e-11
     for i in range(first, end):
-        size = largest(d, i)
+        size = largest(d.t + i * d.width, d.n)          # of row i of M
         for j in range(first, end):
             if fabs(d.t[i * d.width + j]) > most * size:
                 one[0], two[0], most = i, j, fabs(d.t[i * d.width + j]) / size
@@ -294,7 +285,7 @@ cdef inline int32_t bounded_pivot(lemke_t* l, int32_t end, int32_t* one, int32_t
     cdef double share, across, most = 1e-11
     cdef const double* y
     for i in range(end):
-        d.t[i * d.width + d.n] = largest(d, i)          # z has no column yet
+        d.t[i * d.width + d.n] = largest(d.t + i * d.width, d.n)    # z has no column yet
     for j in range(first):
         y = d.t + j * d.width
         share, across, r, c = 0.0, 0.0, first, first

@@ -20,9 +20,10 @@ import numpy as np
 
 from lavender_ext.core.arrays cimport doubles
 from lavender_ext.core.csr cimport csr_t, scan_entries
+from lavender_ext.core.order cimport sort_by_level
 from lavender_ext.core.parts cimport CONE, CONTACT_ROLLING, FRICTIONS, ROUND, blocks_t, frictions_of, is_rows, lay_frictions
 from lavender_ext.core.problem cimport Data
-from lavender_ext.core.rows cimport rows_t
+from lavender_ext.core.rows cimport bodies_of, rows_t
 from lavender_ext.core.method cimport room_t
 from lavender_ext.factor.tiles cimport has_wide
 from lavender_ext.small.call cimport COUNTS, ENDED, FAILED, KEPT, Rules, few_rules_t, few_t, rooms_t
@@ -356,17 +357,12 @@ cdef inline void cut_matrix(island_t* x, const blocks_t* p, const csr_t* a, cons
             indptr[n] = at
 
 
-cdef inline const int32_t* bodies_at(const rows_t* r, int32_t i) noexcept nogil:
-    """The two of block i."""
-    return r.joint_body + 2 * i if i < r.n_joints else r.contact_body + 2 * (i - r.n_joints)
-
-
 cdef inline int32_t number_bodies(const rows_t* r, const int32_t* block, int32_t k, int32_t* number, int32_t* body) noexcept nogil:
     """Those of k blocks, in the order in which they come, into `body`, their places there into `number`; how many."""
     cdef const int32_t* two
     cdef int32_t i, side, n = 0
     for i in range(k):
-        two = bodies_at(r, block[i])
+        two = bodies_of(r, block[i])
         for side in range(2):
             if two[side] >= 0 and number[two[side]] < 0:
                 number[two[side]] = n
@@ -390,7 +386,7 @@ cdef inline void cut_rows(island_t* x, const blocks_t* p, const rows_t* r, const
     cdef int32_t* pair
     for k in range(own.n_blocks):
         i, m, n = block[k], own.ptr[k], own.ptr[k + 1] - own.ptr[k]
-        j, two, pair = p.ptr[i], bodies_at(r, i), <int32_t*>bodies_at(y, k)
+        j, two, pair = p.ptr[i], bodies_of(r, i), <int32_t*>bodies_of(y, k)
         for c in range(2):
             pair[c] = number[two[c]] if two[c] >= 0 else -1
         memcpy(<void*>(y.compliance + m), r.compliance + j, n * sizeof(double))
@@ -498,10 +494,10 @@ cdef class Islands(Small):
         Small.__init__(self, data, over)
         self.count = count
         cdef const int32_t* ptr = over.blocks.ptr
-        cdef int32_t i, k = over.blocks.n_blocks, rows, joints = over.rows.n_joints if over.factored else 0, at = 0
+        cdef int32_t i, k = over.blocks.n_blocks, rows, joints = over.rows.n_joints if over.factored else 0
         self.size, self.block = np.zeros((self.count, SIZES), np.int32), np.empty(k, np.int32)
         cdef int32_t[:, ::1] size = self.size
-        cdef int32_t[::1] block = self.block, first = np.empty(self.count, np.int32)
+        cdef int32_t[::1] block = self.block, first = np.empty(self.count + 1, np.int32)
         for i in range(k):
             rows = ptr[i + 1] - ptr[i]
             size[label[i], 0] += rows
@@ -511,12 +507,7 @@ cdef class Islands(Small):
             if i < joints:
                 size[label[i], 3] += rows
                 size[label[i], 4] += 1
-        for i in range(self.count):
-            first[i] = at
-            at += size[i, 1]
-        for i in range(k):
-            block[first[label[i]]] = i
-            first[label[i]] += 1
+        sort_by_level(k, &label[0], count, &first[0], &block[0])
 
     cdef int32_t end(self, few_t* s, const few_rules_t* rules, double* own, bint cold, double tol, double most, double* both,
                      rooms_t* rooms, int32_t* counts) except -1:

@@ -7,7 +7,7 @@ from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memcmp, memcpy, memset
 
-from lavender_ext.core.door cimport first_outside, first_unsized, is_definite, is_frame, is_number, is_size, largest, least
+from lavender_ext.core.door cimport are_pairs, first_unsized, has_outside, is_definite, is_frame, is_size, largest, least
 from lavender_ext.core.generalized cimport generalized_t, jac_row
 from lavender_ext.core.tree cimport tree_factor, tree_pattern
 from lavender_ext.core.method cimport room_t
@@ -120,21 +120,6 @@ cdef inline const double* widened(const worlds_t* w, int32_t which, int64_t firs
         widen(w, which, first + i * row[0], n, out + <int64_t>i * n)
     row[0] = n
     return out
-
-
-cdef inline bint has_outside(const double* x, int32_t n) noexcept nogil:
-    """Does the door exclude any of these? Not where even their sum is a number, of which four are added at once."""
-    cdef int32_t i = 0, k
-    cdef double s[4]
-    s[0] = s[1] = s[2] = s[3] = 0.0
-    while i + 4 <= n:
-        for k in range(4):
-            s[k] += fabs(x[i + k])
-        i += 4
-    while i < n:
-        s[0] += fabs(x[i])
-        i += 1
-    return not is_number((s[0] + s[1]) + (s[2] + s[3])) and first_outside(x, n) >= 0
 
 
 cdef inline int32_t rows_of(const double* a, int64_t row, int32_t m, int32_t n, int32_t* ptr, int32_t* idx,
@@ -385,16 +370,6 @@ cdef inline int32_t lay_matrix(const worlds_t* w, int64_t i, desk_t* d, blocks_t
     if has_outside(b, m) or 0.0 < largest(b, m) < least():
         return BAD
     return lay_blocks(w, at, p, b, d.room.index, b + m)
-
-
-cdef inline bint are_pairs(const int32_t* pair, int32_t k, int32_t n, bint moves) noexcept nogil:
-    """As `checks.are_pairs`."""
-    cdef int32_t i, a, b
-    for i in range(k):
-        a, b = pair[2 * i], pair[2 * i + 1]
-        if not -1 <= a < n or not -1 <= b < n or a == b and (moves or a >= 0):
-            return False
-    return True
 
 
 cdef inline int32_t lay_bodies(const worlds_t* w, int64_t i, desk_t* d, blocks_t* p, rows_t* r) noexcept nogil:

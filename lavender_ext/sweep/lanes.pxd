@@ -19,7 +19,7 @@ from libc.stdint cimport int32_t, int64_t
 
 from lavender_ext.core.block cimport relax_tangents
 from lavender_ext.core.parts cimport blocks_t, is_box, n_directions, parts_of, parts_t
-from lavender_ext.core.rows cimport cross, relax_rows_block, rows_t
+from lavender_ext.core.rows cimport bodies_of, cross, relax_rows_block, rows_t
 from lavender_ext.sweep.pair cimport (LANES, all_within, any_beyond, at, both, clip_pair, gather, gather_six,
                                       not_below_zero, pair_t, scatter_six)
 
@@ -104,10 +104,6 @@ cdef inline int32_t record_size(int32_t kind) noexcept nogil:
     return HEADER + (0 if kind == ALONE else n + C_ROW + C_ROW_SIZE * n
                      + (T_SIZE if n > 1 else 0) + (S_SIZE if n == SPIN or n == ROLL_SPIN else 0)
                      + (B_SIZE if kind == SQUARE else 0) + (n >= ROLL))
-
-
-cdef inline const int32_t* bodies_of(const rows_t* r, int32_t i) noexcept nogil:
-    return r.joint_body + 2 * i if i < r.n_joints else r.contact_body + 2 * (i - r.n_joints)
 
 
 cdef inline void put(pair_t* out, int32_t n, const double* x, const double* y) noexcept nogil:
