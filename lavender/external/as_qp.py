@@ -478,6 +478,15 @@ def bound_rows(qp: QP) -> list[tuple[float, sp.csr_matrix, FloatArray, Any]]:
     return found
 
 
+def bound_multipliers(qp: QP, z: FloatArray) -> FloatArray:
+    """xi (n,) of the multipliers of `bound_rows`, which z begins with."""
+    xi, first = np.zeros(qp.n), 0
+    for sign, _, _, at in bound_rows(qp):
+        xi[at] += sign * z[first : first + len(at)]
+        first += len(at)
+    return xi
+
+
 def two_sided(qp: QP, identity: bool) -> tuple[sp.csc_matrix, FloatArray, FloatArray]:
     """Rows l <= C x <= u; with `identity` the bounds of x as rows after them."""
     low = np.full(len(qp.b), -np.inf)

@@ -15,7 +15,7 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray
 from lavender.base.later import sparse as sp
-from lavender.external.as_qp import QP, bound_rows
+from lavender.external.as_qp import QP, bound_multipliers, bound_rows
 from lavender.external.running import Answer, Call, Limits, at_least, proof, quiet
 from lavender.judge.solution import Status
 
@@ -100,10 +100,7 @@ def _through_qpsolvers(
         x = None  # multipliers are the answer of the velocity form
     xi = np.asarray(solution.z_box, float) if _given(solution.z_box, qp.n) else None
     if bounds and _given(solution.z, len(side)):
-        xi, at0 = np.zeros(qp.n), len(qp.b) - z
-        for sign, _, _, at in bounds:
-            xi[at] += sign * np.asarray(solution.z)[at0 : at0 + len(at)]
-            at0 += len(at)
+        xi = bound_multipliers(qp, np.asarray(solution.z)[len(qp.b) - z :])
     iterations = _iterations(extras)
     work = {} if iterations is None else {"iterations": iterations}
     words = own or words or _words(solution.found, x)

@@ -13,7 +13,7 @@ import numpy as np
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import InputError
 from lavender.base.later import sparse as sp
-from lavender.external.as_qp import QP, bound_rows, two_sided
+from lavender.external.as_qp import QP, bound_multipliers, bound_rows, two_sided
 from lavender.external.running import Answer, Limits, at_least, certificate, proof, quiet, set_all
 from lavender.judge.solution import Status
 
@@ -63,11 +63,7 @@ def call_clarabel(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, A
     }.get(name, Status.NUMERICAL_ERROR)
     x, z = np.array(result.x), np.array(result.z)
     zeta = np.concatenate([z[:first], z[first + n_bounds :]])
-    xi = np.zeros(qp.n)
-    at0 = first
-    for sign, _, _, at in bounds:
-        xi[at] += sign * z[at0 : at0 + len(at)]
-        at0 += len(at)
+    xi = bound_multipliers(qp, z[first:])
     # One factorisation before the first step and one for each.
     work = {"iterations": result.iterations, "factorisations": result.iterations + 1}
     return Answer(

@@ -20,7 +20,7 @@ from lavender.base.errors import InputError
 from lavender.external.as_qp import QP, target
 from lavender.judge.certificates import check_certificate
 from lavender.judge.residuals import at_floor, quick
-from lavender.judge.solution import Claim, Status
+from lavender.judge.solution import Claim, Status, summed
 from lavender.problem import Problem
 
 EPS_MIN = 1e-14  # asked of a backend at the least: its own arithmetic stops there
@@ -116,8 +116,7 @@ def ask(
     limits = _levels(problem, tol, max_iter, time_limit)
     while limits:
         last = _once(qp, impulse, call, limits.pop(0), settings, noisy)
-        for kind, count in last.work.items():
-            work[kind] = work.get(kind, 0) + count
+        work = summed((work, last.work))
         relative, floor = quick(problem, impulse, w, e, floor=True)
         if best is None or relative < best[0]:
             best = (relative, last, impulse.copy())

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from enum import Enum
 from types import MappingProxyType
@@ -318,6 +318,15 @@ def counted(n: int, what: str) -> str:
     """1 sweep, 2 sweeps: a count of `work` with its name in words."""
     what = what.replace("_", " ")
     return f"{n} {what.removesuffix('s') if n == 1 else what}"
+
+
+def summed(works: Iterable[Mapping[str, int]]) -> dict[str, int]:
+    """The work of several claims or turns, kind by kind."""
+    out: dict[str, int] = {}
+    for work in works:
+        for kind, count in work.items():
+            out[kind] = out.get(kind, 0) + count
+    return out
 
 
 def uninterrupted(solution: Solution) -> Solution:

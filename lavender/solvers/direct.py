@@ -30,7 +30,7 @@ from lavender.base.arrays import FloatArray
 from lavender.base.deadline import Deadline
 from lavender.judge.certificates import NEAR, check_certificate
 from lavender.judge.residuals import FLOOR_MOST, at_floor, judged, remember
-from lavender.judge.solution import Claim, Status
+from lavender.judge.solution import Claim, Status, summed
 from lavender.problem import Problem
 from lavender.solvers.factors import SMALL_SIZE, GeneralFactor, PanelsLU
 from lavender.solvers.pivoting import PivotState
@@ -274,8 +274,7 @@ class _Run:
         self.notes = [self.state.note]
         assert isinstance(self.state.general, GeneralFactor)
         claim = self.linear_general(self.state.general)
-        work = {kind: before.get(kind, 0) + claim.work.get(kind, 0) for kind in {**claim.work, **before}}
-        return replace(claim, work=work)
+        return replace(claim, work=summed((claim.work, before)))
 
     # -- symmetric A, and bounded rows -------------------------------------------------------------
 

@@ -25,6 +25,7 @@ from lavender.judge.solution import (
     TIME_LIMIT,
     Claim,
     History,
+    summed,
 )
 from lavender.problem import Problem
 from lavender.solvers.registry import Solver, State
@@ -117,8 +118,7 @@ class Loop:
                 elapsed = watch.seconds
                 self.time += elapsed
                 self.done += claim.iterations
-                for kind, count in claim.work.items():
-                    self.work[kind] = self.work.get(kind, 0) + count
+                self.work = summed((self.work, claim.work))
                 stopped = records and self.done == self.next_record and self._record()
                 if claim.status is not MAX_ITERATIONS:
                     break

@@ -38,7 +38,7 @@ from lavender.base.deadline import Deadline, Stopwatch, TooLate
 from lavender.base.errors import CapabilityError, InputError
 from lavender.judge.certificates import check_certificate
 from lavender.judge.residuals import at_floor, quick
-from lavender.judge.solution import Claim, Status, counted
+from lavender.judge.solution import Claim, Status, counted, summed
 from lavender.problem import OPERATORS, Problem
 from lavender.solvers.costs import SOFT, STEPS, Count, factorisations, newton_cost
 from lavender.solvers.newton_systems import general
@@ -247,9 +247,7 @@ class Newton(Solver):
         )
         if not quick(problem, impulse, w, e)[0] <= best:
             impulse[:] = before
-        work = dict(claim.work)
-        for kind, count in more.work.items():
-            work[kind] = work.get(kind, 0) + count
+        work = summed((claim.work, more.work))
         form = f"{claim.form}, then {more.form or 'impulse'}"
         total = claim.iterations + more.iterations
         return Claim(more.status, total, work, more.message, form=form, certificate=more.certificate)

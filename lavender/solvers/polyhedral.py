@@ -26,7 +26,7 @@ from lavender.base.deadline import Deadline
 from lavender.base.later import sparse as sp
 from lavender.judge.certificates import check_certificate
 from lavender.judge.residuals import at_floor, quick
-from lavender.judge.solution import Claim, Status
+from lavender.judge.solution import Claim, Status, summed
 from lavender.problem import Problem
 from lavender.problem.cones import project
 from lavender.solvers.registry import Solver
@@ -204,7 +204,7 @@ class ThroughRows(Solver):
         more = self._judged(
             form, path.run(path.prepare(form.rows), z, max_iter, tol, deadline.left(1e-3)), z, impulse, tol
         )
-        work = {k: claim.work.get(k, 0) + more.work.get(k, 0) for k in {**claim.work, **more.work}}
+        work = summed((claim.work, more.work))
         words = f"{claim.message or 'no exchange helped'}, then complementary pivots"
         return replace(more, work=work, message=f"{words}: {more.message}" if more.message else words)
 

@@ -18,7 +18,7 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray
 from lavender.judge.residuals import judged, reference
-from lavender.judge.solution import Claim, Status, Turn, counted
+from lavender.judge.solution import Claim, Status, Turn, counted, summed
 from lavender.problem import Problem
 from lavender.solvers.costs import RATES, SOFT, STEPS, SWEEPS, factorisations, sweep_cost
 from lavender.solvers.islands import islands
@@ -221,7 +221,7 @@ class SmallCall:
                 note = "A is singular on the free rows: shifted and refined"
             return Claim(status, done, ran[0][1], note, form="band" if symmetric else "LU")
         turns = _turns(problem, ran, start, after)
-        return Claim(status, done, summed(turns), told(turns) or nothing, turns=turns)
+        return Claim(status, done, summed(turn.work for turn in turns), told(turns) or nothing, turns=turns)
 
 
 Ran = list[tuple[str, dict[str, int]]]  # who, and what it did
@@ -261,19 +261,11 @@ def _turns(problem: Problem, ran: Ran, start: FloatArray | None, after: float) -
     return tuple(Turn(*of, *at[i : i + 2]) for i, of in enumerate(ran))
 
 
-def summed(turns: Sequence[Turn]) -> dict[str, int]:
-    """What all of them did."""
-    work: dict[str, int] = {}
-    for turn in turns:
-        for kind, count in turn.work.items():
-            work[kind] = work.get(kind, 0) + count
-    return work
-
-
 def told(turns: Sequence[Turn]) -> str:
     """What ran, in words: turns of one solver in a row are one."""
     return " -> ".join(
-        said(name, summed(list(of))) for name, of in groupby(turns, key=lambda turn: turn.solver)
+        said(name, summed(turn.work for turn in of))
+        for name, of in groupby(turns, key=lambda turn: turn.solver)
     )
 
 

@@ -10,7 +10,7 @@ from lavender.base.arrays import FloatArray
 from lavender.base.deadline import NEVER, Deadline
 from lavender.judge.certificates import check_certificate
 from lavender.judge.residuals import FLOOR_MOST, at_floor, judged, known, remember, remembered
-from lavender.judge.solution import Claim, Status, Turn
+from lavender.judge.solution import Claim, Status, Turn, summed
 from lavender.problem import Problem
 from lavender.solvers.small import NO_TIME, NOTHING, told
 
@@ -50,8 +50,7 @@ class SolveLog:
     def note(self, name: str, claim: Claim, before: float) -> None:
         """Record a turn that has ended; the residual was `before`."""
         self.iterations += claim.iterations
-        for kind, count in claim.work.items():
-            self.work[kind] = self.work.get(kind, 0) + count
+        self.work = summed((self.work, claim.work))
         self.turns.append(Turn(name, dict(claim.work), before, self.best))
         if claim.certificate is not None:
             if check_certificate(self.problem, claim.certificate, self.tol, self.deadline) is None:

@@ -50,5 +50,5 @@ def warm_start(
         return NOTHING
     if time_limit is not None and MOST_SWEEPS * 1e-9 * problem.data.work > time_limit:
         return NOTHING
-    how, sweeps, factorisations = from_guess(problem.data, impulse, tol)
-    return how, sweeps, factorisations
+    found: tuple[int, int, int] = from_guess(problem.data, impulse, tol)
+    return found
