@@ -34,7 +34,7 @@ def test_a_contradicted_claim_is_marked(lavender, path, plug_in):
 
 
 def test_check_ends_each_solver_at_its_time_limit(lavender):
-    code, out, _ = lavender("check", "granularF(n=12)", "--solvers", "pgs", "newton", "--time-limit", "1e-9")
+    code, out, _ = lavender("check", "granularF(n=3)", "--solvers", "pgs", "newton", "--time-limit", "1e-9")
     assert code == 0
     assert out.count("TIME_LIMIT") == 2
 

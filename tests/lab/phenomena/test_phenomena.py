@@ -18,6 +18,7 @@ from lavender.base.errors import LavenderError
 from lavender.lab.phenomena import PHENOMENA, WAYS, Record, Track, run, ways
 from lavender.lab.phenomena import table as tables
 from lavender.lab.phenomena.engines import PACKAGES_OF_NODE, follow, make, versions_of_node
+from lavender.lab.phenomena.engines.tree import collision_shape
 from lavender.lab.phenomena.parts import crossing, judged
 from lavender.lab.phenomena.running import Apart
 from lavender.sim.scene.steppers import STEPPERS
@@ -217,6 +218,17 @@ def test_what_an_engine_cannot_build_is_said(way):
     for scene, word in ((lv.Scene("four_bar"), "loop"), (soft, "rigid"), (rough, "one friction")):
         with pytest.raises(lv.CapabilityError, match=word):
             make(WAYS[way], scene)
+
+
+def test_a_static_box_is_refused_where_an_engines_file_makes_none():
+    scene = lv.Scene()
+    scene.add_box(static=True, name="shelf")
+    scene.add_box(position=(0.0, 0.0, 2.0))
+    held, moving = scene.bodies
+    assert collision_shape(held, "engine") is held.shape
+    assert collision_shape(moving, "engine", static=False) is moving.shape
+    with pytest.raises(lv.CapabilityError, match="shelf has no shape that engine could be given"):
+        collision_shape(held, "engine", static=False)
 
 
 @pytest.mark.skipif(importlib.util.find_spec("mujoco") is None, reason="needs mujoco")

@@ -8,7 +8,7 @@ from lavender.base.arrays import FloatArray
 from lavender.base.errors import CapabilityError
 from lavender.external.running import quiet
 from lavender.lab.phenomena.engines import Stepping
-from lavender.lab.phenomena.engines.tree import parents, relative, shape_of, xyzw
+from lavender.lab.phenomena.engines.tree import collision_shape, parents, relative, xyzw
 from lavender.sim.scene import Body, Joint, Plane, Scene, Sphere
 from lavender.sim.scene.parts import rotation
 
@@ -57,7 +57,7 @@ class Engine(Stepping):
             self._tie(joint)
 
     def _shape(self, body: Body) -> int:
-        shape = shape_of(body, "pybullet")
+        shape = collision_shape(body, "pybullet")
         if isinstance(shape, Plane):
             made = pybullet.createCollisionShape(
                 pybullet.GEOM_PLANE, planeNormal=list(shape.normal), **self.at

@@ -34,7 +34,7 @@ from pydrake.systems.framework import DiagramBuilder
 
 from lavender.base.arrays import FloatArray
 from lavender.lab.phenomena.engines import Stepping
-from lavender.lab.phenomena.engines.tree import parents, relative, shape_of
+from lavender.lab.phenomena.engines.tree import collision_shape, parents, relative
 from lavender.sim.scene import Body, Plane, Scene, Sphere
 
 MODULUS = 1e8  # Pa, of compliant bodies
@@ -88,7 +88,7 @@ class Engine(Stepping):
 
     def _add(self, i: int) -> Any:
         body = self.scene.bodies[i]
-        shape = shape_of(body, "drake")
+        shape = collision_shape(body, "drake", static=False)
         if isinstance(shape, Plane):
             normal = _any(shape.normal)
             pose = HalfSpace.MakePose(normal, _any(shape.offset * normal))

@@ -7,7 +7,7 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray
 from lavender.lab.phenomena.engines import Stepping
-from lavender.lab.phenomena.engines.tree import parents, shape_of, xyzw
+from lavender.lab.phenomena.engines.tree import collision_shape, parents, xyzw
 from lavender.sim.scene import Plane, Scene, Sphere
 from lavender.sim.scene.arithmetic import frame_quaternion
 from lavender.sim.scene.parts import rotation
@@ -61,7 +61,7 @@ class Engine(Stepping):
 
     def _add(self, made: lavendersim.Scene, i: int, jointed: bool) -> lavendersim.BodyRef:
         body = self.scene.bodies[i]
-        shape = shape_of(body, "lavendersim")
+        shape = collision_shape(body, "lavendersim")
         if isinstance(shape, Plane):
             normal = self.frame @ np.asarray(shape.normal)
             turn = _frame(normal).T

@@ -11,7 +11,7 @@ from lavender.base.arrays import FloatArray
 from lavender.io.mujoco import from_mujoco, impulse
 from lavender.judge.residuals import residual
 from lavender.lab.phenomena.engines import Stepping
-from lavender.lab.phenomena.engines.tree import parents, relative, shape_of
+from lavender.lab.phenomena.engines.tree import collision_shape, parents, relative
 from lavender.problem import Problem
 from lavender.sim.scene import Joint, Plane, Scene, Sphere
 from lavender.sim.scene.parts import rotation
@@ -88,7 +88,7 @@ class Engine(Stepping):
 
     def _body(self, i: int) -> str:
         body, joint = self.scene.bodies[i], self.up.get(i)
-        shape = shape_of(body, "mujoco")
+        shape = collision_shape(body, "mujoco")
         if isinstance(shape, Plane):
             at = f'pos="{_text(shape.offset * np.asarray(shape.normal))}" zaxis="{_text(shape.normal)}"'
             return f'<body name="b{i}"><geom type="plane" size="0 0 1" {at}/></body>'

@@ -8,7 +8,7 @@ import warp as wp
 
 from lavender.base.arrays import FloatArray
 from lavender.lab.phenomena.engines import Stepping
-from lavender.lab.phenomena.engines.tree import parents, relative, shape_of, xyzw
+from lavender.lab.phenomena.engines.tree import collision_shape, parents, relative, xyzw
 from lavender.sim.scene import Plane, Scene, Sphere
 
 SUBSTEPS = 4
@@ -42,7 +42,7 @@ class Engine(Stepping):
 
     def _add(self, builder: newton.ModelBuilder, i: int, material: newton.ModelBuilder.ShapeConfig) -> int:
         body = self.scene.bodies[i]
-        shape = shape_of(body, "newton")
+        shape = collision_shape(body, "newton", static=False)
         if isinstance(shape, Plane):
             builder.add_shape_plane(
                 (*map(float, shape.normal), -float(shape.offset)), width=0.0, length=0.0, cfg=material

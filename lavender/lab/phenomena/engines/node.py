@@ -11,7 +11,7 @@ from lavender.base.apart.lines import Lines
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import CapabilityError, LavenderError
 from lavender.lab.phenomena.engines import PACKAGES_OF_NODE, Stepping, missing_in_node, node_folder
-from lavender.lab.phenomena.engines.tree import parents, shape_of
+from lavender.lab.phenomena.engines.tree import collision_shape, parents
 from lavender.sim.scene import Body, Plane, Scene, Sphere
 
 SCRIPT = Path(__file__).with_name("served.mjs")
@@ -76,7 +76,7 @@ class Engine(Stepping):
 
 
 def _body(body: Body, engine: str) -> dict[str, Any]:
-    shape = shape_of(body, engine)
+    shape = collision_shape(body, engine, static=False)
     if isinstance(shape, Plane):
         told: dict[str, Any] = {"kind": "plane", "normal": list(shape.normal), "offset": shape.offset}
     elif isinstance(shape, Sphere):

@@ -30,11 +30,12 @@ def parents(scene: Scene, engine: str) -> dict[int, Joint]:
     return found
 
 
-def shape_of(body: Body, engine: str) -> Plane | Sphere | Box:
-    """What a body is in contacts; CapabilityError where that is nothing."""
-    if body.shape is None:
+def collision_shape(body: Body, engine: str, static: bool = True) -> Plane | Sphere | Box:
+    """What a body is in contacts; CapabilityError of none, and of a static one that is no plane unless `static`."""
+    shape = body.shape
+    if shape is None or (body.is_static and not static and not isinstance(shape, Plane)):
         raise CapabilityError(f"{body.name} has no shape that {engine} could be given")
-    return body.shape
+    return shape
 
 
 def relative(parent: Body | None, child: Body) -> tuple[FloatArray, FloatArray]:
