@@ -14,13 +14,13 @@ judge's floor is that of float32. Rows of zeros, with which MJX and Warp pad, ar
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from lavender.base.arrays import FloatArray, as_array, number, one_of, precision_of, whole_number
 from lavender.base.errors import CapabilityError, InputError
+from lavender.base.threads import together
 from lavender.io import mujoco as single
 from lavender.problem.batch import ERRORS, Batch
 from lavender.problem.cones import Cones, kinds_of
@@ -193,11 +193,13 @@ def from_mujoco_many(model: Any, states: Any, *, threads: int = 1, errors: str =
     todo = iter(range(n))
     threads = min(whole_number("threads", threads, 1, None), max(n, 1))
 
-    def work(_: int) -> tuple[_Stretches, _Stretches]:
+    def work(stop: bytearray) -> tuple[_Stretches, _Stretches]:
         data = mj.MjData(model)
         rows = _Stretches(n // threads, efc_J=(float, (nv,)), **OF_ROWS)
         contacts = _Stretches(n // threads, **OF_CONTACTS)
         for i in todo:
+            if stop[0]:
+                break
             if not all_finite(given[i]):
                 continue
             mj.mj_setState(model, data, given[i], kinds[size])
@@ -220,11 +222,7 @@ def from_mujoco_many(model: Any, states: Any, *, threads: int = 1, errors: str =
         mj.mju_sparse2dense(jac, data.efc_J, data.efc_J_rownnz, data.efc_J_rowadr, data.efc_J_colind)
         return jac
 
-    if threads == 1:
-        parts = [work(0)]
-    else:
-        with ThreadPoolExecutor(threads) as pool:
-            parts = list(pool.map(work, range(threads)))
+    parts = together(work, threads)
     rows, ptr = _in_order([of_rows for of_rows, _ in parts], n)
     contacts, contact_ptr = _in_order([of_contacts for _, of_contacts in parts], n)
     made = _gathered(model, rows, ptr, contacts, contact_ptr, mass, free, smooth)

@@ -7,7 +7,6 @@ the way of a single one. `lavender/solving/many.py` solves by the same loop.
 
 from __future__ import annotations
 
-from _thread import allocate_lock, start_new_thread
 from collections.abc import Callable, Iterable, Sequence
 from types import SimpleNamespace
 from typing import Any
@@ -16,6 +15,7 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray, as_array, number, one_of, places, whole_number
 from lavender.base.errors import InputError, LavenderError
+from lavender.base.threads import together
 from lavender.judge.residuals import AT_REST, ENOUGH, Residual, residual, verdict_of
 from lavender.problem import PRECISIONS, Problem, check_problem
 from lavender.problem.batch import ERRORS, Batch
@@ -127,49 +127,23 @@ class Many:
         self, turn: Callable[[Hand], int], alone: Callable[[int], None], threads: int, errors: str
     ) -> None:
         """All worlds by `turn`; those that it leaves by `alone`; what is bad by its number in `faults`."""
-        stop = bytearray(1)  # not 0: nothing more is begun
 
-        def single(i: int) -> None:
+        def single(i: int, stop: bytearray) -> None:
             try:
                 alone(i)
             except LavenderError as error:
                 self.faults[i] = self._fault(i, error)
                 stop[0] |= errors == "raise"
 
-        def work() -> None:
+        def work(stop: bytearray) -> None:
             hand = Hand(self._worlds, stop)
             while (i := turn(hand)) != DONE_ALL:
                 if i >= 0:
-                    single(i)
+                    single(i, stop)
 
-        failed: list[BaseException] = []
-
-        def beside(held: Any) -> None:
-            try:
-                work()
-            except BaseException as error:
-                failed.append(error)
-            finally:
-                held.release()
-
-        # A `Thread` is waited for until it runs, a fifth of what many problems take on two: bare ones begin meanwhile.
-        others: list[Any] = []
-        try:
-            for _ in range(min(threads, len(self)) - 1):
-                held = allocate_lock()
-                held.acquire()
-                start_new_thread(beside, (held,))
-                others.append(held)
-            work()
-            wait_for(others)
-        finally:
-            stop[0] = 1  # of Ctrl-C the other threads hear nothing
-            wait_for(others)
-        if failed:
-            raise failed[0]
-        stop[0] = 0
+        together(work, min(threads, len(self)))
         for i in np.flatnonzero(self._worlds.code[:-1] == CODE["bad"]).tolist():
-            single(i)  # which finds the words
+            single(i, bytearray(1))  # which finds the words
         if self.faults and errors == "raise":
             raise self.faults[min(self.faults)]
         self.faults.update(self._unusable)
@@ -302,13 +276,6 @@ def residual_many(
 
     made._run(lambda hand: int(hand.judge(single)), alone, threads, errors)
     return made
-
-
-def wait_for(held: Iterable[Any]) -> None:
-    """Until each of these locks was released."""
-    for lock in held:
-        with lock:
-            pass
 
 
 def given_problems(problems: Any, errors: str) -> Any:

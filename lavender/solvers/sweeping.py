@@ -7,11 +7,11 @@ end, so their places depend only on the numbers.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from lavender.base.arrays import FloatArray, whole_number
 from lavender.base.errors import InputError
+from lavender.base.threads import helpers
 from lavender.judge.residuals import reference
 from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
@@ -20,9 +20,6 @@ from lavender.solvers.registry import Solver
 from lavender.solvers.setup_times import forming, ordered
 from lavender_ext.judge.watch import AT_FLOOR, CONVERGED, DIVERGED, RUNNING, STALLED, Watch
 from lavender_ext.sweep import serial, threaded
-
-if TYPE_CHECKING:
-    from concurrent.futures import ThreadPoolExecutor
 
 STATUS = {
     RUNNING: Status.MAX_ITERATIONS,
@@ -34,7 +31,6 @@ STATUS = {
 # Multiply-adds per colour from which a second thread gains (measured: where both take the same time).
 GRAIN = 20_000
 LEAST = 400_000  # multiply-adds of a sweep: 4,000 contacts, below which starting threads costs what they save
-MOST_THREADS = 64
 PATIENCE = 64  # sweeps that may always pass without a better check
 
 
@@ -96,18 +92,10 @@ def run_threads(state: SweepState, impulse: FloatArray, max_iter: int, tol: floa
     alone = state.alone or {}
     team = threaded.Team(state.sweeps, state.watch, impulse, state.order.color_ptr, threads, **alone)
     for thread in range(1, threads):
-        _helpers().submit(team.help, thread)
+        helpers().submit(team.help, thread)  # one that begins late finds nothing left to do
     result = claim(*team.lead(max_iter, tol))
     state.alone = {"alone": team.alone}
     return result
-
-
-@cache
-def _helpers() -> ThreadPoolExecutor:
-    from concurrent.futures import ThreadPoolExecutor  # 5 ms to import, needed only here
-
-    # Threads for all runs; one that is started late finds nothing left to do.
-    return ThreadPoolExecutor(MOST_THREADS - 1, thread_name_prefix="lavender")
 
 
 def reads_whitened(problem: Problem) -> bool:

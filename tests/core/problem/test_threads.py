@@ -14,6 +14,7 @@ from worked import python
 
 import lavender as lv
 import lavender_ext
+from lavender.base import threads
 from lavender.base.errors import InUse
 
 KERNELS = Path(lavender_ext.__file__).parent
@@ -139,3 +140,38 @@ def test_a_process_forked_while_a_thread_works_solves_the_same_problem():
         thread.join()
         assert status == 0, status"""
     python("-W", "ignore::DeprecationWarning", "-c", script)
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="forks are of POSIX")
+def test_a_fork_has_threads_of_its_own():
+    """Two calls of `work` that wait for each other: a child's is not left to a thread that it has not."""
+    script = """if True:
+        import os, threading
+        from lavender.base.threads import together
+
+        def both():
+            each = threading.Barrier(2, timeout=20.0)
+            return len(together(lambda stop: each.wait(), 2))
+
+        assert both() == 2
+        child = os.fork()
+        if not child:
+            os._exit(both() != 2)
+        status = os.waitpid(child, 0)[1]
+        assert status == 0, status"""
+    python("-W", "ignore::DeprecationWarning", "-c", script)
+
+
+def test_threads_that_ask_for_threads_do_not_wait_for_each_other(monkeypatch):
+    """All that are kept are busy with calls that want more: what nobody begins is nobody's."""
+    monkeypatch.setattr(threads, "MOST", 1)
+    threads.helpers.cache_clear()
+    two, inner = threading.Barrier(2, timeout=10.0), []
+
+    def work(stop):
+        two.wait()
+        inner.append(threads.together(lambda stop: None, 3))
+
+    threads.together(work, 2)
+    threads.helpers.cache_clear()
+    assert len(inner) == 2 and min(map(len, inner)) == 1
