@@ -45,6 +45,7 @@ from lavender.problem.generalized import Compressed, Generalized, compressed, lo
 from lavender_ext.core.assemble import dense_to_csr, stacked
 from lavender_ext.core.checks import largest
 from lavender_ext.judge.measure import all_finite, program_residuals
+from lavender_ext.newton.program import balanced
 
 IntpArray = npt.NDArray[np.intp]
 
@@ -492,18 +493,13 @@ def _units(jac: Compressed, diagonal: FloatArray) -> FloatArray:
     c = sqrt(unit) and r are found as Ruiz (2001, A scaling algorithm to equilibrate both rows and columns norms in
     matrices) does, with c kept where P_ii > 0.
     """
-    ptr, idx, val = jac
-    c = np.sqrt(np.where(diagonal > 0.0, diagonal, diagonal.max(initial=0.0) or 1.0))
-    row = np.repeat(np.arange(len(ptr) - 1), np.diff(ptr))
-    r, held, size = np.ones(len(ptr) - 1), diagonal > 0.0, np.abs(val)
-    for _ in range(BALANCED):
-        entry = size / (r[row] * c[idx])
-        for scale, at in ((r, row), (c, idx)):
-            most = np.zeros(len(scale))
-            np.maximum.at(most, at, entry)
-            scale *= np.sqrt(np.where(most > 0.0, most, 1.0))
-        c[held] = np.sqrt(diagonal[held])
-    return c * c
+    held, nothing = (
+        diagonal > 0.0,
+        (np.zeros(len(diagonal) + 1, np.int32), np.zeros(0, np.int32), np.zeros(0)),
+    )
+    start = 1.0 / np.sqrt(np.where(held, diagonal, diagonal.max(initial=0.0) or 1.0))
+    column, _ = balanced(nothing, jac, BALANCED, start, ~held)
+    return 1.0 / column**2
 
 
 def _largest_of_rows(jac: Compressed, root: FloatArray) -> FloatArray:

@@ -144,6 +144,8 @@ def solve_qp(
             qp = problem.qp
             inner = max(min(tol, CENTRED) / far, TIGHTEST)
         tightest, limit = inner, None if time_limit is None else left
+        if idle == 0:  # as long as steps gain, none is asked for what rounding hides
+            inner = max(inner, residual(problem, solution.impulse).floor)
         solution, x = _over_velocities(problem, solver, inner, limit, solution.impulse, options)
         answer = qp.solution(solution, tol, x)
         idle = 0 if answer.error < best.error else idle + 1

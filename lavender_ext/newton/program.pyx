@@ -32,11 +32,15 @@ cdef csr_t rows_of(matrix):
     return a
 
 
-def balanced(p, j, int passes):
-    """Factors of columns (n,) and rows (m,) with which the largest entry of each in (1) comes near 1 (Ruiz 2001)."""
+def balanced(p, j, int passes, start=None, moves=None):
+    """Factors of columns (n,) and rows (m,) with which the largest entry of each in (1) comes near 1 (Ruiz 2001).
+
+    start (n,): of columns, 1 by default; moves (n,) bool: those that are looked for, all by default.
+    """
     cdef csr_t a = rows_of(p), b = rows_of(j)
     cdef int32_t i, k, q, n = <int32_t>(len(p[0]) - 1), m = <int32_t>(len(j[0]) - 1)
-    columns, rows = np.ones(n), np.ones(m)
+    columns, rows = np.ones(n) if start is None else start.copy(), np.ones(m)
+    cdef const unsigned char[::1] move = np.ones(n, np.uint8) if moves is None else moves.view(np.uint8)
     cdef double[::1] column = columns, row = rows, high = np.empty(n), beside = np.empty(m)
     cdef double x
     for _ in range(passes):
@@ -53,7 +57,7 @@ def balanced(p, j, int passes):
                 high[k] = widest(high[k], b.data[q] * row[i])
             beside[i] = x
         for i in range(n):
-            if column[i] * high[i] > 0.0:
+            if move[i] and column[i] * high[i] > 0.0:
                 column[i] /= sqrt(column[i] * high[i])
         for i in range(m):
             if row[i] * beside[i] > 0.0:

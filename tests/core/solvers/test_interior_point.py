@@ -236,6 +236,19 @@ def test_balanced_rows_and_columns_have_entries_near_1(seed):
 
 
 @pytest.mark.parametrize("seed", range(8))
+def test_columns_that_are_held_keep_their_factor_and_the_others_come_near_1_beside_them(seed):
+    _, J, p, j, _, _, rng = laid_out(seed)
+    n = J.shape[1]
+    start, moves = 10.0 ** rng.uniform(-2, 2, n), rng.random(n) < 0.5
+    nothing = np.zeros_like(p[0]), p[1][:0], p[2][:0]
+    column, row = balanced(nothing, j, 40, start, moves)
+    np.testing.assert_array_equal(column[~moves], start[~moves])
+    J = np.abs(row[:, None] * J * column)
+    for largest in (J.max(axis=0)[moves], J.max(axis=1)):
+        np.testing.assert_allclose(largest[largest > 0.0], 1.0, rtol=1e-6)  # of a factor of 1e9, as above
+
+
+@pytest.mark.parametrize("seed", range(8))
 def test_the_iterate_measures_and_steps_as_its_formulas_say(seed):
     """And what is left of a solution with rho and delta in it."""
     _, J, p, j, q, target, rng = laid_out(seed)
