@@ -39,12 +39,12 @@ def long_way(problem, solver, **options):
 
 
 def facts(solution):
-    """Everything a solution says but its times, arrays by their bits, numbers by their words: NaN is NaN."""
+    """Everything a solution says but its times, arrays by their bits, numbers and turns by their words: NaN is NaN."""
     r = solution.residual
     told = {f.name: getattr(solution, f.name) for f in fields(solution) if f.name not in (*TIMES, "residual")}
     told |= {f"residual {f.name}": getattr(r, f.name) for f in fields(r) if f.name != "_problem"}
     told["line"] = re.sub(r", [\d.e+-]+ (s|ms|us)(;|$)", "", str(solution))
-    words = {k: repr(v) if isinstance(v, float) else v for k, v in told.items()}
+    words = {k: repr(v) if isinstance(v, float | tuple) else v for k, v in told.items()}
     return {k: v.tobytes() if isinstance(v, np.ndarray) else v for k, v in words.items()}
 
 

@@ -132,14 +132,13 @@ class Problem:
     def _of_matrix(self):
         diag, big = np.diag(self.A).copy(), self.size.max(axis=1, initial=ZERO)
         d = np.where(diag > L(1e-10) * big, diag, big)
-        self.d = self._filled(np.where(big < LEAST, ZERO, d))
+        self.d = self._filled(d, big >= LEAST)
         self.nu = self.d.copy()
         self.d_edge = bool(np.any(np.abs(diag - L(1e-10) * big) <= L(1e-14) * big)) or self._at_least(big)
 
-    def _filled(self, d):
-        # a row below LEAST counts as empty
-        positive = d[d >= LEAST]
-        return np.where(d >= LEAST, d, positive.mean() if len(positive) else L(1.0))
+    def _filled(self, d, held):
+        # where a row counts as empty, the mean of those that are held
+        return np.where(held, d, d[held].mean() if held.any() else L(1.0))
 
     def _at_least(self, d):
         return bool(np.any(np.abs(d - LEAST) <= L(1e-9) * LEAST))
@@ -200,7 +199,7 @@ class Problem:
         self.A *= np.outer(self.stretch, self.stretch)
         self.size *= np.outer(self.stretch, self.stretch)
         d = np.diag(self.A).copy()
-        self.d = self._filled(d)
+        self.d = self._filled(d, d >= LEAST)
         self.d_edge = bool(np.any((d > 0) & (d < L(1e-12) * np.diag(self.size)))) or self._at_least(d)
         self.nu = self.d.copy()
         for j in range(joints):
@@ -225,7 +224,7 @@ class Problem:
         self.A = y @ y.T + np.diag(soft)
         self.size = np.abs(y) @ np.abs(y.T) + np.diag(soft)
         d = np.diag(self.A).copy()
-        self.d = self._filled(d)
+        self.d = self._filled(d, d >= LEAST)
         self.nu = self.d.copy()
         # A solve by the factor of M is as exact as M in the best units of its velocities allows.
         unit = 1 / np.sqrt(np.diag(mass))

@@ -146,7 +146,7 @@ def least_violation(log: SolveLog) -> None:
         cones = replace(cones, mu=0.0 * cones.mu, rolling=0.0 * cones.rolling)
     squares = of.jac.multiply(of.jac).tocsr()
     mass = squares.T @ (1.0 / np.maximum(squares.sum(axis=1), np.finfo(float).tiny))
-    mass[mass == 0.0] = 1.0  # of what no row moves
+    mass[mass < LEAST] = 1.0  # of what no row moves, or dust alone
     d = squares @ (1.0 / mass)
     y = lam = np.zeros(of.m)
     yields = problem.compliance > 0.0

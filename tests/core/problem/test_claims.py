@@ -237,6 +237,7 @@ def test_what_is_no_claim_is_a_numerical_error_that_names_the_solver(plug_in, cl
     assert lv.solve_many([problem], name)[0].status is lv.Status.NUMERICAL_ERROR
 
 
+@pytest.mark.filterwarnings("ignore:Setting the (shape|dtype):DeprecationWarning")
 @pytest.mark.parametrize("resumable", [False, True])
 @pytest.mark.parametrize("way", ["kept", "nan", "shape", "dtype", "best"])
 def test_what_a_plug_in_does_to_its_impulse_reaches_no_earlier_solution(register, way, resumable):

@@ -46,7 +46,8 @@ def assert_same(many, i, single):
     )  # fmt: skip
     assert many.status[i] is own.status is single.status
     assert many.iterations[i] == own.iterations == single.iterations
-    assert (own.message, own.work, own.turns) == (single.message, single.work, single.turns)
+    assert (own.message, own.work) == (single.message, single.work)
+    assert repr(own.turns) == repr(single.turns)  # what nobody judged in between is NaN
 
 
 @pytest.mark.parametrize("again", [copy.copy, copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))])

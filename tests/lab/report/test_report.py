@@ -353,7 +353,7 @@ def test_the_picture_of_all_cases_is_the_median_of_what_was_reached_by_each_time
     # Shares of a batch, and the least time of repetitions of which another left less, are no points of it.
     more = [record("a", "pgs", 1e-9, 1e-12, turns="one", way=way, mode=mode) for way, mode in
             (("batch", "tol"), ("call", "time"))]  # fmt: skip
-    assert overall_figure(records_of(*made, *more)) == found
+    assert repr(overall_figure(records_of(*made, *more))) == repr(found)  # whose floor is NaN
 
 
 def test_a_report_of_nothing_says_so(tmp_path):

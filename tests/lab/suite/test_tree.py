@@ -343,6 +343,20 @@ def test_squeezed_bodies_are_proved_to_have_no_solution_before_all_go_in_turn():
     assert [turn.solver for turn in found.turns][-2:] == ["newton", "linear program"]
 
 
+def test_a_velocity_that_rows_move_by_dust_alone_is_in_no_ones_way():
+    """Two contacts push apart what cannot part; a third has a tangent of one velocity, and of another by 1e-47."""
+    rng = np.random.default_rng(0)
+    jac = np.hstack([rng.standard_normal((9, 6)), np.zeros((9, 1))])
+    jac[3], jac[8] = -jac[0], [0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1e-47]
+    target = rng.standard_normal(9)
+    target[::3] = 3.0 * np.abs(target[::3])
+    problem = lv.Problem.from_jacobian(
+        jac, np.eye(7), np.zeros(7), target=target, cones=lv.Cones.contacts(0.3, count=3)
+    )
+    found = lv.solve(problem)
+    assert found.status is lv.Status.INFEASIBLE and not found.contradicted
+
+
 def test_no_certificate_is_begun_that_would_end_late(monkeypatch):
     problem = suite.case("infeasible").problem
     log = SolveLog(problem, 1e-6, 10**6, deadline=Deadline(1e-3))
