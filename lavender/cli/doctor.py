@@ -8,7 +8,6 @@ from dataclasses import asdict
 import click
 
 from lavender.cli.options import Reading, say
-from lavender.lab.bench import doctor as bench_doctor
 
 
 @click.command()
@@ -26,7 +25,9 @@ def doctor(files: tuple[str, ...], as_json: bool) -> None:
     if files:
         _suspect(files, as_json)
         return
-    found = bench_doctor.examine()
+    from lavender.lab.bench.doctor import examine
+
+    found = examine()
     if as_json:
         click.echo(json.dumps(found, indent=2, ensure_ascii=True))
     else:

@@ -5,15 +5,15 @@ from __future__ import annotations
 import json
 from dataclasses import asdict
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from lavender.cli.options import PATH, parameters_of, refuse_unused
 from lavender.io.stored import writable, write_text
-from lavender.lab.bench.machine import cpu_name, versions
-from lavender.lab.phenomena import WAYS, Record, chosen, run
-from lavender.lab.phenomena import table as tables
-from lavender.lab.phenomena.engines import versions_of_node
+
+if TYPE_CHECKING:
+    from lavender.lab.phenomena import Record
 
 PACKAGES = ("mujoco", "pybullet", "drake", "lavendersim", "newton", "numpy")
 
@@ -64,6 +64,9 @@ def phenomena(
     A cell shows the worst distance from the exact motion and the number of cases within all bounds. A note says which
     engine is missing, crashed, or cannot build a scene.
     """
+    from lavender.lab.phenomena import WAYS, chosen, run
+    from lavender.lab.phenomena import table as tables
+
     if listed:
         refuse_unused(context, ["steppers", "engines", "parameters", "limit", "out"], "with --list")
         click.echo(tables.described(chosen(names)))
@@ -99,6 +102,9 @@ def phenomena(
 
 
 def _told(found: list[Record]) -> dict[str, object]:
+    from lavender.lab.bench.machine import cpu_name, versions
+    from lavender.lab.phenomena.engines import versions_of_node
+
     return {
         "cpu": cpu_name(),
         "versions": versions(PACKAGES) | versions_of_node(),

@@ -31,7 +31,6 @@ from lavender.cli.options import (
     was_given,
 )
 from lavender.io.stored import writable, write_text
-from lavender.lab.bench.record import file_name
 
 
 @click.command(cls=ManyValues)
@@ -182,6 +181,7 @@ def _recorded(word: str, out: Path, taken: set[Path], fresh: bool, how: Mapping[
     if path.suffix.lower() != ".xml":
         return word
     from lavender.io.recording import record_file
+    from lavender.lab.bench.record import file_name
 
     model, n = str(path.resolve()), 1
     first = out / "recorded" / file_name(f"{path.resolve().parent.name}-{path.stem}")

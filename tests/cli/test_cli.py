@@ -178,7 +178,8 @@ def test_help_is_quick_and_names_every_command():
         assert name in done.stdout
     # What takes time to load is loaded by the command that needs it.
     assert (
-        set(done.stderr.split()) & {"matplotlib", "h5py", "qpsolvers", "pandas", "rich.table", "jinja2"}
+        set(done.stderr.split())
+        & {"matplotlib", "h5py", "qpsolvers", "pandas", "rich.table", "jinja2", "lavender.lab"}
         == set()
     )
 
@@ -341,7 +342,7 @@ def _must_not_begin(*_, **__):
         ("run stack --film {}/x.film", "lavender.sim.engine.Simulation.step"),
         ("run stack --film {}/x.gif", "lavender.sim.engine.Simulation.step"),
         ("solve toy_stack --output {}/x.npz", "lavender.lab.bench.resolve"),
-        ("phenomena lift --out {}/x.json", "lavender.cli.phenomena.run"),
+        ("phenomena lift --out {}/x.json", "lavender.lab.phenomena.run"),
         ("web build {}/x.wasm", "lavender.sim.web.compile.build"),
         ("export c {}/sub", "lavender.out.library.source"),
         ("export npm {}/sub", "lavender.out.library.source"),
