@@ -63,6 +63,6 @@ def audit(context: click.Context, /, model: Path, out: Path, accept: float | Non
     with progress() as watch:
         found = run(model, watch=watch, **asked)
     found.write(out)
-    show_sheet(found.sheet, out, found.stopped)
+    show_sheet(found.sheet, out)
     if accept is not None and found.largest > accept:
         raise click.exceptions.Exit(EXIT_UNMET)

@@ -13,9 +13,9 @@ import click
 
 from lavender.base.errors import InputError
 from lavender.cli.options import (
-    EXIT_INTERRUPTED,
     bytes_of,
     console,
+    end_stopped,
     going_on,
     one_thread,
     refuse_unused,
@@ -157,15 +157,14 @@ def run_campaign(context: click.Context, files: Sequence[str], path: Path) -> Me
         return Measured(made, False)
 
 
-def show_sheet(sheet: Sheet, folder: Path, stopped: bool) -> None:
+def show_sheet(sheet: Sheet, folder: Path) -> None:
     """Write a page and print its short form; an exit where Ctrl-C came before the end."""
     page = sheet.write(folder)
     with going_on():
         sheet.show(console())
         say(f"\npage: {page}")
-    if stopped:
-        say("Stopped: of what was done until then.", style="yellow")
-        raise click.exceptions.Exit(EXIT_INTERRUPTED)
+    if sheet.stopped:
+        end_stopped()
 
 
 @contextlib.contextmanager

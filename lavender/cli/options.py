@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import click
 
@@ -310,6 +310,12 @@ def say(text: str, err: bool = False, style: str = "") -> None:
         console(err).print(plain(text), style=style, highlight=False, soft_wrap=True)
     else:
         click.echo(printable(text, lines=True), err=err)
+
+
+def end_stopped() -> NoReturn:
+    """The end of a command that Ctrl-C ended early, once what was done is written."""
+    say("Stopped: of what was done until then.", style="yellow")
+    raise click.exceptions.Exit(EXIT_INTERRUPTED)
 
 
 class Reading:

@@ -11,8 +11,8 @@ from typing import Any
 import click
 
 from lavender.base.errors import InputError
-from lavender.cli.options import PATH, going_on, parameters_of, refuse_unused, say
-from lavender.io.stored import check_figure, writable
+from lavender.cli.options import PATH, end_stopped, going_on, parameters_of, refuse_unused, say
+from lavender.io.stored import check_figure, destination, writable
 
 
 @click.command()
@@ -73,6 +73,8 @@ def run(
 
     SCENE is stack, pyramid, card_house, pile, chain, bridge, heavy_on_light, table, ramp, spinner,
     newtons_cradle or four_bar.
+
+    Exit code 130: stopped by Ctrl-C; what was asked for holds the steps until then.
     """
     from lavender.sim.engine import Simulation
     from lavender.sim.engine import run as stepped
@@ -82,19 +84,23 @@ def run(
 
     if record is None:
         refuse_unused(context, ["replace"], "without --record")
-    for path in (trace, plot, film):
-        if path is not None:
-            writable(path)
     if plot is not None:
-        check_figure(plot)
+        plot = check_figure(plot)
+    files = {
+        name: path for name, path in (("trace", trace), ("figure", plot), ("film", film)) if path is not None
+    }
+    if len({destination(path) for path in files.values()}) < len(files):
+        raise InputError(f"{', '.join(map(str, files.values()))}: a file can hold one of these; name several")
+    for path in files.values():
+        writable(path)
     drawn = film is not None and film.suffix.lower() in PICTURES
     if film is not None and drawn:
         picture_suffix(film)
-    live, files = sys.stdout.isatty(), any(path is not None for path in (trace, plot, film, record))
+    live, writes = sys.stdout.isatty(), bool(files) or record is not None
 
     def show(text: str) -> None:
         # on a terminal each line takes the place of the one before
-        with going_on() if files else contextlib.nullcontext():
+        with going_on() if writes else contextlib.nullcontext():
             click.echo(f"\r{text}\x1b[K" if live else text, nl=not live)
 
     simulation = Simulation(Scene(scene, **_parameters(parameters, of_the_scene)), report_residual=residual)
@@ -123,19 +129,21 @@ def run(
                 save_picture(taken, film)
             else:
                 taken.save(film)
-        if viewer is not None:
+        if viewer is not None and not found.stopped:
             viewer.wait()
     if live:
         click.echo()
-    for name, path in (("trace", trace), ("figure", plot), ("film", film)):
-        if path is not None:
-            say(f"{name}: {path}")
+    for name, path in files.items():
+        shown_by = f": lavender view {path}" if name == "film" and not drawn else ""
+        say(f"{name}: {path}{shown_by}")
     if record is not None:
         say(f"{found.recorded} problems in {record}: lavender report {record}")
     best = 1e3 * found.cost.min()
     click.echo(
         f"{found.scene}: {len(found)} steps, {found.time[-1]:.3f} s, {found.method}, {best:.3g} ms a step at best"
     )
+    if found.stopped:
+        end_stopped()
 
 
 def _parameters(words: tuple[str, ...], options: dict[str, Any]) -> dict[str, Any]:

@@ -34,4 +34,4 @@ def tune(model: Path, out: Path, **asked: Any) -> None:
     one_thread()
     with progress() as watch:
         found = run(model, watch=watch, **asked)
-    show_sheet(found.sheet, out, found.stopped)
+    show_sheet(found.sheet, out)

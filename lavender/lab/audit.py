@@ -242,6 +242,7 @@ class Audit:
                 Section("The worst worlds", [self.table_of_worst], short=WORST, note=OF_FILES),
             ],
             self.told,
+            self.stopped,
         )  # fmt: skip
 
 

@@ -359,6 +359,7 @@ class Tuning:
             ],
             {"model": self.runs.model, "lines": self.lines, "stopped": self.stopped,
              "measured": [_told(m) for m in self.measured], "held": [_told(m) for m in self.held]},
+            self.stopped,
         )  # fmt: skip
 
 

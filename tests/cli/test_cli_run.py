@@ -10,7 +10,7 @@ from click.testing import CliRunner
 from lavender.base.errors import LavenderError
 from lavender.cli import cli
 from lavender.io import load
-from lavender.sim.engine import Film
+from lavender.sim.engine import Film, Simulation
 from lavender.sim.web import pages
 
 
@@ -38,10 +38,42 @@ def test_lavender_run_shows_a_line_and_writes_what_was_asked_for(lavender, tmp_p
 def test_lavender_run_writes_films_and_pictures(lavender, tmp_path):
     for name in ("a.film", "a.gif"):
         code, out, _ = lavender("run", "spinner", "--steps", "5", "--film", tmp_path / name)
-        assert not code and name in out
+        assert not code and name in out and ("lavender view" in out) == (name == "a.film")
     assert len(Film.load(tmp_path / "a.film")) == 6
     code, _, err = lavender("view", tmp_path / "a.gif")
     assert code == 2 and "no film" in err
+
+
+@pytest.mark.parametrize("names", [("x", "x.png"), ("x.png", "sub/../x.png")])
+def test_two_outputs_of_a_run_are_not_one_file(lavender, tmp_path, names):
+    (tmp_path / "sub").mkdir()
+    plot, film = (tmp_path / name for name in names)
+    code, out, err = lavender("run", "spinner", "--steps", "2", "--plot", plot, "--film", film)
+    assert (code, out) == (2, "") and "name several" in err
+    assert not (tmp_path / "x.png").exists()
+    code, out, _ = lavender("run", "spinner", "--steps", "2", "--plot", plot)
+    assert not code and f"figure: {tmp_path / 'x.png'}" in out
+
+
+@pytest.mark.parametrize("more", [(), ("--view",)])
+def test_ctrl_c_keeps_the_steps_until_then(lavender, monkeypatch, tmp_path, more):
+    step = Simulation.step
+
+    def stopped(self):
+        if self.time > 0.04:
+            raise KeyboardInterrupt
+        return step(self)
+
+    monkeypatch.setattr(Simulation, "step", stopped)
+    monkeypatch.setattr("webbrowser.open", lambda address: None)
+    trace, film, problems = (tmp_path / name for name in ("t.csv", "f.film", "steps"))
+    files = ("--trace", trace, "--film", film, "--record", problems)
+    code, out, _ = lavender("run", "stack", "--steps", "50", *files, *more)
+    assert code == 130 and "5 steps" in out and "Stopped" in out
+    assert len(trace.read_text().splitlines()) == 1 + 5 and len(Film.load(film)) == 1 + 5
+    assert len(list(problems.iterdir())) >= 5
+    monkeypatch.setattr(Simulation, "step", lambda self: (_ for _ in ()).throw(KeyboardInterrupt))
+    assert lavender("run", "stack")[0] == 130  # nothing to keep
 
 
 def test_lavender_run_shows_itself_until_ctrl_c(lavender, monkeypatch):

@@ -150,6 +150,7 @@ def test_ctrl_c_keeps_what_there_is(boxes, monkeypatch):
     seen = []
     found = tune(boxes(EARLY), worlds=2, steps=10, rounds=1, watch=watch)
     assert found.stopped and len(found.measured) == 5 and not found.held
+    assert "Stopped before the end" in found.sheet.html()
     assert "not measured" in "".join(found.lines) or found.faster is found.closer is None
 
 

@@ -100,6 +100,7 @@ class Run(_Texts):
     # commit, hash of the kernels, compiler, BLAS, clock
     build: Mapping[str, str] = field(default_factory=dict)
     load: float | None = None  # processes that wanted the processor, mean of the minute before
+    whole: bool = True  # False from its start until all that was asked for is measured
 
 
 @dataclass(frozen=True)

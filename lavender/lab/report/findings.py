@@ -60,6 +60,13 @@ class Report:
         return tables.is_campaign(self.records)
 
     @cached_property
+    def stopped(self) -> str:
+        """What is to be said of a run that ended before all was measured; empty where nothing is."""
+        if all(run.whole for run in self.every.runs.values()):
+            return ""
+        return "Stopped before the end: what was not measured is in no number here."
+
+    @cached_property
     def busy(self) -> str:
         """What is to be said of times that were taken while others used the processors too; empty where nothing is."""
         if self.is_campaign or not len(self.every):

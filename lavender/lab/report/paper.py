@@ -194,7 +194,7 @@ def _method(report: Report) -> str:
         "computed from the problem's data, whatever the solver reports: the larger of its errors in energy norm and",
         "in velocity, each over that of doing nothing, so that 1 is doing nothing and 0 a solution. Times are those",
         f"of set-up and solve, {least}, within a limit of {limit}; BLAS and OpenMP had {threads}.",
-        f"{_own(records, {r.solver for r in own})} {report.busy} Means of times are",
+        f"{_own(records, {r.solver for r in own})} {report.stopped} {report.busy} Means of times are",
         f"geometric, with {seconds(tables.SHIFT)} added to each and a miss charged the limit. Profiles follow Dolan",
         f"and Moré (2002). Machine: {run.cpu}, {run.cores} cores, {run.platform}; lavender {run.lavender}, Python",
         f"{run.python}, {versions}; run {run.run}, {run.started}.",

@@ -40,6 +40,7 @@ class Sheet:
     head: str
     parts: Sequence[Part]
     numbers: dict[str, Any]
+    stopped: bool = False  # before its end: all is of what was done until then
 
     def html(self) -> str:
         """One file that needs nothing else; every text is escaped."""

@@ -38,8 +38,7 @@ def print_report(report: Report, console: Console, whole: bool = False) -> None:
             in_c = (f"# in C: {told.in_c}",) * bool(told.in_c)
             code = (*told.code, *in_c) if whole else (told.line + around,) * bool(told.line)
             said += [Text(f"    {line}") for line in code]
-    if report.busy:
-        said.append(Text(report.busy, style="yellow"))
+    said += [Text(warning, style="yellow") for warning in (report.stopped, report.busy) if warning]
     notes = [Text.assemble((text, style)) for text, style in _notes(report, MOST if whole else 1)]
     for text in said:
         console.print(text, highlight=False)

@@ -63,7 +63,8 @@ def summary(report: Report) -> str:
     for run in records.runs.values():
         machine = f"{run.cpu}, {run.threads} thread; lavender {run.lavender}, Python {run.python}"
         lines += [plain(f"{machine}; run {run.run}, {run.started}"), ""]
-    lines += [f"**{plain(report.busy)}**", ""] if report.busy else []
+    for warning in (report.stopped, report.busy):
+        lines += [f"**{plain(warning)}**", ""] if warning else []
     for told in found.told:
         lines += [plain(told.text), "", *(["```python", *told.code, "```", ""] if told.code else [])]
     for what, reason in left_out(records):

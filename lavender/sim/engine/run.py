@@ -32,6 +32,7 @@ class Trace:
     title: str = ""  # of figures
     order: str = ""  # in which each sweep visits the contacts
     method: str = ""  # in words: the solver unless it is the engine's own, the order unless it takes none
+    stopped: bool = False  # by Ctrl-C: these are the steps until then
 
     def __len__(self) -> int:
         return len(self.time)
@@ -80,7 +81,7 @@ def run(
     replace: bool = False,
     watch: Callable[[int, dict[str, Any], dict[str, Any]], Any] | None = None,
 ) -> Trace:
-    """Step a simulation and keep its trace; stops where the state is no longer finite.
+    """Step a simulation and keep its trace; stops where the state is no longer finite, and after Ctrl-C.
 
     `record`: a folder for the problem of every step; `replace` takes the problems of another recording out of it, which
     is refused otherwise. `watch(step, observation, info)` is called after every step.
@@ -88,21 +89,26 @@ def run(
     steps = whole_number("steps", steps, 1)
     recorded = 0
     solver, depth, cost, time = np.zeros((steps, 8)), np.zeros(steps), np.zeros(steps), np.zeros(steps)
-    lost, done = "", 0
+    lost, done, stopped = "", 0, False
     with nullcontext() if record is None else folder_for_steps(record, replace) as folder:
-        while done < steps and not lost:
-            if folder is not None:
-                recorded += simulation.write_problem(folder, 6) is not None
-            start = perf_counter()
-            observation, _, _, _, info = simulation.step()
-            cost[done] = perf_counter() - start
-            solver[done] = observation["solver"]
-            depth[done] = observation["contacts"]["depth"].max(initial=0.0)
-            time[done] = info["time"]
-            lost = info.get("lost_body", "")
-            done += 1
-            if watch is not None:
-                watch(done, observation, info)
+        try:
+            while done < steps and not lost:
+                if folder is not None:
+                    recorded += simulation.write_problem(folder, 6) is not None
+                start = perf_counter()
+                observation, _, _, _, info = simulation.step()
+                cost[done] = perf_counter() - start
+                solver[done] = observation["solver"]
+                depth[done] = observation["contacts"]["depth"].max(initial=0.0)
+                time[done] = info["time"]
+                lost = info.get("lost_body", "")
+                done += 1
+                if watch is not None:
+                    watch(done, observation, info)
+        except KeyboardInterrupt:
+            if not done:
+                raise
+            stopped = True
     scene = simulation.scene
     spec = get(scene.parameters.solver)
     order = str(scene.parameters.solver_options.get("order", scene.parameters.order))
@@ -120,6 +126,7 @@ def run(
         f"{'warm' if simulation.warm_start else 'cold'}, {method}",
         order=order,
         method=method,
+        stopped=stopped,
     )
 
 

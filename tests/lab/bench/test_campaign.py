@@ -4,6 +4,7 @@ import json
 import math
 import os
 import signal
+import subprocess
 import sys
 import threading
 import time
@@ -14,7 +15,9 @@ import pytest
 import lavender as lv
 from lavender import bench, report
 from lavender.lab.bench.record import to_json
+from lavender.lab.bench.running import campaign as module
 from lavender.lab.report import tables
+from lavender.lab.report.findings import Report
 
 NAMES = bench.seeds(["random_spd(n=12, condition=100)", "granular(n=2)", "toy_stack"], 4)
 PLAN = bench.CampaignPlan(levels=(1e-3, 1e-6), budgets=(4, 8), orders=("random:1",))
@@ -50,6 +53,19 @@ def test_the_same_bits_by_one_worker_and_by_two_and_no_times():
 
             again = lv.solve(suite.case(NAMES[0]).problem, "pgs", tol=0.0, max_iter=r.max_iter)
             assert again.residual.relative == r.relative
+
+
+def test_what_ends_a_campaign_comes_alone_and_its_report_says_so(tmp_path, recwarn):
+    def full(event):
+        raise OSError("no room")
+
+    path = tmp_path / "records.jsonl"
+    with pytest.raises(OSError, match="no room"):
+        bench.campaign(NAMES, ["pgs", "direct"], PLAN, path, workers=2, watch=full)
+    assert not recwarn.list
+    assert Report(bench.read(path)).stopped
+    bench.campaign(NAMES, ["pgs", "direct"], PLAN, path, workers=1)
+    assert not Report(bench.read(path)).stopped
 
 
 def test_a_file_that_has_changed_is_run_again(tmp_path):
@@ -170,6 +186,40 @@ def test_a_cluster_that_loses_a_worker_midway_loses_no_record():
             time.sleep(0.1)
     assert half.is_set()
     assert lines(found) == lines(expected)
+
+
+@pytest.mark.slow
+def test_a_cluster_that_goes_midway_is_told_and_the_next_one_goes_on(tmp_path, monkeypatch):
+    pytest.importorskip("distributed", reason="a cluster needs dask.distributed (extra: cluster)")
+    names, path = bench.seeds(["granular(n=2)"], 40), tmp_path / "records.jsonl"
+    plan = bench.CampaignPlan(levels=(1e-6,), budgets=(8, 64), orders=())
+    code = (
+        "import sys, distributed\n"
+        "if __name__ == '__main__':\n"
+        "    c = distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=':0')\n"
+        "    print(c.scheduler_address, flush=True)\n"
+        "    sys.stdin.read()\n"
+    )
+    monkeypatch.setattr(module, "CONNECT", 1.0)
+    cluster = subprocess.Popen(
+        [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    try:
+        address = cluster.stdout.readline().strip()
+
+        def watch(event):
+            if event.done == event.total // 10:
+                cluster.kill()
+
+        with pytest.raises(OSError, match="tcp://"):
+            bench.campaign(names, ["pgs"], plan, path, backend=f"dask={address}", watch=watch)
+    finally:
+        cluster.kill()
+        cluster.communicate()
+    done = len(bench.read(path).done)
+    assert 0 < done < len(names)
+    found = bench.campaign(names, ["pgs"], plan, path, workers=1)
+    assert lines(found) == lines(bench.campaign(names, ["pgs"], plan, workers=1))
 
 
 def test_errors_travel_between_processes():

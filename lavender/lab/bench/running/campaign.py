@@ -14,6 +14,7 @@ import os
 import signal
 import threading
 import time
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
@@ -166,7 +167,7 @@ def campaign(
         out.source = str(kept.path) if kept is not None else ""
         done = {p.index: known[p.case, p.solver] for p in pairs if (p.case, p.solver) in known}
         out.add(this)
-        _keep(kept, [this])
+        _keep(kept, [replace(this, whole=False)])
         for attempt in range(ATTEMPTS + 1):
             left = [p for p in pairs if p.index not in done]
             if not left:
@@ -182,6 +183,7 @@ def campaign(
                 _keep(kept, [*entries, Done(this.run, pair.case, pair.solver, sha)])
                 if watch is not None:
                     watch(Event(len(done), len(pairs), pair.case, pair.solver))
+        _keep(kept, [this])
     for index in sorted(done):
         for entry in done[index]:
             out.add(entry)
@@ -258,9 +260,10 @@ def hand_out(
 
         lost = (*lost, BrokenProcessPool)
     with contextlib.suppress(ImportError):
+        from distributed.client import FutureCancelledError
         from distributed.scheduler import KilledWorker
 
-        lost = (*lost, KilledWorker)
+        lost = (*lost, KilledWorker, FutureCancelledError)
     parent = os.getpid() if backend == "loky" else 0  # 0: workers belong to a cluster
     with joblib.parallel_config(backend=backend, n_jobs=workers):
         calls = (joblib.delayed(_led)(parent, function, given) for given in arguments)
@@ -274,7 +277,14 @@ def hand_out(
                 return
             with _deaf() if hasattr(signal, "pthread_sigmask") else contextlib.nullcontext():
                 found = parallel(calls)
-            yield from found
+            try:
+                for made in found:  # noqa: UP028 - which would close it before this does
+                    yield made
+            except GeneratorExit:
+                with warnings.catch_warnings():  # joblib's, of what it cancels
+                    warnings.simplefilter("ignore", UserWarning)
+                    found.close()
+                raise
         except lost:
             return
 

@@ -184,10 +184,8 @@ class Runner:
         self.done = 0
         self.total = 0
         self.known: dict[Any, Record] = {}
-        self.skipped: set[tuple[str, str]] = set()
         if store is not None:
             self.known = {r.key: r for r in store.records.records if r.run == this.run}
-            self.skipped = {(s.case, s.solver) for s in store.records.skips if s.run == this.run}
 
     def keep(self, entry: Run | CaseInfo | Skip | Record) -> None:
         """Add an entry to what is returned and to what is stored."""
@@ -207,12 +205,13 @@ class Runner:
     def run(self, items: list[Item]) -> Records:
         """Measure every case and sequence."""
         self.total = len(items) * len(self.names)
-        self.keep(self.this)
+        self.keep(replace(self.this, whole=False))
         for name, group in _sequences(items):
             if name:
                 self.sequence(group)
             else:
                 self.single(group[0])
+        self.keep(self.this)
         self.tell("", "")
         return self.out
 
