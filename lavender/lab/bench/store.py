@@ -24,7 +24,18 @@ from typing import Any
 from lavender.base.arrays import table_of
 from lavender.base.errors import InputError
 from lavender.io.stored import MAX_BYTES, as_path, destination, make_folder, write_atomically, write_text
-from lavender.lab.bench.record import CaseInfo, Done, Entry, Record, Run, Skip, from_json, printable, to_json
+from lavender.lab.bench.record import (
+    CaseInfo,
+    Done,
+    Entry,
+    Record,
+    Run,
+    Skip,
+    from_json,
+    plain,
+    printable,
+    to_json,
+)
 
 MOST_LINE = 2**26  # bytes of a record; the longest of ours hold a few thousand
 TRIES = 100  # a holder that leaves takes its file with it; so often in a row nobody leaves
@@ -404,7 +415,7 @@ def _lines(path: Path) -> Iterator[str]:
 
 
 def write_csv(records: Records, path: str | Path) -> None:
-    """One row for each record; `work`, `options` and `versions` are JSON in their cells."""
+    """One row for each record; `work`, `options`, `versions`, `times` and `reached` are JSON in their cells."""
     rows = records.rows()
     columns = list(rows[0]) if rows else [f.name for f in fields(Record)]
 
@@ -414,7 +425,7 @@ def write_csv(records: Records, path: str | Path) -> None:
             writer.writeheader()
             for row in rows:
                 writer.writerow(
-                    {k: json.dumps(v, default=str) if isinstance(v, dict) else v for k, v in row.items()}
+                    {k: json.dumps(plain(v)) if isinstance(v, (dict, tuple)) else v for k, v in row.items()}
                 )
 
     write_atomically(path, write)
@@ -423,16 +434,16 @@ def write_csv(records: Records, path: str | Path) -> None:
 def write_json(records: Records, path: str | Path) -> None:
     """{"runs": [...], "cases": [...], "skips": [...], "records": [...]}; inf and nan are words."""
 
-    def plain(entries: Iterable[Any]) -> list[dict[str, Any]]:
+    def told(entries: Iterable[Any]) -> list[dict[str, Any]]:
         return [{k: v for k, v in to_json(e).items() if k != "kind"} for e in entries]
 
     content = {
-        "runs": plain(records.runs.values()),
-        "cases": plain(records.cases.values()),
-        "skips": plain(records.skips),
+        "runs": told(records.runs.values()),
+        "cases": told(records.cases.values()),
+        "skips": told(records.skips),
         "records": [
             {**entry, "success": records.success(r)}
-            for entry, r in zip(plain(records.records), records.records, strict=True)
+            for entry, r in zip(told(records.records), records.records, strict=True)
         ],
     }
     write_text(path, json.dumps(content, indent=1, allow_nan=False) + "\n")

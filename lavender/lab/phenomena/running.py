@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 from lavender.base.apart import served
 from lavender.base.apart.process import Ended, NoAnswer, Process, Raised
+from lavender.base.arrays import number
 from lavender.base.errors import CapabilityError, InputError, UnknownName
 from lavender.lab.phenomena.engines import WAYS, Way, follow, make
 from lavender.lab.phenomena.friction import FRICTION
@@ -87,7 +89,7 @@ def chosen(names: Sequence[str] = ()) -> list[Phenomenon]:
     for name in names:
         if name not in PHENOMENA:
             raise UnknownName("phenomenon", name, PHENOMENA)
-    return [PHENOMENA[name] for name in names or PHENOMENA]
+    return [PHENOMENA[name] for name in dict.fromkeys(names or PHENOMENA)]
 
 
 def ways(steppers: Sequence[str] | None = None, engines: Sequence[str] | None = None) -> list[Way]:
@@ -146,8 +148,10 @@ def run(
     UnknownName
         No such phenomenon, stepper, engine or parameter.
     InputError
-        A parameter outside its range, or neither stepper nor engine; nothing has run.
+        A parameter or limit outside its range, or neither stepper nor engine; nothing has run.
     """
+    if limit != math.inf:
+        limit = number("limit", limit, above=0.0)
     plan = [
         (p, case)
         for p in chosen(names)

@@ -1,6 +1,7 @@
 """Records: judged, timed apart, written when they are made, and never lost to a backend."""
 
 import dataclasses
+import io
 import itertools
 import json
 import math
@@ -23,7 +24,9 @@ from lavender.lab.bench.line import code_of
 from lavender.lab.bench.record import Record, from_json, to_json
 from lavender.lab.bench.running import timing
 from lavender.lab.report.findings import Report
+from lavender.lab.report.paper import write_paper
 from lavender.lab.report.terminal import print_report
+from lavender.lab.report.write import write
 
 QUICK = bench.Plan(levels=(1e-3, 1e-8), budgets=(2, 5), repeats=2, time_limit=60.0, orders=("reverse",))
 
@@ -266,6 +269,17 @@ def test_another_version_or_cpu_is_another_run(tmp_path, monkeypatch):
     assert len(bench.read(path).latest()) == len(first)
 
 
+def shown(records, folder):
+    """The first lines of all that a report says of records, where each of them has them."""
+    page = write(records, folder / "report", figures=False).read_text()
+    out = io.StringIO()
+    print_report(Report(records), Console(file=out, width=200))
+    method = (write_paper(Report(records), folder / "paper") / "method.tex").read_text()
+    said = [page, (folder / "report" / "summary.md").read_text(), out.getvalue(), method]
+    assert len({"Stopped" in text for text in said}) == 1
+    return page
+
+
 def test_ctrl_c_keeps_what_there_is(tmp_path, plug_in):
     plug_in(interrupted, "fake_interrupt")
     path, into = tmp_path / "records.jsonl", []
@@ -274,6 +288,11 @@ def test_ctrl_c_keeps_what_there_is(tmp_path, plug_in):
     kept = bench.read(path).records
     assert {r.solver for r in kept} == {"pgs"}
     assert into[0].records == kept
+    for records in (into[0], bench.read(path)):
+        assert Report(records).stopped and Report(records).stopped in shown(records, tmp_path)
+    whole = bench.run([stack(5)], ["pgs", "direct"], QUICK, path)
+    for records in (whole, bench.read(path)):
+        assert not Report(records).stopped and "Stopped" not in shown(records, tmp_path)
 
 
 def test_a_full_disk_is_said_and_the_next_run_goes_on(tmp_path):
@@ -319,6 +338,7 @@ def test_json_and_csv_hold_every_number(tmp_path):
         assert float(row["relative"]) == r.relative
         assert float(row["time_min"]) == r.time_min
         assert json.loads(row["work"]) == dict(r.work)
+        assert tuple(json.loads(row["times"])) == r.times
         assert row["cpu"] == bench.cpu_name()
         assert json.loads(row["versions"])["numpy"] == np.__version__
 

@@ -15,7 +15,7 @@ import pytest
 import lavender as lv
 from lavender.base.apart.lines import Lines
 from lavender.base.errors import LavenderError
-from lavender.lab.phenomena import PHENOMENA, WAYS, Record, Track, run, ways
+from lavender.lab.phenomena import PHENOMENA, WAYS, Record, Track, chosen, run, ways
 from lavender.lab.phenomena import table as tables
 from lavender.lab.phenomena.engines import PACKAGES_OF_NODE, follow, make, versions_of_node
 from lavender.lab.phenomena.engines.tree import collision_shape
@@ -405,7 +405,14 @@ def test_a_stepper_that_does_not_take_a_scene_is_a_note_and_the_others_go_on():
     assert not notes["impulses"]
 
 
+@pytest.mark.parametrize("limit", [math.nan, 0.0, -1.0, "long"])
+def test_a_limit_that_is_none_is_refused(limit):
+    with pytest.raises(lv.InputError, match="limit"):
+        run(["stick"], steppers=["impulses"], limit=limit)
+
+
 def test_names_of_ways():
+    assert [p.name for p in chosen(["stick", "stop", "stick"])] == ["stick", "stop"]
     assert {w.name for w in ways(["soft_step"], [])} == {"soft_step", "soft_step 16x4"}
     assert [w.name for w in ways([], ["pybullet 4x100"])] == ["pybullet 4x100"]
     assert len(ways()) == len(WAYS)
