@@ -446,7 +446,7 @@ class Problem:
     def _rounds(self, y, z, share):
         """(m,) where rounding of the data by `share` explains A^T y: of A by its rows, of J as a whole; never of R."""
         length = np.sqrt(self.d)
-        size = length @ np.abs(y)
+        size, least = length @ np.abs(y), ZERO
         if self.operator == "matrix":
             return np.abs(z) <= share * length * size
         if self.operator == "general":
@@ -455,8 +455,11 @@ class Problem:
             jac, minv = self.jac_minv
             r = (jac.T @ y).reshape(-1, 6)
             square = np.einsum("ni,nij,nj->", r, minv, r)
+            # An inertia that is flat to rounding: what J has along it counts for nothing.
+            least = L(4.0) * U * np.einsum("ni,nij,nj->", np.abs(r), np.abs(minv), np.abs(r))
         off = np.abs(z - self.soft * y)
-        return (self.soft * y == 0) & (square <= (share * size) ** 2) & (off <= share * length * size)
+        explained = square <= max((share * size) ** 2, least)
+        return (self.soft * y == 0) & explained & (off <= share * length * size)
 
     def refutes(self, y):
         """Why y (m,) does not prove that there is no solution, or None where it does.
@@ -472,8 +475,8 @@ class Problem:
         gain, most = self.b @ y, np.abs(self.b) @ np.abs(y)
         if not gain > 0:
             return "b.y is not positive"
-        z = self.A.T @ y
-        z = np.where(self._rounds(y, z, min(L(4.0) * (self.m + 2) * U, L(1e-9) * gain / most)), ZERO, z)
+        z, share = self.A.T @ y, min(L(4.0) * (self.m + 2) * U, L(1e-9) * gain / most)
+        z = np.where(self._rounds(y, z, share), ZERO, z)
         pull = ZERO
         for k in range(len(c["kind"])):
             part = slice(c["ptr"][k], c["ptr"][k + 1])
@@ -496,5 +499,8 @@ class Problem:
             if self.law == "coulomb" and yk[1:].any():
                 return "y is not along a normal"
             rim = sum(reach * np.sqrt(zk[at] @ zk[at]) for at, reach in parts)
-            pull += max(ZERO, zk[0] + rim) * LARGEST
+            along = np.zeros(self.m, L)
+            along[c["ptr"][k]] = zk[0] + rim
+            if along.any() and not self._rounds(y, along, share)[c["ptr"][k]]:
+                pull += max(ZERO, zk[0] + rim) * LARGEST
         return None if gain > pull else "impulses within the bounds can meet b.y"

@@ -8,6 +8,7 @@ import stat
 import subprocess
 import sys
 from importlib.util import find_spec
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -249,14 +250,14 @@ def test_a_folder_that_cannot_be_made_is_named_in_words(words, lavender, tmp_pat
     """Some file systems tell only when they are asked: /proc is writable to root, and makes nothing."""
     if words[0] == "export":
         pytest.importorskip("Cython", reason="the export translates the kernels (extra: test)")
-    make, folder = os.mkdir, tmp_path / "new"
+    make, folder = Path.mkdir, tmp_path / "new"
 
     def mkdir(path, *more, **others):
-        if os.fspath(path) == str(folder):
-            raise OSError(errno.ENOENT, os.strerror(errno.ENOENT), path)
+        if path == folder:
+            raise OSError(errno.ENOENT, os.strerror(errno.ENOENT), str(path))
         make(path, *more, **others)
 
-    monkeypatch.setattr(os, "mkdir", mkdir)
+    monkeypatch.setattr(Path, "mkdir", mkdir)
     code, _, said = lavender(*words, folder)
     assert code == 2
     why = f"cannot make the folder {folder}: {os.strerror(errno.ENOENT)}; give another path"
