@@ -213,6 +213,8 @@ class _Reader:
             if not isinstance(link, self.h5py.HardLink):
                 raise InputError(f"{path} is a {type(link).__name__}; links out of a group are not followed")
             node = node[part]
+        if isinstance(node, self.h5py.Dataset) and node.fletcher32 and node.id.chunk_iter(_is_cut_off):
+            raise InputError(f"{path}: numbers are cut off; their chunk is shorter than its checksum")
         return node
 
     def has(self, path: str) -> bool:
@@ -299,6 +301,11 @@ class _Reader:
 def _chunk(data: Any) -> int:
     """Numbers that are unpacked at a time, however few are read."""
     return math.prod(data.chunks) if data.chunks else 0
+
+
+def _is_cut_off(chunk: Any) -> bool | None:
+    """Whether a chunk has less than a checksum of 4 bytes: HDF5 would read on from there. None: ask the next one."""
+    return True if chunk.size < 4 else None
 
 
 def _triplets(p: np.ndarray, i: np.ndarray, x: np.ndarray, nz: int, m: int, n: int) -> sp.csr_array:

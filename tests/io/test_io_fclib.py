@@ -444,6 +444,16 @@ def test_a_flipped_bit_of_any_array_is_told(tmp_path):
                     lavender.io.read(path)
 
 
+def test_numbers_that_are_shorter_than_their_checksum_are_told(tmp_path):
+    """HDF5 2.0 reads on from there, to the end of the process."""
+    path = tmp_path / "p.hdf5"
+    lavender.io.save(local_problem(), path)
+    with h5py.File(path, "r+") as file:
+        file["fclib_local/vectors/mu"].id.write_direct_chunk((0,), b"cut")
+    with pytest.raises(lv.InputError, match="mu: numbers are cut off"):
+        lavender.io.load(path)
+
+
 def test_files_that_are_no_fclib_are_refused(tmp_path):
     with h5py.File(tmp_path / "foreign.h5", "w") as file:
         file["weights"] = np.zeros(3)
