@@ -5,6 +5,7 @@ import importlib.metadata
 import importlib.util
 import os
 import re
+import shlex
 import shutil
 import signal
 import subprocess
@@ -238,7 +239,7 @@ def test_without_a_compiler_nothing_is_translated_first(tmp_path):
     """Two minutes of it ended in "[Errno 2] No such file or directory"."""
     pytest.importorskip("Cython", reason="setup.py imports it (extra: test)")
     words = ("setup.py", "-q", "build_ext", "--build-lib", tmp_path, "--build-temp", tmp_path)
-    env = {**os.environ, "CC": str(tmp_path / "cc")}
+    env = {**os.environ, "CC": shlex.quote(str(tmp_path / "cc"))}
     assert "install one (Debian" in python(*words, status=1, env=env, timeout=60.0).stderr
     code = f"""if True:
         import runpy, sys, sysconfig
@@ -246,7 +247,7 @@ def test_without_a_compiler_nothing_is_translated_first(tmp_path):
         sysconfig.get_path = lambda name, *_: {str(tmp_path)!r}
         sys.argv = {list(map(str, words))}
         runpy.run_path("setup.py", run_name="__main__")"""
-    env["CC"] = sys.executable
+    env["CC"] = shlex.quote(sys.executable)
     assert "apt install python3-dev" in python("-c", code, status=1, env=env, timeout=60.0).stderr
 
 
@@ -293,7 +294,7 @@ def test_a_build_that_is_killed_leaves_no_word_that_its_files_are_current(tmp_pa
         sys.argv = ["setup.py", "-q", "build_ext"]
         runpy.run_path("setup.py", run_name="__main__")"""
     stamp.write_text("as it is asked for now")
-    env = {**os.environ, "CC": sys.executable}  # which is never called
+    env = {**os.environ, "CC": shlex.quote(sys.executable)}  # which is never called
     python("-c", code, cwd=tmp_path, status=-signal.SIGKILL, env=env)
     assert not stamp.exists()
 

@@ -298,4 +298,7 @@ def test_the_iterate_measures_and_steps_as_its_formulas_say(seed):
     moved = np.r_[at.x - x, lam - at.lam]
     t = moved @ u / (u @ u)
     np.testing.assert_allclose(moved, t * u, atol=1e-9 * (1.0 + np.abs(u).max()))
-    assert 0.0 < t <= 1.0 and min(at.w[free:].min(initial=1.0), at.lam[free:].min(initial=1.0)) > 0.0
+    assert (
+        0.0 < t <= 1.0 + 1e-15 * (m + n)
+        and min(at.w[free:].min(initial=1.0), at.lam[free:].min(initial=1.0)) > 0.0
+    )
