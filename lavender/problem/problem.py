@@ -16,6 +16,7 @@ from lavender.problem.builders import Builders
 from lavender.problem.cones import Cones
 from lavender.problem.derived import once
 from lavender.problem.generalized import Generalized
+from lavender_ext.core.checks import LEAST
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,6 +199,7 @@ class Problem(Builders):
             jac = sp.csr_array(sp.diags_array(s) @ g.jac)
             assert self.compliance is not None
             soft = s * s * self.compliance
+            soft[soft < LEAST] = 0.0  # less than a compliance may have
             given = Generalized(jac, g.mass, g.v_free, g.names)
             made = Problem(s * self.b, cones, generalized=given, compliance=soft, copy=False, **more)
         if self.rows is not None:

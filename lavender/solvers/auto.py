@@ -51,7 +51,7 @@ from lavender.solvers.certify import LINEAR_PROGRAM, certify, least_violation, l
 from lavender.solvers.islands import pairs
 from lavender.solvers.newton import WARM, NewtonState
 from lavender.solvers.registry import SMALL_ROWS, Solver, SolverSpec, get
-from lavender.solvers.setup_times import factored, forming, over_rows, sweeping
+from lavender.solvers.setup_times import first_factor, formed_once, forming, over_rows, sweeping
 from lavender.solvers.small import AUTO, NO_TIME, QUARTER, call_ends_within
 from lavender.solvers.solve_log import GAIN, SolveLog
 from lavender.solvers.steps import METHODS, NEAR, PROBE, Iterations, Newton, Step, Sweeps, setup_time
@@ -127,6 +127,13 @@ class Tree:
         if state is None or state.general is None or p.cones.has_round:
             return inf
         return costs.newton_cost(costs.formed(p), self.law)
+
+    @property
+    def factored(self) -> float:
+        """A of J and M, unless a line before has formed it, and a first factor: whatever else is known of A."""
+        p = self.problem
+        made = 0.0 if "newton over rows" in self.states else formed_once(p)
+        return 1e9 * (made + first_factor(p.m, float(p.metric.entries_of_a)))
 
     def add_rows(self, most: float) -> bool:
         """Analyse A of J and M as well, if that is counted to cost less and has time; last comes what has failed."""
@@ -261,7 +268,7 @@ class Tree:
         cost = times * MOST * (self.newton if self.newton < inf else costs.SWEEPS * self.sweep)
         why = f"in turn, {times * MOST:g} times newton's cost"
         yield from self.factorisations(times * MOST)
-        if self.problem.generalized is None or 1e9 * factored(self.problem) <= cost:
+        if self.problem.generalized is None or self.factored <= cost:
             yield self.iterations("admm", cost, why)
         yield self.iterations("nncg", cost, why)
         if not self.swept and not self.problem.cones.has_round:

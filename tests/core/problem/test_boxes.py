@@ -161,6 +161,19 @@ def test_coefficients_come_back_and_equal_ones_are_a_disk():
     np.testing.assert_allclose(t[1:, 1:], [[0, 0.1], [0.3, 0.0], [0, 0]], atol=1e-15)
 
 
+def test_a_compliance_that_a_thin_ellipse_makes_less_than_one_may_be_is_none():
+    """1e-40 in rows that are 1e-12 as long, beside a d of 1e-24."""
+    problem = lv.Problem.from_jacobian(
+        np.eye(3),
+        np.eye(3),
+        [0.3, 0.2, -1.0],
+        cones=lv.Cones.contacts([(0.5, 5e-13)]),
+        compliance=[0.0, 0.0, 1e-40],
+    )
+    assert problem.disk.compliance.tolist() == [0.0, 0.0, 0.0]
+    assert lv.solve(problem, tol=1e-9).success
+
+
 ELLIPSES = {"generalized": ellipses, "matrix": lambda *a, **k: as_matrix(ellipses(*a, **k)), "rows": on_rows}
 
 

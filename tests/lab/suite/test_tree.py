@@ -1,6 +1,7 @@
 """The tree of `auto`: each line is reached and named, counts are what Newton does, the best of all goes back."""
 
 import json
+from itertools import islice
 
 import numpy as np
 import pytest
@@ -341,6 +342,20 @@ def test_squeezed_bodies_are_proved_to_have_no_solution_before_all_go_in_turn():
     found = lv.solve(problem)
     assert found.status is lv.Status.INFEASIBLE and not found.contradicted
     assert [turn.solver for turn in found.turns][-2:] == ["newton", "linear program"]
+
+
+@pytest.mark.parametrize("n", [3, 5, 8])
+def test_lines_are_those_of_the_data_whatever_is_known_of_it(n, monkeypatch):
+    """A of J and M is formed by who needs it first: solved again, the problem has the same lines, and bits."""
+    monkeypatch.setattr(costs, "RATES", costs.RATES | {"start": 0.0, "row": 0.0})  # less than A takes
+    rng = np.random.default_rng(n)
+    cones = lv.Cones.contacts([0.5, 0.5], tangents=3)
+    problem = lv.Problem.from_jacobian(
+        rng.standard_normal((8, n)), np.eye(n), rng.standard_normal(n), cones=cones, friction="cone"
+    )
+    lines = [(stage.solver, stage.iterations) for stage in islice(Tree(problem), 30)]
+    assert problem.csr.shape == (8, 8)  # which is kept
+    assert [(stage.solver, stage.iterations) for stage in islice(Tree(problem), 30)] == lines
 
 
 def test_a_velocity_that_rows_move_by_dust_alone_is_in_no_ones_way():
