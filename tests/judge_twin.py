@@ -461,6 +461,15 @@ class Problem:
         explained = square <= max((share * size) ** 2, least)
         return (self.soft * y == 0) & explained & (off <= share * length * size)
 
+    def _rim_rounds(self, y, slack, share, part, parts):
+        """Whether rounding of the data explains what A^T y pulls along a contact's cone."""
+        if self.operator == "matrix":
+            limit = share * np.sqrt(self.d[part]) * (np.sqrt(self.d) @ np.abs(y))
+            return slack <= limit[0] + sum(reach * np.sqrt(limit[at] @ limit[at]) for at, reach in parts)
+        along = np.zeros(self.m, L)
+        along[part.start] = slack
+        return bool(self._rounds(y, along, share)[part.start])
+
     def refutes(self, y):
         """Why y (m,) does not prove that there is no solution, or None where it does.
 
@@ -499,8 +508,6 @@ class Problem:
             if self.law == "coulomb" and yk[1:].any():
                 return "y is not along a normal"
             rim = sum(reach * np.sqrt(zk[at] @ zk[at]) for at, reach in parts)
-            along = np.zeros(self.m, L)
-            along[c["ptr"][k]] = zk[0] + rim
-            if along.any() and not self._rounds(y, along, share)[c["ptr"][k]]:
+            if not self._rim_rounds(y, zk[0] + rim, share, part, parts):
                 pull += max(ZERO, zk[0] + rim) * LARGEST
         return None if gain > pull else "impulses within the bounds can meet b.y"

@@ -9,6 +9,7 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray, IntArray
 from lavender.problem import Problem
+from lavender_ext.core.checks import LEAST, largest
 from lavender_ext.factor import graph
 
 
@@ -54,11 +55,11 @@ def rows_of(problem: Problem, blocks: IntArray) -> IntArray:
 
 
 def restrict(problem: Problem, blocks: IntArray, rows: IntArray) -> Problem:
-    """The problem of these blocks alone; exact where they are whole islands."""
+    """The problem of these blocks alone; exact where they are whole islands, but for a b that is dust in all rows."""
     cones = problem.cones.take(blocks)
     names = None if problem.names is None else [problem.names[i] for i in blocks]
     more: dict[str, Any] = {"friction": problem.friction, "names": names, "name": problem.name}
-    b: FloatArray = problem.b[rows]
+    b: FloatArray = problem.b[rows] if largest(problem.b[rows]) >= LEAST else np.zeros(len(rows))
     if problem.generalized is not None:
         assert problem.compliance is not None
         trees = problem.generalized.trees

@@ -41,3 +41,11 @@ def test_islands_are_those_of_the_matrix_and_each_can_stand_alone(form, seed):
         np.testing.assert_allclose(alone, whole, rtol=0, atol=1e-9 * np.abs(whole).max())
         others = np.setdiff1d(np.arange(problem.m), rows)
         assert not a[np.ix_(rows, others)].any()
+
+
+def test_an_island_may_ask_for_dust():
+    """1e-300 m/s beside 1 m/s: no problem alone may ask for so little, beside which nothing is."""
+    problem = lv.Problem(np.array([1.0, 1e-300]), lv.Cones.free(2), np.eye(2))
+    _, label = islands(problem)
+    parts = [restrict(problem, np.flatnonzero(label == i), np.flatnonzero(label == i)) for i in range(2)]
+    assert [part.b.tolist() for part in parts] == [[1.0], [0.0]]
