@@ -286,10 +286,10 @@ class Store:
     """
 
     def __init__(self, path: str | Path) -> None:
-        self.path, real = as_path(path), destination(path)
+        self.path, self._real = as_path(path), destination(path)
         make_folder(self.path.parent)
         try:
-            self._lock = Lock(real)  # one for all names of a file
+            self._lock = Lock(self._real)  # one for all names of a file
             try:
                 self.records = read(self.path) if self.path.exists() else Records()
                 _cut_torn_line(self.path)
@@ -309,7 +309,7 @@ class Store:
         Raises
         ------
         InputError
-            No room, or the folder is gone; what was written before is there.
+            No room: what was written before is there. Or the file is gone, which nobody else would tell.
         """
         line = json.dumps(to_json(entry), allow_nan=False)
         try:
@@ -318,6 +318,11 @@ class Store:
             if time.monotonic() - self._synced > SYNC:
                 os.fsync(self.file.fileno())
                 self._synced = time.monotonic()
+                if not self._real.exists():
+                    raise InputError(
+                        f"{self.path} was removed while it was being written, with what it held: run the command "
+                        "again, in a folder that stays"
+                    )
         except OSError as error:
             raise InputError(
                 f"cannot write {self.path} ({error.strerror or error}): make room and run the same command again; "

@@ -295,6 +295,22 @@ def test_ctrl_c_keeps_what_there_is(tmp_path, plug_in):
         assert not Report(records).stopped and "Stopped" not in shown(records, tmp_path)
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="an open file cannot be removed there")
+def test_a_file_that_is_removed_meanwhile_is_told(tmp_path, monkeypatch):
+    monkeypatch.setattr(store, "SYNC", -1.0)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "sub").mkdir()
+    with bench.Store("sub/records.jsonl") as opened:
+
+        def watch(event):
+            if event.solver == "direct" and event.record is None:
+                (tmp_path / "sub" / "records.jsonl").unlink()
+
+        monkeypatch.chdir("/")  # a relative name is of the folder where it was given
+        with pytest.raises(lv.InputError, match="was removed"):
+            bench.run([stack(5)], ["pgs", "direct"], QUICK, opened, watch=watch)
+
+
 def test_a_full_disk_is_said_and_the_next_run_goes_on(tmp_path):
     path = tmp_path / "records.jsonl"
     full = OSError(28, "No space left on device")
