@@ -38,11 +38,19 @@ def together(work: Callable[[bytearray], T], threads: int) -> list[T]:
     ended.
     """
     stop = bytearray(1)
-    others = [helpers().submit(work, stop) for _ in range(threads - 1)]
+
+    def working() -> T:
+        try:
+            return work(stop)
+        except BaseException:
+            stop[0] = 1
+            raise
+
+    others = [helpers().submit(working) for _ in range(threads - 1)]
     try:
-        return [work(stop), *(other.result() for other in others if not other.cancel())]
+        return [working(), *(other.result() for other in others if not other.cancel())]
     finally:
-        stop[0] = 1
+        stop[0] = 1  # Ctrl-C may come while this thread waits
         for other in others:
             if not other.cancel():
                 other.exception()

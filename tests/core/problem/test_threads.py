@@ -4,6 +4,7 @@ import os
 import sys
 import sysconfig
 import threading
+import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -160,6 +161,24 @@ def test_a_fork_has_threads_of_its_own():
         status = os.waitpid(child, 0)[1]
         assert status == 0, status"""
     python("-W", "ignore::DeprecationWarning", "-c", script)
+
+
+def test_an_error_of_one_thread_stops_the_others():
+    """This one waits for the error of the other, and is told to begin nothing more."""
+    both, told = threading.Barrier(2, timeout=10.0), []
+
+    def work(stop):
+        both.wait()
+        if threading.current_thread() is not threading.main_thread():
+            raise ZeroDivisionError("planted")
+        end = time.monotonic() + 10.0
+        while not stop[0] and time.monotonic() < end:
+            time.sleep(1e-3)
+        told.append(stop[0])
+
+    with pytest.raises(ZeroDivisionError, match="planted"):
+        threads.together(work, 2)
+    assert told == [1]
 
 
 def test_threads_that_ask_for_threads_do_not_wait_for_each_other(monkeypatch):
