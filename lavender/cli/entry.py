@@ -10,6 +10,7 @@ import signal
 import sys
 from collections.abc import Iterator, Sequence
 from types import FrameType
+from typing import Any
 
 import click
 
@@ -59,7 +60,10 @@ def cli() -> None:
 
 
 def main(args: Sequence[str] | None = None) -> None:
-    """Entry point: what lavender raises on purpose becomes one line and status 2, whatever Ctrl-C ends 130."""
+    """Entry point: what lavender raises on purpose becomes one line and status 2, whatever Ctrl-C ends 130.
+
+    SIGTERM, of a queue whose time is over or of `timeout`, is as Ctrl-C, with 143; a second one ends it at once.
+    """
     _starting.end()
     with _interruptions() as came:
         try:
@@ -72,28 +76,36 @@ def main(args: Sequence[str] | None = None) -> None:
     if came and code not in (0, EXIT_INTERRUPTED):
         click.echo("lavender: stopped", err=True)
         code = EXIT_INTERRUPTED
+    if code == EXIT_INTERRUPTED and signal.SIGTERM in came:
+        code = 128 + signal.SIGTERM
     raise SystemExit(code)
+
+
+#: What stops a command -> what Python does with it by itself.
+STOPS: dict[int, Any] = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}
 
 
 @contextlib.contextmanager
 def _interruptions() -> Iterator[list[int]]:
-    """A number for each Ctrl-C: libraries in C make an error of their own of the exception that it raises in them."""
+    """Those that came: libraries in C make an error of their own of the exception that one raises in them."""
     came: list[int] = []
 
     def note(number: int, frame: FrameType | None) -> None:
         came.append(number)
+        if number == signal.SIGTERM:
+            signal.signal(number, signal.SIG_DFL)
         signal.default_int_handler(number, frame)
 
-    try:
-        if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-            signal.signal(signal.SIGINT, note)
-    except ValueError:  # of another thread than the first
-        pass
+    for number, usual in STOPS.items():
+        with contextlib.suppress(ValueError):  # of another thread than the first
+            if signal.getsignal(number) is usual:
+                signal.signal(number, note)
     try:
         yield came
     finally:
-        if signal.getsignal(signal.SIGINT) is note:
-            signal.signal(signal.SIGINT, signal.default_int_handler)
+        for number, usual in STOPS.items():
+            if signal.getsignal(number) is note:
+                signal.signal(number, usual)
 
 
 def _code_of(args: Sequence[str] | None) -> int:

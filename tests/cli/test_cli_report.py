@@ -256,7 +256,8 @@ def test_a_report_that_measured_nothing_says_why(lavender, tmp_path):
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
-def test_ctrl_c_keeps_the_records_and_writes_the_page(tmp_path):
+@pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
+def test_what_stops_a_report_keeps_the_records_and_writes_the_page(stop, tmp_path):
     # A problem that nothing solves in the time: every run to a level takes its limit.
     out = tmp_path / "out"
     a = np.array([[1.0, -1.0], [-1.0, 1.0]])
@@ -273,9 +274,9 @@ def test_ctrl_c_keeps_the_records_and_writes_the_page(tmp_path):
     while not (records.exists() and '"case": "hard"' in records.read_text()):
         assert process.poll() is None
         time.sleep(0.05)
-    os.killpg(process.pid, signal.SIGINT)
+    os.killpg(process.pid, stop)
     printed, said = process.communicate(timeout=600)
-    assert process.returncode == 130, said
+    assert process.returncode == 128 + stop, said
     assert b"Traceback" not in said
     assert b"continues from here" in printed
     assert (out / "index.html").exists()
