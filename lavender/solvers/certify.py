@@ -150,9 +150,12 @@ def least_violation(log: SolveLog) -> None:
     d = squares @ (1.0 / mass)
     y = lam = np.zeros(of.m)
     yields = problem.compliance > 0.0
-    rigid = Problem.from_jacobian(
-        of.jac, sp.diags_array(mass), v, target=problem.b, cones=cones, friction="cone"
-    )
+    try:
+        rigid = Problem.from_jacobian(
+            of.jac, sp.diags_array(mass), v, target=problem.b, cones=cones, friction="cone"
+        )
+    except InputError:  # beside J of 1e47 a C of 1 is as nothing
+        return
     for share in NEARLY_RIGID:
         eps = np.where(yields, 1.0, share) * d
         soft = replace(rigid, compliance=np.where(eps < LEAST, 0.0, eps))  # rows of dust are empty

@@ -358,18 +358,24 @@ def test_lines_are_those_of_the_data_whatever_is_known_of_it(n, monkeypatch):
     assert [(stage.solver, stage.iterations) for stage in islice(Tree(problem), 30)] == lines
 
 
-def test_a_velocity_that_rows_move_by_dust_alone_is_in_no_ones_way():
-    """Two contacts push apart what cannot part; a third has a tangent of one velocity, and of another by 1e-47."""
+@pytest.mark.parametrize("unit", [1.0, 1e47])
+def test_a_velocity_that_rows_move_by_dust_alone_is_in_no_ones_way(unit):
+    """Two contacts push apart what cannot part; a third has a tangent of one velocity, and of another by 1e-47.
+
+    With J of 1e47 the problem is stated, as M is as large, and no mass of 1 can stand for that M.
+    """
     rng = np.random.default_rng(0)
     jac = np.hstack([rng.standard_normal((9, 6)), np.zeros((9, 1))])
     jac[3], jac[8] = -jac[0], [0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1e-47]
     target = rng.standard_normal(9)
     target[::3] = 3.0 * np.abs(target[::3])
-    problem = lv.Problem.from_jacobian(
-        jac, np.eye(7), np.zeros(7), target=target, cones=lv.Cones.contacts(0.3, count=3)
+    cones = lv.Cones.contacts(0.3, count=3)
+    mass = min(unit, 1e40) * np.eye(7)
+    found = lv.solve(
+        lv.Problem.from_jacobian(unit * jac, mass, np.zeros(7), target=unit * target, cones=cones)
     )
-    found = lv.solve(problem)
-    assert found.status is lv.Status.INFEASIBLE and not found.contradicted
+    assert not found.success and not found.contradicted
+    assert found.status is lv.Status.INFEASIBLE or unit > 1.0
 
 
 def test_no_certificate_is_begun_that_would_end_late(monkeypatch):
