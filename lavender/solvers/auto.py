@@ -128,13 +128,6 @@ class Tree:
             return inf
         return costs.newton_cost(costs.formed(p), self.law)
 
-    @property
-    def factored(self) -> float:
-        """A of J and M, unless a line before has formed it, and a first factor: whatever else is known of A."""
-        p = self.problem
-        made = 0.0 if "newton over rows" in self.states else formed_once(p)
-        return 1e9 * (made + first_factor(p.m, float(p.metric.entries_of_a)))
-
     def add_rows(self, most: float) -> bool:
         """Analyse A of J and M as well, if that is counted to cost less and has time; last comes what has failed."""
         p, states = self.problem, self.states
@@ -268,7 +261,10 @@ class Tree:
         cost = times * MOST * (self.newton if self.newton < inf else costs.SWEEPS * self.sweep)
         why = f"in turn, {times * MOST:g} times newton's cost"
         yield from self.factorisations(times * MOST)
-        if self.problem.generalized is None or self.factored <= cost:
+        p = self.problem
+        # A of J and M that no line has formed, and its first factor, whatever else is known of A.
+        formed = 0.0 if p.generalized is None or "newton over rows" in self.states else formed_once(p)
+        if p.generalized is None or 1e9 * (formed + first_factor(p.m, float(p.metric.entries_of_a))) <= cost:
             yield self.iterations("admm", cost, why)
         yield self.iterations("nncg", cost, why)
         if not self.swept and not self.problem.cones.has_round:
