@@ -138,9 +138,10 @@ def prepare(problem: Problem, solver: str = "auto", **options: Any) -> Prepared:
     Returns
     -------
     Prepared
-        `prepared.solve(impulse=..., tol=...)` solves this problem; `prepared.solve(problem2, ...)` solves another. If
-        that has the same structure (blocks, sparsity pattern of A or J), the preparation is reused. Both may be called
-        any number of times. `setup_time` [s] is the time that preparing took.
+        `prepared.solve(impulse=..., tol=...)` solves this problem. `prepared.solve(problem2, ...)` solves another,
+        which takes its place: the next `prepared.solve()` solves `problem2`. If that has the same structure (blocks,
+        sparsity pattern of A or J), the preparation is reused. Both may be called any number of times. `setup_time`
+        [s] is the time that preparing took.
 
     Examples
     --------
@@ -211,9 +212,11 @@ class Prepared:
         self._fresh = True
         self.setup_time += watch.seconds
 
-    def _replace(self, problem: Problem) -> None:
-        """Another problem in the place of the prepared one; nothing is set up for it yet."""
-        self._given, self.problem, self.solver = problem, problem.disk, None
+    def _take(self, problem: Problem | None) -> None:
+        """Another problem, if one is given, in the place of the prepared one; nothing is set up for it yet."""
+        if problem is not None and problem is not self._given:
+            check_taken(problem, self.spec)
+            self._given, self.problem, self.solver = problem, problem.disk, None
 
     def solve(
         self,
@@ -226,7 +229,7 @@ class Prepared:
         history: bool = False,
         callback: Callback | None = None,
     ) -> Solution:
-        """As `lavender.solve`; `problem`, if given, replaces the prepared one.
+        """As `lavender.solve`; `problem`, if given, replaces the prepared one unless an error is raised.
 
         Raises
         ------
@@ -252,31 +255,31 @@ class Prepared:
                 "make one for each thread (lavender.prepare)"
             )
         try:
+            given = self._given if problem is None else problem
             plain = max_iter is None and callback is None and history is False
             if plain and self.spec.delegates and not self.options:
-                asked = self._given if problem is None else problem
-                made = solve_small(asked, self.spec, impulse, tol, deadline.left(LEAST) or math.inf)
+                made = solve_small(given, self.spec, impulse, tol, deadline.left(LEAST) or math.inf)
                 if made is not None:
-                    if problem is not None and problem is not self._given:
-                        self._replace(problem)
+                    self._take(problem)
                     return made
             tol, max_iter = check_budget(self.spec, tol, max_iter)
             _check_records(self.spec, history, callback)
+            check_problem(given)
+            asked = given.disk
+            start = None if impulse is None else given.on_disk(asked.impulse_array(impulse))
             if deadline.is_set:
-                asked = self.problem if problem is None else problem.disk
                 # Of what was found, and of where it began.
-                passes = 2 if impulse is not None or asked.guess is not None else 1
+                passes = 2 if start is not None or asked.guess is not None else 1
                 last = passes * judging_time(asked)
                 if deadline.passed(setup_time(asked) + last) and not self.spec.external:
-                    return unjudged(problem or self._given, self.spec, self.options, impulse, tol, JUDGE_LATE)
+                    self._take(problem)
+                    return unjudged(given, self.spec, self.options, impulse, tol, JUDGE_LATE)
                 deadline.keep(last)
             if self.solver is None:
-                if problem is not None and problem is not self._given:
-                    check_taken(problem, self.spec)
-                    self._replace(problem)
+                self._take(problem)
                 self._begin(deadline)
             self._refresh(problem, deadline)
-            loop = self._loop(impulse, tol, deadline, history, callback)
+            loop = self._loop(start, tol, deadline, history, callback)
             return self._run(loop, max_iter)
         finally:
             if self._late:
@@ -284,14 +287,17 @@ class Prepared:
             self._lock.release()
 
     def _loop(
-        self, impulse: Any, tol: float, deadline: Deadline, history: bool, callback: Callback | None
+        self,
+        lam: FloatArray | None,
+        tol: float,
+        deadline: Deadline,
+        history: bool,
+        callback: Callback | None,
     ) -> Loop:
         problem, given = self.problem, self._given
         if given is not problem and callback is not None:
             callback = _in_rows_of(given, given.cones.stretch, callback)
-        if impulse is not None:
-            lam = given.on_disk(problem.impulse_array(impulse))
-        else:
+        if lam is None:
             lam = problem.start() if problem.guess is None else problem.guess.copy()
         left = deadline.left()
         if left is not None and not self._late and not self._broken:
