@@ -294,7 +294,7 @@ def check_not_negative(what: str, array: np.ndarray) -> None:
 
 def several(what: str, given: Any, things: str) -> list[Any]:
     """A list of what is given, or InputError for a text and what is none."""
-    if isinstance(given, (str, bytes)) or not isinstance(given, Iterable):
+    if isinstance(given, (str, bytes)) or not isinstance(given, Iterable) or getattr(given, "ndim", 1) == 0:
         raise InputError(f"{what}: {given!r:.60}; a sequence of {things} is needed")
     return list(given)
 

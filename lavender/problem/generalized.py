@@ -249,23 +249,24 @@ class Generalized:
 
     def velocity_of(self, v: FloatArray) -> FloatArray:
         """J v (m,) [m/s, rad/s] of velocities v (nv,)."""
-        own = np.ascontiguousarray(v, np.float64)
+        own = as_array("v", v, (self.nv,), finite=False)
         out: FloatArray = self.operator.times(own if self.order is None else own[self.order])
         return out
 
     def bias(self, target: FloatArray) -> FloatArray:
         """b = target - J v* (m,) [m/s, rad/s] of targets (m,)."""
         v = self.v_free if self.order is None else self.v_free[self.order]
-        b: FloatArray = self.operator.bias(v, target)
+        b: FloatArray = self.operator.bias(v, as_array("target", target, (self.m,), finite=False))
         return b
 
     def momentum_of(self, v: FloatArray) -> FloatArray:
         """M v (nv,) [kg m/s] of velocities v (nv,)."""
+        v = as_array("v", v, (self.nv,), finite=False)
         return self._given(self.operator.momentum(v if self.order is None else v[self.order]))
 
     def force(self, impulse: FloatArray) -> FloatArray:
         """J^T impulse (nv,) [N s] of impulses (m,)."""
-        return self._given(self.operator.force(impulse))
+        return self._given(self.operator.force(as_array("impulse", impulse, (self.m,), finite=False)))
 
     def solve(self, x: Any) -> FloatArray:
         """M^-1 x (nv,)."""
@@ -276,7 +277,7 @@ class Generalized:
 
     def change(self, impulse: FloatArray) -> FloatArray:
         """M^-1 J^T impulse (nv,) [m/s, rad/s] of impulses (m,)."""
-        x = self.operator.force(impulse)
+        x = self.operator.force(as_array("impulse", impulse, (self.m,), finite=False))
         self.operator.solve(x)
         return self._given(x)
 

@@ -104,6 +104,9 @@ ARRAYS = {
     "from_jacobian: target": (
         lambda x: lv.Problem.from_jacobian(A, A, [1.0, 1.0], target=x, cones=lv.Cones.free(2)), [1.0, 2.0], False
     ),
+    **{f"products, {call}: {name}": (getattr(GENERAL.generalized, call), [0.5, 0.25], False) for call, name in {
+        "velocity_of": "v", "momentum_of": "v", "bias": "target", "force": "impulse", "change": "impulse",
+    }.items()},
     "updated: b": (lambda x: LCP.updated(b=x), [1.0, 2.0], False),
     "updated: guess": (lambda x: LCP.updated(guess=x), [1.0, 2.0], False),
     "updated: target": (lambda x: GENERAL.updated(target=x), [1.0, 2.0], False),
@@ -154,6 +157,8 @@ def test_an_array_that_is_none_of_numbers_is_refused_by_name(door):
     for what, x in wrong_arrays(good, free):
         if what == "NaN" and door.startswith("residual"):
             assert call(x).relative == np.inf  # a number that measures an impulse that ran away, too
+        elif what == "NaN" and door.startswith("products"):
+            assert np.isnan(call(x)).any()
         else:
             refused(call, x, door, what)
 

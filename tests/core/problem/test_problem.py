@@ -190,6 +190,10 @@ BAD_PROBLEMS = {
     ),
     "sparse mu": (lambda: lv.Cones.contacts(ONE), "mu has dtype object"),
     "names are no words": (lambda: lv.Problem.lcp(I2, [1, 1], names=7), "a sequence of 2 words"),
+    "names are one word alone": (
+        lambda: lv.Problem.lcp(I2, [1, 1], names=np.array("x")),
+        "a sequence of 2 words",
+    ),
     "a word for names": (lambda: lv.Generalized(I2, I2, [0, 0], names="ab"), "a sequence of 2 words"),
     "friction beyond float64": (
         lambda: lv.Problem.contact(np.eye(3), np.ones(3), 10.0).boxed(1e60),
