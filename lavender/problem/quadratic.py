@@ -493,10 +493,8 @@ def _units(jac: Compressed, diagonal: FloatArray) -> FloatArray:
     c = sqrt(unit) and r are found as Ruiz (2001, A scaling algorithm to equilibrate both rows and columns norms in
     matrices) does, with c kept where P_ii > 0.
     """
-    held, nothing = (
-        diagonal > 0.0,
-        (np.zeros(len(diagonal) + 1, np.int32), np.zeros(0, np.int32), np.zeros(0)),
-    )
+    held = diagonal > 0.0
+    nothing = np.zeros(len(diagonal) + 1, np.int32), np.zeros(0, np.int32), np.zeros(0)
     start = 1.0 / np.sqrt(np.where(held, diagonal, diagonal.max(initial=0.0) or 1.0))
     column, _ = balanced(nothing, jac, BALANCED, start, ~held)
     return 1.0 / column**2
