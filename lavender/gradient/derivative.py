@@ -168,7 +168,7 @@ class Derivative:
     def _moved(self, x: FloatArray) -> FloatArray:
         """M^-1 J^T x (nv,)."""
         if self.problem.generalized is not None:
-            return self.problem.generalized.change(np.ascontiguousarray(x))
+            return self.problem.generalized.change(x)
         return self._through_mass(self._wrench(x))
 
     def _a(self, x: FloatArray, back: bool = False) -> FloatArray:
