@@ -345,3 +345,20 @@ def test_the_motion_is_not_computed_for_those_who_do_not_ask(monkeypatch):
     monkeypatch.setattr(stepping, "moved", None)
     *_, info = lv.Simulation("stack").step()
     assert "motion" not in info
+
+
+@pytest.mark.parametrize(
+    ("parameters", "order"),
+    [
+        ({}, "alternating"),
+        *(({"order": order}, order) for order in SCENE_ORDERS),
+        ({"solver": "pgs"}, "given"),
+        ({"solver": "pgs", "solver_options": {"order": "reverse"}}, "reverse"),
+        ({"solver": "newton"}, None),
+    ],
+)
+def test_every_step_tells_the_order_of_its_sweeps(parameters, order):
+    sim = lv.Simulation(lv.Scene("stack", n=2, **parameters))
+    assert sim.reset()[1]["order"] == sim.step()[-1]["order"] == order
+    if sim.last_solution is not None:
+        assert sim.last_solution.solver.order == (order or "")
