@@ -115,7 +115,9 @@ def draw(runs: dict[tuple[int, bool], FloatArray], path: Path) -> None:
     import engine_sweeps
     from matplotlib.figure import Figure
 
-    ours = {(n, turn): engine_sweeps.run(n, "alternating" if turn else "bottom_up", False) for n, turn in runs}
+    ours = {
+        (n, turn): engine_sweeps.run(n, "alternating" if turn else "bottom_up", False) for n, turn in runs
+    }
     canvas = Figure(figsize=(10, 4.2), layout="constrained")
     titles = ("lavendersim 0.2.0, residual added", "here")
     for axes, title, by in zip(canvas.subplots(1, 2, sharey=True), titles, (runs, ours), strict=True):
