@@ -6,8 +6,8 @@ centres of the boxes,
     drift = max over boxes and t >= 2 s of |p(t) - p(2 s)|,                                     (1)
 
 looked at ten times a second. The tower has fallen once a box is half an edge lower than it began
-(`lavender.lab.phenomena.parts.has_fallen`); the run ends then. Lines are sorted by what they spend on a second of simulation:
-sweeps x substeps / dt.
+(`lavender.lab.phenomena.parts.has_fallen`); the run ends then. Lines are sorted by what they spend on a second of
+simulation: sweeps x substeps / dt.
 
 LavenderSim is stepped as a user steps it, with its observation; the others by their own call for a step. MuJoCo,
 PyBullet and lavendersim are Python packages; Rapier (`@dimforge/rapier3d-compat`) and Jolt (`jolt-physics`) run under

@@ -140,9 +140,8 @@ def crossing(time: FloatArray, x: FloatArray, level: float) -> float:
     return float(time[i - 1] + part * (time[i] - time[i - 1]))
 
 
-FALL_DROP_EDGES = (
-    0.5  # A body of a tower has fallen once it is lower than at its start by more than this share of an edge.
-)
+# A body of a tower has fallen once it is lower than at its start by more than this share of an edge.
+FALL_DROP_EDGES = 0.5
 
 
 def has_fallen(start: FloatArray, now: FloatArray, edge: float = 1.0) -> bool:

@@ -14,7 +14,8 @@ import numpy as np
 from lavender.base.arrays import FloatArray, whole_number
 from lavender.io.stored import folder_for_steps, write_figure, write_text
 from lavender.sim.engine.simulation import Simulation
-from lavender.sim.engine.stepping import SOLVER_FIELDS, sweep_order
+from lavender.sim.engine.stepping import sweep_order
+from lavender.sim.engine.values import SOLVER_FIELDS
 from lavender.solvers.registry import get
 
 

@@ -32,19 +32,6 @@ from lavender.solving.outcome import finish
 from lavender.solving.solve import solve
 from lavender_ext.engine.arrays import NEED_ROOM, OK
 
-#: The eight values of `observation["solver"]`, of the final substep: sweep budget, warm-start mode (0 or 1),
-#: contacts, contacts found in the cache, max |e_n| [N s] before the first sweep and after the last, and
-#: max(0, -w_n) [m/s] likewise.
-SOLVER_FIELDS = (
-    "iterations",
-    "warm_start",
-    "contacts",
-    "cache_matches",
-    "residual_initial",
-    "residual_final",
-    "violation_initial",
-    "violation_final",
-)
 NEWTON = NEWTON_SPEC.factory
 TOL = 1e-6  # of lavender.solve
 INSIDE = "this simulation is inside a step; a solver or callback may not use it until the step has ended"
@@ -258,10 +245,10 @@ class Stepping:
         -------
         observation : dict of fresh arrays
             positions (n, 3) [m], quaternions (n, 4) w x y z, velocities (n, 6) [m/s, rad/s],
-            joint_impulses (mj,) [N s, N m s], solver (8,) see `SOLVER_FIELDS`, and contacts: pair (c, 2),
-            point, normal, tangent (c, 3), depth (c,) [m, positive inside], impulses (c, r) [N s, N m s], the
-            rows that contacts of this scene can have: normal, two tangents, spin, two that roll. Contacts and
-            impulses are those of the final substep.
+            joint_impulses (mj,) [N s, N m s], solver (8,) see `SOLVER_FIELDS` (its text has names and units), and
+            contacts: pair (c, 2), point, normal, tangent (c, 3), depth (c,) [m, positive inside], impulses (c, r)
+            [N s, N m s], the rows that contacts of this scene can have: normal, two tangents, spin, two that roll.
+            Contacts and impulses are those of the final substep.
         reward : float
             0.0
         terminated : bool
