@@ -7,7 +7,6 @@ missing: another version, machine or plan.
 """
 
 import contextlib
-import functools
 import hashlib
 import importlib
 import importlib.util
@@ -437,16 +436,20 @@ def example_page(site, cache):
             source = f"Source: `examples/{path.name}`."
             parts += [f"## {path.stem}", f"**{first}**", docstrings.markdown(rest), source]
             continue
-        if hasattr(module, "PANELS"):
-            module.numbers = functools.cache(module.numbers)
-        files = [f"figures/{path.stem}/{panel}.svg" for panel in getattr(module, "PANELS", ())]
-        files = files or [f"figures/example-{path.stem}.svg"]
-        figure = site.path(files[0])
         printed = io.StringIO()
-        with contextlib.redirect_stdout(printed):
-            module.main(str(figure))
-        for file in files[1:]:
-            save(module.PANELS, module.numbers(), str(site.path(file)))
+        if hasattr(module, "PANELS"):
+            files = [f"figures/{path.stem}/{panel}.svg" for panel in module.PANELS]
+            found = module.numbers()
+            with contextlib.redirect_stdout(printed):
+                module.print_numbers(found)
+            for file in files:
+                save(module.PANELS, found, str(site.path(file)))
+            figure = site.path(files[0])
+        else:
+            files = [f"figures/example-{path.stem}.svg"]
+            figure = site.path(files[0])
+            with contextlib.redirect_stdout(printed):
+                module.main(str(figure))
         first, _, rest = inspect.cleandoc(module.__doc__).partition("\n")
         rest = re.sub(r"\n+ +python examples/\S+ .*", "", rest)
         output = "\n".join(line for line in printed.getvalue().splitlines() if str(figure) not in line)
