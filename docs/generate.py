@@ -45,7 +45,6 @@ from lavender.lab.report.page import page as report_page
 from lavender.lab.report.tables import NOISE, RESIDUAL_NOISE
 from lavender.lab.report.text import residual
 from lavender.problem import LAWS
-from lavender.problem.ordering import ORDERS
 from lavender.sim.scene.gallery import SCENES
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -521,13 +520,6 @@ def suite_page(site):
     site.write("cases.md", "\n\n".join(parts))
 
 
-def part_pages(site):
-    """Tables that hand-written pages include."""
-    text = inspect.getdoc(sys.modules["lavender.problem.ordering"])
-    assert all(order in text for order in ORDERS)
-    site.write("parts/orders.md", docstrings.markdown(text.partition("\n")[2]))
-
-
 def calibration_part(site):
     """Residual against motion error on CASES: a table and a figure for the page on motion."""
     seen = []
@@ -596,7 +588,6 @@ def write(source, cache):
     stability_part(site)
     scene_page(site)
     suite_page(site)
-    part_pages(site)
     calibration_part(site)
     api_page(site)
     site.forget_others()

@@ -26,7 +26,7 @@ not approach is a solution. The position projection reduces the depth step by st
 
     python examples/toy_stack.py [FIGURE.png]
 
-A file named after a panel shows it alone: impulses.png, slacks.png, sweeps.png, residual.png.
+A file named after a panel shows it alone: impulses.png, slacks.png, by_sweep.png, residual.png.
 """
 
 import sys
@@ -163,7 +163,7 @@ def draw_slacks(axes, found):
     axes.set(title=title, xlabel="contact, from the ground", ylabel="slack w [m/s]", ylim=(-0.02, None))
 
 
-def draw_sweeps(axes, found):
+def draw_by_sweep(axes, found):
     """Draw the impulse of each contact against the sweeps."""
     for i in range(N):
         axes.plot(np.arange(SWEEPS + 1), found["impulse"][:, i], color=f"C{i}", label=f"contact {i + 1}")
@@ -193,7 +193,7 @@ def draw_residual(axes, found):
 PANELS = {
     "impulses": draw_impulses,
     "slacks": draw_slacks,
-    "sweeps": draw_sweeps,
+    "by_sweep": draw_by_sweep,
     "residual": draw_residual,
 }
 
