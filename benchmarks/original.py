@@ -1,17 +1,20 @@
-"""What the chapter's own engine publishes once it is asked: lavendersim 0.2.0, with its residual added to a copy.
+"""Residuals of the chapter's own engine: lavendersim 0.2.0, with lines added to a copy that compute them.
 
-The release says no residual and has no switch for warm starts or for the order. Four places of `engine/physics.cpp`
-are added to, in a temporary folder: before and after the sweeps of a substep the largest error of a normal,
+The release publishes no residual and has no switch for warm starts or for the sweep order. Lines are added at four
+places of a temporary copy of `engine/physics.cpp`. They compute, before and after the sweeps of a substep, the largest
+error of a normal,
 
     e_n = lam_n - max(0, lam_n - w_n/d_n) [N s],     w_n = v_n + bias [m/s]                          (1)
 
-impulses of the cache are set to zero if asked, and every other substep visits the contacts from the last to the first
-if asked. Six unit boxes of 1 kg stand on the ground, friction 0.5, as in the gallery's `stack`.
+set the impulses of the cache to zero for a cold start, and reverse the order of the contacts in every other substep for
+the order `alternating`. Six boxes of 1 kg with edges of 1 m are stacked on the ground, friction 0.5, as in the scene
+`stack`.
 """
 
 from __future__ import annotations
 
 import ctypes
+import shutil
 import subprocess
 import sys
 import sysconfig
@@ -26,7 +29,7 @@ import numpy as np
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import InputError
 
-# Where something is added: the text that is there once, and what stands there instead ({} is the text).
+# Each pair: a text that the source contains once, and its replacement ({} is the text).
 ADDED = (
     (
         "static void positional_point_correction(",
@@ -63,7 +66,7 @@ static float largest_error(float dt) {
     ),
     ("for(int j=0;j<gJointCount;++j)gJoints[j].appliedEffort=", "error_after = largest_error(dt);\n  {}"),
 )
-DOORS = """
+EXPORTS = """
 EXPORT void ask(int warm, int turn) { asked_warm = warm; asked_turn = turn; substep_number = 0; }
 EXPORT float before() { return error_before; }
 EXPORT float after() { return error_after; }
@@ -72,20 +75,20 @@ TAILS, STARTS = ((20, 60), (180, 240)), ((20, 90), (90, 120))  # steps, as in ex
 
 
 def instrumented(source: str) -> str:
-    """The engine's source with the lines added; InputError where it is another version's."""
+    """Return the engine's source with the lines added; InputError if it is that of another version."""
     for text, instead in ADDED:
         if source.count(text) != 1:
             raise InputError(
-                f"this is not physics.cpp of lavendersim 0.2.0: {text!r} stands there {source.count(text)} times"
+                f"this is not physics.cpp of lavendersim 0.2.0: it has {text!r} {source.count(text)} times, not once"
             )
         source = source.replace(text, instead.replace("{}", text))
-    return source + DOORS
+    return source + EXPORTS
 
 
 def run(
     library: Path, sweeps: int, steps: int, dt: float, *, warm: bool = False, turn: bool = False
 ) -> FloatArray:
-    """(steps, 3): of the last substep of each step the error before and after its sweeps [N s], and contacts."""
+    """Return (steps, 3): the error before and after the sweeps of the last substep [N s], and the contacts."""
     from lavendersim import Scene
     from lavendersim.runtime import CodeSceneEnv
 
@@ -110,17 +113,19 @@ def run(
 
 
 def draw(runs: dict[tuple[int, bool], FloatArray], path: Path) -> None:
-    """max |e_n| of every step beside that of LavenderSim, from examples/engine_sweeps.py."""
+    """Draw max |e_n| of every step in both engines, cold; runs: (sweeps, alternating) -> (240, 3)."""
     sys.path.append(str(Path(__file__).resolve().parent.parent / "examples"))
     import engine_sweeps
     from matplotlib.figure import Figure
 
-    ours = {(n, turn): engine_sweeps.run(n, "alternating" if turn else "bottom_up") for n, turn in runs}
+    ours = {
+        (n, turn): engine_sweeps.run(n, "alternating" if turn else "bottom_up", False) for n, turn in runs
+    }
     canvas = Figure(figsize=(10, 4.2), layout="constrained")
     titles = ("lavendersim 0.2.0, residual added", "here")
     for axes, title, by in zip(canvas.subplots(1, 2, sharey=True), titles, (runs, ours), strict=True):
         for (n, turn), rows in by.items():
-            label = f"{'turned round' if turn else 'one way'}, {n} sweeps"
+            label = f"{'alternating' if turn else 'one direction'}, {n} sweeps"
             axes.semilogy(
                 np.arange(1, 241), rows[:, 1], "C0" if turn else "C1", ls="--" if n == 4 else "-", label=label
             )
@@ -133,10 +138,12 @@ def draw(runs: dict[tuple[int, bool], FloatArray], path: Path) -> None:
 @click.command("original")
 @click.argument("archive", type=click.Path(exists=True, dir_okay=False, path_type=Path))
 @click.option(
-    "--figure", type=click.Path(dir_okay=False, path_type=Path), help="Draw every step, beside LavenderSim's."
+    "--figure", type=click.Path(dir_okay=False, path_type=Path), help="Draw every step of both engines."
 )
 def command(archive: Path, figure: Path | None) -> None:
-    """Cold and warm residuals of lavendersim, from its source distribution lavendersim-0.2.0.tar.gz; needs c++."""
+    """Residuals of lavendersim 0.2.0, cold and warm, from its source archive; needs a C++ compiler (`c++`)."""
+    if shutil.which("c++") is None:
+        raise InputError("a C++ compiler is needed, under the name c++ (on Debian: apt-get install g++)")
     with tempfile.TemporaryDirectory() as folder:
         with tarfile.open(archive) as held:
             held.extractall(folder, filter="data")
@@ -165,8 +172,10 @@ def command(archive: Path, figure: Path | None) -> None:
             times = [np.median(cold[a:b, 1]) / np.median(runs[64, turn][a:b, 1]) for a, b in TAILS]
             times += [np.median(cold[a:b, 0]) / np.median(warm[a:b, 0]) for a, b in STARTS]
             found = ", ".join(f"{a}-{b} {x:.0f}" for (a, b), x in zip((*TAILS, *STARTS), times, strict=True))
-            way = "turned round" if turn else "one way"
-            click.echo(f"{way}: 4 to 64, then cold to warm, steps {found}; contacts {warm[-1, 2]:.0f}")
+            order = "alternating" if turn else "one direction"
+            click.echo(
+                f"{order}: 4 to 64 sweeps cold, then cold to warm on 4, steps {found}; contacts {warm[-1, 2]:.0f}"
+            )
         if figure:
             draw(runs, figure)
             click.echo(f"figure: {figure}")

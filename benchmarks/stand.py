@@ -5,9 +5,9 @@ centres of the boxes,
 
     drift = max over boxes and t >= 2 s of |p(t) - p(2 s)|,                                     (1)
 
-looked at ten times a second. Where a box is half an edge beside or below where it began the tower has fallen and the
-run ends; soft contacts may throw it up at first. Lines are sorted by what they spend on a second of simulation:
-sweeps x substeps / dt.
+looked at ten times a second. The tower has fallen once a box is half an edge lower than it began
+(`lavender.lab.phenomena.parts.has_fallen`); the run ends then. Lines are sorted by what they spend on a second of
+simulation: sweeps x substeps / dt.
 
 LavenderSim is stepped as a user steps it, with its observation; the others by their own call for a step. MuJoCo,
 PyBullet and lavendersim are Python packages; Rapier (`@dimforge/rapier3d-compat`) and Jolt (`jolt-physics`) run under
@@ -32,13 +32,13 @@ from lavender.base.errors import InputError, UnknownName
 from lavender.cli.options import Listed
 from lavender.lab.bench.machine import versions
 from lavender.lab.phenomena.engines import PACKAGES_OF_NODE, Stepping, engine, lacks, versions_of_node
+from lavender.lab.phenomena.parts import has_fallen
 from lavender.sim.scene import Scene
 from lavender.sim.scene.scene import SCENE_ORDERS
 
 FRICTION = 0.5
 SETTLE = 2.0  # s
 LOOK = 0.1  # s
-FELL = 0.5  # m, half an edge
 
 
 @dataclass(frozen=True)
@@ -196,9 +196,7 @@ def _watch(made: Standing, tower: Tower) -> Line:
         steps += every
         time = steps * tower.dt
         now = made.centres()
-        away = now - first
-        away[:, 2] = np.minimum(away[:, 2], 0.0)
-        if not np.linalg.norm(away, axis=1).max() <= FELL:
+        if has_fallen(first, now):
             stood = time
             break
         if time >= SETTLE - 1e-9:

@@ -7,7 +7,6 @@ missing: another version, machine or plan.
 """
 
 import contextlib
-import functools
 import hashlib
 import importlib
 import importlib.util
@@ -46,7 +45,6 @@ from lavender.lab.report.page import page as report_page
 from lavender.lab.report.tables import NOISE, RESIDUAL_NOISE
 from lavender.lab.report.text import residual
 from lavender.problem import LAWS
-from lavender.problem.ordering import ORDERS
 from lavender.sim.scene.gallery import SCENES
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -437,16 +435,20 @@ def example_page(site, cache):
             source = f"Source: `examples/{path.name}`."
             parts += [f"## {path.stem}", f"**{first}**", docstrings.markdown(rest), source]
             continue
-        if hasattr(module, "PANELS"):
-            module.numbers = functools.cache(module.numbers)
-        files = [f"figures/{path.stem}/{panel}.svg" for panel in getattr(module, "PANELS", ())]
-        files = files or [f"figures/example-{path.stem}.svg"]
-        figure = site.path(files[0])
         printed = io.StringIO()
-        with contextlib.redirect_stdout(printed):
-            module.main(str(figure))
-        for file in files[1:]:
-            save(module.PANELS, module.numbers(), str(site.path(file)))
+        if hasattr(module, "PANELS"):
+            files = [f"figures/{path.stem}/{panel}.svg" for panel in module.PANELS]
+            found = module.numbers()
+            with contextlib.redirect_stdout(printed):
+                module.print_numbers(found)
+            for file in files:
+                save(module.PANELS, found, str(site.path(file)))
+            figure = site.path(files[0])
+        else:
+            files = [f"figures/example-{path.stem}.svg"]
+            figure = site.path(files[0])
+            with contextlib.redirect_stdout(printed):
+                module.main(str(figure))
         first, _, rest = inspect.cleandoc(module.__doc__).partition("\n")
         rest = re.sub(r"\n+ +python examples/\S+ .*", "", rest)
         output = "\n".join(line for line in printed.getvalue().splitlines() if str(figure) not in line)
@@ -518,13 +520,6 @@ def suite_page(site):
     site.write("cases.md", "\n\n".join(parts))
 
 
-def part_pages(site):
-    """Tables that hand-written pages include."""
-    text = inspect.getdoc(sys.modules["lavender.problem.ordering"])
-    assert all(order in text for order in ORDERS)
-    site.write("parts/orders.md", docstrings.markdown(text.partition("\n")[2]))
-
-
 def calibration_part(site):
     """Residual against motion error on CASES: a table and a figure for the page on motion."""
     seen = []
@@ -593,7 +588,6 @@ def write(source, cache):
     stability_part(site)
     scene_page(site)
     suite_page(site)
-    part_pages(site)
     calibration_part(site)
     api_page(site)
     site.forget_others()

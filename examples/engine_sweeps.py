@@ -1,83 +1,87 @@
-"""Experiment 4: what a sweep budget of 4 to 64 buys inside an engine.
+"""Experiment 4: what a budget of 4 to 64 sweeps gives inside an engine.
 
-The scene is `stack` with its defaults: six boxes, friction 0.5. Every step leaves a residual max |e_n| [N s],
-an approach velocity that should not be [m/s], and, summed over the steps, penetration [m].
+The scene is `stack` with its defaults: six boxes of 1 kg with edges of 1 m, friction 0.5, steps of 1/120 s in two
+substeps. Every step publishes the residual max |e_n| [N s], the approach velocity that is left [m/s], and the
+penetration [m], which adds up over the steps.
 
-First solve, from rest and from zero: the error by budget and order, with the judge's residual of all rows beside it.
-The two disagree across orders. e_n = w_n/d_n, and at the ground only one body moves: d_n is half of what it is between
-two boxes, so that the same approach velocity w_n publishes twice the residual there. From the bottom up the largest
-velocity is left at the ground, from the top down the ground is swept last and the velocities are left above it:
-max |e_n| is half as large, yet boxes approach faster and sink deeper. The judge, which adds up the energy of all
-rows and takes the largest velocity, says so.
+First solve, at rest and from zero impulses: the error by budget and order, by the published residual and by the judge
+over all rows. They disagree across orders. e_n = w_n/d_n, and at the ground only one body moves: d_n is half of that
+between two boxes, so the same approach velocity w_n publishes twice the residual there. Swept from the bottom up, the
+largest velocity is left at the ground. Swept from the top down, the ground is swept last and the velocities are left
+above: max |e_n| is half as large, yet the boxes approach faster and sink deeper. The judge adds the energy of all
+rows and takes the largest velocity, and says so.
 
-Cold run, before anything tips: the residual is larger than in the first solve where sweeps are few. Each solve
-must carry the whole weight from zero, so the boxes sink until b is large enough that n sweeps get there. With G
-the error matrix of a sweep and l the impulses that hold the stack,
+Cold run, steps 20 to 60: with few sweeps the residual is larger than in the first solve. Each solve must build up the
+whole weight from zero, so the boxes sink until b is large enough that n sweeps reach it. With G the error matrix of a
+sweep and l the impulses that hold the stack,
 
-    l = (1 - G^n) x,   e = (A (l - x)) / d                                                    (dense twin)
+    l = (1 - G^n) x,   e = (A (l - x)) / d                                                    (dense model)
 
-taken without friction, since the friction disks do not sweep like a matrix. Cold stacks then fall over, so the
-run is not averaged over its fall: how long it stands is a number of its own. Warm ones stand on every budget.
+without friction, since the friction disks do not sweep like a matrix. Cold stacks move sideways, lean, and fall in
+the end. A stack has fallen once a box is half an edge lower than it began (`has_fallen`), which is much later than
+the time at which a box has moved by 5 cm. Warm stacks stand on every budget.
 
-Order: with friction a cold run swept always the same way keeps a slow sway that 64 sweeps do not see. Turned round in
-every other substep (`alternating`, the default), 64 sweeps leave several times less by the judge; 4 to 16 sweeps, which
-leave much of everything, gain nothing. How much depends on when one looks, so that each number has its window: late in
-the run the stack on 4 sweeps leans.
+Order: with friction, a cold run that is always swept in the same direction keeps a slow sway that 64 sweeps do not
+remove. If the order of the contacts is reversed in every other substep (`alternating`, the default), 64 sweeps leave
+several times less by the judge; 4 to 16 sweeps, which leave much of every error, gain nothing. The ratio depends on
+the steps at which it is taken, so every number has its window.
 
     python examples/engine_sweeps.py [FIGURE.png]
 
-A file named after a panel holds it alone: by_budget.png, stand.png.
+A file named after a panel shows it alone: published.png, by_budget.png, stand.png.
 """
 
 import functools
 import sys
 
 import numpy as np
-from panels import beside, save
+from panels import Numbers, put_legend_right, show
 
 import lavender as lv
+from lavender.lab.phenomena.parts import has_fallen
 
 BUDGETS = (4, 8, 16, 32, 64)
 ORDERS = ("alternating", "bottom_up", "top_down", "random", "colored", "symmetric")
 RUNS = ("alternating", "bottom_up", "top_down")
 COMPARED = ("bottom_up", "alternating")
-FIRST, LAST = 20, 60  # steps of which medians are taken; no cold stack tips before
-MOST = 0.05  # m: a stack of which a box has moved so far no longer stands
-LONG = 60.0  # s
-TRAIL = 240  # steps
-ENDS = (4, 64)  # sweeps between which the tail is told
-TAILS = ((20, 60), (180, 240))  # steps of which medians are taken
-STARTS = ((20, 90), (90, 120))
+WINDOW = (20, 60)  # steps of which medians are taken
+TAILS = ((20, 60), (180, 240))  # steps of which the ratio of 4 to 64 sweeps is taken
+STARTS = ((20, 90), (90, 120))  # steps of which the ratio of cold to warm starts is taken
+STEPS = 240
+ENDS = (BUDGETS[0], BUDGETS[-1])
+MOVED = 0.05  # m
+LIMIT = 180.0  # s, simulated to see whether a stack falls
 
 
-def first_solve(sweeps, order):
-    """Of the first solve: max |e_n| [N s], and the judge's relative residual of all rows [-]."""
+def solve_first(sweeps, order):
+    """Return of the first solve max |e_n| [N s], and the judge's relative residual of all rows [-]."""
     problem = lv.Simulation(lv.Scene("stack", warm_start=False)).constraint_problem()
-    order = (
-        "given" if order == "alternating" else order
-    )  # the problem of a substep lists its contacts in that order
+    # the problem of a substep lists its contacts in the order in which `alternating` sweeps them
+    order = "given" if order == "alternating" else order
     impulse = lv.solve(problem, "sequential_impulses", tol=0, max_iter=sweeps, order=order).impulse
     judged = lv.residual(problem, impulse)
     return np.abs(judged.error[problem.cones.ptr[:-1]]).max(), judged.relative
 
 
+def make_simulation(sweeps, order, warm):
+    """Return a simulation of the stack and the positions (7, 3) [m] at its start."""
+    sim = lv.Simulation(lv.Scene("stack", solver_iterations=sweeps, order=order, warm_start=warm))
+    return sim, sim.reset()[0]["positions"]
+
+
 @functools.cache
 def run(sweeps, order, warm):
-    """Of each of the steps that are looked at six columns."""
-    scene = lv.Scene("stack", solver_iterations=sweeps, order=order, warm_start=warm)
-    sim = lv.Simulation(scene)
-    start = sim.reset()[0]["positions"]
+    """Return five columns for each of STEPS steps, in the order of the comments below."""
+    sim, start = make_simulation(sweeps, order, warm)
     rows = []
-    for step in range(TRAIL if order in COMPARED and not warm else STARTS[-1][-1]):
-        sim.report_residual = any(a <= step < b for a, b in TAILS)  # costs as much as ten steps
-        observation, *_, info = sim.step()
+    for _ in range(STEPS):
+        observation = sim.step()[0]
         values = dict(zip(lv.SOLVER_FIELDS, observation["solver"], strict=True))
         rows.append(
             (
                 values["residual_initial"],  # N s, before the first sweep
-                values["residual_final"],  # N s
+                values["residual_final"],  # N s, after the last sweep
                 values["violation_final"],  # m/s
-                info["residual"]["relative"] if sim.report_residual else np.nan,  # -, of all rows
                 observation["contacts"]["depth"].max(),  # m
                 np.abs(observation["positions"] - start).max(),  # m, how far a box has moved
             )
@@ -85,14 +89,27 @@ def run(sweeps, order, warm):
     return np.array(rows)
 
 
-def summary(sweeps, order, warm):
-    """Of the steps FIRST to LAST: medians of residual, violation and judge; of all up to LAST the largest depth."""
-    rows = run(sweeps, order, warm)[:LAST]
-    return (*np.median(rows[FIRST:, 1:4], axis=0), rows[:, 4].max())
+@functools.cache
+def judge(sweeps, order, warm, window=WINDOW):
+    """Return the median relative residual of all rows [-] over the steps of a window."""
+    sim, _ = make_simulation(sweeps, order, warm)
+    relative = []
+    for step in range(window[1]):
+        sim.report_residual = step >= window[0]  # costs as much as ten steps
+        info = sim.step()[-1]
+        if sim.report_residual:
+            relative.append(info["residual"]["relative"])
+    return np.median(relative)
 
 
-def alternation():
-    """By order: tails 4 -> 64 in the windows TAILS, starts cold over warm in STARTS, m moved on 64, judged (2, 5)."""
+def summarize(order, warm):
+    """Return by budget (5, 3): medians of residual and violation in WINDOW, and the largest depth up to its end."""
+    rows = [run(n, order, warm)[: WINDOW[1]] for n in BUDGETS]
+    return np.array([(*np.median(x[WINDOW[0] :, 1:3], axis=0), x[:, 3].max()) for x in rows])
+
+
+def compare_orders():
+    """Return by order: ratios 4 to 64 in TAILS and cold to warm in STARTS, m moved on 64 sweeps, judged (2, 5)."""
     out = {}
     for order in COMPARED:
         few, many = (run(n, order, False) for n in ENDS)
@@ -100,26 +117,30 @@ def alternation():
         out[order] = {
             "tails": [np.median(few[a:b, 1]) / np.median(many[a:b, 1]) for a, b in TAILS],
             "starts": [np.median(few[a:b, 0]) / np.median(warm[a:b, 0]) for a, b in STARTS],
-            "moved": many[-1, 5],
-            "judged": np.array(
-                [[np.median(run(n, order, False)[a:b, 3]) for n in BUDGETS] for a, b in TAILS]
-            ),
+            "moved": many[-1, 4],
+            "judged": np.array([[judge(n, order, False, window) for n in BUDGETS] for window in TAILS]),
         }
     return out
 
 
-def standing(sweeps, warm):
-    """Seconds until a box has moved MOST from where it began, or LONG."""
-    sim = lv.Simulation(lv.Scene("stack", solver_iterations=sweeps, warm_start=warm))
-    start = sim.reset()[0]["positions"]
-    while sim.time < LONG:
-        if np.abs(sim.step()[0]["positions"] - start).max() > MOST:
-            return sim.time
-    return LONG
+def time_fall(sweeps, warm):
+    """Return times [s]: a box has moved by MOVED, a contact is lost, the stack has fallen; nan if not in LIMIT."""
+    sim, start = make_simulation(sweeps, "alternating", warm)
+    moved = lost = np.nan
+    while sim.time < LIMIT:
+        observation = sim.step()[0]
+        positions = observation["positions"]
+        if np.isnan(moved) and np.abs(positions - start).max() > MOVED:
+            moved = sim.time
+        if np.isnan(lost) and len(observation["contacts"]["depth"]) < 24:
+            lost = sim.time
+        if has_fallen(start, positions):
+            return moved, lost, sim.time
+    return moved, lost, np.nan
 
 
-def twin(sweeps):
-    """max |e_n| [N s] that the dense twin predicts for a cold run without friction, swept bottom-up."""
+def predict_residual(sweeps):
+    """Return max |e_n| [N s] that the dense model predicts for a cold run without friction, swept bottom-up."""
     scene = lv.Scene("stack", friction=0.0)
     problem = lv.Simulation(scene).constraint_problem()
     a, m = problem.dense(), problem.m
@@ -130,64 +151,98 @@ def twin(sweeps):
     return np.abs((a @ (weight - x)) / np.diag(a)).max()
 
 
-def bare(sweeps):
-    """max |e_n| [N s] of the run that the twin is of."""
+def run_without_friction(sweeps):
+    """Return max |e_n| [N s] of the run that the dense model describes."""
     scene = lv.Scene("stack", friction=0.0, warm_start=False, solver_iterations=sweeps, order="bottom_up")
     sim = lv.Simulation(scene)
     at = lv.SOLVER_FIELDS.index("residual_final")
-    return float(np.median([sim.step()[0]["solver"][at] for _ in range(2 * LAST)][LAST:]))
+    return float(np.median([sim.step()[0]["solver"][at] for _ in range(2 * WINDOW[1])][WINDOW[1] :]))
 
 
 def numbers():
-    """First solves and runs by order and budget, how long stacks stand, and the twin beside its run."""
-    return {
-        "first": {order: np.array([first_solve(n, order) for n in BUDGETS]) for order in ORDERS},  # (5, 2)
-        "cold": {order: np.array([summary(n, order, False) for n in BUDGETS]) for order in RUNS},  # (5, 4)
-        "warm": np.array([summary(n, "alternating", True) for n in BUDGETS]),  # (5, 4)
-        "standing": {warm: np.array([standing(n, warm) for n in BUDGETS]) for warm in (False, True)},
-        "alternation": alternation(),
-        "twin": np.array([twin(n) for n in BUDGETS]),
-        "bare": np.array([bare(n) for n in BUDGETS]),
-    }
+    """Return first solves and runs by order and budget, the times at which stacks fall, and the dense model."""
+    return Numbers(
+        first=lambda: {
+            order: np.array([solve_first(n, order) for n in BUDGETS]) for order in ORDERS
+        },  # (5, 2)
+        cold=lambda: {order: summarize(order, False) for order in RUNS},  # (5, 3) each
+        warm=lambda: summarize("alternating", True),
+        judged=lambda: {order: np.array([judge(n, order, False) for n in BUDGETS]) for order in RUNS},
+        judged_warm=lambda: np.array([judge(n, "alternating", True) for n in BUDGETS]),
+        falls=lambda: {
+            warm: np.array([time_fall(n, warm) for n in BUDGETS]) for warm in (False, True)
+        },  # (5, 3) s
+        compared=compare_orders,
+        predicted=lambda: np.array([predict_residual(n) for n in BUDGETS]),
+        without_friction=lambda: np.array([run_without_friction(n) for n in BUDGETS]),
+    )
 
 
-def against_budget(axes):
-    """Ticks at the budgets."""
+def set_budget_axis(axes):
+    """Show the budgets on a logarithmic axis."""
     axes.set_xscale("log")
     axes.set_yscale("log")
     axes.set_xticks(BUDGETS, [str(n) for n in BUDGETS])
     axes.set_xticks([], minor=True)
+    axes.set_xlabel("sweeps")
+
+
+def draw_published(axes, found):
+    """Draw residual, violation and penetration of the cold run against the budget."""
+    for order, style in (("alternating", "-"), ("bottom_up", "--")):
+        for i, (name, marker) in enumerate(
+            (("violation [m/s]", "s"), ("penetration [m]", "^"), ("residual [N s]", "o"))
+        ):
+            values = found["cold"][order][:, (1, 2, 0)[i]]
+            axes.plot(
+                BUDGETS,
+                values,
+                marker + style,
+                color=f"C{i}",
+                markersize=4,
+                label=f"{name},\n{order.replace('_', ' ')}",
+            )
+    set_budget_axis(axes)
+    axes.set(title=f"cold, steps {WINDOW[0]} to {WINDOW[1]}", ylabel="units in the legend")
+    put_legend_right(axes)
 
 
 def draw_by_budget(axes, found):
-    """The run: what the judge says."""
-    curves = {f"cold,\n{order.replace('_', ' ')}": by for order, by in found["cold"].items()}
-    curves["warm,\nalternating"] = found["warm"]
+    """Draw the judge's residual of all rows against the budget."""
+    curves = {f"cold,\n{order.replace('_', ' ')}": by for order, by in found["judged"].items()}
+    curves["warm,\nalternating"] = found["judged_warm"]
     for i, (name, by) in enumerate(curves.items()):
         style = "o^vs"[i] + ("-" if name.startswith("warm") else "--")
-        axes.plot(BUDGETS, by[:, 2], style, markersize=4, label=name)
-    against_budget(axes)
-    axes.set(title="the run: all rows, by the judge", xlabel="sweeps", ylabel="relative residual [-]")
-    beside(axes)
+        axes.plot(BUDGETS, by, style, markersize=4, label=name)
+    set_budget_axis(axes)
+    axes.set(
+        title=f"all rows, by the judge, steps {WINDOW[0]} to {WINDOW[1]}", ylabel="relative residual [-]"
+    )
+    put_legend_right(axes)
 
 
 def draw_stand(axes, found):
-    """How long stacks stand."""
-    for warm, style in ((False, "o--"), (True, "s-")):
-        axes.plot(BUDGETS, found["standing"][warm], style, markersize=4, label="warm" if warm else "cold")
-    against_budget(axes)
-    axes.set(title=f"how long the stack stands (looked at for {LONG:.0f} s)", xlabel="sweeps", ylabel="[s]")
-    axes.set_yticks([2, 5, 10, 20, 60], ["2", "5", "10", "20", "60"])
+    """Draw when cold stacks lose a contact and fall, and how long warm ones were watched."""
+    moved, lost, fallen = found["falls"][False].T
+    axes.plot(BUDGETS, fallen, "o-", color="C3", markersize=4, label="cold: has fallen")
+    axes.plot(BUDGETS, lost, "v--", color="C1", markersize=4, label="cold: first\ncontact lost")
+    axes.plot(BUDGETS, moved, ".:", color="0.5", label=f"cold: moved\nby {100 * MOVED:g} cm")
+    standing = np.isnan(found["falls"][True][:, 2])
+    axes.plot(
+        np.array(BUDGETS)[standing], np.full(standing.sum(), LIMIT), "C0^", label="warm: still\nstanding"
+    )
+    set_budget_axis(axes)
+    axes.set(title=f"six boxes, watched for {LIMIT:.0f} s", ylabel="time [s]")
+    axes.set_yticks([2, 5, 10, 20, 50, 100, 180], ["2", "5", "10", "20", "50", "100", "180"])
     axes.set_yticks([], minor=True)
-    beside(axes)
+    put_legend_right(axes)
 
 
-PANELS = {"by_budget": draw_by_budget, "stand": draw_stand}
+PANELS = {"published": draw_published, "by_budget": draw_by_budget, "stand": draw_stand}
 
 
-def main(path="engine_sweeps.png"):
-    """Print the tables, save the figure."""
-    found = numbers()
+def print_numbers(found):
+    """Print the tables."""
     print(f"first solve   {'max |e_n| [N s]':>34}{'relative residual of all rows':>40}")
     print(f"{'order':<13}{4:>12}{64:>12}{'ratio':>10}{4:>17}{64:>13}{'ratio':>10}")
     for order, by in found["first"].items():
@@ -197,43 +252,48 @@ def main(path="engine_sweeps.png"):
             f"{r[0]:>17.2e}{r[-1]:>13.2e}{r[0] / r[-1]:>10.1f}"
         )
     print(
-        f"\ncold run, steps {FIRST} to {LAST}\n"
-        f"{'order':<13}{'sweeps':>7}{'residual':>11}{'violation':>11}{'all rows':>10}{'depth mm':>10}"
+        f"\nrun, steps {WINDOW[0]} to {WINDOW[1]}\n"
+        f"{'start, order':<19}{'sweeps':>7}{'residual':>11}{'violation':>11}{'all rows':>10}{'depth mm':>10}"
     )
-    for order, by in [*found["cold"].items(), ("warm", found["warm"])]:
-        for n, (e, v, r, depth) in zip(BUDGETS, by, strict=True):
-            print(f"{order:<13}{n:>7}{e:>11.2e}{v:>11.2e}{r:>10.1e}{1e3 * depth:>10.2f}")
-        print(f"{'':<13}   residual falls {by[0, 0] / by[-1, 0]:.0f} times")
+    runs = [(f"cold {order}", by, found["judged"][order]) for order, by in found["cold"].items()]
+    for name, by, judged in [*runs, ("warm alternating", found["warm"], found["judged_warm"])]:
+        for n, (e, v, depth), r in zip(BUDGETS, by, judged, strict=True):
+            print(f"{name:<19}{n:>7}{e:>11.2e}{v:>11.2e}{r:>10.1e}{1e3 * depth:>10.2f}")
+        print(f"{'':<19}   the residual falls {by[0, 0] / by[-1, 0]:.0f} times")
+    engine, model = found["without_friction"], found["predicted"]
     print(
-        f"without friction, bottom up: {found['bare'][0] / found['bare'][-1]:.0f} times, "
-        f"the dense twin {found['twin'][0] / found['twin'][-1]:.0f} times"
+        f"without friction, bottom up: {engine[0] / engine[-1]:.0f} times, "
+        f"the dense model {model[0] / model[-1]:.0f} times"
     )
-    print(f"\n{'':<13}tail {ENDS[0]} -> {ENDS[1]}, steps:{'':>9}start cold / warm on {ENDS[0]}, steps:")
+    print(f"\n{'':<13}4 -> 64 sweeps, steps:{'':>9}start cold / warm on 4 sweeps, steps:")
     windows = "".join(f"{f'{a}-{b}':>12}" for a, b in (*TAILS, *STARTS))
-    print(f"{'order':<13}{windows}   moved by step {TRAIL} on {ENDS[1]}, mm")
-    found_in = {order: (*by["tails"], *by["starts"]) for order, by in found["alternation"].items()}
-    for order, values in found_in.items():
-        moved = 1e3 * found["alternation"][order]["moved"]
+    print(f"{'order':<13}{windows}   moved by step {STEPS} on {ENDS[1]}, mm")
+    ratios = {order: (*by["tails"], *by["starts"]) for order, by in found["compared"].items()}
+    for order, values in ratios.items():
+        moved = 1e3 * found["compared"][order]["moved"]
         print(f"{order + ':':<13}" + "".join(f"{x:>12.0f}" for x in values) + f"{moved:>10.1f}")
-    print(f"{'ratio':<13}" + "".join(f"{b / a:>12.1f}" for a, b in zip(*found_in.values(), strict=True)))
-    print(
-        f"\njudged, cold: what is left of doing nothing, medians{'':>7}" + "".join(f"{n:>9}" for n in BUDGETS)
-    )
-    one_way, turned = (found["alternation"][order]["judged"] for order in found_in)
-    for (a, b), *both in zip(TAILS, one_way, turned, strict=True):
-        for name, values in zip(
-            ("bottom_up", "alternating", "gain"), (*both, both[0] / both[1]), strict=True
-        ):
+    print(f"{'ratio':<13}" + "".join(f"{b / a:>12.1f}" for a, b in zip(*ratios.values(), strict=True)))
+    print(f"\nrelative residual of all rows, cold, medians{'':>15}" + "".join(f"{n:>9}" for n in BUDGETS))
+    one_way, alternating = (found["compared"][order]["judged"] for order in COMPARED)
+    for (a, b), *both in zip(TAILS, one_way, alternating, strict=True):
+        for name, values in zip((*COMPARED, "gain"), (*both, both[0] / both[1]), strict=True):
             digits = ".1f" if name == "gain" else ".3f"
             print(f"{f'steps {a}-{b}':<14} {name:<46}" + "".join(f"{x:>9{digits}}" for x in values))
+    print(f"\ntimes in s, of {LIMIT:.0f} s{'':<32}" + "".join(f"{n:>9}" for n in BUDGETS))
     for warm in (False, True):
-        times = "  ".join(
-            f"{n}: {'all' if t >= LONG else f'{t:.1f}'}"
-            for n, t in zip(BUDGETS, found["standing"][warm], strict=True)
+        names = (
+            f"a box has moved by {100 * MOVED:g} cm",
+            "the first contact is lost",
+            "the stack has fallen",
         )
-        print(f"{'warm' if warm else 'cold'} stacks stand for, of {LONG:.0f} s:  {times}")
-    save(PANELS, found, path)
-    print(f"figure: {path}")
+        for name, times in zip(names, found["falls"][warm].T, strict=True):
+            shown = "".join(f"{'never' if np.isnan(t) else f'{t:.1f}':>9}" for t in times)
+            print(f"{'warm' if warm else 'cold'}, {name:<44}{shown}")
+
+
+def main(path="engine_sweeps.png"):
+    """Print the tables and draw the figure."""
+    show(PANELS, numbers(), print_numbers, path)
 
 
 if __name__ == "__main__":

@@ -1,119 +1,129 @@
-"""Exercise 2: what Jacobi buys in place of Gauss-Seidel, and what it costs.
+"""Exercise 2: Jacobi, coloured Gauss-Seidel and Gauss-Seidel: what parallel updates cost in convergence.
 
-A Gauss-Seidel sweep uses what it has just found; row i waits for row i - 1. A Jacobi sweep reads only what
-the sweep before has left, so all rows can go at once, and one thread each is not too many. Coloured
-Gauss-Seidel stands between: rows of one colour share no body, and a stack of boxes needs two colours.
+Row i of a Gauss-Seidel sweep uses the newest values of the rows before it, so the rows of a sweep are updated one
+after the other. A Jacobi sweep reads only the values of the sweep before, so all of its rows can be updated at once.
+A coloured sweep lies between: rows of one colour share no body, so none of them reads what another one writes. They
+can be updated in any order or at once, with the same bits. A stack of boxes needs two colours.
 
-The price is in sweeps. On a stack (A tridiagonal) the error of a Gauss-Seidel sweep shrinks by the square of
-what undamped Jacobi's does: twice the sweeps. So two colours with half as many threads wait as long as Jacobi with a
-thread for each row, and with as many threads as rows no longer than that: Jacobi wins nothing here. Where rows of
-one contact repeat each other, undamped Jacobi
-does not end at all (k equal rows: it is k - 1 times too strong); the damping that makes it safe for every
-problem costs more sweeps again.
-
-This counts; it measures no time, for `jacobi` itself runs on one thread: sweep by sweep, and by how many rows wait.
-
-Rows done one after the other, with T threads: sweeps x the sum over the colours of ceil(rows of it / T).
+The price is in sweeps. For a stack (A tridiagonal) the error of a Gauss-Seidel sweep shrinks by the square of that of
+an undamped Jacobi sweep: Jacobi needs twice as many sweeps. The number of updates that must follow each other is the
+number of sweeps times the colours of a sweep. For two colours and for Jacobi this is the same number here. If rows of
+one contact repeat each other, undamped Jacobi does not converge (k equal rows: its step is k - 1 times too long); the
+damping that is safe for every problem costs more sweeps.
 
     python examples/jacobi.py [FIGURE.png]
 
-The chapter shows it as threads.png.
+The chapter shows it as stages.png.
 """
 
 import sys
 
 import numpy as np
-from panels import beside, save
+from panels import Numbers, put_legend_right, show
 
 import lavender as lv
+from lavender.problem.ordering import colors
 
 N = 32  # contacts of the stack
 GRAVITY_STEP = 9.81 / 100.0  # m/s, gravity over one step
 TOL = 1e-3  # relative residual
-MOST = 100_000  # sweeps
-THREADS = (1, 2, 4, 8, 16, 32)
-WAYS = {
+MAX_SWEEPS = 100_000
+METHODS = {
     "Gauss-Seidel": ("pgs", {"order": "given"}),
     "Gauss-Seidel, coloured": ("pgs", {"order": "colored"}),
     "Jacobi, undamped": ("jacobi", {"omega": 1.0}),
     "Jacobi, safe damping": ("jacobi", {}),
 }
-COLOURS = {"Gauss-Seidel": N, "Gauss-Seidel, coloured": 2, "Jacobi, undamped": 1, "Jacobi, safe damping": 1}
+STAGES = {"Gauss-Seidel": N, "Gauss-Seidel, coloured": 2, "Jacobi, undamped": 1, "Jacobi, safe damping": 1}
+SHUFFLES = 20
+BUDGET = 50  # sweeps of the comparison of orders
 
 
-def stack():
-    """N boxes that fall by one step of gravity: A (N, N) tridiagonal [1/kg], b (N,) [m/s]."""
+def make_stack():
+    """Return the LCP of N boxes that fall by one step of gravity: A (N, N) tridiagonal [1/kg], b (N,) [m/s]."""
     jacobian = np.eye(N) - np.eye(N, k=-1)
     return lv.Problem.lcp(jacobian @ jacobian.T, jacobian @ np.full(N, GRAVITY_STEP), name="stack")
 
 
-def repeated(k=3):
-    """One contact counted k times: A (k, k) of ones."""
+def make_repeated(k=3):
+    """Return one contact counted k times: A (k, k) of ones."""
     return lv.Problem.lcp(np.ones((k, k)), np.ones(k), name=f"{k} equal rows")
 
 
-def one_after_the_other(name, sweeps, threads):
-    """Rows that wait for each other."""
-    rows = N / COLOURS[name]
-    return sweeps * COLOURS[name] * int(np.ceil(rows / threads))
+def compare_orders():
+    """Return how many different impulses (in bits) shuffled orders give: within the colours, and of all rows."""
+    stack, rng = make_stack(), np.random.default_rng(0)
+    color = colors(stack)
+
+    def sweep(order):
+        return lv.solve(stack, "pgs", order=order, tol=0.0, max_iter=BUDGET).impulse.tobytes()
+
+    within = {sweep("colored")}
+    within |= {sweep(np.lexsort((rng.random(N), color)).astype(np.int32)) for _ in range(SHUFFLES)}
+    every = {sweep(rng.permutation(N).astype(np.int32)) for _ in range(SHUFFLES)}
+    return {"colours": int(color.max()) + 1, "within": len(within), "every": len(every)}
+
+
+def solve_by(name, problem, max_iter, **more):
+    """Return the solution of a problem by one of METHODS."""
+    solver, options = METHODS[name]
+    return lv.solve(problem, solver, tol=TOL, max_iter=max_iter, **options, **more)
 
 
 def numbers():
-    """Solutions of the stack and of the repeated contact, and rows done one after the other by threads."""
-    solved = {
-        name: lv.solve(stack(), solver, tol=TOL, max_iter=MOST, history=True, **more)
-        for name, (solver, more) in WAYS.items()
-    }
-    return {
-        "stack": solved,
-        "repeated": {
-            name: lv.solve(repeated(), solver, tol=TOL, max_iter=1000, **more)
-            for name, (solver, more) in WAYS.items()
-        },
-        "waiting": {
-            name: [one_after_the_other(name, s.work["sweeps"], t) for t in THREADS]
-            for name, s in solved.items()
-        },
-    }
+    """Return the solutions of the stack and of the repeated contact, and the comparison of orders."""
+    return Numbers(
+        stack=lambda: {name: solve_by(name, make_stack(), MAX_SWEEPS, history=True) for name in METHODS},
+        repeated=lambda: {name: solve_by(name, make_repeated(), 1000) for name in METHODS},
+        orders=compare_orders,
+    )
 
 
-def draw_threads(axes, found):
-    """Rows one after the other against threads."""
-    for i, (name, waiting) in enumerate(found["waiting"].items()):
-        axes.loglog(THREADS, waiting, "o^sx"[i] + "-", color=f"C{i}", label=name)
-    title = f"until the relative residual is {TOL:g}"
-    axes.set(title=title, xlabel="threads", ylabel="rows one after the other")
-    axes.set_xticks(THREADS, [str(t) for t in THREADS])
-    axes.minorticks_off()
-    beside(axes)
-
-
-PANELS = {"threads": draw_threads}
-
-
-def main(path="jacobi.png"):
-    """Print the table, save the figure."""
-    found = numbers()
-    print(f"{'':<24}{'sweeps':>8}  rows one after the other, by threads")
-    print(f"{'':<24}{'':>8}" + "".join(f"{t:>9}" for t in THREADS) + "   three equal rows")
-    for name, solution in found["stack"].items():
-        print(
-            f"{name:<24}{solution.work['sweeps']:>8}"
-            + "".join(f"{x:>9}" for x in found["waiting"][name])
-            + f"   {found['repeated'][name].status.name.lower().replace('_', ' ')}"
+def draw_stages(axes, found):
+    """Draw the residual against the number of updates that follow each other."""
+    for i, (name, solution) in enumerate(found["stack"].items()):
+        h = solution.history
+        axes.loglog(
+            h.iterations[1:] * STAGES[name],
+            h.relative[1:],
+            ["-", "-", "--", ":"][i],
+            color=f"C{i}",
+            label=name,
         )
-    coloured, jacobi = found["waiting"]["Gauss-Seidel, coloured"], found["waiting"]["Jacobi, undamped"]
+    axes.axhline(TOL, color="0.7", linewidth=0.8)
+    axes.set(
+        title=f"a stack of {N}, to {TOL:g}",
+        xlabel="updates one after the other",
+        ylabel="relative residual [-]",
+    )
+    put_legend_right(axes)
+
+
+PANELS = {"stages": draw_stages}
+
+
+def print_numbers(found):
+    """Print the tables."""
+    print(f"{'':<24}{'sweeps':>8}{'stages of one':>15}{'stages':>9}   three equal rows")
+    for name, solution in found["stack"].items():
+        sweeps = solution.work["sweeps"]
+        status = found["repeated"][name].status.name.lower().replace("_", " ")
+        print(f"{name:<24}{sweeps:>8}{STAGES[name]:>15}{sweeps * STAGES[name]:>9}   {status}")
+    orders = found["orders"]
     print(
-        f"coloured Gauss-Seidel on {THREADS[-2]} threads waits for {coloured[-2]} rows, "
-        f"Jacobi on {THREADS[-1]} for {jacobi[-1]}"
+        f"{orders['colours']} colours: {SHUFFLES} shuffled orders within the colours and order='colored' give "
+        f"{orders['within']} result in bits after {BUDGET} sweeps; {SHUFFLES} orders of all rows give {orders['every']}"
     )
     for name in ("Gauss-Seidel", "Jacobi, safe damping"):
         impulse = found["repeated"][name].impulse
         print(
             f"three equal rows, {name}: impulses {' '.join(f'{x + 0.0:.3f}' for x in impulse)}, sum {impulse.sum():.3f}"
         )
-    save(PANELS, found, path)
-    print(f"figure: {path}")
+
+
+def main(path="jacobi.png"):
+    """Print the tables and draw the figure."""
+    show(PANELS, numbers(), print_numbers, path)
 
 
 if __name__ == "__main__":

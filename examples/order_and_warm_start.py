@@ -1,81 +1,81 @@
-"""Experiment 3: order of the sweep and warm start: what each is worth.
+"""Experiment 3: the order of a sweep and the start of a solve: how much each changes the error.
 
-Eight boxes on each other, projected Gauss-Seidel. b is zero but where boxes approach: at the ground
-when all of them fall, at the top when only the top one comes down. A sweep that starts there and goes
-on carries the impulse through all contacts in one pass; the opposite one moves it on by one contact.
-Where each box stands on a heavier one, little comes back, and few passes are enough; among equal boxes most
-comes back, and the order matters little. A random order does it in pieces, each seed otherwise.
+Eight boxes are on each other, solved by projected Gauss-Seidel. b is not zero where bodies approach: at the ground if
+all boxes fall, at the top if only the top box comes down. A sweep that starts there carries the impulse through all
+contacts in one pass. A sweep in the opposite direction carries it one contact further. If each box stands on a
+heavier one, the contact above returns little, and a few sweeps are enough. Equal boxes return half, and the order
+matters little. A random order carries the impulse piece by piece, differently for every seed.
 
-Warm start: a small change of load, from the exact impulses before it, begins as much closer as the load has
-changed little: 20 times for 5 %, before the first sweep.
+Warm start: if the load changes by 5 %, a solve that starts from the exact impulses before the change starts 20 times
+closer than from zero.
 
-Stale impulses hurt for as long as sweeps take to remove what is wrong with them. The error has parts that die at
-different rates: neighbours that disagree are put right in a few sweeps, an impulse that is missing or too much in all
-contacts together shrinks by cos^2(pi / 2n) a sweep (n = 8: 0.962), the slowest part of all. Matched to the wrong
-contacts (in reverse), the same numbers begin 9 times further off than nothing at all, but hardly any of that is of the
-slow part: they are behind for some sweeps and then ahead. Ten times too large, as after a load that is gone or in a
-step that is ten times shorter, they begin as far off, all of it of the slow part: behind nothing at all for good.
+Stale impulses. The error has parts that shrink at different rates. Differences between neighbours disappear in a few
+sweeps. An excess or lack of impulse in all contacts together shrinks by cos^2(pi / 2n) per sweep (n = 8: 0.962), the
+slowest part. If the impulses are matched to the wrong contacts (in reverse), the start is 9 times worse than zero,
+but hardly any of this error is in the slow part: after some sweeps it is better than the cold start. If they are ten
+times too large, as in a step that is ten times shorter, nearly all of the error is in the slow part, and it stays
+worse.
 
     python examples/order_and_warm_start.py [FIGURE.png]
 
-A file named after a panel holds it alone: lighter.png, starts.png.
+A file named after a panel shows it alone: lighter.png, starts.png.
 """
 
 import sys
 
 import numpy as np
-from panels import beside, save
+from panels import Numbers, put_legend_right, show
 
 import lavender as lv
 
 N = 8
-BUDGET = 8
+BUDGET = 8  # sweeps
 SEEDS = range(20)
 GRAVITY_STEP = 9.81 / 100.0  # m/s, gravity over one step
 BLOW = 1.0  # m/s, top box downwards
-RATIO = 3.0  # mass of a box over that of the one on it
-CHANGE = 0.05  # relative change of the load
+RATIO = 3.0  # mass of a box over that of the box on it
+CHANGE = 0.05  # relative change of the load of the upper half
 SWEEPS = (0, 1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64)
 ORDERS = {"bottom up": "given", "top down": "reverse", "colored": "colored"}
 
 
-def stack(mass, velocity):
-    """N contacts of boxes with masses (N,) [kg] and velocities (N,) [m/s] upwards, lowest first."""
+def make_stack(mass, velocity):
+    """Return the LCP of N boxes with masses (N,) [kg] and upward velocities (N,) [m/s], lowest first."""
     jacobian = np.eye(N) - np.eye(N, k=-1)
     return lv.Problem.lcp(jacobian @ np.diag(1.0 / mass) @ jacobian.T, -jacobian @ velocity)
 
 
-def falling(mass, load=1.0):
-    """All boxes after one step of gravity, `load` times as much on the upper half."""
+def make_falling(mass, load=1.0):
+    """Return the stack after one step of gravity, which is `load` times as large on the upper half."""
     velocity = np.full(N, -GRAVITY_STEP)
     velocity[N // 2 :] *= load
-    return stack(mass, velocity)
+    return make_stack(mass, velocity)
 
 
-def struck(mass):
-    """At rest, but the top box comes down."""
-    return stack(mass, np.where(np.arange(N) == N - 1, -BLOW, 0.0))
+def make_struck(mass):
+    """Return the stack at rest, with a top box that comes down."""
+    return make_stack(mass, np.where(np.arange(N) == N - 1, -BLOW, 0.0))
 
 
-def cases():
-    """Name -> problem."""
+def make_cases():
+    """Return the problems by name."""
     lighter_above = RATIO ** -np.arange(float(N))
     return {
-        "falling, lighter above": falling(lighter_above),
-        "falling, equal": falling(np.ones(N)),
-        "struck, lighter above": struck(lighter_above),
+        "falling, lighter above": make_falling(lighter_above),
+        "falling, equal": make_falling(np.ones(N)),
+        "struck, lighter above": make_struck(lighter_above),
     }
 
 
-def error(problem, impulse=None, sweeps=BUDGET, solver="pgs", **order):
-    """Relative residual after that many sweeps, from `impulse` or from zero."""
+def measure_error(problem, impulse=None, sweeps=BUDGET, solver="pgs", **order):
+    """Return the relative residual after so many sweeps, from `impulse` or from zero."""
     return lv.solve(problem, solver, tol=0.0, max_iter=sweeps, impulse=impulse, **order).residual.relative
 
 
-def slow_part(problem, impulse, exact):
-    """The slowest part of an impulse's error, of that of no impulse [-]: as that part is left, sweep after sweep.
+def measure_slow_part(problem, impulse, exact):
+    """Return the slowest part of an impulse's error over that of the zero impulse [-].
 
-    A sweep from the bottom up multiplies the error by G = I - (L + D)^-1 A; a left eigenvector of G picks one part.
+    A sweep from the bottom up multiplies the error by G = I - (L + D)^-1 A; a left eigenvector of G selects one part.
     """
     a = problem.dense()
     values, vectors = np.linalg.eig((np.eye(N) - np.linalg.solve(np.tril(a), a)).T)
@@ -83,60 +83,81 @@ def slow_part(problem, impulse, exact):
     return abs(slow @ (impulse - exact)) / abs(slow @ exact)
 
 
-def histories(problem):
-    """Residual after each of SWEEPS by order, of Jacobi, and of random orders (seeds, sweeps)."""
-    out = {name: [error(problem, sweeps=n, order=order) for n in SWEEPS] for name, order in ORDERS.items()}
-    out["Jacobi"] = [error(problem, sweeps=n, solver="jacobi") for n in SWEEPS]
+def measure_orders():
+    """Return the residual after BUDGET sweeps by case and order."""
+    return {
+        name: {
+            "bottom up": measure_error(problem, order="given"),
+            "top down": measure_error(problem, order="reverse"),
+            "random": [measure_error(problem, order="random", seed=seed) for seed in SEEDS],
+        }
+        for name, problem in make_cases().items()
+    }
+
+
+def measure_histories(problem):
+    """Return the residual after each of SWEEPS by order, of Jacobi, and of random orders (seeds, sweeps)."""
+    out = {
+        name: [measure_error(problem, sweeps=n, order=order) for n in SWEEPS]
+        for name, order in ORDERS.items()
+    }
+    out["Jacobi"] = [measure_error(problem, sweeps=n, solver="jacobi") for n in SWEEPS]
     out["random"] = np.array(
-        [[error(problem, sweeps=n, order="random", seed=seed) for n in SWEEPS] for seed in SEEDS]
+        [[measure_error(problem, sweeps=n, order="random", seed=seed) for n in SWEEPS] for seed in SEEDS]
     )
     return out
 
 
-def numbers():
-    """Residuals by order for three stacks, histories of one of them, and warm, stale and cold over sweeps."""
-    orders = {}
-    for name, problem in cases().items():
-        orders[name] = {
-            "bottom up": error(problem, order="given"),
-            "top down": error(problem, order="reverse"),
-            "random": [error(problem, order="random", seed=seed) for seed in SEEDS],
-        }
-    before = lv.solve(falling(np.ones(N)), "direct", tol=1e-12).impulse
-    changed = falling(np.ones(N), 1.0 + CHANGE)
-    exact = lv.solve(changed, "direct", tol=1e-12).impulse
+def make_starts():
+    """Return the changed problem, its exact impulse, and the impulses from which its solve starts, by name."""
+    before = lv.solve(make_falling(np.ones(N)), "direct", tol=1e-12).impulse
+    changed = make_falling(np.ones(N), 1.0 + CHANGE)
     starts = {
         "cold": np.zeros(N),
         "warm": before,
         "in reverse": before[::-1],
         "10 x too large": 10.0 * before,
     }
+    return changed, lv.solve(changed, "direct", tol=1e-12).impulse, starts
+
+
+def measure_starts():
+    """Return the residual after each of SWEEPS, the slow part of each start, and cold and reversed over 16 sweeps."""
+    changed, exact, starts = make_starts()
     return {
-        "orders": orders,
-        "lighter above": histories(cases()["falling, lighter above"]),
-        "starts": {
-            name: np.array([error(changed, start, n) for n in SWEEPS]) for name, start in starts.items()
+        "residual": {
+            name: np.array([measure_error(changed, start, n) for n in SWEEPS])
+            for name, start in starts.items()
         },
-        "slow": {name: slow_part(changed, start, exact) for name, start in starts.items()},
-        "behind": np.array(
-            [[error(changed, starts[k], n) for n in range(16)] for k in ("cold", "in reverse")]
+        "slow": {name: measure_slow_part(changed, start, exact) for name, start in starts.items()},
+        "cold and reversed": np.array(
+            [[measure_error(changed, starts[k], n) for n in range(16)] for k in ("cold", "in reverse")]
         ),
     }
 
 
-def against_sweeps(axes):
-    """Sweeps from 0 on, even steps from 1 to 64."""
+def numbers():
+    """Return residuals by order for three stacks, histories of one of them, and the starts over the sweeps."""
+    return Numbers(
+        orders=measure_orders,
+        lighter=lambda: measure_histories(make_cases()["falling, lighter above"]),
+        starts=measure_starts,
+    )
+
+
+def set_sweep_axis(axes):
+    """Show the sweeps from 0 on, with even steps from 1 to 64."""
     axes.set_xscale("symlog", linthresh=1.0)
     axes.set_yscale("log")
     axes.set_xticks([0, 1, 4, 8, 16, 32, 64], ["0", "1", "4", "8", "16", "32", "64"])
     axes.minorticks_off()
     axes.set(xlabel="sweeps", ylabel="relative residual [-]")
-    beside(axes)
+    put_legend_right(axes)
 
 
 def draw_lighter(axes, found):
-    """Each box stands on one that is three times as heavy."""
-    by = found["lighter above"]
+    """Draw the residual by order; each box stands on one that is three times as heavy."""
+    by = found["lighter"]
     low, high = by["random"].min(axis=0), by["random"].max(axis=0)
     axes.fill_between(SWEEPS, low, high, color="0.85", label=f"random, {len(SEEDS)} seeds")
     for (key, style), color in zip(
@@ -146,24 +167,23 @@ def draw_lighter(axes, found):
     ):
         axes.plot(SWEEPS, by[key], style, color=color, markersize=4, label=key)
     axes.set_title("eight boxes falling, lighter above")
-    against_sweeps(axes)
+    set_sweep_axis(axes)
 
 
 def draw_starts(axes, found):
-    """Where a solve begins, and what becomes of it."""
+    """Draw the residual from each start."""
     looks = {"10 x too large": "C3D-", "in reverse": "C1s-", "cold": "ko-", "warm": "C0^-"}
     for name, style in looks.items():
-        axes.plot(SWEEPS, found["starts"][name], style, markersize=4, label=name)
-    axes.set_title(f"the load has changed by {100 * CHANGE:g} %")
-    against_sweeps(axes)
+        axes.plot(SWEEPS, found["starts"]["residual"][name], style, markersize=4, label=name)
+    axes.set_title(f"the load of the upper half has changed by {100 * CHANGE:g} %")
+    set_sweep_axis(axes)
 
 
 PANELS = {"lighter": draw_lighter, "starts": draw_starts}
 
 
-def main(path="order_and_warm_start.png"):
-    """Print the numbers, save the figure."""
-    found = numbers()
+def print_numbers(found):
+    """Print the tables."""
     for name, by in found["orders"].items():
         random = by["random"]
         print(
@@ -172,19 +192,19 @@ def main(path="order_and_warm_start.png"):
         )
     falling, equal, struck = found["orders"].values()
     print(
-        f"after {BUDGET} sweeps bottom up is {falling['top down'] / falling['bottom up']:.1f} times closer where boxes "
-        f"fall, lighter above,\n{100 * (equal['top down'] / equal['bottom up'] - 1):.1f} % among equal ones; "
+        f"after {BUDGET} sweeps bottom up is {falling['top down'] / falling['bottom up']:.1f} times closer "
+        f"if boxes fall, lighter above,\n{100 * (equal['top down'] / equal['bottom up'] - 1):.1f} % if they are equal; "
         f"struck from above, top down is {struck['bottom up'] / struck['top down']:.1f} times closer"
     )
-    starts = found["starts"]
+    starts = found["starts"]["residual"]
     print(f"\n{'sweeps':>9}" + "".join(f"{name:>16}" for name in starts))
     for i, n in enumerate(SWEEPS):
         print(f"{n:>9}" + "".join(f"{by[i]:>16.3g}" for by in starts.values()))
-    print("slow part" + "".join(f"{x:>16.3g}" for x in found["slow"].values()))
-    cold, stale = found["behind"]
+    print("slow part" + "".join(f"{x:>16.3g}" for x in found["starts"]["slow"].values()))
+    cold, stale = found["starts"]["cold and reversed"]
     print(
         f"before the first sweep: warm {starts['cold'][0] / starts['warm'][0]:.0f} times closer than cold, in reverse "
-        f"{starts['in reverse'][0] / starts['cold'][0]:.0f} times further, and behind for "
+        f"{starts['in reverse'][0] / starts['cold'][0]:.0f} times further; in reverse is behind for "
         f"{np.argmax(stale <= cold) - 1} sweeps"
     )
     last = {name: by[-1] for name, by in starts.items()}
@@ -192,8 +212,11 @@ def main(path="order_and_warm_start.png"):
         f"after {SWEEPS[-1]} sweeps: 10 x too large {last['10 x too large']:.3f} against {last['cold']:.3f} cold, "
         f"in reverse {last['in reverse']:.5f} against {last['warm']:.5f} warm"
     )
-    save(PANELS, found, path)
-    print(f"figure: {path}")
+
+
+def main(path="order_and_warm_start.png"):
+    """Print the tables and draw the figure."""
+    show(PANELS, numbers(), print_numbers, path)
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
-"""What a scene does not declare costs nothing: a tall stack with and without friction, spin and rolling.
+"""Rows that a scene does not declare cost nothing: a tall stack with and without friction, spin and rolling.
 
-A contact has a row for its normal, two more with friction, one more where a patch resists spinning, and two more where
-it resists rolling. Rows that no body asks for are not there: the same boxes are stepped with the same sweeps, and what
-differs is what was declared.
+A contact has a row for its normal, two more with friction, one more if a patch resists spinning, and two more if it
+resists rolling. Rows that no body declares do not exist. The same twenty boxes are stepped with the same 64 sweeps;
+only the declared rows differ.
 
     python examples/what_a_row_costs.py [FIGURE.png]
 
@@ -14,7 +14,7 @@ The chapter shows it as step.png. One of these stacks by itself:
 import sys
 from time import perf_counter
 
-from panels import save
+from panels import Numbers, show
 
 import lavender as lv
 
@@ -29,7 +29,12 @@ DECLARED = {
 
 
 def numbers():
-    """Rows, and the time of each step (ROUNDS * STEPS,) [s], by what is declared; taken in turns."""
+    """Return the number of rows and the times of the steps (ROUNDS * STEPS,) [s] by declared rows."""
+    return Numbers(measured=measure)
+
+
+def measure():
+    """Measure all scenes alternately."""
     scenes = {
         name: lv.Scene("stack", n=BOXES, solver_iterations=SWEEPS, **more) for name, more in DECLARED.items()
     }
@@ -47,16 +52,16 @@ def numbers():
     return found
 
 
-def least(found):
-    """The least time of a step [s] by what is declared: what else ran on the machine only adds to it."""
-    return {name: min(one["times"]) for name, one in found.items()}
+def get_shortest_times(found):
+    """Return the shortest time of a step [s] by declared rows; other programs on the machine only add to it."""
+    return {name: min(one["times"]) for name, one in found["measured"].items()}
 
 
 def draw_step(axes, found):
-    """Time of a step."""
-    times = least(found)
+    """Draw the time of a step."""
+    times = get_shortest_times(found)
     axes.barh(list(times), [1e3 * t for t in times.values()], color="C4")
-    for name, one in found.items():
+    for name, one in found["measured"].items():
         axes.text(0.0, name, f"  {one['rows']} rows", va="center", color="white")
     axes.set(title=f"a step of {BOXES} boxes, {SWEEPS} sweeps", xlabel="time [ms]")
     axes.invert_yaxis()
@@ -65,15 +70,17 @@ def draw_step(axes, found):
 PANELS = {"step": draw_step}
 
 
-def main(path="what_a_row_costs.png"):
-    """Print the table, save the figure."""
-    found = numbers()
-    times = least(found)
-    print(f"{'declared':<26}{'rows':>6}{'ms a step':>12}{'of friction alone':>20}")
+def print_numbers(found):
+    """Print the table."""
+    times = get_shortest_times(found)
+    print(f"{'declared':<26}{'rows':>6}{'ms a step':>12}{'over friction alone':>20}")
     for name, t in times.items():
-        print(f"{name:<26}{found[name]['rows']:>6}{1e3 * t:>12.3f}{t / times['friction']:>20.2f}")
-    save(PANELS, found, path)
-    print(f"figure: {path}")
+        print(f"{name:<26}{found['measured'][name]['rows']:>6}{1e3 * t:>12.3f}{t / times['friction']:>20.2f}")
+
+
+def main(path="what_a_row_costs.png"):
+    """Print the table and draw the figure."""
+    show(PANELS, numbers(), print_numbers, path)
 
 
 if __name__ == "__main__":

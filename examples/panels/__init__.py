@@ -1,20 +1,47 @@
-"""How the examples of the chapter draw; what they draw is in each of them."""
+"""What the chapter's examples share: numbers that are computed when they are read, and figures of several panels."""
 
+from collections.abc import Mapping
 from pathlib import Path
 
 
-def save(panels, found, path):
-    """Every panel below the other, or alone the one that the file is named after."""
+class Numbers(Mapping):
+    """Results by name. Each is computed when it is first read, so that a panel computes only what it draws."""
+
+    def __init__(self, **functions):
+        self._functions, self._values = functions, {}
+
+    def __getitem__(self, name):
+        if name not in self._values:
+            self._values[name] = self._functions[name]()
+        return self._values[name]
+
+    def __iter__(self):
+        return iter(self._functions)
+
+    def __len__(self):
+        return len(self._functions)
+
+
+def show(panels, numbers, print_numbers, path):
+    """Draw the panel that the file is named after. For any other name print all numbers and draw all panels."""
+    if Path(str(path)).stem not in panels:
+        print_numbers(numbers)
+    save(panels, numbers, path)
+    print(f"figure: {path}")
+
+
+def save(panels, numbers, path):
+    """Save the panel that the file is named after, otherwise all panels, one below the other."""
     from matplotlib.figure import Figure
 
     name = Path(str(path)).stem
     shown = [panels[name]] if name in panels else list(panels.values())
     canvas = Figure(figsize=(8, 3.2 * len(shown)), layout="constrained")
     for axes, draw in zip(canvas.subplots(len(shown), squeeze=False).flat, shown, strict=True):
-        draw(axes, found)
+        draw(axes, numbers)
     canvas.savefig(path)
 
 
-def beside(axes):
-    """The legend beside the axes, where it covers nothing."""
+def put_legend_right(axes):
+    """Put the legend to the right of the axes, where it covers no curve."""
     axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8, frameon=False)

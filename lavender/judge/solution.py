@@ -114,6 +114,7 @@ class SolverRun:
     name: str
     options: Mapping[str, Any]
     form: str = ""
+    order: str = ""  # in which a sweep visits the blocks, by name; empty if the solver takes no order
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -136,7 +137,7 @@ class Solution:
         Counts of sweeps, products, factorisations, pivots, ... that were done.
     setup_time, solve_time : float, s
     solver : SolverRun
-        Name, options, and the form of the problem that was solved.
+        Name, options, the form of the problem that was solved, and the sweep order of a solver that takes one.
     message : str
     history : History or None
         With `history=True`.
@@ -298,7 +299,8 @@ class Solution:
 
     @property
     def _done(self) -> str:
-        return ", ".join(counted(n, k) for k, n in (self.work or {"iterations": self.iterations}).items())
+        done = ", ".join(counted(n, k) for k, n in (self.work or {"iterations": self.iterations}).items())
+        return f"{done}, order {self.solver.order}" if self.solver.order else done
 
     @property
     def _took(self) -> str:
@@ -312,6 +314,11 @@ class Solution:
             f"{self.solver.name}: {self.status.name}, {self.residual}, {self._done}, "
             f"{self._took}{note}{wrong}"
         )
+
+
+def order_name(order: Any) -> str:
+    """Return the name of a sweep order; an array of blocks is a permutation."""
+    return order if isinstance(order, str) else "permutation"
 
 
 def counted(n: int, what: str) -> str:

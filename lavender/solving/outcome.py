@@ -25,6 +25,7 @@ from lavender.judge.solution import (
     History,
     Solution,
     SolverRun,
+    order_name,
 )
 from lavender.problem import Problem
 from lavender.solvers.registry import SolverSpec, in_one_call
@@ -94,6 +95,7 @@ def finish(
     if status is MAX_ITERATIONS:
         way = _way_left(problem, relative, tol, claim.iterations, sweeps_per_decade)
         message = _joined(message, way)
+    order = order_name(options.get("order", "given")) if spec.order else ""
     impulse.setflags(write=False)
     return Solution.of(
         {
@@ -105,7 +107,7 @@ def finish(
             "work": MappingProxyType(dict(claim.work)),
             "setup_time": setup_time,
             "solve_time": solve_time,
-            "solver": SolverRun(spec.name, options, claim.form),
+            "solver": SolverRun(spec.name, options, claim.form, order),
             "message": message,
             "history": history,
             "dual": claim.dual,

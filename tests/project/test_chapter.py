@@ -132,11 +132,33 @@ def test_every_panel_is_one_of_its_example_with_the_order_that_draws_it():
     for name, panel in re.findall(r"`python examples/(\w+)\.py (\w+)\.png`", PAGE):
         assert panel in example(name).PANELS
     other = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "docs").glob("*.md"))
+    assert set(re.findall(r"\(static/chapter/(\w+)\.png\)", other)) == {file for file, *_ in shown}
     for name, panel in re.findall(r"generated/figures/(\w+)/(\w+)\.svg", other):
         assert panel in example(name).PANELS
     named = {re.match(r"python examples/(\w+)\.py", command) for command in CLAIMS}
     for module in (example(found[1]) for found in named if found):
         assert all(f"{panel}.png" in module.__doc__ for panel in module.PANELS)
+
+
+def test_a_panel_computes_only_what_it_draws(tmp_path, monkeypatch, capsys):
+    module = example("engine_sweeps")
+    for name in ("solve_first", "judge", "run", "compare_orders", "predict_residual", "run_without_friction"):
+        monkeypatch.setattr(module, name, None)  # neither tables nor the other panels
+    monkeypatch.setattr(module, "numbers", module.numbers.__wrapped__)
+    monkeypatch.setattr(module, "LIMIT", 0.1)
+    module.main(str(tmp_path / "stand.png"))
+    assert capsys.readouterr().out == f"figure: {tmp_path / 'stand.png'}\n"
+    for name in {
+        re.match(r"python examples/(\w+)\.py", command)[1] for command in CLAIMS if "examples/" in command
+    }:
+        assert len(example(name).numbers()) >= 1 and callable(example(name).print_numbers)
+
+
+def test_every_python_block_runs_by_itself():
+    blocks = re.findall(r"^```python\n(.*?)^```$", PAGE, re.DOTALL | re.MULTILINE)
+    assert len(blocks) > 8
+    for block in blocks:
+        exec(compile(block, "chapter.md", "exec"), {})
 
 
 def test_a_file_named_after_a_panel_holds_it_alone(tmp_path):
@@ -148,8 +170,11 @@ def test_a_file_named_after_a_panel_holds_it_alone(tmp_path):
 
 
 def test_every_failure_has_a_command_that_shows_it():
-    section = PAGE.partition("## Failure modes")[2].partition("\n## ")[0]
-    rows = [row.strip("|").split(" | ") for row in re.findall(r"^\| .*", section, re.MULTILINE)[1:]]
+    tables = re.findall(
+        r"^\| failure \| how it shows \| command \|\n\|[-|]+\|\n((?:\|.*\n)+)", PAGE, re.MULTILINE
+    )
+    assert len(tables) == 6  # one for each experiment, and what is in none of them
+    rows = [re.split(r"(?<!\\)\| ", row.strip("|")) for table in tables for row in table.splitlines()]
     assert len(rows) > 14
     for row in rows:
         command = row[-1].strip().strip("`")

@@ -149,6 +149,8 @@ def test_the_chapter_names_functions_that_exist():
     ):
         assert f" {function}(" in (ROOT / "lavender_ext" / file).read_text(encoding="utf-8")
         assert file in text
+    for file in re.findall(r"`((?:lavender_ext|tests)/[\w/]+\.\w+)`", text):
+        assert (ROOT / file).is_file(), file
 
 
 def test_every_function_of_the_page_on_webassembly_is_exported():

@@ -46,6 +46,17 @@ def test_solvers_of_every_kind_agree_with_osqp():
             assert row.verdict == "agrees" or row.status not in ("CONVERGED", "FLOOR"), str(table)
 
 
+def test_orders_within_a_colour_have_the_same_bits():
+    """The statements of the exercise on colours: one result in bits for every order within them, and more sweeps."""
+    module = example("jacobi")
+    found = module.numbers()
+    assert found["orders"] == {"colours": 2, "within": 1, "every": module.SHUFFLES}
+    sweeps = {name: solution.work["sweeps"] for name, solution in found["stack"].items()}
+    assert sweeps["Gauss-Seidel"] < sweeps["Gauss-Seidel, coloured"] < sweeps["Jacobi, undamped"]
+    stages = {name: n * module.STAGES[name] for name, n in sweeps.items()}
+    assert stages["Gauss-Seidel, coloured"] < 0.1 * stages["Gauss-Seidel"]
+
+
 def test_friction_bounds_are_met_and_the_right_bounds_give_coulomb():
     module = example("friction_bounds")
     found = module.numbers()

@@ -140,6 +140,23 @@ def crossing(time: FloatArray, x: FloatArray, level: float) -> float:
     return float(time[i - 1] + part * (time[i] - time[i - 1]))
 
 
+# A body of a tower has fallen once it is lower than at its start by more than this share of an edge.
+FALL_DROP_EDGES = 0.5
+
+
+def has_fallen(start: FloatArray, now: FloatArray, edge: float = 1.0) -> bool:
+    """Return whether a body of a tower has fallen, or is at no finite place.
+
+    Parameters
+    ----------
+    start, now : (n, 3) m
+        Centres of the bodies at the start and now.
+    edge : float, m
+        Height of one body.
+    """
+    return not (start[:, 2] - now[:, 2]).max() <= FALL_DROP_EDGES * edge
+
+
 def judged(phenomenon: Phenomenon, engine: str, case: dict[str, float], track: Track) -> Record:
     """Measure a track. One with poses that are not finite is a note."""
     head: dict[str, Any] = {"phenomenon": phenomenon.name, "engine": engine, "case": case}

@@ -8,15 +8,25 @@ from typing import Any
 
 import numpy as np
 
-from lavender.lab.phenomena.parts import GRAVITY, Parameter, Phenomenon, Quantity, Track, Values, crossing
+from lavender.lab.phenomena.parts import (
+    GRAVITY,
+    Parameter,
+    Phenomenon,
+    Quantity,
+    Track,
+    Values,
+    crossing,
+    has_fallen,
+)
 from lavender.lab.phenomena.truths import thinnest_arch, tipping_time
 from lavender.sim.scene import Scene
 from lavender.sim.scene.parts import quaternion
 
 TIPPED = 0.5  # rad
 BRICK = (1.0, 0.5, 0.25)  # m
-FELL = 0.1  # m
-WRONG = Quantity("wrong side", "", 0.0, "1 where it falls and should stand, or stands and should fall")
+MAX_STANDING_DROP = 0.1  # m: a brick or stone that ends lower than this does not stand.
+TIPS = Quantity("wrong side", "", 0.0, "1 if it tips and should stand, or stands and should tip")
+DROPS = Quantity("wrong side", "", 0.0, "1 if it drops by 0.1 m and should stand, or stands and should drop")
 
 
 def _tall(p: Values, more: Mapping[str, Any]) -> Scene:
@@ -54,7 +64,7 @@ def _overhang(p: Values, track: Track) -> dict[str, float]:
     drop = max(0.0, -float(track.moved(track.positions.shape[1] - 1)[-1, 2]))
     return {
         "drop": drop if p["reach"] < 1.0 else 0.0,
-        "wrong side": float((drop > FELL) != (p["reach"] > 1.0)),
+        "wrong side": float((drop > MAX_STANDING_DROP) != (p["reach"] > 1.0)),
     }
 
 
@@ -65,9 +75,8 @@ def _heavy(p: Values, more: Mapping[str, Any]) -> Scene:
 
 
 def _loaded(p: Values, track: Track) -> dict[str, float]:
-    away = track.positions - track.positions[:1]
-    sink = -np.minimum(away[-1, :, 2], 0.0)
-    return {"sink": float(sink.max()), "fell": float(not np.linalg.norm(away[-1], axis=1).max() < 0.5)}
+    sink = float((track.positions[0] - track.positions[-1])[:, 2].max())
+    return {"sink": max(0.0, sink), "fell": float(has_fallen(track.positions[0], track.positions[-1]))}
 
 
 def _arch(p: Values, more: Mapping[str, Any]) -> Scene:
@@ -91,7 +100,7 @@ def _arch(p: Values, more: Mapping[str, Any]) -> Scene:
 def _arch_stands(p: Values, track: Track) -> dict[str, float]:
     drop = max(0.0, -float((track.positions - track.positions[:1])[-1, :, 2].min()))
     stands = p["thickness"] > 1.0
-    return {"drop": drop if stands else 0.0, "wrong side": float((drop > FELL) != (not stands))}
+    return {"drop": drop if stands else 0.0, "wrong side": float((drop > MAX_STANDING_DROP) != (not stands))}
 
 
 STACKS = (
@@ -110,7 +119,7 @@ STACKS = (
         cases=({"slope": 0.95}, {"slope": 0.98}, {"slope": 1.02}, {"slope": 1.1}),
         quantities=(
             Quantity("time", "s", 0.05, "distance from the time to tip by 0.5 rad; three samples"),
-            WRONG,
+            TIPS,
         ),
         needs=frozenset({"box"}),
         build=_tall,
@@ -132,7 +141,7 @@ STACKS = (
             {"reach": 0.98, "bricks": 10},
             {"reach": 1.02, "bricks": 10},
         ),
-        quantities=(Quantity("drop", "m", 0.01, "of the top brick in 10 s, where it should stand"), WRONG),
+        quantities=(Quantity("drop", "m", 0.01, "of the top brick in 10 s, where it should stand"), DROPS),
         needs=frozenset({"box"}),
         build=_bricks,
         seconds=lambda p: 10.0,
@@ -150,7 +159,7 @@ STACKS = (
         cases=({"ratio": 1.0}, {"ratio": 100.0}, {"ratio": 1e4}),
         quantities=(
             Quantity("sink", "m", 0.01, "largest of a box at the end; a hundredth of its edge"),
-            Quantity("fell", "", 0.0, "1 where a box has moved by half an edge"),
+            Quantity("fell", "", 0.0, "1 if a box ends half an edge lower than it began"),
         ),
         needs=frozenset({"box"}),
         build=_heavy,
@@ -172,7 +181,7 @@ STACKS = (
             "lean": Parameter(0.5, 0.2, 0.9, "tangent of a leg's angle from upright [-]"),
         },
         cases=({"thickness": 1.1}, {"thickness": 0.9}, {"thickness": 1.05}, {"thickness": 0.95}),
-        quantities=(Quantity("drop", "m", 0.05, "largest of a stone in 10 s, where it should stand"), WRONG),
+        quantities=(Quantity("drop", "m", 0.05, "largest of a stone in 10 s, where it should stand"), DROPS),
         needs=frozenset({"box"}),
         build=_arch,
         seconds=lambda p: 10.0,

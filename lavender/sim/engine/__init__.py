@@ -4,6 +4,6 @@ from lavender.sim.engine.film import Film
 from lavender.sim.engine.run import Trace, run
 from lavender.sim.engine.simulation import Simulation
 from lavender.sim.engine.snapshot import Snapshot
-from lavender.sim.engine.stepping import SOLVER_FIELDS
+from lavender.sim.engine.values import SOLVER_FIELDS
 
 __all__ = ["SOLVER_FIELDS", "Film", "Simulation", "Snapshot", "Trace", "run"]

@@ -60,8 +60,7 @@ def problem_of(state: State, bodies: Sequence[str], joints: Sequence[str], name:
     )
     # joints above all contacts: 24 bits for each body leave the pair (2^24 - 1, ...) free
     above = np.uint64(0xFFFFFF << 40) + np.arange(kj, dtype=np.uint64)
-    points = (a["key"][:c] & np.uint64(0xFFFF)).tolist()
-    pairs = zip(a["contact_pair"][:c].tolist(), points, strict=True)
+    pairs = zip(a["contact_pair"][:c].tolist(), _point_numbers(a["key"][:c]), strict=True)
     guess = a["impulse"][:m].copy() if state.head[HEAD["warm_start"]] else None
     return Problem(
         a["b"][:m].copy(),
@@ -70,10 +69,21 @@ def problem_of(state: State, bodies: Sequence[str], joints: Sequence[str], name:
         compliance=a["compliance"][:m].copy(),
         guess=guess,
         key=np.concatenate([above, a["key"][:c]]),
-        names=[*joints, *(f"{bodies[i]} on {bodies[j]}, point {f}" for (i, j), f in pairs)],
+        names=[*joints, *(f"{bodies[j]} on {bodies[i]}, point {number}" for (i, j), number in pairs)],
         name=name,
         copy=False,
     )
+
+
+def _point_numbers(key: np.ndarray) -> list[int]:
+    """Number the contacts of each pair of bodies from 1 on, in the order of their keys."""
+    order = np.argsort(key)
+    pair = key[order] >> np.uint64(16)
+    place = np.arange(len(key))
+    first = np.maximum.accumulate(np.where(np.append(True, pair[1:] != pair[:-1])[: len(key)], place, 0))
+    number = np.empty(len(key), np.int64)
+    number[order] = 1 + place - first
+    return list(number.tolist())
 
 
 def _any_tangent(normal: FloatArray) -> FloatArray:

@@ -14,7 +14,8 @@ import numpy as np
 from lavender.base.arrays import FloatArray, whole_number
 from lavender.io.stored import folder_for_steps, write_figure, write_text
 from lavender.sim.engine.simulation import Simulation
-from lavender.sim.engine.stepping import SOLVER_FIELDS
+from lavender.sim.engine.stepping import sweep_order
+from lavender.sim.engine.values import SOLVER_FIELDS
 from lavender.solvers.registry import get
 
 
@@ -111,7 +112,7 @@ def run(
             stopped = True
     scene = simulation.scene
     spec = get(scene.parameters.solver)
-    order = str(scene.parameters.solver_options.get("order", scene.parameters.order))
+    order = sweep_order(scene.parameters) or scene.parameters.order
     words = [] if spec.name == "sequential_impulses" else [spec.name]
     method = ", ".join([*words, f"order {order}"] if spec.order else words)
     return Trace(

@@ -18,7 +18,7 @@ from lavender.sim.engine.layout import HEAD
 from lavender.sim.engine.picture import save_picture
 from lavender.sim.engine.snapshot import Snapshot
 from lavender.sim.engine.state import State
-from lavender.sim.engine.stepping import HALF, Stepping, alone, make_pairs_anew
+from lavender.sim.engine.stepping import CLOSED, HALF, INSIDE, Stepping, alone, make_pairs_anew
 from lavender.sim.scene import Scene
 from lavender_ext.engine.arrays import NEED_ROOM, lengths
 
@@ -28,6 +28,8 @@ class Simulation(Stepping):
 
     Threads may share a simulation: a call waits until the calls of other threads have ended. A call from inside a step
     (by a solver that the step runs) is refused.
+
+    A simulation is a context manager: `close` ends its films and viewers.
 
     Parameters
     ----------
@@ -46,6 +48,15 @@ class Simulation(Stepping):
     ------
     InputError
         `scene` is not a scene, or has no bodies.
+
+    Examples
+    --------
+    >>> import lavender as lv
+    >>> with lv.Simulation("stack") as sim:
+    ...     sim.set_velocity("box 6", (1.0, 0.0, 0.0))  # m/s, an impact on the top box
+    ...     observation, *_ = sim.step()
+    >>> bool(observation["velocities"][6, 0] > 0.9)
+    True
     """
 
     # -- the problem ----------------------------------------------------------------------------
@@ -189,11 +200,13 @@ class Simulation(Stepping):
         self.films.append(film)
         return film
 
-    @alone
     def end_film(self, film: Film) -> None:
-        """No step is added to that film any more."""
-        film.ended = True
-        self.films = [other for other in self.films if other is not film]
+        """Add no further step to a film."""
+        with self._lock:
+            if self._refusal == INSIDE:
+                raise LavenderError(INSIDE)
+            film.ended = True
+            self.films = [other for other in self.films if other is not film]
 
     def frames(self, path: str | PathLike[str], steps: int = 120, **more: Any) -> Path:
         """Step `steps` times and write pictures: `.gif`, `.mp4` an animation, `.png`, `.svg`, `.pdf` a strip.
@@ -247,13 +260,48 @@ class Simulation(Stepping):
         11
         """
         film = self.start_film()
+
+        def end() -> None:
+            self._viewers.pop(id(film), None)
+            self.end_film(film)
+
         try:
-            return above("lavender.sim.web.view").Viewer(
-                film, port=port, browser=browser, end=lambda: self.end_film(film)
-            )
+            viewer = above("lavender.sim.web.view").Viewer(film, port=port, browser=browser, end=end)
         except BaseException:
             self.end_film(film)
             raise
+        self._viewers[id(film)] = viewer
+        return viewer
+
+    # -- the end --------------------------------------------------------------------------------
+
+    def close(self) -> None:
+        """End the films and close the viewers of this simulation.
+
+        Later calls raise LavenderError; the time, the number of steps and the settings can still be read. A second
+        `close` does nothing.
+
+        Raises
+        ------
+        LavenderError
+            Called from inside a step.
+        """
+        with self._lock:
+            if self._refusal == INSIDE:
+                raise LavenderError(INSIDE)
+            self._refusal = CLOSED
+            for film in self.films:
+                film.ended = True
+            self.films = []
+            self._before = self._last = None
+        for viewer in list(self._viewers.values()):
+            viewer.close()
+
+    def __enter__(self) -> Simulation:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
 
     # -- snapshots ------------------------------------------------------------------------------
 

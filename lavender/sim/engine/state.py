@@ -10,6 +10,7 @@ import numpy as np
 from lavender.base.errors import InputError
 from lavender.problem.derived import cached_property
 from lavender.sim.engine.layout import HEAD, JOINT, JOINT_KINDS, ORDER_NUMBER, SETTING, SIZE
+from lavender.sim.engine.values import SolverValues
 from lavender.sim.scene import Box, Plane, Scene, Sphere, arithmetic
 from lavender.sim.scene.parts import Body, Joint
 from lavender.sim.scene.scene import SCENE_ORDERS, Parameters
@@ -89,7 +90,7 @@ class State:
             per = int(self.size[SIZE["rows_per_contact"]])
             even = rows == contacts * per
             block = a["impulse"][first : first + rows].reshape(contacts, per).copy if even else None
-            out = self.setting[SETTING["out"] : SETTING["out"] + 8]
+            out = self.setting[SETTING["out"] : SETTING["out"] + 8].view(SolverValues)
             whole = {
                 "positions": "x",
                 "quaternions": "q",

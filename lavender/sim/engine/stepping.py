@@ -13,16 +13,17 @@ from typing import Any, Concatenate, ParamSpec, TypeVar
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray, whole_number
+from lavender.base.arrays import FloatArray, as_array, whole_number
 from lavender.base.arrays import flag as checked
-from lavender.base.errors import InputError, LavenderError, SolveFailed
-from lavender.judge.solution import Solution, uninterrupted
+from lavender.base.errors import InputError, LavenderError, SolveFailed, UnknownName
+from lavender.judge.solution import Solution, order_name, uninterrupted
 from lavender.problem import Problem
 from lavender.sim.engine.film import Film
 from lavender.sim.engine.layout import HEAD, SIZE
 from lavender.sim.engine.problem import judged, moved, problem_of
 from lavender.sim.engine.state import State
 from lavender.sim.scene import Scene
+from lavender.sim.scene.scene import Parameters
 from lavender.sim.scene.steppers import get_stepper
 from lavender.solvers.newton import SPEC as NEWTON_SPEC
 from lavender.solvers.registry import get
@@ -31,22 +32,10 @@ from lavender.solving.outcome import finish
 from lavender.solving.solve import solve
 from lavender_ext.engine.arrays import NEED_ROOM, OK
 
-#: The eight values of `observation["solver"]`, of the final substep: sweep budget, warm-start mode (0 or 1),
-#: contacts, contacts found in the cache, max |e_n| [N s] before the first sweep and after the last, and
-#: max(0, -w_n) [m/s] likewise.
-SOLVER_FIELDS = (
-    "iterations",
-    "warm_start",
-    "contacts",
-    "cache_matches",
-    "residual_initial",
-    "residual_final",
-    "violation_initial",
-    "violation_final",
-)
 NEWTON = NEWTON_SPEC.factory
 TOL = 1e-6  # of lavender.solve
 INSIDE = "this simulation is inside a step; a solver or callback may not use it until the step has ended"
+CLOSED = "this simulation is closed"
 CHUNK = 256  # compiled substeps between two looks for Ctrl-C
 HALF = "a step ended between its substeps"
 LAST_STEP = 2**31 - 1  # head's count of substeps begins again after it
@@ -68,13 +57,13 @@ class _Pending:
 def alone(
     method: Callable[Concatenate[S, P], R],
 ) -> Callable[Concatenate[S, P], R]:
-    """One call at a time: other threads wait, and a call from inside a step is refused."""
+    """One call at a time: other threads wait; a call from inside a step or after `close` is refused."""
 
     @wraps(method)
     def call(self: S, /, *args: P.args, **kwargs: P.kwargs) -> R:
         with self._lock:
-            if self._inside:
-                raise LavenderError(INSIDE)
+            if self._refusal:
+                raise LavenderError(self._refusal)
             return method(self, *args, **kwargs)
 
     return call
@@ -102,8 +91,9 @@ class Stepping:
         self.scene = scene = copy(scene)  # what is added to it later is not in this simulation
         self.report_residual = checked("report_residual", report_residual)
         self.report_motion = checked("report_motion", report_motion)
-        self._lock, self._inside = RLock(), False
+        self._lock, self._refusal = RLock(), ""  # why no call is accepted: INSIDE, CLOSED, or empty
         self.films: list[Film] = []  # that every step is added to
+        self._viewers: dict[int, Any] = {}  # open pages by the id of their film
         self._load(scene)
 
     def _load(self, scene: Scene) -> None:
@@ -119,6 +109,7 @@ class Stepping:
         self._warm_tol = 0.0
         if p.solver == "newton" and set(p.solver_options) <= {"tol"} and isinstance(tol, (int, float)):
             self._warm_tol = float(tol) if 0.0 < tol < np.inf else 0.0
+        self._order = sweep_order(p)
         self._steps = 0
         self._failed = 0
         self._over = ""  # why no step can follow
@@ -178,6 +169,52 @@ class Stepping:
         self.state.head[HEAD["warm_start"]] = checked("warm_start", flag)
 
     @alone
+    def set_velocity(self, body: int | str, velocity: Any = None, angular_velocity: Any = None) -> None:
+        """Set the velocity with which a body enters the next step, for example to apply an impact.
+
+        What the last step published (observation, residual, solution, contact cache) does not change. A snapshot
+        keeps the new velocity.
+
+        Parameters
+        ----------
+        body : int or str
+            Number or name of a body that is not static.
+        velocity, angular_velocity : (3,) m/s, rad/s, optional
+            In world axes. One that is left out stays as it is.
+
+        Raises
+        ------
+        UnknownName
+            No body has that name.
+        InputError
+            No such number, a name that several bodies have, a static body, or numbers that are not finite or too large.
+        LavenderError
+            The simulation had terminated: reset it or restore a snapshot.
+        """
+        self._check_can_step()
+        i = self._body_number(body)
+        name = self._names[i]
+        if self.state.a["dyn"][i] < 0:
+            raise InputError(f"{name} is static; it has no velocity")
+        parts = ((0, "velocity", velocity, "m/s"), (3, "angular_velocity", angular_velocity, "rad/s"))
+        values = [
+            (first, as_array(f"{what} of {name}", x, (3,), unit=unit))
+            for first, what, x, unit in parts
+            if x is not None
+        ]
+        for first, x in values:
+            self.state.a["v"][i, first : first + 3] = x
+
+    def _body_number(self, body: int | str) -> int:
+        if not isinstance(body, str):
+            return whole_number("body", body, 0, len(self._names) - 1)
+        if body not in self._names:
+            raise UnknownName("body", body, self._names)
+        if self._names.count(body) > 1:
+            raise InputError(f"{self._names.count(body)} bodies are named {body!r}; give the number of one")
+        return self._names.index(body)
+
+    @alone
     def reset(self, seed: int | None = None) -> tuple[dict[str, Any], dict[str, Any]]:
         """Back to the start of the scene; with `seed`, of the scene built with that seed.
 
@@ -208,10 +245,10 @@ class Stepping:
         -------
         observation : dict of fresh arrays
             positions (n, 3) [m], quaternions (n, 4) w x y z, velocities (n, 6) [m/s, rad/s],
-            joint_impulses (mj,) [N s, N m s], solver (8,) see `SOLVER_FIELDS`, and contacts: pair (c, 2),
-            point, normal, tangent (c, 3), depth (c,) [m, positive inside], impulses (c, r) [N s, N m s], the
-            rows that contacts of this scene can have: normal, two tangents, spin, two that roll. Contacts and
-            impulses are those of the final substep.
+            joint_impulses (mj,) [N s, N m s], solver (8,) see `SOLVER_FIELDS` (its text has names and units), and
+            contacts: pair (c, 2), point, normal, tangent (c, 3), depth (c,) [m, positive inside], impulses (c, r)
+            [N s, N m s], the rows that contacts of this scene can have: normal, two tangents, spin, two that roll.
+            Contacts and impulses are those of the final substep.
         reward : float
             0.0
         terminated : bool
@@ -219,7 +256,8 @@ class Stepping:
         truncated : bool
             False
         info : dict
-            time [s], step, failed_solves, and on request residual and motion.
+            time [s], step, failed_solves, order (of the sweeps, by name; None if the solver takes none), and on
+            request residual and motion.
 
         Raises
         ------
@@ -229,16 +267,15 @@ class Stepping:
             Ctrl-C while a registered solver runs: the state is that of before the step, or of after it where it
             was done already; never of a part.
         LavenderError
-            The simulation had terminated: reset it or restore a snapshot.
+            The simulation had terminated (reset it or restore a snapshot), or is closed.
         """
         if action is not None:
             raise InputError(f"action is {action!r}; this simulation takes none")
         with self._lock:
-            if self._inside:
-                raise LavenderError(INSIDE)
-            if self._over:
-                raise LavenderError(f"{self._over}; reset() or restore a snapshot")
-            self._inside = True
+            if self._refusal:
+                raise LavenderError(self._refusal)
+            self._check_can_step()
+            self._refusal = INSIDE
             try:
                 self._advance()
                 lost = self._lost_body()
@@ -248,7 +285,11 @@ class Stepping:
                         film.add(self.time, observation)
                 return observation, 0.0, bool(lost), False, self._info(lost)
             finally:
-                self._inside = False
+                self._refusal = ""
+
+    def _check_can_step(self) -> None:
+        if self._over:
+            raise LavenderError(f"{self._over}; reset() or restore a snapshot")
 
     def _advance(self) -> None:
         substeps, first = self._parameters.substeps, self.state
@@ -397,7 +438,12 @@ class Stepping:
         return out
 
     def _info(self, lost: str = "") -> dict[str, Any]:
-        info: dict[str, Any] = {"time": self.time, "step": self._steps, "failed_solves": self._failed}
+        info: dict[str, Any] = {
+            "time": self.time,
+            "step": self._steps,
+            "failed_solves": self._failed,
+            "order": self._order,
+        }
         if lost:
             info["lost_body"] = lost
         elif self.state.head.item(HEAD["solved"]):
@@ -429,6 +475,13 @@ class Stepping:
 
     def __repr__(self) -> str:
         return f"<Simulation of {self.scene!r}, step {self._steps}>"
+
+
+def sweep_order(p: Parameters) -> str | None:
+    """Return the order in which the solver of a scene visits the blocks in each sweep; None if it takes none."""
+    if not get(p.solver).order:
+        return None
+    return order_name(p.solver_options.get("order", p.order))
 
 
 def make_pairs_anew(state: State) -> None:

@@ -13,20 +13,20 @@ from lavender.sim.scene import Scene
 from lavender_ext.engine.arrays import CAP_CONTACT, CAP_PAIR, SHAPES, offsets
 
 #: Scenes of the page, the whole gallery: name, title, what to look for, what the caption measures of each side:
-#: "lean" (how far sideways of its start, or below it, a body is), "gap" (how far the ends of a joint are apart),
-#: "apart" (how far a body of B is from the same of A).
+#: "displacement" (largest distance of a body from its start, sideways or downwards), "gap" (how far the ends of a joint
+#: are apart), "apart" (how far a body of B is from the same of A).
 PAGE: tuple[tuple[str, str, str, str], ...] = (
     (
         "stack",
         "Stack of six boxes",
         "24 contacts, 72 rows. The slowest error shrinks by cos²(π/12) a sweep; warm starts go on from the last step.",
-        "lean",
+        "displacement",
     ),
     (
         "pyramid",
         "Pyramid of 55 boxes",
         "400 contacts, more rows than the bodies can tell apart: the impulses are not unique, the motion is.",
-        "lean",
+        "displacement",
     ),
     (
         "chain",
@@ -44,13 +44,13 @@ PAGE: tuple[tuple[str, str, str, str], ...] = (
         "heavy_on_light",
         "Heavy box on a light one",
         "A hundred times the mass on top: a sweep leaves 100/101 of the error.",
-        "lean",
+        "displacement",
     ),
     (
         "card_house",
         "House of cards",
         "Cards that stand by friction alone: what a solver leaves over, they slide by.",
-        "lean",
+        "displacement",
     ),
     (
         "bridge",
@@ -68,7 +68,7 @@ PAGE: tuple[tuple[str, str, str, str], ...] = (
         "table",
         "Table on nine legs",
         "More legs than it needs: how they share the load is not unique, how it moves is.",
-        "lean",
+        "displacement",
     ),
     ("ramp", "Box on a ramp", "Sticks below tan θ = μ, slides above it: one body, four contacts.", "apart"),
     (
@@ -173,7 +173,7 @@ EXPERIMENTS = (
         sides=(Side(4, COLD, "bottom_up"), Side(64, COLD, "bottom_up")),
         note="B sweeps sixteen times as often; both from nothing, from the ground up. How much less it "
         "leaves depends on "
-        "when you look: A begins to lean.",
+        "when you look: A moves sideways.",
         numbers=tuple(
             Number(_LEFT, "residual_final", *steps, "AB") for steps in ((0, 0), (20, 60), (180, 240))
         ),

@@ -110,3 +110,30 @@ def test_the_damping_is_the_same_in_every_unit(seed):
     size = 2.0 ** rng.integers(-8, 9, 12)  # each row in a unit of its own; rounds by the square roots alone
     other = lv.Problem.lcp(size[:, None] * problem.dense() * size, size * problem.b)
     assert serial.damping(other.csr_data) == pytest.approx(serial.damping(problem.csr_data), rel=1e-12)
+
+
+@pytest.mark.parametrize("name", ["gauss_seidel", "sor", "jacobi", "pgs"])
+@pytest.mark.parametrize(
+    ("a", "words"),
+    [
+        ([[0.0, 1.0], [1.0, 2.0]], "row 0 has a zero diagonal"),
+        ([[2.0, 3.0], [3.0, -1.0]], "row 1 has a negative diagonal, -1"),
+        ([[1.0, 3.0], [3.0, 1.0]], ""),  # diverges without such an entry: nothing to name
+    ],
+)
+def test_divergence_names_the_diagonal_entry_that_no_sweep_can_divide_by(name, a, words):
+    solution = lv.solve(lv.Problem.linear(a, [1.0, -1.0]), name)
+    assert solution.status is lv.Status.DIVERGED
+    assert solution.message.startswith(words) and bool(solution.message) == bool(words)
+
+
+@pytest.mark.parametrize("name", lv.available(order=True))
+def test_the_order_of_a_sweep_is_in_the_solution_and_its_text(name):
+    problem = lv.suite.case("stack(n=4)").problem
+    if name not in lv.available(problem):
+        problem = lv.Problem.linear(problem.dense(), problem.b)
+    for order, words in (("given", "given"), ("reverse", "reverse"), ([3, 1, 0, 2], "permutation")):
+        solution = lv.solve(problem, name, order=order, max_iter=3)
+        assert solution.solver.order == words and f", order {words}" in str(solution)
+    assert lv.solve(problem, name, max_iter=3).solver.order == "given"
+    assert lv.solve(problem, "direct").solver.order == "" and "order" not in str(lv.solve(problem, "direct"))

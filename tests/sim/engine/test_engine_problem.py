@@ -1,6 +1,7 @@
 """The problem inside a step: the same bits as the step, the judge's values, snapshots, other solvers."""
 
 import hashlib
+import re
 from dataclasses import replace
 from itertools import product
 
@@ -75,9 +76,9 @@ def test_names_keys_and_guess_travel_with_the_problem():
     sim = after(60, "bridge", n=4)
     problem = sim.constraint_problem()
     assert problem.row_name(3) == "hinge 0, axis 3"
-    assert problem.row_name(len(problem.rows.jac)).startswith("plank") and "load" in problem.row_name(
-        problem.m - 1
-    )
+    contacts = [problem.row_name(row) for row in problem.cones.ptr[problem.rows.n_joints : -1]]
+    assert len(set(contacts)) == len(contacts) > 3
+    assert all(re.fullmatch(r"load on plank \d, point [1-4], normal", name) for name in contacts)
     assert len(set(problem.key.tolist())) == problem.n_blocks
     assert problem.guess.shape == (problem.m,) and np.abs(problem.guess).max() > 0
     sim.set_warm_start(False)
@@ -345,3 +346,35 @@ def test_the_motion_is_not_computed_for_those_who_do_not_ask(monkeypatch):
     monkeypatch.setattr(stepping, "moved", None)
     *_, info = lv.Simulation("stack").step()
     assert "motion" not in info
+
+
+@pytest.mark.parametrize(
+    ("parameters", "order"),
+    [
+        ({}, "alternating"),
+        *(({"order": order}, order) for order in SCENE_ORDERS),
+        ({"solver": "pgs"}, "given"),
+        ({"solver": "pgs", "solver_options": {"order": "reverse"}}, "reverse"),
+        ({"solver": "newton"}, None),
+    ],
+)
+def test_every_step_tells_the_order_of_its_sweeps(parameters, order):
+    sim = lv.Simulation(lv.Scene("stack", n=2, **parameters))
+    assert sim.reset()[1]["order"] == sim.step()[-1]["order"] == order
+    if sim.last_solution is not None:
+        assert sim.last_solution.solver.order == (order or "")
+
+
+def test_the_eight_values_print_with_their_names_and_units():
+    sim = after(3, "stack", n=2, solver_iterations=9)
+    values = sim.step()[0]["solver"]
+    lines = str(values).splitlines()
+    assert [line.split()[0] for line in lines] == list(lv.SOLVER_FIELDS)
+    assert [line.split()[2:] for line in lines] == [[]] * 4 + [["N", "s"]] * 2 + [["m/s"]] * 2
+    np.testing.assert_allclose([float(line.split()[1]) for line in lines], values, rtol=1e-3)
+    assert lines[0] == "iterations         9" and values.dtype == np.float64
+    # everything else is as of any array
+    assert (
+        str(values[:2]) == "[9. 1.]" and repr(values).startswith("array([9.") and len(str(values == 9.0)) < 60
+    )
+    assert isinstance(values[4], float) and not (values - values).any()

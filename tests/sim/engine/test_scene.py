@@ -18,7 +18,7 @@ def test_the_readme_of_a_scene_by_hand():
     assert (scene.add_plane(), scene.add_box((1, 1, 1), mass=2.0, position=(0, 0, 0.5))) == (0, 1)
     observation, reward, terminated, truncated, info = lv.Simulation(scene).step()
     assert (reward, terminated, truncated) == (0.0, False, False)
-    assert info == {"time": 0.01, "step": 1, "failed_solves": 0}
+    assert info == {"time": 0.01, "step": 1, "failed_solves": 0, "order": "alternating"}
     assert set(observation) == {
         "positions",
         "quaternions",

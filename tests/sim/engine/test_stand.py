@@ -9,7 +9,7 @@ from lavender.sim.scene.scene import SCENE_ORDERS
 
 MOST = 5e-3  # m, that a box may move between two seconds and the end
 MINUTE = 60.0  # s
-FELL = 0.05  # m, from where a box began
+MAX_DISPLACEMENT = 0.05  # m: a box that is further from its start at any time does not stand still
 
 
 def drift(name, seconds=MINUTE, *, dt=1 / 60, **parameters):
@@ -24,7 +24,7 @@ def drift(name, seconds=MINUTE, *, dt=1 / 60, **parameters):
             if status == 1:
                 sim.state = sim.state.grown()
         x = sim.state.a["x"]
-        if np.abs(x - first).max() > FELL:  # also before it counts
+        if np.abs(x - first).max() > MAX_DISPLACEMENT:  # also in the first two seconds
             return np.inf
         if step * dt >= 2.0 - 1e-9:
             if start is None:
@@ -58,8 +58,8 @@ def test_stacks_stand_on_few_sweeps_in_every_order_and_friction(name, seconds, p
     assert drift(name, seconds, **parameters) < MOST
 
 
-def test_what_falls_without_the_defaults_falls_here_too():
-    # Whole steps swept in one direction: the measure above does see a stack that falls.
+def test_what_moves_without_the_defaults_moves_here_too():
+    # Whole steps swept in one direction: the measure above does see a stack that leaves its place.
     assert drift("stack", n=10, solver_iterations=8, substeps=1, order="given", seconds=30.0) > 10 * MOST
 
 

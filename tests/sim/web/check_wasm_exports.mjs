@@ -166,7 +166,11 @@ function replay(scene) {
   let snapshot = null;
   for (let step = 0; step < scene.steps; step++) {
     if (scene.changes[step]) {
-      simulation.set(scene.changes[step]);
+      const { velocity, ...settings } = scene.changes[step];
+      simulation.set(settings);
+      if (velocity) {
+        simulation.setVelocity(...velocity);
+      }
     }
     // A detour of three steps from which a snapshot leads back.
     if (step % 150 === 149) {

@@ -20,12 +20,21 @@ import lavender as lv
 from lavender.sim.web.scenes import describe, layout
 
 STEPS = 300
+BLOW = [
+    1.5,
+    0.2,
+    -1.0,
+    0.0,
+    3.0,
+    0.1,
+]  # m/s, rad/s: set before the snapshot that the replay makes at step 149, too
 BODY_ARRAYS = ("x", "q", "v")
 
 #: Gallery scene, parameters, and what is changed before which step.
 SCENES = [
     ("stack", {}, {100: {"warm_start": 0}, 200: {"warm_start": 1}}),
     ("stack", {"substeps": 1}, {}),
+    ("stack", {"n": 4}, {40: {"velocity": [4, BLOW]}, 149: {"velocity": [2, BLOW[::-1]]}}),
     ("pyramid", {"base": 8}, {150: {"iterations": 4}}),
     ("chain", {"tip_mass": 5.0}, {}),
     ("spinner", {}, {}),
@@ -86,6 +95,9 @@ def record_scene(writer, name, parameters, changes, steps=STEPS):
             simulation.set_solver_iterations(change["iterations"])
         if "warm_start" in change:
             simulation.set_warm_start(bool(change["warm_start"]))
+        if "velocity" in change:
+            body, v = change["velocity"]
+            simulation.set_velocity(body, v[:3], v[3:])
         observation = simulation.step()[0]
         shot = simulation.snapshot()
         states.append(

@@ -288,11 +288,11 @@ def test_presets_set_everything_and_are_part_of_the_address(visit, preset):
     assert v.page.locator("#note").text_content() == note
     v.page.wait_for_function("!lavender.waiting")
     v.js("lavender.advance(30)")
-    leans = v.js("lavender.sides.map((side) => side.lean())")
+    displaced = v.js("lavender.sides.map((side) => side.displacement())")
     for i, side in enumerate(sides):
-        values, lean = run(scene, 30, **side._asdict())
+        values, moved = run(scene, 30, **side._asdict())
         assert v.values(i)[0] == values
-        assert leans[i] == pytest.approx(lean, abs=1e-12)
+        assert displaced[i] == pytest.approx(moved, abs=1e-12)
 
 
 def medians(number, side):

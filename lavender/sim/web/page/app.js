@@ -390,10 +390,10 @@ class App {
     if (measure === "gap") {
       const [a, b] = this.sides.map((side) => length(side.gap()));
       say(`A's joints are open by ${a}`, ", ", `B's by ${b}`);
-    } else if (measure === "lean") {
+    } else if (measure === "displacement") {
       const [a, b] = this.sides.map((side, i) => {
-        const [across, down] = side.lean();
-        return `${"AB"[i]} ${across >= down ? "leans" : "sinks"} ${length(Math.max(across, down))}`;
+        const [across, down] = side.displacement();
+        return across >= down ? `${"AB"[i]} moved sideways by ${length(across)}` : `${"AB"[i]} sank by ${length(down)}`;
       });
       say(a, ", ", b);
     } else {

@@ -206,6 +206,14 @@ export class Simulation {
     }
   }
 
+  // The velocity [m/s, rad/s] with which a body that is not static enters the next step: six numbers, in world axes.
+  setVelocity(body, velocity) {
+    if (!(this.array("dyn")[body] >= 0) || velocity.length !== 6) {
+      throw new Error("the number of a body that is not static, and six numbers are needed");
+    }
+    this.array("v").set(velocity, 6 * body);
+  }
+
   // The eight values of SOLVER_FIELDS.
   get values() {
     const { out } = this.k.layout.setting;

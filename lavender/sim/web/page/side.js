@@ -103,8 +103,8 @@ export class Side {
     }
   }
 
-  // How far [m] a body is from its start at most: sideways, and below it.
-  lean() {
+  // Largest distance [m] of a body from its start: sideways, and downwards.
+  displacement() {
     const [x, dynamic] = [this.simulation.array("x"), this.simulation.array("dyn")];
     const most = [0, 0];
     for (let i = 0; i < dynamic.length; i++) {

@@ -1,0 +1,102 @@
+"""`Simulation.set_velocity`: the next step starts from the new velocity, and nothing before it changes."""
+
+import numpy as np
+import pytest
+
+import lavender as lv
+from lavender.sim.scene.steppers import STEPPERS
+
+LINEAR, ANGULAR = (0.3, -0.2, 1.5), (0.4, 2.0, -0.1)  # m/s, rad/s
+
+
+def boxes(velocity=(0.0, 0.0, 0.0), angular_velocity=(0.0, 0.0, 0.0), **parameters):
+    """Three boxes on the ground; the middle one has a velocity and a name of its own."""
+    scene = lv.Scene(**parameters)
+    scene.add_plane()
+    for i in range(3):
+        moving = {"velocity": velocity, "angular_velocity": angular_velocity} if i == 1 else {}
+        scene.add_box((1.0, 1.0, 0.5), position=(0.0, 0.0, 0.25 + 0.5 * i), name=f"box {i}", **moving)
+    return scene
+
+
+def trajectory(sim, steps=30):
+    return [
+        sim.step()[0][key]
+        for _ in range(steps)
+        for key in ("positions", "quaternions", "velocities", "solver")
+    ]
+
+
+def assert_same_bits(a, b):
+    assert [x.tobytes() for x in a] == [x.tobytes() for x in b]
+
+
+@pytest.mark.parametrize("body", [2, "box 1"])
+@pytest.mark.parametrize(
+    "parameters",
+    [*({"stepper": name} for name in STEPPERS), {"solver": "newton"}, {"restitution": 0.5}],
+    ids=lambda parameters: str(*parameters.values()),
+)
+def test_a_run_has_the_bits_of_a_scene_that_begins_with_this_velocity(parameters, body):
+    sim = lv.Simulation(boxes(**parameters))
+    sim.set_velocity(body, LINEAR)
+    sim.set_velocity(body, angular_velocity=ANGULAR)  # the linear part stays
+    assert_same_bits(trajectory(sim), trajectory(lv.Simulation(boxes(LINEAR, ANGULAR, **parameters))))
+
+
+@pytest.mark.parametrize("solver", ["sequential_impulses", "newton"])
+def test_what_the_last_step_published_does_not_change(solver):
+    sim = lv.Simulation(boxes(solver=solver), report_residual=True)
+    trajectory(sim, 5)
+    published = sim.residual(), str(sim.last_solution and sim.last_solution.residual), sim.time
+    before = sim.snapshot()
+    sim.set_velocity("box 2", LINEAR, ANGULAR)
+    assert (sim.residual(), str(sim.last_solution and sim.last_solution.residual), sim.time) == published
+    after = sim.snapshot()
+    assert np.flatnonzero(before.real != after.real).size == 6
+    assert (before.index == after.index).all() and (before.keys == after.keys).all()
+
+
+def test_snapshots_and_files_keep_the_velocity(tmp_path):
+    sim = lv.Simulation(boxes())
+    trajectory(sim, 5)
+    sim.set_velocity(3, LINEAR)
+    state = sim.snapshot()
+    sim.save(tmp_path / "state")
+    expected = trajectory(sim)
+    sim.restore(state)
+    assert_same_bits(trajectory(sim), expected)
+    sim.load(tmp_path / "state")
+    assert_same_bits(trajectory(sim), expected)
+
+
+def test_what_cannot_be_set_is_refused_and_changes_nothing():
+    scene = boxes()
+    scene.add_sphere(position=(5.0, 0.0, 0.5), name="box 0")  # the name of two bodies
+    sim = lv.Simulation(scene)
+    before = sim.snapshot()
+    for body, velocity, error, words in (
+        ("plane 0", LINEAR, lv.InputError, "static"),
+        ("box 9", LINEAR, lv.UnknownName, "box 9"),
+        ("box 0", LINEAR, lv.InputError, "2 bodies are named"),
+        (5, LINEAR, lv.InputError, "0 to 4"),
+        (-1, LINEAR, lv.InputError, "0 to 4"),
+        (1.0, LINEAR, lv.InputError, "whole number"),
+        (2, (1.0, 2.0), lv.InputError, "velocity of box 1"),
+        (2, (np.nan, 0.0, 0.0), lv.InputError, "velocity of box 1"),
+        (2, (1e61, 0.0, 0.0), lv.InputError, "velocity of box 1"),
+    ):
+        with pytest.raises(error, match=words):
+            sim.set_velocity(body, velocity)
+    with pytest.raises(lv.InputError, match="angular_velocity"):
+        sim.set_velocity(2, LINEAR, "fast")
+    assert sim.snapshot().real.tobytes() == before.real.tobytes()
+
+
+def test_a_run_that_has_ended_is_not_continued_by_a_velocity():
+    sim = lv.Simulation(boxes())
+    sim.set_velocity(2, (1e60, 0.0, 0.0))
+    while not sim.step()[2]:
+        pass
+    with pytest.raises(lv.LavenderError, match="not finite"):
+        sim.set_velocity(2, LINEAR)
