@@ -19,7 +19,7 @@ from lavender.base.errors import InputError, LavenderError
 from lavender.io import mujoco as adapter
 from lavender.io import npz
 from lavender.io.stored import ENGINE, as_path, first_bytes, folder_for_steps, write_text
-from lavender.judge.residuals import AT_FLOOR, EARLY, ENOUGH, WRONG, residual
+from lavender.judge.residuals import AT_FLOOR, ENOUGH, UNCONVERGED, WRONG, residual
 from lavender.problem import PRECISIONS, Problem
 
 CONTROLS = ("zero", "random")
@@ -139,7 +139,7 @@ def record(
             npz.write(problem, file, impulse=own)
             kept.append({"file": file.name, "step": step + 1, **told})
         write_text(folder / ENGINE, "".join(f"{json.dumps(line)}\n" for line in (*kept, *left_out)))
-    far = [line for line in kept if line["verdict"] in (EARLY, WRONG)]
+    far = [line for line in kept if line["verdict"] in (UNCONVERGED, WRONG)]
     worst = max(far, key=lambda line: float(line["velocity"]), default=None)
     short = worst and f"{worst['velocity']:.2g} m/s short at {worst['worst']} (step {worst['step']})"
     return Recording(

@@ -29,7 +29,7 @@ from lavender.io.efc import from_mujoco_many
 from lavender.io.recording import Control
 from lavender.io.stored import folder_for_steps, write_arrays
 from lavender.judge.many import residual_many
-from lavender.judge.residuals import AT_FLOOR, CLOSE, EARLY, ENOUGH, WRONG
+from lavender.judge.residuals import AT_FLOOR, CLOSE, ENOUGH, UNCONVERGED, WRONG
 from lavender.lab.bench.running.campaign import check_workers, connected, hand_out
 from lavender.lab.bench.running.runner import Event
 from lavender.lab.report.curves import Curve, Figure
@@ -41,7 +41,7 @@ from lavender.lab.worlds import ENGINES, Runs, fields_of, frames, states_of
 from lavender.problem import PRECISIONS, Problem
 from lavender.problem.batch import Batch
 
-VERDICTS = (AT_FLOOR, CLOSE, EARLY, WRONG, "not finite")
+VERDICTS = (AT_FLOOR, CLOSE, UNCONVERGED, WRONG, "not finite")
 NUMBERS = ("velocity", "impulse", "relative", "floor")  # m/s, N s, -, - of the worst row
 QUANTILES = (0.5, 0.9, 0.99, 0.999, 1.0)
 AT_ONCE = 512  # problems in memory
@@ -113,7 +113,7 @@ class Audit:
     @property
     def early(self) -> Any:
         """(worlds, steps) bool: stopped early, or wrong."""
-        return (self.verdict == VERDICTS.index(EARLY)) | (self.verdict == VERDICTS.index(WRONG))
+        return (self.verdict == VERDICTS.index(UNCONVERGED)) | (self.verdict == VERDICTS.index(WRONG))
 
     @property
     def done(self) -> int:
@@ -390,7 +390,7 @@ def _judged(
     verdict = np.full(len(words), len(VERDICTS) - 1, np.int8)
     for i, word in enumerate(VERDICTS[:-1]):
         verdict[words == word] = i
-    early = np.flatnonzero((words == EARLY) | (words == WRONG))
+    early = np.flatnonzero((words == UNCONVERGED) | (words == WRONG))
     rows = {int(i): found[int(i)].worst_name for i in early}
     order = early[np.argsort(-numbers[0, early], kind="stable")]
     _, first = np.unique(world[order], return_index=True)

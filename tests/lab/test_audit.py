@@ -36,7 +36,9 @@ def test_numbers_are_those_of_the_run_itself(boxes, options):
         np.testing.assert_allclose(found.numbers[0, world], [r.velocity for r in want], rtol=1e-6, atol=1e-12)
         pushes = [abs(r.error[r.worst_row]) if r.worst_row >= 0 else 0.0 for r in want]
         np.testing.assert_allclose(found.numbers[1, world], pushes, rtol=1e-6, atol=1e-12)
-        assert found.early[world].tolist() == [r.verdict in ("stopped early", "wrong") for r in want]
+        assert found.early[world].tolist() == [
+            r.verdict in ("stopped before convergence", "wrong") for r in want
+        ]
     assert found.early.any()
 
 

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from lavender.io.stored import ENGINE, whole_file
-from lavender.judge.residuals import AT_FLOOR, EARLY, WRONG
+from lavender.judge.residuals import AT_FLOOR, UNCONVERGED, VERDICTS_OF_OLD, WRONG
 from lavender.lab.bench.record import Record, printable
 from lavender.lab.bench.store import Records
 
@@ -58,7 +58,14 @@ def contestants(words: Sequence[str], records: Records) -> list[Contestant]:
                 lost += "left_out" in entry
                 numbers = [float(entry[name]) for name in _NUMBERS]
                 row = float(entry.get("velocity", math.nan)), str(entry.get("worst", ""))
-                found.append((*numbers, row, str(entry["verdict"]), str(entry["solver"])))
+                found.append(
+                    (
+                        *numbers,
+                        row,
+                        VERDICTS_OF_OLD.get(str(entry["verdict"]), str(entry["verdict"])),
+                        str(entry["solver"]),
+                    )
+                )
             except (ValueError, KeyError, TypeError, RecursionError):
                 continue
         if not found:
@@ -77,7 +84,7 @@ def contestants(words: Sequence[str], records: Records) -> list[Contestant]:
                 relative=float(np.median(relative)),
                 worst=float(np.max(relative)),
                 above_floor=sum(said != AT_FLOOR for said in verdicts),
-                early=sum(said in (EARLY, WRONG) for said in verdicts),
+                early=sum(said in (UNCONVERGED, WRONG) for said in verdicts),
                 velocity=velocity,
                 where=where,
                 ours=name,

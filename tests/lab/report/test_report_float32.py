@@ -20,7 +20,7 @@ def test_a_report_shows_the_verdict_of_a_stored_answer_in_float32(tmp_path):
     lv.io.save(problem, tmp_path / "early.npz", impulse=0.9 * lv.solve(problem, tol=1e-11).impulse)
     (item,) = resolve([tmp_path / "early.npz"])
     info = describe(item, "run")
-    assert info.stored_verdict.startswith("stopped early, ")
+    assert info.stored_verdict.startswith("stopped before convergence, ")
     assert from_json(to_json(info)) == info
 
 
