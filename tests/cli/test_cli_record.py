@@ -43,7 +43,7 @@ def test_what_a_robot_does_not_feel_is_close_enough_and_the_threshold_is_the_use
 
 
 def test_record_and_report_take_the_same_options_with_the_same_defaults():
-    names = ("steps", "every", "control", "seed", "threshold")
+    names = ("steps", "every", "control", "seed", "states", "threshold")
     both = [{p.name: p for p in cli.get_command(None, name).params} for name in ("record", "report")]
     for name in names:
         one, two = (options[name] for options in both)

@@ -323,7 +323,7 @@ def test_numbers_are_written_with_what_they_know():
         "1.00 s", "12.3 ms", "1.00 ms", "45.0 µs", "0.09 µs", "123 s", "–",
     ]  # fmt: skip
     assert times(99.7) == "100 times"
-    assert [percent(n, 10_000, 1) for n in (10_000, 9_999, 1, 0)] == ["100.0 %", "99.9 %", "0.0 %", "0.0 %"]
+    assert [percent(n, 10_000, 1) for n in (10_000, 9_999, 1, 0)] == ["100.0 %", "99.9 %", "0.01 %", "0.0 %"]
     assert (percent(999, 1000), percent(1, 3)) == ("99 %", "33 %")
     assert [times(x) for x in (1.34, 85.0, 1234.4, 7.3e13, math.nan)] == [
         "1.3 times", "85 times", "1234 times", "10^14 times", "–",
