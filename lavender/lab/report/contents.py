@@ -135,9 +135,10 @@ def _solver_table(report: Report, level: float) -> Table:
     rows += [[c.solver, seconds(c.score) + share(c.solved, c.cases), c.how, ALONE] for c in alone]
     engine = engine_choice(report.engines, report.records, report.lines[0].cases, level)
     if engine is not None and engine.solved:
-        raced_before = sum(not is_ahead(engine, choice) for _, choice in raced.values())
+        ranked = [*(choice for _, choice in raced.values()), *alone]
+        before = sum(not is_ahead(engine, choice) for choice in ranked)
         time = seconds(engine.score) + share(engine.solved, engine.cases)
-        rows.insert(raced_before, [f"engine's {engine.solver}", time, "own, warm", "inside the engine"])
+        rows.insert(before, [f"engine's {engine.solver}", time, "own, warm", "inside the engine"])
     return Table(["solver", f"to {level_name(level)}", "asked", "timed"], rows)
 
 

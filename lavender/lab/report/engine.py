@@ -82,7 +82,7 @@ def _read_folder(folder: Path) -> Contestant | None:
     return Contestant(
         folder=folder.name,
         source=printable(str(folder)),
-        solver=max(set(solvers), key=solvers.count).capitalize(),
+        solver=max(set(solvers), key=solvers.count).replace("NEWTON", "Newton"),
         steps=len(found),
         left_out=lost,
         rows=float(np.median(sizes)),
