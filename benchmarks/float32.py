@@ -1,4 +1,4 @@
-"""Early stops of a float32 Newton, planted in steps of robots and looked for: `python -m benchmarks float32 MODEL...`.
+"""Stops before convergence of a float32 Newton, planted in steps of robots: `python -m benchmarks float32 MODEL...`.
 
 Two Newton's methods of this file alone, all of them in float32, on bounded soft rows (pyramidal friction).
 **velocities** goes over x = v+ - v* and reads impulses off it, as engines do:
@@ -8,8 +8,8 @@ Two Newton's methods of this file alone, all of them in float32, on bounded soft
 **impulses** solves for lambda on the rows that are off their bounds, and chooses these anew. Each runs to its end, the
 first far past it: the last iterate is the answer **at the floor**. An iterate is **unfinished** where its impulse
 (|lambda - lambda*|_A, lambda* by the first in float64) is ten times further off than any of the last ten (of impulses:
-than the last). The judge sees the impulse alone and says which is which. Early stops are unfinished iterates, one drawn
-from each step, and last steps of which a line search left a share out.
+than the last). The judge sees the impulse alone and says which is which. The planted stops are unfinished iterates, one
+drawn from each step, and last steps of which a line search left a share out.
 """
 
 from __future__ import annotations
@@ -199,7 +199,7 @@ def table(stops: Sequence[Stop]) -> str:
 @click.option("--every", default=5, show_default=True, help="Steps of the simulation between two.")
 @click.option("--seed", default=0, show_default=True)
 def command(models: tuple[Path, ...], steps: int, every: int, seed: int) -> None:
-    """Early stops planted in a float32 Newton over steps of MuJoCo models, and what the judge says of them."""
+    """Plant stops before convergence in a float32 Newton over steps of MuJoCo models, and judge them."""
     rng, stops = np.random.default_rng(seed), []
     for model in models:
         for problem in robot_steps(model, steps, every, seed):

@@ -32,7 +32,7 @@ import lavender as lv
 from benchmarks.made import fresh
 from benchmarks.output import markdown
 from lavender.base.errors import LavenderError
-from lavender.lab.worlds import Runs, states_of
+from lavender.lab.worlds import Runs, simulate_world
 
 TOL = 1e-6
 TOLERANCES = (1e-2, 1e-4, 1e-6, 1e-8, 1e-10, 1e-12, 1e-15)  # of the engine
@@ -55,7 +55,9 @@ def states(path: Path, worlds: int, seed: int) -> tuple[Any, Any, np.ndarray]:
     """MuJoCo, the model with its Newton's method, cold, and so many states of ten runs."""
     runs = Runs(str(path), worlds=10, steps=LOOK * -(-worlds // 10), seed=seed)
     mj, model = runs.load()
-    found = np.concatenate([states_of(mj, model, runs, i)[LOOK - 1 :: LOOK] for i in range(runs.worlds)])
+    found = np.concatenate(
+        [simulate_world(mj, model, runs, i)[0][LOOK - 1 :: LOOK] for i in range(runs.worlds)]
+    )
     model.opt.solver = mj.mjtSolver.mjSOL_NEWTON
     model.opt.disableflags |= int(mj.mjtDisableBit.mjDSBL_WARMSTART)
     model.opt.iterations, model.opt.noslip_iterations = 200, 0

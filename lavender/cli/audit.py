@@ -33,7 +33,7 @@ from lavender.io.stored import writable
     help="Who steps the worlds.",
 )
 @click.option("--accept", type=float, metavar="M/S",
-              help="Velocity error of an early stop [m/s] up to which the exit code is 0.")  # fmt: skip
+              help="Velocity error [m/s] up to which a step that is not at its floor is accepted.")  # fmt: skip
 @threshold_option
 @precision_option
 @click.option("--workers", type=int, default=-1, help="Processes, for mujoco; -1: one for each core.")
@@ -44,11 +44,12 @@ from lavender.io.stored import writable
 def audit(context: click.Context, /, model: Path, out: Path, accept: float | None, **asked: Any) -> None:
     """Simulate worlds of a MuJoCo model (MJCF) and judge the engine's answer to every step.
 
-    The page says how many steps ended early, how wrong they are and where. The worst worlds are problem files in
-    OUT/worst; OUT/states.npz holds the states before them.
+    The page says how many steps were judged, how many of these stopped before convergence, how wrong they are and
+    where, and how many rows and contacts they have. The worst worlds are problem files in OUT/worst; OUT/states.npz
+    holds the states before them, from which --states starts again.
 
-    Exit code 1: with --accept, an answer that is not at its floor is further off. Exit code 130: stopped by Ctrl-C; the
-    page tells of what was done.
+    Exit code 1: a world diverged, or a step could not be judged; with --accept, an answer that is not at its floor is
+    further off. Exit code 130: stopped by Ctrl-C; the page shows what was done.
     """
     from lavender.lab.audit import audit as run
 
@@ -61,8 +62,8 @@ def audit(context: click.Context, /, model: Path, out: Path, accept: float | Non
     writable(out, folder=True)
     one_thread()
     with progress() as watch:
-        found = run(model, watch=watch, **asked)
-    found.write(out)
-    show_sheet(found.sheet, out)
-    if accept is not None and found.largest > accept:
+        result = run(model, watch=watch, **asked)
+    result.write(out)
+    show_sheet(result.sheet, out)
+    if result.diverged or result.unjudged or (accept is not None and result.largest > accept):
         raise click.exceptions.Exit(EXIT_UNMET)

@@ -183,7 +183,9 @@ def worlds_options(worlds: int, steps: int) -> Callable[[Callable[..., Any]], Ca
         (("--spread",), {"default": 0.1, "metavar": "M/S",
                          "help": "Standard deviation of what the others' first velocities differ by."}),
     ]  # fmt: skip
-    options += [(names, more) for names, more in RECORDING_OPTIONS if names[0] in ("--controls", "--seed")]
+    options += [
+        (names, more) for names, more in RECORDING_OPTIONS if names[0] in ("--controls", "--seed", "--states")
+    ]
     return adding(options, show_default=True)
 
 
@@ -246,8 +248,12 @@ RECORDING_OPTIONS: tuple[Option, ...] = (
     (("--controls", "control"), {"default": "random", "metavar": "zero|random|FILE",
                                  "help": "MODEL.xml: its controls. FILE: an .npy array of shape (any, nu)."}),
     (("--seed",), {"default": 0, "help": "MODEL.xml: seed of random controls."}),
+    (("--states",), {"default": None, "metavar": "FILE|keyframes",
+                     "help": "MODEL.xml: start from these states. FILE: an .npz, best with `state`, vectors of "
+                     "mjSTATE_INTEGRATION (with warm start and controls) in its rows; else qpos and qvel, and other "
+                     "arrays of MjData, such as `lavender audit` writes. keyframes: those of the model."}),
 )  # fmt: skip
-RECORDING = ("steps", "every", "control", "seed", "threshold")  # their names
+RECORDING = ("steps", "every", "control", "seed", "states", "threshold")  # their names
 recording_options = adding([THRESHOLD, *RECORDING_OPTIONS], show_default=True)
 
 #: Of what is measured.

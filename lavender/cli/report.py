@@ -191,7 +191,7 @@ def _recorded(word: str, out: Path, taken: set[Path], fresh: bool, how: Mapping[
         folder = first.with_name(f"{first.name}-{n}")
     taken.add(folder)
     kept = folder / "how.json"
-    asked = json.dumps({"model": model, "changed": _ages(path, how["control"]), **how})
+    asked = json.dumps({"model": model, "changed": _ages(path, how["control"], how["states"]), **how})
     if fresh or not kept.is_file() or kept.read_text(encoding="utf-8") != asked:
         kept.unlink(missing_ok=True)  # a recording that is stopped on the way is none
         say(str(record_file(path, folder, **how, replace=True)))
@@ -207,8 +207,8 @@ def _model_of(folder: Path) -> str:
         return ""
 
 
-def _ages(path: Path, controls: str) -> list[float]:
-    """When the model, the files that it includes and its controls were changed."""
+def _ages(path: Path, controls: str, states: str | None) -> list[float]:
+    """When the model, the files that it includes, its controls and its start states were changed."""
     try:
         found = [path.stat().st_mtime]
     except OSError as error:
@@ -218,6 +218,6 @@ def _ages(path: Path, controls: str) -> list[float]:
     except ImportError:  # none, or an earlier one
         return found
     with contextlib.suppress(ValueError, RuntimeError, FatalError):  # no model: said where it is read
-        others = (*sorted(mju_getXMLDependencies(str(path))), controls)
+        others = (*sorted(mju_getXMLDependencies(str(path))), controls, states or "")
         found += [p.stat().st_mtime for p in map(Path, others) if p.is_file()]
     return found

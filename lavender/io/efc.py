@@ -123,7 +123,7 @@ def from_efc(
     mass = _whole(*map(np.asarray, M)) if isinstance(M, tuple) else np.asarray(M)
     precision = precision_of(jac, mass, np.asarray(qvel))
     if qfrc_smooth is not None:
-        _check_mass(mass, smooth, as_array("qfrc_smooth", qfrc_smooth, (n, nv)), precision)
+        _check_mass(mass, smooth, as_array("qfrc_smooth", qfrc_smooth, (n, nv), finite=False), precision)
     free = before + dt * smooth
     step = max(1, CHUNK // max(1, m * nv))
     for i in range(0, n, step):
@@ -235,6 +235,8 @@ def from_mujoco_many(model: Any, states: Any, *, threads: int = 1, errors: str =
         return single._words(mj, model, held, int(ptr[i + 1] - ptr[i]), 1)
 
     made.batch.names_of = words
+    world = np.repeat(np.arange(n), np.diff(contact_ptr))
+    made.batch.contact_counts = np.bincount(world[contacts["efc_address"] >= 0], minlength=n)
     return made
 
 

@@ -38,8 +38,8 @@ Differences to know:
 
 What MuJoCo holds is checked against itself: every index before it is followed; M a0 must be its smooth force, 1 / R its
 efc_D; and J must be the matrix that made its efc_vel, efc_b and qfrc_constraint. Data of another problem than M's are
-refused, with the option that makes them. What its solver answered is in no check: where it stopped early `impulse` is
-further off, and the judge says by how much.
+refused, with the option that makes them. What its solver answered is in no check: if it stopped before convergence,
+`impulse` is further off, and the judge says by how much.
 """
 
 from __future__ import annotations
@@ -128,7 +128,7 @@ def from_mujoco(model: Any, data: Any, *, name: str = "mujoco") -> Problem:
         The data belong to another problem than J, M and R: an integrator that treats damping inside M
         (`integrator="discrete"`), a Jacobian that is not the one of the forward pass (`opt.jacobian` changed since),
         or a copy that lacks what the problem needs; after `mj_step`, joints of one body that move it alike. Never
-        because MuJoCo's solver stopped early: the problem does not depend on its answer.
+        because MuJoCo's solver stopped before convergence: the problem does not depend on its answer.
     """
     seen, m, contacts, smooth = _mujoco(model, data)
     opt, like = model.opt, seen.like

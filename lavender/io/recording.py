@@ -18,8 +18,9 @@ from lavender.base.arrays import FloatArray, as_array, number, one_of, whole_num
 from lavender.base.errors import InputError, LavenderError
 from lavender.io import mujoco as adapter
 from lavender.io import npz
+from lavender.io.states import read_states
 from lavender.io.stored import ENGINE, as_path, first_bytes, folder_for_steps, write_text
-from lavender.judge.residuals import AT_FLOOR, EARLY, ENOUGH, WRONG, residual
+from lavender.judge.residuals import AT_FLOOR, ENOUGH, UNCONVERGED, WRONG, residual
 from lavender.problem import PRECISIONS, Problem
 
 CONTROLS = ("zero", "random")
@@ -37,7 +38,7 @@ class Recording:
     above_floor: int = 0  # of MuJoCo's answers, those that rounding does not explain
     stopped: int = 0  # of these, those more than `threshold` off
     threshold: float = ENOUGH  # m/s
-    worst: str = ""  # by how much the worst answer is off, and where
+    worst: str = ""  # verdict of the worst answer, by how much it is off, and where
 
     def __str__(self) -> str:
         more = f", {self.without} steps without constraints" if self.without else ""
@@ -45,7 +46,7 @@ class Recording:
         made = f"{len(self.files)} problems in {self.folder}{more}{lost}"
         if not self.above_floor:
             return made
-        far = f": MuJoCo stopped {self.worst} in the worst" if self.stopped else ""
+        far = f"; the worst {self.worst}" if self.stopped else ""
         return (
             f"{made}\nMuJoCo's own answers: {self.above_floor} above their floor, {self.stopped} more than "
             f"{self.threshold:g} m/s off{far}"
@@ -61,6 +62,7 @@ def record(
     every: int = 1,
     control: Control = "random",
     seed: int = 0,
+    states: Any = None,
     replace: bool = False,
     precision: str = "float64",
     threshold: float = ENOUGH,
@@ -69,8 +71,8 @@ def record(
 
     Each file holds the problem with keys of its blocks and MuJoCo's own impulse. `engine.jsonl` has a line for each:
     file, step, rows, the engine's iterations, the time of its constraint solver [s] and, by our judge, its
-    residual, velocity error [m/s] and worst row, the floor of its precision and the verdict. Where MuJoCo's solver
-    stopped early, that is said of its answer; the problem is kept like any other. A step that cannot be exported has no
+    residual, velocity error [m/s] and worst row, the floor of its precision and the verdict. A step in which MuJoCo's
+    solver stopped before convergence has that verdict and is kept like any other. A step that cannot be exported has no
     file, and `left_out` in its line says why: whatever is measured on the others names it.
 
     Parameters
@@ -88,6 +90,9 @@ def record(
         start where it ends. What a callable returns is written to `data.ctrl`, unless it is None.
     seed : int
         Of "random".
+    states : path of an .npz, "keyframes", or arrays, optional
+        Start states (`lavender.io.states`): the steps are divided evenly among them. The first step from a state uses
+        its controls, if it has any. Default: `data` as it is.
     replace : bool
         Take the problem files of another recording out of the folder, which is refused otherwise.
     precision : {"float64", "float32"}
@@ -110,6 +115,8 @@ def record(
     precision = one_of("precision", precision, PRECISIONS)
     threshold = number("threshold", threshold, low=0.0)
     drive = drive_of(model, control, seed)
+    starts = None if states is None else read_states(mj, model, states).take(steps)
+    firsts = {} if starts is None else {steps * i // len(starts): i for i in range(len(starts))}
     kept: list[dict[str, Any]] = []
     left_out: list[dict[str, Any]] = []
     without = 0
@@ -117,6 +124,10 @@ def record(
     with folder_for_steps(folder, replace) as folder:
         for step in range(steps):
             ctrl = drive(data, step)
+            if starts is not None and step in firsts:
+                i = firsts[step]
+                mj.mj_setState(model, data, starts.vectors[i], mj.mjtState.mjSTATE_INTEGRATION)
+                ctrl = ctrl if starts.controls is None else starts.controls[i]
             if ctrl is not None:
                 data.ctrl[:] = ctrl
             try:
@@ -139,9 +150,10 @@ def record(
             npz.write(problem, file, impulse=own)
             kept.append({"file": file.name, "step": step + 1, **told})
         write_text(folder / ENGINE, "".join(f"{json.dumps(line)}\n" for line in (*kept, *left_out)))
-    far = [line for line in kept if line["verdict"] in (EARLY, WRONG)]
+    far = [line for line in kept if line["verdict"] in (UNCONVERGED, WRONG)]
     worst = max(far, key=lambda line: float(line["velocity"]), default=None)
-    short = worst and f"{worst['velocity']:.2g} m/s short at {worst['worst']} (step {worst['step']})"
+    verdict = UNCONVERGED if worst and worst["verdict"] == UNCONVERGED else f"is {WRONG}"
+    short = worst and f"{verdict}, {worst['velocity']:.2g} m/s off at {worst['worst']} (step {worst['step']})"
     return Recording(
         folder=folder,
         files=tuple(line["file"] for line in kept),

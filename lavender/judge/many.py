@@ -16,7 +16,7 @@ import numpy as np
 from lavender.base.arrays import FloatArray, as_array, number, one_of, places, whole_number
 from lavender.base.errors import InputError, LavenderError
 from lavender.base.threads import together
-from lavender.judge.residuals import AT_REST, ENOUGH, Residual, residual, verdict_of
+from lavender.judge.residuals import AT_REST, ENOUGH, VERDICTS, Residual, residual, verdict_of
 from lavender.problem import PRECISIONS, Problem, check_problem
 from lavender.problem.batch import ERRORS, Batch
 from lavender.problem.derived import cached_property
@@ -179,7 +179,7 @@ class Residuals(Many):
 
     @cached_property
     def verdict(self) -> np.ndarray:
-        """(n,) as `Residual.verdict`: "at its floor", "close enough", "stopped early", "wrong"; "" of a bad world."""
+        """(n,) as `Residual.verdict`; "" of a bad world."""
         nothing = (self._numbers("start_relative") < 0.5) | (self._numbers("start_speed") < AT_REST)
         for i, known in self._nothing.items():
             nothing[i] = known
@@ -190,7 +190,7 @@ class Residuals(Many):
         words = [verdict_of(*x, self.threshold) for x in each]  # type: ignore[call-arg]
         for i in self.faults:
             words[i] = ""
-        return np.array(words, "U13")
+        return np.array(words, f"U{max(map(len, VERDICTS))}")
 
     @property
     def excess(self) -> FloatArray:
@@ -255,7 +255,7 @@ def residual_many(
     >>> batch = lv.Batch(J, M, v_free, cones=lv.Cones.contacts(0.0, tangents=0))
     >>> found = lv.residual_many(batch, [[1.0], [0.9], [0.0]])  # N s
     >>> found.verdict.tolist(), found.velocity_error.round(6).tolist()
-    (['at its floor', 'stopped early', 'wrong'], [0.0, 0.1, 1.0])
+    (['at its floor', 'stopped before convergence', 'wrong'], [0.0, 0.1, 1.0])
     """
     given = given_problems(problems, errors)
     if precision is not None:

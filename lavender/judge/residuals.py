@@ -61,7 +61,10 @@ OF_ROW = 32  # multiply-adds of that pass for each row on two bodies
 at_floor = measure.at_floor
 
 ENOUGH = 1e-6  # m/s, below which a robot's velocities are no further off than anybody measures
-AT_FLOOR, CLOSE, EARLY, WRONG = "at its floor", "close enough", "stopped early", "wrong"
+VERDICTS = AT_FLOOR, CLOSE, UNCONVERGED, WRONG = (
+    "at its floor", "close enough", "stopped before convergence", "wrong",
+)  # fmt: skip
+VERDICTS_OF_OLD = {"stopped early": UNCONVERGED}  # words in files of earlier versions
 
 
 @dataclass(frozen=True)
@@ -136,11 +139,11 @@ class Residual:
 
     @property
     def verdict(self) -> str:
-        """What to think of the answer: "at its floor", "close enough", "stopped early" (by `excess`) or "wrong".
+        """The judgement: "at its floor", "close enough", "stopped before convergence" (by `excess`) or "wrong".
 
         At its floor: within `at_floor`. Close enough: above it, and no row is further off than `threshold`. Wrong: not
-        finite, or as far off as doing nothing. A residual tells no mistake that is smaller from an early stop: another
-        mu, say, leaves the same error.
+        finite, or as far off as doing nothing. A residual cannot tell a smaller mistake from a stop before
+        convergence: another mu, say, leaves the same error.
         """
         return verdict_of(
             self.relative, self.floor, self.energy, self.velocity, self.energy_rhs, self.nothing_to_do,
@@ -149,12 +152,13 @@ class Residual:
 
     @property
     def verdict_in_words(self) -> str:
-        """The verdict, of an early stop with by how much."""
-        return f"{EARLY}, {self.excess:.2g} times its floor" if self.verdict == EARLY else self.verdict
+        """The verdict; of an answer that stopped before convergence also the factor over its floor."""
+        verdict = self.verdict
+        return f"{verdict}, {self.excess:.2g} times its floor" if verdict == UNCONVERGED else verdict
 
     @property
     def excess(self) -> float:
-        """The relative residual over its floor [-]: by how much an answer stopped early; 0 of an exact one."""
+        """The relative residual over its floor [-]; 0 of an exact answer."""
         if self.relative == 0.0:
             return 0.0
         return self.relative / self.floor if self.floor > 0.0 else math.inf
@@ -220,7 +224,7 @@ def verdict_of(
         return AT_FLOOR if energy <= energy_rhs else WRONG
     if velocity <= threshold:
         return CLOSE
-    return EARLY if relative < 1.0 else WRONG
+    return UNCONVERGED if relative < 1.0 else WRONG
 
 
 def relative_of(data: Any, energy: float, velocity: float) -> float:
@@ -357,7 +361,7 @@ def residual(
     'at its floor'
     >>> early = lv.residual(problem, np.float32([0.49, 0.0]), precision="float32")  # 2 % short of it
     >>> early.verdict, early.excess > 1e4
-    ('stopped early', True)
+    ('stopped before convergence', True)
     """
     check_problem(problem)
     precision = problem.precision if precision is None else one_of("precision", precision, PRECISIONS)

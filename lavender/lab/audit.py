@@ -1,13 +1,17 @@
-"""Every step of many worlds judged: how many ended early, how wrong they are and where, and the worst to go back to.
+"""Judge every step of many worlds: which solves stopped before convergence, how wrong they are, and the worst states.
 
-    found = audit("ant.xml", worlds=64, steps=200)
-    found.table_of_errors; found.worst[0].problem; found.write("lavender-audit"); found.sheet.write("lavender-audit")
+    result = audit("ant.xml", worlds=64, steps=200)
+    result.table_of_errors; result.worst[0].problem
+    result.write("lavender-audit"); result.sheet.write("lavender-audit")
 
-An answer that rounding explains, in the precision of the engine, is at its floor and no early stop
-(`Residual.verdict`). MuJoCo's problems are those of `lavender.io.from_mujoco_many`, made anew from the state before
-each step, its warm start and controls: its own answer to the bit. `noslip_iterations` come after the problem, and what
-is judged is the answer before them. An answer are forces: MuJoCo's Newton and CG move bodies by accelerations of their
-own, which an early stop leaves less far off (docs/mujoco.md).
+An answer that rounding explains, in the precision of the engine, is at its floor and did not stop before convergence
+(`Residual.verdict`). MuJoCo's problems are those of `lavender.io.from_mujoco_many`, computed again from the state
+before each step, its warm start and controls: its own answer to the bit. `noslip_iterations` come after the problem,
+and the answer before them is judged. An answer consists of forces: MuJoCo's Newton and CG move bodies by accelerations
+of their own, which are less far off after a stop before convergence (docs/mujoco.md).
+
+A step is judged if its error is finite. When a world diverges, its later steps cannot be judged, and the step in which
+it diverged is judged only if the engine's answer is finite.
 """
 
 from __future__ import annotations
@@ -15,7 +19,7 @@ from __future__ import annotations
 import copy
 import os
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -27,21 +31,33 @@ from lavender.base.errors import InputError, UnknownName
 from lavender.io import npz
 from lavender.io.efc import from_mujoco_many
 from lavender.io.recording import Control
+from lavender.io.states import VECTOR
 from lavender.io.stored import folder_for_steps, write_arrays
 from lavender.judge.many import residual_many
-from lavender.judge.residuals import AT_FLOOR, CLOSE, EARLY, ENOUGH, WRONG
+from lavender.judge.residuals import AT_FLOOR, CLOSE, ENOUGH, UNCONVERGED, WRONG
+from lavender.judge.residuals import VERDICTS as JUDGED
 from lavender.lab.bench.running.campaign import check_workers, connected, hand_out
 from lavender.lab.bench.running.runner import Event
 from lavender.lab.report.curves import Curve, Figure
 from lavender.lab.report.sheet import Part as Section
 from lavender.lab.report.sheet import Sheet
 from lavender.lab.report.table import Cell, Table
-from lavender.lab.report.text import count, percent, size
-from lavender.lab.worlds import ENGINES, Runs, fields_of, frames, states_of
+from lavender.lab.report.text import NONE, count, percent, size
+from lavender.lab.worlds import (
+    ENGINES,
+    Divergence,
+    Runs,
+    StepSizes,
+    can_touch,
+    fields_of,
+    frames,
+    simulate_world,
+)
 from lavender.problem import PRECISIONS, Problem
 from lavender.problem.batch import Batch
 
-VERDICTS = (AT_FLOOR, CLOSE, EARLY, WRONG, "not finite")
+VERDICTS = (*JUDGED, "not judged")
+NOT_JUDGED = len(JUDGED)
 NUMBERS = ("velocity", "impulse", "relative", "floor")  # m/s, N s, -, - of the worst row
 QUANTILES = (0.5, 0.9, 0.99, 0.999, 1.0)
 AT_ONCE = 512  # problems in memory
@@ -49,13 +65,21 @@ TASK = 4096  # steps that a worker does between two answers
 WORST = 3  # worlds that are kept as files
 POINTS = 60  # of a curve over time
 OF_ERRORS = (
-    "Of the worst row of each step. At its floor: rounding explains the error, in the engine's precision. Close "
-    "enough: no row is further off than the threshold. Stopped early, or wrong: the rest. The errors are of the "
-    "engine's forces: the accelerations by which MuJoCo's Newton and CG move bodies are mostly less far off."
+    "Of the worst row of each step judged. At its floor: rounding explains the error, in the engine's precision. Close "
+    "enough: no row is further off than the threshold. Stopped before convergence, or wrong: the rest. Not judged: the "
+    "engine's answer is not finite, or the world diverged before. The errors are of the engine's forces: the "
+    "accelerations by which MuJoCo's Newton and CG move bodies are mostly less far off."
 )
+OF_SIZES = "Rows and contacts of the steps judged."
 OF_FILES = (
-    "Problems with the engine's impulses, in the folder worst; states.npz holds the states to go back to."
+    "Problems with the engine's impulses, in the folder worst; states.npz holds the states before these steps "
+    "(--states starts from them again)."
 )
+OF_DIVERGED = (
+    "The step in which each world diverged, what was not finite or above 1e10 in it, and whether every solve of the "
+    "world until then was exact. If so, the cause lies outside the constraint solver."
+)
+OUTSIDE = "outside the constraint solver (time step, integrator, actuators or the model itself)"
 NUMBER = re.compile(r"^contact \d+ ")  # of a contact within its step, which says nothing over steps
 
 
@@ -73,31 +97,40 @@ class Worst:
 
 
 class Piece(NamedTuple):
-    """What was found of some steps."""
+    """Results of some steps."""
 
     world: Any  # (k,) int
     step: Any
     numbers: FloatArray  # (len(NUMBERS), k)
     verdict: Any  # (k,) places in VERDICTS
-    where: list[tuple[int, str]]  # place among these steps and row, of those that ended early
+    rows: Any  # (k,) int
+    contacts: Any
+    where: list[tuple[int, str]]  # place among these steps and row, of those that stopped before convergence
     worst: list[Worst]
+    divergences: Sequence[Divergence] = ()
 
 
 @dataclass(frozen=True, eq=False)
 class Audit:
-    """What `audit` found.
+    """Result of `audit`.
 
     Parameters
     ----------
     runs : Runs
     engine : str
     numbers : (4, worlds, steps)
-        Errors of the worst row [m/s, N s], relative residual and its floor; NaN where nothing was judged.
+        Errors of the worst row [m/s, N s], relative residual and its floor; NaN if the step was not judged.
     verdict : (worlds, steps) int
-        Places in `VERDICTS`; -1 where the audit did not come.
+        Places in `VERDICTS`; -1 if the audit was stopped before the step.
+    rows, contacts : (worlds, steps) int
+        Contacts that have rows; 0 if the step was not judged.
+    can_touch : bool
+        Whether the model has geoms that can collide.
     where : dict
-        Row (without the contact's number): how often it was the worst of an early stop, by how much at most [m/s].
+        Row (without the contact's number): in how many steps that stopped before convergence it was the worst, and its
+        largest error [m/s].
     worst : list of Worst
+    divergences : list of Divergence
     stopped : bool
         By Ctrl-C, or workers were lost.
     """
@@ -106,65 +139,119 @@ class Audit:
     engine: str
     numbers: FloatArray
     verdict: Any
+    rows: Any
+    contacts: Any
+    can_touch: bool
     where: dict[str, tuple[int, float]]
     worst: list[Worst]
+    divergences: list[Divergence]
     stopped: bool = False
 
     @property
-    def early(self) -> Any:
-        """(worlds, steps) bool: stopped early, or wrong."""
-        return (self.verdict == VERDICTS.index(EARLY)) | (self.verdict == VERDICTS.index(WRONG))
+    def is_judged(self) -> Any:
+        """(worlds, steps) bool: the error is finite."""
+        return (self.verdict >= 0) & (self.verdict < NOT_JUDGED)
+
+    @property
+    def unconverged(self) -> Any:
+        """(worlds, steps) bool: stopped before convergence, or wrong."""
+        return (self.verdict == VERDICTS.index(UNCONVERGED)) | (self.verdict == VERDICTS.index(WRONG))
+
+    @property
+    def judged(self) -> int:
+        """Number of steps judged."""
+        return int(np.count_nonzero(self.is_judged))
+
+    @property
+    def unjudged(self) -> int:
+        """Number of steps that were asked for and not judged."""
+        return self.verdict.size - self.judged
 
     @property
     def done(self) -> int:
-        """Steps judged."""
+        """Number of steps that the audit came to."""
         return int(np.count_nonzero(self.verdict >= 0))
 
     @property
-    def apart(self) -> Any:
-        """(worlds,) bool: not finite from some step on."""
-        return (self.verdict == VERDICTS.index("not finite")).any(axis=1)
+    def diverged(self) -> int:
+        """Number of steps in which a world diverged: one for each world that did."""
+        return len(self.divergences)
 
     @property
     def largest(self) -> float:
-        """Largest velocity error that rounding does not explain [m/s]; infinite where a world is not finite."""
-        if self.apart.any():
-            return np.inf
-        return float(np.max(self.numbers[0][self.verdict > VERDICTS.index(AT_FLOOR)], initial=0.0))
+        """Largest velocity error that rounding does not explain, of the steps judged [m/s]."""
+        measured = self.is_judged & (self.verdict > VERDICTS.index(AT_FLOOR))
+        return float(np.max(self.numbers[0][measured], initial=0.0))
+
+    @property
+    def sizes(self) -> StepSizes:
+        """Rows and contacts of the steps judged."""
+        return StepSizes(self.rows[self.is_judged], self.contacts[self.is_judged], self.can_touch)
+
+    def has_exact_solves(self, divergence: Divergence) -> bool:
+        """Whether every solve of a world that diverged was exact: at its floor, or close enough and within `ENOUGH`.
+
+        The solve of the last step does not count if the state or the unconstrained acceleration was already too large.
+        """
+        some = divergence.world, slice(0, divergence.step + (not divergence.is_outside))
+        verdict = self.verdict[some]
+        close = (verdict == VERDICTS.index(CLOSE)) & (self.numbers[0][some] <= ENOUGH)
+        return bool(np.all(close | (verdict == VERDICTS.index(AT_FLOOR))))
 
     @property
     def head(self) -> str:
-        """All in a sentence."""
-        early, of = self.early, np.count_nonzero((self.verdict >= 0).any(axis=1))
-        begun = f"{Path(self.runs.model).name}, {self.engine}: "
-        done = f"{self.done} steps of {count(int(of), 'world')}"
-        lost = int(self.apart.sum())
-        end = (
-            f". {count(lost, 'world')} flew apart, of which no step is judged from there on." if lost else "."
+        """All in a few sentences."""
+        unconverged, judged = self.unconverged, self.judged
+        worlds = count(int(np.count_nonzero(self.is_judged.any(axis=1))), "world")
+        n = int(unconverged.sum())
+        said = (
+            f"{Path(self.runs.model).name}, {self.engine}: {n or 'none'} of {count(judged, 'step')} judged in {worlds} "
+            "stopped before convergence"
         )
-        if not early.any():
-            return f"{begun}none of {done} ended early{end}"
-        return (
-            f"{begun}{np.count_nonzero(early)} of {done} ended early ({percent(int(early.sum()), self.done, 1)}), in "
-            f"{np.count_nonzero(early.any(axis=1))} worlds; {size(self.largest)} m/s off in the worst{end}"
-        )
+        if n:
+            said += (
+                f" ({percent(n, judged, 1)}), in {count(int(unconverged.any(axis=1).sum()), 'world')}; "
+                f"the worst is {size(self.largest)} m/s off"
+            )
+        few = "" if self.sizes.is_enough else (
+            f"Only {self.sizes.sentence}: this says little about the solver. Start from other states with --states."
+        )  # fmt: skip
+        more = [self._of_divergence, few]
+        return " ".join([f"{said}.", *filter(None, more)])
+
+    @property
+    def _of_divergence(self) -> str:
+        lost = self.verdict == NOT_JUDGED
+        unjudged = count(int(lost.sum()), "step")
+        were = "was" if lost.sum() == 1 else "were"
+        if not self.divergences:
+            return f"{unjudged} {were} not judged: the answer is not finite." if lost.any() else ""
+        first = min(d.step for d in self.divergences)
+        said = f"{count(self.diverged, 'world')} diverged, in step {first} at the earliest"
+        said += f"; {unjudged} {were} not judged." if lost.any() else "."
+        exact = sum(map(self.has_exact_solves, self.divergences))
+        if exact == self.diverged:
+            return f"{said} Every solve until then was exact: the cause lies {OUTSIDE}."
+        if exact:
+            said += f" In {exact} of these every solve until then was exact: the cause lies {OUTSIDE}."
+        return said
 
     @property
     def table_of_errors(self) -> Table:
-        """Quantiles of the errors over all steps, and over those that ended early."""
+        """Quantiles of the errors over all steps judged, and over those that stopped before convergence."""
         heads = ["error", *(f"{100.0 * q:g} %" for q in QUANTILES[:-1]), "worst"]
         rows: list[list[str | Cell]] = []
-        for of, chosen in (("all steps", self.verdict >= 0), ("early stops", self.early)):
+        for of, chosen in (("all steps judged", self.is_judged), (UNCONVERGED, self.unconverged)):
             for name, unit, x in (("velocity", "m/s", self.numbers[0]), ("impulse", "N s", self.numbers[1])):
                 known = x[chosen & np.isfinite(x)]
                 if len(known):
-                    found = np.quantile(known, QUANTILES, method="higher")
-                    rows.append([f"{name} [{unit}], {of}", *map(size, found.tolist())])
+                    quantiles = np.quantile(known, QUANTILES, method="higher")
+                    rows.append([f"{name} [{unit}], {of}", *map(size, quantiles.tolist())])
         return Table(heads, rows, words=frozenset({"error"}))
 
     @property
     def table_of_verdicts(self) -> Table:
-        """How many steps, in how many worlds."""
+        """How many steps have each verdict, in how many worlds."""
         rows = []
         for i, word in enumerate(VERDICTS):
             here = self.verdict == i
@@ -175,10 +262,22 @@ class Audit:
 
     @property
     def table_of_rows(self) -> Table:
-        """Where early stops have their worst row, most often first."""
+        """The worst rows of steps that stopped before convergence, most often first."""
         ranked = sorted(self.where.items(), key=lambda entry: -entry[1][0])
-        rows = [[name, str(n), size(most)] for name, (n, most) in ranked]
-        return Table(["worst row", "early stops", "at most [m/s]"], rows)
+        rows = [[name, str(n), size(largest)] for name, (n, largest) in ranked]
+        return Table(["worst row", UNCONVERGED, "at most [m/s]"], rows)
+
+    @property
+    def table_of_diverged(self) -> Table:
+        """The step in which each world diverged."""
+        rows = []
+        for d in self.divergences:
+            error = self.numbers[0, d.world, d.step]
+            known = size(error) if np.isfinite(error) else NONE
+            exact = "exact" if self.has_exact_solves(d) else "not exact"
+            rows.append([d.cause, str(d.world), str(d.step), known, exact])
+        heads = ["too large", "world", "step", "error [m/s]", "solves until then"]
+        return Table(heads, rows, words=frozenset({"too large", "solves until then"}))
 
     @property
     def table_of_worst(self) -> Table:
@@ -204,10 +303,11 @@ class Audit:
         return Figure("over-time", "over time", "step", "velocity error [m/s]", curves, x_log=False)
 
     def write(self, folder: str | os.PathLike[str]) -> None:
-        """`records.npz`, the worst as `worst/worst_1.npz`, and `states.npz`; the page is `sheet.write`.
+        """Write `records.npz`, the worst steps as `worst/worst_1.npz`, and `states.npz`; `sheet.write` writes the page.
 
-        `records.npz` holds `velocity` [m/s], `impulse` [N s], `relative`, `floor`, `verdict` (worlds, steps) and
-        `verdicts`; `states.npz` qpos, qvel, act, ctrl, qacc_warmstart of the worst, a row each, before their step.
+        `records.npz` holds `velocity` [m/s], `impulse` [N s], `relative`, `floor`, `verdict`, `rows`, `contacts` (each
+        (worlds, steps)), `verdicts` and `diverged`, rows of (world, step). `states.npz` holds qpos, qvel, act, ctrl,
+        qacc_warmstart of the worst, a row each, before their step, and of MuJoCo `state`, their mjSTATE_INTEGRATION.
         """
         folder = Path(folder)
         with folder_for_steps(folder / "worst", replace=True) as worst:
@@ -218,17 +318,21 @@ class Audit:
         places = {name: np.array([getattr(w, name) for w in self.worst], int) for name in ("world", "step")}
         held = dict(zip(NUMBERS, self.numbers, strict=True))
         write_arrays(folder / "states.npz", states | places)
-        write_arrays(folder / "records.npz", held | {"verdict": self.verdict, "verdicts": np.array(VERDICTS)})
+        held |= {"verdict": self.verdict, "verdicts": np.array(VERDICTS)}
+        held |= {"rows": self.rows, "contacts": self.contacts}
+        held["diverged"] = np.array([(d.world, d.step) for d in self.divergences], int).reshape(-1, 2)
+        write_arrays(folder / "records.npz", held)
 
     @property
-    def told(self) -> dict[str, Any]:
+    def totals(self) -> dict[str, Any]:
         """The sums, as `numbers.json` has them."""
-        runs, early, largest = self.runs, self.early, self.largest
+        runs, unconverged = self.runs, self.unconverged
+        divergences = [d._asdict() | {"exact": self.has_exact_solves(d)} for d in self.divergences]
         return {
             "head": self.head, "engine": self.engine, "model": runs.model, "worlds": runs.worlds, "steps": runs.steps,
-            "seed": runs.seed, "done": self.done, "early": int(early.sum()),
-            "worlds_early": int(early.any(axis=1).sum()), "worlds_apart": int(self.apart.sum()),
-            "largest": largest if np.isfinite(largest) else None, "stopped": self.stopped,
+            "seed": runs.seed, "judged": self.judged, "unjudged": self.unjudged, "diverged": self.diverged,
+            "unconverged": int(unconverged.sum()), "worlds_unconverged": int(unconverged.any(axis=1).sum()),
+            "largest": self.largest, "divergences": divergences, **self.sizes.numbers, "stopped": self.stopped,
         }  # fmt: skip
 
     @property
@@ -238,10 +342,13 @@ class Audit:
             "lavender audit", self.head,
             [
                 Section("How wrong", [self.table_of_errors, self.table_of_verdicts], [self.figure], OF_ERRORS, short=4),
-                Section("Where", [self.table_of_rows], short=5, note="Rows that were the worst of an early stop."),
+                Section("Rows and contacts", [self.sizes.table], short=2, note=OF_SIZES),
+                Section("Worlds that diverged", [self.table_of_diverged], short=2, note=OF_DIVERGED),
+                Section("Where", [self.table_of_rows], short=3,
+                        note="Rows that were the worst of a step that stopped before convergence."),
                 Section("The worst worlds", [self.table_of_worst], short=WORST, note=OF_FILES),
             ],
-            self.told,
+            self.totals,
             self.stopped,
         )  # fmt: skip
 
@@ -255,6 +362,7 @@ def audit(
     control: Control = "random",
     seed: int = 0,
     spread: float = 0.1,
+    states: Any = None,
     precision: str | None = None,
     threshold: float = ENOUGH,
     workers: int = -1,
@@ -268,6 +376,8 @@ def audit(
     model : path (MJCF)
     worlds, steps, control, seed, spread : as `Runs`
     engine : {"mujoco", "mjx", "mujoco_warp"}
+    states : path of an .npz, "keyframes", or arrays, optional
+        States in which the worlds start: see `lavender.io.states`. Default: the model's own.
     precision : {"float64", "float32"}, optional
         In which MuJoCo computes; default float64. The others say it themselves.
     threshold : float, m/s
@@ -298,10 +408,14 @@ def audit(
     if precision not in (None, *PRECISIONS) or (precision and engine != "mujoco"):
         raise InputError(f"precision is {precision!r}; {' or '.join(PRECISIONS)}, of MuJoCo alone, is needed")
     check_workers(workers)
-    runs = Runs(os.fspath(model), worlds, steps, control=control, seed=seed, spread=spread)
+    runs = Runs(os.fspath(model), worlds, steps, control=control, seed=seed, spread=spread).start_from(states)
     how = precision or "float64", number("threshold", threshold, low=0.0)
     numbers, verdict = np.full((len(NUMBERS), worlds, steps), np.nan), np.full((worlds, steps), -1, np.int8)
-    found = Audit(runs, engine, numbers, verdict, where={}, worst=[])
+    rows, contacts = np.zeros((2, worlds, steps), int)
+    result = Audit(
+        runs, engine, numbers, verdict, rows=rows, contacts=contacts, can_touch=can_touch(*runs.load()), where={},
+        worst=[], divergences=[],
+    )  # fmt: skip
     if engine == "mujoco":
         pieces = _by_mujoco(runs, how, workers, backend)
     else:
@@ -310,18 +424,22 @@ def audit(
         for piece in pieces:
             numbers[:, piece.world, piece.step] = piece.numbers
             verdict[piece.world, piece.step] = piece.verdict
+            rows[piece.world, piece.step] = piece.rows
+            contacts[piece.world, piece.step] = piece.contacts
             for i, name in piece.where:
-                n, most = found.where.get(name, (0, 0.0))
-                found.where[name] = n + 1, max(most, float(piece.numbers[0, i]))
-            found.worst[:] = _worst([*found.worst, *piece.worst])
+                times, largest = result.where.get(name, (0, 0.0))
+                result.where[name] = times + 1, max(largest, float(piece.numbers[0, i]))
+            result.worst[:] = _worst([*result.worst, *piece.worst])
+            result.divergences[:] = sorted([*result.divergences, *piece.divergences])
             if watch is not None:
-                watch(Event(found.done, worlds * steps, f"{int(found.early.sum())} early", ""))
+                n = int(result.unconverged.sum())
+                watch(Event(result.done, worlds * steps, f"{n} {UNCONVERGED}", ""))
     except KeyboardInterrupt:
-        if not found.done:
+        if not result.done:
             raise
-    if not found.done:
+    if not result.done:
         raise InputError("no step was judged: workers were lost; fewer of them (--workers) need less memory")
-    return replace(found, stopped=found.done < worlds * steps)
+    return replace(result, stopped=result.done < worlds * steps)
 
 
 def _worst(some: list[Worst]) -> list[Worst]:
@@ -348,7 +466,9 @@ def _by_mujoco(runs: Runs, how: tuple[str, float], workers: int, backend: str) -
 def simulated(runs: Runs, how: tuple[str, float], worlds: range) -> list[Piece]:
     """MuJoCo's steps of some worlds, in a worker."""
     mj, model = runs.load()
-    states = np.concatenate([states_of(mj, model, runs, world) for world in worlds])
+    simulations = [simulate_world(mj, model, runs, world) for world in worlds]
+    states = np.concatenate([states for states, _ in simulations])
+    divergences = [divergence for _, divergence in simulations if divergence is not None]
     judge = copy.copy(model)
     judge.opt.noslip_iterations = 0
     world, step = np.repeat(worlds, runs.steps), np.tile(np.arange(runs.steps), len(worlds))
@@ -359,21 +479,31 @@ def simulated(runs: Runs, how: tuple[str, float], worlds: range) -> list[Piece]:
         assert impulse is not None
 
         def state_of(k: int, some: FloatArray = states[some]) -> dict[str, FloatArray]:
-            return fields_of(mj, model, some[k])
+            return fields_of(mj, model, some[k]) | {VECTOR: some[k].copy()}
 
-        out.append(_judged(batch, impulse, how, world[some], step[some], state_of))
-    return out
+        sizes = batch.row_counts, batch.contact_counts
+        out.append(_judged(batch, impulse, how, world[some], step[some], state_of, sizes))
+    return [*out[:-1], out[-1]._replace(divergences=divergences)]
 
 
 def _by_frames(engine: str, runs: Runs, threshold: float) -> Iterator[Piece]:
-    world = np.arange(runs.worlds)
+    world, diverged = np.arange(runs.worlds), np.zeros(runs.worlds, bool)
     for step, frame in enumerate(frames(engine, runs)):
 
         def state_of(k: int, frame: Any = frame) -> dict[str, FloatArray]:
             return {name: x[k] for name, x in frame.state.items()}
 
-        how = frame.batch.precision, threshold
-        yield _judged(frame.batch, frame.impulse, how, world, np.full(runs.worlds, step), state_of)
+        how, sizes = (frame.batch.precision, threshold), (frame.rows, frame.contacts)
+        at = np.full(runs.worlds, step)
+        piece = _judged(frame.batch, frame.impulse, how, world, at, state_of, sizes)
+        lost = (piece.verdict == NOT_JUDGED) & ~diverged
+        finite = [all(np.isfinite(x[k]).all() for x in frame.state.values()) for k in world]
+        divergences = [
+            Divergence(k, step, "answer" if finite[k] else "state before the step", not finite[k])
+            for k in np.flatnonzero(lost).tolist()
+        ]
+        diverged |= lost
+        yield piece._replace(divergences=divergences)
 
 
 def _judged(
@@ -383,22 +513,29 @@ def _judged(
     world: Any,
     step: Any,
     state_of: Callable[[int], Any],
+    sizes: tuple[Any, Any],
 ) -> Piece:
+    """Judge some steps."""
     found = residual_many(batch, impulse, precision=how[0], threshold=how[1], errors="status")
     numbers = np.array([found.velocity_error, found.impulse_error, found.relative, found.floor])
     words = found.verdict
-    verdict = np.full(len(words), len(VERDICTS) - 1, np.int8)
-    for i, word in enumerate(VERDICTS[:-1]):
-        verdict[words == word] = i
-    early = np.flatnonzero((words == EARLY) | (words == WRONG))
-    rows = {int(i): found[int(i)].worst_name for i in early}
-    order = early[np.argsort(-numbers[0, early], kind="stable")]
+    verdict = np.full(len(words), NOT_JUDGED, np.int8)
+    measured = np.isfinite(numbers[0])
+    for i, word in enumerate(JUDGED):
+        verdict[measured & (words == word)] = i
+    numbers[:, verdict == NOT_JUDGED] = np.nan
+    rows, contacts = (np.where(verdict == NOT_JUDGED, 0, x) for x in sizes)
+    unconverged = np.flatnonzero((verdict == JUDGED.index(UNCONVERGED)) | (verdict == JUDGED.index(WRONG)))
+    names = {int(i): found[int(i)].worst_name for i in unconverged}
+    order = unconverged[np.argsort(-numbers[0, unconverged], kind="stable")]
     _, first = np.unique(world[order], return_index=True)
     flat, worst = impulse.reshape(-1), []
     for i in order[np.sort(first)][:WORST].tolist():
         own = flat[batch.rows_of(i)].copy()
         at = int(world[i]), int(step[i])
-        kept = {"where": rows[i], "problem": batch[i], "impulse": own, "state": state_of(i)}
+        kept = {"where": names[i], "problem": batch[i], "impulse": own, "state": state_of(i)}
         worst.append(Worst(float(numbers[0, i]), *at, **kept))
-    where = [(i, NUMBER.sub("contact ", name)) for i, name in rows.items()]
-    return Piece(world, step, numbers, verdict, where=where, worst=worst)
+    where = [(i, NUMBER.sub("contact ", name)) for i, name in names.items()]
+    return Piece(
+        world, step, numbers, verdict=verdict, rows=rows, contacts=contacts, where=where, worst=worst
+    )

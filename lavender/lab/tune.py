@@ -10,6 +10,9 @@ settings that the model has. From the start of each, a setting makes its own ste
     error   of the engine's answer to the problem of each step, by the judge [m/s]
     motion  how far the body that is furthest off is, after `ahead` steps, from where the converged run has it [m]
 
+If fewer than `MIN_CONTACT_SHARE` of the steps have contact, only the model's own setting is measured and no line is
+recommended.
+
 A cone, impratio or noslip other than the model's is another problem: its error is that of its own, its motion says how
 far it leads away, and no line names it.
 """
@@ -39,7 +42,7 @@ from lavender.lab.report.curves import Curve, Figure
 from lavender.lab.report.sheet import Part, Sheet
 from lavender.lab.report.table import Table
 from lavender.lab.report.text import size, times
-from lavender.lab.worlds import Runs, flew_apart, states_of
+from lavender.lab.worlds import Runs, StepSizes, can_touch, has_diverged, simulate_world
 from lavender.problem.derived import cached_property
 
 WORST = 0.99  # quantile of the error by which settings are compared
@@ -121,6 +124,8 @@ class Measured:
     motion: FloatArray = field(repr=False)  # (stretches,) m
     # (steps,) s, each the least of all rounds: what interrupts one is no part of it
     times: FloatArray = field(repr=False)
+    rows: Any = field(default=(), repr=False)  # (steps,) int
+    contacts: Any = field(default=(), repr=False)
 
     @property
     def time(self) -> float:
@@ -156,7 +161,7 @@ class Stage:
             drive = runs.drive(model, world)
             each = np.array([drive(None, step) for step in range(runs.steps)])
             ctrl = each.reshape(runs.steps // ahead, ahead, model.nu)
-            starts.append(states_of(mj, model, runs, world)[::ahead])
+            starts.append(simulate_world(mj, model, runs, world)[0][::ahead])
             controls.append(ctrl)
         made = cls(mj, model, np.concatenate(starts), np.concatenate(controls))
         try:
@@ -182,34 +187,39 @@ class Stage:
                 mj.mj_step(model, data)
                 spent[ahead * i + k] = perf_counter() - begin
             mj.mj_kinematics(model, data)
-            ends[i] = np.nan if flew_apart(mj, data) else data.xpos
+            ends[i] = np.nan if has_diverged(mj, data) else data.xpos
         return spent, ends
 
     def measured(self, setting: Setting) -> Measured:
-        """A setting judged, not timed yet; its errors are infinite where a world flies apart."""
+        """Judge a setting without timing it; its errors are infinite if a world diverges."""
         mj, model = self.mj, setting.on(self.mj, self.model)
         never = np.full(1, np.inf)
         apart = Measured(setting, str(_word(mj, model, "solver")), never, never, never)
         states = np.empty((self.controls.shape[0] * self.controls.shape[1], self.starts.shape[1]))
         judge = copy.copy(model)
         judge.opt.noslip_iterations = 0
-        errors = []
+        errors: list[FloatArray] = []
+        rows: list[Any] = []
+        contacts: list[Any] = []
         try:
             ends = self.run(model, states)[1]
             for i in range(0, len(states), AT_ONCE):
                 batch, impulse = from_mujoco_many(judge, states[i : i + AT_ONCE], errors="status")
                 errors.append(residual_many(batch, impulse, errors="status").velocity_error)
+                rows.append(batch.row_counts)
+                contacts.append(batch.contact_counts)
         except (mj.FatalError, InputError):  # of a step, of its forward pass
             return apart
         off = np.linalg.norm(ends - self.ends, axis=2).max(axis=1)
         if np.isnan(off).any():
             return apart
-        return replace(apart, error=np.nan_to_num(np.concatenate(errors), nan=np.inf), motion=off)
+        sizes: dict[str, Any] = {"rows": np.concatenate(rows), "contacts": np.concatenate(contacts)}
+        return replace(apart, error=np.nan_to_num(np.concatenate(errors), nan=np.inf), motion=off, **sizes)
 
     def time(self, some: list[Measured], rounds: int, tell: Callable[[str], None]) -> None:
         """Steps of several rounds in which all take turns, the first of them the model's own setting.
 
-        Worlds that fly apart tell no time.
+        A setting with which a world diverges is not timed.
         """
         some = [m for m in some if np.isfinite(m.error).all()]
         models = [m.setting.on(self.mj, self.model) for m in some]
@@ -237,6 +247,8 @@ class Tuning:
     threshold : float, m/s, m
         Error, and distance, below which nobody asks for less.
     stopped : bool
+    sizes : StepSizes, optional
+        Rows and contacts of the steps of all worlds with the model's own setting.
     """
 
     runs: Runs
@@ -245,6 +257,7 @@ class Tuning:
     held: list[Measured]
     threshold: float
     stopped: bool = False
+    sizes: StepSizes | None = None
 
     @property
     def now(self) -> Measured:
@@ -287,8 +300,22 @@ class Tuning:
         return kept
 
     @property
+    def why_no_line(self) -> str:
+        """Why no line is recommended; empty if enough of the steps have contact."""
+        if self.sizes is None or self.sizes.is_enough:
+            return ""
+        if not self.sizes.can_touch:
+            return f"No setting is recommended: {self.sizes.sentence}, and settings do not matter without."
+        return (
+            f"No setting is recommended: {self.sizes.sentence}. A setting that is fast and accurate without contact "
+            "may be neither with it. Start from states with contact (--states FILE), or take more --steps."
+        )
+
+    @property
     def lines(self) -> list[str]:
-        """What to copy, and how it did on the worlds that were held back."""
+        """Lines to copy, and their results on the worlds held back; none if too few steps have contact."""
+        if self.why_no_line:
+            return []
         none = f"none of {len(self._own)} settings"
         enough = f"not needed, {size(self.now.worst)} m/s is within {self.threshold:g}"
         closer = enough if self.now.worst <= self.threshold else none
@@ -345,19 +372,27 @@ class Tuning:
         if self.closer is not None:
             gain = times(now.worst / self.closer.worst) if self.closer.worst else "exact:"
             head += f" In the same time it can be {gain} less."
+        if self.why_no_line:
+            head += f" {self.why_no_line}"
         other = [m for m in self.measured if m.setting.is_other]
         shown = [now, *(m for m in self.front if m is not now)]
         every = sorted(self.measured, key=lambda m: m.time)
+        sizes = [] if self.sizes is None else [self.sizes.table]
+        figures = [] if self.why_no_line else [self.figure]
         return Sheet(
             "lavender tune", head,
             [
-                Part("Lines to copy", code=self.lines, note="Chosen on the even worlds, tried on the odd ones."),
-                Part("The front of time and error", [self._table(shown)], [self.figure], short=9),
-                Part("Other problems", [self._table(other)], short=4,
+                Part("Lines to copy", code=self.lines,
+                     note="None, for the reason above." if self.why_no_line
+                     else "Chosen on the even worlds, tried on the odd ones."),
+                Part("Rows and contacts", sizes, short=2, note="Of the steps with the model's own setting."),
+                Part("The front of time and error", [self._table(shown)], figures, short=5),
+                Part("Other problems", [self._table(other)], short=2,
                      note="A cone, impratio or noslip other than the model's: the error is that of its own problem."),
-                Part("Every setting", [self._table(every)], note="Without those with which a world flies apart."),
+                Part("Every setting", [self._table(every)], note="Without those with which a world diverges."),
             ],
-            {"model": self.runs.model, "lines": self.lines, "stopped": self.stopped,
+            {"model": self.runs.model, "lines": self.lines, "why_no_line": self.why_no_line,
+             **({} if self.sizes is None else self.sizes.numbers), "stopped": self.stopped,
              "measured": [_told(m) for m in self.measured], "held": [_told(m) for m in self.held]},
             self.stopped,
         )  # fmt: skip
@@ -403,6 +438,7 @@ def tune(
     control: Control = "random",
     seed: int = 0,
     spread: float = 0.1,
+    states: Any = None,
     ahead: int = 10,
     rounds: int = 5,
     threshold: float = ENOUGH,
@@ -415,6 +451,8 @@ def tune(
     model : path (MJCF)
     worlds, steps, control, seed, spread : as `Runs`
         Half of the worlds are held back; `steps` is a multiple of `ahead`.
+    states : path of an .npz, "keyframes", or arrays, optional
+        As of `audit`.
     ahead : int
         Steps of a stretch.
     rounds : int
@@ -436,8 +474,8 @@ def tune(
     CapabilityError
         An integrator whose problem is not of M.
     """
-    own = {"worlds": whole_number("worlds", worlds, 2, None), "steps": steps}
-    runs = Runs(os.fspath(model), **own, control=control, seed=seed, spread=spread)
+    own: dict[str, Any] = {"worlds": whole_number("worlds", worlds, 2, None), "steps": steps}
+    runs = Runs(os.fspath(model), **own, control=control, seed=seed, spread=spread).start_from(states)
     ahead, rounds = whole_number("ahead", ahead, 1, None), whole_number("rounds", rounds, 1, None)
     threshold = number("threshold", threshold, low=0.0)
     if steps % ahead:
@@ -454,10 +492,11 @@ def tune(
 
     measured: list[Measured] = []
     held: list[Measured] = []
+    sizes: StepSizes | None = None
 
     def found(stopped: bool) -> Tuning:
         timed = [m for m in measured if np.isfinite(m.time)]
-        return Tuning(runs, ahead, timed, held, threshold=threshold, stopped=stopped)
+        return Tuning(runs, ahead, timed, held, threshold=threshold, stopped=stopped, sizes=sizes)
 
     def judge(stage: Stage, settings: list[Setting]) -> list[Measured]:
         out = []
@@ -467,10 +506,17 @@ def tune(
         return out
 
     try:
-        stage = Stage.of(mj, made, runs, range(0, worlds, 2), ahead)
+        stage, held_back = (Stage.of(mj, made, runs, range(i, worlds, 2), ahead) for i in (0, 1))
         measured += judge(stage, [Setting()])
         if not np.isfinite(measured[0].error).all():
-            raise InputError(f"{runs.model}: these worlds fly apart with the model's own setting")
+            raise InputError(f"{runs.model}: these worlds diverge with the model's own setting")
+        last = judge(held_back, [Setting()])
+        both = [*measured, *last]
+        rows, contacts = (np.concatenate([getattr(m, name) for m in both]) for name in ("rows", "contacts"))
+        sizes = StepSizes(rows, contacts, can_touch(mj, made))
+        if not sizes.is_enough:
+            stage.time(measured, rounds, tell)
+            return found(False)
         measured += judge(stage, grid(mj, made)[1:])
         stage.time(measured, min(TRIAL, rounds), tell)
         near = [m.setting for m in found(False).front if m.time <= NEAR * measured[0].time]
@@ -479,10 +525,9 @@ def tune(
         measured += judge(stage, list(more))
         stage.time(measured, rounds, tell)
         chosen = found(False)
-        kept = [Setting(), *(m.setting for m in (chosen.faster, chosen.closer) if m is not None)]
-        stage = Stage.of(mj, made, runs, range(1, worlds, 2), ahead)
-        last = judge(stage, list(dict.fromkeys(kept)))
-        stage.time(last, 2 * rounds, tell)
+        other = dict.fromkeys(m.setting for m in (chosen.faster, chosen.closer) if m is not None)
+        last += judge(held_back, list(other))
+        held_back.time(last, 2 * rounds, tell)
         held += last if np.isfinite(last[0].time) else []
     except KeyboardInterrupt:
         if not measured or not np.isfinite(measured[0].time):

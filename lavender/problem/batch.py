@@ -239,6 +239,7 @@ class Batch(Sequence[Problem]):
         return made
 
     names_of: Callable[[int], Sequence[str]] | None = None  # of the blocks of a world
+    contact_counts: np.ndarray | None = None  # (n,) contacts with rows; None if not known
     _shared = True
     _pattern: tuple[np.ndarray, np.ndarray] | None = None
     _jac_row = _mass_row = 0
@@ -310,6 +311,11 @@ class Batch(Sequence[Problem]):
         return self.__dict__ | {"names_of": tuple(map(self.names_of, range(len(self)))).__getitem__}
 
     # -- a sequence of problems ------------------------------------------------------------------------
+
+    @property
+    def row_counts(self) -> np.ndarray:
+        """(n,) rows of each world."""
+        return self.at[:, PLACE["rows"]].copy()
 
     def __len__(self) -> int:
         return self._n

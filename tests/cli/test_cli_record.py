@@ -26,8 +26,8 @@ def test_what_a_robot_does_not_feel_is_close_enough_and_the_threshold_is_the_use
     stored = lv.io.read(tmp_path / "a" / at["file"])
     for threshold, said in (
         (at["velocity"], "close enough"),
-        (0.99 * at["velocity"], "stopped early"),
-        (0.0, "stopped early"),
+        (0.99 * at["velocity"], "stopped before convergence"),
+        (0.0, "stopped before convergence"),
     ):
         judged = lv.residual(stored.problem, stored.impulse, threshold=threshold)
         assert (judged.verdict, judged.relative) == (said, at["relative"])
@@ -43,7 +43,7 @@ def test_what_a_robot_does_not_feel_is_close_enough_and_the_threshold_is_the_use
 
 
 def test_record_and_report_take_the_same_options_with_the_same_defaults():
-    names = ("steps", "every", "control", "seed", "threshold")
+    names = ("steps", "every", "control", "seed", "states", "threshold")
     both = [{p.name: p for p in cli.get_command(None, name).params} for name in ("record", "report")]
     for name in names:
         one, two = (options[name] for options in both)

@@ -2,6 +2,7 @@
 
 import json
 
+import numpy as np
 import pytest
 from calls import EARLY_BOXES as EARLY
 
@@ -13,14 +14,15 @@ pytest.importorskip("mujoco", reason="needs MuJoCo: pip install 'lavender-contac
 def test_an_audit_accepts_or_does_not(lavender, boxes, tmp_path):
     words = ("--worlds", 2, "--steps", 20, "--workers", 1, "--out", tmp_path / "out", "--accept", "1e-3")
     code, out, _ = lavender("audit", boxes(EARLY), *words)
-    assert code == 1 and "ended early" in out
+    assert code == 1 and "stopped before convergence" in out
     assert len(out.splitlines()) <= 25
     page = (tmp_path / "out" / "index.html").read_text()
     assert "worst_1.npz" in page and "<svg" in page
     told = json.loads((tmp_path / "out" / "numbers.json").read_text())
-    assert told["early"] > 0 and told["largest"] > 1e-3
+    assert told["unconverged"] > 0 and told["largest"] > 1e-3
+    assert told["contacts"]["maximum"] > 0 and told["judged"] == 40
     code, out, _ = lavender("audit", boxes(), *words)
-    assert code == 0 and "none of 40 steps of 2 worlds ended early" in out
+    assert code == 0 and "none of 40 steps judged in 2 worlds stopped before convergence" in out
     assert not list((tmp_path / "out" / "worst").glob("*.npz"))  # those of another run are gone
 
 
@@ -35,3 +37,60 @@ def test_tuning_prints_a_page_and_few_lines(lavender, boxes, tmp_path, monkeypat
     page = (tmp_path / "out" / "index.html").read_text()
     assert "&lt;option" in page and "<svg" in page
     assert (tmp_path / "out" / "figures" / "time-and-error.png").is_file()
+
+
+def test_worlds_that_diverge_end_an_audit_with_1(lavender, boxes, tmp_path):
+    words = ("--worlds", 2, "--steps", 5, "--workers", 1, "--out", tmp_path / "out")
+    code, out, _ = lavender("audit", boxes(), *words, "--spread", "1e12")
+    assert code == 1 and "1 world diverged" in out
+    told = json.loads((tmp_path / "out" / "numbers.json").read_text())
+    assert (told["judged"], told["unjudged"], told["diverged"]) == (6, 4, 1)
+    assert told["divergences"][0]["world"] == 1 and told["largest"] < 1.0
+    assert lavender("audit", boxes(), *words)[0] == 0
+
+
+def test_no_line_is_printed_of_states_without_contact(lavender, boxes, tmp_path, monkeypatch):
+    monkeypatch.setattr(tuning, "TOLERANCES", (1e-6,))
+    monkeypatch.setattr(tuning, "ITERATIONS", {"Newton": (2,)})
+    high = boxes(EARLY)
+    high.write_text(high.read_text().replace("0 0 0.099", "0 0 9").replace("0.32", "20"))
+    words = ("tune", high, "--worlds", 2, "--steps", 10, "--rounds", 1, "--out", tmp_path / "out")
+    code, out, _ = lavender(*words)
+    assert code == 0 and "<option" not in out
+    assert "No setting is recommended: 0 of 20 steps judged have contact (0 %), fewer than 20 %" in " ".join(
+        out.split()
+    )
+    told = json.loads((tmp_path / "out" / "numbers.json").read_text())
+    assert told["lines"] == [] and told["contacts"] == {"median": 0.0, "maximum": 0, "share": 0.0}
+    assert "&lt;option" not in (tmp_path / "out" / "index.html").read_text()
+    low = tmp_path / "low.npz"
+    np.savez(low, qpos=[0, 0, 0.099, 1, 0, 0, 0, 0.02, 0, 0.32, 1, 0, 0, 0, 0], qvel=np.zeros(13))
+    code, out, _ = lavender(*words, "--states", low)
+    told = json.loads((tmp_path / "out" / "numbers.json").read_text())
+    assert code == 0 and told["contacts"]["share"] == 1.0 and "No setting" not in out
+    assert len(out.splitlines()) <= 25
+
+
+def test_recordings_start_from_states(lavender, tmp_path, boxes):
+    path = boxes()
+    assert (
+        lavender("audit", path, "--worlds", 1, "--steps", 40, "--workers", 1, "--out", tmp_path / "a")[0] == 0
+    )
+    low = [0, 0, 0.099, 1, 0, 0, 0, 0.02, 0, 0.32, 1, 0, 0, 0, 0]
+    states = {
+        "qpos": np.array([low, [0, 0, 7, *low[3:]]]),
+        "qvel": np.zeros((2, 13)),
+        "ctrl": np.array([[1.0], [-1.0]]),
+    }
+    np.savez(tmp_path / "two.npz", **states)
+    words = (path, "--steps", 10, "--every", 5, "--states", tmp_path / "two.npz", "--controls", "zero")
+    assert lavender("record", *words, "--out", tmp_path / "steps")[0] == 0
+    rows = [
+        json.loads(line)["rows"] for line in (tmp_path / "steps" / "engine.jsonl").read_text().splitlines()
+    ]
+    assert rows[0] > rows[-1]  # The lower box of the second state is far above the floor.
+    words = ("report", *words, "--solvers", "auto", "--no-figures", "--out", tmp_path / "page")
+    assert lavender(*words)[0] == 0
+    (how,) = (tmp_path / "page" / "recorded").glob("*/how.json")
+    assert json.loads(how.read_text())["states"].endswith("two.npz")
+    assert lavender("report", "stack(n=4)", "--states", "keyframes", "--out", tmp_path / "no")[0] == 2

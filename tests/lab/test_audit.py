@@ -1,7 +1,10 @@
-"""Every step of many worlds judged: MuJoCo's own answers, what ended early, and the way back to the worst."""
+"""Every step of many worlds judged: MuJoCo's own answers, which stopped before convergence, and the worst states."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from calls import BOXES
 from calls import EARLY_BOXES as EARLY
 from mujoco_scene import mj, whole_mass
 
@@ -36,8 +39,10 @@ def test_numbers_are_those_of_the_run_itself(boxes, options):
         np.testing.assert_allclose(found.numbers[0, world], [r.velocity for r in want], rtol=1e-6, atol=1e-12)
         pushes = [abs(r.error[r.worst_row]) if r.worst_row >= 0 else 0.0 for r in want]
         np.testing.assert_allclose(found.numbers[1, world], pushes, rtol=1e-6, atol=1e-12)
-        assert found.early[world].tolist() == [r.verdict in ("stopped early", "wrong") for r in want]
-    assert found.early.any()
+        assert found.unconverged[world].tolist() == [
+            r.verdict in ("stopped before convergence", "wrong") for r in want
+        ]
+    assert found.unconverged.any()
 
 
 def test_workers_change_no_bit(boxes, monkeypatch):
@@ -55,7 +60,7 @@ def test_the_worst_can_be_gone_back_to(boxes, tmp_path):
     found.write(tmp_path / "out")
     made = mj.MjModel.from_xml_path(str(path))
     states = np.load(tmp_path / "out" / "states.npz")
-    speeds = np.where(found.early, found.numbers[0], 0.0)
+    speeds = np.where(found.unconverged, found.numbers[0], 0.0)
     assert states["world"].tolist() == np.argsort(-speeds.max(axis=1)).tolist()
     for i, (world, step) in enumerate(zip(states["world"], states["step"], strict=True)):
         stored = lv.io.read(tmp_path / "out" / "worst" / f"worst_{i + 1}.npz")
@@ -88,7 +93,7 @@ def frames_in_float32(planted):
             yield Frame(*from_efc(
                 **given, **{name: x.astype(np.float32) for name, x in rest.items()}, efc_type=data.efc_type[None],
                 efc_force=force[None].astype(np.float32), timestep=made.opt.timestep,
-            ), {"qpos": data.qpos[None].copy()})  # fmt: skip
+            ), {"qpos": data.qpos[None].copy()}, np.array([data.nefc]), np.array([data.ncon]))  # fmt: skip
             mj.mj_step(made, data)
 
     return frames
@@ -98,8 +103,38 @@ def test_the_floor_of_float32_is_told_from_an_early_stop(boxes, monkeypatch):
     planted = {3, 9, 12}
     monkeypatch.setattr(module, "frames", frames_in_float32(planted))
     found = audit(boxes('jacobian="dense"'), worlds=1, steps=16, engine="mjx", threshold=0.0)
-    assert set(np.flatnonzero(found.early[0])) == planted
+    assert set(np.flatnonzero(found.unconverged[0])) == planted
     assert (found.numbers[0, 0] > 1e-9).sum() > len(planted)  # rounding leaves errors that float64 would not
+
+
+def test_a_world_of_another_engine_that_diverges_does_not_end_the_audit(boxes, monkeypatch):
+    """MJX and MuJoCo Warp go on with numbers that are not finite."""
+
+    def frames(engine, runs):
+        _, made = runs.load()
+        data = mj.MjData(made)
+        for step in range(runs.steps):
+            mj.mj_forward(made, data)
+            bad = np.array([1.0, np.nan if step >= 4 else 1.0])[:, None]
+
+            def both(x, bad=bad):
+                return np.stack([x, x]).astype(np.float32) * bad.reshape(2, *[1] * np.ndim(x)).astype(
+                    np.float32
+                )
+
+            yield Frame(*from_efc(
+                efc_J=both(data.efc_J.reshape(-1, made.nv)), efc_D=both(data.efc_D), efc_aref=both(data.efc_aref),
+                efc_type=data.efc_type, efc_force=both(data.efc_force), M=both(whole_mass(made, data)),
+                qvel=both(data.qvel), qacc_smooth=both(data.qacc_smooth), qfrc_smooth=both(data.qfrc_smooth),
+                timestep=made.opt.timestep,
+            ), {"qpos": both(data.qpos)}, np.full(2, data.nefc), np.full(2, data.ncon))  # fmt: skip
+            mj.mj_step(made, data)
+
+    monkeypatch.setattr(module, "frames", frames)
+    found = audit(boxes('jacobian="dense"'), worlds=2, steps=10, engine="mjx")
+    assert (found.judged, found.unjudged, found.diverged) == (14, 6, 1)
+    assert [(d.world, d.step, d.is_outside) for d in found.divergences] == [(1, 4, True)]
+    assert "1 world diverged, in step 4 at the earliest; 6 steps were not judged" in found.head
 
 
 def test_ctrl_c_keeps_what_there_is(boxes, tmp_path, monkeypatch):
@@ -117,23 +152,25 @@ def test_ctrl_c_keeps_what_there_is(boxes, tmp_path, monkeypatch):
 
 def test_what_is_close_enough_may_still_not_be_accepted(boxes):
     found = audit(boxes(EARLY), worlds=1, steps=10, workers=1, threshold=1e3)
-    assert not found.early.any() and found.largest == found.numbers[0].max() > 1e-3
+    assert not found.unconverged.any() and found.largest == found.numbers[0].max() > 1e-3
 
 
-def test_a_world_that_is_not_finite_is_accepted_by_nobody(boxes, monkeypatch):
-    states_of = module.states_of
+def test_a_step_whose_state_is_not_finite_is_not_judged(boxes, monkeypatch):
+    simulate_world = module.simulate_world
 
     def spoiled(*given):
-        states = states_of(*given)
+        states, divergence = simulate_world(*given)
         states[5] = np.nan
-        return states
+        return states, divergence
 
-    monkeypatch.setattr(module, "states_of", spoiled)
+    monkeypatch.setattr(module, "simulate_world", spoiled)
     found = audit(boxes(), worlds=1, steps=10, workers=1)
-    assert VERDICTS[found.verdict[0, 5]] == "not finite" and found.largest == np.inf
+    assert VERDICTS[found.verdict[0, 5]] == "not judged" and np.isnan(found.numbers[:, 0, 5]).all()
+    assert (found.judged, found.unjudged, found.diverged) == (9, 1, 0)
+    assert found.head.endswith("1 step was not judged: the answer is not finite.")
 
 
-def test_a_world_in_which_mujoco_ends_in_an_error_is_not_finite_from_there_on(boxes, monkeypatch):
+def test_a_world_in_which_mujoco_ends_in_an_error_is_not_judged_from_there_on(boxes, monkeypatch):
     step = mj.mj_step
 
     def dies(boxes, data):
@@ -143,9 +180,150 @@ def test_a_world_in_which_mujoco_ends_in_an_error_is_not_finite_from_there_on(bo
 
     monkeypatch.setattr(mj, "mj_step", dies)
     found = audit(boxes(), worlds=1, steps=12, workers=1)
-    assert [VERDICTS[i] == "not finite" for i in found.verdict[0]] == [k >= 8 for k in range(12)]
-    assert found.head.endswith("ended early. 1 world flew apart, of which no step is judged from there on.")
-    assert found.told["worlds_apart"] == 1
+    assert [VERDICTS[i] == "not judged" for i in found.verdict[0]] == [k >= 8 for k in range(12)]
+    assert (found.judged, found.unjudged, found.diverged) == (8, 4, 1)
+    assert (
+        "none of 8 steps judged in 1 world stopped before convergence. 1 world diverged, in step 8"
+        in found.head
+    )
+    assert "4 steps were not judged" in found.head
+    assert "out of memory" in found.divergences[0].cause
+    assert "outside" not in found.head  # An error of MuJoCo says nothing about the solver.
+
+
+# A motor that drives itself: its force grows with the velocity, so that no answer of the constraint solver helps.
+RUNAWAY = """<mujoco><option timestep="0.01"/><worldbody><geom type="plane" size="5 5 .1"/>
+  <body pos="0 0 .099"><freejoint/><geom type="box" size=".1 .1 .1"/></body>
+  <body pos="2 0 1"><joint name="j" axis="0 1 0"/><geom size=".1" mass="1" pos=".1 0 0"/></body></worldbody>
+  <actuator><general joint="j" biastype="affine" biasprm="0 0 {gain}" gainprm="1"/></actuator></mujoco>"""
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("threshold", [1e-6, 1e3])  # What is close enough to the user need not be exact.
+@pytest.mark.parametrize("options", ["", 'solver="PGS" iterations="1"'])
+def test_a_blow_up_after_exact_solves_has_its_cause_outside_the_solver(
+    tmp_path, monkeypatch, options, threshold
+):
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes a log there
+    (tmp_path / "runaway.xml").write_text(RUNAWAY.format(gain=60).replace('"0.01"', f'"0.01" {options}'))
+    found = audit("runaway.xml", worlds=3, steps=60, workers=1, threshold=threshold)
+    assert found.diverged == 3 and found.unjudged > 0
+    assert found.judged + found.unjudged == found.verdict.size
+    assert found.judged == np.isfinite(found.numbers[0]).sum()
+    assert f"of {found.judged} steps judged" in found.head and "inf" not in found.head
+    assert np.isfinite(found.largest)
+    exact = options == ""  # One sweep of PGS does not hold the box.
+    assert found.unconverged.any() == (not exact and threshold < 1.0)
+    assert ("outside the constraint solver" in found.head) == exact
+    assert [row[-1] for row in found.table_of_diverged.texts] == [["exact"], ["not exact"]][not exact] * 3
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_a_world_that_diverges_in_its_last_step_is_counted(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "runaway.xml").write_text(RUNAWAY.format(gain=60))
+    steps = 1 + audit("runaway.xml", worlds=1, steps=60, workers=1, spread=0.0).divergences[0].step
+    found = audit("runaway.xml", worlds=1, steps=steps, workers=1, spread=0.0)
+    assert found.diverged == 1
+    assert audit("runaway.xml", worlds=1, steps=steps - 1, workers=1, spread=0.0).diverged == 0
+
+
+def test_shares_are_never_rounded_to_nothing(boxes):
+    found = audit(boxes(), worlds=1, steps=3, workers=1)
+    verdict = np.zeros((10, 320), np.int8)
+    verdict[0, :3] = VERDICTS.index("stopped before convergence")
+    many = replace(found, verdict=verdict, numbers=np.zeros((4, 10, 320)), rows=verdict, contacts=verdict + 1)
+    assert "3 of 3200 steps judged in 10 worlds stopped before convergence (0.09 %)" in many.head
+
+
+def test_rows_and_contacts_are_those_of_the_run(boxes):
+    path = boxes()
+    found = audit(path, worlds=2, steps=60, workers=1)
+    made = mj.MjModel.from_xml_path(str(path))
+    data, rng = mj.MjData(made), np.random.default_rng(0)
+    for step in range(60):
+        data.ctrl[:] = rng.uniform(-1.0, 1.0, made.nu)
+        mj.mj_forward(made, data)
+        acting = np.count_nonzero(data.contact.efc_address >= 0) if data.ncon else 0
+        assert (found.rows[0, step], found.contacts[0, step]) == (data.nefc, acting)
+        mj.mj_step(made, data)
+    assert found.sizes.is_enough and found.contacts.max() >= 8
+    assert found.totals["contacts"]["maximum"] == found.contacts.max()
+    assert found.totals["contacts"]["share"] == np.mean(found.contacts > 0)
+
+
+def test_an_audit_of_steps_without_contact_says_so(tmp_path):
+    (tmp_path / "high.xml").write_text(
+        BOXES.format(options="").replace("0 0 0.099", "0 0 9").replace("0.32", "20")
+    )
+    found = audit(tmp_path / "high.xml", worlds=2, steps=20, workers=1)
+    assert "Only 0 of 40 steps judged have contact (0 %), fewer than 20 %" in found.head
+    none = BOXES.format(options="").replace('type="box"', 'type="box" contype="0" conaffinity="0"')
+    (tmp_path / "none.xml").write_text(
+        none.replace('type="capsule"', 'type="capsule" contype="0" conaffinity="0"')
+    )
+    found = audit(tmp_path / "none.xml", worlds=1, steps=20, workers=1)
+    assert not found.can_touch and "0 of 20 steps judged have a constraint (0 %)" in found.head
+
+
+@pytest.mark.parametrize(
+    "names", [("state",), ("qpos", "qvel", "act", "ctrl", "qacc_warmstart", "world", "step")]
+)
+def test_an_audit_starts_again_from_the_states_of_an_audit(boxes, tmp_path, names):
+    path = boxes(EARLY)
+    found = audit(path, worlds=3, steps=25, workers=1)
+    found.write(tmp_path / "out")
+    states = np.load(tmp_path / "out" / "states.npz")
+    np.savez(tmp_path / "some.npz", **{name: states[name] for name in names})
+    again = audit(path, worlds=4, steps=2, workers=1, states=tmp_path / "some.npz")
+    # The fourth world starts from the first state with other velocities.
+    assert [w.velocity for w in found.worst] == again.numbers[0, :3, 0].tolist()
+    assert again.numbers[0, 3, 0] != again.numbers[0, 0, 0]
+
+
+KEYFRAMES = """<keyframe><key qpos="0 0 .099 1 0 0 0  0 0 .5 1 0 0 0  0" ctrl=".5"/>
+  <key qpos="0 0 2 1 0 0 0  0 0 3 1 0 0 0  0"/></keyframe></mujoco>"""
+
+
+def test_worlds_start_from_keyframes(tmp_path):
+    (tmp_path / "keyed.xml").write_text(BOXES.format(options="").replace("</mujoco>", KEYFRAMES))
+    found = audit(tmp_path / "keyed.xml", worlds=2, steps=1, workers=1, states="keyframes")
+    assert found.contacts[:, 0].tolist() == [4, 0]
+    assert (
+        len(audit(tmp_path / "keyed.xml", worlds=1, steps=1, workers=1, states="keyframes").runs.starts) == 1
+    )
+
+
+@pytest.mark.parametrize(
+    ("arrays", "words"),
+    [
+        ({"qpos": np.zeros((2, 15))}, "qvel missing"),
+        ({"qpos": np.zeros((2, 15)), "qvel": np.zeros((3, 13))}, "as many of each"),
+        ({"qpos": np.zeros((2, 14)), "qvel": np.zeros((2, 13))}, "qpos"),
+        ({"qpos": np.full((1, 15), np.nan), "qvel": np.zeros((1, 13))}, "qpos"),
+        ({"qpos": np.zeros((0, 15)), "qvel": np.zeros((0, 13))}, "at least one"),
+        (
+            {"qpos": np.zeros((1, 15)), "qvel": np.zeros((1, 13)), "speed": np.zeros(1)},
+            "'speed' is no part of a state",
+        ),
+        ({"state": np.zeros((2, 3))}, "mjSTATE_INTEGRATION"),
+    ],
+)
+def test_bad_start_states_are_refused(boxes, tmp_path, arrays, words):
+    np.savez(tmp_path / "bad.npz", **arrays)
+    with pytest.raises(lv.InputError, match=words):
+        audit(boxes(), worlds=1, steps=2, workers=1, states=tmp_path / "bad.npz")
+
+
+def test_start_states_that_are_no_file_are_refused(boxes, tmp_path):
+    (tmp_path / "torn.npz").write_bytes(b"PK torn")
+    for source, words in (
+        (tmp_path / "torn.npz", "torn.npz"),
+        (tmp_path / "no.npz", "no.npz"),
+        ("keyframes", "none"),
+    ):
+        with pytest.raises(lv.InputError, match=words):
+            audit(boxes(), worlds=1, steps=2, workers=1, states=source)
 
 
 def test_a_model_whose_start_ends_mujoco_in_an_error_is_refused(boxes, monkeypatch):
@@ -161,8 +339,9 @@ def test_a_model_whose_start_ends_mujoco_in_an_error_is_refused(boxes, monkeypat
 def test_a_world_that_mujoco_begins_anew_ends_there(boxes, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)  # MuJoCo writes a log there
     found = audit(boxes(), worlds=2, steps=10, workers=1, spread=1e12)
-    assert (found.verdict[1, 1:] == VERDICTS.index("not finite")).all()
-    assert (found.verdict[0] < VERDICTS.index("not finite")).all() and found.largest == np.inf
+    assert (found.verdict[1, 1:] == VERDICTS.index("not judged")).all()
+    assert (found.verdict[0] < VERDICTS.index("not judged")).all() and np.isfinite(found.largest)
+    assert [(d.world, d.step, d.is_outside) for d in found.divergences] == [(1, 0, True)]
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,7 @@
 """Settings of MuJoCo beside each other: what is measured, what is chosen, and the line to copy."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from calls import BOXES
@@ -9,7 +11,7 @@ import lavender as lv
 from lavender.lab import tune as module
 from lavender.lab.audit import audit
 from lavender.lab.tune import Measured, Setting, Stage, Tuning, grid, tune
-from lavender.lab.worlds import Runs
+from lavender.lab.worlds import Runs, StepSizes
 
 mj = pytest.importorskip("mujoco", reason="needs MuJoCo: pip install 'lavender-contact[mujoco]'")
 
@@ -88,6 +90,19 @@ def measured(time, error, **options):
 
 def chosen(*some, held=(), threshold=1e-6):
     return Tuning(Runs("m.xml", 2, 10), 10, list(some), list(held), threshold)
+
+
+@pytest.mark.parametrize(("with_contact", "is_enough"), [(19, False), (20, True)])
+def test_no_line_is_recommended_if_few_steps_have_contact(with_contact, is_enough):
+    now, quick = measured(10.0, 1e-3), measured(8.0, 1e-3, iterations=9)
+    contacts = (np.arange(100) < with_contact).astype(int)
+    found = replace(chosen(now, quick), sizes=StepSizes(contacts + 1, contacts, True))
+    assert bool(found.lines) == is_enough == (not found.why_no_line)
+    assert ("No setting is recommended: 19 of 100" in found.sheet.head) != is_enough
+    assert "(19.0 %)" in found.why_no_line or is_enough
+    # A model without geoms that can collide is judged by its rows.
+    assert replace(found, sizes=StepSizes(contacts + 1, 0 * contacts, False)).lines
+    assert not replace(found, sizes=StepSizes(0 * contacts, 0 * contacts, False)).lines
 
 
 def test_what_is_chosen():
@@ -175,5 +190,5 @@ def test_a_setting_with_which_mujoco_ends_in_an_error_is_left_out(boxes, monkeyp
     found = tune(boxes(), worlds=2, steps=10, rounds=1)
     assert not any(dict(m.setting.options).get("iterations") == 25 for m in found.measured)
     monkeypatch.setattr(Stage, "measured", lambda self, setting: measured(np.inf, np.inf))
-    with pytest.raises(lv.InputError, match="fly apart"):
+    with pytest.raises(lv.InputError, match="diverge"):
         tune(boxes(), worlds=2, steps=10, rounds=1)

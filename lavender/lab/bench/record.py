@@ -9,6 +9,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any
 
+from lavender.judge.residuals import VERDICTS_OF_OLD
+
 # Beside the statuses of a solve: what can happen to a run that brings no solution back.
 ERROR, KILLED, CRASHED = "ERROR", "KILLED", "CRASHED"
 
@@ -126,7 +128,7 @@ class CaseInfo(_Texts):
     step: int = -1
     nothing_to_do: bool = False  # doing nothing is a solution: the case is not ranked
     identity: str = ""  # of the sequence, from the numbers of all its steps: steps of two are never one
-    # of a stored answer in float32: at its floor, stopped early (by how much) or wrong
+    # of a stored answer in float32: at its floor, stopped before convergence (by how much) or wrong
     stored_verdict: str = ""
     suspicions: tuple[str, ...] = ()  # what looks like a mistake in its data
     guess: str = ""  # to begin at: a "start"; an "answer", from which nothing is measured; or nothing
@@ -262,7 +264,11 @@ def from_json(line: Any) -> Entry:
         raise ValueError("not an entry of a records file")
     cls = KINDS[line["kind"]]
     try:
-        return cls(**values_in(cls, line))
+        values = values_in(cls, line)
+        word, comma, rest = str(values.get("stored_verdict", "")).partition(",")
+        if word in VERDICTS_OF_OLD:
+            values["stored_verdict"] = VERDICTS_OF_OLD[word] + comma + rest
+        return cls(**values)
     except (TypeError, ValueError) as error:
         raise ValueError(f"not an entry of a records file ({error})") from None
 

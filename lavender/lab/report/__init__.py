@@ -6,7 +6,7 @@ lavender.lab.report.write(records, "report")  # records.csv, records.json, figur
 lavender.lab.report.write(lavender.lab.report.Report(records, earlier), "report")  # compared with an earlier run
 """
 
-from lavender.lab.report.choices import advice
+from lavender.lab.report.finals import advice
 from lavender.lab.report.findings import Report
 from lavender.lab.report.tables import (
     claims,

@@ -105,16 +105,21 @@ class Line:
     """A line of the table of recommendations: a structure and its cases, or a sequence and its steps."""
 
     name: str
-    size: int
+    cases: tuple[str, ...]
     sequence: bool
     left_out: int  # steps that did not load
     by_level: Mapping[float, Advice]
     by_time: Mapping[float, Advice]
     by_sweeps: Mapping[float, Advice]
 
+    @property
+    def size(self) -> int:
+        """Number of cases."""
+        return len(self.cases)
 
-def advice(records: Records, times: Sequence[float] = ()) -> list[Line]:
-    """Every recommendation: structures, then sequences; at each level, within each time [s], with each budget.
+
+def advice_alone(records: Records, times: Sequence[float] = ()) -> list[Line]:
+    """Every recommendation by runs that were timed alone: structures, then sequences.
 
     To a level: first who brings most cases there, then who is fastest (shifted geometric mean). In a time, and with a
     budget of those whose iterations are sweeps: who serves most cases, then the residual at the 90th percentile; nobody
@@ -127,7 +132,7 @@ def advice(records: Records, times: Sequence[float] = ()) -> list[Line]:
     return [
         Line(
             name=name,
-            size=len(cases),
+            cases=tuple(cases),
             sequence=is_sequence,
             left_out=len(lost.get(name, ())) if is_sequence else 0,
             by_level={x: to_level(records, name, cases, x, ways) for x in levels_of(records)},
@@ -205,7 +210,7 @@ def steps_of(records: Records) -> dict[str, list[str]]:
 def to_level(
     records: Records, family: str, cases: Sequence[str], level: float, ways: Ways | None = None
 ) -> Advice:
-    """Who brings these cases, or steps, to a level; see `advice`. `ways` spares a pass over the records.
+    """Who brings these cases, or steps, to a level; see `advice_alone`. `ways` spares a pass over the records.
 
     Steps of several sequences count together, by the lines that were asked for the level or have a budget.
     """
@@ -226,7 +231,7 @@ def to_level(
 def within(
     records: Records, family: str, cases: Sequence[str], limit: float, ways: Ways | None = None
 ) -> Advice:
-    """Who comes closest on these cases, or steps, within a time [s]; see `advice`.
+    """Who comes closest on these cases, or steps, within a time [s]; see `advice_alone`.
 
     A run that takes the time within noise may be in it or not the next time: who would be the best with it is
     as good as the best.

@@ -29,6 +29,7 @@ class Subject:
     """What a recommendation is for: all single cases, or all sequences."""
 
     names: tuple[str, ...]  # cases, or sequences
+    cases: tuple[str, ...]  # cases, or steps of the sequences
     way: str  # "call" or "steps"
     best: Advice  # to the middle level
     quick: tuple[Advice, ...]  # in each time
@@ -43,13 +44,15 @@ def subjects(records: Records, times: Sequence[float] = ()) -> list[Subject]:
     cases = tuple(dict.fromkeys(r.case for r in records if r.step < 0))
     if cases:
         quick = tuple(choices.within(records, "all", cases, t) for t in times)
-        found.append(Subject(cases, "call", choices.to_level(records, "all", cases, level), quick))
+        found.append(Subject(cases, cases, "call", choices.to_level(records, "all", cases, level), quick))
     sequences = choices.steps_of(records)
     if sequences:
         steps = [step for some in sequences.values() for step in some]
         quick = tuple(choices.within(records, "all", steps, t) for t in times)
         found.append(
-            Subject(tuple(sequences), "steps", choices.to_level(records, "all", steps, level), quick)
+            Subject(
+                tuple(sequences), tuple(steps), "steps", choices.to_level(records, "all", steps, level), quick
+            )
         )
     return found
 

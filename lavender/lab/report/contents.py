@@ -11,11 +11,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from lavender.base.deadline import seconds
+from lavender.judge.residuals import UNCONVERGED
 from lavender.lab.bench.record import Record, Skip, file_name, level_name, printable
 from lavender.lab.bench.store import Records
-from lavender.lab.report import choices, tables
-from lavender.lab.report.choices import Advice, Line
-from lavender.lab.report.engine import Contestant
+from lavender.lab.report import choices, finals, tables
+from lavender.lab.report.choices import Advice, Choice, Line
+from lavender.lab.report.engine import INSIDE, cases_of, engine_choice, is_ahead
 from lavender.lab.report.findings import Report
 from lavender.lab.report.moved import idle, speed_name
 from lavender.lab.report.table import WORDS, Cell, Table
@@ -29,6 +30,7 @@ DIFFICULTY = (
     "border of two states; solvers with the same bits and no iteration, whose times are of one shortcut"
 )
 IN_TURNS, ALONE = "in turns", "alone"  # lines of a recommendation, timed again; runs one after the other
+ENGINES_OWN = "engine's own"  # column of the solver of the engine that recorded the cases
 NOT_COMPARED = "no case has the same numbers in both (steps of sequences are not compared)"
 
 
@@ -56,20 +58,28 @@ def sections(report: Report) -> list[Section]:
             Section("By motion error", moved, by_speed, grouped=True),
         ]
     else:
+        timed = (
+            f"{IN_TURNS} to {level_name(levels[len(levels) // 2])}, else {ALONE}"
+            if has_turns(report)
+            else ALONE
+        )
         by_structure = (
-            f"to a level: mean time, {ALONE} (cold, if not carried), share of cases that get there, budget; in a time "
+            f"to a level: mean time, {timed} (cold, if not carried), share of cases that get there, budget; in a time "
             "or with sweeps: share of cases served, nine of ten at least, residual at the 90th percentile; ≈ as good "
             "within noise"
         )
         by_sweeps = "share of cases served, residual at the 90th percentile"
-        inside = "its own answers, judged like ours; its time holds no copy of the problem and no judge"
+        inside = (
+            "its own answers, judged like ours; its time holds no copy of the problem and no judge; ranked as in the "
+            "first sentence"
+        )
         every = "floor: rounding to float64 allows no better"
         carried = "median residual, time of all steps; carried from step to step, or cold"
         cases = reach_table(tables.reaches(records, levels), levels).without("form")
         found = [
             Section("By structure", by_structure, advice_table(report)),
             Section("By sweeps", by_sweeps, sweeps_table(report.lines)),
-            Section("Inside the engine", inside, engine_table(report.engines)),
+            Section("Inside the engine", inside, engine_table(report)),
             Section("By motion error", moved, speed_table(report)),
             Section("Motion error of each case", moved, moved_table(report), grouped=True),
             Section("Cases", every, cases, grouped=True),
@@ -95,9 +105,18 @@ def short_table(report: Report) -> Table:
         return _solver_table(report, report.levels[middle])
     found = speed_table(report) if by_motion else advice_table(report)
     column = 1 + (len(report.speeds) // 2 if by_motion else middle)
-    rows = [[str(row[0]), replace(row[column], after="")] for row in found.rows]  # type: ignore[type-var]
-    head = f"{found.heads[column]}, timed {ALONE}"
-    return Table(["structure", head], rows, words=WORDS | {head})
+    rows: Rows = [[str(row[0]), replace(row[column], after="")] for row in found.rows]  # type: ignore[type-var]
+    head = f"{found.heads[column]}, timed {IN_TURNS if has_turns(report) and not by_motion else ALONE}"
+    heads = ["structure", head]
+    if ENGINES_OWN in found.heads:
+        heads.append(ENGINES_OWN)
+        rows = [[*row, whole[-1]] for row, whole in zip(rows, found.rows, strict=True)]
+    return Table(heads, rows, words=WORDS | set(heads))
+
+
+def has_turns(report: Report) -> bool:
+    """Whether lines of the recommendation took turns."""
+    return any(r.turns for r in report.records)
 
 
 def _solver_table(report: Report, level: float) -> Table:
@@ -114,6 +133,12 @@ def _solver_table(report: Report, level: float) -> Table:
         for line, c in raced.values()
     ]
     rows += [[c.solver, seconds(c.score) + share(c.solved, c.cases), c.how, ALONE] for c in alone]
+    engine = engine_choice(report.engines, report.records, report.lines[0].cases, level)
+    if engine is not None and engine.solved:
+        ranked = [*(choice for _, choice in raced.values()), *alone]
+        before = sum(not is_ahead(engine, choice) for choice in ranked)
+        time = seconds(engine.score) + share(engine.solved, engine.cases)
+        rows.insert(before, [f"engine's {engine.solver}", time, "own, warm", "inside the engine"])
     return Table(["solver", f"to {level_name(level)}", "asked", "timed"], rows)
 
 
@@ -149,6 +174,8 @@ def advice_table(report: Report, links: Mapping[str, str] | None = None) -> Tabl
     `links` are the parts of the page that a name leads to.
     """
     heads = [*(f"to {level_name(x)}" for x in report.levels), *(f"in {seconds(t)}" for t in report.times)]
+    level = report.levels[len(report.levels) // 2]
+    engines = [engine_choice(report.engines, report.records, line.cases, level) for line in report.lines]
     rows: Rows = [
         [
             Cell(
@@ -159,10 +186,20 @@ def advice_table(report: Report, links: Mapping[str, str] | None = None) -> Tabl
             ),
             *(advised(a, False) for a in line.by_level.values()),
             *(advised(a, True) for a in line.by_time.values()),
+            _engine_cell(engine, level),
         ]
-        for line in report.lines
+        for line, engine in zip(report.lines, engines, strict=True)
     ]
-    return Table(["structure", *heads], rows, folds=True)
+    found = Table(["structure", *heads, ENGINES_OWN], rows, folds=True)
+    return found if any(engines) else found.without(ENGINES_OWN)
+
+
+def _engine_cell(engine: Choice | None, level: float) -> Cell:
+    """The engine's own solver to the level of the first sentence."""
+    if engine is None or not engine.solved:
+        return Cell(NONE if engine is None else f"nothing to {level_name(level)}")
+    text = seconds(engine.score) + share(engine.solved, engine.cases)
+    return Cell(text, engine.solver, f", to {level_name(level)}", title=INSIDE)
 
 
 def sweeps_table(lines: Sequence[Line]) -> Table:
@@ -182,7 +219,7 @@ def speed_table(report: Report) -> Table:
     heads = [f"to {speed_name(x)}" for x in report.speeds]
     rows: Rows = [
         [line.name, *(advised(a, False) for a in line.by_level.values())]
-        for line in choices.advice(report.by_speed)
+        for line in choices.advice_alone(report.by_speed)
         if not line.sequence
     ]
     return Table(["structure", *heads], rows, folds=True)
@@ -240,7 +277,7 @@ def difficulty_table(found: Sequence[tables.Difficulty]) -> Table:
             str(d.rows),
             NONE if d.sweeps is None else str(d.sweeps),
             NONE if d.condition is None else f"{d.condition:.1e}",
-            NONE if d.degenerate is None else f"{d.degenerate:.0%}",
+            NONE if d.degenerate is None else percent(round(1e6 * d.degenerate), 10**6),
             ", ".join(d.same),
             d.proof,
         ]
@@ -399,24 +436,45 @@ def pass_table(passes: Sequence[tables.Pass]) -> Table:
     return Table(["sequence", "solver", "asked", "steps", "gain", *heads], rows)
 
 
-def engine_table(found: Sequence[Contestant]) -> Table:
-    """Engines' own answers beside the solver here that is the fastest to a level as good in every step."""
-    rows = [
-        {
-            "recorded": c.folder,
-            "steps": f"{c.steps}{without(c.left_out)}",
-            "rows": f"{c.rows:g}",
-            "engine's own": c.solver,
-            "time": seconds(c.seconds),
-            "residual, median": residual(c.relative),
-            "worst": residual(c.worst),
-            "above floor": str(c.above_floor),
-            "stopped early": str(c.early),
-            "furthest off": f"{c.velocity:.2g} m/s, {c.where}" if c.early and c.where else NONE,
-            "fastest here": c.ours or "none in every step",
-            "time here": seconds(c.our_seconds) if c.ours else NONE,
-            "worst here": residual(c.our_worst) if c.ours else NONE,
-        }
-        for c in found
-    ]
+def engine_table(report: Report) -> Table:
+    """Engines' own answers, and the first solver here on the same cases, to the middle level."""
+    records, level = report.records, report.levels[len(report.levels) // 2]
+    rows = []
+    for c in report.engines:
+        cases = cases_of(c, records)
+        engine = engine_choice([c], records, cases, level)
+        first = _first_here(records, cases, level)
+        far = c.unconverged and c.where
+        rows.append(
+            {
+                "recorded": c.folder,
+                "steps": f"{c.steps}{without(c.left_out)}",
+                "rows": f"{c.rows:g}",
+                "engine's own": f"{c.solver} (inside the engine)",
+                f"to {level_name(level)}": _time_of(engine),
+                "residual, median": residual(c.relative),
+                "worst": residual(c.worst),
+                "above floor": str(c.above_floor),
+                UNCONVERGED: str(c.unconverged),
+                "furthest off": f"{c.velocity:.2g} m/s, {c.where}" if far else NONE,
+                "first here": NONE if first is None else first.solver,
+                f"to {level_name(level)}, here": _time_of(first),
+            }
+        )
     return Table.of(rows)
+
+
+def _first_here(records: Records, cases: Sequence[str], level: float) -> Choice | None:
+    """The solver that is recommended for the cases of a folder, by the rule of the first sentence."""
+    if not cases:
+        return None
+    way = "steps" if records.cases[cases[0]].sequence else "call"
+    alone = choices.to_level(records, "", cases, level)
+    best = finals.recommend(records, alone, finals.lines(records, way), cases).best
+    return best if best is not None and best.solved else None
+
+
+def _time_of(choice: Choice | None) -> str:
+    if choice is None or not choice.solved:
+        return NONE
+    return seconds(choice.score) + share(choice.solved, choice.cases)

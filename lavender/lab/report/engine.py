@@ -1,111 +1,131 @@
-"""The answer of the engine that recorded a folder of steps, as a contestant: judged like the others, timed inside it.
+"""The answers of the engine that recorded a folder of steps: judged like the others, timed inside it.
 
-Its time holds neither a copy of the problem nor the judge, and it starts from what the engine kept of the step before;
-so it stands beside the table, not in it.
+Its time holds neither a copy of the problem nor the judge, and it starts from what the engine kept of the step before.
+`engine_choice` ranks it by the rule of the solvers: cases brought to a level, then the shifted geometric mean of times.
 """
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from lavender.io.stored import ENGINE, whole_file
-from lavender.judge.residuals import AT_FLOOR, EARLY, WRONG
-from lavender.lab.bench.record import Record, printable
+from lavender.io.stored import ENGINE, SUFFIXES, whole_file
+from lavender.judge.residuals import AT_FLOOR, UNCONVERGED, VERDICTS_OF_OLD, WRONG
+from lavender.lab.bench.record import printable
 from lavender.lab.bench.store import Records
+from lavender.lab.report.choices import Choice
+from lavender.lab.report.tables import SHIFT, geometric_mean, limit_of
 
 _NUMBERS = ("rows", "seconds", "relative")
+INSIDE = "inside the engine, warm from the step before, without copy and judge"
 
 
 @dataclass(frozen=True)
 class Contestant:
-    """One folder of recorded steps; times in s, residuals relative."""
+    """One folder of recorded steps; residuals relative."""
 
     folder: str
+    source: str  # the folder's path as the records have it
     solver: str  # of the engine
     steps: int
     left_out: int  # steps of the recording that could not be kept
     rows: float  # median
-    seconds: float  # median, inside the engine
     relative: float  # median
     worst: float
     above_floor: int  # answers that rounding does not explain
-    # of these, answers that stopped early or are wrong, by more than the threshold of the recording
-    early: int
+    # of these, answers that stopped before convergence or are wrong, by more than the threshold of the recording
+    unconverged: int
     velocity: float  # m/s, of the worst row of all answers; nan where the recording does not say
     where: str  # that row
-    ours: str  # the fastest solver that reached the level in every step, its start, the level; empty if none did
-    our_seconds: float  # median
-    our_worst: float
+    answers: Mapping[
+        str, tuple[float, float]
+    ]  # by the file's name: time inside the engine [s], relative residual
 
 
 def contestants(words: Sequence[str], records: Records) -> list[Contestant]:
-    """Of the folders among `words` in which an engine left its own answers; lines that cannot be read are left out."""
-    out = []
-    for word in words:
-        path = Path(word) / ENGINE
-        if not path.is_file():
-            continue
-        found, lost = [], 0
-        for line in whole_file(path, "the engine's answers").decode(errors="replace").splitlines():
-            try:
-                entry = json.loads(line)
-                lost += "left_out" in entry
-                numbers = [float(entry[name]) for name in _NUMBERS]
-                row = float(entry.get("velocity", math.nan)), str(entry.get("worst", ""))
-                found.append((*numbers, row, str(entry["verdict"]), str(entry["solver"])))
-            except (ValueError, KeyError, TypeError, RecursionError):
-                continue
-        if not found:
-            continue
-        rows, seconds, relative, worst_rows, verdicts, solvers = zip(*found, strict=True)
-        velocity, where = max(worst_rows, key=lambda row: (row[0] == row[0], row[0]))
-        name, ours, worst = _fastest(Path(word), records, float(np.max(relative)))
-        out.append(
-            Contestant(
-                folder=Path(word).name,
-                solver=f"{max(set(solvers), key=solvers.count).capitalize()} (inside the engine)",
-                steps=len(found),
-                left_out=lost,
-                rows=float(np.median(rows)),
-                seconds=float(np.median(seconds)),
-                relative=float(np.median(relative)),
-                worst=float(np.max(relative)),
-                above_floor=sum(said != AT_FLOOR for said in verdicts),
-                early=sum(said in (EARLY, WRONG) for said in verdicts),
-                velocity=velocity,
-                where=where,
-                ours=name,
-                our_seconds=ours,
-                our_worst=worst,
-            )
-        )
-    return out
+    """Read the engine's answers in the folders among `words` and in those of the records' files.
+
+    Lines that cannot be read are left out.
+    """
+    parents = (Path(x.source).parent for x in records.cases.values() if x.source.endswith(SUFFIXES))
+    found = (_read_folder(folder) for folder in dict.fromkeys([*map(Path, words), *parents]))
+    return [contestant for contestant in found if contestant is not None]
 
 
-def _fastest(folder: Path, records: Records, engine: float) -> tuple[str, float, float]:
-    """The fastest at the loosest level that is no worse than the engine's worst residual, else at the closest."""
-    inside = printable(str(folder))  # as the records have it
-    working = {
-        name for name, info in records.cases.items()
-        if not info.nothing_to_do and str(Path(info.source).parent) == inside
-    }  # fmt: skip
-    runs = [r for r in records if r.mode == "tol" and not r.turns and r.case in working]
-    levels = {r.tol for r in runs}
-    level = max((tol for tol in levels if tol <= engine), default=min(levels, default=math.nan))
-    by_solver: dict[tuple[str, str], list[Record]] = {}
-    for r in runs:
-        if r.tol == level:
-            by_solver.setdefault((r.solver, r.start), []).append(r)
-    best = ("", math.nan, math.nan)
-    for (solver, start), steps in by_solver.items():
-        if len(steps) == len(working) and all(r.success for r in steps):  # none was left to a limit of time
-            time = float(np.median([r.time_min for r in steps]))
-            if not time >= best[1]:
-                best = (f"{solver}, {start}, to {level:g}", time, max(r.relative for r in steps))
-    return best
+def _read_folder(folder: Path) -> Contestant | None:
+    path = folder / ENGINE
+    if not path.is_file():
+        return None
+    found, lost, answers = [], 0, {}
+    for line in whole_file(path, "the engine's answers").decode(errors="replace").splitlines():
+        try:
+            entry = json.loads(line)
+            lost += "left_out" in entry
+            rows, time, relative = (float(entry[name]) for name in _NUMBERS)
+            row = float(entry.get("velocity", math.nan)), str(entry.get("worst", ""))
+            verdict = str(entry["verdict"])
+            verdict = VERDICTS_OF_OLD.get(verdict, verdict)
+            found.append((rows, relative, row, verdict, printable(str(entry["solver"]))))
+            if math.isfinite(time) and time >= 0.0:
+                answers[printable(str(entry.get("file", "")))] = time, relative
+        except (ValueError, KeyError, TypeError, RecursionError):
+            continue
+    if not found:
+        return None
+    sizes, relatives, worst_rows, verdicts, solvers = zip(*found, strict=True)
+    velocity, where = max(worst_rows, key=lambda row: (row[0] == row[0], row[0]))
+    return Contestant(
+        folder=folder.name,
+        source=printable(str(folder)),
+        solver=max(set(solvers), key=solvers.count).replace("NEWTON", "Newton"),
+        steps=len(found),
+        left_out=lost,
+        rows=float(np.median(sizes)),
+        relative=float(np.median(relatives)),
+        worst=float(np.max(relatives)),
+        above_floor=sum(verdict != AT_FLOOR for verdict in verdicts),
+        unconverged=sum(verdict in (UNCONVERGED, WRONG) for verdict in verdicts),
+        velocity=velocity,
+        where=printable(where),
+        answers=answers,
+    )
+
+
+def cases_of(engine: Contestant, records: Records) -> tuple[str, ...]:
+    """The cases of the records that are files of its folder."""
+    sources = {name: Path(info.source) for name, info in records.cases.items()}
+    return tuple(name for name, path in sources.items() if str(path.parent) == engine.source)
+
+
+def engine_choice(
+    engines: Sequence[Contestant], records: Records, cases: Sequence[str], level: float
+) -> Choice | None:
+    """Rank the engines' own answers to these cases to a level as lines of solvers are ranked.
+
+    None unless an engine answered every case.
+    """
+    answers: dict[str, tuple[float, float]] = {}
+    solvers: dict[str, None] = {}
+    for engine in engines:
+        for name in cases:
+            source = Path(records.cases[name].source)
+            if str(source.parent) == engine.source and source.name in engine.answers:
+                answers[name] = engine.answers[source.name]
+                solvers[engine.solver] = None
+    if not cases or len(answers) < len(cases):
+        return None
+    times = {name: time if relative <= level else math.inf for name, (time, relative) in answers.items()}
+    limit = limit_of(records)
+    score = geometric_mean([t if math.isfinite(t) else limit for t in times.values()], SHIFT)
+    solved = sum(map(math.isfinite, times.values()))
+    return Choice.of(" and ".join(solvers), times, solved, score)
+
+
+def is_ahead(one: Choice, other: Choice) -> bool:
+    """Whether one solver ranks before another: more cases, or as many in less time."""
+    return (-one.solved, one.score) < (-other.solved, other.score)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -17,8 +17,9 @@ from lavender.base.arrays import FloatArray
 from lavender.lab.bench.line import code_of
 from lavender.lab.bench.record import Record
 from lavender.lab.bench.store import Records
-from lavender.lab.report.choices import FIRST, HALF, QUANTILE, Choice, counts_sweeps
-from lavender.lab.report.tables import SHIFT, limit_of
+from lavender.lab.report import choices
+from lavender.lab.report.choices import FIRST, HALF, QUANTILE, Advice, Choice, counts_sweeps
+from lavender.lab.report.tables import SHIFT, levels_of, limit_of
 
 SAMPLES = 500
 AT_ONCE = 1_000_000  # numbers of a few samples
@@ -134,6 +135,41 @@ def to_level(records: Records, some: Sequence[Final], level: float, cases: int =
         return Choice.of(some[i].line.solver, found, solved, value, cases=max(cases, len(found)))
 
     return _race(records, some, names, charged, missed, score, choice)
+
+
+def advice(records: Records, times: Sequence[float] = ()) -> list[choices.Line]:
+    """Every recommendation: as `choices.advice_alone`, and to the middle level by the lines that took turns, if any."""
+    levels = levels_of(records)
+    level = levels[len(levels) // 2]
+    in_turns = {way: lines(records, way) for way in ("call", "steps")}
+    found = []
+    for line in choices.advice_alone(records, times):
+        some = in_turns["steps" if line.sequence else "call"]
+        first = recommend(records, line.by_level[level], some, line.cases)
+        found.append(replace(line, by_level={**line.by_level, level: first}))
+    return found
+
+
+def recommend(records: Records, alone: Advice, some: Sequence[Final], cases: Sequence[str]) -> Advice:
+    """Rank solvers to a level on some cases by the rule and the times of the report's first sentence.
+
+    Solvers whose lines took turns (`some`) come first, then the others of `alone`. Returns `alone` if no line took
+    turns on these cases, or if the lines that did solve fewer of them.
+    """
+    parts = [replace(f, runs={c: f.runs[c] for c in cases if c in f.runs}) for f in some]
+    race = to_level(records, [f for f in parts if f.runs], alone.target, len(cases))
+    best = alone.ranking[0].solved if alone.ranking else 0
+    if race is None or race.ranking[0][1].solved < max(1, best):
+        return alone
+    hows = {c.solver: c.how for c in alone.ranking}
+    raced = [
+        replace(c, how=f"{f.line.asked}, {f.line.start}" if f.line.step >= 0 else hows.get(c.solver, ""))
+        for f, c in race.ranking
+    ]
+    raced.sort(key=lambda c: race.named.index(c.solver) if c.solver in race.named else len(raced))
+    known = {c.solver for c in raced}
+    rest = [c for c in alone.ranking if c.solver not in known]
+    return replace(alone, ranking=(*raced, *rest), equal=len(race.named))
 
 
 def in_time(records: Records, some: Sequence[Final], limit: float, cases: int = 0) -> Race | None:

@@ -9,6 +9,7 @@ from statistics import fmean
 from lavender.lab.bench.store import Records
 from lavender.lab.report import choices, tables
 from lavender.lab.report.engine import Contestant
+from lavender.lab.report.finals import advice
 from lavender.lab.report.moved import by_speed, speed_levels, working
 from lavender.lab.report.text import count
 from lavender.lab.report.verdict import Verdict, verdict
@@ -104,9 +105,9 @@ class Report:
     @cached_property
     def verdict(self) -> Verdict:
         """What the whole comes to."""
-        return verdict(self.records, tuple(self.asked), tuple(self.sweeps))
+        return verdict(self.records, tuple(self.asked), tuple(self.sweeps), self.engines)
 
     @cached_property
     def lines(self) -> list[choices.Line]:
         """Recommendations by structure and sequence; none of a campaign."""
-        return [] if self.is_campaign else choices.advice(self.records, self.times)
+        return [] if self.is_campaign else advice(self.records, self.times)

@@ -31,6 +31,12 @@ class Part:
     code: Sequence[str] = ()  # lines to copy
     short: int = 0  # rows of the first table that a terminal shows
 
+    @property
+    def is_shown(self) -> bool:
+        """Whether there is anything under the heading: tables without rows and figures without curves do not count."""
+        filled = any(t.rows for t in self.tables) or any(f.curves for f in self.figures)
+        return filled or bool(self.code) or not (self.tables or self.figures)
+
 
 @dataclass(frozen=True)
 class Sheet:
@@ -46,7 +52,8 @@ class Sheet:
         """One file that needs nothing else; every text is escaped."""
         names = list(dict.fromkeys(c.solver for part in self.parts for f in part.figures for c in f.curves))
         number = {name: i for i, name in enumerate(names)}
-        parts = [(part, [svg(f, number, names) for f in part.figures if f.curves]) for part in self.parts]
+        shown = [part for part in self.parts if part.is_shown]
+        parts = [(part, [svg(f, number, names) for f in part.figures if f.curves]) for part in shown]
         return str(environment().get_template("sheet.html.j2").render(sheet=self, parts=parts, number=number))
 
     def write(self, folder: str | os.PathLike[str]) -> Path:

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 #: Heads of columns that hold words; what stands under any other is a number.
 WORDS = frozenset({
     "case", "solver", "status", "claim", "form", "structure", "law", "change", "asked", "hardest", "sequence",
-    "message", "worst row", "reason", "residual by order", "recorded", "engine's own", "fastest here",
+    "message", "worst row", "reason", "residual by order", "recorded", "engine's own", "first here",
     "furthest off",
 })  # fmt: skip
 COLOURS = {"good": "green", "warn": "yellow", "bad": "red"}

@@ -62,7 +62,9 @@ def without(lost: int) -> str:
 
 
 def percent(part: int, whole: int, digits: int = 0) -> str:
-    """Part of a whole, rounded down: 100 % is all of it."""
+    """Return part of a whole, rounded down, with at least so many digits: 100 % is all of it, and 0 % is nothing."""
+    while 0 < 100 * 10**digits * part < whole:
+        digits += 1
     tenths = 100 * 10**digits * part // whole
     return f"{tenths / 10**digits:.{digits}f} %"
 

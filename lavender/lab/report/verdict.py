@@ -14,6 +14,7 @@ from lavender.lab.bench.store import Records
 from lavender.lab.report import tables
 from lavender.lab.report.choices import QUANTILE, Choice
 from lavender.lab.report.contenders import QUICKER, Subject, subjects
+from lavender.lab.report.engine import INSIDE, Contestant, engine_choice, is_ahead
 from lavender.lab.report.finals import STARTS, Final, Race, in_time, lines, serves_in
 from lavender.lab.report.finals import to_level as race_to_level
 from lavender.lab.report.moved import by_speed, speed_levels, speed_name
@@ -58,12 +59,18 @@ def _until(speed: float) -> str:
     return f"until no body is wrong by more than {speed_name(speed)}"
 
 
-def verdict(records: Records, times: Sequence[float] = (), sweeps: Sequence[int] = ()) -> Verdict:
+def verdict(
+    records: Records,
+    times: Sequence[float] = (),
+    sweeps: Sequence[int] = (),
+    engines: Sequence[Contestant] = (),
+) -> Verdict:
     """The recommendation for everything that was measured together: single cases, then sequences.
 
     By motion error where the plan names speed levels; where motion errors were measured beside residuals, a sentence
     says who is first by them. `times` [s] and `sweeps` that are asked for each get a sentence; those of the newest plan
-    if none are given.
+    if none are given. The first sentence also ranks the solver of the engine that recorded the cases, by its answers in
+    `engines`.
     """
     if tables.is_campaign(records) or not len(records):
         return Verdict((), ())
@@ -73,7 +80,7 @@ def verdict(records: Records, times: Sequence[float] = (), sweeps: Sequence[int]
         return _by_advice(by_speed(records))
     times = tuple(times) or tuple(plan.get("times", ()))
     sweeps = tuple(sweeps) or tuple(plan.get("sweeps", ()))
-    parts = [_of(records, subject, times, sweeps) for subject in subjects(records, times)]
+    parts = [_of(records, subject, times, sweeps, engines) for subject in subjects(records, times)]
     told = [t for part in parts for t in part.told]
     if speeds and parts:
         best = subjects(by_speed(records))[0].best.best
@@ -84,18 +91,28 @@ def verdict(records: Records, times: Sequence[float] = (), sweeps: Sequence[int]
     return Verdict(tuple(told), tuple(leaders)[:3], parts[0].raced if len(parts) == 1 else ())
 
 
-def _of(records: Records, subject: Subject, times: Sequence[float], sweeps: Sequence[int]) -> Verdict:
+def _of(
+    records: Records,
+    subject: Subject,
+    times: Sequence[float],
+    sweeps: Sequence[int],
+    engines: Sequence[Contestant],
+) -> Verdict:
     """The recommendation for one subject, by the lines that were timed in turns or, without any, by those measured."""
     level, n = subject.best.target, subject.best.ranking[0].cases if subject.best.ranking else 0
     in_turns = lines(records, subject.way)
     race = race_to_level(records, in_turns or lines(records, subject.way, rounds=False), level, n)
     what, reached = _what(records, subject, n), f"down to {level_name(level)} of the error of doing nothing"
+    engine = engine_choice(engines, records, subject.cases, level)
     if race is None or not race.ranking[0][1].solved:
         near = tuple(c.solver for c in subject.best.ranking[:3] if c.solved)
-        return Verdict((Told(f"No solver brings {what} {reached}."),), near)
+        said = f"No solver brings {what} {reached}."
+        return Verdict((Told(_add_engine(records, said, None, engine, what)),), near)
     final, first = race.ranking[0]
+    of = "them" if engine is not None and is_ahead(engine, first) else what
+    head = _head(records, first, f"{STARTS[final.line.start]}, {reached}", of)
     told = [
-        _told(records, final, _head(records, first, f"{STARTS[final.line.start]}, {reached}", what)),
+        _told(records, final, _add_engine(records, head, first, engine, what)),
         *_sure(race),
     ]
     leaders = [c.solver for _, c in race.ranking[:3] if c.solved]
@@ -152,6 +169,24 @@ def _head(records: Records, first: Choice, reached: str, what: str) -> str:
     elif math.isfinite(first.worst) and first.worst > 3.0 * first.score:
         said += f" ({seconds(first.worst)} at worst, {first.hardest})"
     return f"{said}, {reached}."
+
+
+def _add_engine(records: Records, head: str, first: Choice | None, engine: Choice | None, what: str) -> str:
+    """Add the engine's own solver to the first sentence: before it if it ranks first, else after it."""
+    if engine is None:
+        return head
+    missed = engine.solved < engine.cases
+    time = seconds(engine.score) + (" on average" if engine.cases > 1 else "")
+    if missed:
+        time += f" (a miss counted as {seconds(tables.limit_of(records))})"
+    if engine.solved and (first is None or is_ahead(engine, first)):
+        of = f"{engine.solved} of " if missed else ""
+        here = head if first is None else f"Of the solvers here, u{head[1:]}"
+        return f"First is the engine's own {engine.solver}: it solves {of}{what} in {time}, {INSIDE}. {here}"
+    if not engine.solved:
+        return f"{head} The engine's own {engine.solver} solves none of them to that level."
+    of = f"solves {engine.solved} of them in" if missed else "takes"
+    return f"{head} The engine's own {engine.solver} {of} {time}, {INSIDE}."
 
 
 def _sure(race: Race) -> list[Told]:

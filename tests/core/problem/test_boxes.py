@@ -194,7 +194,7 @@ def test_what_comes_back_is_in_the_rows_of_the_problem(form):
         np.testing.assert_allclose(at.slack, problem.dense() @ x - problem.b, rtol=1e-9, atol=1e-12)
     single = np.float32(lv.solve(problem, tol=1e-9).impulse)
     assert lv.residual(problem, single, "float32").verdict == "at its floor"
-    assert lv.residual(problem, 1.001 * single, "float32").verdict == "stopped early"
+    assert lv.residual(problem, 1.001 * single, "float32").verdict == "stopped before convergence"
     pairs = [int(i) for i in problem.cones.ptr[:-1][problem.cones.kind == lv.CONTACT_ELLIPSE]]
     rows = r.velocity_by_row.copy()
     for n in pairs:

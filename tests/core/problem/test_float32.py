@@ -1,4 +1,4 @@
-"""Answers made in float32: what rounding explains, what stopped early, and data that are widened exactly."""
+"""Answers made in float32: errors that rounding explains, stops before convergence, data that are widened exactly."""
 
 import numpy as np
 import pytest
@@ -67,9 +67,9 @@ def test_a_solution_rounded_to_float32_is_at_its_floor_and_one_further_off_is_no
     assert there.relative <= 4.0 * there.floor
     off = lv.residual(p, 0.99 * exact.impulse, precision="float32")
     if off.relative > 1e-4:  # of what 1 % less does; rounding is below that here
-        assert off.verdict == "stopped early"
+        assert off.verdict == "stopped before convergence"
         assert off.excess == off.relative / off.floor > 4.0
-        assert f"stopped early, {off.excess:.2g} times its floor" in str(off)
+        assert f"stopped before convergence, {off.excess:.2g} times its floor" in str(off)
 
 
 @pytest.mark.parametrize("word", ["float16", "single", 32, np.zeros(2)], ids=repr)

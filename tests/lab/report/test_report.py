@@ -16,7 +16,7 @@ import lavender as lv
 from lavender import bench, report
 from lavender.base.deadline import seconds
 from lavender.lab.bench.record import CaseInfo, Record, Run
-from lavender.lab.report import choices, curves, tables
+from lavender.lab.report import choices, contents, curves, tables
 from lavender.lab.report.curves import overall_figure
 from lavender.lab.report.engine import contestants
 from lavender.lab.report.findings import Report
@@ -323,7 +323,7 @@ def test_numbers_are_written_with_what_they_know():
         "1.00 s", "12.3 ms", "1.00 ms", "45.0 µs", "0.09 µs", "123 s", "–",
     ]  # fmt: skip
     assert times(99.7) == "100 times"
-    assert [percent(n, 10_000, 1) for n in (10_000, 9_999, 1, 0)] == ["100.0 %", "99.9 %", "0.0 %", "0.0 %"]
+    assert [percent(n, 10_000, 1) for n in (10_000, 9_999, 1, 0)] == ["100.0 %", "99.9 %", "0.01 %", "0.0 %"]
     assert (percent(999, 1000), percent(1, 3)) == ("99 %", "33 %")
     assert [times(x) for x in (1.34, 85.0, 1234.4, 7.3e13, math.nan)] == [
         "1.3 times", "85 times", "1234 times", "10^14 times", "–",
@@ -458,37 +458,99 @@ def test_changes_beyond_noise_are_named(tmp_path):
     assert "no case has the same numbers in both" in text
 
 
-@pytest.mark.parametrize(
-    "worst, level, name", [(1e-2, 1e-3, "pgs"), (1e-5, 1e-6, "newton"), (1e-9, 1e-6, "newton")]
-)
-def test_an_engine_stands_beside_the_fastest_to_a_level_as_good_as_its_own(tmp_path, worst, level, name):
+def recorded(folder, answers, solver="NEWTON", sequence=""):
+    """Records of two solvers on cases that an engine recorded, with its own answers: (time, residual) of each."""
     lines = [
-        {"rows": 3, "seconds": 1e-4, "relative": e, "solver": "newton", "verdict": ""}
-        for e in (worst, worst / 2)
+        {
+            "file": f"step_{i}.npz",
+            "rows": 3,
+            "seconds": time,
+            "relative": relative,
+            "solver": solver,
+            "verdict": "wrong",
+        }
+        for i, (time, relative) in enumerate(answers)
     ]
-    (tmp_path / "engine.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
-    times = {"pgs": {1e-3: 1e-6, 1e-6: 5e-3}, "newton": {1e-3: 1e-3, 1e-6: 2e-3}}
+    folder.mkdir(exist_ok=True)
+    (folder / "engine.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    made = []
+    for i in range(len(answers)):
+        for name, time in (("auto", 40e-6), ("newton", 60e-6), ("pgs", 900e-6)):
+            case = f"{folder.name} {i}"
+            made.append(record(case, name, 0.5 * time * (1 + i), 1e-8))  # alone twice as fast
+            if name != "pgs":
+                more = {"way": "call", "turns": "one", "times": (time * (1 + i),) * 7, "pace": 1e-4}
+                made.append(record(case, name, time * (1 + i), 1e-8, **more))
+    found = records_of(*made)
+    for i in range(len(answers)):
+        own = {"source": str(folder / f"step_{i}.npz"), "sequence": sequence, "step": i if sequence else -1}
+        found.add(dataclasses.replace(found.cases[f"{folder.name} {i}"], **own))
+    return found
 
-    def steps(sequence, first, times=times):
-        return [
-            record(f"{sequence}[{step}]", solver, time, tol / 2, tol=tol)
-            for step in range(first, 2)
-            for solver, levels in times.items()
-            for tol, time in levels.items()
-        ]
 
-    def answers(*made):
-        found, place = records_of(*made), {"near": tmp_path, "other/near": tmp_path / "other" / "near"}
-        for case in found.cases.values():
-            sequence, _, step = case.case.partition("[")
-            found.add(dataclasses.replace(case, source=str(place[sequence] / f"step_{step[:-1]}.npz")))
-        return contestants([str(tmp_path)], found)[0]
+def mean(values, shift=tables.SHIFT):
+    return math.exp(sum(math.log(v + shift) for v in values) / len(values)) - shift
 
-    # A folder of the same name elsewhere, and a solver that a limit of time ended after one step, are not it.
-    quick = {solver: dict.fromkeys(levels, 1e-9) for solver, levels in times.items()}
-    ended = {"quickest": dict.fromkeys((1e-3, 1e-6), 1e-9)}
-    engine = answers(*steps("other/near", 0, quick), *steps("near", 0), *steps("near", 1, ended))
-    assert engine.ours == f"{name}, cold, to {level:g}"
-    assert engine.our_seconds == times[name][level]
-    assert engine.our_worst == level / 2
-    assert answers(*steps("near", 0, ended)[:2], *steps("near", 1)).ours == ""
+
+@pytest.mark.parametrize(
+    ("answers", "first"),
+    [
+        ([(1e-5, 1e-9), (2e-5, 1e-9)], True),  # faster
+        ([(1e-4, 1e-9), (2e-4, 1e-9)], False),  # slower
+        ([(1e-6, 1e-9), (1e-6, 1e-2)], False),  # fewer cases
+        ([(1e-6, 1e-2), (1e-6, math.nan)], False),  # none
+    ],
+)
+def test_the_first_sentence_the_structures_and_the_engine_have_one_set_of_numbers(tmp_path, answers, first):
+    found = recorded(tmp_path / "robot", answers)
+    engines = contestants([str(tmp_path / "robot")], found)
+    made = Report(found, engines=engines)
+    text = made.verdict.told[0].text
+    assert text.startswith("First is the engine's own Newton") == first
+    solved = sum(relative <= 1e-6 for _, relative in answers)
+    score = mean([time if relative <= 1e-6 else 2.0 for time, relative in answers])  # the limit is 2 s
+    if solved:
+        assert f"in {seconds(score)} on average" in text or f"takes {seconds(score)} on average" in text
+    else:
+        assert "engine's own Newton solves none of them" in text
+    ours = seconds(mean([40e-6, 80e-6]))
+    assert "se auto: " in text and f"in {ours} on average" in text
+    (structure,) = contents.advice_table(made).rows
+    assert structure[2].lead == "auto" and structure[2].text == ours
+    assert (seconds(score) in str(structure[-1])) == (solved > 0)
+    (row,) = contents.engine_table(made).rows
+    own = dict(zip(contents.engine_table(made).heads, row, strict=True))
+    assert (own["first here"], own["to 1e-6, here"]) == ("auto", ours)
+    assert own["to 1e-6"].startswith(seconds(score) if solved else "–")
+    terminal = shown(made).splitlines()
+    assert sum(line.startswith("engine's Newton") for line in terminal) == (solved > 0)
+    ends = ("in turns", "inside the engine", "alone")
+    rows = [line.split()[0] for line in terminal if line.endswith(ends)]
+    wanted = ["auto", "newton", "pgs"]
+    if solved:
+        wanted.insert(0 if first else 2 if solved == 2 else 3, "engine's")
+    assert rows == wanted
+
+
+def test_an_engine_that_answered_only_some_cases_is_not_in_the_first_sentence(tmp_path):
+    found = recorded(tmp_path / "robot", [(1e-6, 1e-9), (1e-6, 1e-9)])
+    other = recorded(tmp_path / "other", [(1e-6, 1e-9)])
+    (tmp_path / "other" / "engine.jsonl").unlink()
+    for case in other.cases.values():
+        found.add(dataclasses.replace(case, structure=("pile",)))
+    for r in other:
+        found.add(r)
+    engines = contestants([str(tmp_path / "robot")], found)
+    made = Report(found, engines=engines)
+    assert "engine" not in made.verdict.told[0].text
+    by_name = {str(row[0]): row[-1] for row in contents.advice_table(made).rows}
+    assert by_name["stack"].lead == "Newton" and by_name["pile"].text == "–"
+    # Records that are shown again name the folders themselves.
+    assert contestants(["records.jsonl"], found) == engines
+
+
+def test_lines_that_took_turns_on_fewer_cases_do_not_replace_those_that_solved_more():
+    made = [record(case, "x", 1e-3, 1e-9) for case in "abc"]
+    made.append(record("a", "x", 2e-3, 1e-9, way="call", turns="one", times=(2e-3,) * 5, pace=1e-4))
+    (line,) = report.advice(records_of(*made))
+    assert (line.by_level[1e-6].best.solved, line.by_level[1e-6].best.score) == (3, pytest.approx(1e-3))

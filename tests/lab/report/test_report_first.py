@@ -9,7 +9,7 @@ import pytest
 
 import lavender as lv
 from lavender import bench, report
-from lavender.lab.report import choices, curves, paper, tables
+from lavender.lab.report import curves, paper, tables
 from lavender.lab.report.contents import advice_table
 from lavender.lab.report.draw import looks
 from lavender.lab.report.findings import Report
@@ -65,7 +65,7 @@ def test_tables_stay_within_the_terminal_and_nothing_is_cut(real, width):
     out = shown(Report(real[0]), width, whole=True)
     assert max(map(len, out.splitlines())) <= width
     assert "…" not in out
-    found = choices.advice(real[0])
+    found = report.advice(real[0])
     for name in {line.name for line in found}:
         assert name in out
     for best in (a.best for line in found for a in (*line.by_level.values(), *line.by_time.values())):

@@ -13,6 +13,7 @@ from lavender.lab.bench.record import from_json, to_json
 from lavender.lab.bench.store import Records
 from lavender.lab.report.contents import engine_table
 from lavender.lab.report.engine import contestants
+from lavender.lab.report.findings import Report
 
 
 def test_a_report_shows_the_verdict_of_a_stored_answer_in_float32(tmp_path):
@@ -20,8 +21,12 @@ def test_a_report_shows_the_verdict_of_a_stored_answer_in_float32(tmp_path):
     lv.io.save(problem, tmp_path / "early.npz", impulse=0.9 * lv.solve(problem, tol=1e-11).impulse)
     (item,) = resolve([tmp_path / "early.npz"])
     info = describe(item, "run")
-    assert info.stored_verdict.startswith("stopped early, ")
+    assert info.stored_verdict.startswith("stopped before convergence, ")
     assert from_json(to_json(info)) == info
+    of_old = to_json(info) | {
+        "stored_verdict": info.stored_verdict.replace("stopped before convergence", "stopped early")
+    }
+    assert from_json(of_old) == info
 
 
 def test_a_recording_of_a_float32_engine_counts_its_early_answers(tmp_path):
@@ -40,8 +45,17 @@ def test_a_recording_of_a_float32_engine_counts_its_early_answers(tmp_path):
     assert all(line["precision"] == "float32" and line["floor"] > 1e-9 for line in lines)
     assert early > 0  # at its tolerance, far above the floor
     (engine,) = contestants([str(tmp_path)], Records())
-    assert engine.early == early
-    (row,) = engine_table([engine]).texts
+    assert engine.unconverged == early
+    (row,) = engine_table(Report(Records(), engines=[engine])).texts
     assert str(early) in row
     with pytest.raises(lv.InputError, match="precision is 'half'"):
         lv.io.record(model, mujoco.MjData(model), tmp_path / "other", 1, precision="half")
+
+
+def test_verdicts_of_earlier_recordings_are_read(tmp_path):
+    line = {"rows": 3, "seconds": 1e-5, "relative": 1e-3, "solver": "PGS", "file": "step_1.npz"}
+    verdicts = ("stopped early", "stopped before convergence", "wrong", "close enough", "at its floor")
+    lines = [json.dumps(line | {"verdict": verdict}) for verdict in verdicts]
+    (tmp_path / "engine.jsonl").write_text("\n".join(lines))
+    (engine,) = contestants([str(tmp_path)], Records())
+    assert (engine.unconverged, engine.above_floor) == (3, 4)

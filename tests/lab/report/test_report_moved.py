@@ -40,7 +40,7 @@ def test_times_to_a_speed_are_those_of_runs_that_reached_it(records):
 def test_the_first_sentence_is_by_motion_error_where_that_was_asked_for(records):
     working = moved.working(records)
     said = verdict(working)
-    line, *_ = choices.advice(moved.by_speed(working))
+    line, *_ = choices.advice_alone(moved.by_speed(working))
     best = line.by_level[1e-4].best
     assert said.text.startswith(f"Use {best.solver}: it solves stack(n=16) in ")
     assert "until no body is wrong by more than 1e-4 m/s." in said.told[0].text
@@ -83,7 +83,7 @@ def test_what_has_nothing_to_do_is_in_no_ranking(records):
     (case,) = moved.idle(records)
     assert (case.case, case.rows) == ("flying apart", 3)
     assert case.velocity == max(r.velocity for r in records if r.case == "flying apart")
-    assert {a.ranking[0].cases for line in choices.advice(busy) for a in line.by_level.values()} == {1}
+    assert {a.ranking[0].cases for line in choices.advice_alone(busy) for a in line.by_level.values()} == {1}
     assert moved.working(busy) is busy
 
 

@@ -1,0 +1,163 @@
+"""Start states of a MuJoCo simulation, from a file, from arrays, or from the model's keyframes.
+
+    starts = read_states(mujoco, model, "lavender-audit/states.npz")    # or "keyframes"
+    mujoco.mj_setState(model, data, starts.vectors[0], mujoco.mjtState.mjSTATE_INTEGRATION)
+
+A file holds `state`, a vector of mjSTATE_INTEGRATION in each row, or arrays by their names in MjData, of which qpos and
+qvel are needed. Only the vector has everything that a step depends on: warm start, controls, mocap bodies, applied
+forces, the state of plug-ins. What arrays leave out begins as in a new MjData.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from contextlib import closing
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from lavender.base.arrays import FloatArray, as_array
+from lavender.base.errors import InputError
+from lavender.io.npz import Archive
+from lavender.io.stored import first_bytes
+
+KEYFRAMES = "keyframes"
+VECTOR = "state"
+NEEDED = ("qpos", "qvel")
+OPTIONAL = (
+    "act", "ctrl", "qacc_warmstart", "time", "mocap_pos", "mocap_quat", "userdata", "eq_active", "qfrc_applied",
+    "xfrc_applied",
+)  # fmt: skip
+LABELS = ("world", "step")  # `lavender audit` also writes where each state comes from.
+
+
+@dataclass(frozen=True, eq=False)
+class StartStates:
+    """States in which simulations start.
+
+    Parameters
+    ----------
+    vectors : (n, size)
+        As `mj_getState` gives them for mjSTATE_INTEGRATION.
+    controls : (n, nu), optional
+        Controls of the first step; None if the source has none.
+    """
+
+    vectors: FloatArray
+    controls: FloatArray | None = None
+
+    def __len__(self) -> int:
+        return len(self.vectors)
+
+    def take(self, count: int) -> StartStates:
+        """Return at most `count` of the states, evenly spaced."""
+        if len(self) <= count:
+            return self
+        chosen = np.arange(count) * len(self) // count
+        return StartStates(self.vectors[chosen], None if self.controls is None else self.controls[chosen])
+
+
+def read_states(mj: Any, model: Any, source: Any) -> StartStates:
+    """Read start states.
+
+    Parameters
+    ----------
+    mj : module
+        MuJoCo.
+    model : mujoco.MjModel
+    source : path of an .npz, "keyframes", mapping of arrays, array (n, size), or StartStates
+
+    Returns
+    -------
+    StartStates
+
+    Raises
+    ------
+    InputError
+        The file cannot be read, or its arrays do not fit the model; a number is not finite; the model has no keyframes.
+    """
+    if isinstance(source, StartStates):
+        return source
+    if isinstance(source, str) and source == KEYFRAMES:
+        return _read_keyframes(mj, model)
+    if isinstance(source, (str, os.PathLike)):
+        first_bytes(source)  # of a regular file
+        with closing(Archive(source)) as archive:
+            return _read_arrays(mj, model, dict(archive), f"states {os.fspath(source)}")
+    arrays = source if isinstance(source, Mapping) else {VECTOR: source}
+    return _read_arrays(mj, model, arrays, "states")
+
+
+def _read_keyframes(mj: Any, model: Any) -> StartStates:
+    if not model.nkey:
+        raise InputError("states are 'keyframes', and the model has none; an .npz of states is needed")
+    data, found = mj.MjData(model), []
+    for key in range(model.nkey):
+        mj.mj_resetDataKeyframe(model, data, key)
+        found.append(_vector_of(mj, model, data))
+    return StartStates(np.array(found), np.array(model.key_ctrl, float).reshape(model.nkey, model.nu))
+
+
+def _read_arrays(mj: Any, model: Any, arrays: Mapping[str, Any], what: str) -> StartStates:
+    known = (VECTOR, *NEEDED, *OPTIONAL, *LABELS)
+    unknown = [name for name in arrays if name not in known]
+    if unknown:
+        raise InputError(f"{what}: {unknown[0]!r} is no part of a state; known are {', '.join(known)}")
+    if VECTOR in arrays:
+        return _read_vectors(mj, model, arrays[VECTOR], what)
+    missing = [name for name in NEEDED if name not in arrays]
+    if missing:
+        raise InputError(f"{what}: {' and '.join(missing)} missing; {VECTOR!r}, or qpos and qvel, are needed")
+    data = mj.MjData(model)
+    parts: dict[str, FloatArray] = {}
+    for name in (*NEEDED, *OPTIONAL):
+        if name in arrays:
+            shape = np.shape(getattr(data, name))
+            given = np.asarray(arrays[name])
+            given = given[None] if given.ndim == len(shape) else given
+            parts[name] = as_array(f"{what}: {name}", given, (None, *shape))
+    counts = {name: len(x) for name, x in parts.items()}
+    n = counts["qpos"]
+    if n == 0 or set(counts.values()) != {n}:
+        told = ", ".join(f"{count} of {name}" for name, count in counts.items())
+        raise InputError(f"{what}: {told}; as many of each, and at least one, are needed")
+    vectors = []
+    for i in range(n):
+        data = mj.MjData(model)
+        for name, x in parts.items():
+            if name == "time":
+                data.time = float(x[i])
+            else:
+                getattr(data, name)[:] = x[i]
+        vectors.append(_vector_of(mj, model, data))
+    return StartStates(np.array(vectors), parts.get("ctrl"))
+
+
+def _read_vectors(mj: Any, model: Any, given: Any, what: str) -> StartStates:
+    whole = mj.mjtState.mjSTATE_INTEGRATION
+    kinds = {mj.mj_stateSize(model, kind): kind for kind in
+             (mj.mjtState.mjSTATE_PHYSICS, mj.mjtState.mjSTATE_FULLPHYSICS, whole)}  # fmt: skip
+    given = np.asarray(given)
+    given = as_array(f"{what}: {VECTOR}", given[None] if given.ndim == 1 else given, (None, None))
+    n, size = given.shape
+    if size not in kinds or n == 0:
+        raise InputError(
+            f"{what}: {VECTOR} has shape {given.shape}; (n, {mj.mj_stateSize(model, whole)}) of mjSTATE_INTEGRATION is "
+            "needed for this model"
+        )
+    vectors, controls = [], []
+    for state in given:
+        data = mj.MjData(model)
+        mj.mj_setState(model, data, state, kinds[size])
+        vectors.append(_vector_of(mj, model, data))
+        controls.append(np.array(data.ctrl))
+    return StartStates(np.array(vectors), np.array(controls) if kinds[size] == whole else None)
+
+
+def _vector_of(mj: Any, model: Any, data: Any) -> FloatArray:
+    kind = mj.mjtState.mjSTATE_INTEGRATION
+    vector = np.empty(mj.mj_stateSize(model, kind))
+    mj.mj_getState(model, data, vector, kind)
+    return vector
