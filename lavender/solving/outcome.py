@@ -125,19 +125,18 @@ def finish(
 
 
 def describe_end(problem: Problem, status: Status, iterations: int) -> str:
-    """Say why iterations that give no reason of their own found no solution, and which row of A is in their way."""
+    """Say why iterations that give no reason of their own found no solution; a row of A in their way comes first."""
     what = "the residual grew instead of falling" if status is DIVERGED else "the residual falls no further"
     words = f"{what}, {counted(iterations, 'iterations')}"
     if problem.matrix is None:
         return words
     diagonal = problem.matrix.diagonal()
-    bad = np.flatnonzero(~(diagonal > 0.0))
-    if len(bad):
-        words += (
-            f": {problem.row_name(int(bad[0]))} has {diagonal[bad[0]]:g} on the diagonal of A, where sweeps need a "
-            f"number above 0 ({counted(len(bad), 'such rows')})"
-        )
-    elif status is DIVERGED:
+    rows = np.flatnonzero(diagonal <= 0.0)
+    if len(rows):
+        value = diagonal[rows[0]]
+        size = "a zero diagonal" if value == 0.0 else f"a negative diagonal, {value:.3g}"
+        return f"{problem.row_name(int(rows[0]))} has {size}: sweeps need A_ii > 0; {words}"
+    if status is DIVERGED:
         words += ": sweeps are sure to converge only if A is symmetric and positive definite"
     return words
 
