@@ -214,6 +214,10 @@ CALLS |= {
         on(lambda: lv.Simulation("stack"), "restore"), {"snapshot": lv.Simulation("stack").snapshot()},
     ),
     "Simulation.set_solver_iterations": (on(lambda: lv.Simulation("stack"), "set_solver_iterations"), {"n": 8}),
+    "Simulation.set_velocity": (
+        on(lambda: lv.Simulation("stack"), "set_velocity"),
+        {"body": 1, "velocity": np.ones(3), "angular_velocity": np.ones(3)},
+    ),
     "Simulation.set_warm_start": (on(lambda: lv.Simulation("stack"), "set_warm_start"), {"flag": True}),
     "Simulation.step": (on(lambda: lv.Simulation("stack"), "step"), {"action": None}),
     "Solution.motion_error": (SOLVED.motion_error, {"reference": B}),
