@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lavender.base.errors import InputError
+from lavender.base.later import issparse
 from lavender.base.later import sparse as sp
 from lavender_ext.core import checks
 from lavender_ext.core.checks import LEAST, MOST
@@ -23,7 +24,8 @@ IntArray = npt.NDArray[np.int32]
 ArrayLike = npt.ArrayLike  #: numbers, nested sequences of them, or an array; the docstring has shape and unit
 
 
-FLOAT64, INT32 = np.dtype(np.float64), np.dtype(np.int32)
+FLOAT64, FLOAT32, INT32 = np.dtype(np.float64), np.dtype(np.float32), np.dtype(np.int32)
+FLOATS = {FLOAT32, FLOAT64}  # dtypes that batches read in place
 
 
 def _fits(given: tuple[int, ...], wanted: tuple[int | None, ...]) -> bool:
@@ -111,6 +113,27 @@ def as_array(
     return read_only(array)
 
 
+def as_floats(name: str, value: Any) -> np.ndarray:
+    """`value` as an array of float32 or float64 of any shape, in place if it is one of them; numbers are not checked.
+
+    Raises
+    ------
+    InputError
+        As `as_array`: not numeric, complex, masked entries, or nested sequences of several lengths.
+    """
+    shape_of(name, value)
+    check_unmasked(name, value)
+    given = np.asarray(value)
+    if given.dtype in FLOATS:
+        return given
+    native = given.dtype.newbyteorder("=")
+    return (
+        given.astype(native)
+        if native in FLOATS
+        else as_array(name, given, (None,) * given.ndim, finite=False)
+    )
+
+
 def check_unmasked(what: str, value: Any) -> None:
     """Raise InputError at the first masked entry of `what`: as a plain array it has the number under the mask."""
     if hasattr(value, "mask") and np.ma.is_masked(value):  # NumPy loads its module when it is first named
@@ -127,17 +150,22 @@ def shape_of(what: str, value: Any) -> tuple[int, ...]:
         raise InputError(f"{what} is not an array of numbers ({error})") from None
 
 
-def places(i: Any, n: int) -> int | list[int]:
+def places(i: Any, n: int, thing: str = "world") -> int | list[int]:
     """What an index names of n worlds: a whole number one of them; a slice, a mask (n,) or whole numbers a list."""
     if isinstance(i, slice):
         return list(range(*i.indices(n)))
-    if hasattr(i, "__index__") and np.ndim(i) == 0:
+    what = f"an index of {thing}s"
+    is_array = isinstance(i, np.ndarray) and i.ndim == 0 and i.dtype.kind in "iu"
+    if is_array or (isinstance(i, (int, np.integer)) and not isinstance(i, (bool, np.timedelta64))):
         if not -n <= i < n:
-            raise IndexError(f"world {i}; there are {n}")
+            raise IndexError(f"{thing} {i}; there are {n}")
         return range(n)[i]
-    at = np.array(several("an index of worlds", i, "whole numbers, or a mask,"))
-    if at.dtype.kind not in "biu" and at.size:
-        raise InputError(f"an index of worlds is {i!r:.60}; whole numbers, or a mask, are needed")
+    check_unmasked(what, i)
+    given = several(what, i, "whole numbers, or a mask,")
+    shape = shape_of(what, given)
+    at = np.array(given)
+    if len(shape) != 1 or (at.dtype.kind not in "biu" and at.size):
+        raise InputError(f"{what} is {i!r:.60}; whole numbers, or a mask, are needed")
     chosen: list[int] = np.arange(n)[at if at.size else []].tolist()
     return chosen
 
@@ -211,7 +239,11 @@ def as_csr(name: str, given: Any, *, copy: bool = True, unit: str = "", too_many
 def precision_of(*given: Any) -> str:
     """The word float32 where all of these are arrays of it, dense or sparse, or None, not all None; else float64."""
     types = {getattr(x, "dtype", None) for x in given if x is not None}
-    return "float32" if types == {np.dtype(np.float32)} else "float64"
+    if types == {FLOAT32} or FLOAT64 in types:
+        return "float64" if FLOAT64 in types else "float32"
+    # Float32 in the byte order of another machine is another dtype, and no other precision.
+    is_single = bool(types) and all(isinstance(x, np.dtype) and x.newbyteorder("=") == FLOAT32 for x in types)
+    return "float32" if is_single else "float64"
 
 
 def borrowed(name: str, value: Any, shape: tuple[int | None, ...]) -> np.ndarray:
@@ -294,7 +326,10 @@ def check_not_negative(what: str, array: np.ndarray) -> None:
 
 def several(what: str, given: Any, things: str) -> list[Any]:
     """A list of what is given, or InputError for a text and what is none."""
-    if isinstance(given, (str, bytes)) or not isinstance(given, Iterable) or getattr(given, "ndim", 1) == 0:
+    is_sequence = (
+        isinstance(given, Iterable) and getattr(given, "ndim", 1) != 0 and not isinstance(given, type)
+    )
+    if isinstance(given, (str, bytes)) or not is_sequence or issparse(given):
         raise InputError(f"{what}: {given!r:.60}; a sequence of {things} is needed")
     return list(given)
 

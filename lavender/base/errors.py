@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,7 @@ __all__ = [
     "SolverUnavailable",
     "TooLarge",
     "UnknownName",
+    "check_name",
     "last_words",
 ]
 
@@ -58,6 +59,13 @@ class UnknownName(LavenderError, KeyError):
     def __reduce__(self) -> tuple[Any, ...]:
         # Between processes exceptions travel by their arguments; those of __init__ are others.
         return _restored, (self.message,)
+
+
+def check_name(kind: str, name: object, known: Collection[str]) -> str:
+    """Return a name of those that are known; raise UnknownName for every other value."""
+    if not isinstance(name, str) or name not in known:
+        raise UnknownName(kind, name, known)
+    return name
 
 
 def _restored(message: str) -> UnknownName:

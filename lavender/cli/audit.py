@@ -19,7 +19,7 @@ from lavender.cli.options import (
     was_given,
     worlds_options,
 )
-from lavender.io.stored import writable
+from lavender.io.stored import lock_output
 
 
 @click.command()
@@ -59,7 +59,7 @@ def audit(context: click.Context, /, model: Path, out: Path, accept: float | Non
         for name in ("workers", "backend", "precision"):
             if was_given(context, name):
                 raise InputError(f"--{name} is of --engine mujoco: leave it out")
-    writable(out, folder=True)
+    context.with_resource(lock_output(out, folder=True))
     one_thread()
     with progress() as watch:
         result = run(model, watch=watch, **asked)

@@ -62,6 +62,7 @@ def check(
     from lavender.judge.residuals import AT_FLOOR, CLOSE
     from lavender.lab import bench
     from lavender.lab.check import cross_check
+    from lavender.solving.solve import seconds_of
 
     one_thread()
     if files and files[0].endswith(".jsonl"):
@@ -76,6 +77,7 @@ def check(
     bench.solver_names([*(solvers or ()), reference])
     number("tol", tol, low=0.0)
     number("threshold", threshold, low=0.0)
+    seconds_of(time_limit)
     for item in bench.resolve(files):
         with reading(item):
             found = cross_check(

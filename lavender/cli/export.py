@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from lavender.cli.options import FOLDER, refuse_unused, say
-from lavender.io.stored import writable
+from lavender.io.stored import lock_output
 
 VECTORS = 4  # problems in the test vectors, at most
 
@@ -37,7 +37,7 @@ def export(
         refuse_unused(context, ["solver"], "without --for")
     elif kind != "c":
         raise click.UsageError("--for goes with c: test vectors are checked by a C program")
-    writable(folder, folder=True)  # before the vectors are solved for
+    context.with_resource(lock_output(folder, folder=True))  # before the vectors are solved for
     more = vectors.made(records, solver, VECTORS) if records is not None else {}
     written = library.write(kind, folder, more=more, replace=replace)
     say(f"{len(written)} files in {folder}: {', '.join(p.name for p in written)}")

@@ -8,7 +8,7 @@ import click
 
 from lavender.base.errors import InputError
 from lavender.cli.options import EXIT_UNMET, FILE, FOLDER, one_thread, refuse_unused, say
-from lavender.io.stored import make_folder, writable, write_text
+from lavender.io.stored import lock_output, writable, write_text
 
 
 @click.command()
@@ -60,9 +60,11 @@ def problems(
         refuse_unused(context, ["count"], "without --secret")
         if check:
             refuse_unused(context, ["out"], "with --check")
-    for path, is_folder in ((out, True), (certify, False), (page, False)):
+    if out is not None:
+        context.with_resource(lock_output(out, folder=True))
+    for path in (certify, page):
         if path is not None:
-            writable(path, is_folder)
+            writable(path)
     names = [group.removeprefix("@") for group in groups]
     for name in names:
         if not is_path(name):
@@ -97,7 +99,6 @@ def problems(
                 raise click.exceptions.Exit(EXIT_UNMET)
             return
     if out is not None:
-        make_folder(out)
         for name in chosen:
             (case,) = suite.cases(name)
             case.problem.save(out / f"{file_name(name)}.npz")

@@ -30,7 +30,7 @@ from lavender.cli.options import (
     say,
     was_given,
 )
-from lavender.io.stored import writable, write_text
+from lavender.io.stored import lock_output, write_text
 
 
 @click.command(cls=ManyValues)
@@ -94,14 +94,14 @@ def report(context: click.Context, /, files: tuple[str, ...], out: Path, **asked
     from lavender.lab.report.engine import contestants
     from lavender.lab.report.findings import Report
     from lavender.lab.report.terminal import print_report
-    from lavender.lab.report.text import count
+    from lavender.lab.report.text import count, reasons
     from lavender.lab.report.write import write
 
     for limit in asked["time_budgets"]:
         if not (math.isfinite(limit) and limit > 0.0):
             raise InputError(f"time budget {limit} must be a positive number of seconds")
     _refuse_unused(context, files, asked["solvers"])
-    writable(out, folder=True)
+    context.with_resource(lock_output(out, folder=True))
     taken: set[Path] = set()
     how = {name: asked[name] for name in RECORDING}
     files = tuple(_recorded(f, out, taken, asked["fresh"], how) for f in files)
@@ -138,8 +138,7 @@ def report(context: click.Context, /, files: tuple[str, ...], out: Path, **asked
         say("Stopped; the same command continues from here.", style="yellow")
         raise click.exceptions.Exit(EXIT_INTERRUPTED)
     if not (again or done.records.records):
-        why = "; ".join(dict.fromkeys(skip.reason for skip in done.records.skips))
-        say(f"nothing was measured: {why}", style="yellow")
+        say(f"nothing was measured: {'; '.join(reasons(done.records.skips))}", style="yellow")
         raise click.exceptions.Exit(EXIT_UNMET)
     if done.lost and not again:
         say(f"{count(done.lost, 'case')} of a folder left out of every number", style="yellow")

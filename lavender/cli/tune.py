@@ -9,7 +9,7 @@ import click
 
 from lavender.cli.measuring import progress, show_sheet
 from lavender.cli.options import FILE, FOLDER, one_thread, threshold_option, worlds_options
-from lavender.io.stored import writable
+from lavender.io.stored import lock_output
 
 
 @click.command()
@@ -20,7 +20,8 @@ from lavender.io.stored import writable
 @threshold_option
 @click.option("--out", type=FOLDER, default=Path("lavender-tune"),
               show_default=True, help="Folder of the page.")  # fmt: skip
-def tune(model: Path, out: Path, **asked: Any) -> None:
+@click.pass_context
+def tune(context: click.Context, /, model: Path, out: Path, **asked: Any) -> None:
     """Measure MuJoCo's settings on worlds of a model (MJCF): time of a step beside error.
 
     Prints the <option> line that is as accurate as now and faster, and the one that is as fast as now and more
@@ -31,7 +32,7 @@ def tune(model: Path, out: Path, **asked: Any) -> None:
     """
     from lavender.lab.tune import tune as run
 
-    writable(out, folder=True)
+    context.with_resource(lock_output(out, folder=True))
     one_thread()
     with progress() as watch:
         found = run(model, watch=watch, **asked)

@@ -105,10 +105,13 @@ class Derivatives(_Each):
             As `Derivative.vjp`.
         """
         n, given = len(self), {"velocity": velocity, "impulse": impulse, "slack": slack}
-        for name, x in given.items():
-            if x is not None and len(x) != n:
+        each = [
+            [None] * n if x is None else several(name, x, "cotangents, one for each problem,")
+            for name, x in given.items()
+        ]
+        for name, x in zip(given, each, strict=True):
+            if len(x) != n:
                 raise InputError(f"{name} has {len(x)} cotangents for {n} problems; one for each is needed")
-        each = [[None] * n if x is None else list(x) for x in given.values()]
         numbers, left = self._linears.adjoint(*each)
         alone = {}
         for i in [*self._alone, *left]:

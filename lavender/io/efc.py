@@ -18,15 +18,26 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray, as_array, number, one_of, precision_of, whole_number
+from lavender.base.arrays import (
+    FloatArray,
+    as_array,
+    as_floats,
+    number,
+    one_of,
+    precision_of,
+    shape_of,
+    whole_number,
+)
 from lavender.base.errors import CapabilityError, InputError
 from lavender.base.threads import together
 from lavender.io import mujoco as single
-from lavender.problem.batch import ERRORS, Batch
+from lavender.problem.batch import ERRORS, Batch, check_counts, check_triangle
 from lavender.problem.cones import Cones, kinds_of
 from lavender_ext.judge.measure import all_finite
 
-EQUALITY, FRICTION, ELLIPTIC = 0, (1, 2), 7  # numbers of mjtConstraint; all others push only
+# Values of mjtConstraint: an equality, friction loss, the first and the last one. Rows of all others only push.
+EQUALITY, FRICTION, ELLIPTIC = 0, (1, 2), 7
+MAX_CONTACT_ROWS = 6  # The largest condim: a contact has a normal and up to five friction rows.
 # What is read of each row, beside efc_J, and of each contact: type and shape.
 OF_ROWS: dict[str, Any] = dict.fromkeys(
     ("efc_D", "efc_aref", "efc_force", "efc_frictionloss", "efc_vel"), (float, ())
@@ -70,19 +81,20 @@ def from_efc(
     efc_J : (n, m, nv)
     efc_D, efc_aref : (n, m)
     efc_type : (n, m) or (m,) int
-        Of mjtConstraint.
+        Values of mjtConstraint, 0 to 7.
     M : (n, nv, nv)
         Mass matrix, both triangles. Or its lower triangles in compressed rows, as MuJoCo Warp holds them: (values
         (n, entries), indices, indptr).
     qvel, qacc_smooth : (n, nv)
         Velocity before the step and unconstrained acceleration.
     timestep : float, s
-    efc_frictionloss : (n, m) or (m,)
+    efc_frictionloss : scalar, (n, m) or (m,)
         Read on rows of friction loss.
     nefc : (n,) int, optional
-        Rows that count; default m.
+        Rows that count, 0 to m; default m. The numbers of the rows behind them are not read.
     contacts : (world, efc_address, dim, friction), optional
-        Of contacts: (c,), (c,), (c,) int and (c, 5). Read where elliptic rows begin; others are left out.
+        Of contacts: (c,), (c,), (c,) int and (c, 5). Those that begin at an elliptic row that counts are read, and
+        must name each of these rows once. All others are ignored.
     efc_force : (n, m), optional
         The engine's answer.
     qfrc_smooth : (n, nv), optional
@@ -96,32 +108,36 @@ def from_efc(
     Raises
     ------
     InputError
-        Shapes that do not fit; a D that is not above 0; elliptic rows without contacts.
+        Shapes that do not fit; an efc_type that is no value of mjtConstraint; a D that is not above 0; a friction loss
+        below 0; elliptic rows that no contact names, or several.
     CapabilityError
         M qacc_smooth is not the smooth force: another matrix has made the problem.
     """
-    jac = np.asarray(efc_J)
-    one = np.asarray(timestep)  # MJX and Warp hold the time step as an array of one number
-    dt = number("timestep", one.item() if one.size == 1 else timestep, above=0.0)
+    jac, before = as_floats("efc_J", efc_J), as_floats("qvel", qvel)
+    # MJX and Warp hold the time step as an array of one number.
+    is_one = np.prod(shape_of("timestep", timestep)) == 1
+    dt = number("timestep", np.asarray(timestep).item() if is_one else timestep, above=0.0)
     if jac.ndim != 3:
         raise InputError(f"efc_J has shape {jac.shape}; (n, m, nv) is needed")
     n, m, nv = jac.shape
     stiff = as_array("efc_D", efc_D, (n, m), finite=False)
     goal = dt * as_array("efc_aref", efc_aref, (n, m), finite=False)
-    before, smooth = (
-        as_array(name, x, (n, nv), finite=False) for name, x in (("qvel", qvel), ("qacc_smooth", qacc_smooth))
-    )
-    of = np.broadcast_to(np.asarray(efc_type), (n, m))
-    loss = np.broadcast_to(np.asarray(efc_frictionloss, float), (n, m))
-    count = np.full(n, m) if nefc is None else np.minimum(as_array("nefc", nefc, (n,), dtype=np.int32), m)
+    smooth = as_array("qacc_smooth", qacc_smooth, (n, nv), finite=False)
+    of, loss = _of_rows("efc_type", efc_type, n, m), _of_rows("efc_frictionloss", efc_frictionloss, n, m)
+    count = np.full(n, m) if nefc is None else check_counts("nefc", nefc, n, m)
     counted = np.arange(m) < count[:, None]
-    off = np.argwhere(counted & ~(stiff > 0.0) & np.isfinite(stiff))
-    if len(off):
-        raise InputError(
-            f"efc_D of world {off[0][0]}, row {off[0][1]} is {stiff[tuple(off[0])]:g}; above 0 is needed"
-        )
-    mass = _whole(*map(np.asarray, M)) if isinstance(M, tuple) else np.asarray(M)
-    precision = precision_of(jac, mass, np.asarray(qvel))
+    _check_rows(
+        "efc_type",
+        of,
+        counted & ~((of >= 0.0) & (of <= ELLIPTIC) & (of == np.rint(of))),
+        "a value of mjtConstraint, 0 to 7,",
+    )
+    _check_rows("efc_D", stiff, counted & (stiff <= 0.0), "above 0")
+    held = counted & ((of == FRICTION[0]) | (of == FRICTION[1]))
+    _check_rows("efc_frictionloss", loss, held & ~((loss >= 0.0) & (loss < np.inf)), "a finite number from 0")
+    mass = _mass(M, n, nv)
+    precision = precision_of(jac, mass, before)
+    before = as_array("qvel", before, (n, nv), finite=False)
     if qfrc_smooth is not None:
         _check_mass(mass, smooth, as_array("qfrc_smooth", qfrc_smooth, (n, nv), finite=False), precision)
     free = before + dt * smooth
@@ -314,12 +330,39 @@ def _gathered(
     return Imported(batch, lam)
 
 
-def _whole(values: Any, indices: Any, indptr: Any) -> Any:
-    """M (n, nv, nv) of its lower triangles in compressed rows."""
-    nv = len(indptr) - 1
-    row, whole = np.repeat(np.arange(nv), np.diff(indptr)), np.zeros((len(values), nv, nv), values.dtype)
-    whole[:, row, indices] = values
-    whole[:, indices, row] = values
+def _of_rows(name: str, given: Any, n: int, m: int) -> FloatArray:
+    """Numbers of all rows (n, m), of (n, m), (m,) or one number."""
+    if len(shape_of(name, given)) == 2:
+        return as_array(name, given, (n, m), finite=False)
+    return np.broadcast_to(as_array(name, given, (m,), finite=False), (n, m))
+
+
+def _check_rows(name: str, numbers: FloatArray, wrong: Any, needed: str) -> None:
+    """Raise InputError at the first row of a world that is wrong."""
+    if wrong.any():
+        at = np.argwhere(wrong)
+        i, row = at[0]
+        raise InputError(
+            f"{name} of world {i}, row {row} is {numbers[i, row]:g}, {len(at)} in all; {needed} is needed"
+        )
+
+
+def _mass(given: Any, n: int, nv: int) -> Any:
+    """M (n, nv, nv), also of its lower triangles in compressed rows."""
+    values, *pattern = given if isinstance(given, tuple) and given else (given,)
+    values = as_floats("M", values)
+    if not pattern:
+        if values.ndim == 2:
+            values = np.broadcast_to(values, (n, *values.shape))
+        if values.shape != (n, nv, nv):
+            raise InputError(f"M has shape {values.shape}; {(n, nv, nv)} is needed")
+        return values
+    if values.ndim != 2 or len(values) != n:
+        raise InputError(f"values of M have shape {values.shape}; ({n}, entries) is needed")
+    ptr, col = check_triangle(pattern, np.full(n, nv), values)
+    row, whole = np.repeat(np.arange(nv), np.diff(ptr)), np.zeros((n, nv, nv), values.dtype)
+    whole[:, row, col] = values
+    whole[:, col, row] = values
     return whole
 
 
@@ -336,6 +379,53 @@ def _check_mass(mass: Any, smooth: FloatArray, force: FloatArray, precision: str
         )
 
 
+def _elliptic_contacts(contacts: Any, elliptic: Any) -> tuple[Any, ...]:
+    """Return world, first row, rows and coefficients of each contact that begins at a row of `elliptic` (n, m).
+
+    Raises
+    ------
+    InputError
+        Not four arrays of one length; a contact without friction coefficients; rows that no contact or several name.
+    """
+    if not isinstance(contacts, (tuple, list)) or len(contacts) != 4:
+        raise InputError(f"contacts is {contacts!r:.60}; (world, efc_address, dim, friction) is needed")
+    names = [f"{name} of contacts" for name in ("world", "efc_address", "dim")]
+    size = (shape_of(names[0], contacts[0]) or (None,))[0]
+    world, address, dim = (
+        as_array(name, x, (size,), dtype=np.int32) for name, x in zip(names, contacts, strict=False)
+    )
+    rub = as_array("friction of contacts", contacts[3], (size, MAX_CONTACT_ROWS - 1), finite=False)
+    n, m = elliptic.shape
+    here = np.flatnonzero((address < m) & (world >= 0) & (world < n) & (address >= 0))
+    here = here[elliptic[world[here], address[here]] & (dim[here] > 1)]
+    world, address, dim, rub = world[here], address[here], dim[here], rub[here]
+    large = np.flatnonzero(dim > np.minimum(MAX_CONTACT_ROWS, m - address))
+    if len(large):
+        k = large[0]
+        raise InputError(
+            f"dim of contact {here[k]} is {dim[k]}; at most {MAX_CONTACT_ROWS}, and rows up to {m}, are needed"
+        )
+    used = np.arange(1, MAX_CONTACT_ROWS) < dim[:, None]
+    bad = np.argwhere(used & ~((rub > 0.0) & (rub < np.inf)))
+    if len(bad):
+        k, j = bad[0]
+        raise InputError(
+            f"friction of contact {here[k]} is {rub[k, j]:g} at {j}; a finite number above 0 is needed"
+        )
+    first = world * np.int64(m) + address
+    rows = [first[dim > j] + j for j in range(MAX_CONTACT_ROWS)]
+    named = np.bincount(np.concatenate(rows), minlength=n * m).reshape(n, m)
+    if (named != elliptic).any():
+        off = np.argwhere(named != elliptic)
+        i, row = off[0]
+        kind = "an" if elliptic[i, row] else "no"
+        raise InputError(
+            f"row {row} of world {i} is {kind} elliptic row by efc_type, and {named[i, row]} contacts name it, "
+            f"{len(off)} such rows in all; each elliptic row is needed once"
+        )
+    return world, address, dim, rub
+
+
 def _blocks(of: Any, loss: Any, counted: Any, contacts: Any, dt: float) -> tuple[Cones, FloatArray | None]:
     """Blocks of all rows that count, one world after the other, and the factor of each row (n, m), None: 1."""
     n, m = of.shape
@@ -345,16 +435,7 @@ def _blocks(of: Any, loss: Any, counted: Any, contacts: Any, dt: float) -> tuple
     if elliptic.any() and contacts is None:
         raise InputError("efc_type has rows of elliptic contacts; contacts= is needed, with their friction")
     if contacts is not None:
-        world, address, dim, rub = (np.asarray(x) for x in contacts)
-        inside = (address < m) & (world >= 0) & (world < n) & (address >= 0)
-        here = np.flatnonzero(inside)
-        here = here[elliptic[world[here], address[here]] & (dim[here] > 1)]
-        world, address, dim, rub = world[here], address[here], dim[here], rub[here].astype(float)
-        if np.sum(dim) != np.count_nonzero(elliptic):
-            rows = np.count_nonzero(elliptic)
-            raise InputError(
-                f"efc_type has {rows} rows of elliptic contacts, contacts name {np.sum(dim)} of them"
-            )
+        world, address, dim, rub = _elliptic_contacts(contacts, elliptic)
         tangents[world, address], mu[world, address] = dim - 1, rub[:, 0]
         factor = np.ones((n, m))
         for j in range(1, int(np.max(dim, initial=1))):

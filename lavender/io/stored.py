@@ -29,6 +29,14 @@ ENGINE = "engine.jsonl"  # beside recorded problems: what the engine itself said
 
 MAX_BYTES = 2**31  # of what a file makes in memory; a megabyte can declare a terabyte
 PART_OF_NAME = 40  # characters, at most four bytes each, of the 255 that a name may have
+FOLDER_LOCK = (
+    ".lavender.lock"  # The lock file of an output folder; that of an output file is FILE.lock beside it.
+)
+# An output is written without a lock if its file system answers with one of these errors: it has no locks.
+WITHOUT_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP)
+LOCK_TIMEOUT = (
+    0.2  # s until an output counts as held: long enough for a second try if its holder ends meanwhile.
+)
 NUMBER = 8  # bytes of a number once it is read: float64, or an index before it is checked
 PART = re.compile(r"\..*\.(\d+)\.\d+\.part(\.\w+)?")  # names of files that are not whole yet
 FORGOTTEN = 86400.0  # s, after which a part is of a writer that was killed: none takes that long
@@ -60,13 +68,11 @@ def folder_for_steps(
     """A folder, made where it is not, that holds no problem file: steps of two recordings are no sequence.
 
     `replace` takes the problem files out that it holds; those of a recording that is `continued` stay. What an engine
-    said of others goes in either case. Whoever records into it meanwhile is refused.
+    said of others goes in either case. Another recording into it is refused meanwhile.
     """
-    folder, replace = writable(path, folder=True), flag("replace", replace)
-    with contextlib.ExitStack() as held:
+    replace = flag("replace", replace)
+    with lock_output(path, folder=True) as folder:
         try:
-            make_folder(folder)
-            _hold(folder, held)
             old = [p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES and p.is_file()]
             if old and not replace and not continued:
                 raise InputError(
@@ -80,22 +86,51 @@ def folder_for_steps(
         yield folder
 
 
-def _hold(folder: Path, held: contextlib.ExitStack) -> None:
-    """Lock a folder where the system can, until `held` ends; a process that dies holds nothing."""
+@contextlib.contextmanager
+def lock_output(path: str | os.PathLike[str], folder: bool = False) -> Iterator[Path]:
+    """Hold the lock of an output, a file or a folder, until the block ends, and return its path.
+
+    The lock is the operating system's: a process that dies holds nothing. A folder is made if it is not there, and
+    removed at the end if it is still empty then.
+
+    Raises
+    ------
+    InputError
+        Another command or another thread holds the lock, or the output cannot be written.
+    """
+    from filelock import FileLock, Timeout  # takes 30 ms, which commands that write nothing need not pay
+
+    path = writable(path, folder)
+    place = _behind_links(path) if folder else destination(path)  # one lock for all names of an output
+    is_new = folder and not place.exists()
+    if folder:
+        make_folder(place)
+    lock = FileLock(place / FOLDER_LOCK if folder else f"{place}.lock", thread_local=False)
     try:
-        import fcntl
-    except ImportError:  # not on Windows
-        return
-    descriptor = os.open(folder, os.O_RDONLY)
-    held.callback(os.close, descriptor)
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
+        lock.acquire(timeout=LOCK_TIMEOUT)
+    except Timeout:
         raise InputError(
-            f"another recording is being written into {folder}: wait for it, or give another folder"
+            f"{path} is being written by another command: wait for it, or give another {'folder' if folder else 'file'}"
         ) from None
-    except OSError:
-        pass  # a file system without locks
+    except NotImplementedError:
+        pass
+    except OSError as error:
+        if error.errno not in WITHOUT_LOCKS:
+            raise InputError(
+                f"cannot write {path} ({lock.lock_file}: {error.strerror or error}): give a path that you may write to"
+            ) from None
+    try:
+        yield path
+    finally:
+        if lock.is_locked:
+            with contextlib.suppress(OSError):  # an open file cannot be removed on Windows
+                os.unlink(
+                    lock.lock_file
+                )  # before its lock goes: FileLock rejects a file that has lost its name
+            lock.release()
+        if is_new:
+            with contextlib.suppress(OSError):
+                place.rmdir()
 
 
 def _behind_links(path: Path) -> Path:

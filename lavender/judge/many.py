@@ -13,7 +13,16 @@ from typing import Any
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray, as_array, number, one_of, places, whole_number
+from lavender.base.arrays import (
+    FloatArray,
+    as_array,
+    number,
+    one_of,
+    places,
+    read_only,
+    several,
+    whole_number,
+)
 from lavender.base.errors import InputError, LavenderError
 from lavender.base.threads import together
 from lavender.judge.residuals import AT_REST, ENOUGH, VERDICTS, Residual, residual, verdict_of
@@ -26,7 +35,7 @@ DONE_ALL = -1  # of `Hand`: there are no more worlds
 
 
 class Many:
-    """n worlds, and what the judge found of them."""
+    """n worlds, and what the judge found of them; all arrays are read-only."""
 
     def __init__(self, given: Any, starts: Any, cold: bool) -> None:
         """Of a batch, or of problems; starts: flat impulses [N s] of the batch, or (m,) or None of each problem."""
@@ -76,13 +85,11 @@ class Many:
     def worst_row(self) -> np.ndarray:
         """(n,) row of the largest velocity error, counted in its world; -1 where there is none."""
         self._read()
-        worst: np.ndarray = self._worlds.worst[:-1]
-        return worst
+        return read_only(self._worlds.worst[:-1])
 
     def _numbers(self, which: str) -> FloatArray:
         self._read()
-        found: FloatArray = self._worlds.numbers[NUMBER[which], :-1]
-        return found
+        return read_only(self._worlds.numbers[NUMBER[which], :-1])
 
     def _read(self) -> None:
         """Judge what is not yet."""
@@ -190,7 +197,7 @@ class Residuals(Many):
         words = [verdict_of(*x, self.threshold) for x in each]  # type: ignore[call-arg]
         for i in self.faults:
             words[i] = ""
-        return np.array(words, f"U{max(map(len, VERDICTS))}")
+        return read_only(np.array(words, f"U{max(map(len, VERDICTS))}"))
 
     @property
     def excess(self) -> FloatArray:
@@ -267,6 +274,11 @@ def residual_many(
         words = len(given) * [given.precision if precision is None else precision]
     else:
         starts = of_each(given, impulses)
+        for i, start in enumerate(starts):
+            if start is None:
+                raise InputError(
+                    f"impulses of world {i} is None, and the problem has no guess; (m,) is needed"
+                )
         words = [p.precision if precision is None else precision for p in given]
     made = Residuals(given, starts, words, threshold)
     single = isinstance(given, Batch) and "float32" in words
@@ -285,9 +297,7 @@ def given_problems(problems: Any, errors: str) -> Any:
         raise InputError("problems is one Problem; a list of them is needed, or `solve`")
     if isinstance(problems, Batch):
         return problems
-    if not isinstance(problems, Iterable):
-        raise InputError(f"problems is {problems!r:.60}; a Batch or problems are needed")
-    given = list(problems)
+    given = several("problems", problems, "Problems, or a Batch,")
     for problem in given:
         if type(problem) is not Problem:
             check_problem(problem)
@@ -296,8 +306,7 @@ def given_problems(problems: Any, errors: str) -> Any:
 
 def of_each(given: Any, impulses: Any) -> list[Any]:
     """Impulses (m,) [N s] of each problem, its guess where there are none."""
-    if not hasattr(impulses, "__len__"):
-        raise InputError(f"impulses is {impulses!r:.60}; one (m,) for each problem is needed")
+    impulses = several("impulses", impulses, "(m,), one for each problem,")
     if len(impulses) != len(given):
         raise InputError(f"{len(impulses)} impulses for {len(given)} problems; one for each is needed")
     return [

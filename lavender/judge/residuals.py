@@ -375,7 +375,7 @@ def residual(
     if last is None:
         last = judged(problem, impulse)
     found = told(problem, last)
-    if threshold != ENOUGH:
+    if type(threshold) is not float or threshold != ENOUGH:
         found = replace(found, threshold=number("threshold", threshold, low=0.0))
     return found if precision == "float64" else _in_float32(problem, found, impulse)
 

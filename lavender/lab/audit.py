@@ -27,7 +27,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lavender.base.arrays import FloatArray, number
-from lavender.base.errors import InputError, UnknownName
+from lavender.base.errors import InputError, check_name
 from lavender.io import npz
 from lavender.io.efc import from_mujoco_many
 from lavender.io.recording import Control
@@ -400,11 +400,10 @@ def audit(
         A model that cannot be read, an engine that is not installed, numbers out of range.
     CapabilityError
         An integrator whose problem is not of M.
-    UnknownName
+    check_name
         Another engine.
     """
-    if engine not in ENGINES:
-        raise UnknownName("engine", engine, ENGINES)
+    check_name("engine", engine, ENGINES)
     if precision not in (None, *PRECISIONS) or (precision and engine != "mujoco"):
         raise InputError(f"precision is {precision!r}; {' or '.join(PRECISIONS)}, of MuJoCo alone, is needed")
     check_workers(workers)

@@ -6,21 +6,24 @@ Arrays are read where they stand, in float32 or float64: what is made of one wor
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, overload
 
 import numpy as np
 
 from lavender.base.arrays import (
+    FLOATS,
     ArrayLike,
     FloatArray,
     as_array,
+    as_floats,
     check_sizes,
     check_unmasked,
     one_of,
     places,
     precision_of,
+    several,
     shape_of,
 )
 from lavender.base.errors import InputError
@@ -36,7 +39,6 @@ __all__ = ["Batch"]
 ERRORS = ("raise", "status")
 FIELDS = ("inv_mass", "inv_inertia", "v_free", "jac", "normal", "tangent", "arm_a", "arm_b")  # of bodies
 PAIRS = ("joint_body", "contact_body")
-MADE = {np.dtype(np.float32), np.dtype(np.float64)}
 
 
 class Batch(Sequence[Problem]):
@@ -108,7 +110,7 @@ class Batch(Sequence[Problem]):
     ) -> None:
         friction = one_of("friction", friction, FRICTION)
         values, *pattern = M if isinstance(M, tuple) else (M,)
-        jac, mass, free = (_numbers(name, x) for name, x in (("J", J), ("M", values), ("v_free", v_free)))
+        jac, mass, free = (as_floats(name, x) for name, x in (("J", J), ("M", values), ("v_free", v_free)))
         if row_ptr is not None and count is None:
             rows = _pointers("row_ptr", row_ptr)
             if jac.ndim == 2 and velocity_ptr is None:
@@ -129,7 +131,7 @@ class Batch(Sequence[Problem]):
             room = None
         elif row_ptr is None and velocity_ptr is None and jac.ndim == 3:
             n, room, nv = jac.shape
-            sizes = np.full(n, room) if count is None else _counts(count, n, room)
+            sizes = np.full(n, room) if count is None else check_counts("count", count, n, room)
             nvs = np.full(n, nv)
             rows, velocities = room * np.arange(n + 1), nv * np.arange(n + 1)
             self.shape, self.velocity_shape = (n, room), (n, nv)
@@ -143,7 +145,7 @@ class Batch(Sequence[Problem]):
         at[:, PLACE["rows"]], at[:, PLACE["velocities"]] = sizes, nvs
         at[:, PLACE["row"]], at[:, PLACE["velocity"]] = rows[:-1], velocities[:-1]
         self._place_cones(cones)
-        self._pattern = _triangle(pattern, nvs, mass) if pattern else None
+        self._pattern = check_triangle(pattern, nvs, mass) if pattern else None
         if room is not None and mass.ndim == 2 and not pattern:
             mass = np.broadcast_to(mass, (n, *mass.shape))
         square = (None, None) if room is None else ((room, nv), (nv, nv))
@@ -173,7 +175,7 @@ class Batch(Sequence[Problem]):
         friction: str = "coulomb",
     ) -> Batch:
         """Of matrices A (n, m, m) [1/kg] and b (n, m) [m/s]; each becomes a `Problem` when its turn comes."""
-        matrix, rhs = _numbers("A", A), _numbers("b", b)
+        matrix, rhs = as_floats("A", A), as_floats("b", b)
         if matrix.ndim != 3 or matrix.shape[1] != matrix.shape[2] or rhs.shape != matrix.shape[:2]:
             raise InputError(f"A has shape {matrix.shape} and b {rhs.shape}; (n, m, m) and (n, m) are needed")
         n, m = rhs.shape
@@ -298,7 +300,7 @@ class Batch(Sequence[Problem]):
         c = self.cones
         if self._shared and mu is None:
             return c
-        part = c.take(np.arange(block, block + k))
+        part = c._take_blocks(np.arange(block, block + k))
         if mu is None:
             return part
         check_sizes("mu", mu, "-")
@@ -431,7 +433,9 @@ class Batch(Sequence[Problem]):
             x, kind = {**parts, **more}.get(name, own), np.int32 if name in PAIRS else np.float64
             if np.ndim(x) <= own.ndim:
                 found[name] = np.ascontiguousarray(own), 0
-            elif x.shape == (n, *own.shape) and (x.dtype in MADE if kind is np.float64 else _are_indices(x)):
+            elif x.shape == (n, *own.shape) and (
+                x.dtype in FLOATS if kind is np.float64 else _are_indices(x)
+            ):
                 found[name] = np.ascontiguousarray(x, kind), own.size
             else:
                 return None
@@ -444,16 +448,6 @@ class Batch(Sequence[Problem]):
 
 
 # -- what is given ------------------------------------------------------------------------------------
-
-
-def _numbers(name: str, x: Any) -> np.ndarray:
-    """As float32 or float64, where it stands if it is one of them."""
-    shape_of(name, x)
-    check_unmasked(name, x)
-    given = np.asarray(x)
-    if given.dtype not in MADE:
-        given = as_array(name, given, (None,) * given.ndim, finite=False)
-    return given
 
 
 def _are_indices(x: np.ndarray) -> bool:
@@ -475,8 +469,8 @@ def _pointers(name: str, given: Any) -> np.ndarray:
     return ptr
 
 
-def _triangle(given: Sequence[Any], nvs: Any, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(indptr, indices) of lower triangles that worlds of nvs velocities share, from (indices, indptr)."""
+def check_triangle(given: Sequence[Any], nvs: Any, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return (indptr, indices) of lower triangles that worlds of nvs velocities share, from (indices, indptr)."""
     if len(given) != 2:
         raise InputError(f"M is a tuple of {1 + len(given)}; (values, indices, indptr) is needed")
     col, ptr = (
@@ -500,11 +494,14 @@ def _triangle(given: Sequence[Any], nvs: Any, values: np.ndarray) -> tuple[np.nd
     return ptr, col
 
 
-def _counts(given: Any, n: int, room: int) -> np.ndarray:
-    count = as_array("count", given, (n,), dtype=np.int32).astype(np.int64)
-    bad = np.flatnonzero((count < 0) | (count > room))
+def check_counts(name: str, given: Any, n: int, capacity: int) -> np.ndarray:
+    """Numbers of rows of n worlds (n,), each from 0 to the rows that J has; InputError names the first other one."""
+    count = as_array(name, given, (n,), dtype=np.int32).astype(np.int64)
+    bad = np.flatnonzero((count < 0) | (count > capacity))
     if len(bad):
-        raise InputError(f"count of world {bad[0]} is {count[bad[0]]}; J has room for 0 to {room} rows")
+        raise InputError(
+            f"{name} of world {bad[0]} is {count[bad[0]]}; 0 to {capacity}, the rows that J has, are needed"
+        )
     return count
 
 
@@ -541,7 +538,7 @@ def _matrices(
 
 def _vectors(name: str, given: Any, n: int, each: int | None, sizes: Any) -> tuple[np.ndarray, Any]:
     """Vectors of n worlds, flat, and where each begins; a scalar, or one of one world, is of all."""
-    x = _numbers(name, given)
+    x = as_floats(name, given)
     if x.ndim == 0:
         return np.full(int(np.max(sizes, initial=0)), float(x)), 0
     if each is None:
@@ -566,7 +563,7 @@ def _ragged(name: str, x: np.ndarray, sizes: Any) -> tuple[np.ndarray, Any]:
 
 def _joined(cones: Any, n: int) -> Cones:
     """The blocks of n worlds one after the other."""
-    each = list(cones) if isinstance(cones, Iterable) else []
+    each = several("cones", cones, f"Cones, one for each of {n} worlds,")
     if len(each) != n or not all(isinstance(c, Cones) for c in each):
         raise InputError(f"cones is a Cones, or one for each of {n} worlds; {len(each)} things came")
     return Cones._joined(each)

@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Any, TypeVar
 
 import numpy as np
 
-from lavender.base.arrays import ArrayLike, FloatArray, IntArray, as_array, precision_of, shape_of
+from lavender.base.arrays import (
+    ArrayLike,
+    FloatArray,
+    IntArray,
+    as_array,
+    check_unmasked,
+    precision_of,
+    shape_of,
+)
 from lavender.base.errors import InputError
 from lavender.problem.cones import Cones, kinds_of
 from lavender.problem.data import checked_matrix
@@ -22,6 +30,18 @@ from lavender_ext.core.problem import rows_velocity
 
 P = TypeVar("P", bound="Builders")
 
+#: What every method that makes a problem passes on to `Problem`.
+SHARED = ("name", "names", "key", "friction", "guess", "compliance", "precision", "copy")
+BOUNDS = ("lower", "upper", "mu", "tangents", "patch_radius", "rolling", "shape")  # of rows of bodies
+
+
+def check_keywords(method: str, given: Iterable[str], own: Sequence[str] = ()) -> None:
+    """Raise InputError at a keyword that `Problem.method` does not take; the message names those that it takes."""
+    for name in given:
+        if name not in SHARED:
+            takes = ", ".join(f"{word}=" for word in (*own, *SHARED))
+            raise InputError(f"Problem.{method} has no argument {name}=; it takes {takes}")
+
 
 class Builders(Operators):
     """Ways to make a problem."""
@@ -29,6 +49,7 @@ class Builders(Operators):
     @classmethod
     def linear(cls: type[P], A: Any, b: ArrayLike, **more: Any) -> P:
         """A lambda = b: every row unbounded. A (m, m) [1/kg], b (m,) [m/s]."""
+        check_keywords("linear", more)
         b = as_array("b", b, (None,), unit="m/s")
         return cls(b, Cones.free(len(b)), A, **more)
 
@@ -37,6 +58,7 @@ class Builders(Operators):
         cls: type[P], A: Any, b: ArrayLike, lower: ArrayLike = 0.0, upper: ArrayLike = np.inf, **more: Any
     ) -> P:
         """Boxed LCP: lower <= lambda <= upper complementary to A lambda - b; bounds scalar or (m,) [N s]."""
+        check_keywords("lcp", more, ("lower", "upper"))
         b = as_array("b", b, (None,), unit="m/s")
         bounds = [
             as_array(n, x, (len(b),), finite=False, unit="N s")
@@ -75,7 +97,9 @@ class Builders(Operators):
         InputError
             The rows do not part among the contacts; mu > 0 where contacts have no row for friction.
         """
+        check_keywords("contact", more, ("mu", "patch_radius", "rolling"))
         b = as_array("b", b, (None,), unit="m/s")
+        check_unmasked("mu", mu)
         if len(shape_of("mu", mu)) > 1:
             return cls(b, Cones.contacts(mu, 2, patch_radius, rolling=rolling), A, **more)
         turns = (patch_radius is not None) + 2 * (rolling is not None)
@@ -143,6 +167,7 @@ class Builders(Operators):
         >>> lv.solve(problem, tol=1e-9).impulse.tolist()  # N s: the first slides, the second holds
         [10.0, 5.0, -1.0]
         """
+        check_keywords("from_findex", more, ("lower", "upper", "findex"))
         b = as_array("b", b, (None,), unit="m/s")
         order, cones = blocks_of(lower, upper, findex, len(b))
         if (order[1:] < order[:-1]).any():
@@ -241,6 +266,7 @@ class Builders(Operators):
         >>> round(float(v * dt), 6)  # m: it rises by its depth
         0.01
         """
+        check_keywords("from_rows", more, ("target", *BOUNDS))
         if not isinstance(rows, Rows):
             raise InputError(f"rows is a {type(rows).__name__}; a Rows is needed")
         mu = as_array("mu", mu, (rows.n_contacts,))
@@ -316,6 +342,7 @@ class Builders(Operators):
         >>> round(float((inside.generalized.velocity_of(inside.velocity(pushed.impulse)))[0] / 60), 6)  # m
         0.01
         """
+        check_keywords("from_jacobian", more, ("target", "cones", "dof_names"))
         generalized = J if isinstance(J, Generalized) else Generalized(J, M, v_free, dof_names)
         m = generalized.m
         if isinstance(cones, Cones) and cones.n_rows != m:
@@ -387,6 +414,7 @@ class Builders(Operators):
         >>> answer.x.round(9).tolist(), answer.y.round(9).tolist(), answer.z_box.round(9).tolist()
         ([0.3, 0.7], [-1.95], [0.0, 0.1])
         """
+        check_keywords("from_qp", more, ("P", "q", "G", "h", "A", "b", "lb", "ub"))
         qp = quadratic(unpacked((P, q, G, h, A, b, lb, ub)))
         return cls(qp.generalized.bias(qp.target), qp.cones, generalized=qp.generalized, qp=qp, **more)
 
@@ -437,6 +465,8 @@ class Builders(Operators):
                     general.names,
                 )
             )
+        if general is not None and general.m != self.m:
+            raise InputError(f"J has {general.m} rows; {self.m} are needed, as the problem has")
         if target is not None and general is not None:
             with np.errstate(over="ignore", invalid="ignore"):  # what is not finite, the problem refuses
                 b = as_array("target", target, (self.m,), unit="m/s") - general.velocity_of(general.v_free)

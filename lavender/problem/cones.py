@@ -34,6 +34,7 @@ from lavender.base.arrays import (
     check_not_nan,
     check_sizes,
     equal,
+    places,
     read_only,
     shape_of,
     whole_number,
@@ -508,8 +509,16 @@ class Cones:
             if rolling[i] >= 0:
                 yield i, np.arange(rolling[i], rolling[i] + 2)
 
-    def take(self, blocks: IntArray) -> Cones:
-        """These blocks, by number, in this order."""
+    def take(self, blocks: ArrayLike) -> Cones:
+        """Return these blocks, by number or by a mask, in this order; InputError at a number that no block has."""
+        try:
+            chosen = places(blocks, self.n_blocks, "block")
+        except IndexError as error:
+            raise InputError(f"blocks: {error}") from None
+        return self._take_blocks(np.array(chosen if isinstance(chosen, list) else [chosen], np.int32))
+
+    def _take_blocks(self, blocks: IntArray) -> Cones:
+        """`take` of numbers that are known to be those of blocks."""
         size = np.diff(self.ptr)[blocks]
         ptr = np.concatenate([[0], np.cumsum(size)]).astype(np.int32)
         rows = np.arange(ptr[-1]) + np.repeat(self.ptr[:-1][blocks] - ptr[:-1], size)

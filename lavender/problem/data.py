@@ -15,6 +15,7 @@ from lavender.base.arrays import (
     as_csr,
     check_finite,
     check_sizes,
+    check_unmasked,
     equal,
     one_of,
     read_only,
@@ -135,6 +136,7 @@ class ProblemData:
             put(self, "guess", guess)
         if self.key is not None:
             shape_of("key", self.key)
+            check_unmasked("key", self.key)
             key = np.asarray(self.key)
             if (
                 key.shape != (k,)
@@ -310,6 +312,9 @@ def _check_rhs(b: FloatArray) -> None:
             f"b [m/s] is {top:g} at most, at [{int(np.argmax(np.abs(b)))}]; its largest must be 0 or at least "
             f"{LEAST:g}: another unit of length or time brings it nearer to 1"
         )
+
+
+ProblemData.__init__.__qualname__ = "Problem.__init__"  # a TypeError then names the class that users call
 
 
 def check_problem(problem: Any) -> None:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from lavender.base.arrays import FloatArray, as_array, check_sizes
-from lavender.base.errors import InputError, UnknownName
+from lavender.base.errors import InputError, check_name
 
 # What bounds two tangents: their norm, or each by itself.
 SHAPES = ("disk", "box")
@@ -24,8 +24,7 @@ def check_shape(name: str, shape: Any) -> str:
     UnknownName
         None of them.
     """
-    if not isinstance(shape, str) or shape not in SHAPES:
-        raise UnknownName(name, shape, SHAPES)
+    check_name(name, shape, SHAPES)
     return shape
 
 

@@ -23,6 +23,7 @@ from lavender.base.arrays import (
     equal,
     precision_of,
     read_only,
+    whole_number,
     words_for,
 )
 from lavender.base.errors import InputError
@@ -206,7 +207,8 @@ class Generalized:
         return int(self.operator.n)
 
     def velocity_name(self, i: int) -> str:
-        """Name of velocity i."""
+        """Name of velocity i; InputError if there is no such velocity."""
+        i = whole_number("i", i, high=self.nv - 1)
         return f"velocity {i}" if self.names is None else self.names[i]
 
     @cached_property

@@ -231,6 +231,11 @@ class Rows:
 
     def jacobian(self, cones: Cones) -> sp.csr_array:
         """J as CSR (m, 6 n); the columns of body i are 6 i .. 6 i + 5, linear then angular."""
+        fits = isinstance(cones, Cones) and cones.n_blocks == self.n_joints + self.n_contacts
+        if not fits or cones.ptr[self.n_joints] != len(self.jac):
+            raise InputError(
+                f"cones is {cones!r:.60}; the Cones of {self.n_joints} joints and {self.n_contacts} contacts are needed"
+            )
         tangents = cones.n_tangents[self.n_joints :]
         first = cones.ptr[self.n_joints : -1]
         m = cones.n_rows

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any
 
-from lavender.base.errors import InputError, UnknownName
+from lavender.base.errors import InputError, check_name
 from lavender.judge.solution import Claim
 from lavender.problem import Problem
 from lavender.problem.ordering import Order, block_order
@@ -64,8 +64,8 @@ class Accelerated(Sweeping):
         return forming(problem) if over_a else 0.0
 
     def _check(self, problem: Problem) -> None:
-        if self.sweep is not None and self.sweep not in SWEEPS:
-            raise UnknownName("sweep", self.sweep, SWEEPS)
+        if self.sweep is not None:
+            check_name("sweep", self.sweep, SWEEPS)
         if self.sweep == "pgs" and problem.law == "cone":
             raise InputError("sweep='pgs' has no update for the cone law; sweep='blocks' has")
         if not isinstance(self.convex, int) or self.convex < 0:

@@ -56,7 +56,7 @@ def rows_of(problem: Problem, blocks: IntArray) -> IntArray:
 
 def restrict(problem: Problem, blocks: IntArray, rows: IntArray) -> Problem:
     """The problem of these blocks alone; exact where they are whole islands, but for a b that is dust in all rows."""
-    cones = problem.cones.take(blocks)
+    cones = problem.cones._take_blocks(blocks)
     names = None if problem.names is None else [problem.names[i] for i in blocks]
     more: dict[str, Any] = {"friction": problem.friction, "names": names, "name": problem.name}
     b: FloatArray = problem.b[rows] if largest(problem.b[rows]) >= LEAST else np.zeros(len(rows))

@@ -71,7 +71,7 @@ def lay_out(problem: Problem, blocks: IntArray, before: Layout | None = None) ->
     rank = np.append(ranks, np.int32(-1))  # a static body, -1, stays -1
     body = np.argsort(rank[:-1])
     given = _apart(
-        *c.take(blocks)._blocks.arrays, problem.b[rows],
+        *c._take_blocks(blocks)._blocks.arrays, problem.b[rows],
         r.jac[rows[:mj]], rank[r.joint_body[joint]], r.normal[contact], r.tangent[contact], r.arm_a[contact],
         r.arm_b[contact], rank[r.contact_body[contact]], r.inv_mass[body], r.inv_inertia[body],
         problem.compliance[rows],

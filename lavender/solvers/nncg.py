@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from lavender.base.errors import UnknownName
+from lavender.base.errors import check_name
 from lavender.solvers._accelerated import CONVEX_OPTION, SWEEP_OPTION, Accelerated
 from lavender.solvers.registry import SolverSpec
 
@@ -31,8 +31,7 @@ class NNCG(Accelerated):
     restart: str = "growth"
 
     def __post_init__(self) -> None:
-        if self.restart not in RESTARTS:
-            raise UnknownName("restart", self.restart, RESTARTS)
+        check_name("restart", self.restart, RESTARTS)
 
     @property
     def _keeps(self) -> bool:

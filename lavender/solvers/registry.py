@@ -16,7 +16,7 @@ from typing import Any, Protocol
 
 from lavender.base.arrays import FloatArray, flag, whole_number
 from lavender.base.deadline import Deadline
-from lavender.base.errors import InputError, SolverUnavailable, UnknownName, last_words
+from lavender.base.errors import InputError, SolverUnavailable, UnknownName, check_name, last_words
 from lavender.base.later import imported, loading
 from lavender.judge.solution import Claim, Status
 from lavender.problem import LAWS, OPERATORS, Problem, check_problem
@@ -229,6 +229,7 @@ class SolverSpec:
         """None when the solver takes this problem, else the reason."""
         if self.takes_all:
             return None
+        check_problem(problem)
         asked, problem = problem, problem.disk
         law = problem.law
         if law in self.laws and law not in ("linear", "lcp", *self.boxes) and problem.cones.has_box:
@@ -270,6 +271,7 @@ class SolverSpec:
 
     def standing_in(self, problem: Problem) -> SolverSpec | None:
         """The same method with bounds, where a problem's bounds are what this one refuses; else None."""
+        check_problem(problem)
         other = specs().get(self.with_bounds)
         bounds = other is not None and problem.law not in self.laws and other.refuses(problem) is None
         return other if bounds else None
@@ -360,7 +362,7 @@ def register(spec: SolverSpec, *, replace: bool = False) -> None:
         Not a SolverSpec, or the name is taken.
     """
     load()
-    _add(spec, replace)
+    _add(spec, flag("replace", replace))
 
 
 def _add(spec: SolverSpec, replace: bool) -> None:
@@ -436,15 +438,17 @@ def available(problem: Problem | None = None, *, law: str | None = None, **capab
     for name in capabilities:
         if name not in flags:
             raise InputError(f"unknown capability {name!r}; known: {', '.join(sorted(flags))}")
-    if law is not None and law not in LAWS:
-        raise UnknownName("law", law, LAWS)
+    if law is not None:
+        check_name("law", law, LAWS)
+    for name, value in capabilities.items():
+        flag(name, value)
     table = specs()
     return [
         name
         for name, reason in known(problem).items()
         if reason is None
         and (law is None or law in table[name].laws)
-        and all(bool(getattr(table[name], c)) == bool(v) for c, v in capabilities.items())
+        and all(getattr(table[name], c) == v for c, v in capabilities.items())
     ]
 
 

@@ -139,6 +139,10 @@ class SmallCall:
         rules = Rules(SMALL_ROWS, SWEPT, WARM, self.pivots, self.hands_over)
         object.__setattr__(self, "rules", rules)
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Copied or pickled it is the call of that name: what the kernels read has no pickle."""
+        return _call_of, (self.name,)
+
     def may_cost(self, problem: Problem, kernel: Any) -> float:
         """What the call over J and M may cost as counted [ns]; 0 where it is not made whatever it costs."""
         return 0.0 if self.limits is None else float(self.limits.cost(problem.metric, 0.0, kernel.islands)[1])
@@ -282,3 +286,7 @@ def said(name: str, work: Mapping[str, int]) -> str:
 AUTO = SmallCall("auto", limits(SWEEPS, steps=AUTO_STEPS), True, True)
 DIRECT = SmallCall("direct", None, True)
 NEWTON = SmallCall("newton", limits(inf), False)
+
+
+def _call_of(name: str) -> SmallCall:
+    return {call.name: call for call in (AUTO, DIRECT, NEWTON)}[name]

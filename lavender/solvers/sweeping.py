@@ -6,10 +6,8 @@ end, so their places depend only on the numbers.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
-
-import numpy as np
 
 from lavender.base.arrays import FloatArray, whole_number
 from lavender.base.errors import InputError
@@ -76,19 +74,6 @@ def claim(status: int, done: int) -> Claim:
     return Claim(STATUS[status], done, {"sweeps": done})
 
 
-def explain_divergence(problem: Problem) -> str:
-    """Name the first row of a given A whose diagonal entry no update can divide by; empty if there is none."""
-    if problem.matrix is None:
-        return ""
-    diagonal = problem.csr.diagonal()
-    rows = np.flatnonzero(diagonal <= 0.0)
-    if not len(rows):
-        return ""
-    value = diagonal[rows[0]]
-    size = "a zero diagonal" if value == 0.0 else f"a negative diagonal, {value:.3g}"
-    return f"{problem.row_name(rows[0])} has {size}: sweeps need A_ii > 0"
-
-
 def plan_of(order: Order) -> tuple[Any, ...]:
     """(blocks, split, mode, rng) of an order, as kernels take it."""
     return order.blocks, order.split, order.mode, order.rng
@@ -144,10 +129,7 @@ class Swept(Solver):
     ) -> Claim:
         """`max_iter` sweeps in one call of the kernel, or fewer where a check ends them; tol = 0 checks nothing."""
         status, done, again = state.sweeps.run(state.watch, impulse, max_iter, tol)
-        result = claim(status, done)
-        if status == DIVERGED:
-            result = replace(result, message=explain_divergence(state.problem))
-        return self._told(state, result, again)
+        return self._told(state, claim(status, done), again)
 
     def _told(self, state: Any, claim: Claim, again: int) -> Claim:
         """The claim with what else is to tell: `again` counts fallbacks of exact blocks, or restarts."""

@@ -12,7 +12,7 @@ from typing import Any, overload
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray, whole_number
+from lavender.base.arrays import FloatArray, read_only, whole_number
 from lavender.base.deadline import NEVER, Deadline
 from lavender.base.errors import InputError, LavenderError
 from lavender.judge.many import Many, given_problems, of_each
@@ -34,7 +34,7 @@ from lavender.solving.solve import (
     unjudged,
 )
 from lavender_ext.judge.measure import all_finite
-from lavender_ext.small.many import CODE, PLACE, Hand
+from lavender_ext.small.many import CODE, NUMBER, PLACE, Hand
 
 __all__ = ["Solutions", "solve_many"]
 
@@ -48,7 +48,7 @@ NUMBER_OF = {status: i for i, status in enumerate(Status)}
 
 
 class Solutions(Many, Sequence[Solution]):
-    """Results of `solve_many`, in arrays; `many[i]` is the `Solution` of world i.
+    """Results of `solve_many`, in read-only arrays; `many[i]` is the `Solution` of world i.
 
     `many[many.success]`, `many[2:5]` and `many[[0, 7]]` are lists of them; faults of those that are REFUSED are raised.
 
@@ -85,21 +85,20 @@ class Solutions(Many, Sequence[Solution]):
     @property
     def impulse(self) -> FloatArray:
         """See the class."""
-        return (
-            self._impulse.reshape(self.problems.shape) if isinstance(self.problems, Batch) else self._impulse
-        )
+        shape = self.problems.shape if isinstance(self.problems, Batch) else self._impulse.shape
+        return read_only(self._impulse.reshape(shape))
 
     @cached_property
     def velocity(self) -> FloatArray:
         """v+ [m/s, rad/s]: of a stacked batch (n, nv); else of all worlds one after the other, none of a matrix."""
         if isinstance(self.problems, Batch):
-            return self._velocity.reshape(self.problems.velocity_shape)  # type: ignore[union-attr]
+            return read_only(self._velocity.reshape(self.problems.velocity_shape))  # type: ignore[union-attr]
         found = [np.zeros(0)]
         for i, p in enumerate(self.problems):
             if p.matrix is None:
                 own = p.velocity(p._start if i in self.faults else self._impulse[self._rows(i)]).ravel()
                 found.append(np.full_like(own, np.nan) if i in self.faults else own)
-        return np.concatenate(found)
+        return read_only(np.concatenate(found))
 
     @cached_property
     def status(self) -> np.ndarray:
@@ -110,13 +109,12 @@ class Solutions(Many, Sequence[Solution]):
             out[i] = NUMBER_OF[solution.status]
         for i in self.faults:
             out[i] = NUMBER_OF[Status.REFUSED]
-        return STATUS[out]
+        return read_only(STATUS[out])
 
     @property
     def iterations(self) -> np.ndarray:
         """(n,) in the solver's own unit."""
-        counts: np.ndarray = self._worlds.counts[:-1, 0]
-        return counts
+        return read_only(self._worlds.counts[:-1, 0])
 
     @property
     def success(self) -> np.ndarray:
@@ -131,7 +129,7 @@ class Solutions(Many, Sequence[Solution]):
     @property
     def placed(self) -> tuple[FloatArray, np.ndarray, np.ndarray]:
         """All impulses [N s], flat; where each world's begin, and how many rows it has."""
-        return self._impulse, self._first, self._sizes
+        return read_only(self._impulse.view()), self._first, self._sizes
 
     def start(self, i: int) -> Any:
         """The start (m,) [N s] of world i, None of one without."""
@@ -207,7 +205,14 @@ class Solutions(Many, Sequence[Solution]):
         found = judged(problem, impulse)
         started = self._worlds.code[i] in (CODE["late"], CODE["started"])
         counts = None if started else self._counts(problem, i)
-        return rest_of(problem, self._spec, found, counts, self.start(i), status)
+        rest = rest_of(problem, self._spec, found, counts, self.start(i), status)
+        then = float(self._worlds.numbers[NUMBER["relative"], i])
+        if status is Status.CONVERGED and found.relative != then:  # the same data have the same bits
+            rest["contradicted"] = (
+                f"says {status.name} of other data, with relative residual {then:.2e} (now {found.relative:.2e}): "
+                f"the arrays of world {i} were written over after the solve"
+            )
+        return rest
 
     def _counts(self, problem: Problem, i: int) -> tuple[int, ...]:
         """What the loop did for world i."""

@@ -25,6 +25,8 @@ from lavender.judge.solution import (
     History,
     Solution,
     SolverRun,
+    Status,
+    counted,
     order_name,
 )
 from lavender.problem import Problem
@@ -92,6 +94,8 @@ def finish(
     elif status is FLOOR and not judged.at_floor:
         least = min(2.0 * judged.floor, FLOOR_MOST)
         contradicted = f"says FLOOR, relative residual {relative:.2e} is above {least:.2e}"
+    if status in (DIVERGED, STALLED) and not message and spec.resumable:
+        message = describe_end(problem, status, claim.iterations)
     if status is MAX_ITERATIONS:
         way = _way_left(problem, relative, tol, claim.iterations, sweeps_per_decade)
         message = _joined(message, way)
@@ -118,6 +122,23 @@ def finish(
             "turns": claim.turns,
         }
     )
+
+
+def describe_end(problem: Problem, status: Status, iterations: int) -> str:
+    """Say why iterations that give no reason of their own found no solution; a row of A in their way comes first."""
+    what = "the residual grew instead of falling" if status is DIVERGED else "the residual falls no further"
+    words = f"{what}, {counted(iterations, 'iterations')}"
+    if problem.matrix is None:
+        return words
+    diagonal = problem.matrix.diagonal()
+    rows = np.flatnonzero(diagonal <= 0.0)
+    if len(rows):
+        value = diagonal[rows[0]]
+        size = "a zero diagonal" if value == 0.0 else f"a negative diagonal, {value:.3g}"
+        return f"{problem.row_name(int(rows[0]))} has {size}: sweeps need A_ii > 0; {words}"
+    if status is DIVERGED:
+        words += ": sweeps are sure to converge only if A is symmetric and positive definite"
+    return words
 
 
 def _joined(message: str, more: str) -> str:

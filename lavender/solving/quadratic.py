@@ -101,7 +101,9 @@ def solve_qp(
         )
     tol, end = number("tol", tol, low=0.0), perf_counter() + seconds_of(time_limit)
     start = options.pop("impulse", None)
-    large = solver == "auto" and tol > 0.0 and not options and problem.m > SMALL_ROWS
+    large = (
+        isinstance(solver, str) and solver == "auto" and tol > 0.0 and not options and problem.m > SMALL_ROWS
+    )
     first = _by_interior_point if large else _over_velocities
     solution, x = first(problem, solver, tol, time_limit, start, options)
     answer = best = qp.solution(solution, tol, x)

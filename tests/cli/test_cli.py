@@ -7,14 +7,17 @@ import signal
 import subprocess
 import sys
 
+import click
 import numpy as np
 import pytest
 from calls import robot
+from mujoco_scene import scene
 from stacks import stack
 from worked import python
 
 import lavender as lv
 from lavender import bench, cli, io, registry
+from lavender.cli import entry
 from lavender.lab.bench.record import Skip, to_json
 
 TOLD = {"capture_output": False, "stderr": subprocess.PIPE}  # where the output goes to a place of its own
@@ -42,6 +45,33 @@ def test_a_problem_that_none_of_the_solvers_takes_is_not_checked(lavender):
     code, out, _ = lavender("check", "granularF(n=3)", "--solvers", "sor")
     assert code == cli.EXIT_UNMET and "1 problems are taken by none of these solvers" in out
     assert lavender("check", "granularF(n=3)", "--solvers", "sor", "pgs")[0] == 0
+
+
+#: The words with which a command would run, where it has an option of a real number.
+RUNS = {
+    "audit": ("m.xml", "--worlds", 1, "--steps", 1, "--workers", 1), "tune": ("m.xml", "--worlds", 2, "--steps", 2),
+    "record": ("m.xml", "--steps", 1, "--out", "out"), "check": ("stack(n=2)", "--solvers", "pgs"),
+    "explain": ("stack(n=2)",), "phenomena": ("--steppers", "none"), "prove": ("stack(n=2)",),
+    "report": ("stack(n=2)", "m.xml", "--solvers", "pgs", *QUICK), "solve": ("stack(n=2)",),
+}  # fmt: skip
+
+
+def options_of_real_numbers():
+    """(Command, option) of every command."""
+    for command in entry.cli.list_commands(click.Context(entry.cli)):
+        for option in entry.cli.get_command(click.Context(entry.cli), command).params:
+            if getattr(option.type, "kind", float if option.type.name.startswith("float") else None) is float:
+                yield command, option.opts[0]
+
+
+@pytest.mark.parametrize("asked", ["nan", "-1"])
+@pytest.mark.parametrize(("command", "option"), list(options_of_real_numbers()))
+def test_a_number_that_means_nothing_ends_every_command_with_2(lavender, command, option, asked):
+    with open("m.xml", "w") as file:
+        file.write(scene())
+    code, _, err = lavender(command, *RUNS[command], f"{option}={asked}")
+    assert code == cli.EXIT_BAD_INPUT
+    assert asked in err or option in err
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="the device that is always full is Linux's")

@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ from stacks import idle_problem, stack
 from worked import python
 
 import lavender as lv
-from lavender import bench, cli, io
+from lavender import bench, cli, io, suite
 from lavender import out as export
 from lavender.base.errors import InputError
 from lavender.cli import measuring
@@ -23,6 +24,7 @@ from lavender.cli.bench import mujoco
 from lavender.lab.bench import Event, simulators
 from lavender.lab.phenomena import PHENOMENA
 from lavender.lab.report import moved
+from lavender.lab.suite import steps
 from lavender.out import vectors
 
 
@@ -253,6 +255,21 @@ def test_a_report_that_measured_nothing_says_why(lavender, tmp_path):
     code, out, _ = lavender("report", tmp_path / "friction.npz", "--solvers", "direct")
     assert code == 1
     assert "nothing was measured: takes laws linear, lcp, not 'coulomb'" in out
+
+
+def test_one_reason_of_many_cases_is_said_once(lavender, tmp_path, monkeypatch):
+    """As of 60 robots whose package is not installed."""
+    monkeypatch.setattr(steps, "missing", lambda package: f"robots need {package}: pip install {package}")
+    code, out, _ = lavender("report", "@robots", "--out", tmp_path / "out")
+    assert code == cli.EXIT_UNMET
+    said = "; ".join(
+        f"robots need {package}: pip install {package} ({n} cases)"
+        for package, n in Counter(map(steps.package_of, suite.names("@robots"))).items()
+    )
+    assert f"nothing was measured: {said}\n" in out
+    summary = (tmp_path / "out" / "summary.md").read_text()
+    assert "and 31 more cases: robots need" in summary
+    assert max(map(len, (out + summary).splitlines())) < 500
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")

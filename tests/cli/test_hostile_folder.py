@@ -4,9 +4,6 @@ import dataclasses
 import io as text_io
 import json
 import os
-import socket
-import subprocess
-import sys
 
 import pytest
 from mujoco_scene import scene
@@ -15,10 +12,10 @@ from worked import python
 
 import lavender as lv
 from lavender import bench, cli, io
+from lavender.io.stored import lock_output
 from lavender.lab.bench import machine
 from lavender.lab.bench.line import code_of
 from lavender.lab.bench.record import KINDS, file_name, printable, to_json
-from lavender.lab.bench.store import Lock
 from lavender.lab.report.findings import Report
 from lavender.lab.report.terminal import print_report
 
@@ -213,28 +210,49 @@ def test_the_newest_run_shows_its_own_cases_and_only_as_they_are_now(tmp_path, m
 # -- two reports in one folder --------------------------------------------------------------------
 
 
-def test_one_process_writes_records_and_only_who_is_gone_is_not_believed(tmp_path):
+def test_one_process_writes_records_and_who_died_holds_nothing(tmp_path):
     path = tmp_path / "records.jsonl"
-    lock = Lock(path)
-    with pytest.raises(lv.InputError, match=f"process {os.getpid()} on"):
-        bench.Store(path)
-    with pytest.raises(lv.InputError):  # and the refusal took nothing away
-        bench.Store(path)
-    other = python("-c", f"from lavender import bench; bench.Store({str(path)!r})", status=1)
-    assert f"process {os.getpid()} on {socket.gethostname()}" in other.stderr
-    text = lock.path.read_bytes()
-    lock.release()
-    lock.release()
-    lock.path.write_bytes(text.replace(socket.gethostname().encode(), b"elsewhere"))
-    with pytest.raises(lv.InputError, match=f"process {os.getpid()} on elsewhere.*remove"):
-        bench.Store(path)
-    ended = subprocess.Popen([sys.executable, "-S", "-c", ""])
-    ended.wait()
-    lock.path.write_bytes(text.replace(str(os.getpid()).encode(), str(ended.pid).encode()))
-    bench.Store(path).close()  # who is gone holds nothing
-    lock.path.write_bytes(b"torn")
+    with bench.Store(path) as store:
+        for _ in range(2):  # and the refusal took nothing away
+            with pytest.raises(lv.InputError, match="is being written by another command"):
+                bench.Store(path)
+        other = python("-c", f"from lavender import bench; bench.Store({str(path)!r})", status=1)
+        assert "is being written by another command" in other.stderr
+        store.close()
+        bench.Store(path).close()
+    killed = f"import os; from lavender import bench; s = bench.Store({str(path)!r}); os.kill(os.getpid(), 9)"
+    python("-c", killed, status=-9)
     bench.Store(path).close()
     assert list(tmp_path.iterdir()) == [path]
+
+
+#: Each command that writes a folder, and its words.
+WRITE_A_FOLDER = {
+    "audit": ("audit", "MODEL", "--worlds", 1, "--steps", 1, "--out", "OUT"),
+    "tune": ("tune", "MODEL", "--worlds", 1, "--steps", 1, "--out", "OUT"),
+    "record": ("record", "MODEL", "--steps", 1, "--out", "OUT"),
+    "report": ("report", "stack(n=2)", *QUICK, "--out", "OUT"),
+    "records shown again": ("report", "records.jsonl", "--out", "OUT"),
+    "campaign": ("report", "--campaign", "stack(n=2)", *QUICK[:6], "--out", "OUT"),
+    "problems": ("problems", "--secret", "word", "--count", 1, "--out", "OUT"),
+    "run": ("run", "stack", "--steps", 1, "--record", "OUT"),
+    "export": ("export", "c", "OUT"),
+    "web": ("web", "page", "OUT"),
+}
+
+
+@pytest.mark.parametrize("name", WRITE_A_FOLDER)
+def test_a_folder_that_another_command_writes_is_refused_before_the_work(lavender, tmp_path, name):
+    (tmp_path / "model.xml").write_text(scene())
+    (tmp_path / "records.jsonl").touch()
+    out = tmp_path / "out"
+    words = [{"MODEL": tmp_path / "model.xml", "OUT": out}.get(word, word) for word in WRITE_A_FOLDER[name]]
+    with lock_output(out, folder=True):
+        held = list(out.iterdir())
+        code, _, err = lavender(*words)
+        assert code == 2 and "is being written by another command" in err
+        assert list(out.iterdir()) == held
+    assert not out.exists()  # it was made for the lock alone
 
 
 @pytest.mark.parametrize(

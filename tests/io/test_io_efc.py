@@ -231,3 +231,68 @@ def test_arrays_that_do_not_fit_say_so():
         lv.io.from_mujoco_many(model, np.zeros((2, 3)))
     with pytest.raises(lv.InputError, match="MjModel is needed"):
         lv.io.from_mujoco_many(None, np.zeros((2, 3)))
+
+
+def contact(given, k, change):
+    """The contacts with another array in place k: world, efc_address, dim, friction."""
+    return {"contacts": tuple(change(x) if i == k else x for i, x in enumerate(given["contacts"]))}
+
+
+def contacts(given, change):
+    return {"contacts": tuple(map(change, given["contacts"]))}
+
+
+#: A change of valid arrays, and the words of its refusal. Most were read as problems before.
+MALFORMED = {
+    "no type that there is": (lambda g: {"efc_type": 0 * g["efc_type"] + 99}, "efc_type of world 0, row 0 is 99"),
+    "half a type": (lambda g: {"efc_type": 0 * g["efc_type"] + 0.5}, r"efc_type of world 0, row 0 is 0\.5"),
+    "a type that is NaN": (lambda g: {"efc_type": g["efc_type"] * np.nan}, "efc_type of world 0, row 0 is nan"),
+    "a negative type": (lambda g: {"efc_type": g["efc_type"] - 8}, "efc_type of world 0, row 0 is -"),
+    "no type": (lambda g: {"efc_type": None}, "efc_type has dtype object"),
+    "a type in words": (lambda g: {"efc_type": g["efc_type"].astype(str)}, "efc_type has dtype"),
+    "types of worlds": (lambda g: {"efc_type": g["efc_type"][:, :1]}, r"efc_type has shape \(3, 1\)"),
+    "types of fewer rows": (lambda g: {"efc_type": g["efc_type"][:, :-1]}, "efc_type has shape"),
+    "a masked J": (lambda g: {"efc_J": np.ma.masked_equal(g["efc_J"], 0.0)}, "efc_J has no value at"),
+    "J in words": (lambda g: {"efc_J": g["efc_J"].astype(str)}, "efc_J has dtype"),
+    "a flat J": (lambda g: {"efc_J": g["efc_J"].reshape(3, -1)}, "efc_J has shape"),
+    "more rows than J has": (lambda g: {"nefc": np.array([100, 1, 1])}, "nefc of world 0 is 100"),
+    "a negative count": (lambda g: {"nefc": np.array([1, -1, 1])}, "nefc of world 1 is -1"),
+    "half a row": (lambda g: {"nefc": np.array([1.5, 1.0, 1.0])}, "nefc must hold whole numbers"),
+    "counts of other worlds": (lambda g: {"nefc": np.array([1, 1])}, "nefc has shape"),
+    "an infinite D": (lambda g: {"efc_D": -np.inf * g["efc_D"]}, "efc_D of world 0, row 0 is -inf"),
+    "a negative friction loss": (
+        lambda g: {"efc_type": 0 * g["efc_type"] + 1, "efc_frictionloss": -1.0, "contacts": None},
+        "efc_frictionloss of world 0, row 0 is -1",
+    ),
+    "friction losses of worlds": (lambda g: {"efc_frictionloss": np.ones((3, 1))}, "efc_frictionloss has shape"),
+    "a flat M": (lambda g: {"M": g["M"].reshape(3, -1)}, "M has shape"),
+    "M of other velocities": (lambda g: {"M": g["M"][:, 1:, 1:]}, "M has shape"),
+    "a triangle without pointers": (lambda g: {"M": (g["M"][:, 0],)}, "M has shape"),
+    "a triangle out of range": (lambda g: {"M": (g["M"][:, 0], [1, 2], [0, 1, 2])}, "M's rows must"),
+    "no contacts": (lambda g: {"contacts": ()}, "contacts is"),
+    "contacts without friction": (lambda g: {"contacts": g["contacts"][:3]}, "contacts is"),
+    "contacts of several lengths": (lambda g: contact(g, 0, lambda x: x[1:]), "efc_address of contacts has shape"),
+    "one contact for another": (
+        lambda g: contacts(g, lambda x: np.concatenate([x[:1], x[:1], x[2:]])),
+        r"row \d+ of world 0 is an elliptic row by efc_type, and [02] contacts name it",
+    ),
+    "a contact twice": (lambda g: contacts(g, lambda x: np.concatenate([x[:1], x])), "and 2 contacts name it"),
+    "contacts a row too far": (lambda g: contact(g, 1, lambda x: x + 1), "contacts name it|rows up to"),
+    "contacts of other worlds": (lambda g: contact(g, 0, lambda x: (x + 1) % 3), "contacts name it|rows up to"),
+    "seven rows": (lambda g: contact(g, 2, lambda x: x + 4), "dim of contact 0 is 7"),
+    "no coefficient": (lambda g: contact(g, 3, lambda x: 0.0 * x), "friction of contact 0 is 0"),
+    "a coefficient that is NaN": (lambda g: contact(g, 3, lambda x: np.nan * x), "friction of contact 0 is nan"),
+    "addresses in words": (lambda g: contact(g, 1, lambda x: x.astype(str)), "efc_address of contacts has dtype"),
+    "a time step of two numbers": (lambda g: {"timestep": [0.1, 0.2]}, "timestep"),
+    "a ragged time step": (lambda g: {"timestep": [[0.1], [0.1, 0.2]]}, "timestep"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", MALFORMED)
+def test_malformed_arrays_are_refused_by_name(what):
+    model = mj.MjModel.from_xml_string(scene(cone="elliptic", condim=3))
+    given = stacked(model, states_of(model, 3), np.float64)
+    lv.io.from_efc(**given)
+    change, words = MALFORMED[what]
+    with pytest.raises(lv.InputError, match=words):
+        lv.io.from_efc(**given | change(given))

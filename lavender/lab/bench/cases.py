@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lavender import io
-from lavender.base.arrays import FloatArray, several
+from lavender.base.arrays import FloatArray, flag, several
 from lavender.base.errors import InputError, SolverUnavailable
 from lavender.io.stored import ENGINE, SUFFIXES, whole_file
 from lavender.judge.residuals import ENOUGH, Residual, nothing_to_do, residual
@@ -26,7 +26,7 @@ from lavender.lab import suite
 from lavender.lab.bench.record import CaseInfo, file_name, printable
 from lavender.lab.suite import Case
 from lavender.lab.suspicions import diagnose
-from lavender.problem import Problem
+from lavender.problem import Problem, check_problem
 from lavender.problem.derived import cached_property
 
 RANK_ROWS = 300  # rows up to which the rank of A is computed, a fraction of a second
@@ -103,6 +103,8 @@ def resolve(words: Source | Iterable[Source], sequences: bool | None = None) -> 
     UnknownName
         A case that the suite does not have.
     """
+    if sequences is not None:
+        flag("sequences", sequences)
     items: list[Item] = []
     read: set[Path] = set()  # folders, which a link in one of them may lead back to
     words = (
@@ -152,10 +154,13 @@ def resolve(words: Source | Iterable[Source], sequences: bool | None = None) -> 
 
 def sequence(problems: Iterable[Problem], name: str) -> list[Item]:
     """Consecutive problems as the steps of one sequence."""
-    return [
-        Item(f"{name}[{i}]", name, _constant(problem), sequence=name, step=i)
-        for i, problem in enumerate(problems)
-    ]
+    if not isinstance(name, str):
+        raise InputError(f"name of a sequence is {name!r:.60}; a text is needed")
+    items = []
+    for i, problem in enumerate(several("problems", problems, "Problems")):
+        check_problem(problem)
+        items.append(Item(f"{name}[{i}]", name, _constant(problem), sequence=name, step=i))
+    return items
 
 
 def steps_in(folder: str | Path) -> list[Item]:
@@ -400,6 +405,7 @@ def structure_of(problem: Problem) -> tuple[str, ...]:
     - "asymmetric": A is not symmetric. A matrix that is not even nearly so comes from no scene of
       bodies, and gets no word for its shape or masses.
     """
+    check_problem(problem)
     if problem.m == 0:
         return ("empty",)
     found = []

@@ -22,7 +22,7 @@ from lavender.judge.residuals import Residual, residual
 from lavender.judge.solution import Solution, uninterrupted
 from lavender.lab.motion import operator as operators
 from lavender.lab.motion.bound import Witness, witness
-from lavender.problem import Problem
+from lavender.problem import Problem, check_problem
 from lavender.solving.solve import solve
 
 SOLVER = "auto"
@@ -78,6 +78,7 @@ def kept(problem: Problem) -> Kept:
     CapabilityError
         A problem with ellipses, whose motion is that of its disks.
     """
+    check_problem(problem)
     if problem.cones.has_ellipse:
         raise CapabilityError(
             "the motions of ellipses are those of problem.disk: give that, and impulses as problem.on_disk(impulse)"
@@ -111,6 +112,7 @@ def adopt(problem: Problem, impulse: Any, solver: str = "given") -> Reference:
     return own.reference
 
 
+@np.errstate(over="ignore", invalid="ignore")  # of impulses at the edge of float64
 def judged(problem: Problem, impulse: FloatArray, solver: str) -> Reference:
     """A reference of an impulse that is finite and of the right length."""
     own = kept(problem)

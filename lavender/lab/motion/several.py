@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray, flag, one_of, whole_number
+from lavender.base.arrays import ArrayLike, FloatArray, flag, one_of, places, several, whole_number
 from lavender.base.errors import CapabilityError, InputError, LavenderError
 from lavender.judge.residuals import residual
 from lavender.judge.solution import uninterrupted
@@ -102,8 +102,10 @@ class Motions:
     def __bool__(self) -> bool:
         return True  # also where none was found: the search has been
 
-    def __getitem__(self, i: int) -> Motion:
-        return self.motions[i]
+    def __getitem__(self, i: Any) -> Any:
+        """Motion i, or a list of several."""
+        i = places(i, len(self.motions), "motion")
+        return [self.motions[j] for j in i] if isinstance(i, list) else self.motions[i]
 
     def select(self, choice: str, impulse: Any = None) -> Motion:
         """One of the motions by a rule that has a name.
@@ -154,7 +156,7 @@ class Motions:
         """
         p = self.problem
         out: dict[str, Pick | None] = {}
-        for name in available(p) if solvers is None else solvers:
+        for name in available(p) if solvers is None else several("solvers", solvers, "names"):
             try:
                 budget = max_iter if get(name).resumable else None
                 found = uninterrupted(solve(p, name, tol=tol, max_iter=budget))
@@ -273,6 +275,7 @@ def branch(problem: Problem, impulse: Any) -> Reference:
     Where Coulomb's law leaves several motions, this is the one that a solver stopped early was on its way to.
     Kept by nobody; `accepted` says whether it is a solution.
     """
+    check_problem(problem)
     found = None
     x = problem.impulse_array(impulse)
     for name in ("anderson", "newton"):
@@ -377,10 +380,12 @@ def _motion(problem: Problem, reference: Reference, labels: tuple[str, ...]) -> 
     )
 
 
-def distance(problem: Problem, x: FloatArray, y: FloatArray) -> Distance:
+@np.errstate(over="ignore", invalid="ignore")  # of impulses at the edge of float64
+def distance(problem: Problem, x: ArrayLike, y: ArrayLike) -> Distance:
     """How far apart the motions of two impulses (m,) [N s] are."""
     own = kept(problem)
     operator = own.operator
+    x, y = problem.impulse_array(x, "x"), problem.impulse_array(y, "y")
     delta, size = difference(operator, x, y)
     velocity = operator.velocity(delta, np.zeros(problem.m))
     rows = np.abs(operator.slack(delta)[0] + problem.b)

@@ -8,8 +8,8 @@ from typing import Any
 
 from lavender.base.apart import served
 from lavender.base.apart.process import Ended, NoAnswer, Process, Raised
-from lavender.base.arrays import number
-from lavender.base.errors import CapabilityError, InputError, UnknownName
+from lavender.base.arrays import number, several
+from lavender.base.errors import CapabilityError, InputError, UnknownName, check_name
 from lavender.lab.phenomena.engines import WAYS, Way, follow, make
 from lavender.lab.phenomena.friction import FRICTION
 from lavender.lab.phenomena.joints import JOINTS
@@ -86,9 +86,9 @@ def chosen(names: Sequence[str] = ()) -> list[Phenomenon]:
     UnknownName
         No such phenomenon.
     """
+    names = several("names", names, "phenomena")
     for name in names:
-        if name not in PHENOMENA:
-            raise UnknownName("phenomenon", name, PHENOMENA)
+        check_name("phenomenon", name, PHENOMENA)
     return [PHENOMENA[name] for name in dict.fromkeys(names or PHENOMENA)]
 
 

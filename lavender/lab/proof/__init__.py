@@ -71,6 +71,9 @@ def prove(problem: Problem, solution: Any) -> Enclosure:
 
     Notes
     -----
+    python-flint has one precision for the whole process. Proofs in several threads therefore run one after the other,
+    and another thread's own balls have the precision of the proof while one runs.
+
     R. Krawczyk 1969, Computing 4, 187-201; A. Neumaier 1990, Interval Methods for Systems of Equations; F. Johansson
     2017, Arb, IEEE Trans. Computers 66, 1281-1292.
 

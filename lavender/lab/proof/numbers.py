@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
+from threading import RLock
 from typing import Any
 
 import numpy as np
@@ -12,21 +14,41 @@ from lavender.base.errors import SolverUnavailable
 
 UNIT = 2.0**-53
 
+_precision_lock = (
+    RLock()
+)  # Held while python-flint's precision, one for the whole process, is that of a proof.
+
+
+def _forked() -> None:
+    global _precision_lock
+    _precision_lock = RLock()  # A fork's child has no thread that could release the other one.
+
+
+if hasattr(os, "register_at_fork"):  # not on Windows
+    os.register_at_fork(after_in_child=_forked)
+
 
 @contextmanager
 def balls(bits: int) -> Iterator[Any]:
-    """python-flint, whose balls have so many bits; SolverUnavailable where it is not installed."""
+    """Set the precision of python-flint to `bits` and restore it at the end; one thread at a time.
+
+    Raises
+    ------
+    SolverUnavailable
+        python-flint is not installed.
+    """
     try:
         import flint
     except ImportError:
         raise SolverUnavailable(
             "prove needs python-flint (interval arithmetic): pip install 'lavender-contact[proof]'"
         ) from None
-    before, flint.ctx.prec = flint.ctx.prec, bits
-    try:
-        yield flint
-    finally:
-        flint.ctx.prec = before
+    with _precision_lock:
+        before, flint.ctx.prec = flint.ctx.prec, bits
+        try:
+            yield flint
+        finally:
+            flint.ctx.prec = before
 
 
 class Balls:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 
+from lavender.lab.bench.record import Skip
 from lavender.lab.bench.store import Records
 
 NONE = "–"  # where there is no number
@@ -49,9 +51,34 @@ def suspicions(records: Records) -> list[tuple[str, str]]:
     ]
 
 
+def _cause_of(skip: Skip) -> str:
+    """The reason of a skip without the name of its case, which others may share."""
+    return skip.reason.removeprefix("did not load: ").removeprefix(f"{skip.case}: ")
+
+
+def reasons(skips: Iterable[Skip]) -> list[str]:
+    """Return each reason of some skips once, with the number of cases that it holds for if these are several."""
+    same: dict[str, list[Skip]] = {}
+    for skip in skips:
+        same.setdefault(_cause_of(skip), []).append(skip)
+    cases = {cause: len({skip.case for skip in some}) for cause, some in same.items()}
+    return [
+        some[0].reason if cases[cause] == 1 else f"{cause} ({cases[cause]} cases)"
+        for cause, some in same.items()
+    ]
+
+
 def left_out(records: Records) -> list[tuple[str, str]]:
-    """(what did not load, why): cases, and how many steps of each sequence, with the reason of the first."""
-    single = [(skip.case, skip.reason) for skip in records.left_out.get("", ())]
+    """(what did not load, why): cases, those of one reason together, and how many steps of each sequence."""
+    same: dict[str, list[Skip]] = {}
+    for skip in records.left_out.get("", ()):
+        same.setdefault(_cause_of(skip), []).append(skip)
+    single = [
+        (some[0].case, some[0].reason)
+        if len(some) == 1
+        else (f"{some[0].case} and {count(len(some) - 1, 'more case')}", cause)
+        for cause, some in same.items()
+    ]
     steps = {f"{count(len(some), 'step')} of {name}": some for name, some in records.left_out.items() if name}
     return [*single, *((told, some[0].reason) for told, some in steps.items())]
 

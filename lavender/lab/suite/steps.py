@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lavender.base.errors import SolverUnavailable, UnknownName
+from lavender.base.errors import SolverUnavailable, UnknownName, check_name
 from lavender.lab.suite.case import Draft, family, parse
 from lavender.lab.suite.families import at_least, positive, product
 from lavender.problem import Problem
@@ -29,8 +29,7 @@ def engine_step(scene: str = "pyramid", at: int = 30) -> Draft:
     from lavender.sim.engine import Simulation
     from lavender.sim.scene import SCENES, Scene
 
-    if scene not in SCENES:
-        raise UnknownName("scene", scene, SCENES)
+    check_name("scene", scene, SCENES)
     simulation = Simulation(Scene(scene))
     for _ in range(at):
         simulation.step()
@@ -79,8 +78,7 @@ def robot(package: str = "gymnasium", model: str = "ant", cone: str = "pyramidal
     The numbers are those of one version of MuJoCo and of the package (`versions`).
     """
     path, known = _find(package, model), tuple(CONES)
-    if cone not in CONES:
-        raise UnknownName("cone", cone, known)
+    check_name("cone", cone, known)
     import mujoco
 
     from lavender.io import from_mujoco
@@ -121,8 +119,7 @@ def versions(package: str) -> str:
 
 
 def _find(package: str, model: str) -> Path:
-    if package not in FOLDERS:
-        raise UnknownName("package of models", package, FOLDERS)
+    check_name("package of models", package, FOLDERS)
     spec, told = find_spec(package), missing(package)
     if told or spec is None or not spec.submodule_search_locations:
         raise SolverUnavailable(told)

@@ -8,7 +8,7 @@ from typing import Any
 
 from lavender import io
 from lavender.base.arrays import read_only, whole_number
-from lavender.base.errors import InputError, LavenderError, UnknownName
+from lavender.base.errors import InputError, LavenderError, check_name
 from lavender.base.later import above
 from lavender.io.stored import folder_for_steps
 from lavender.problem import Problem
@@ -145,8 +145,7 @@ class Simulation(Stepping):
         CapabilityError
             FCLIB cannot hold the rows of the next step, which is not done; files of the steps before it stay.
         """
-        if form not in ("npz", "fclib"):
-            raise UnknownName("form", form, ("npz", "fclib"))
+        check_name("form", form, ("npz", "fclib"))
         steps = whole_number("steps", steps, 1)
         folder = Path(folder)
         digits, written = len(str(self._steps + steps)), []

@@ -86,7 +86,7 @@ class Stepping:
             raise InputError(f"scene is a {type(scene).__name__}; a lavender.Scene is needed, or a name")
         if not scene.bodies:
             raise InputError("the scene has no bodies; add some (add_box, add_sphere, add_plane)")
-        if stepper is not None and stepper != scene.parameters.stepper:
+        if stepper is not None and get_stepper(stepper).name != scene.parameters.stepper:
             scene = scene.with_parameters(stepper=stepper, stepper_options={})
         self.scene = scene = copy(scene)  # what is added to it later is not in this simulation
         self.report_residual = checked("report_residual", report_residual)

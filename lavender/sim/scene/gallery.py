@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from lavender.base.arrays import number, whole_number
-from lavender.base.errors import UnknownName
+from lavender.base.errors import check_name
 from lavender.sim.scene.arithmetic import frame_quaternion, norm, sine_cosine, turned
 from lavender.sim.scene.parts import quaternion, rotation
 from lavender.sim.scene.scene import SCENES, Scene, named_scene
@@ -92,8 +92,7 @@ def pile(scene: Scene, n: int = 100, kind: str = "spheres", size: float = 0.5, w
     """
     whole_number("n", n, 1)
     size = number("size", size, above=0.0)
-    if kind not in ("spheres", "boxes", "mixed"):
-        raise UnknownName("kind of pile", kind, ("spheres", "boxes", "mixed"))
+    check_name("kind of pile", kind, ("spheres", "boxes", "mixed"))
     side = next(k for k in range(1, n + 1) if 5 * k**3 >= 4 * n)  # a quarter more high than wide
     pitch = 1.15 * size if kind == "spheres" else 1.5 * size
     half = 0.5 * side * pitch

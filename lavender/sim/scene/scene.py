@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from lavender.base.arrays import FloatArray, check_sizes, flag, number, shape_of, whole_number
-from lavender.base.errors import InputError, UnknownName
+from lavender.base.errors import InputError, UnknownName, check_name
 from lavender.problem.friction import check_shape
 from lavender.problem.ordering import ENGINE_ORDERS
 from lavender.sim.scene import arithmetic
@@ -116,8 +116,7 @@ class Parameters:
         order: Any = self.order
         if order is None:
             put(self, "order", stepper.order if own else "given")
-        if self.order not in SCENE_ORDERS:
-            raise UnknownName("order", self.order, SCENE_ORDERS)
+        check_name("order", self.order, SCENE_ORDERS)
         if self.order != "given" and not own:
             raise InputError(
                 f"order={self.order!r} is for sequential_impulses; give {self.solver} its own in solver_options"
@@ -135,8 +134,7 @@ class Parameters:
                 f"position_iterations is {projections}; stepper {stepper.name!r} has no position projection"
             )
         put(self, "seed", whole_number("seed", self.seed))
-        if self.on_failure not in ON_FAILURE:
-            raise UnknownName("on_failure", self.on_failure, ON_FAILURE)
+        check_name("on_failure", self.on_failure, ON_FAILURE)
 
     def _sweeps(self, spec: SolverSpec, stepper: StepperSpec) -> int:
         given = self.solver_iterations
@@ -457,8 +455,7 @@ class Scene:
         InputError
             A missing body, no dynamic body, an anchor or axis too few or too many. Nothing is added.
         """
-        if kind not in (DISTANCE, BALL, HINGE):
-            raise UnknownName("joint", kind, (DISTANCE, BALL, HINGE))
+        check_name("joint", kind, (DISTANCE, BALL, HINGE))
         label = name or f"{kind} {len(self.joints)}"
         a, b = self._joined(label, a, b)
         ends = (anchor, anchor_a, anchor_b, length)

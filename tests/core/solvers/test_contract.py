@@ -446,6 +446,24 @@ def test_any_matrix_a_claim_is_a_solution(name, seed, m):
 
 
 @pytest.mark.parametrize("name", HERE)
+@pytest.mark.parametrize(
+    ("matrix", "row"),
+    [([[0.0, 1.0], [1.0, 2.0]], 0), ([[2.0, 1.0], [1.0, -1.0]], 1), ([[1.0, 3.0], [3.0, 1.0]], None)],
+)
+def test_what_was_not_solved_says_why(name, matrix, row):
+    """A zero, a negative number on the diagonal of A, and an A that is not definite: sweeps find nothing."""
+    for problem in (lv.Problem.linear(matrix, [1.0, 1.0]), lv.Problem.lcp(matrix, [1.0, 1.0])):
+        if registry.get(name).refuses(problem) is not None:
+            continue
+        solution = lv.solve(problem, name, tol=1e-6)
+        if solution.status in (lv.Status.DIVERGED, lv.Status.STALLED, lv.Status.NUMERICAL_ERROR):
+            assert solution.message
+        if solution.status is lv.Status.DIVERGED and row is not None:
+            size = "a negative diagonal" if matrix[row][row] < 0.0 else "a zero diagonal"
+            assert f"row {row} has {size}" in str(solution)
+
+
+@pytest.mark.parametrize("name", HERE)
 def test_a_row_that_nothing_can_meet_is_infeasible(name):
     problem = lv.Problem.lcp(np.diag([1.0, 0.0]), [1.0, 1.0])
     if registry.get(name).refuses(problem):

@@ -48,6 +48,7 @@ def assert_same(many, i, single):
     assert many.iterations[i] == own.iterations == single.iterations
     assert (own.message, own.work) == (single.message, single.work)
     assert repr(own.turns) == repr(single.turns)  # what nobody judged in between is NaN
+    assert own.contradicted == single.contradicted
 
 
 @pytest.mark.parametrize("again", [copy.copy, copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))])
@@ -287,6 +288,34 @@ def test_worlds_are_chosen_as_entries_of_an_array_are():
         batch[5]
 
 
+@pytest.mark.parametrize("listed", [False, True])
+def test_arrays_of_results_cannot_be_written_to(listed):
+    """A world is read when it is asked for: what was written over by then would be handed out as its answer."""
+    batch = lv.Batch(*worlds(3), cones=DISKS)
+    given = list(batch) if listed else batch
+    many = lv.solve_many(given, tol=1e-9)
+    found = lv.residual_many(given, [s.impulse for s in lv.solve_many(given, tol=1e-9)])
+    names = [(of, name) for of in (many, found) for name in dir(of) if name[0] != "_"]
+    arrays = {f"{type(of).__name__}.{name}": getattr(of, name) for of, name in names}
+    new = {"Solutions.ptr", "Solutions.success", "Residuals.excess"}  # at each call
+    arrays = {name: x for name, x in arrays.items() if isinstance(x, np.ndarray) and name not in new}
+    assert len(arrays) >= 16
+    assert [name for name, x in arrays.items() if x.flags.writeable] == []
+    assert all(one.success and not one.contradicted for one in many)
+
+
+def test_a_world_written_over_before_it_is_read_contradicts_its_status():
+    jac, mass, free = worlds(4)
+    batch = lv.Batch(jac, mass, free, cones=DISKS)
+    many = lv.solve_many(batch, tol=1e-9)
+    assert many[0].success and not many[0].contradicted
+    free[1:3] *= -2.0
+    for i in (1, 2):
+        assert many[i].residual.relative > 1e-3
+        assert "CONVERGED of other data" in many[i].contradicted and f"world {i}" in str(many[i])
+    assert many[3].success and not many[3].contradicted
+
+
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 @pytest.mark.parametrize("soft", [0.0, 0.05])
 def test_verdicts_of_many_are_those_of_each(dtype, soft):
@@ -333,9 +362,9 @@ def test_a_list_goes_the_same_way_as_a_batch():
     assert found.relative.tobytes() == many.relative.tobytes()
     with pytest.raises(lv.InputError, match="impulses of world 1"):
         lv.residual_many(given, [np.zeros(12), *(np.zeros(3) for _ in range(6))])
-    with pytest.raises(lv.InputError, match="impulses is None; one"):
+    with pytest.raises(lv.InputError, match="impulses: None; a sequence of"):
         lv.residual_many(given, None)
-    with pytest.raises(lv.InputError, match="problems is 3; a Batch"):
+    with pytest.raises(lv.InputError, match="problems: 3; a sequence of Problems, or a Batch"):
         lv.solve_many(3)
 
 

@@ -312,6 +312,17 @@ def test_a_worker_says_what_this_process_says_and_judges_a_problem_that_no_backe
             assert dataclasses.replace(far, **times) == dataclasses.replace(near, **times)
 
 
+def test_time_that_a_line_took_before_its_process_was_asked_is_no_lie_of_its_process():
+    """Carrying impulses is timed here: on a loaded machine it took longer than the whole answer."""
+    p = stack()
+    lead = 100.0  # s
+    with Worker() as worker:
+        asked = task(p, "pgs", start="carried", way="call", repeats=2, lead=lead)
+        record, impulse = worker.measure(p, asked, np.zeros(p.m))
+        assert record.status == "CONVERGED" and impulse is not None
+        assert len(record.times) == 1 and lead <= record.times[0] < lead + 60.0
+
+
 @pytest.mark.parametrize(
     "said",
     [

@@ -1,6 +1,8 @@
 """`lavender.prove`: what is proven is so, for every law, kind of contact and form; what is not says why."""
 
 import sys
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from fractions import Fraction
 
 import numpy as np
@@ -11,7 +13,7 @@ import lavender as lv
 from lavender import suite
 from lavender.lab import proof
 from lavender.lab.proof import dependence, island, operator, search
-from lavender.lab.proof.numbers import Balls, Rationals
+from lavender.lab.proof.numbers import Balls, Rationals, balls
 from lavender.lab.proof.operator import Operator
 from tests import proof_twin
 from tests.kkt_truth import Exact
@@ -100,6 +102,30 @@ def test_doing_nothing_and_empty_problems():
     found = lv.prove(problem, np.zeros(2))
     assert found.proven and found.impulse_radius == 0.0 == found.velocity_radius
     assert lv.prove(lv.Problem.lcp(np.zeros((0, 0)), []), np.zeros(0)).proven
+
+
+def test_proofs_in_threads_keep_their_precision_and_that_of_the_caller():
+    """python-flint has one precision for the process: a second proof waits until the first has restored it."""
+    before, seen = flint.ctx.prec, []
+
+    def other():
+        with balls(256):
+            seen.append(flint.ctx.prec)
+
+    thread = threading.Thread(target=other)
+    with balls(128):
+        thread.start()
+        thread.join(0.2)  # s, for the other one to begin, if it could
+        assert (seen, flint.ctx.prec) == ([], 128)
+    thread.join()
+    assert (seen, flint.ctx.prec) == ([256], before)
+    problem = suite.case("pyramidF(k=4, sliding=0.5)").problem
+    solution = lv.solve(problem, "newton", tol=1e-12)
+    alone = lv.prove(problem, solution)
+    with ThreadPoolExecutor(4) as pool:
+        for found in pool.map(lambda _: lv.prove(problem, solution), range(8)):
+            assert (found.proven, found.velocity_radius) == (alone.proven, alone.velocity_radius)
+    assert flint.ctx.prec == before
 
 
 def test_without_python_flint_it_says_what_to_install(monkeypatch):

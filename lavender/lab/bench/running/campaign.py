@@ -22,6 +22,7 @@ from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any
 
+from lavender.base.arrays import several, whole_number
 from lavender.base.errors import InputError
 from lavender.lab.bench import machine
 from lavender.lab.bench.cases import Item, Source, describe, fingerprint, is_path, resolve
@@ -85,12 +86,15 @@ def seeds(words: Iterable[str], n: int, first: int = 0) -> list[str]:
     UnknownName, InputError
         A name that the suite does not have; more than a million seeds, each of which is a case with a name.
     """
-    if not 0 <= n <= MOST_SEEDS:
+    n, first = whole_number("n", n, high=None), whole_number("first", first, high=None)
+    if n > MOST_SEEDS:
         raise InputError(
             f"{n} seeds are asked for; at most {MOST_SEEDS} in one run: give A:B, part after part"
         )
     out = []
-    for word in words:
+    for word in several("cases", words, "names"):
+        if not isinstance(word, str):
+            raise InputError(f"case {word!r:.60} is no name of the suite")
         if is_path(word) or word.startswith("@"):
             out.append(word)
             continue

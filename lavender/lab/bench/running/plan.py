@@ -70,7 +70,8 @@ class Plan:
 
     def __post_init__(self) -> None:
         for name in ("levels", "budgets", "orders", "speed_levels", "times", "sweeps"):
-            several(name, getattr(self, name), "words" if name == "orders" else "numbers")
+            given = several(name, getattr(self, name), "words" if name == "orders" else "numbers")
+            object.__setattr__(self, name, tuple(given))
         for name, values in (
             ("level", self.levels),
             ("speed level", self.speed_levels),

@@ -26,7 +26,7 @@ from lavender.lab.motion import load_reference
 from lavender.lab.motion.bound import separation
 from lavender.lab.motion.reference import as_reference
 from lavender.lab.proof import enclosed
-from lavender.problem import Problem
+from lavender.problem import Problem, check_problem
 from lavender.solvers import registry
 from lavender.solvers.registry import SolverSpec
 
@@ -51,6 +51,7 @@ class Event:
 
 def carry(before: Problem, impulse: FloatArray, problem: Problem) -> FloatArray:
     """Start of `problem` (m,) [N s] from the impulses of the step before."""
+    check_problem(problem)
     return problem.carry((before, impulse))
 
 

@@ -94,7 +94,7 @@ class Worker:
         self._holds = task.sha
         try:
             said, arrays = process.ask(messages, limit, 16 * problem.m)
-            return outcome_in(said, arrays, problem.m, time.monotonic() - begun)
+            return outcome_in(said, arrays, problem.m, time.monotonic() - begun, task.lead)
         except TimeoutError:
             raise Lost(KILLED, f"did not stop; its process was killed after {limit:.3g} s") from None
         except Ended as end:
@@ -178,8 +178,10 @@ def _runner() -> served.Handler:
     return run
 
 
-def outcome_in(said: dict[str, Any], arrays: list[Any], m: int, took: float) -> Outcome:
+def outcome_in(said: dict[str, Any], arrays: list[Any], m: int, took: float, lead: float = 0.0) -> Outcome:
     """What an answer says, every part of it checked.
+
+    `took` [s] is what the whole took here. `lead` [s] passed before, in this process, and is in each time of a line.
 
     Raises
     ------
@@ -198,8 +200,9 @@ def outcome_in(said: dict[str, Any], arrays: list[Any], m: int, took: float) -> 
     parts = (*found.setups, *found.solves)
     if not parts or len(found.setups) != len(found.solves):
         raise ValueError("no times")
-    known = all(t >= 0.0 for t in (*parts, *found.times))
-    if not known or not max(math.fsum(parts), math.fsum(found.times)) <= took:
+    lines = [t - lead for t in found.times]
+    known = all(t >= 0.0 for t in (*parts, *lines))
+    if not known or not max(math.fsum(parts), math.fsum(lines)) <= took:
         raise ValueError("times that did not pass")
     if not all(t is None or t <= took for t in (found.pace, found.own)):
         raise ValueError("a pace, or a time of its own, that did not pass")

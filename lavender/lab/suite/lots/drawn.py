@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from lavender.base.errors import UnknownName
+from lavender.base.errors import check_name
 from lavender.base.later import sparse as sp
 from lavender.base.later import spatial
 from lavender.lab.suite.build import Bodies, Contacts, each, sideways, tenfold
@@ -323,8 +323,7 @@ def drawn(seed: int = 0, rows: int = 3000, part: str = "all") -> Draft:
     Or "rolling": worlds to tune on whose contacts resist rolling, and perhaps spin.
     """
     at_least(8, rows=rows)
-    if part not in PART:
-        raise UnknownName("part", part, PART)
+    check_name("part", part, PART)
     rng = np.random.default_rng([seed, 0x647261, PART.index(part)])
     rolls = part == "rolling"
     lot = {"all": frozenset(STRUCTURES), "judged": JUDGED}.get(part, TUNED)
