@@ -214,10 +214,10 @@ class Solutions(Many, Sequence[Solution]):
 
     def _one(self, i: int) -> Solution:
         if i not in self._kept:
-            self._kept[i] = self._late_solution(i) if i in self._unread else self._solution(i)
+            self._kept[i] = self._make_late_solution(i) if i in self._unread else self._solution(i)
         return self._kept[i]
 
-    def _late_solution(self, i: int) -> Solution:
+    def _make_late_solution(self, i: int) -> Solution:
         """Of a world of a batch of which nothing was read before the deadline."""
         try:
             problem = self.problems[i]
