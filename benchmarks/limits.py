@@ -13,6 +13,7 @@ bring the counts closest to it (relative least squares, none negative). The file
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from statistics import median
 from time import perf_counter, thread_time
 from typing import Any
@@ -50,6 +51,12 @@ RATES = {
         "ANALYSED",
         "BODIES",
         "VELOCITIES",
+        "DISK_J",
+        "DISK_J_ROW",
+        "DISK_J_ENTRY",
+        "DISK_A",
+        "DISK_A_ROW",
+        "DISK_A_ENTRY",
     ),
     residuals: ("RESULT", "PASS", "WHITENED", "READ"),
 }
@@ -73,6 +80,14 @@ def problem_of(name: str) -> Callable[[], Problem]:
     half, b = rng.normal(size=(m, m // 2)), rng.normal(size=m)
     matrix = half @ half.T / m + 0.01 * np.eye(m)
     return lambda: Problem.contact(matrix, b, 0.5, friction="cone")
+
+
+def with_ellipses(problem: Problem) -> Problem:
+    """The problem with an ellipse for each contact of two tangents, mu_2 = mu_1 / 2."""
+    c = problem.cones
+    two = (c.kind == lv.CONTACT) & (c.n_tangents == 2)
+    kind, ratio = np.where(two, lv.CONTACT_ELLIPSE, c.kind), np.where(two, 0.5, c.patch_radius)
+    return replace(problem, cones=replace(c, kind=kind, patch_radius=ratio))
 
 
 def calls(make: Callable[[], Problem], solver: str, limit: float, repeats: int) -> tuple[float, float, Any]:
@@ -104,6 +119,13 @@ def set_ups(name: str) -> Iterator[tuple[str, Callable[[], float], float]]:
         lambda: residuals.judging_time(problem) - residuals.RESULT,
         least(ready, lambda p: residuals.judged(p, impulse)),
     )
+    stretched = with_ellipses(make())
+    if stretched.cones.has_ellipse:
+        yield (
+            "disks",
+            lambda: setup_times.estimate_disk_time(stretched),
+            least(lambda: with_ellipses(make()), lambda p: p.disk),
+        )
     for solver in SOLVERS:
         spec = get(solver)
         own = spec.load()()

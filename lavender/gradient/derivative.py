@@ -15,7 +15,7 @@ from lavender.gradient.chains import Bodies, Parts
 from lavender.gradient.result import BODIES, INPUTS, MATRICES, REACHES, Gradient
 from lavender.gradient.system import SMALL, System, prepared
 from lavender.judge.residuals import at_floor, residual
-from lavender.judge.states import States, linear_of
+from lavender.judge.states import States, linear_of, states_of
 from lavender.problem import Problem, check_problem
 from lavender.problem.derived import cached_property
 from lavender_ext.core.problem import rows_velocity
@@ -448,7 +448,12 @@ class Derivative:
 
     @cached_property
     def states(self) -> States:
-        """What each block does; `within` is how far Newton's next step would move it, and rounding."""
+        """What each block does, as `solution.states`, with a bound of the error that `distance_in_errors` estimates."""
+        return states_of(self.problem, self._impulse, self._linear)
+
+    @cached_property
+    def _estimated_error(self) -> FloatArray:
+        """(k,) N s: how far the next step of Newton's method would move each block, and rounding."""
         n, p = self._linear, self.problem
         with np.errstate(all="ignore"):
             size = np.abs(self._a_of_sizes()) + np.abs(p.b)
@@ -459,7 +464,8 @@ class Derivative:
                 ds = self._a(dz / self._root) / self._root
                 error += np.abs(dz - ds) / self._root
             error += 4.0 * U * size / self._root**2
-        return States(p, n, np.nan_to_num(error, nan=np.inf))
+        first = p.cones.ptr[:-1]
+        return np.maximum.reduceat(np.nan_to_num(error, nan=np.inf), first) if len(first) else error
 
     def _a_of_sizes(self) -> FloatArray:
         """|A| |lambda|, or no less where A is not formed."""
@@ -477,14 +483,16 @@ class Derivative:
 
     @property
     def distance_in_errors(self) -> FloatArray:
-        """(k,) the same over the solution's own error there."""
+        """(k,) the same over an estimate of the solution's error there: one step of Newton's method, and rounding."""
         with np.errstate(divide="ignore", invalid="ignore"):
-            found: FloatArray = np.where(self.distance == 0.0, 0.0, self.distance / self.states.within)
+            found: FloatArray = np.where(self.distance == 0.0, 0.0, self.distance / self._estimated_error)
         return found
 
     @cached_property
     def switching(self) -> tuple[int, ...]:
-        """Blocks within ten errors of another state: there are several derivatives, this one is of `states[i].name`."""
+        """Blocks within ten estimated errors of another state: there are several derivatives, this one is of
+        `states[i].name`.
+        """
         return tuple(int(i) for i in np.flatnonzero(self.distance_in_errors <= MANY))
 
     @property

@@ -229,12 +229,12 @@ class Solution:
 
     @property
     def states(self) -> States:
-        """What each block does, a sequence: open, sticks, slides, at a bound or free, and how far the next state is."""
+        """What each block does (open, sticks, slides, at a bound or free), and which states are not certain."""
         kept = self.__dict__
         if "_states" not in kept:
             from lavender.judge.states import states_of
 
-            kept["_states"] = states_of(self.residual._problem, self.impulse, self.residual)
+            kept["_states"] = states_of(self.residual._problem, self.impulse)
         found: States = kept["_states"]
         return found
 

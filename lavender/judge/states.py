@@ -1,6 +1,7 @@
-"""What each block of a problem does at an answer: open, sticks, slides, at a bound or free, and how far the next is.
+"""What each block of a problem does at an answer: open, sticks, slides, at a bound or free, and how certain that is.
 
-The cases are those of the judge's map (`lavender_ext/derivative/natural.pxd`): y = lambda - w / d decides.
+The cases are those of the judge's map (`lavender_ext/derivative/natural.pxd`): y = lambda - w / d decides. The distance
+between the answer and an exact solution is bounded by `lavender.judge.error_bound`.
 """
 
 from __future__ import annotations
@@ -12,8 +13,10 @@ from typing import Any
 import numpy as np
 
 from lavender.base.arrays import FloatArray, whole_number
-from lavender.judge.residuals import Residual, reference
+from lavender.judge.error_bound import bound_errors
+from lavender.judge.residuals import reference
 from lavender.problem import Problem
+from lavender.problem.derived import cached_property
 from lavender_ext.derivative.linear import CASES, Linear, Linears
 
 NAMES = ("open", "closed", "sticks", "slides", "free", "at a bound", "at a bound")  # by the kernels' numbers
@@ -22,48 +25,76 @@ assert tuple(CASES.values()) == tuple(range(len(NAMES)))
 
 @dataclass(frozen=True)
 class State:
-    """What one block does; `str()` says it."""
+    """What one block does; `str()` is a short sentence."""
 
-    name: str  # open, closed (no friction), sticks, slides (some part does), free, at a bound (some row is)
+    name: str  # open, closed (no friction), sticks, slides (some component does), free, at a bound (some row is)
     rows: tuple[str, ...]  # of each row; that of a contact's normal is open or closed
-    margin: float  # N s (N m s on angular rows), to the nearest other state; inf without one
-    within: float  # N s, error of the answer here: the judge's, and what rounding may hide
+    margin: float  # N s (N m s on angular rows), distance to the nearest other state; inf without one
+    # N s: an exact solution exists at which this block's impulse (by the norm of its rows) and its margin differ from
+    # those of the answer by at most this; inf if no bound is known.
+    tolerance: float
 
     @property
-    def border(self) -> bool:
-        """Nearer to another state than the answer's error: which of them it is in, nothing tells."""
-        return self.margin <= self.within
+    def at_boundary(self) -> bool:
+        """Whether the exact solution may have this block in another state: margin <= tolerance; True if unknown."""
+        return self.margin <= self.tolerance and self.margin < np.inf
+
+    @property
+    def is_known(self) -> bool:
+        """Whether there is a bound of the error: `tolerance` is finite."""
+        return self.tolerance < np.inf
 
     def __str__(self) -> str:
-        if self.border:
-            return f"on a border: {self.name}, {self.margin:.2g} N s from another state, known within {self.within:.2g}"
-        return f"{self.name}, {self.margin:.3g} N s from another state"
+        if self.margin == np.inf:
+            return f"{self.name}, no other state"
+        far = f"{self.name}, {self.margin:.3g} N s from another state"
+        if not self.is_known:
+            return f"{far}, error unknown"
+        return f"at a boundary: {far}, known to {self.tolerance:.2g} N s" if self.at_boundary else far
 
 
 class States(Sequence[State]):
-    """States of all k blocks of an answer; arrays for who wants all at once.
+    """States of all k blocks of an answer, and the same in arrays.
 
     Parameters
     ----------
     problem : Problem
+    impulse : (m,) N s
     linear : Linear
-        As `linear_of` makes it.
-    within : (m,) N s
-        Error of each row's impulse.
+        `linear_of` these two.
+
+    Attributes
+    ----------
+    case : (m,) int8
+        Case of each row by the kernels' numbers.
+    margin : (k,) N s
+        As of `State`.
     """
 
-    def __init__(self, problem: Problem, linear: Linear, within: FloatArray) -> None:
-        cones = problem.cones
-        self.case: Any = linear.case  # (m,) int8, case of each row by the kernels' numbers
-        self._ptr = cones.ptr
-        first = cones.ptr[:-1]
+    def __init__(self, problem: Problem, impulse: FloatArray, linear: Linear) -> None:
+        self._problem, self._impulse, self._linear = problem, impulse, linear
+        self.case: Any = linear.case
+        first = problem.cones.ptr[:-1]
         if len(first):
-            self.margin: FloatArray = np.minimum.reduceat(linear.margin, first)  # (k,) N s
-            self.within: FloatArray = np.maximum.reduceat(within, first)  # (k,) N s
-            # A contact slides where some part does, a joint is at a bound where some row is.
+            self.margin: FloatArray = np.minimum.reduceat(linear.margin, first)
+            # A contact slides where some component does, a joint is at a bound where some row is.
             self._code = np.maximum.reduceat(self.case, first)
         else:
-            self.margin, self.within, self._code = np.zeros(0), np.zeros(0), np.zeros(0, np.int8)
+            self.margin, self._code = np.zeros(0), np.zeros(0, np.int8)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return states_of, (self._problem, self._impulse)
+
+    @cached_property
+    def tolerance(self) -> FloatArray:
+        """(k,) N s: as of `State`, by `lavender.judge.error_bound` when it is first read."""
+        first = self._problem.cones.ptr[:-1]
+        if not len(first):
+            return np.zeros(0)
+        impulse_error, margin_error = bound_errors(self._problem, self._impulse, self._linear)
+        with np.errstate(over="ignore"):
+            error = np.sqrt(np.add.reduceat(impulse_error**2, first))
+        return np.maximum(error, np.maximum.reduceat(margin_error, first))
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -71,9 +102,22 @@ class States(Sequence[State]):
         return tuple(NAMES[code] for code in self._code)
 
     @property
-    def borders(self) -> tuple[int, ...]:
-        """Blocks on a border: nearer to another state than the answer's error."""
-        return tuple(int(i) for i in np.flatnonzero(self.margin <= self.within))
+    def boundary(self) -> tuple[int, ...]:
+        """Blocks whose state is not certain: `State.at_boundary`. Those without a bound are among them."""
+        return tuple(int(i) for i in np.flatnonzero((self.margin <= self.tolerance) & (self.margin < np.inf)))
+
+    @property
+    def unknown(self) -> tuple[int, ...]:
+        """Blocks whose error has no known bound: they share a load, or the answer is far from a solution."""
+        return tuple(int(i) for i in np.flatnonzero(self.tolerance == np.inf))
+
+    @property
+    def boundary_fraction(self) -> float | None:
+        """Share of blocks at a boundary among those whose error has a bound; None if none has one, 0 without blocks."""
+        known = self.tolerance < np.inf
+        if not known.any():
+            return None if len(known) else 0.0
+        return float(np.mean((self.margin <= self.tolerance)[known]))
 
     def __len__(self) -> int:
         return len(self._code)
@@ -84,8 +128,9 @@ class States(Sequence[State]):
         i = whole_number("block", i + len(self) if isinstance(i, int) and i < 0 else i)
         if i >= len(self):
             raise IndexError(f"block {i}; there are {len(self)}")
-        rows = tuple(NAMES[case] for case in self.case[self._ptr[i] : self._ptr[i + 1]])
-        return State(NAMES[self._code[i]], rows, float(self.margin[i]), float(self.within[i]))
+        ptr = self._problem.cones.ptr
+        rows = tuple(NAMES[case] for case in self.case[ptr[i] : ptr[i + 1]])
+        return State(NAMES[self._code[i]], rows, float(self.margin[i]), float(self.tolerance[i]))
 
     def __repr__(self) -> str:
         names = self.names
@@ -100,13 +145,6 @@ def linear_of(problem: Problem, impulse: FloatArray, most: int = 0) -> Linear:
     return Linears([data], [problem.on_disk(impulse)], most).one(0)
 
 
-def states_of(problem: Problem, impulse: FloatArray, found: Residual) -> States:
-    """States at an impulse (m,) [N s] that the judge has seen."""
-    metric = problem.disk.metric
-    with np.errstate(all="ignore"):
-        # sum F^2 / d <= (floor E0)^2 and F sqrt(nu / d) <= floor V0, F what rounding changes in w
-        hidden = found.floor * np.minimum(
-            found.energy_start / np.sqrt(metric.d), found.velocity_start / metric.weight
-        )
-        within = np.abs(found.error) + np.nan_to_num(hidden)
-    return States(problem, linear_of(problem, impulse), within)
+def states_of(problem: Problem, impulse: FloatArray, linear: Linear | None = None) -> States:
+    """Return the states at an impulse (m,) [N s]; `linear`: `linear_of` that, if it is known."""
+    return States(problem, impulse, linear_of(problem, impulse) if linear is None else linear)

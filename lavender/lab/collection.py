@@ -55,7 +55,9 @@ class Entry:
     sweeps: int | None = None
     # of A, scaled to a diagonal of 1, over its range; None above CONDITION rows
     condition: float | None = None
-    degenerate: float = 0.0  # share of blocks that are nearer to another state than the answer's error
+    degenerate: float = (
+        0.0  # share of blocks at a boundary, among those whose error has a bound (0 if none has one)
+    )
     known: str = "open"  # enclosed, infeasible or open
     radius: float | None = None  # m/s, of every row of the enclosed solution
     unique: bool = False  # proved to be the only motion
@@ -79,7 +81,7 @@ def certified(problem: Problem, name: str, group: str) -> Entry:
         made=suite.versions(package),
         sweeps=difficulty(problem),
         condition=condition(problem),
-        degenerate=round(len(answer.states.borders) / max(len(answer.states), 1), 3),
+        degenerate=round(answer.states.boundary_fraction or 0.0, 3),
     )
     base = asdict(entry)
     if answer.status is Status.INFEASIBLE:
@@ -209,8 +211,8 @@ def page(found: list[Entry], recorded: Sequence[Entry] = ()) -> str:
     columns = (
         "Rows from the least to the most; sweeps of PGS to a thousandth of the error of doing nothing, in the median "
         f"({SWEEPS:,} where it does not get there or does not take the problem), the same of the condition of A, "
-        "problems with blocks on a border; problems by law; and what is known. "
-        "Open are problems on the border of two states, where no proof by signs exists."
+        "problems with blocks at a boundary; problems by law; and what is known. "
+        "Open are problems on the boundary of two states, where no proof by signs exists."
     )
     claims = (
         "None of the files says which solver claimed what, so no published claim stands here to be contradicted; "
@@ -223,7 +225,7 @@ def page(found: list[Entry], recorded: Sequence[Entry] = ()) -> str:
         how,
         columns,
         claims,
-        "| set | problems | rows | sweeps | condition | on a border | "
+        "| set | problems | rows | sweeps | condition | at a boundary | "
         + " | ".join(laws)
         + " | enclosed | one motion | infeasible | open |",
         "|---|---|---|---|---|---|" + "---|" * (len(laws) + 4),

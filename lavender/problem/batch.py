@@ -31,7 +31,7 @@ from lavender.problem import FRICTION, Problem
 from lavender.problem.cones import Cones
 from lavender.problem.generalized import ASYMMETRY, ASYMMETRY32
 from lavender.problem.rows import Rows
-from lavender_ext.core.problem import LAWS
+from lavender_ext.core.problem import LAWS, nothing_done
 from lavender_ext.small.many import PLACE, Worlds
 
 __all__ = ["Batch"]
@@ -383,6 +383,13 @@ class Batch(Sequence[Problem]):
         """Where world i stands in an impulse of all, flat."""
         first, m = (int(self.at[i, PLACE[name]]) for name in ("row", "rows"))
         return slice(first, first + m)
+
+    def start(self, i: int) -> FloatArray:
+        """Zero impulses (m,) [N s] of world i, clipped to its bounds."""
+        if self._arrays is None:
+            return self[i].start()
+        first, m = (int(self.at[i, PLACE[name]]) for name in ("cone_row", "rows"))
+        return nothing_done(self.cones.lower[first : first + m], self.cones.upper[first : first + m])
 
     def impulses(self, name: str, given: Any) -> FloatArray:
         """Impulses of all worlds [N s], of the batch's shape, finite or not, as a new flat array."""

@@ -130,6 +130,20 @@ class Generalized:
         made._fill(_rows(jac, self.nv), self.operator.mass, velocity, self.names)
         return made
 
+    def with_scaled_rows(self, scale: FloatArray) -> Generalized:
+        """Return the same M, factor and v* with row i of J multiplied by scale[i], scale (m,) > 0."""
+        indptr, indices, data = self.operator.jac
+        data = data * np.repeat(scale, np.diff(indptr))
+        kept = data != 0.0
+        if not kept.all():  # products that vanished
+            indptr = np.append(0, np.cumsum(kept))[indptr].astype(np.int32)
+            indices, data = indices[kept], data[kept]
+        made = object.__new__(Generalized)
+        operator = kernels.Operator(indptr, indices, read_only(data), *self.operator.mass, self.operator)
+        operator.share_factor(self.operator)
+        made.__dict__.update(v_free=self.v_free, names=self.names, order=self.order, operator=operator)
+        return made
+
     def shifted(self, d: FloatArray, momentum: FloatArray | None = None) -> Generalized:
         """The same J, M + diag(d) with d (nv,) in the same order, and the same v* or that with this M v* (nv,)."""
         indptr, indices, data = self.operator.mass

@@ -15,7 +15,6 @@ from lavender.base.later import sparse as sp
 from lavender.problem.builders import Builders
 from lavender.problem.cones import Cones
 from lavender.problem.derived import once
-from lavender.problem.generalized import Generalized
 from lavender_ext.core.checks import LEAST
 
 
@@ -192,16 +191,16 @@ class Problem(Builders):
         more: dict[str, Any] = {"guess": guess, "key": self.key, "names": self.names, "name": self.name}
         more |= {"friction": self.friction, "precision": self.precision}
         if self.generalized is None:
-            a = sp.csr_array(sp.diags_array(s) @ self.csr @ sp.diags_array(s))
+            indptr, indices, data = self._compressed
+            data = np.repeat(s, np.diff(indptr)) * data * s[indices]
+            a = sp.csr_array((data, indices, indptr), shape=(self.m, self.m))
             made = Problem(s * self.b, cones, a, copy=False, **more)
         else:
-            g = self.generalized
-            jac = sp.csr_array(sp.diags_array(s) @ g.jac)
             assert self.compliance is not None
             soft = s * s * self.compliance
             soft[soft < LEAST] = 0.0  # less than a compliance may have
-            given = Generalized(jac, g.mass, g.v_free, g.names)
-            made = Problem(s * self.b, cones, generalized=given, compliance=soft, copy=False, **more)
+            scaled = self.generalized.with_scaled_rows(s)
+            made = Problem(s * self.b, cones, generalized=scaled, compliance=soft, copy=False, **more)
         if self.rows is not None:
             made.metric.weigh_as(self.metric, True)
         return made

@@ -225,13 +225,18 @@ class SolverSpec:
         kinds = self.boxes == {"coulomb", "cone"} and self.round_cones and self.parts
         return kinds and self.laws == set(LAWS) and "matrix" in self.operators and self.refusal is None
 
-    def refuses(self, problem: Problem) -> str | None:
-        """None when the solver takes this problem, else the reason."""
+    def refuses(self, problem: Problem, kind_alone: bool = False) -> str | None:
+        """None when the solver takes this problem, else the reason.
+
+        kind_alone: Compare the problem's kind with the spec alone, for which nothing of the problem is worked out, and
+        do not call `refusal`.
+        """
         if self.takes_all:
             return None
         check_problem(problem)
-        asked, problem = problem, problem.disk
-        law = problem.law
+        law, operator = problem.law, problem.operator
+        if operator == "rows" and problem.cones.has_ellipse:
+            operator = "matrix"  # of `problem.disk`, which is what solvers get
         if law in self.laws and law not in ("linear", "lcp", *self.boxes) and problem.cones.has_box:
             return (
                 "takes no boxes, contacts that bound each tangent by itself: use one of those that do, "
@@ -243,12 +248,12 @@ class SolverSpec:
             if law == "coulomb" and "cone" in self.boxes and problem.cones.is_polyhedral:
                 way = ": pass problem.relaxed('cone'), or use a solver for Coulomb friction"
             return f"takes laws {takes}, not {law!r}{self.bounded or way}"
-        if "matrix" not in self.operators and problem.operator not in self.operators:
+        if "matrix" not in self.operators and operator not in self.operators:
             makers = {"rows": "Problem.from_rows", "generalized": "Problem.from_jacobian"}
             needs = " or ".join(f"{o} ({makers[o]})" for o in OPERATORS if o in self.operators)
-            given = "as a matrix" if problem.operator == "matrix" else f"by its {problem.operator} form"
-            if asked.operator != problem.operator:
-                given = f"by its {asked.operator} form with ellipses, which becomes a matrix (problem.disk)"
+            given = "as a matrix" if operator == "matrix" else f"by its {operator} form"
+            if problem.operator != operator:
+                given = f"by its {problem.operator} form with ellipses, which becomes a matrix (problem.disk)"
             return f"needs a problem with {needs}; this one was given {given}"
         if problem.cones.has_round and not self.round_cones:
             return (
@@ -260,10 +265,10 @@ class SolverSpec:
                 "takes no contacts that resist what rolls: use one of those that do, lavender.available(problem) lists "
                 "them, or leave the rows that roll out"
             )
-        if self.refusal is None:
+        if self.refusal is None or kind_alone:
             return None
         try:
-            return self.refusal(problem) or None
+            return self.refusal(problem.disk) or None
         except Exception as error:
             if self.own:
                 raise

@@ -11,7 +11,7 @@ from math import inf
 
 from lavender.judge import residuals
 from lavender.problem import Problem
-from lavender.solvers.registry import SMALL_ROWS
+from lavender.solvers.registry import SMALL_ROWS, SolverSpec
 from lavender_ext.factor.sparse import bandwidth
 
 START = 5e-5  # s, of each
@@ -27,6 +27,9 @@ BODIES, VELOCITIES, ORDERED = 3e-8, 4.5e-8, 1e-7
 SWEPT = 1.5e-9  # s for each multiply-add of a sweep, of its room and of itself
 LOADING, SCIPY = 0.3, ("scipy.sparse", "scipy.linalg.lapack")  # s of a part of SciPy; what factors need
 DENSE, SPARSE = 1.5e-10, 1e-9  # s for each multiply-add of a first factor
+# s of `Problem.disk` over J and M: its calls, each row, each entry of J; and over a matrix, each entry of A.
+DISK_J, DISK_J_ROW, DISK_J_ENTRY = 1e-4, 3e-8, 2.5e-9
+DISK_A, DISK_A_ROW, DISK_A_ENTRY = 1.5e-4, 4e-8, 8e-9
 
 
 def forming(problem: Problem) -> float:
@@ -43,6 +46,28 @@ def formed_once(problem: Problem) -> float:
     else:
         entries = FORMED * problem.most_entries
     return START + EACH * problem.m + entries
+
+
+def estimate_disk_time(problem: Problem) -> float:
+    """Estimate the time [s] of making `problem.disk`; 0 if it is known, or if the problem has no ellipses.
+
+    Nothing is worked out for the estimate but the numbers of bodies, and these only after their own time is counted.
+    """
+    if not problem.cones.has_ellipse or "_disk" in problem.__dict__:
+        return 0.0
+    if problem.generalized is not None:
+        of_j = len(problem.generalized.operator.jac[1])
+        return DISK_J + DISK_J_ROW * problem.m + DISK_J_ENTRY * of_j
+    entries = problem.most_entries if problem.matrix is None else problem.matrix.size
+    made = DISK_A + DISK_A_ROW * problem.m + DISK_A_ENTRY * entries
+    return made + forming(problem) + loading("scipy.sparse")
+
+
+def estimate_refusal_time(problem: Problem, spec: SolverSpec) -> float:
+    """Estimate the time [s] of `SolverSpec.refusal`: adapters of other packages read a whole matrix."""
+    if not spec.external or problem.matrix is None or "_scan" in problem.__dict__:
+        return 0.0
+    return residuals.setup_time(problem) + residuals.READ * float(problem.matrix.size)
 
 
 def loading(*modules: str) -> float:

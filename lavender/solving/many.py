@@ -67,11 +67,21 @@ class Solutions(Many, Sequence[Solution]):
         What is wrong with the worlds that are REFUSED, by their numbers.
     """
 
-    def __init__(self, given: Any, starts: Any, cold: bool, tol: float, spec: SolverSpec) -> None:
+    def __init__(
+        self,
+        given: Any,
+        starts: Any,
+        cold: bool,
+        tol: float,
+        spec: SolverSpec,
+        options: dict[str, Any],
+        errors: str,
+    ) -> None:
         super().__init__(given, starts, cold)
         self.tol, self._spec, self._starts, self._cold = tol, spec, starts, cold
+        self._options, self._errors = options, errors
         self._kept: dict[int, Solution] = {}
-        self._unread: list[int] = []  # worlds whose turn came too late: their starts, unjudged
+        self._unread: list[int] = []  # worlds whose turn came too late: their starts, not judged yet
         self._seconds = 0.0  # share of each
         # Of a batch the loop writes over the starts.
         self._given = None if cold or not isinstance(given, Batch) else starts.copy()
@@ -92,6 +102,7 @@ class Solutions(Many, Sequence[Solution]):
     def velocity(self) -> FloatArray:
         """v+ [m/s, rad/s]: of a stacked batch (n, nv); else of all worlds one after the other, none of a matrix."""
         if isinstance(self.problems, Batch):
+            self._read()
             return read_only(self._velocity.reshape(self.problems.velocity_shape))  # type: ignore[union-attr]
         found = [np.zeros(0)]
         for i, p in enumerate(self.problems):
@@ -143,10 +154,23 @@ class Solutions(Many, Sequence[Solution]):
         self._impulse[self._rows(i)] = found.impulse
         self._unread.append(i)
 
+    def mark_late(self, i: int) -> None:
+        """Keep the start of a late world of a batch, whose problem is made when its numbers are read."""
+        if self._cold:
+            self._impulse[self._rows(i)] = self.problems.start(i)  # type: ignore[attr-defined]
+        self._worlds.code[i] = CODE["late"]
+        self._unread.append(i)
+
     def _read(self) -> None:
         # A thread that comes meanwhile works out the same numbers.
         for i in self._unread:
-            self.keep(i, self._kept[i])
+            try:
+                self.keep(i, self._one(i))
+            except LavenderError as error:
+                if self._errors == "raise":
+                    raise
+                self.faults[i], self._worlds.numbers[:, i] = error, np.nan
+                self.empty_refused()
         self._unread = []
 
     def keep(self, i: int, found: Solution) -> None:
@@ -188,8 +212,17 @@ class Solutions(Many, Sequence[Solution]):
 
     def _one(self, i: int) -> Solution:
         if i not in self._kept:
-            self._kept[i] = self._solution(i)
+            self._kept[i] = self._make_late_solution(i) if i in self._unread else self._solution(i)
         return self._kept[i]
+
+    def _make_late_solution(self, i: int) -> Solution:
+        """Of a world of a batch of which nothing was read before the deadline."""
+        try:
+            problem = self.problems[i]
+        except LavenderError as error:
+            raise self._fault(i, error) from None
+        start = self._impulse[self._rows(i)]
+        return unjudged(problem, self._spec, self._options, start, self.tol, f"{NO_TURN}, unjudged")
 
     def _solution(self, i: int) -> Solution:
         """Of a world that the loop ended."""
@@ -252,7 +285,8 @@ def solve_many(
         As `solve`.
     time_limit : float, optional, s
         Limit of the whole call on the wall clock. Worlds take their turns in order, each with all of the time left;
-        those whose turn comes too late keep their start, with status TIME_LIMIT.
+        those whose turn comes too late keep their start, with status TIME_LIMIT; the data of such a world of a batch
+        may be checked only when its numbers are read.
     errors : {"raise", "status"}
         Of a world whose data or start are refused (NaN, an M that is not definite, a negative mu): raise what is wrong
         with the first, or go on and give it the status REFUSED; `Solutions.faults` has the words.
@@ -277,7 +311,7 @@ def solve_many(
     deadline = NEVER if limit == np.inf else Deadline(limit)
     check_budget(spec, tol, max_iter)
     starts, unusable = _starts(given, impulse, impulses, errors)
-    made = Solutions(given, starts, starts is None, tol, spec)
+    made = Solutions(given, starts, starts is None, tol, spec, options, errors)
     made._unusable = unusable
     # What the results of those to come take is kept free.
     if deadline.is_set:
@@ -296,17 +330,25 @@ def solve_many(
         return int(hand.solve(tol, *asked, COUNTED * (deadline.left(LEAST) or LEAST)))
 
     def alone(i: int) -> None:
+        # The first late world of a batch is made, so that a solver that refuses its kind says so; the others are not.
+        is_another = isinstance(given, Batch) and made._unread and made._worlds.code[i] != CODE["bad"]
+        if is_another and deadline.passed():
+            made.mark_late(i)
+            return
         problem, start = given[i], made.start(i)
         if small is not None and made._worlds.code[i] == CODE["tried"] and not deadline.is_set:
             small.in_vain(problem, start, tol, made._counts(problem, i))
-        if deadline.is_set and not isinstance(given, Batch):
-            deadline.keep(-UNREAD)
+        if deadline.is_set:
+            if not isinstance(given, Batch):
+                deadline.keep(-UNREAD)
             if deadline.passed():
-                check_taken(problem, spec)
+                check_taken(problem, spec, deadline)
                 made.late(i, unjudged(problem, spec, options, start, tol, f"{NO_TURN}, unjudged"))
                 return
         found = solve(problem, solver, impulse=start, time_limit=deadline.left(LEAST), **more)
-        made.keep(i, found if "callback" in options else uninterrupted(found))
+        is_judged = found.status is not Status.TIME_LIMIT or "residual" in vars(found)
+        keep = made.keep if is_judged else made.late
+        keep(i, found if "callback" in options else uninterrupted(found))
 
     begin = perf_counter()
     made._run(turn, alone, threads, errors)

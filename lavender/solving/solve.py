@@ -22,6 +22,7 @@ from lavender.judge.residuals import (
     judging_time,
     known,
     reference,
+    residual,
     setup_time,
     told,
     unstretched,
@@ -39,7 +40,7 @@ from lavender.judge.solution import (
 from lavender.problem import Problem, check_problem
 from lavender.solvers.loop import LEAST, Callback, Loop, Record, best_of
 from lavender.solvers.registry import SMALL_ROWS, Solver, SolverSpec, get
-from lavender.solvers.setup_times import SCIPY, loading
+from lavender.solvers.setup_times import SCIPY, estimate_disk_time, estimate_refusal_time, loading
 from lavender.solving.outcome import decide_empty_rows, finish
 from lavender_ext.judge.measure import all_finite
 
@@ -119,7 +120,7 @@ def solve(
         if made is not None:
             return made
     deadline = _deadline(spec, limit, begun)
-    return Prepared(problem, spec, options, False)._solve(
+    return Prepared(problem, spec, options, False, deadline)._solve(
         None, impulse, tol, max_iter, deadline, history, callback
     )
 
@@ -170,10 +171,15 @@ class Prepared:
     """
 
     def __init__(
-        self, problem: Problem, spec: SolverSpec, options: dict[str, Any], begin: bool = True
+        self,
+        problem: Problem,
+        spec: SolverSpec,
+        options: dict[str, Any],
+        begin: bool = True,
+        deadline: Deadline = NEVER,
     ) -> None:
-        watch = Stopwatch()  # a check may form A, which is set-up
-        check_taken(problem, spec)
+        watch = Stopwatch()  # a check may form A, and ellipses become disks: both are set-up
+        late = check_taken(problem, spec, deadline)
         for name in options:
             if name not in spec.accepts:
                 if name in FRONT_DOOR:
@@ -188,7 +194,7 @@ class Prepared:
                 raise UnknownName(f"option of solver {spec.name!r}", name, {*spec.accepts, *FRONT_DOOR})
         self.spec = spec
         self.options = options
-        self._given, self.problem = problem, problem.disk
+        self._given, self.problem = problem, problem if late else problem.disk
         self._lock = Lock()
         # `auto` prepares nothing before its compiled call for small problems was made.
         if begin and (options or not spec.delegates):
@@ -203,6 +209,7 @@ class Prepared:
 
     def _begin(self, deadline: Deadline) -> None:
         watch = Stopwatch()
+        self.problem = self._given.disk
         self.solver = _make(self.spec, self.options)
         try:
             self._set_up(self.problem, True, deadline)
@@ -212,11 +219,11 @@ class Prepared:
         self._fresh = True
         self.setup_time += watch.seconds
 
-    def _take(self, problem: Problem | None) -> None:
+    def _take(self, problem: Problem | None, deadline: Deadline = NEVER) -> None:
         """Another problem, if one is given, in the place of the prepared one; nothing is set up for it yet."""
         if problem is not None and problem is not self._given:
-            check_taken(problem, self.spec)
-            self._given, self.problem, self.solver = problem, problem.disk, None
+            late = check_taken(problem, self.spec, deadline)
+            self._given, self.problem, self.solver = problem, problem if late else problem.disk, None
 
     def solve(
         self,
@@ -265,6 +272,9 @@ class Prepared:
             tol, max_iter = check_budget(self.spec, tol, max_iter)
             _check_records(self.spec, history, callback)
             check_problem(given)
+            if comes_too_late(given, self.spec, deadline):
+                self._take(problem, deadline)
+                return unjudged(given, self.spec, self.options, impulse, tol, JUDGE_LATE)
             asked = given.disk
             start = None if impulse is None else given.on_disk(asked.impulse_array(impulse))
             if deadline.is_set:
@@ -394,14 +404,11 @@ def unjudged(
     words: str,
     setup_time: float = 0.0,
 ) -> Solution:
-    """The start as it is, where even the judge would be late; he measures it for the first who asks."""
-    problem = given.disk
-    start = problem._start if problem.guess is None else problem.guess
-    if impulse is not None:
-        start = given.on_disk(problem.impulse_array(impulse))
-    answer = start if given is problem else given.cones.stretch * start
-    late = judged_later, (given, problem, spec, options, start.copy(), Claim(TIME_LIMIT, 0, {}, words), tol)
-    return Solution.late(read_only(answer.copy()), TIME_LIMIT, tol, 0.0, late, setup_time)
+    """The start as it is, if even the judge would be late: it measures the start when a field is first read."""
+    start = given._start if given.guess is None else given.guess
+    start = start.copy() if impulse is None else given.impulse_array(impulse)
+    late = judged_later, (given, spec, options, start, Claim(TIME_LIMIT, 0, {}, words), tol)
+    return Solution.late(read_only(start), TIME_LIMIT, tol, 0.0, late, setup_time)
 
 
 def _in_rows_of(given: Problem, stretch: FloatArray, callback: Callback) -> Callback:
@@ -455,11 +462,14 @@ def same_structure(p: Problem, q: Problem) -> bool:
     return equal(p.csr.indptr, q.csr.indptr) and equal(p.csr.indices, q.csr.indices)
 
 
-def judged_later(given: Problem, problem: Problem, *more: Any) -> dict[str, Any]:
-    """The fields that `unjudged` leaves for later."""
-    spec, options, impulse, claim, tol = more
-    made = finish(problem, spec, options, impulse, claim, tol, 0.0, 0.0, None)
-    made = made if given is problem else made.unstretched(given)
+def judged_later(
+    given: Problem, spec: SolverSpec, options: dict[str, Any], impulse: FloatArray, claim: Claim, tol: float
+) -> dict[str, Any]:
+    """The fields that `unjudged` leaves for later; impulse (m,) [N s] in the rows of `given`, read-only."""
+    disk = given.disk
+    made = finish(disk, spec, options, given.on_disk(impulse), claim, tol, 0.0, 0.0, None)
+    if given is not disk:
+        made = replace(made.unstretched(given), residual=residual(given, impulse, "float64"))
     return {name: getattr(made, name) for name in ("residual", *LATER)}
 
 
@@ -544,12 +554,37 @@ def rest_of(
     }
 
 
-def check_taken(problem: Problem, spec: SolverSpec) -> None:
-    """Raise where it is no problem, or the solver refuses it."""
+def check_taken(problem: Problem, spec: SolverSpec, deadline: Deadline = NEVER) -> bool:
+    """Raise if it is not a problem, or if the solver refuses it; return `comes_too_late`.
+
+    If that is so, only the kind of the problem is checked: whatever is checked beyond it takes longer than is left.
+    """
     check_problem(problem)
-    reason = spec.refuses(problem)
+    late = comes_too_late(problem, spec, deadline)
+    reason = spec.refuses(problem, late)
     if reason:
         raise CapabilityError(f"solver {spec.name!r} {reason}")
+    return late
+
+
+def comes_too_late(problem: Problem, spec: SolverSpec, deadline: Deadline) -> bool:
+    """Whether the forms of a problem that are read before any solver has it would be made after the deadline.
+
+    These are `problem.disk`, and A where a package of others refuses by its entries. Such a call returns its start.
+    """
+    if not deadline.is_set:
+        return False
+    if problem.rows is not None and problem.cones.has_ellipse and deadline.passed(setup_time(problem)):
+        return True  # the numbers of bodies alone, from which the entries of A are counted
+    needed = estimate_disk_time(problem) + estimate_refusal_time(problem, spec)
+    if needed > 0.0 and problem.generalized is None and deadline.passed(needed) and loading("scipy.sparse"):
+        watch = Stopwatch()
+        load()
+        deadline.keep(
+            -watch.seconds
+        )  # as processes are started: else no call within the limit would ever have it
+        needed = estimate_disk_time(problem) + estimate_refusal_time(problem, spec)
+    return needed > 0.0 and deadline.passed(needed)
 
 
 def seconds_of(time_limit: Any) -> float:

@@ -83,6 +83,12 @@ cdef class Operator:
         for i in range(n):
             numbers[n + i] = sqrt(numbers[i])
 
+    def share_factor(self, Operator other):
+        """Take L and D of another operator, whose M is the same and whose factor is known."""
+        self.keep.append(other.keep[1])
+        self.g.lval, self.g.inv_pivot, self.g.root = other.g.lval, other.g.inv_pivot, other.g.root
+        self.failed = other.failed
+
     cdef bint has_pattern(self, int32_t n, const int32_t* mptr, const int32_t* midx):
         return self.g.n == n and (self.mptr == mptr or memcmp(self.mptr, mptr, (n + 1) * sizeof(int32_t)) == 0) and (
             self.midx == midx or memcmp(self.midx, midx, mptr[n] * sizeof(int32_t)) == 0)

@@ -127,6 +127,7 @@ def solved(spec, problem):
     if "others" in spec:
         yield from together(spec, problem, solution)
     if spec["again"]:
+        yield from states(spec, problem, solution)
         COUNTS["repeated"] += 1
         COUNTS["solves"] += 1
         if data_of(problem) != before:
@@ -231,6 +232,26 @@ def claims(spec, problem, solution):
             np.abs(twin.d).max(initial=0)
         ):
             yield "wrong number", f"{name}: d"
+
+
+def states(spec, problem, solution):
+    """Blocks in another state at a tighter answer, and errors beyond their bounds, if the solution is unique."""
+    own = solution.states
+    if not (own.tolerance >= 0.0).all() or own.unknown != tuple(np.flatnonzero(np.isinf(own.tolerance))):
+        yield "wrong number", f"{spec['solver']}: bounds of errors {own.tolerance}"
+    if problem.m == 0 or problem.law == "coulomb" or not problem.is_semidefinite:
+        return
+    other = lv.solve(problem, tol=1e-13)
+    tight = other.states
+    with np.errstate(all="ignore"):  # impulses that are not finite
+        off = problem.on_disk(solution.impulse - other.impulse)
+        error = np.sqrt(np.add.reduceat(off**2, problem.cones.ptr[:-1]))
+        beyond = error > (own.tolerance + tight.tolerance) * (1.0 + 1e-9)
+    if beyond.any():
+        yield "false claim", f"{spec['solver']}: an error of {error[beyond]} within {own.tolerance[beyond]}"
+    for i in set(range(len(own))) - set(own.boundary) - set(tight.boundary):
+        if own.names[i] != tight.names[i]:
+            yield "false claim", f"{spec['solver']}: '{own[i]}' is '{tight[i]}' at a tighter answer"
 
 
 # -- files -----------------------------------------------------------------------------------------------------

@@ -185,7 +185,7 @@ class Record(_Texts):
     motion: float | None = None  # -, relative motion error; None if it was not requested, or if there is none
     motion_speed: float | None = None  # m/s, of the body that is furthest off (row, without bodies)
     bound: float | None = None  # sqrt J, proved bound of the motion error
-    degenerate: float | None = None  # -, share of blocks on a border at the answer
+    degenerate: float | None = None  # -, share of blocks at a boundary; None if no error has a bound
     bits: str = ""  # hash of the answer: equal where two answers are, to the last bit
     worst_row: int = -1
     worst_name: str = ""

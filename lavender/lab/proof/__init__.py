@@ -18,7 +18,7 @@ where each inequality holds over the box of the zero, it is a solution. Rows tha
 included, keep the impulse that they were given: the impulses are one of a family, the velocities are those of all.
 Balls cannot tell a zero from a small number: a row that carries nothing and has w = 0 is proven where it depends, as
 exactly, on rows that have, or where a solution in rational numbers says so (nothing slides, up to RATIONAL unknowns);
-else it is named as on the border of two cases, unless a proof begins from an answer of OTHERS, inside of a family.
+else it is named as on the boundary of two cases, unless a proof begins from an answer of OTHERS, inside of a family.
 
 Needs python-flint (extra `proof`).
 """
@@ -88,7 +88,7 @@ def prove(problem: Problem, solution: Any) -> Enclosure:
     check_problem(problem)
     given = problem.impulse_array(solution.impulse if isinstance(solution, Solution) else solution)
     found = _searched(problem, given, given)
-    if found.borders and problem.m <= OTHERS_ROWS:
+    if found.boundary and problem.m <= OTHERS_ROWS:
         for name in OTHERS:
             try:
                 other = solve(problem, name, tol=1e-12, time_limit=SECONDS)

@@ -168,7 +168,7 @@ class Island:
         for step in range(30):
             value, speeds = self.value(x)
             if any(not (s > 0) for _, s in speeds):
-                break  # its case is wrong, or on the border
+                break  # its case is wrong, or on the boundary
             if (
                 inverse is None
                 or moved > (1e-3 if self.sliding else 0.1) * last

@@ -17,7 +17,7 @@ from lavender.lab.proof.numbers import UNIT, Balls, Rationals, sign_of, upper_en
 from lavender.lab.proof.operator import Operator, Part
 from lavender.problem import Problem
 
-RATIONAL = 100  # unknowns up to which borders are decided in rational numbers, where nothing slides
+RATIONAL = 100  # unknowns up to which boundaries are decided in rational numbers, where nothing slides
 
 NAMED = 2000  # unknowns up to which a singular direction is looked for
 
@@ -41,7 +41,7 @@ class Enclosure:
     reason: str = ""
     impulse: FloatArray | None = field(default=None, repr=False)  # (m,) N s, the exact one rounded
     # degenerate blocks by name: between two cases, dependent to rounding, or singular
-    borders: tuple[str, ...] = ()
+    boundary: tuple[str, ...] = ()
 
     def __str__(self) -> str:
         if not self.proven:
@@ -76,9 +76,9 @@ class _Block:
 class _Undecided(Exception):
     """A condition that balls or the number of rounds leave open."""
 
-    def __init__(self, reason: str, borders: tuple[str, ...] = ()) -> None:
+    def __init__(self, reason: str, boundary: tuple[str, ...] = ()) -> None:
         super().__init__(reason)
-        self.borders = borders
+        self.boundary = boundary
 
 
 class Search:
@@ -147,19 +147,19 @@ class Search:
                 except _Recase:
                     continue
                 if not (exactly and self.exact):
-                    borders = self._changed(lam, w)
-                    exactly = bool(borders) and self.exact
+                    boundary = self._changed(lam, w)
+                    exactly = bool(boundary) and self.exact
                 if exactly:
-                    borders = self._changed(*self.solve(Rationals(self.flint)))
-                if borders == []:
+                    boundary = self._changed(*self.solve(Rationals(self.flint)))
+                if boundary == []:
                     return self.told(lam, w)
-                if borders:
+                if boundary:
                     raise self._undecided(
-                        borders, f"on the border of two cases, closer than {self.flint.ctx.prec} bits tell"
+                        boundary, f"on the boundary of two cases, closer than {self.flint.ctx.prec} bits tell"
                     )
             raise _Undecided(f"cases still change after {ROUNDS} rounds; a more accurate answer is needed")
         except _Undecided as undecided:
-            return Enclosure(False, reason=str(undecided), borders=undecided.borders)
+            return Enclosure(False, reason=str(undecided), boundary=undecided.boundary)
 
     def _undecided(self, blocks: list[_Block], words: str) -> _Undecided:
         names = tuple(dict.fromkeys(self.problem.row_name(block.first) for block in blocks))
@@ -334,7 +334,7 @@ class Search:
 
     def _changed(self, lam: list[Any], w: list[Any]) -> list[_Block] | None:
         """Change the cases that are certainly wrong: None; else the blocks whose inequalities cannot be told."""
-        changed, border = False, []
+        changed, boundary = False, []
         cones, number = self.problem.cones, self.number
         for block in self.blocks:
             r = block.first
@@ -359,7 +359,7 @@ class Search:
                     elif not sign and not block.touches:
                         block.touches = changed = True
                     elif not sign and r not in self.still:
-                        border.append(block)
+                        boundary.append(block)
                 continue
             speeds = [
                 sum(((number(c) * w[k]) ** 2 for k, c in zip(p.rows, p.reach, strict=True)), 0 * w[r])
@@ -379,7 +379,7 @@ class Search:
                 elif not sign and not block.touches:
                     block.touches = changed = True
                 elif not sign and ((self.cone and block.parts) or r not in self.still):
-                    border.append(block)
+                    boundary.append(block)
                 continue
             sign = sign_of(lam[r])
             if sign <= 0:
@@ -396,8 +396,8 @@ class Search:
                 if sign < 0:
                     part.slides = changed = True
                 elif not sign:
-                    border.append(block)
-        return None if changed else border
+                    boundary.append(block)
+        return None if changed else boundary
 
     def _root(self, square: Any) -> Any:
         """A ball that holds the root; a ball of a square may reach below 0."""

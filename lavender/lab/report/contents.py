@@ -26,8 +26,9 @@ Rows = list[Sequence[str | Cell]]
 GOOD = ("CONVERGED", "FLOOR")
 SHOWN_TIES = 2
 DIFFICULTY = (
-    "sweeps of pgs to a thousandth of doing nothing; condition of A scaled to a diagonal of 1; share of blocks on the "
-    "border of two states; solvers with the same bits and no iteration, whose times are of one shortcut"
+    "sweeps of pgs to a thousandth of doing nothing; condition of A scaled to a diagonal of 1; share of blocks at the "
+    "boundary of two states, among those whose error has a bound; "
+    "solvers with the same bits and no iteration, whose times are of one shortcut"
 )
 IN_TURNS, ALONE = "in turns", "alone"  # lines of a recommendation, timed again; runs one after the other
 ENGINES_OWN = "engine's own"  # column of the solver of the engine that recorded the cases
@@ -283,7 +284,7 @@ def difficulty_table(found: Sequence[tables.Difficulty]) -> Table:
         ]
         for d in found
     ]
-    heads = ["case", "rows", "sweeps", "condition", "on a border", "same answer", "exact solution"]
+    heads = ["case", "rows", "sweeps", "condition", "at a boundary", "same answer", "exact solution"]
     return Table(heads, rows).without(*(heads[i] for i in (5, 6) if not any(row[i] for row in rows)))
 
 

@@ -102,7 +102,9 @@ class Difficulty:
     rows: int
     sweeps: int | None  # of `pgs` to EASY; None where it did not get there, or was not asked
     condition: float | None  # of A, as `CaseInfo.condition`
-    degenerate: float | None  # share of blocks on a border at the best answer
+    degenerate: (
+        float | None
+    )  # share of blocks at a boundary at the best answer, of those whose error has a bound
     proof: str
     same: tuple[str, ...]  # solvers that gave the same bits without an iteration: a shortcut of all was timed
 

@@ -94,7 +94,7 @@ def test_states_of_rows_and_parts():
     solution = lv.solve(p, tol=1e-12)
     assert solution.states.names == ("free", "at a bound", "at a bound", "at a bound")
     assert [s.margin for s in solution.states[:3]] == pytest.approx([1.0, 1.0, 1.0])
-    assert solution.states.borders == (3,) and "on a border" in str(solution.state(3))
+    assert solution.states.boundary == (3,) and "at a boundary" in str(solution.state(3))
     with pytest.raises(IndexError, match="block 4; there are 4"):
         solution.state(4)
     spin = lv.Problem(np.array([10.0, 9.0, 0.0, 0.5]), lv.Cones.contacts(0.5, 2, 1.0), np.eye(4))

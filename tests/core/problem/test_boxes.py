@@ -174,6 +174,35 @@ def test_a_compliance_that_a_thin_ellipse_makes_less_than_one_may_be_is_none():
     assert lv.solve(problem, tol=1e-9).success
 
 
+@pytest.mark.parametrize("mass", ["in order", "in another order"])
+def test_disks_share_the_factor_of_the_mass_matrix(mass):
+    """Bit for bit what J with longer rows and the same M come to, although M is neither checked nor factored again."""
+    rng, n = np.random.default_rng(0), 12
+    half = np.eye(n) + np.diag(rng.normal(size=n - 1), 1)
+    M = half @ half.T
+    if mass == "in another order":  # an arrow, which fills in as it stands
+        M = np.diag(np.full(n, 20.0))
+        M[-1], M[:, -1] = 1.0, 1.0
+        M[-1, -1] = 20.0
+    J = rng.normal(size=(9, n)) * (rng.random((9, n)) < 0.5)
+    J[2] *= 1e-306  # some products with 1e-18 vanish
+    cones = lv.Cones.contacts([(0.5, 2e-18), (0.8, 0.3), (0.2, 0.9)])
+    problem = lv.Problem.from_jacobian(J, M, rng.normal(size=n), cones=cones, compliance=0.1)
+    s, disk = cones.stretch, problem.disk
+    anew = lv.problem.generalized.Generalized(s[:, None] * J, M, problem.generalized.v_free)
+    assert disk.generalized == anew
+    for own, other in zip(disk.generalized.operator.jac, anew.operator.jac, strict=True):
+        assert own.tobytes() == other.tobytes()
+    x = rng.normal(size=9)
+    assert disk.generalized.change(x).tobytes() == anew.change(x).tobytes()
+    assert (
+        disk.metric.whitened()[2].tobytes()
+        == lv.Problem(disk.b, disk.cones, generalized=anew, compliance=disk.compliance)
+        .metric.whitened()[2]
+        .tobytes()
+    )
+
+
 ELLIPSES = {"generalized": ellipses, "matrix": lambda *a, **k: as_matrix(ellipses(*a, **k)), "rows": on_rows}
 
 

@@ -2,13 +2,14 @@
 
 import os
 import sys
+from itertools import product
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import scipy.sparse as sp
 from calls import dense, over_velocities
-from random_problems import FORMS, random_contact_problem, random_lcp
+from random_problems import FORMS, random_contact_problem, random_ellipses, random_lcp
 from worked import python
 
 import lavender as lv
@@ -17,9 +18,11 @@ from lavender import registry
 from lavender.base.later import load
 from lavender.judge import residuals
 from lavender.judge.residuals import judging_time
+from lavender.problem.derived import once
+from lavender.problem.operators import Operators
 from lavender.solvers import factors
 from lavender.solvers.auto import Auto
-from lavender.solvers.setup_times import forming
+from lavender.solvers.setup_times import estimate_disk_time, forming
 from lavender.solvers.small import AUTO
 
 
@@ -232,6 +235,137 @@ def test_a_world_of_j_and_m_whose_turn_comes_too_late_says_so(name):
     for late in lv.solve_many(worlds, name, time_limit=1e-9):
         assert (late.status, late.iterations, dict(late.work)) == (lv.Status.TIME_LIMIT, 0, {})
         assert "time limit" in late.message and not late.impulse.any() and str(late)
+
+
+@pytest.fixture
+def slow_disks(clock, monkeypatch):
+    """Disks and the judge's numbers take, by a clock that is played, what is counted for them; how many were made."""
+    made = SimpleNamespace(disks=0)
+    disk, metric = (vars(of)[name] for of, name in ((lv.Problem, "_disk"), (Operators, "metric")))
+    make_disk, make_metric = disk.function, metric.function
+
+    def slow_disk(problem):
+        counted = estimate_disk_time(problem)
+        found = make_disk(problem)
+        clock.now, made.disks = clock.now + counted, made.disks + 1
+        return found
+
+    def slow_metric(problem):
+        clock.now += residuals.setup_time(problem)
+        return make_metric(problem)
+
+    monkeypatch.setattr(disk, "function", slow_disk)
+    monkeypatch.setattr(metric, "function", slow_metric)
+    return made
+
+
+def grown(seed, form, kind):
+    """Contacts with ellipses, or with disks, enough of them that no form is made in a microsecond."""
+    own = (random_ellipses if kind == "ellipse" else random_contact_problem)(
+        seed, "cone", bodies=30, contacts=40
+    )
+    return FORMS[form](own)
+
+
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("kind", ["ellipse", "disk"])
+def test_no_form_of_a_problem_is_made_after_the_deadline(form, kind, slow_disks, clock):
+    """`Problem.disk` was made, and A for it, before the clock was read: 0.2 ms took 8 to 20 times as long."""
+    start, before = grown(0, form, kind).start(), made_once(grown(0, form, kind))
+    for name, spec in registry.specs().items():
+        problem = grown(0, form, kind)
+        if spec.missing() or spec.external or spec.refuses(problem, True) is not None:
+            continue
+        prepared = lv.prepare(problem, name)
+        for limit, again in product((1e-9, 1e-4, 2e-4, 5e-4), (False, True)):
+            given, clock.now = grown(0, form, kind), 0.0
+            late = (
+                prepared.solve(given, time_limit=limit) if again else lv.solve(given, name, time_limit=limit)
+            )
+            assert clock.now <= limit, (name, limit)
+            if limit == 1e-9:
+                assert made_once(given) == before and late.status is lv.Status.TIME_LIMIT, name
+                assert np.array_equal(late.impulse, start)  # to the bit: nothing was stretched and back
+                assert late.residual.relative == lv.residual(given, late.impulse).relative
+                assert late.message and not late.iterations
+
+
+def made_once(problem):
+    """What was worked out of a problem and kept."""
+    return {name for name in vars(problem) if isinstance(getattr(type(problem), name, None), once)}
+
+
+def test_a_package_of_others_does_not_read_a_matrix_after_the_deadline(clock):
+    pytest.importorskip("daqp")
+    problem = lv.Problem.lcp(np.eye(30), np.ones(30))
+    assert lv.solve(problem, "daqp", time_limit=1e-9).status is lv.Status.TIME_LIMIT
+    assert not made_once(problem)
+
+
+def test_a_kind_that_a_solver_does_not_take_is_refused_under_any_limit(slow_disks, clock):
+    problem = grown(0, "rows", "ellipse")
+    for name in ("gauss_seidel", "sequential_impulses"):
+        with pytest.raises(lv.CapabilityError):
+            lv.solve(problem, name, time_limit=1e-9)
+    assert not slow_disks.disks
+
+
+def test_no_disks_are_made_of_late_worlds_of_a_list(clock):
+    ellipses = [grown(seed, "J and M", "ellipse") for seed in range(3)]
+    for problem, late in zip(ellipses, lv.solve_many(ellipses, time_limit=1e-9), strict=True):
+        assert late.status is lv.Status.TIME_LIMIT and "_disk" not in vars(problem)
+        assert late.residual.relative == lv.residual(problem, late.impulse).relative
+
+
+def test_late_worlds_of_a_batch_are_not_made(clock, monkeypatch):
+    """Of ellipses each was, with its disks, and judged: 20 ms of 200 worlds took 14 to 18 times as long."""
+    rng, n, each = np.random.default_rng(0), 60, 1e-3
+    cones = lv.Cones.contacts([(0.5, 0.8)] * 3) + lv.Cones.bounded([0.25], [np.inf])
+    batch = lv.Batch(rng.normal(size=(n, 10, 8)), np.eye(8), rng.normal(size=(n, 8)), cones=cones)
+    make, made = lv.Batch.__getitem__, []
+
+    def slow(self, i):
+        clock.now += each
+        made.append(i)
+        return make(self, i)
+
+    monkeypatch.setattr(lv.Batch, "__getitem__", slow)
+    starts = np.zeros((n, 10))
+    starts[:, 0] = 0.5
+    for more in ({}, {"impulse": starts}):
+        made.clear()
+        clock.now = 0.0
+        found = lv.solve_many(batch, time_limit=20.0 * each, **more)
+        assert (
+            clock.now <= 22.0 * each and len(made) <= 22
+        )  # one that the limit overtakes, one that says if it refuses
+        late = np.array([status is lv.Status.TIME_LIMIT for status in found.status])
+        assert np.sum(~late) >= 15 and found.success[~late].all() and late[-1]
+        wanted = starts[-1] if more else make(batch, 0).start()
+        assert wanted.any() and (found.impulse[late] == wanted).all()
+        i = n - 1  # its numbers, when they are read
+        assert found[i].residual.relative == found.relative[i] == lv.residual(make(batch, i), wanted).relative
+        assert found.velocity[i].tobytes() == make(batch, i).velocity(wanted).tobytes()
+        assert "turn" in found[i].message and not found.iterations[i]
+    with pytest.raises(lv.CapabilityError):
+        lv.solve_many(batch, "direct", time_limit=1e-9)
+
+
+def test_a_late_world_whose_data_are_no_problems_says_so_when_it_is_read(clock, monkeypatch):
+    cones, free = lv.Cones.contacts([(0.5, 0.8)]), np.zeros((9, 3))
+    free[7] = np.nan
+    batch, make = lv.Batch(np.tile(np.eye(3), (9, 1, 1)), np.eye(3), free, cones=cones), lv.Batch.__getitem__
+
+    def slow(self, i):
+        clock.now += 1.0
+        return make(self, i)
+
+    monkeypatch.setattr(lv.Batch, "__getitem__", slow)
+    found = lv.solve_many(batch, time_limit=2.0, errors="status")
+    assert np.isnan(found.relative[7]) and np.isnan(found.impulse[7]).all() and np.isfinite(found.relative[8])
+    assert "world 7" in str(found.faults[7])
+    with pytest.raises(lv.InputError, match="world 7"):
+        lv.solve_many(batch, time_limit=2.0).relative  # noqa: B018
 
 
 SLOW = """

@@ -81,13 +81,13 @@ def test_an_answer_at_the_edge_of_a_family_of_impulses_is_proven_from_inside_of_
     assert found.proven and found.velocity_radius < 1e-9
     assert abs(found.impulse - edge.impulse).max() <= found.impulse_radius  # of this answer, not of the other
     monkeypatch.setattr(proof, "OTHERS", ())
-    assert lv.prove(problem, edge).borders == ("row 12", "row 21")
+    assert lv.prove(problem, edge).boundary == ("row 12", "row 21")
 
 
-def test_a_border_is_named():
+def test_a_block_on_the_boundary_of_two_cases_is_named():
     """A block pushed exactly as hard as friction holds: between sticking and sliding, for any arithmetic."""
     found = lv.prove((problem := suite.case("threshold").problem), lv.solve(problem, tol=1e-12))
-    assert not found.proven and found.borders == ("contact 0, normal",) and "contact 0" in str(found)
+    assert not found.proven and found.boundary == ("contact 0, normal",) and "contact 0" in str(found)
 
 
 def test_what_has_no_solution_is_not_proven():

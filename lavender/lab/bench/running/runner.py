@@ -12,7 +12,6 @@ from typing import Any
 
 from lavender.base.arrays import FloatArray, several
 from lavender.base.errors import LavenderError
-from lavender.judge.residuals import residual
 from lavender.judge.states import states_of
 from lavender.lab import motion
 from lavender.lab.bench import machine
@@ -86,10 +85,10 @@ def with_motion(record: Record, problem: Problem, impulse: Any) -> Record:
 
 
 def with_answer(record: Record, problem: Problem, impulse: FloatArray) -> Record:
-    """The record with what its impulses (m,) [N s] are: their bits, and how many blocks are on a border."""
-    states = states_of(problem, impulse, residual(problem, impulse))
+    """The record with what its impulses (m,) [N s] are: their bits, and how many blocks are at a boundary."""
+    fraction = states_of(problem, impulse).boundary_fraction
     bits = hashlib.sha256(impulse.tobytes()).hexdigest()[:16]
-    return replace(record, bits=bits, degenerate=len(states.borders) / max(len(states), 1))
+    return replace(record, bits=bits, degenerate=fraction)
 
 
 def is_foreign(spec: SolverSpec) -> bool:
