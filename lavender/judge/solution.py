@@ -49,6 +49,9 @@ NUMERICAL_ERROR = Status.NUMERICAL_ERROR
 STALLED = Status.STALLED
 TIME_LIMIT = Status.TIME_LIMIT
 
+#: Values of `Solution.claim_check`, from best to worst.
+CLAIM_CHECKS = CONFIRMED, NOT_PROVEN, CONTRADICTED = "confirmed", "not proven", "contradicted"
+
 
 @dataclass(frozen=True)
 class Turn:
@@ -128,7 +131,7 @@ class Solution:
     residual : Residual
         Its error, measured by the judge: `relative` [-], `energy` [sqrt J], `velocity` [m/s], the worst row.
     status : Status
-        The solver's claim. `success` and `contradicted` are the judge's findings.
+        The solver's claim. `success` and `claim_check` are the judge's findings.
     tol : float, -
         The relative residual that was asked for.
     iterations : int
@@ -148,8 +151,12 @@ class Solution:
     impulse_bound : float or None, N s
         With a certificate: the least sum of |impulse| of every solution of the problem as it was given; inf where it
         has none. Also of STALLED, where a solver met a direction that shows such a bound.
-    contradicted : str
-        Why the judge disagrees with `status`; empty if it agrees.
+    claim_check : {"confirmed", "not proven", "contradicted"}
+        Result of comparing `status` with the judge's residual and certificate. "confirmed": they agree, or the status
+        claims nothing that can be checked. "not proven": the status is INFEASIBLE, and no certificate proves it.
+        "contradicted": the judge's figures exclude what the status claims.
+    status_conflict : str
+        Reason if the claim is contradicted, else empty.
 
     Examples
     --------
@@ -176,7 +183,8 @@ class Solution:
     dual: Any
     certificate: FloatArray | None  # (m,), with INFEASIBLE
     impulse_bound: float | None  # N s, with a certificate: the least sum |impulse| of every solution
-    contradicted: str  # why the judge disagrees with `status`; empty where it does not
+    claim_check: str  # CONFIRMED, NOT_PROVEN or CONTRADICTED
+    status_conflict: str  # why the judge's figures exclude what `status` claims; empty if they do not
     # of the last checks, in which the residual falls tenfold; NaN where it did not fall, or no sweeps were checked
     sweeps_per_decade: float
     turns: tuple[Turn, ...]  # of `auto`: who ran, in order, and what came of it; () of other solvers
@@ -290,8 +298,8 @@ class Solution:
             "work": self._done,
             "time": self._took,
         }
-        if self.contradicted:
-            facts["contradicted"] = self.contradicted
+        if self.claim_check != CONFIRMED:
+            facts[self.claim_check] = self.status_conflict or self.status.name
         return table_of(facts, self.solver.name)
 
     def __repr__(self) -> str:
@@ -309,7 +317,7 @@ class Solution:
 
     def __str__(self) -> str:
         note = f"; {self.message}" if self.message else ""
-        wrong = f"; CONTRADICTED: {self.contradicted}" if self.contradicted else ""
+        wrong = f"; CONTRADICTED: {self.status_conflict}" if self.claim_check == CONTRADICTED else ""
         return (
             f"{self.solver.name}: {self.status.name}, {self.residual}, {self._done}, "
             f"{self._took}{note}{wrong}"

@@ -103,7 +103,7 @@ class QPSolution:
         if how == "CONVERGED, ":
             how = "the last step CONVERGED, "
         words = "solved" if self.found else f"not solved to {self.tol:g}"
-        wrong = "" if self.solution is None else self.solution.contradicted
+        wrong = "" if self.solution is None else self.solution.status_conflict
         wrong = f"; CONTRADICTED: {wrong}" if wrong else ""
         return f"{words}: {how}error {self.error:.1e}, objective {self.objective:.6g}{wrong}"
 

@@ -29,6 +29,9 @@ from lavender.solvers.setup_times import over_rows
 from lavender_ext.pivot import lemke
 from lavender_ext.pivot.lemke import DONE, LATE, RAY
 
+RAY_MESSAGE = (
+    "ended on a secondary ray: this method cannot go on, and a solution may exist (auto looks further)"
+)
 LIMIT = 2000  # rows: a dictionary of 32 MB
 ENTRY = 1e-9  # s for each entry of the dictionary in a pivot
 LAID_OUT, ELIMINATED = 5e-8, 5e-10  # s for each of the first one; for each that a free row's pivot touches
@@ -96,13 +99,13 @@ class Lemke(Solver):
         while True:
             code = paths.run(min(chunk, max_iter - paths.pivots))
             if code == RAY:
-                message = "ended on a secondary ray"
+                message = RAY_MESSAGE
                 certificate = _direction(paths.ray)
             if (
                 certificate is not None
                 and check_certificate(state.problem, certificate, tol, deadline) is None
             ):
-                status, message = Status.INFEASIBLE, f"{message}: no impulse meets every row"
+                status, message = Status.INFEASIBLE, "ended on a secondary ray: no impulse meets every row"
             elif code == DONE and rows.relative <= tol:
                 status, message = Status.CONVERGED, ""
             elif code == DONE:

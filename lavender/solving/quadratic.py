@@ -75,8 +75,8 @@ def solve_qp(
     -------
     QPSolution
         x, y, z, z_box; `error` says how wrong they are, `solution.status` how it ended. INFEASIBLE: no x fulfils the
-        constraints, and `problem.qp.multipliers(answer.solution.certificate)` proves it, unless the claim of another
-        package's solver is `contradicted`. An unbounded program has a `ray`.
+        constraints, and `problem.qp.multipliers(answer.solution.certificate)` proves it, if
+        `solution.claim_check` is "confirmed". An unbounded program has a `ray`.
 
     Raises
     ------
@@ -118,7 +118,7 @@ def solve_qp(
         if ray is not None and point is None and left > 0.0:
             limit = None if time_limit is None else left
             point = solve(_nearest(problem, qp), solver, tol=UNBOUNDED, time_limit=limit, **options)
-            if point.status is Status.INFEASIBLE and not point.contradicted:
+            if point.status is Status.INFEASIBLE and point.claim_check == "confirmed":
                 return replace(answer, solution=point)
             if point.success or point.residual.at_floor:
                 return replace(answer, ray=ray)
