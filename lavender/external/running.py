@@ -41,6 +41,7 @@ class Limits:
     gap_relative: float  # the same, of the objective; either will do
     max_iter: int
     time_limit: float | None  # s
+    repeated: bool = False  # the judge did not accept the answer of a call before
 
 
 @dataclass(frozen=True)
@@ -130,9 +131,12 @@ def ask(
             or at_floor(relative, floor)
             or left <= 0
             or deadline.passed()
+            or np.any(e[qp.assumed] != 0.0)  # another program is to be solved
         ):
             break
-        limits = [replace(level, max_iter=left, time_limit=deadline.left()) for level in limits]
+        limits = [
+            replace(level, max_iter=left, time_limit=deadline.left(), repeated=True) for level in limits
+        ]
         if limits:
             impulse[:] = start
     assert best is not None

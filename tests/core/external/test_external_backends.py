@@ -16,7 +16,7 @@ from worked import python
 
 import lavender as lv
 from lavender import registry
-from lavender.external import backends, qp_solver
+from lavender.external import as_qp, backends, qp_solver
 from lavender.external.as_qp import impulse_form, pick_form, target, velocity_form
 from lavender.external.running import Answer, quiet
 from lavender.judge.certificates import check_certificate
@@ -210,6 +210,37 @@ def test_contradicting_rows_are_proved_in_the_velocity_form(name):
     solution = lv.solve(problem, name, form="velocity")
     assert solution.status is lv.Status.INFEASIBLE, str(solution)
     assert check_certificate(problem, solution.certificate) is None
+
+
+@pytest.mark.parametrize("name", BACKENDS)
+@pytest.mark.parametrize("form", ["impulse", "velocity"])
+@pytest.mark.parametrize("share", [1e-3, 1e2])
+def test_rows_that_are_assumed_to_stay_at_their_bound_are_looked_at(name, form, share, monkeypatch):
+    """With a threshold of 1e-3 nearly every row that b pushes to a bound is taken out, and many of them act."""
+    if form == "velocity" and name in DEFINITE:
+        pytest.skip("its velocity form has a definite P without bounds of joints alone")
+    monkeypatch.setattr(as_qp, "FAR_FROM_BOUND", share)
+    for seed in range(4):
+        problem = random_contact_problem(seed, tangents=0, spin=False, bodies=4, contacts=8)
+        problem = replace(problem, compliance=np.full(problem.m, 1e-3))
+        if form == "impulse":
+            problem = as_matrix(problem)
+        assumed = qp_solver.QPSolver(next(b for b in backends.BACKENDS if b.name == name), form=form)
+        assert (len(assumed.prepare(problem).assumed) > 0) is (share < 1.0)
+        solution = lv.solve(problem, name, form=form)
+        assert solution.success, str(solution)
+
+
+@pytest.mark.parametrize("name", installed("clarabel_cone"))
+def test_contacts_that_separate_are_taken_out_with_their_friction(name):
+    problem = random_contact_problem(3, "cone", bodies=4, contacts=8)
+    away = problem.updated(b=np.where(np.arange(problem.m) == problem.cones.ptr[-2], -1e9, problem.b))
+    rows = range(away.cones.ptr[-2], away.cones.ptr[-1])
+    for one, taken_out in ((problem, []), (away, list(rows))):
+        solution = lv.solve(one, name)
+        assert solution.success, str(solution)
+        assert impulse_form(one, assume=True).assumed.tolist() == taken_out
+    assert not solution.impulse[list(rows)].any()
 
 
 @pytest.mark.parametrize("name", BACKENDS)
