@@ -258,6 +258,12 @@ class Solution:
         return found
 
     @property
+    def is_contradicted(self) -> bool:
+        """The judge's figures exclude what `status` claims."""
+        # Fields that `late` left for later belong to claims that were checked: they are not made for this.
+        return self.__dict__.get("claim_check") == CONTRADICTED
+
+    @property
     def success(self) -> bool:
         """The judge's relative residual is at most `tol`."""
         return self.residual.relative <= self.tol

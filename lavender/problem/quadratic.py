@@ -115,14 +115,15 @@ class QPSolution:
 
     @cached_property
     def _residuals(self) -> tuple[float, ...]:
-        """r_p, r_d, gap, and the three relative to their own terms."""
+        """r_p, r_d, gap, the three relative to their own terms, and the largest of these."""
         qp, of = self.qp, self.qp.generalized
         curved = 0.0
         if largest(qp.q) == 0.0:  # all forces may vanish; with q an x that runs away must not excuse it
             curved = FLAT * min(largest(of.operator.mass[2]), self._unseen / max(largest(self.x), TINY))
         found: tuple[float, ...] = program_residuals(
             self.x, qp.q, self._curvature, of.force(self.impulse), of.velocity_of(self.x), qp.target, self.impulse,
-            qp.free, of.operator.jac, self.x if of.order is None else self.x[of.order], qp.unbounded_sizes, curved,
+            qp.free, of.operator.jac, self.x if of.order is None else self.x[of.order],
+            qp.sizes_without_rows, curved,
         )  # fmt: skip
         return found
 
@@ -169,7 +170,7 @@ class QPSolution:
         If q is 0 all forces may vanish: then the dual residual is also relative to 1e-3 of the largest force of an x as
         large as rows let one expect, or to 1e-3 max |P_ij| max |x_i| if that is less.
         """
-        return float(np.max(self._residuals[3:]))  # NaN if one is
+        return self._residuals[6]
 
     @property
     def found(self) -> bool:
@@ -181,8 +182,9 @@ class QPSolution:
         solution = self.solution
         if solution is None:
             return True
-        infeasible = solution.status.name == "INFEASIBLE" and solution.claim_check == "confirmed"
-        return not infeasible and solution.claim_check != "contradicted"
+        if solution.status.name == "INFEASIBLE":
+            return bool(solution.claim_check == "not proven")
+        return not solution.is_contradicted
 
 
 @dataclass(frozen=True, eq=False)
@@ -245,8 +247,7 @@ class QuadraticProgram:
         force = np.abs(self.q) + abs(of.mass) @ far + np.abs(impulse) @ abs(of.jac)
         return read_only(np.divide(force, FAR * far, out=np.zeros(len(x)), where=far > 0.0))
 
-    @cached_property
-    def unbounded_sizes(self) -> FloatArray:
+    def sizes_without_rows(self) -> FloatArray:
         """(n,) Size of each variable without rows, |q_i| / M_ii or else |v*_i|, in the order of J's columns."""
         of = self.generalized
         ptr, _, value = of.operator.mass  # the lower triangle, diagonal last
@@ -254,7 +255,8 @@ class QuadraticProgram:
         if of.order is not None:
             force, free = force[of.order], free[of.order]
         size = force / value[ptr[1:] - 1]
-        return read_only(np.where(size > 0.0, size, free))
+        out: FloatArray = np.where(size > 0.0, size, free)
+        return out
 
     def sizes(self, x: FloatArray, impulse: FloatArray, most: np.ufunc, without: float) -> FloatArray:
         """(n,) What x_i would be if it were all of its rows: of the smallest or largest, by np.minimum or np.maximum.

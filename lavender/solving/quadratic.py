@@ -24,7 +24,7 @@ from lavender.base.errors import InputError
 from lavender.base.later import sparse as sp
 from lavender.judge.certificates import prove
 from lavender.judge.residuals import Residual, residual
-from lavender.judge.solution import CONFIRMED, Claim, Solution, Status, Turn
+from lavender.judge.solution import CONFIRMED, CONVERGED, Claim, Solution, Status, Turn
 from lavender.problem import Problem, QPSolution
 from lavender.problem.generalized import Generalized
 from lavender.problem.quadratic import QuadraticProgram
@@ -117,24 +117,15 @@ def _complete(answer: QPSolution, seconds: float) -> None:
     Residuals of the constraint problem are relative to that of x = v*; those of the program decide.
     """
     solution: Solution = answer.solution
-    known: dict[str, Any] = {"solve_time": seconds - solution.setup_time}
-    # Fields that nobody has read belong to a claim that was confirmed; reading them costs as much as a small solve.
-    holds = solution.status is Status.CONVERGED and vars(solution).get("claim_check", CONFIRMED) == CONFIRMED
-    if (
-        not holds
-        and solution.status not in KEEPS_STATUS
-        and answer.ray is None
-        and answer.error <= answer.tol
-    ):
+    values = solution.__dict__
+    values["solve_time"] = seconds - solution.setup_time
+    if solution.status in KEEPS_STATUS or (solution.status is CONVERGED and not solution.is_contradicted):
+        return
+    if answer.ray is None and answer.error <= answer.tol:
         relative = solution.residual.relative
         if solution.certificate is None and relative < math.inf:
-            known |= {
-                "status": Status.CONVERGED,
-                "tol": max(solution.tol, relative),
-                "claim_check": CONFIRMED,
-            }
-            known["status_conflict"] = ""
-    solution.__dict__.update(known)
+            values |= {"status": CONVERGED, "tol": max(solution.tol, relative)}
+            values |= {"claim_check": CONFIRMED, "status_conflict": ""}
 
 
 def _solve(

@@ -1,12 +1,12 @@
 """The judge for Python: thin entries of judge/measure.pxd, and the residuals of quadratic programs."""
 from libc.math cimport fabs
-from libc.stdint cimport int8_t, int32_t
+from libc.stdint cimport int32_t
 from libc.string cimport memcmp
 
 import numpy as np
 
 from lavender_ext.core cimport door
-from lavender_ext.core.arrays cimport doubles
+from lavender_ext.core.arrays cimport doubles, ints
 from lavender_ext.core.generalized cimport whitened_gather
 from lavender_ext.core.problem cimport Data, Room, room_for
 from lavender_ext.core.velocity cimport rows_velocity
@@ -220,8 +220,8 @@ cdef double ROUNDING = 1e-12
 cdef double SHARE_OF_TERMS = 1e-3
 
 
-def program_residuals(x_, q_, px_, force_, jx_, target_, lam_, int32_t free, jac, ordered_, unbounded_,
-                      double curved):
+def program_residuals(x_, q_, px_, force_, jx_, target_, lam_, int32_t free, jac, ordered_,
+                      sizes_without_rows, double curved):
     """Residuals of a quadratic program, and each relative to its own terms.
 
     Rows: J x = target (the first `free`), J x >= target (the others). Row i acts if it is one of the first, is violated,
@@ -236,12 +236,12 @@ def program_residuals(x_, q_, px_, force_, jx_, target_, lam_, int32_t free, jac
     c = 1e-3 for equations with a target that is not 0, else 1
     size_j = max terms_k / |J_kj| over the rows k that act; at least `unbounded` (n,) if all of these have target 0
 
-    px (n,) = P x, force (n,) = J^T lambda, jx (m,); jac: (indptr, indices, data) of J, with `ordered` (n,) = x and
-    `unbounded` in the order of its columns. Forces are at least `curved` max |x|, the terms of the gap this times |x_j|.
+    px (n,) = P x, force (n,) = J^T lambda, jx (m,); jac: (indptr, indices, data) of J, with `ordered` (n,) = x in the
+    order of its columns; `sizes_without_rows()` returns `unbounded` in this order. Forces are at least `curved` max |x|, the terms of the gap this times |x_j|.
 
     Returns
     -------
-    r_p, r_d, gap, and the three relative ones
+    r_p, r_d, gap, the three relative ones, and the largest of these
     """
     cdef Py_ssize_t i, j, k, n = len(x_), m = len(lam_)
     cdef const double* x = doubles(x_, n)
@@ -252,11 +252,14 @@ def program_residuals(x_, q_, px_, force_, jx_, target_, lam_, int32_t free, jac
     cdef const double* target = doubles(target_, m)
     cdef const double* lam = doubles(lam_, m)
     cdef const double* ordered = doubles(ordered_, n)
-    cdef const double* unbounded = doubles(unbounded_, n)
-    cdef const int32_t[::1] ptr = jac[0], column = jac[1]
-    cdef const double[::1] value = jac[2]
-    cdef double[::1] terms = np.zeros(m + 1), size = np.zeros(n + 1)
-    cdef int8_t[::1] acts = np.zeros(m + 1, np.int8)
+    cdef const double* unbounded = NULL
+    cdef const int32_t* ptr = ints(jac[0], m + 1)
+    cdef const int32_t* column = ints(jac[1], len(jac[1]))
+    cdef const double* value = doubles(jac[2], len(jac[2]))
+    cdef Room room = room_for((n + 2 * m) * sizeof(double))
+    cdef double* size = <double*>room.at
+    cdef double* terms = size + n
+    cdef double* acts = terms + m                       # 1 of a row that acts, else 0
     cdef double primal = 0.0, dual = 0.0, gap = 0.0, row_error = 0.0, force_error = 0.0, negative = 0.0
     cdef double forces = 0.0, far = 0.0, curvature = 0.0, linear = 0.0, multiplied = 0.0, sums = 0.0, total = 0.0
     cdef double violation, own, scale, largest, floor
@@ -269,6 +272,7 @@ def program_residuals(x_, q_, px_, force_, jx_, target_, lam_, int32_t free, jac
         forces = max_nan(forces, own)
         sums += fabs(x[j]) * own
         total += fabs(x[j])
+        size[j] = 0.0
         far = max_nan(far, fabs(x[j]))
     forces = max_nan(forces, curved * far)
     gap = curvature + linear
@@ -280,7 +284,7 @@ def program_residuals(x_, q_, px_, force_, jx_, target_, lam_, int32_t free, jac
         violation = target[i] - jx[i]
         acts[i] = i < free or violation > 0.0 or (lam[i] > 0.0 and -violation <= 0.5 * own)
         gap -= target[i] * lam[i]
-        if not acts[i]:
+        if acts[i] == 0.0:
             continue
         multiplied += target[i] * lam[i]
         homogeneous = homogeneous and target[i] == 0.0
@@ -288,6 +292,9 @@ def program_residuals(x_, q_, px_, force_, jx_, target_, lam_, int32_t free, jac
             if value[k] != 0.0:
                 size[column[k]] = max_nan(size[column[k]], own / fabs(value[k]))
     floor = SHARE_OF_LARGEST * far
+    if homogeneous:
+        kept = sizes_without_rows()
+        unbounded = doubles(kept, n)
     for j in range(n):
         if homogeneous:
             size[j] = max_nan(size[j], unbounded[j])
@@ -304,7 +311,7 @@ def program_residuals(x_, q_, px_, force_, jx_, target_, lam_, int32_t free, jac
         scale = max_nan(terms[i], scale)
         primal = max_nan(primal, violation)
         row_error = max_nan(row_error, ratio(violation, scale))
-        if acts[i]:
+        if acts[i] != 0.0:
             sums += fabs(lam[i]) * scale
         if i >= free:
             dual = max_nan(dual, -lam[i])
@@ -313,4 +320,6 @@ def program_residuals(x_, q_, px_, force_, jx_, target_, lam_, int32_t free, jac
     scale = max_nan(max_nan(fabs(curvature), fabs(linear)), max_nan(fabs(multiplied), SHARE_OF_TERMS * sums))
     scale = max_nan(scale, curved * far * total)
     gap = fabs(gap)
-    return primal, dual, gap, row_error, ratio(max_nan(force_error, negative), forces), ratio(gap, scale)
+    force_error = ratio(max_nan(force_error, negative), forces)
+    scale = ratio(gap, scale)
+    return primal, dual, gap, row_error, force_error, scale, max_nan(max_nan(row_error, force_error), scale)
