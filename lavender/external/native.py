@@ -68,6 +68,9 @@ def call_clarabel(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, A
     x, z = np.array(result.x), np.array(result.z)
     zeta = np.concatenate([z[:first], z[first + n_bounds :]])
     xi = bound_multipliers(qp, z[first:])
+    almost = name in ("AlmostPrimalInfeasible", "AlmostDualInfeasible")
+    if almost and any(part is not None for part in proof(qp, x, zeta)):
+        status = Status.INFEASIBLE  # its own test is stricter than the certificate needs
     # One factorisation before the first step and one for each.
     work = {"iterations": result.iterations, "factorisations": result.iterations + 1}
     return Answer(

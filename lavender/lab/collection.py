@@ -91,6 +91,8 @@ def certified(problem: Problem, name: str, group: str) -> Entry:
     except CapabilityError as error:
         return Entry(**base | {"reason": str(error)})
     base |= {"reason": found.reason, "unique": found.unique}
+    if found.infeasible:
+        return Entry(**base | {"known": "infeasible"})
     if found.proven:
         base |= {"known": "enclosed", "radius": found.velocity_radius}
     if problem.law == "coulomb" and not found.unique and problem.m <= SEARCHED:

@@ -253,7 +253,9 @@ def _is_open(problem: Problem) -> bool:
 
 
 def find_direction(problem: Problem, deadline: Deadline) -> FloatArray | None:
-    """A direction y (m,) from a linear program, still to be checked."""
+    """Find a direction y (m,) by a linear program, to be checked; None if a row has another bound than 0 below."""
+    if not _is_open(problem):
+        return None
     from scipy.optimize import linprog  # 0.1 s to import, needed only here
 
     # max b.y, A^T y + R u <= 0 (= 0 on free rows), |A^T y| <= u on tangents, 0 <= y <= 1, in units of d.
