@@ -100,6 +100,8 @@ class QPSolution:
             return f"unbounded: the objective falls for ever along ray; at x it is {self.objective:.6g}"
         # The solution's status is that of its own problem, with an M for P: no verdict on the program.
         how = "" if self.solution is None or self.found else f"{self.solution.status.name}, "
+        if self.solution is not None and self.solution.claim_check == "not proven":
+            how = f"{self.solution.status.name} (not proven), "
         if how == "CONVERGED, ":
             how = "the last step CONVERGED, "
         words = "solved" if self.found else f"not solved to {self.tol:g}"

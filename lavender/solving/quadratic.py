@@ -33,6 +33,7 @@ from lavender.solvers.interior_point import NAME, InteriorPoint
 from lavender.solvers.registry import SMALL_ROWS, get
 from lavender.solvers.setup_times import LAID_OUT, loading
 from lavender.solvers.small import told
+from lavender.solving.outcome import finish
 from lavender.solving.solve import judged_later, seconds_of, solve, solve_small
 
 STEPS = 50  # proximal steps
@@ -47,7 +48,7 @@ CENTRED = 1e-9  # tol of a step around a centre, at most: a ray shows only to UN
 SET_UP = 5e-3  # s of an interior point before its first step, in Python, whatever the size
 SOONER = 5e6  # counted cost [ns] of a compiled call, in which an interior point would hardly have begun
 HARD = (Status.FLOOR, Status.STALLED)  # after which the next step has more of D, too: M is nearly singular
-KEEPS_STATUS = (
+FINAL_STATUSES = (
     Status.FLOOR,
     Status.INTERRUPTED,
 )  # of the constraint problem, whatever the program's error is
@@ -119,7 +120,7 @@ def _complete(answer: QPSolution, seconds: float) -> None:
     solution: Solution = answer.solution
     values = solution.__dict__
     values["solve_time"] = seconds - solution.setup_time
-    if solution.status in KEEPS_STATUS or (solution.status is CONVERGED and not solution.is_contradicted):
+    if solution.status in FINAL_STATUSES or (solution.status is CONVERGED and not solution.is_contradicted):
         return
     if answer.ray is None and answer.error <= answer.tol:
         relative = solution.residual.relative
@@ -254,6 +255,9 @@ def _by_interior_point(
     work = {"factorisations": point.factorisations}
     turn = Turn(NAME, work, problem.metric.start_relative, judged.relative)
     claim = Claim(status, point.factorisations, work, told([turn]), certificate=proof, turns=(turn,))
+    if proof is not None:  # with an impulse within its bounds, which `finish` chooses
+        spec = get(solver)
+        return finish(problem, spec, {}, lam.copy(), claim, tol, 0.0, watch.seconds, None), answer.x
     rest: tuple[Any, ...] = judged_later, (problem, problem, get(solver), {}, lam, claim, tol)
     return Solution.late(lam, status, tol, watch.seconds, rest), answer.x
 

@@ -211,18 +211,18 @@ cdef inline double ratio(double x, double scale) noexcept nogil:
 
 
 # Rows that are zero at the solution, as x >= 0, have no terms of their own there. They are compared with what acting rows
-# make of their variables, and with this share of the largest variable; equations whose target is more than ROUNDING of
-# that, and so is their size, with FOR_EQUATIONS of both.
+# make of their variables, and with this share of the largest variable; equations whose target is more than TARGET_ROUNDING of
+# that, and so is their size, with EQUATION_SHARE of both.
 cdef double SHARE_OF_LARGEST = 1e-3
-cdef double FOR_EQUATIONS = 1e-3
-cdef double ROUNDING = 1e-12
+cdef double EQUATION_SHARE = 1e-3
+cdef double TARGET_ROUNDING = 1e-12
 # Share of the sum of |terms| that the gap is compared with at least: an objective whose terms cancel has no size.
 cdef double SHARE_OF_TERMS = 1e-3
 
 
 def program_residuals(x_, q_, px_, force_, jx_, target_, lam_, int32_t free, jac, ordered_,
                       sizes_without_rows, double curved):
-    """Residuals of a quadratic program, and each relative to its own terms.
+    """Compute the residuals of a quadratic program, and each relative to its own terms.
 
     Rows: J x = target (the first `free`), J x >= target (the others). Row i acts if it is one of the first, is violated,
     or has lambda_i > 0 and a slack of at most half its terms. Others enter no scale.
@@ -233,11 +233,12 @@ def program_residuals(x_, q_, px_, force_, jx_, target_, lam_, int32_t free, jac
                                                                1e-3 (sum_j |x_j| forces_j + sum_i |lambda_i| scale_i)
 
     scale_i = max(terms_i, c max_j |J_ij| max(size_j, 1e-3 max |x|)),  terms_i = max(|target_i|, max_j |J_ij x_j|),
-    c = 1e-3 for equations with a target that is not 0, else 1
+    c = 1e-3 for equations with a target above rounding, else 1
     size_j = max terms_k / |J_kj| over the rows k that act; at least `unbounded` (n,) if all of these have target 0
 
     px (n,) = P x, force (n,) = J^T lambda, jx (m,); jac: (indptr, indices, data) of J, with `ordered` (n,) = x in the
-    order of its columns; `sizes_without_rows()` returns `unbounded` in this order. Forces are at least `curved` max |x|, the terms of the gap this times |x_j|.
+    order of its columns; `sizes_without_rows()` returns `unbounded` in this order. Forces are at least `curved` max |x|,
+    and the gap's terms this times sum |x_j|.
 
     Returns
     -------
@@ -306,8 +307,8 @@ def program_residuals(x_, q_, px_, force_, jx_, target_, lam_, int32_t free, jac
         for k in range(ptr[i], ptr[i + 1]):
             largest = max_nan(largest, fabs(value[k]))
             scale = max_nan(scale, fabs(value[k]) * size[column[k]])
-        if i < free and fabs(target[i]) > ROUNDING * scale:
-            scale *= FOR_EQUATIONS
+        if i < free and fabs(target[i]) > TARGET_ROUNDING * scale:
+            scale *= EQUATION_SHARE
         scale = max_nan(terms[i], scale)
         primal = max_nan(primal, violation)
         row_error = max_nan(row_error, ratio(violation, scale))

@@ -47,7 +47,8 @@ OTHERS = ("newton", "admm")
 OTHERS_ROWS = 2000
 SECONDS = 10.0  # for each of them
 NEAR = 1e-6  # of the largest b: from the velocities of the answer
-SOLVED = 1e-6  # Relative residual above which an answer without a proof may be one of a problem without a solution.
+# If an answer without a proof has a larger relative residual, the problem may have no solution.
+UNSOLVED_RESIDUAL = 1e-6
 
 
 def prove(problem: Problem, solution: Any) -> Enclosure:
@@ -108,7 +109,7 @@ def prove(problem: Problem, solution: Any) -> Enclosure:
             again = _searched(problem, other.impulse, given)
             if again.proven and again.velocity_radius <= NEAR * float(abs(problem.b).max()):
                 return again
-    if not found.proven and not residual(problem, given).relative <= SOLVED:
+    if not found.proven and not residual(problem, given).relative <= UNSOLVED_RESIDUAL:
         other = solve(problem, time_limit=SECONDS)
         if other.certificate is not None:
             refuted = _infeasible(problem, other.certificate)

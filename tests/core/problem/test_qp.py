@@ -288,6 +288,20 @@ def test_contradicting_rows_are_infeasible_with_a_certificate_by_every_solver_th
         assert solution.claim_check == "confirmed" and solution.certificate is not None
 
 
+def test_the_residual_of_an_infeasible_program_is_that_of_its_impulse():
+    """Of more than 64 rows an interior point proves it; impulses are within their bounds and judged as they are."""
+    rng, n = np.random.default_rng(0), 40
+    root, G = rng.normal(size=(n, n)), rng.normal(size=(120, n))
+    h = G @ rng.normal(size=n)
+    problem = lv.Problem.from_qp(
+        root.T @ root, rng.normal(size=n), G=np.vstack([G, -G[0]]), h=[*h, -h[0] - 1.0]
+    )
+    solution = lv.solve_qp(problem).solution
+    assert solution.status is lv.Status.INFEASIBLE and solution.claim_check == "confirmed"
+    assert (solution.impulse >= 0.0).all()
+    assert solution.residual.relative == lv.residual(problem, solution.impulse).relative
+
+
 def test_bounds_in_the_wrong_order_are_refused_and_not_infeasible():
     with pytest.raises(lv.InputError, match="variable 1"):
         lv.Problem.from_qp(np.eye(2), np.zeros(2), lb=[0.0, 1.0], ub=[1.0, 0.5])
