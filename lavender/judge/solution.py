@@ -29,7 +29,7 @@ class Status(str, Enum):
     TIME_LIMIT = "the time limit was reached"
     STALLED = "no progress any more"
     DIVERGED = "the iterate grew, or is not finite"
-    INFEASIBLE = "no solution exists; `certificate` proves it"
+    INFEASIBLE = "no solution exists; `certificate` proves it, unless `claim_check` says otherwise"
     NUMERICAL_ERROR = "a factorisation or the backend failed"
     INTERRUPTED = "stopped by Ctrl-C or by the callback"
     REFUSED = "of one world of many: its data are no problem's"
@@ -147,7 +147,7 @@ class Solution:
     dual : object
         A backend's own multipliers.
     certificate : (m,), or None
-        With INFEASIBLE: the proof that there is no solution.
+        With INFEASIBLE: the proof that there is no solution, if the claim is confirmed.
     impulse_bound : float or None, N s
         With a certificate: the least sum of |impulse| of every solution of the problem as it was given; inf where it
         has none. Also of STALLED, where a solver met a direction that shows such a bound.

@@ -11,7 +11,7 @@ import numpy as np
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import InputError
 from lavender.judge.certificates import prove, rounded_down
-from lavender.judge.residuals import FLOOR_MOST, at_floor, reference, relative_of, residual
+from lavender.judge.residuals import FLOOR_MOST, Residual, at_floor, reference, relative_of, residual
 from lavender.judge.solution import (
     CONFIRMED,
     CONTRADICTED,
@@ -60,9 +60,11 @@ def finish(
 
     `refutation` says which solution the caller found if the solver claims that there is none.
     """
+    # In float64, in which solvers work, whatever the data were.
     if claim.status is INFEASIBLE and all_finite(impulse):
-        impulse = _within_bounds(problem, impulse)
-    judged = residual(problem, impulse, "float64")  # in which solvers work, whatever the data were
+        impulse, judged = _within_bounds(problem, impulse)
+    else:
+        judged = residual(problem, impulse, "float64")
     status, message = claim.status, claim.message
     relative = judged.relative
     if status is not NUMERICAL_ERROR and not all_finite(impulse):
@@ -133,7 +135,7 @@ def finish(
             "message": message,
             "history": history,
             "dual": claim.dual,
-            "certificate": certificate if status is INFEASIBLE else None,
+            "certificate": certificate if status is INFEASIBLE and not unproven else None,
             "impulse_bound": bound,
             "claim_check": CONTRADICTED if status_conflict else NOT_PROVEN if unproven else CONFIRMED,
             "status_conflict": status_conflict,
@@ -160,13 +162,14 @@ def describe_end(problem: Problem, status: Status, iterations: int) -> str:
     return words
 
 
-def _within_bounds(problem: Problem, impulse: FloatArray) -> FloatArray:
-    """Project an impulse (m,) [N s] onto the bounds, or return the zero impulse if its residual is smaller.
+def _within_bounds(problem: Problem, impulse: FloatArray) -> tuple[FloatArray, Residual]:
+    """Project an impulse (m,) [N s] onto the bounds; take the zero impulse instead if its residual is smaller.
 
     An engine that applies the impulse of an infeasible step must not pull at a contact.
     """
     candidates = project(problem.cones, impulse), problem.start()
-    return min(candidates, key=lambda lam: residual(problem, lam, "float64").relative)
+    results = [(lam, residual(problem, lam, "float64")) for lam in candidates]
+    return min(results, key=lambda result: result[1].relative)
 
 
 def _contradicting_impulse(problem: Problem) -> float:

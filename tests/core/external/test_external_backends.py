@@ -500,6 +500,7 @@ def test_a_claim_of_infeasibility_that_nobody_decides_is_not_proven(register, mo
     monkeypatch.setattr(certify, "CERTIFICATE_ROWS", 1)  # too many rows for our own search
     solution = lv.solve(lv.Problem.lcp(*spd(3)), "osqp")
     assert solution.status is lv.Status.INFEASIBLE and solution.claim_check == "not proven"
+    assert solution.certificate is None
     assert solution.status_conflict == "" and "not proven: no certificate was given" in solution.message
     assert "CONTRADICTED" not in str(solution)
 
