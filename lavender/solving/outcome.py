@@ -163,13 +163,14 @@ def describe_end(problem: Problem, status: Status, iterations: int) -> str:
 
 
 def _within_bounds(problem: Problem, impulse: FloatArray) -> tuple[FloatArray, Residual]:
-    """Project an impulse (m,) [N s] onto the bounds; take the zero impulse instead if its residual is smaller.
+    """Project an impulse (m,) [N s] onto the bounds; take the zero impulse instead if its error has less energy.
 
-    An engine that applies the impulse of an infeasible step must not pull at a contact.
+    An engine that applies the impulse of an infeasible step must not pull at a contact. The largest velocity error does
+    not decide: it is that of the rows that cannot be met, whatever the others gained.
     """
     candidates = project(problem.cones, impulse), problem.start()
     results = [(lam, residual(problem, lam, "float64")) for lam in candidates]
-    return min(results, key=lambda result: result[1].relative)
+    return min(results, key=lambda result: result[1].energy)
 
 
 def _contradicting_impulse(problem: Problem) -> float:

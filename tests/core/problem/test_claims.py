@@ -153,8 +153,22 @@ def test_the_impulse_of_an_infeasible_problem_is_within_its_bounds(name, seed, m
     assert not solution.success
     if solution.status is lv.Status.INFEASIBLE:
         assert (solution.impulse >= 0.0).all()
-        assert solution.residual.relative <= 1.0
+        assert solution.residual.energy <= solution.residual.energy_start
         assert solution.claim_check == "confirmed" and solution.certificate is not None
+
+
+def test_rows_that_contradict_each_other_cost_no_other_row_its_impulse(plug_in):
+    """The largest velocity error is that of rows that cannot be met; it chose the zero impulse for all."""
+
+    def run(problem, impulse):
+        impulse[:] = [*np.full(10, 0.1), 0.0, 0.1]  # the last two rows are off by 1.1 and 0.9, 1 each at rest
+        return lv.Claim(lv.Status.INFEASIBLE, 1, certificate=np.array([*np.zeros(10), 1.0, 1.0]))
+
+    contradicting = np.array([[1.0, -1.0], [-1.0, 1.0]])
+    a = np.block([[np.eye(10), np.zeros((10, 2))], [np.zeros((2, 10)), contradicting]])
+    solution = lv.solve(lv.Problem.lcp(a, [*np.full(10, 0.1), 1.0, 1.0]), plug_in(run))
+    assert solution.status is lv.Status.INFEASIBLE and solution.claim_check == "confirmed"
+    np.testing.assert_array_equal(solution.impulse[:10], 0.1)
 
 
 def test_a_ray_of_lemke_does_not_blame_the_data():

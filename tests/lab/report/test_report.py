@@ -100,6 +100,24 @@ def test_time_to_a_level_is_that_of_the_cheapest_run_that_reached_it():
     assert (y.best, y.status_conflict) == (2e-3, "says CONVERGED")
 
 
+@pytest.mark.parametrize(
+    ("check", "conflict", "mark", "wrong"),
+    [
+        ("confirmed", "", "", 0),
+        ("not proven", "", "not proven", 0),
+        ("contradicted", "says INFEASIBLE, auto found a solution", "✗ contradicted", 1),
+    ],
+)
+def test_a_claim_that_is_not_proven_is_neither_a_proof_nor_a_false_claim(check, conflict, mark, wrong):
+    claim = {"status": "INFEASIBLE", "claim_check": check, "status_conflict": conflict}
+    found = records_of(record("a", "x", 1.0, 0.5, **claim))
+    assert len(report.failures(found)) == (0 if check == "confirmed" else 1)
+    assert [c.wrong for c in report.claims(found)] == [wrong]
+    table = contents.reach_table(report.reaches(found), LEVELS)
+    assert str(table.rows[0][table.heads.index("claim")]) == mark
+    assert table.marks == ["bad" if wrong else ""]
+
+
 def test_profiles_count_misses_and_refusals_at_infinity():
     found = records_of(
         record("a", "fast", 1.0, 1e-7), record("a", "slow", 3.0, 1e-7),
