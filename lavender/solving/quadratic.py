@@ -258,7 +258,7 @@ def _by_interior_point(
     if proof is not None:  # with an impulse within its bounds, which `finish` chooses
         spec = get(solver)
         return finish(problem, spec, {}, lam.copy(), claim, tol, 0.0, watch.seconds, None), answer.x
-    rest: tuple[Any, ...] = judged_later, (problem, problem, get(solver), {}, lam, claim, tol)
+    rest: tuple[Any, ...] = judged_later, (problem, get(solver), {}, lam, claim, tol)
     return Solution.late(lam, status, tol, watch.seconds, rest), answer.x
 
 
