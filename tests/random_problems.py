@@ -215,7 +215,10 @@ def without_solution(seed, m):
 
 def good(solution, tol=1e-12):
     """Within tol, or twice what rounding lambda to float64 costs, and not contradicted."""
-    return solution.residual.relative <= max(tol, 2.0 * solution.residual.floor) and not solution.contradicted
+    return (
+        solution.residual.relative <= max(tol, 2.0 * solution.residual.floor)
+        and solution.claim_check == "confirmed"
+    )
 
 
 def sweeps(problem, name, n, **options):

@@ -16,7 +16,8 @@ from lavender.cli.options import Reading, one_thread, say
 def prove(files: tuple[str, ...], solver: str, tol: float) -> None:
     """Solve problems (files, folders or cases of the suite) and prove an exact solution near each answer.
 
-    Needs the extra `proof`. Each line says how far the exact solution is at most, or what could not be decided.
+    Needs the extra `proof`. Each line says how far the exact solution is at most, that there is none, or what could not
+    be decided.
 
     Exit code 1: an answer without a proof, or a file in a folder that cannot be read. Exit code 2: a named file cannot
     be read.
@@ -41,5 +42,5 @@ def prove(files: tuple[str, ...], solver: str, tol: float) -> None:
             found = enclose(item.problem, solution)
             short = "" if solution.success else f"; {solver}: {solution.status.name}"
             say(f"{item.name}: {found}{short}")
-            unmet |= not found.proven
+            unmet |= not (found.proven or found.infeasible)
     reading.end(unmet)

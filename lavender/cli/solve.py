@@ -87,7 +87,7 @@ def solve(
         say(f"written: {output}")
     if solution.status.name == "INTERRUPTED":
         raise click.exceptions.Exit(EXIT_INTERRUPTED)
-    if solution.status.name == "INFEASIBLE" and not solution.contradicted:
+    if solution.status.name == "INFEASIBLE" and solution.claim_check == "confirmed":
         raise click.exceptions.Exit(EXIT_INFEASIBLE)
     judged = solution.residual
     if judged.nothing_to_do and judged.verdict != WRONG:

@@ -25,7 +25,9 @@ the velocities, and J is never squared.
 
 sigma = max(E0 / sqrt(m), V0 sqrt(heaviest mass)) makes both free of units, with unknowns near 1 also at
 large mass ratios; a residual of x times sigma is a residual of the judge. Rows whose impulse is known
-(lower = upper, friction with mu = 0, rows of A that are all zero) are taken out first.
+(lower = upper, friction with mu = 0, rows of A that are all zero) are taken out first. So are rows and contacts that b
+pushes to a bound by more than FAR_FROM_BOUND times the size of the unknowns, as placeholder bounds do: a tolerance of
+the backend is relative to its largest number. `QPSolver` checks them at the answer.
 """
 
 from __future__ import annotations
@@ -45,6 +47,9 @@ from lavender.problem import Problem
 FORMS = ("impulse", "velocity", "auto")
 IntpArray = npt.NDArray[np.intp]
 LARGEST = 1e20  # of a program's numbers: from there on backends read infinity, or break
+# A row whose scaled |b| is larger is assumed to stay at its bound: backends lose as many digits as the largest b has,
+# and rows that act have b near 1. If the assumption fails, the backend is called once more with all rows.
+FAR_FROM_BOUND = 1e2
 MASS_RATIO = 1e3  # from here on the velocity form is more accurate, whatever the sizes
 
 
@@ -82,11 +87,12 @@ class _Parts:
     problem: Problem
     kept: IntpArray  # (k,) rows of the problem that are unknown here
     fixed: FloatArray  # (m,) N s, impulse of the rows that are not; 0 elsewhere
+    assumed: IntpArray  # rows that are assumed to stay at their bound
     root: FloatArray  # (k,) S, kg^1/2
     sigma: float  # J^1/2
 
     @classmethod
-    def of(cls, problem: Problem, unit_diagonal: bool) -> _Parts:
+    def of(cls, problem: Problem, unit_diagonal: bool, assume: bool) -> _Parts:
         c = problem.cones
         known = (c.lower == c.upper) & np.isfinite(c.lower)
         fixed = np.where(known, c.lower, 0.0)
@@ -99,11 +105,16 @@ class _Parts:
                 known[i] = True
                 fixed[i] = np.clip(bound if np.isfinite(bound) else 0.0, c.lower[i], c.upper[i])
         known[c.friction_rows] = c.reach[c.friction_rows] == 0.0
+        sigma, assumed = _sigma(problem), np.zeros(0, np.intp)
+        if assume:
+            assumed, at = _far_rows(problem, sigma)
+            assumed, at = assumed[~known[assumed]], at[~known[assumed]]
+            known[assumed], fixed[assumed] = True, at
         kept = np.flatnonzero(~known)
         d = problem.d[kept]
         if not unit_diagonal and len(d):
             d = np.full(len(d), np.exp(np.mean(np.log(d))))
-        return cls(problem, kept, fixed, 1.0 / np.sqrt(d), _sigma(problem))
+        return cls(problem, kept, fixed, assumed, 1.0 / np.sqrt(d), sigma)
 
     def friction_rows(self) -> _FrictionRows:
         c = self.problem.cones
@@ -284,13 +295,16 @@ def target(problem: Problem, tol: float) -> float:
     return tol * min([1.0, *each])
 
 
-def impulse_form(problem: Problem, *, unit_diagonal: bool = True, equality: bool = False) -> QP:
+def impulse_form(
+    problem: Problem, *, unit_diagonal: bool = True, equality: bool = False, assume: bool = False
+) -> QP:
     """min 1/2 l.A l - b.l over the bounds or friction cones of a symmetric problem.
 
     `unit_diagonal` scales by D^-1/2, otherwise by one number, so that P is A in other units; `equality` writes a linear
-    system as min 1/2 x.P x subject to P x = -q, for backends that need a row.
+    system as min 1/2 x.P x subject to P x = -q, for backends that need a row; `assume` takes rows out that are far from
+    leaving their bound.
     """
-    parts = _Parts.of(problem, unit_diagonal)
+    parts = _Parts.of(problem, unit_diagonal, assume)
     c, kept, root, sigma = problem.cones, parts.kept, parts.root, parts.sigma
     a = problem.csr
     scale = sp.diags_array(root)
@@ -334,10 +348,10 @@ def impulse_form(problem: Problem, *, unit_diagonal: bool = True, equality: bool
     )
 
 
-def velocity_form(problem: Problem) -> QP:
-    """The mass-scaled velocity form of a problem with rows."""
+def velocity_form(problem: Problem, *, assume: bool = False) -> QP:
+    """The mass-scaled velocity form of a problem with rows; `assume` as in `impulse_form`."""
     form = problem.velocity_form()
-    parts = _Parts.of(problem, True)
+    parts = _Parts.of(problem, True, assume)
     c, kept, root, sigma = problem.cones, parts.kept, parts.root, parts.sigma
     k = len(kept)
     jac = sp.csr_matrix(form.jacobian)
@@ -433,6 +447,18 @@ def _velocity_rows(
             put.row([(tangent, ratio)])
             slack.row([])
     return put, slack, n, len(alone)
+
+
+def _far_rows(problem: Problem, sigma: float) -> tuple[IntpArray, FloatArray]:
+    """Find rows (contacts as a whole) that b pushes to a bound by more than FAR_FROM_BOUND, and their impulses."""
+    c, push = problem.cones, problem.b / (np.sqrt(problem.d) * sigma)
+    at = np.where(push < 0.0, c.lower, c.upper)
+    far = (np.abs(push) > FAR_FROM_BOUND) & np.isfinite(at) & ~c.friction_rows
+    # All of a contact whose normal row is far; a contact of which only friction is far stays.
+    first = np.repeat(c.ptr[:-1], np.diff(c.ptr))
+    of_contact = c.friction_rows & far[first]
+    rows = np.flatnonzero(far | of_contact)
+    return rows, np.where(of_contact, 0.0, at)[rows]
 
 
 def _sigma(problem: Problem) -> float:

@@ -9,13 +9,15 @@ from typing import Any
 import numpy as np
 
 from lavender.base.arrays import FloatArray, flag
+from lavender.base.deadline import Deadline
 from lavender.base.errors import CapabilityError, InputError
 from lavender.base.later import load
 from lavender.external import apart
 from lavender.external.as_qp import QP, impulse_form, pick_form, velocity_form
 from lavender.external.backend import Backend
 from lavender.external.running import ask
-from lavender.judge.solution import Claim, Status
+from lavender.judge.residuals import quick
+from lavender.judge.solution import Claim, Status, summed
 from lavender.problem import Problem
 from lavender.solvers.registry import Solver
 
@@ -53,8 +55,12 @@ class QPSolver(Solver):
 
     @np.errstate(all="ignore")  # what overflows is judged
     def prepare(self, problem: Problem) -> QP:
-        b = self.backend
-        qp = velocity_form(problem) if pick_form(problem, self.form, b.definite) == "velocity" else None
+        return self._form(problem, True)
+
+    def _form(self, problem: Problem, assume: bool) -> QP:
+        b, qp = self.backend, None
+        if pick_form(problem, self.form, b.definite) == "velocity":
+            qp = velocity_form(problem, assume=assume)
         if qp is not None and b.definite and self.form == "auto" and not qp.is_definite:
             qp = None
         if qp is None:
@@ -62,6 +68,7 @@ class QPSolver(Solver):
                 problem,
                 unit_diagonal=self.unit_diagonal,
                 equality=b.linear == "equality" and problem.cones.is_free,
+                assume=assume,
             )
         if len(qp.kept) and qp.is_bounds_only and not b.linear:
             raise CapabilityError(
@@ -89,7 +96,16 @@ class QPSolver(Solver):
             words = "as a quadratic program the problem has numbers that overflow; the backend was not called"
             return Claim(Status.NUMERICAL_ERROR, 0, none, words, qp.form)
         elsewhere = apart.Elsewhere(b) if self.isolate and time_limit is not None else None
+        deadline, start = Deadline(time_limit), impulse.copy()
         claim = ask(qp, impulse, elsewhere or b.run, max_iter, tol, time_limit, self.settings, b.noisy)
+        if len(qp.assumed) and not deadline.passed() and _assumption_fails(qp, impulse, claim):
+            before, impulse[:] = claim, start
+            left = max(1, max_iter - before.iterations)
+            qp = self._form(qp.problem, False)
+            call = elsewhere or b.run
+            claim = ask(qp, impulse, call, left, tol, deadline.left(), self.settings, b.noisy)
+            work = summed((before.work, claim.work))
+            claim = replace(claim, work=work, iterations=before.iterations + claim.iterations)
         if time_limit is None or b.stoppable:
             return claim
         where = "to its end" if elsewhere is None else elsewhere.where
@@ -101,6 +117,15 @@ class QPSolver(Solver):
             apart.ready(self.backend.name)
         else:
             load(*self.backend.modules)
+
+
+def _assumption_fails(qp: QP, impulse: FloatArray, claim: Claim) -> bool:
+    """Whether a row that was assumed to stay at its bound does not, or may be what makes the others contradict."""
+    if claim.status is Status.INFEASIBLE:
+        return True
+    w, error = np.empty(len(impulse)), np.empty(len(impulse))
+    quick(qp.problem, impulse, w, error)
+    return bool(np.any(error[qp.assumed] != 0.0))
 
 
 def refusal(problem: Problem) -> str | None:

@@ -22,11 +22,13 @@ from lavender.judge.certificates import check_certificate
 from lavender.judge.residuals import at_floor, quick
 from lavender.judge.solution import Claim, Status, summed
 from lavender.problem import Problem
+from lavender.solvers.certify import check_infeasible
 
 EPS_MIN = 1e-14  # asked of a backend at the least: its own arithmetic stops there
 GAP_MIN = 1e-18
 # Of the objective: what the sums of a gap lose to rounding at a large mass ratio; and when asked again.
 GAP_RELATIVE, GAP_RELATIVE_MIN = 1e-13, 1e-16
+OUT_OF_BUDGET = (Status.MAX_ITERATIONS, Status.TIME_LIMIT, Status.INTERRUPTED)
 LEFT = 1e-8  # relative residual that a gap of GAP_RELATIVE_MIN may leave, as its root
 
 
@@ -39,6 +41,7 @@ class Limits:
     gap_relative: float  # the same, of the objective; either will do
     max_iter: int
     time_limit: float | None  # s
+    repeated: bool = False  # the judge did not accept the answer of a call before
 
 
 @dataclass(frozen=True)
@@ -104,8 +107,9 @@ def ask(
     """Run the backend and write its iterate to `impulse`, or leave the start point and say why.
 
     A backend that says it is done where the judge does not find `tol` is asked again, 100 times more
-    closely, at most three times in all: its tests are not the judge's. An interior-point method leaves
-    sqrt(x w) on a row where impulse and slack both vanish, so its gap falls towards eps^2.
+    closely, at most three times in all: its tests are not the judge's. The answer with the smallest residual is kept
+    with its claim, whatever later calls end with, unless a later one proves that there is no solution. An
+    interior-point method leaves sqrt(x w) on a row where impulse and slack both vanish, so its gap falls towards eps^2.
     """
     problem, deadline = qp.problem, Deadline(time_limit)
     start, best = impulse.copy(), None
@@ -119,7 +123,7 @@ def ask(
         work = summed((work, last.work))
         relative, floor = quick(problem, impulse, w, e, floor=True)
         if best is None or relative < best[0]:
-            best = (relative, last, impulse.copy())
+            best = (relative, last, impulse.copy(), floor)
         left = max_iter - work.get("iterations", 0)
         if (
             last.status is not Status.CONVERGED
@@ -127,17 +131,24 @@ def ask(
             or at_floor(relative, floor)
             or left <= 0
             or deadline.passed()
+            or np.any(e[qp.assumed] != 0.0)  # another program is to be solved
         ):
             break
-        limits = [replace(level, max_iter=left, time_limit=deadline.left()) for level in limits]
+        limits = [
+            replace(level, max_iter=left, time_limit=deadline.left(), repeated=True) for level in limits
+        ]
         if limits:
             impulse[:] = start
     assert best is not None
-    relative, claim, impulse[:] = best
+    if last is not best[1] and last.status is Status.INFEASIBLE:
+        infeasible, proved, _ = check_infeasible(problem, last, tol, deadline)
+        if proved:
+            return replace(infeasible, work=work, iterations=work.get("iterations", 0))
+    relative, claim, impulse[:], floor = best
     status, words = claim.status, claim.message
     if last is not claim and last.status is not Status.CONVERGED and relative > tol:
-        # Its looser answer was the better one; what it says of the closer ones is the claim.
-        status = Status.STALLED if last.status is Status.NUMERICAL_ERROR else last.status
+        # The best answer and its own claim are kept: a stricter call that fails says nothing about that answer.
+        status = last.status if last.status in OUT_OF_BUDGET else Status.STALLED
         words = f"{words}; asked more closely: {last.message}"
     if status is Status.NUMERICAL_ERROR and claim.dual is not None and relative <= tol:
         # It broke down, in its own words, after it had got there.

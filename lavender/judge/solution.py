@@ -29,7 +29,7 @@ class Status(str, Enum):
     TIME_LIMIT = "the time limit was reached"
     STALLED = "no progress any more"
     DIVERGED = "the iterate grew, or is not finite"
-    INFEASIBLE = "no solution exists; `certificate` proves it"
+    INFEASIBLE = "no solution exists; `certificate` proves it, unless `claim_check` says otherwise"
     NUMERICAL_ERROR = "a factorisation or the backend failed"
     INTERRUPTED = "stopped by Ctrl-C or by the callback"
     REFUSED = "of one world of many: its data are no problem's"
@@ -48,6 +48,9 @@ MAX_ITERATIONS = Status.MAX_ITERATIONS
 NUMERICAL_ERROR = Status.NUMERICAL_ERROR
 STALLED = Status.STALLED
 TIME_LIMIT = Status.TIME_LIMIT
+
+#: Values of `Solution.claim_check`, from best to worst.
+CLAIM_CHECKS = CONFIRMED, NOT_PROVEN, CONTRADICTED = "confirmed", "not proven", "contradicted"
 
 
 @dataclass(frozen=True)
@@ -128,7 +131,7 @@ class Solution:
     residual : Residual
         Its error, measured by the judge: `relative` [-], `energy` [sqrt J], `velocity` [m/s], the worst row.
     status : Status
-        The solver's claim. `success` and `contradicted` are the judge's findings.
+        The solver's claim. `success` and `claim_check` are the judge's findings.
     tol : float, -
         The relative residual that was asked for.
     iterations : int
@@ -144,12 +147,16 @@ class Solution:
     dual : object
         A backend's own multipliers.
     certificate : (m,), or None
-        With INFEASIBLE: the proof that there is no solution.
+        With INFEASIBLE: the proof that there is no solution, if the claim is confirmed.
     impulse_bound : float or None, N s
         With a certificate: the least sum of |impulse| of every solution of the problem as it was given; inf where it
         has none. Also of STALLED, where a solver met a direction that shows such a bound.
-    contradicted : str
-        Why the judge disagrees with `status`; empty if it agrees.
+    claim_check : {"confirmed", "not proven", "contradicted"}
+        Result of comparing `status` with the judge's residual and certificate. "confirmed": they agree, or the status
+        claims nothing that can be checked. "not proven": the status is INFEASIBLE, and no certificate proves it.
+        "contradicted": the judge's figures exclude what the status claims.
+    status_conflict : str
+        Reason if the claim is contradicted, else empty.
 
     Examples
     --------
@@ -176,7 +183,8 @@ class Solution:
     dual: Any
     certificate: FloatArray | None  # (m,), with INFEASIBLE
     impulse_bound: float | None  # N s, with a certificate: the least sum |impulse| of every solution
-    contradicted: str  # why the judge disagrees with `status`; empty where it does not
+    claim_check: str  # CONFIRMED, NOT_PROVEN or CONTRADICTED
+    status_conflict: str  # why the judge's figures exclude what `status` claims; empty if they do not
     # of the last checks, in which the residual falls tenfold; NaN where it did not fall, or no sweeps were checked
     sweeps_per_decade: float
     turns: tuple[Turn, ...]  # of `auto`: who ran, in order, and what came of it; () of other solvers
@@ -250,6 +258,12 @@ class Solution:
         return found
 
     @property
+    def is_contradicted(self) -> bool:
+        """The judge's figures exclude what `status` claims."""
+        # Fields that `late` left for later belong to claims that were checked: they are not made for this.
+        return self.__dict__.get("claim_check") == CONTRADICTED
+
+    @property
     def success(self) -> bool:
         """The judge's relative residual is at most `tol`."""
         return self.residual.relative <= self.tol
@@ -290,8 +304,8 @@ class Solution:
             "work": self._done,
             "time": self._took,
         }
-        if self.contradicted:
-            facts["contradicted"] = self.contradicted
+        if self.claim_check != CONFIRMED:
+            facts[self.claim_check] = self.status_conflict or self.status.name
         return table_of(facts, self.solver.name)
 
     def __repr__(self) -> str:
@@ -309,7 +323,7 @@ class Solution:
 
     def __str__(self) -> str:
         note = f"; {self.message}" if self.message else ""
-        wrong = f"; CONTRADICTED: {self.contradicted}" if self.contradicted else ""
+        wrong = f"; CONTRADICTED: {self.status_conflict}" if self.claim_check == CONTRADICTED else ""
         return (
             f"{self.solver.name}: {self.status.name}, {self.residual}, {self._done}, "
             f"{self._took}{note}{wrong}"

@@ -17,7 +17,7 @@ import numpy as np
 from lavender.base.arrays import several
 from lavender.base.errors import InputError, LavenderError, last_words
 from lavender.judge.residuals import FLOOR_MOST, WRONG
-from lavender.judge.solution import Solution, Status, uninterrupted
+from lavender.judge.solution import CONTRADICTED, NOT_PROVEN, Solution, Status, uninterrupted
 from lavender.lab.bench.running.worker import Lost, Worker, solved
 from lavender.lab.motion.bound import separation
 from lavender.problem import Problem, check_problem
@@ -35,7 +35,8 @@ NEAR_NONE = "no solution within rounding"  # of the data: theirs has huge impuls
 INEXACT = "no exact solution"  # a certificate holds, and others meet the tolerance
 NOT_SOLVED = "not solved"
 NOTHING = "nothing to do"
-CONTRADICTED = "claim contradicted"
+CLAIM_CONTRADICTED = "claim contradicted"
+UNPROVED = "no solution claimed, not proved"
 BREACH = "breach: a residual is computed wrongly"
 REFUSED = "refused"
 
@@ -61,7 +62,7 @@ class CrossCheckRow:
     @property
     def contradicted(self) -> bool:
         """The solver claims what the judge does not find, or inequality (3) is broken."""
-        return self.verdict in (CONTRADICTED, BREACH)
+        return self.verdict in (CLAIM_CONTRADICTED, BREACH)
 
 
 @dataclass(frozen=True)
@@ -287,9 +288,11 @@ def compare(problem: Problem, name: str, solution: Solution, optimum: Solution |
         verdict, breached = AGREES, apart > allowed
     if breached:
         verdict = BREACH
-    elif solution.contradicted:
-        verdict, note = CONTRADICTED, f"{solution.contradicted}; {note}".rstrip("; ")
-    elif solution.status is Status.INFEASIBLE:  # its certificate holds, or the claim would be contradicted
+    elif solution.claim_check == CONTRADICTED:
+        verdict, note = CLAIM_CONTRADICTED, f"{solution.status_conflict}; {note}".rstrip("; ")
+    elif solution.claim_check == NOT_PROVEN:
+        verdict = UNPROVED
+    elif solution.status is Status.INFEASIBLE:
         verdict = PROVED if solution.impulse_bound == np.inf else NEAR_NONE
     elif r.nothing_to_do and r.verdict != WRONG:
         units = f"{r.velocity:.1e} m/s, {r.energy:.1e} sqrt(J)"

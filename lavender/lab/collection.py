@@ -23,7 +23,7 @@ import numpy as np
 
 from lavender.base.errors import CapabilityError, InputError
 from lavender.io.stored import whole_file, write_text
-from lavender.judge.solution import Status
+from lavender.judge.solution import CONFIRMED, Status
 from lavender.lab import suite
 from lavender.lab.bench.cases import condition, fingerprint, is_path, resolve
 from lavender.lab.motion import motions
@@ -84,13 +84,15 @@ def certified(problem: Problem, name: str, group: str) -> Entry:
         degenerate=round(answer.states.boundary_fraction or 0.0, 3),
     )
     base = asdict(entry)
-    if answer.status is Status.INFEASIBLE:
+    if answer.status is Status.INFEASIBLE and answer.claim_check == CONFIRMED:
         return Entry(**base | {"known": "infeasible", "reason": answer.message.rpartition("; ")[2]})
     try:
         found = prove(problem, answer)
     except CapabilityError as error:
         return Entry(**base | {"reason": str(error)})
     base |= {"reason": found.reason, "unique": found.unique}
+    if found.infeasible:
+        return Entry(**base | {"known": "infeasible"})
     if found.proven:
         base |= {"known": "enclosed", "radius": found.velocity_radius}
     if problem.law == "coulomb" and not found.unique and problem.m <= SEARCHED:

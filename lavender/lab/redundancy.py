@@ -6,12 +6,14 @@ what is left of it after all rows before it are taken out,
 
     p_i = A_ii - A_iB A_BB^-1 A_Bi   (B: rows before i that are not redundant)   [1/kg]
 
-is at most `tol` A_ii: the squared share of its direction that is new, in the metric of the masses. Where J is
-known, what is new in J alone counts, too: beside a body that is 1e13 times heavier the masses hide it.
+is at most `tol`^2 A_ii: sqrt(p_i / A_ii) is the share of its direction that is new, in the metric of the masses. If J
+is known, this share is computed from J, and what is new in J alone counts, too: beside a body that is 1e25 times
+heavier the masses hide it. If only A is known, its rounding hides shares below SHARE_OF_A.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -27,6 +29,11 @@ from lavender.problem.operators import semidefinite
 from lavender.problem.ordering import rows_of_each
 from lavender_ext.pivot.direct import Pivoting
 
+# Smallest share of a row's direction that differs from rounding of A: A has the squares of shares, and rounding of its
+# products and of their elimination leaves some 1e-14 of the diagonal, seldom 1e-13.
+SHARE_OF_A = 1e-6
+# The same for data that were float32: rows that are equal differ by roundings of 2^-24, of which some ten add up.
+SHARE_OF_FLOAT32 = 1e-6
 DENSE = 1200  # rows of an island up to which it is decomposed as a dense matrix
 # Larger islands: LDL^T of A + SHIFT D. A zero pivot becomes at most rows SHIFT d: ten times that counts as zero.
 SHIFT = 1e-13
@@ -45,7 +52,7 @@ class Redundancy:
 
     problem: Problem
     rank: int  # of A
-    tol: float  # -, share of A_ii up to which a row counts as redundant; the largest that was used
+    tol: float  # -, share of a row's direction up to which the row counts as redundant; the largest that was used
     method: str  # how the rank was found, in words
     rows: tuple[int, ...]  # redundant rows: each adds nothing to the others that are kept
     impulse_is_unique: npt.NDArray[np.bool_]  # (m,) rows whose impulse no redundancy can change
@@ -99,15 +106,17 @@ class Redundancy:
 def redundancy(problem: Problem, *, tol: float = 1e-12) -> Redundancy:
     """Rank of A, the rows that repeat others, and what is unique.
 
-    Islands (rows that share no body, directly or through others) are decomposed apart: up to 1,200 rows by
-    QR of J M^-1/2, and of J, with column pivoting where J is given (nothing is squared), else by Cholesky with
-    pivoting, or QR for asymmetric or indefinite A; larger ones by LDL^T of A + 1e-13 D, where pivots up to
-    1e-12 d times the number of rows count as zero.
+    Islands (rows that share no body, directly or through others) are decomposed separately. Up to 1,200 rows: by QR of
+    J M^-1/2 and of J with column pivoting if J is given without compliance (nothing is squared); otherwise by Cholesky
+    with pivoting, which works on squares, so that `tol` is at least 1e-6; by QR for asymmetric or indefinite A. More
+    rows: by LDL^T of A + 1e-13 D, where pivots up to 1e-12 d times the number of rows count as zero: `tol` is at least
+    1e-6 times the square root of that number. If the problem's data were float32, `tol` is at least 1e-6. The result's
+    `tol` and `method` have the value that was used.
 
     Parameters
     ----------
     tol : float, default 1e-12
-        Share of A_ii up to which what is new in a row counts as nothing.
+        Share of a row's direction, in the metric of the masses, up to which what is new in it counts as nothing.
 
     Raises
     ------
@@ -119,6 +128,8 @@ def redundancy(problem: Problem, *, tol: float = 1e-12) -> Redundancy:
     check_problem(problem)
     if not number("tol", tol, low=0.0) < 1.0:
         raise InputError(f"tol is {tol}; a share from 0 to 1 is needed")
+    if problem.precision == "float32":
+        tol = max(tol, SHARE_OF_FLOAT32)
     m = problem.m
     unique = np.ones(m, bool)
     dependent: list[int] = []
@@ -137,7 +148,8 @@ def redundancy(problem: Problem, *, tol: float = 1e-12) -> Redundancy:
         a = scaled[island][:, island]
         sound = problem.is_semidefinite or (problem.is_symmetric and semidefinite(a))
         if problem.is_symmetric and len(island) <= DENSE:
-            found, words = _dense_island(a.toarray(), [root[island] for root in roots], tol, sound)
+            found, limit, words = _dense_island(a.toarray(), [root[island] for root in roots], tol, sound)
+            used = max(used, limit)
             if len(found):
                 basis = _null_basis(a.toarray(), found)
                 if unit is not scale:  # to the metric of d
@@ -161,11 +173,17 @@ def redundancy(problem: Problem, *, tol: float = 1e-12) -> Redundancy:
 
 def _dense_island(
     a: FloatArray, roots: list[sp.csr_array], tol: float, sound: bool
-) -> tuple[Places, list[str]]:
-    """Dependent rows of a symmetric island, each of those before it where A is `sound`, and how they were found."""
+) -> tuple[Places, float, list[str]]:
+    """Find the dependent rows of a symmetric island, each of those before it if A is `sound`.
+
+    Returns
+    -------
+    rows; share of a row's direction that counts as nothing; how they were found, in words
+    """
     if not sound:
-        return _by_qr(_even(a), tol, 1), [f"QR with pivoting, {tol:.0e}"]
+        return _by_qr(_even(a), tol), tol, [f"QR with pivoting, {tol:.0e}"]
     if not roots:
+        tol = max(tol, SHARE_OF_A)
         tail, words = _by_cholesky(a, tol), [f"Cholesky with pivoting, {tol:.0e}"]
     else:
         # On the columns that the island has; one at least.
@@ -177,21 +195,21 @@ def _dense_island(
                 f"of {len(a)} rows {len(a) - len(tails[0])} by the masses and "
                 f"{len(a) - len(tails[1])} without them: the larger number counts"
             )
-    return _in_order(a, tail, tol), words
+    return _in_order(a, tail, max(tol, SHARE_OF_A)), tol, words
 
 
 def _other_island(a: sp.csr_array, sound: bool, tol: float) -> tuple[Places, float, list[str]]:
     """Dependent rows of a large or asymmetric island, the share that counts as nothing, how they were found."""
     n = a.shape[0]
     if sound:
-        limit = max(tol, 10.0 * SHIFT * n)
-        return _sparse(a, limit), limit, [f"LDL^T of A + {SHIFT:.0e} D, {limit:.0e}"]
+        limit = max(tol, math.sqrt(10.0 * SHIFT * n))
+        return _sparse(a, limit**2), limit, [f"LDL^T of A + {SHIFT:.0e} D, {limit:.0e}"]
     if n > DENSE:
         raise CapabilityError(
             f"A is asymmetric or indefinite and {n} of its rows hang together; the rank of at most "
             f"{DENSE} can be told: ask for parts, or for the symmetric part of A"
         )
-    return _by_qr(_even(a.toarray().T), tol, 1), tol, [f"QR with pivoting, {tol:.0e}"]
+    return _by_qr(_even(a.toarray().T), tol), tol, [f"QR with pivoting, {tol:.0e}"]
 
 
 def _unit(problem: Problem, scale: FloatArray) -> FloatArray:
@@ -241,15 +259,12 @@ def _roots(problem: Problem) -> tuple[sp.csr_array, sp.csr_array]:
     return whole, bare
 
 
-def _by_qr(a: FloatArray, tol: float, power: int = 2) -> Places:
-    """Columns of `a` that depend on the others, by QR with column pivoting; `tol` of the remaining lengths ** power.
-
-    Two of a root of A, whose squares are what is new in A_ii; one of A itself.
-    """
+def _by_qr(a: FloatArray, tol: float) -> Places:
+    """Find columns of `a` that depend on the others: what is left of them in QR with pivoting is at most `tol`."""
     from scipy.linalg import qr
 
     r, order = qr(a, mode="r", pivoting=True)
-    size = np.abs(np.diagonal(r)) ** power
+    size = np.abs(np.diagonal(r))
     rank = int(np.count_nonzero(size > tol * size[0])) if len(size) and size[0] > 0.0 else 0
     return np.sort(order[rank:])
 
@@ -265,7 +280,7 @@ def _even(a: FloatArray) -> FloatArray:
 def _by_cholesky(a: FloatArray, tol: float) -> Places:
     """Rows of a semidefinite `a` (unit diagonal) that depend on the others, by Cholesky with pivoting."""
     # Rounding alone leaves a pivot of about len(a) 2^-53.
-    _, order, rank, _ = lapack.dpstrf(a, tol=max(tol, len(a) * 2.0**-52))
+    _, order, rank, _ = lapack.dpstrf(a, tol=max(tol**2, len(a) * 2.0**-52))
     return np.sort(order[rank:] - 1)
 
 
@@ -275,7 +290,7 @@ def _in_order(a: FloatArray, tail: Places, tol: float) -> Places:
         return tail
     m = len(a)
     problem = Problem.linear(a, np.zeros(m))
-    pivoting = Pivoting(problem.csr_data, m - 1, np.arange(m, dtype=np.int32), max(tol, m * 2.0**-52))
+    pivoting = Pivoting(problem.csr_data, m - 1, np.arange(m, dtype=np.int32), max(tol**2, m * 2.0**-52))
     pivoting.factor_all()
     found = np.array(pivoting.skipped(), np.intp)
     return found if len(found) == len(tail) else tail

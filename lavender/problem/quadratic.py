@@ -100,10 +100,12 @@ class QPSolution:
             return f"unbounded: the objective falls for ever along ray; at x it is {self.objective:.6g}"
         # The solution's status is that of its own problem, with an M for P: no verdict on the program.
         how = "" if self.solution is None or self.found else f"{self.solution.status.name}, "
+        if self.solution is not None and self.solution.claim_check == "not proven":
+            how = f"{self.solution.status.name} (not proven), "
         if how == "CONVERGED, ":
             how = "the last step CONVERGED, "
         words = "solved" if self.found else f"not solved to {self.tol:g}"
-        wrong = "" if self.solution is None else self.solution.contradicted
+        wrong = "" if self.solution is None else self.solution.status_conflict
         wrong = f"; CONTRADICTED: {wrong}" if wrong else ""
         return f"{words}: {how}error {self.error:.1e}, objective {self.objective:.6g}{wrong}"
 
@@ -115,23 +117,22 @@ class QPSolution:
 
     @cached_property
     def _residuals(self) -> tuple[float, ...]:
-        """r_p, r_d, gap and error."""
+        """r_p, r_d, gap, the three relative to their own terms, and the largest of these."""
         qp, of = self.qp, self.qp.generalized
-        least = curved = 0.0
-        if largest(qp.target) == 0.0:  # x = 0 may be the solution
-            least = FLAT * largest(of.velocity_of(of.v_free))
+        curved = 0.0
         if largest(qp.q) == 0.0:  # all forces may vanish; with q an x that runs away must not excuse it
             curved = FLAT * min(largest(of.operator.mass[2]), self._unseen / max(largest(self.x), TINY))
         found: tuple[float, ...] = program_residuals(
             self.x, qp.q, self._curvature, of.force(self.impulse), of.velocity_of(self.x), qp.target, self.impulse,
-            qp.free, least, curved,
+            qp.free, of.operator.jac, self.x if of.order is None else self.x[of.order],
+            qp.sizes_without_rows, curved,
         )  # fmt: skip
         return found
 
     @property
     def _unseen(self) -> float:
         """max_i sum_j |P_ij| X_j (force): a share of X_j more of x_j is no more than that share in any row of J."""
-        of, size = self.qp.generalized, self.qp.sizes(self.x, np.minimum, np.inf)
+        of, size = self.qp.generalized, self.qp.sizes(self.x, self.impulse, np.minimum, np.inf)
         ptr, column, value = of.operator.mass  # the lower triangle, diagonal last, in the order of its factor
         size = size if of.order is None else size[of.order]
         row, share = np.repeat(np.arange(of.nv), np.diff(ptr)), np.abs(value)
@@ -160,20 +161,32 @@ class QPSolution:
 
     @property
     def error(self) -> float:
-        """The largest of the three, each relative to what it is the sum of; 0 is a solution.
+        """The largest of the three residuals, each relative to its own terms; 0 is a solution.
 
-        The primal residual over the largest of |J x| and |target|, where all targets are 0 of 1e-3 |J v*| too; the dual
-        one over the largest of |q|, |P x| and |J^T lambda|; the gap over these two times the sums of |lambda| and |x|.
-        Where q is 0 all forces may vanish: then the dual one is over 1e-3 of the largest force of an x as large as rows
-        let one expect, too, or over 1e-3 max |P_ij| max |x_i| if that is less.
+        Primal: the violation of each row relative to the largest of |J_ij x_j| and |target_i| of this row. If these
+        vanish, as in x >= 0, it is relative to what the acting rows make of its variables. Dual: relative to the
+        largest of |q|, |P x| and |J^T lambda|. Gap: relative to the objective, which is the largest of |x.P x|, |q.x|
+        and |target.lambda|; if these cancel, to 1e-3 of the sum of their terms. A row that does not act enters no
+        scale: one that is satisfied and has no multiplier, or is far from its bound.
+
+        If q is 0 all forces may vanish: then the dual residual is also relative to 1e-3 of the largest force of an x as
+        large as rows let one expect, or to 1e-3 max |P_ij| max |x_i| if that is less.
         """
-        return self._residuals[3]
+        return self._residuals[6]
 
     @property
     def found(self) -> bool:
-        """Whether the error is at most `tol` and the program is neither unbounded nor proved to be infeasible."""
-        proved = self.solution is not None and self.solution.status.name == "INFEASIBLE"
-        return self.ray is None and not proved and self.error <= self.tol
+        """Whether the error is at most `tol`, no ray or certificate shows that there is no solution, and the solver's
+        claim is not contradicted.
+        """
+        if self.ray is not None or not self.error <= self.tol:
+            return False
+        solution = self.solution
+        if solution is None:
+            return True
+        if solution.status.name == "INFEASIBLE":
+            return bool(solution.claim_check == "not proven")
+        return not solution.is_contradicted
 
 
 @dataclass(frozen=True, eq=False)
@@ -232,20 +245,36 @@ class QuadraticProgram:
 
         Forces and sizes are those of x (n,) and of impulses (m,) that are found so far.
         """
-        of, far = self.generalized, self.sizes(x, np.maximum, 0.0)
+        of, far = self.generalized, self.sizes(x, impulse, np.maximum, 0.0)
         force = np.abs(self.q) + abs(of.mass) @ far + np.abs(impulse) @ abs(of.jac)
         return read_only(np.divide(force, FAR * far, out=np.zeros(len(x)), where=far > 0.0))
 
-    def sizes(self, x: FloatArray, most: np.ufunc, without: float) -> FloatArray:
+    def sizes_without_rows(self) -> FloatArray:
+        """(n,) Size of each variable without rows, |q_i| / M_ii or else |v*_i|, in the order of J's columns."""
+        of = self.generalized
+        ptr, _, value = of.operator.mass  # the lower triangle, diagonal last
+        force, free = np.abs(self.q), np.abs(of.v_free)
+        if of.order is not None:
+            force, free = force[of.order], free[of.order]
+        size = force / value[ptr[1:] - 1]
+        out: FloatArray = np.where(size > 0.0, size, free)
+        return out
+
+    def sizes(self, x: FloatArray, impulse: FloatArray, most: np.ufunc, without: float) -> FloatArray:
         """(n,) What x_i would be if it were all of its rows: of the smallest or largest, by np.minimum or np.maximum.
 
-        `without`: where it has no row; the largest of x for inf.
+        Rows that do not act, as in `program_residuals`, are left out. `without`: the size without a row; the largest of
+        x for inf.
         """
+        slack = self.generalized.velocity_of(x) - self.target
         jac, x = self.generalized.jac, np.abs(x)
         of, size = np.repeat(np.arange(len(self.target)), np.diff(jac.indptr)), np.abs(jac.data)
         row = np.maximum(np.bincount(of, size * x[jac.indices], len(self.target)), np.abs(self.target))
+        acts = (slack < 0.0) | ((impulse > 0.0) & (slack <= 0.5 * row))
+        acts[: self.free] = True
+        of, size, column = of[acts[of]], size[acts[of]], jac.indices[acts[of]]
         far = np.full(len(x), without)
-        most.at(far, jac.indices, row[of] / size)
+        most.at(far, column, row[of] / size)
         return np.where(far < np.inf, far, x.max(initial=0.0))
 
     def multipliers(

@@ -253,7 +253,9 @@ def _is_open(problem: Problem) -> bool:
 
 
 def find_direction(problem: Problem, deadline: Deadline) -> FloatArray | None:
-    """A direction y (m,) from a linear program, still to be checked."""
+    """Find a direction y (m,) by a linear program, to be checked; None if a row has another bound than 0 below."""
+    if not _is_open(problem):
+        return None
     from scipy.optimize import linprog  # 0.1 s to import, needed only here
 
     # max b.y, A^T y + R u <= 0 (= 0 on free rows), |A^T y| <= u on tangents, 0 <= y <= 1, in units of d.
@@ -291,3 +293,36 @@ def find_direction(problem: Problem, deadline: Deadline) -> FloatArray | None:
     x = found.x[: problem.m]
     y: FloatArray = np.where((x > 0.0) | free, x, 0.0) * scale
     return y
+
+
+def check_infeasible(
+    problem: Problem, claim: Claim, tol: float, deadline: Deadline
+) -> tuple[Claim, bool, str]:
+    """Check the claim of another package's solver or a plug-in that a problem has no solution.
+
+    If its certificate does not hold, `auto` looks for one.
+
+    Returns
+    -------
+    Claim
+        With the certificate that `auto` found, if it found one.
+    bool
+        Whether the certificate of this claim holds.
+    str
+        Which solution `auto` found instead; empty without one.
+    """
+    if claim.certificate is not None and not prove(problem, claim.certificate, tol, deadline).reason:
+        return claim, True, ""
+    spec, left = get("auto"), deadline.left()
+    if problem.m > CERTIFICATE_ROWS or (left is not None and left <= 0.0):
+        return claim, False, ""
+    solver, impulse = spec.load()(), problem.start()
+    found = solver.run(solver.prepare(problem), impulse, spec.max_iter, tol, left)
+    if found.status is Status.INTERRUPTED:
+        raise KeyboardInterrupt
+    if found.certificate is not None and not prove(problem, found.certificate, tol, deadline).reason:
+        words = f"{claim.message}; auto found the certificate".removeprefix("; ")
+        return replace(claim, certificate=found.certificate, message=words), True, ""
+    relative = residual(problem, impulse, "float64").relative
+    words = f"auto found a solution to a relative residual of {relative:.1e}"
+    return claim, False, words if relative <= tol else ""

@@ -22,13 +22,17 @@ from lavender.judge.certificates import check_certificate
 from lavender.judge.residuals import at_floor, remember
 from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
+from lavender.solvers.certify import CERTIFICATE_ROWS, LINEAR_PROGRAM, find_direction
 from lavender.solvers.pivoting import PivotState
 from lavender.solvers.polyhedral import count_rows
 from lavender.solvers.registry import Solver, SolverSpec
-from lavender.solvers.setup_times import over_rows
+from lavender.solvers.setup_times import loading, over_rows
 from lavender_ext.pivot import lemke
 from lavender_ext.pivot.lemke import DONE, LATE, RAY
 
+RAY_MESSAGE = (
+    "ended on a secondary ray: this method cannot go on, and a solution may exist (auto looks further)"
+)
 LIMIT = 2000  # rows: a dictionary of 32 MB
 ENTRY = 1e-9  # s for each entry of the dictionary in a pivot
 LAID_OUT, ELIMINATED = 5e-8, 5e-10  # s for each of the first one; for each that a free row's pivot touches
@@ -96,13 +100,13 @@ class Lemke(Solver):
         while True:
             code = paths.run(min(chunk, max_iter - paths.pivots))
             if code == RAY:
-                message = "ended on a secondary ray"
+                message = RAY_MESSAGE
                 certificate = _direction(paths.ray)
             if (
                 certificate is not None
                 and check_certificate(state.problem, certificate, tol, deadline) is None
             ):
-                status, message = Status.INFEASIBLE, f"{message}: no impulse meets every row"
+                status, message = Status.INFEASIBLE, "ended on a secondary ray: no impulse meets every row"
             elif code == DONE and rows.relative <= tol:
                 status, message = Status.CONVERGED, ""
             elif code == DONE:
@@ -113,8 +117,24 @@ class Lemke(Solver):
                 status = Status.MAX_ITERATIONS
             else:
                 continue
+            if status is Status.STALLED:
+                proof = _certificate(state.problem, tol, deadline)
+                if proof is not None:
+                    status, certificate, message = (
+                        Status.INFEASIBLE,
+                        proof,
+                        "a linear program found a certificate",
+                    )
             work = rows.work | {"pivots": paths.pivots, "paths": paths.paths}
             return Claim(status, paths.pivots, work, message, form="dense", certificate=certificate)
+
+
+def _certificate(problem: Problem, tol: float, deadline: Deadline) -> FloatArray | None:
+    """Return a certificate (m,) of a linear program for a problem on which the method itself failed, or None."""
+    if problem.m > CERTIFICATE_ROWS or deadline.passed(1e-9 * LINEAR_PROGRAM + loading("scipy.optimize")):
+        return None
+    y = find_direction(problem, deadline)
+    return y if y is not None and check_certificate(problem, y, tol, deadline) is None else None
 
 
 def _direction(y: FloatArray) -> FloatArray | None:

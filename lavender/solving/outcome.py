@@ -11,13 +11,16 @@ import numpy as np
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import InputError
 from lavender.judge.certificates import prove, rounded_down
-from lavender.judge.residuals import FLOOR_MOST, at_floor, reference, relative_of, residual
+from lavender.judge.residuals import FLOOR_MOST, Residual, at_floor, reference, relative_of, residual
 from lavender.judge.solution import (
+    CONFIRMED,
+    CONTRADICTED,
     CONVERGED,
     DIVERGED,
     FLOOR,
     INFEASIBLE,
     MAX_ITERATIONS,
+    NOT_PROVEN,
     NUMERICAL_ERROR,
     STALLED,
     TIME_LIMIT,
@@ -30,8 +33,14 @@ from lavender.judge.solution import (
     order_name,
 )
 from lavender.problem import Problem
+from lavender.problem.cones import project
 from lavender.solvers.registry import SolverSpec, in_one_call
 from lavender_ext.judge.measure import Judged, all_finite
+
+# A lower bound of every solution's impulse is reported if it is at least this multiple of sum |b_i| / d_i, the impulse
+# that the rows would need one by one. Below, the bound is true of well-posed problems, too, and says nothing about the
+# data. Rows that contradict each other up to a relative difference delta need about 1 / delta times that sum.
+CONTRADICTING_IMPULSE_RATIO = 100.0
 
 
 def finish(
@@ -45,9 +54,17 @@ def finish(
     solve_time: float,
     history: History | None,
     sweeps_per_decade: float = math.nan,
+    refutation: str = "",
 ) -> Solution:
-    """The solution: the judge's residual, the status that it supports, the reason if it contradicts the claim."""
-    judged = residual(problem, impulse, "float64")  # in which solvers work, whatever the data were
+    """Build the solution: the judge's residual, the status that it supports, and the check of the claim.
+
+    `refutation` says which solution the caller found if the solver claims that there is none.
+    """
+    # In float64, in which solvers work, whatever the data were.
+    if claim.status is INFEASIBLE and all_finite(impulse):
+        impulse, judged = _within_bounds(problem, impulse)
+    else:
+        judged = residual(problem, impulse, "float64")
     status, message = claim.status, claim.message
     relative = judged.relative
     if status is not NUMERICAL_ERROR and not all_finite(impulse):
@@ -71,13 +88,13 @@ def finish(
         message = _joined(message, "its test was met only on A as it was formed, not on the given data")
     if status in (CONVERGED, STALLED) and tol < relative and judged.at_floor:
         status = FLOOR
-    certificate, bound, contradicted = claim.certificate, None, ""
+    certificate, bound, unproven, status_conflict = claim.certificate, None, "", ""
     if status is INFEASIBLE and relative <= tol:
         # What meets tol is a solution to tol, whatever can be said of an exact one.
         status = CONVERGED
         message = _joined(message, "the impulse meets tol nevertheless")
     elif status is INFEASIBLE and certificate is None:
-        contradicted = "says INFEASIBLE, no certificate was given"
+        unproven = "no certificate was given"
     elif status in (INFEASIBLE, STALLED) and certificate is not None:
         proof = prove(problem, certificate, tol)
         certificate, bound = proof.y, proof.impulse_bound or None
@@ -86,14 +103,17 @@ def finish(
         elif bound == math.inf:
             status, message = STALLED, _joined(message, proof.reason)
         elif status is INFEASIBLE:
-            contradicted = f"says INFEASIBLE, {proof.reason}"
-        elif bound is not None and bound > np.abs(impulse).sum():
+            unproven = proof.reason
+        elif bound is not None and bound > max(np.abs(impulse).sum(), _contradicting_impulse(problem)):
             message = _joined(message, f"every solution has an impulse of at least {rounded_down(bound)} N s")
+    if unproven:
+        message = _joined(message, f"not proven: {unproven}")
+        status_conflict = f"says INFEASIBLE, {refutation}" if refutation else ""
     if status is CONVERGED and not relative <= tol:
-        contradicted = f"says CONVERGED, relative residual {relative:.2e} is above tol {tol:.1e}"
+        status_conflict = f"says CONVERGED, relative residual {relative:.2e} is above tol {tol:.1e}"
     elif status is FLOOR and not judged.at_floor:
         least = min(2.0 * judged.floor, FLOOR_MOST)
-        contradicted = f"says FLOOR, relative residual {relative:.2e} is above {least:.2e}"
+        status_conflict = f"says FLOOR, relative residual {relative:.2e} is above {least:.2e}"
     if status in (DIVERGED, STALLED) and not message and spec.resumable:
         message = describe_end(problem, status, claim.iterations)
     if status is MAX_ITERATIONS:
@@ -115,9 +135,10 @@ def finish(
             "message": message,
             "history": history,
             "dual": claim.dual,
-            "certificate": certificate if status is INFEASIBLE else None,
+            "certificate": certificate if status is INFEASIBLE and not unproven else None,
             "impulse_bound": bound,
-            "contradicted": contradicted,
+            "claim_check": CONTRADICTED if status_conflict else NOT_PROVEN if unproven else CONFIRMED,
+            "status_conflict": status_conflict,
             "sweeps_per_decade": sweeps_per_decade,
             "turns": claim.turns,
         }
@@ -139,6 +160,22 @@ def describe_end(problem: Problem, status: Status, iterations: int) -> str:
     if status is DIVERGED:
         words += ": sweeps are sure to converge only if A is symmetric and positive definite"
     return words
+
+
+def _within_bounds(problem: Problem, impulse: FloatArray) -> tuple[FloatArray, Residual]:
+    """Project an impulse (m,) [N s] onto the bounds; take the zero impulse instead if its error has less energy.
+
+    An engine that applies the impulse of an infeasible step must not pull at a contact. The largest velocity error does
+    not decide: it is that of the rows that cannot be met, whatever the others gained.
+    """
+    candidates = project(problem.cones, impulse), problem.start()
+    results = [(lam, residual(problem, lam, "float64")) for lam in candidates]
+    return min(results, key=lambda result: result[1].energy)
+
+
+def _contradicting_impulse(problem: Problem) -> float:
+    """Impulse [N s] above which a lower bound of every solution's impulse means that constraints nearly contradict."""
+    return CONTRADICTING_IMPULSE_RATIO * float(np.sum(np.abs(problem.b) / problem.d))
 
 
 def _joined(message: str, more: str) -> str:

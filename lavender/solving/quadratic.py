@@ -10,6 +10,7 @@ program but for a dual residual of D (x_k - x_(k+1)) (Rockafellar 1976).
 
 from __future__ import annotations
 
+import math
 from contextlib import suppress
 from dataclasses import replace
 from time import perf_counter
@@ -23,7 +24,7 @@ from lavender.base.errors import InputError
 from lavender.base.later import sparse as sp
 from lavender.judge.certificates import prove
 from lavender.judge.residuals import Residual, residual
-from lavender.judge.solution import Claim, Solution, Status, Turn
+from lavender.judge.solution import CONFIRMED, CONVERGED, Claim, Solution, Status, Turn
 from lavender.problem import Problem, QPSolution
 from lavender.problem.generalized import Generalized
 from lavender.problem.quadratic import QuadraticProgram
@@ -32,6 +33,7 @@ from lavender.solvers.interior_point import NAME, InteriorPoint
 from lavender.solvers.registry import SMALL_ROWS, get
 from lavender.solvers.setup_times import LAID_OUT, loading
 from lavender.solvers.small import told
+from lavender.solving.outcome import finish
 from lavender.solving.solve import judged_later, seconds_of, solve, solve_small
 
 STEPS = 50  # proximal steps
@@ -46,7 +48,10 @@ CENTRED = 1e-9  # tol of a step around a centre, at most: a ray shows only to UN
 SET_UP = 5e-3  # s of an interior point before its first step, in Python, whatever the size
 SOONER = 5e6  # counted cost [ns] of a compiled call, in which an interior point would hardly have begun
 HARD = (Status.FLOOR, Status.STALLED)  # after which the next step has more of D, too: M is nearly singular
-ENDS = (Status.INFEASIBLE, Status.INTERRUPTED)
+FINAL_STATUSES = (
+    Status.FLOOR,
+    Status.INTERRUPTED,
+)  # of the constraint problem, whatever the program's error is
 UNBOUNDED = 1e-7  # relative: a direction along which the objective falls for ever; a point where it may begin
 
 
@@ -74,9 +79,10 @@ def solve_qp(
     Returns
     -------
     QPSolution
-        x, y, z, z_box; `error` says how wrong they are, `solution.status` how it ended. INFEASIBLE: no x fulfils the
-        constraints, and `problem.qp.multipliers(answer.solution.certificate)` proves it, unless the claim of another
-        package's solver is `contradicted`. An unbounded program has a `ray`.
+        x, y, z, z_box; `error` says how wrong they are, `solution.status` how it ended: CONVERGED if the error is at
+        most `tol`. `solution.setup_time` and `solution.solve_time` add up to the time of this call. INFEASIBLE: no x
+        fulfils the constraints, and `problem.qp.multipliers(answer.solution.certificate)` proves it, if
+        `solution.claim_check` is "confirmed". An unbounded program has a `ray`.
 
     Raises
     ------
@@ -99,7 +105,39 @@ def solve_qp(
             "problem is not a quadratic program: make it with Problem.from_qp; what updated() or a file gives "
             "knows the constraint problem alone"
         )
-    tol, end = number("tol", tol, low=0.0), perf_counter() + seconds_of(time_limit)
+    begun = perf_counter()
+    tol, end = number("tol", tol, low=0.0), begun + seconds_of(time_limit)
+    answer = _solve(problem, qp, solver, tol, time_limit, end, options)
+    _complete(answer, perf_counter() - begun)
+    return answer
+
+
+def _complete(answer: QPSolution, seconds: float) -> None:
+    """Set the time of the whole call, and CONVERGED if the program's error is within `tol`, in the answer's solution.
+
+    Residuals of the constraint problem are relative to that of x = v*; those of the program decide.
+    """
+    solution: Solution = answer.solution
+    values = solution.__dict__
+    values["solve_time"] = seconds - solution.setup_time
+    if solution.status in FINAL_STATUSES or (solution.status is CONVERGED and not solution.is_contradicted):
+        return
+    if answer.ray is None and answer.error <= answer.tol:
+        relative = solution.residual.relative
+        if solution.certificate is None and relative < math.inf:
+            values |= {"status": CONVERGED, "tol": max(solution.tol, relative)}
+            values |= {"claim_check": CONFIRMED, "status_conflict": ""}
+
+
+def _solve(
+    problem: Problem,
+    qp: QuadraticProgram,
+    solver: str,
+    tol: float,
+    time_limit: float | None,
+    end: float,
+    options: dict[str, Any],
+) -> QPSolution:
     start = options.pop("impulse", None)
     large = (
         isinstance(solver, str) and solver == "auto" and tol > 0.0 and not options and problem.m > SMALL_ROWS
@@ -111,14 +149,16 @@ def solve_qp(
     if answer.error <= tol and qp.proximal is None:
         return answer
     for _ in range(STEPS):
-        if solution.status in ENDS:
+        if solution.status is Status.INTERRUPTED:
             return answer
+        if solution.status is Status.INFEASIBLE:
+            return answer if solution.claim_check == CONFIRMED else best
         ray = qp.ray(answer.x if centre is None else answer.x - centre, UNBOUNDED)
         left = end - perf_counter()
         if ray is not None and point is None and left > 0.0:
             limit = None if time_limit is None else left
             point = solve(_nearest(problem, qp), solver, tol=UNBOUNDED, time_limit=limit, **options)
-            if point.status is Status.INFEASIBLE and not point.contradicted:
+            if point.status is Status.INFEASIBLE and point.claim_check == "confirmed":
                 return replace(answer, solution=point)
             if point.success or point.residual.at_floor:
                 return replace(answer, ray=ray)
@@ -215,7 +255,10 @@ def _by_interior_point(
     work = {"factorisations": point.factorisations}
     turn = Turn(NAME, work, problem.metric.start_relative, judged.relative)
     claim = Claim(status, point.factorisations, work, told([turn]), certificate=proof, turns=(turn,))
-    rest: tuple[Any, ...] = judged_later, (problem, problem, get(solver), {}, lam, claim, tol)
+    if proof is not None:  # with an impulse within its bounds, which `finish` chooses
+        spec = get(solver)
+        return finish(problem, spec, {}, lam.copy(), claim, tol, 0.0, watch.seconds, None), answer.x
+    rest: tuple[Any, ...] = judged_later, (problem, get(solver), {}, lam, claim, tol)
     return Solution.late(lam, status, tol, watch.seconds, rest), answer.x
 
 

@@ -28,6 +28,7 @@ from lavender.judge.residuals import (
     unstretched,
 )
 from lavender.judge.solution import (
+    CONFIRMED,
     CONVERGED,
     INFEASIBLE,
     NUMERICAL_ERROR,
@@ -38,6 +39,7 @@ from lavender.judge.solution import (
     Status,
 )
 from lavender.problem import Problem, check_problem
+from lavender.solvers.certify import check_infeasible
 from lavender.solvers.loop import LEAST, Callback, Loop, Record, best_of
 from lavender.solvers.registry import SMALL_ROWS, Solver, SolverSpec, get
 from lavender.solvers.setup_times import SCIPY, estimate_disk_time, estimate_refusal_time, loading
@@ -45,7 +47,7 @@ from lavender.solving.outcome import decide_empty_rows, finish
 from lavender_ext.judge.measure import all_finite
 
 LATER = ("iterations", "work", "solver", "message", "history", "dual", "certificate", "impulse_bound",
-         "contradicted", "sweeps_per_decade", "turns")  # fmt: skip
+         "claim_check", "status_conflict", "sweeps_per_decade", "turns")  # fmt: skip
 COUNTED = 0.9e9  # ns that a small call may be counted for, for each second of its limit
 SET_UP_LATE = "what has to be set up first takes longer than the time limit"
 NO_TURN = "the time limit was over before its turn: the start"
@@ -345,9 +347,12 @@ class Prepared:
                 loop.not_worse(start)
                 if spec.delegates and problem.m > SMALL_ROWS and loading(*SCIPY):
                     claim = replace(claim, message=f"{claim.message}; {WITHOUT_SCIPY}")
+        refutation = ""
+        if claim.status is INFEASIBLE and (spec.external or not spec.own):
+            claim, _, refutation = check_infeasible(problem, claim, loop.tol, loop.deadline)
         solution = finish(
             problem, spec, self.options, loop.impulse, claim, loop.tol, setup_time, loop.time, loop.recorded(),
-            float(getattr(self.state, "sweeps_per_decade", math.nan)),
+            float(getattr(self.state, "sweeps_per_decade", math.nan)), refutation,
         )  # fmt: skip
         return solution if self._given is problem else solution.unstretched(self._given)
 
@@ -548,7 +553,8 @@ def rest_of(
         "dual": None,
         "certificate": None,
         "impulse_bound": None,
-        "contradicted": "",
+        "claim_check": CONFIRMED,
+        "status_conflict": "",
         "sweeps_per_decade": math.nan,
         "turns": claim.turns,
     }

@@ -6,7 +6,7 @@ from libc.string cimport memcmp
 import numpy as np
 
 from lavender_ext.core cimport door
-from lavender_ext.core.arrays cimport doubles
+from lavender_ext.core.arrays cimport doubles, ints
 from lavender_ext.core.generalized cimport whitened_gather
 from lavender_ext.core.problem cimport Data, Room, room_for
 from lavender_ext.core.velocity cimport rows_velocity
@@ -201,25 +201,50 @@ def size_of_square(Data p, const double[::1] square):
     return relative_size(&p.blocks, &square[0] if square.shape[0] else NULL, p.start_energy, p.start_velocity)
 
 
-cdef inline double larger(double s, double x) noexcept nogil:
-    # NaN where either is
+cdef inline double max_nan(double s, double x) noexcept nogil:
+    # NaN if either is
     return s if x <= s or s != s else x
 
 
-cdef inline double share(double x, double of) noexcept nogil:
-    return x / of if of > 0.0 else x
+cdef inline double ratio(double x, double scale) noexcept nogil:
+    return x / scale if scale > 0.0 else 1.0 / 0.0 if x > 0.0 else x
 
 
-def program_residuals(x_, q_, px_, force_, jx_, target_, lam_, int32_t free, double rows, double curved):
-    """(r_p, r_d, gap, error) of a quadratic program; the error is the largest of three over what each is the sum of.
+# Rows that are zero at the solution, as x >= 0, have no terms of their own there. They are compared with what acting rows
+# make of their variables, and with this share of the largest variable; equations whose target is more than TARGET_ROUNDING of
+# that, and so is their size, with EQUATION_SHARE of both.
+cdef double SHARE_OF_LARGEST = 1e-3
+cdef double EQUATION_SHARE = 1e-3
+cdef double TARGET_ROUNDING = 1e-12
+# Share of the sum of |terms| that the gap is compared with at least: an objective whose terms cancel has no size.
+cdef double SHARE_OF_TERMS = 1e-3
 
-    r_p    max |J x - target| on the first `free` rows, max of target - J x on the others;  over rows
-    r_d    max |P x + q - J^T lambda|, and the largest of -lambda on the others;            over forces
-    gap    |x.(P x + q) - target.lambda|;                      over energy = sum |x| forces + sum |lambda| rows
 
-    rows is at least what is given, forces at least `curved` max |x|; px (n,) = P x, force (n,) = J^T lambda, jx (m,).
+def program_residuals(x_, q_, px_, force_, jx_, target_, lam_, int32_t free, jac, ordered_,
+                      sizes_without_rows, double curved):
+    """Compute the residuals of a quadratic program, and each relative to its own terms.
+
+    Rows: J x = target (the first `free`), J x >= target (the others). Row i acts if it is one of the first, is violated,
+    or has lambda_i > 0 and a slack of at most half its terms. Others enter no scale.
+
+    r_p    max_i of |J x - target|, of target - J x;           row i over scale_i
+    r_d    max_j |P x + q - J^T lambda|, max_i -lambda_i;      over max |P x|, |q|, |J^T lambda|; -lambda_i max_j |J_ij|
+    gap    |x.(P x + q) - target.lambda|;                      over the largest of |x.P x|, |q.x|, |target.lambda| and
+                                                               1e-3 (sum_j |x_j| forces_j + sum_i |lambda_i| scale_i)
+
+    scale_i = max(terms_i, c max_j |J_ij| max(size_j, 1e-3 max |x|)),  terms_i = max(|target_i|, max_j |J_ij x_j|),
+    c = 1e-3 for equations with a target above rounding, else 1
+    size_j = max terms_k / |J_kj| over the rows k that act; at least `unbounded` (n,) if all of these have target 0
+
+    px (n,) = P x, force (n,) = J^T lambda, jx (m,); jac: (indptr, indices, data) of J, with `ordered` (n,) = x in the
+    order of its columns; `sizes_without_rows()` returns `unbounded` in this order. Forces are at least `curved` max |x|,
+    and the gap's terms this times sum |x_j|.
+
+    Returns
+    -------
+    r_p, r_d, gap, the three relative ones, and the largest of these
     """
-    cdef Py_ssize_t i, n = len(x_), m = len(lam_)
+    cdef Py_ssize_t i, j, k, n = len(x_), m = len(lam_)
     cdef const double* x = doubles(x_, n)
     cdef const double* q = doubles(q_, n)
     cdef const double* px = doubles(px_, n)
@@ -227,21 +252,75 @@ def program_residuals(x_, q_, px_, force_, jx_, target_, lam_, int32_t free, dou
     cdef const double* jx = doubles(jx_, m)
     cdef const double* target = doubles(target_, m)
     cdef const double* lam = doubles(lam_, m)
-    cdef double primal = 0.0, dual = 0.0, gap = 0.0, forces = 0.0, size = 0.0, far = 0.0, impulse = 0.0, short
-    for i in range(n):
-        dual = larger(dual, fabs(px[i] + q[i] - force[i]))
-        gap += x[i] * (px[i] + q[i])
-        forces = larger(larger(larger(forces, fabs(px[i])), fabs(q[i])), fabs(force[i]))
-        size += fabs(x[i])
-        far = larger(far, fabs(x[i]))
-    forces = larger(forces, curved * far)
+    cdef const double* ordered = doubles(ordered_, n)
+    cdef const double* unbounded = NULL
+    cdef const int32_t* ptr = ints(jac[0], m + 1)
+    cdef const int32_t* column = ints(jac[1], len(jac[1]))
+    cdef const double* value = doubles(jac[2], len(jac[2]))
+    cdef Room room = room_for((n + 2 * m) * sizeof(double))
+    cdef double* size = <double*>room.at
+    cdef double* terms = size + n
+    cdef double* acts = terms + m                       # 1 of a row that acts, else 0
+    cdef double primal = 0.0, dual = 0.0, gap = 0.0, row_error = 0.0, force_error = 0.0, negative = 0.0
+    cdef double forces = 0.0, far = 0.0, curvature = 0.0, linear = 0.0, multiplied = 0.0, sums = 0.0, total = 0.0
+    cdef double violation, own, scale, largest, floor
+    cdef bint homogeneous = True
+    for j in range(n):
+        force_error = max_nan(force_error, fabs(px[j] + q[j] - force[j]))
+        curvature += x[j] * px[j]
+        linear += q[j] * x[j]
+        own = max_nan(max_nan(fabs(px[j]), fabs(q[j])), fabs(force[j]))
+        forces = max_nan(forces, own)
+        sums += fabs(x[j]) * own
+        total += fabs(x[j])
+        size[j] = 0.0
+        far = max_nan(far, fabs(x[j]))
+    forces = max_nan(forces, curved * far)
+    gap = curvature + linear
     for i in range(m):
-        short = target[i] - jx[i]
-        primal = larger(primal, fabs(short) if i < free else short)
-        if i >= free:
-            dual = larger(dual, -lam[i])
+        own = fabs(target[i])
+        for k in range(ptr[i], ptr[i + 1]):
+            own = max_nan(own, fabs(value[k] * ordered[column[k]]))
+        terms[i] = own
+        violation = target[i] - jx[i]
+        acts[i] = i < free or violation > 0.0 or (lam[i] > 0.0 and -violation <= 0.5 * own)
         gap -= target[i] * lam[i]
-        rows = larger(larger(rows, fabs(target[i])), fabs(jx[i]))
-        impulse += fabs(lam[i])
-    gap, size = fabs(gap), size * forces + impulse * rows
-    return primal, dual, gap, larger(larger(share(primal, rows), share(dual, forces)), share(gap, size))
+        if acts[i] == 0.0:
+            continue
+        multiplied += target[i] * lam[i]
+        homogeneous = homogeneous and target[i] == 0.0
+        for k in range(ptr[i], ptr[i + 1]):
+            if value[k] != 0.0:
+                size[column[k]] = max_nan(size[column[k]], own / fabs(value[k]))
+    floor = SHARE_OF_LARGEST * far
+    if homogeneous:
+        kept = sizes_without_rows()
+        unbounded = doubles(kept, n)
+    for j in range(n):
+        if homogeneous:
+            size[j] = max_nan(size[j], unbounded[j])
+        size[j] = max_nan(size[j], floor)
+    for i in range(m):
+        violation = target[i] - jx[i]
+        violation = fabs(violation) if i < free else violation
+        largest = scale = 0.0
+        for k in range(ptr[i], ptr[i + 1]):
+            largest = max_nan(largest, fabs(value[k]))
+            scale = max_nan(scale, fabs(value[k]) * size[column[k]])
+        if i < free and fabs(target[i]) > TARGET_ROUNDING * scale:
+            scale *= EQUATION_SHARE
+        scale = max_nan(terms[i], scale)
+        primal = max_nan(primal, violation)
+        row_error = max_nan(row_error, ratio(violation, scale))
+        if acts[i] != 0.0:
+            sums += fabs(lam[i]) * scale
+        if i >= free:
+            dual = max_nan(dual, -lam[i])
+            negative = max_nan(negative, -lam[i] * largest)
+    dual = max_nan(dual, force_error)
+    scale = max_nan(max_nan(fabs(curvature), fabs(linear)), max_nan(fabs(multiplied), SHARE_OF_TERMS * sums))
+    scale = max_nan(scale, curved * far * total)
+    gap = fabs(gap)
+    force_error = ratio(max_nan(force_error, negative), forces)
+    scale = ratio(gap, scale)
+    return primal, dual, gap, row_error, force_error, scale, max_nan(max_nan(row_error, force_error), scale)

@@ -172,8 +172,8 @@ def claims(spec, problem, solution):
         and lv.get(name).resumable
     ):
         yield "overrun", f"{name}: {solution.iterations} iterations where {budget} were asked for"
-    if solution.contradicted and not lv.get(name).external:
-        yield "contradicted", f"{name}: {solution.contradicted}"
+    if solution.claim_check != "confirmed" and not lv.get(name).external:
+        yield "contradicted", f"{name}: {solution.claim_check}, {solution.status_conflict}"
     finite = bool(np.isfinite(solution.impulse).all())
     if not finite and status not in ("DIVERGED", "NUMERICAL_ERROR"):
         yield "false claim", f"{name}: {status} with an impulse that is not finite"
@@ -193,7 +193,7 @@ def claims(spec, problem, solution):
     twin = judge_twin.Problem(spec["problem"])
     j = twin.judge(solution.impulse)
     slop = 1.0 + 1e-6
-    if status == "INFEASIBLE" and not solution.contradicted:
+    if status == "INFEASIBLE" and solution.claim_check == "confirmed":
         if solution.success:
             yield "false claim", f"{name}: INFEASIBLE and success"
         if solution.certificate is None:
@@ -207,13 +207,13 @@ def claims(spec, problem, solution):
     within = solution.tol * slop + j.allowed
     floor = 2.0 * j.floor * slop + j.allowed
     if (
-        solution.success or (status == "CONVERGED" and not solution.contradicted)
+        solution.success or (status == "CONVERGED" and solution.claim_check == "confirmed")
     ) and not j.relative <= within:
         yield (
             "false claim",
             f"{name}: {status}, success {solution.success}, relative {r.relative:.3e}, in long double {j.relative:.3e}",
         )
-    if ((status == "FLOOR" and not solution.contradicted) or accepted) and not j.relative <= max(
+    if ((status == "FLOOR" and solution.claim_check == "confirmed") or accepted) and not j.relative <= max(
         within, floor
     ):
         found = f"relative {r.relative:.3e} floor {r.floor:.3e}, in long double {j.relative:.3e}"

@@ -81,8 +81,8 @@ def check(spec, counts):
     solution = lv.solve(problem, name, tol=spec["tol"], **more)
     counts["promises"] += 1
     counts["solves"] += 1
-    if solution.contradicted:
-        yield "contradicted", f"{name}: {solution.contradicted}"
+    if solution.claim_check != "confirmed":
+        yield "contradicted", f"{name}: {solution.claim_check}, {solution.status_conflict}"
     slope = solution.sweeps_per_decade
     if not (np.isnan(slope) or 0.0 < slope < np.inf):
         yield "wrong number", f"{name}: sweeps_per_decade is {slope}"

@@ -33,7 +33,10 @@ def test_a_residual_that_is_too_small_breaks_the_inequality():
     assert row.verdict == check.BREACH
     assert row.contradicted
     fair = check.compare(
-        problem, "fair", replace(optimum, impulse=wrong, residual=honest, contradicted=""), optimum
+        problem,
+        "fair",
+        replace(optimum, impulse=wrong, residual=honest, claim_check="confirmed", status_conflict=""),
+        optimum,
     )
     assert fair.verdict == check.NOT_SOLVED
     assert not fair.contradicted

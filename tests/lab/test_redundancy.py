@@ -1,5 +1,6 @@
 """`redundancy`: ranks known by hand, names, uniqueness."""
 
+from dataclasses import replace
 from fractions import Fraction
 
 import numpy as np
@@ -124,13 +125,31 @@ def test_without_the_redundant_rows_the_rank_is_the_same(seed):
     assert again.rows == ()
 
 
+@pytest.mark.parametrize("share", [1e-4, 1e-8, 1e-10])
+def test_a_row_that_is_new_by_more_than_tol_is_kept(share):
+    """`tol` is a share of directions: 1e-12 of squares called rows redundant that were 1e-8 apart."""
+    rng = np.random.default_rng(5)
+    jac = rng.normal(size=(4, 6))
+    jac /= np.linalg.norm(jac, axis=1)[:, None]
+    new = np.linalg.svd(jac[:3])[2][-1]
+    jac[3] = rng.normal(size=3) @ jac[:3]
+    jac[3] = jac[3] / np.linalg.norm(jac[3]) + share * new
+    problem = lv.Problem.from_jacobian(jac, np.eye(6), np.zeros(6), cones=lv.Cones.free(4))
+    kept, dropped = redundancy(problem), redundancy(problem, tol=10.0 * share)
+    assert (kept.rank, dropped.rank) == (4, 3)
+    assert kept.tol == 1e-12 and dropped.tol == 10.0 * share
+    assert redundancy(replace(problem, precision="float32")).rank == (4 if share > 1e-6 else 3)
+    matrix = redundancy(as_matrix(problem))  # A has the squares of shares
+    assert matrix.rank == (4 if share > 1e-6 else 3) and matrix.tol == 1e-6
+
+
 def test_a_large_island_is_decomposed_as_sparse():
     m = 2500
     grid = sp.diags_array([-np.ones(m - 1), 2.0 * np.ones(m), -np.ones(m - 1)], offsets=[-1, 0, 1]).tolil()
     grid[0, 0] = grid[m - 1, m - 1] = 1.0  # a free chain: one null vector
     found = redundancy(lv.Problem.linear(sp.csr_array(grid), np.zeros(m)))
     assert found.rank == m - 1
-    assert found.tol == pytest.approx(1e-12 * m)
+    assert found.tol == pytest.approx(1e-6 * m**0.5)
     assert "LDL^T" in found.method
 
 
@@ -179,7 +198,7 @@ def test_the_rank_is_that_of_exact_numbers_whatever_the_sizes(form, spread):
 def test_a_rank_that_masses_hide_is_told():
     jac = np.array([[1.0, 1.0], [1.0, -1.0]])
     found = lv.redundancy(
-        lv.Problem.from_jacobian(jac, np.diag([1.0, 1e14]), np.zeros(2), cones=lv.Cones.free(2))
+        lv.Problem.from_jacobian(jac, np.diag([1.0, 1e26]), np.zeros(2), cones=lv.Cones.free(2))
     )
     assert found.rank == 2
     assert "1 by the masses and 2 without them" in str(found)

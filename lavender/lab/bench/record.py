@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, fields
 from typing import Any
 
 from lavender.judge.residuals import VERDICTS_OF_OLD
+from lavender.judge.solution import CLAIM_CHECKS, CONFIRMED, CONTRADICTED, NOT_PROVEN
 
 # Beside the statuses of a solve: what can happen to a run that brings no solution back.
 ERROR, KILLED, CRASHED = "ERROR", "KILLED", "CRASHED"
@@ -190,7 +191,8 @@ class Record(_Texts):
     worst_row: int = -1
     worst_name: str = ""
     success: bool = False  # the judge: relative <= tol (a budget: false)
-    contradicted: str = ""  # why the judge disagrees with the claim
+    claim_check: str = CONFIRMED  # "confirmed", "not proven" or "contradicted", as in a Solution
+    status_conflict: str = ""  # why the judge's figures exclude what the status claims; empty if they do not
     claims: bool = False  # the solver claims a solution: CONVERGED, FLOOR or INFEASIBLE
     iterations: int = 0
     work: Mapping[str, int] = field(default_factory=dict)
@@ -243,6 +245,8 @@ def measurement_key(what: Any) -> tuple[Any, ...]:
 
 
 Entry = Run | CaseInfo | Skip | Done | Record
+#: Fields of records by the names that earlier versions wrote.
+RENAMED_FIELDS = {"contradicted": "status_conflict"}
 KINDS: dict[str, type] = {"run": Run, "case": CaseInfo, "skip": Skip, "done": Done, "record": Record}
 
 
@@ -263,6 +267,7 @@ def from_json(line: Any) -> Entry:
     if not isinstance(line, Mapping) or not isinstance(line.get("kind"), str) or line["kind"] not in KINDS:
         raise ValueError("not an entry of a records file")
     cls = KINDS[line["kind"]]
+    line = _with_new_names(line)
     try:
         values = values_in(cls, line)
         word, comma, rest = str(values.get("stored_verdict", "")).partition(",")
@@ -271,6 +276,18 @@ def from_json(line: Any) -> Entry:
         return cls(**values)
     except (TypeError, ValueError) as error:
         raise ValueError(f"not an entry of a records file ({error})") from None
+
+
+def _with_new_names(line: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return a line of an earlier version with the fields' names of this one."""
+    renamed = {RENAMED_FIELDS.get(name, name): value for name, value in line.items()}
+    conflict = line.get("contradicted")
+    if not conflict or "claim_check" in line:
+        return renamed
+    # Earlier versions called a claim of INFEASIBLE contradicted if no certificate proved it.
+    if renamed.get("status") == "INFEASIBLE":
+        return renamed | {"claim_check": NOT_PROVEN, "status_conflict": ""}
+    return renamed | {"claim_check": CONTRADICTED}
 
 
 def values_in(cls: Any, line: Mapping[str, Any]) -> dict[str, Any]:
@@ -365,6 +382,7 @@ _RANGES: dict[Any, _Rule] = {
     ("Record", "start"): ("cold, warm or carried", lambda v: v in ("cold", "warm", "carried")),
     ("Record", "mode"): ("tol, budget or time", lambda v: v in ("tol", "budget", "time")),
     ("Record", "way"): ("call, steps, batch or nothing", lambda v: v in ("", "call", "steps", "batch")),
+    ("Record", "claim_check"): ("confirmed, not proven or contradicted", lambda v: v in CLAIM_CHECKS),
     ("Record", "tol"): ("a finite number of 0 or more", lambda v: 0.0 <= v < math.inf),
     ("Record", "time_limit"): ("a positive number of seconds", _is_positive),
     ("Record", "max_iter"): ("0 or more", lambda v: v >= 0),

@@ -84,7 +84,7 @@ class Submission:
 
 def verdict_of(record: Record) -> str:
     """What the judge says of a run to a tolerance, or of its claim."""
-    if record.contradicted:
+    if record.status_conflict:
         return "claim contradicted"
     if record.success:
         return "solved"

@@ -25,10 +25,13 @@ Needs python-flint (extra `proof`).
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import CapabilityError
+from lavender.judge import certificates
+from lavender.judge.residuals import residual
 from lavender.judge.solution import Solution
 from lavender.lab.motion.reference import PROOF, judged, kept, reference
 from lavender.lab.proof.numbers import balls
@@ -44,10 +47,12 @@ OTHERS = ("newton", "admm")
 OTHERS_ROWS = 2000
 SECONDS = 10.0  # for each of them
 NEAR = 1e-6  # of the largest b: from the velocities of the answer
+# If an answer without a proof has a larger relative residual, the problem may have no solution.
+UNSOLVED_RESIDUAL = 1e-6
 
 
 def prove(problem: Problem, solution: Any) -> Enclosure:
-    """Enclose an exact solution of the problem near an answer, with a proof.
+    """Enclose an exact solution of the problem near an answer, or show that the problem has none, with a proof.
 
     Parameters
     ----------
@@ -60,7 +65,8 @@ def prove(problem: Problem, solution: Any) -> Enclosure:
     Returns
     -------
     Enclosure
-        Not proven is a result: `reason` says which block is undecided, or what else was in the way.
+        Not proven is a result: `reason` says which block is undecided, or what else was in the way. `infeasible`: a
+        certificate, of the answer or of `auto`, proves that there is no solution.
 
     Raises
     ------
@@ -86,7 +92,12 @@ def prove(problem: Problem, solution: Any) -> Enclosure:
     (True, True, True)
     """
     check_problem(problem)
-    given = problem.impulse_array(solution.impulse if isinstance(solution, Solution) else solution)
+    answer = solution.impulse if isinstance(solution, Solution) else solution
+    given = problem.impulse_array(answer)
+    if isinstance(solution, Solution) and solution.certificate is not None:
+        refuted = _infeasible(problem, solution.certificate)
+        if refuted.infeasible:
+            return refuted
     found = _searched(problem, given, given)
     if found.boundary and problem.m <= OTHERS_ROWS:
         for name in OTHERS:
@@ -98,7 +109,19 @@ def prove(problem: Problem, solution: Any) -> Enclosure:
             again = _searched(problem, other.impulse, given)
             if again.proven and again.velocity_radius <= NEAR * float(abs(problem.b).max()):
                 return again
+    if not found.proven and not residual(problem, given).relative <= UNSOLVED_RESIDUAL:
+        other = solve(problem, time_limit=SECONDS)
+        if other.certificate is not None:
+            refuted = _infeasible(problem, other.certificate)
+            return refuted if refuted.infeasible else found
     return found
+
+
+def _infeasible(problem: Problem, certificate: FloatArray) -> Enclosure:
+    """Check a certificate (m,) on the problem's numbers as exact ones."""
+    proof = certificates.prove(problem, certificate)
+    holds = not proof.reason and proof.impulse_bound == math.inf
+    return Enclosure(False, reason=proof.reason or proof.words, infeasible=holds)
 
 
 def _searched(problem: Problem, start: FloatArray, given: FloatArray) -> Enclosure:

@@ -28,9 +28,12 @@ ROUNDS = 30  # changes of cases, as in an active-set method
 
 @dataclass(frozen=True, eq=False)
 class Enclosure:
-    """An exact solution of the problem's own numbers, and how far from an answer it is. `str()` is a line."""
+    """An exact solution of the problem's own numbers and how far from an answer it is, or that there is none.
 
-    proven: bool
+    `str()` is a line.
+    """
+
+    proven: bool  # an exact solution is enclosed
     # N s: largest |lambda_i - lambda_i*| of a row, rounded up; inf where nothing is proven
     impulse_radius: float = math.inf
     velocity_radius: float = math.inf  # m/s: largest |w_i - w_i*| of a row
@@ -42,8 +45,13 @@ class Enclosure:
     impulse: FloatArray | None = field(default=None, repr=False)  # (m,) N s, the exact one rounded
     # degenerate blocks by name: between two cases, dependent to rounding, or singular
     boundary: tuple[str, ...] = ()
+    infeasible: bool = (
+        False  # a certificate proves that the problem has no solution; `reason` names the blocks
+    )
 
     def __str__(self) -> str:
+        if self.infeasible:
+            return self.reason
         if not self.proven:
             return f"not proven: {self.reason}"
         words = "velocities unique" if self.unique else "perhaps one of several motions"

@@ -265,7 +265,7 @@ def within(
 def _liars(records: Records, cases: Sequence[str]) -> set[str]:
     """Solvers with a false claim on any of these."""
     held = set(cases)
-    return {r.solver for r in records if r.contradicted and r.case in held}
+    return {r.solver for r in records if r.status_conflict and r.case in held}
 
 
 def _taking(cases: Sequence[str], ways: Ways) -> list[_Way]:

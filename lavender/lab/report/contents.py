@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 from lavender.base.deadline import seconds
 from lavender.judge.residuals import UNCONVERGED
+from lavender.judge.solution import CONFIRMED, CONTRADICTED, NOT_PROVEN
 from lavender.lab.bench.record import Record, Skip, file_name, level_name, printable
 from lavender.lab.bench.store import Records
 from lavender.lab.report import choices, finals, tables
@@ -24,6 +25,7 @@ from lavender.lab.report.text import NONE, count, percent, residual, share, time
 
 Rows = list[Sequence[str | Cell]]
 GOOD = ("CONVERGED", "FLOOR")
+CLAIM_MARKS = {CONFIRMED: "", NOT_PROVEN: NOT_PROVEN, CONTRADICTED: "✗ contradicted"}
 SHOWN_TIES = 2
 DIFFICULTY = (
     "sweeps of pgs to a thousandth of doing nothing; condition of A scaled to a diagonal of 1; share of blocks at the "
@@ -260,12 +262,12 @@ def reach_table(reaches: Sequence[tables.Reach], levels: Sequence[float]) -> Tab
             *(seconds(r.times[x]) for x in levels),
             Cell(residual(r.best), after=" floor" if r.at_floor else ""),
             Cell(r.status, mark="good" if r.status in GOOD else "warn"),
-            Cell("✗ contradicted" if r.contradicted else "", more=r.contradicted),
+            Cell(CLAIM_MARKS[r.claim_check], more=r.status_conflict),
             r.form,
         ]
         for r in reaches
     ]
-    marks = ["bad" if r.contradicted else "" for r in reaches]
+    marks = ["bad" if r.status_conflict else "" for r in reaches]
     heads = ["case", "solver", *(f"to {level_name(x)}" for x in levels), "best", "status", "claim", "form"]
     return Table(heads, rows, marks)
 
@@ -317,11 +319,11 @@ def failure_table(failures: Sequence[Record], campaign: bool) -> Table:
         [
             Cell(f.case, link="" if campaign else f"case-{file_name(f.case)}"), who(f.solver, f.start), f.asked,
             f.status, residual(f.relative), residual(f.floor), f.worst_name,
-            (f"✗ {f.contradicted}. " if f.contradicted else "") + f.message,
+            (f"✗ {f.status_conflict}. " if f.status_conflict else "") + f.message,
         ]
         for f in failures
     ]  # fmt: skip
-    marks = ["bad" if f.contradicted else "" for f in failures]
+    marks = ["bad" if f.status_conflict else "" for f in failures]
     return Table(
         ["case", "solver", "asked", "status", "residual", "floor", "worst row", "message"], rows, marks
     )

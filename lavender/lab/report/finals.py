@@ -278,7 +278,7 @@ def _race(
     noise = max(NOISE, math.exp(2.0 * math.sqrt(2.0) * 1.36 * deviation / math.sqrt(repeats)))
     whole = score(values)
     wins, losses = np.zeros(n), [[] for _ in range(n)]  # type: ignore[var-annotated]
-    lying = np.array([any(r.contradicted for r in f.runs.values()) for f in some])
+    lying = np.array([any(r.status_conflict for r in f.runs.values()) for f in some])
     for cases, again in _drawn(blocks, repeats, max(1, AT_ONCE // values.size)):
         found = score(values[:, cases[:, :, None], again[:, None, :]])  # (lines, samples)
         # A false claim comes last, then whoever misses more cases.

@@ -113,5 +113,7 @@ def _links(lines: Sequence[choices.Line]) -> dict[str, str]:
 
 def _fastest(rows: Sequence[tables.Reach], level: float) -> tables.Reach | None:
     """Who brings a case to the level first, from a cold start, with claims that hold."""
-    honest = [r for r in rows if r.start == "cold" and not r.contradicted and math.isfinite(r.times[level])]
+    honest = [
+        r for r in rows if r.start == "cold" and not r.status_conflict and math.isfinite(r.times[level])
+    ]
     return min(honest, key=lambda r: r.times[level], default=None)

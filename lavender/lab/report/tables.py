@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from statistics import median
 
 from lavender.judge.residuals import at_floor
+from lavender.judge.solution import CLAIM_CHECKS, CONFIRMED
 from lavender.lab.bench.record import Record, asked_of
 from lavender.lab.bench.store import Records
 
@@ -83,7 +84,8 @@ class Reach:
     best: float  # smallest relative residual of any run
     floor: float  # of that run
     status: str  # of the run to the tightest level asked for
-    contradicted: str
+    claim_check: str  # the worst of all runs
+    status_conflict: str
     form: str
     motion: float  # -, relative motion error of the best run; nan where there is none
     bound: float  # sqrt J, proved bound of it; nan where nothing is proved
@@ -160,7 +162,8 @@ def reaches(records: Records, levels: Sequence[float] | None = None) -> list[Rea
                 best=best.relative if best else math.inf,
                 floor=best.floor if best else math.nan,
                 status=last.status,
-                contradicted=next((r.contradicted for r in group if r.contradicted), ""),
+                claim_check=max((r.claim_check for r in group), key=CLAIM_CHECKS.index),
+                status_conflict=next((r.status_conflict for r in group if r.status_conflict), ""),
                 form=last.form,
                 motion=math.nan if best is None or best.motion is None else best.motion,
                 bound=math.nan if best is None or best.bound is None else best.bound,
@@ -181,9 +184,9 @@ def failures(records: Records) -> list[Record]:
         if _is_again(r):
             continue
         missed = r.mode == "tol" and not r.success and not at_floor(r.relative, r.floor)
-        proven = r.status == "INFEASIBLE" and not r.contradicted
+        proven = r.status == "INFEASIBLE" and r.claim_check == CONFIRMED
         lost = not math.isfinite(r.relative) or r.status.startswith(DIED)
-        if (missed and not proven) or lost or r.contradicted:
+        if (missed and not proven) or lost or r.status_conflict:
             out.append(r)
     return out
 
@@ -225,7 +228,7 @@ def claims(records: Records) -> list[Claims]:
                 solver=solver,
                 runs=len(mine),
                 claims=sum(r.claims for r in mine),
-                wrong=sum(r.claims and bool(r.contradicted) for r in mine),
+                wrong=sum(r.claims and bool(r.status_conflict) for r in mine),
                 reached=sum(r.success for r in asked),
                 asked=len(asked),
                 crashed=sum(r.status.startswith(DIED) for r in mine),
@@ -496,7 +499,7 @@ def robustness(records: Records) -> list[Robustness]:
                     solver=solver,
                     cases=len(mine),
                     reached={x: sum(v <= x for v in best.values()) for x in levels},
-                    wrong=sum(bool(r.contradicted) for r in runs),
+                    wrong=sum(bool(r.status_conflict) for r in runs),
                     died=sum(r.status.startswith(DIED) for r in runs),
                     budgets={n: (median(v), quantile(v, 0.95)) for n, v in sorted(by_budget.items())},
                     hardest=max(best, key=lambda c: best[c]),

@@ -69,7 +69,9 @@ def _print_short(table: Table, console: Console, room: int) -> None:
 def _notes(report: Report, most: int) -> Iterator[tuple[str, str]]:
     """What to know besides, each with a style; of each kind so many, and how many there are."""
     records = report.records
-    wrong = [f"{r.case}, {r.solver}: {r.contradicted}" for r in tables.failures(records) if r.contradicted]
+    wrong = [
+        f"{r.case}, {r.solver}: {r.status_conflict}" for r in tables.failures(records) if r.status_conflict
+    ]
     kinds = {
         "false claim": ("red", wrong),
         "suspicious": ("yellow", [f"{case}: {told}" for case, told in suspicions(records)]),

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 from calls import says
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from random_problems import (
     CONTACTS,
     GIVEN,
@@ -13,6 +15,8 @@ from random_problems import (
     nearly_singular,
     random_contact_problem,
     random_lcp,
+    seeds,
+    without_solution,
 )
 
 import lavender as lv
@@ -38,7 +42,7 @@ def test_no_claim_is_contradicted_where_m_is_nearly_singular(name):
         for tol in (1e-6, 1e-14):
             solution = lv.solve(problem, name, tol=tol)
             count += 1
-            if solution.contradicted:
+            if solution.claim_check != "confirmed":
                 wrong.append((seed, tol, str(solution)))
     assert not wrong, wrong[:3]
     assert count >= 15 or "matrix" not in registry.get(name).operators, "nearly all were refused"
@@ -128,8 +132,54 @@ def test_a_verdict_on_another_problem_is_not_taken(plug_in):
 
     problem = random_lcp(9)
     solution = lv.solve(problem, plug_in(run))
-    assert solution.contradicted
+    assert solution.claim_check == "contradicted"
     np.testing.assert_array_equal(solution.residual.slack, -problem.b)
+
+
+# -- no solution --------------------------------------------------------------------------------------
+
+
+@given(seed=seeds, m=st.integers(1, 6), definite=st.booleans())
+@settings(max_examples=20)
+@pytest.mark.parametrize("name", lv.available())
+def test_the_impulse_of_an_infeasible_problem_is_within_its_bounds(name, seed, m, definite):
+    """An engine that applies it must not pull at a contact; -4.9 N s came back where lower = 0."""
+    rng = np.random.default_rng(seed)
+    a = -np.diag(rng.uniform(0.1, 1.0, m)) if definite else without_solution(seed, m + 1).dense()
+    problem = lv.Problem.lcp(a, rng.uniform(0.1, 1.0, m) if definite else without_solution(seed, m + 1).b)
+    if registry.get(name).refuses(problem):
+        return
+    solution = lv.solve(problem, name)
+    assert not solution.success
+    if solution.status is lv.Status.INFEASIBLE:
+        assert (solution.impulse >= 0.0).all()
+        assert solution.residual.energy <= solution.residual.energy_start
+        assert solution.claim_check == "confirmed" and solution.certificate is not None
+
+
+def test_rows_that_contradict_each_other_cost_no_other_row_its_impulse(plug_in):
+    """The largest velocity error is that of rows that cannot be met; it chose the zero impulse for all."""
+
+    def run(problem, impulse):
+        impulse[:] = [*np.full(10, 0.1), 0.0, 0.1]  # the last two rows are off by 1.1 and 0.9, 1 each at rest
+        return lv.Claim(lv.Status.INFEASIBLE, 1, certificate=np.array([*np.zeros(10), 1.0, 1.0]))
+
+    contradicting = np.array([[1.0, -1.0], [-1.0, 1.0]])
+    a = np.block([[np.eye(10), np.zeros((10, 2))], [np.zeros((2, 10)), contradicting]])
+    solution = lv.solve(lv.Problem.lcp(a, [*np.full(10, 0.1), 1.0, 1.0]), plug_in(run))
+    assert solution.status is lv.Status.INFEASIBLE and solution.claim_check == "confirmed"
+    np.testing.assert_array_equal(solution.impulse[:10], 0.1)
+
+
+def test_a_ray_of_lemke_does_not_blame_the_data():
+    """Three small solutions exist; a bound of 0.03 N s on all of them is no sign of contradicting constraints."""
+    m = [[0.0, 0.0, 10.0, 20.0], [0.0, 0.0, 30.0, 15.0], [10.0, 20.0, 0.0, 0.0], [30.0, 15.0, 0.0, 0.0]]
+    problem = lv.Problem.lcp(m, np.ones(4))
+    lost = lv.solve(problem, "lemke")
+    assert lost.status is lv.Status.STALLED and lv.solve(problem).success
+    assert "secondary ray" in lost.message and "at least" not in lost.message
+    nearly = lv.solve(lv.Problem.lcp([[1.0, -1.0], [-1.0, 1.0 + 1e-6]], [1.0, 1.0]), "pgs", max_iter=100)
+    assert nearly.impulse_bound is None or "at least" in nearly.message
 
 
 # -- plug-ins that lie --------------------------------------------------------------------------------
@@ -175,7 +225,7 @@ def test_a_liar_is_caught_in_every_form_and_law(form, status, plug_in):
 
             liar = plug_in(run, operators={"matrix"}, parts=True, boxes={"coulomb", "cone"})
             solution = lv.solve(problem, liar)
-            assert solution.contradicted, (problem, name, str(solution))
+            assert solution.claim_check == "contradicted", (problem, name, str(solution))
     assert seen == {"linear", "lcp", "coulomb", "cone"}
 
 
@@ -319,7 +369,7 @@ def test_nobody_solves_what_has_no_solution_by_running_away(name, problem):
         {"max_iter": 20_000},
     ):  # one that was used up in vain asks for a proof, too
         solution = lv.solve(problem, name, **budget)
-        assert not solution.success and not solution.contradicted and not solution.residual.at_floor
+        assert not solution.success and solution.claim_check == "confirmed" and not solution.residual.at_floor
         assert solution.status not in (lv.Status.FLOOR, lv.Status.CONVERGED)
         if solution.status is not lv.Status.INFEASIBLE:
             with pytest.raises(lv.errors.SolveFailed):

@@ -179,7 +179,7 @@ def test_newton_over_velocities_reaches_the_floor_or_tol(friction, soft, seed):
         assert lv.solve(problem, "newton", tol=tol).success
     elif friction == "cone":
         assert solution.residual.relative <= max(tol, 2 * solution.residual.floor), str(solution)
-    assert not solution.contradicted
+    assert solution.claim_check == "confirmed"
     assert "csr" not in problem.__dict__  # A was not formed
     assert solution.solver.form in ("generalized velocities", "velocity")  # of bodies that they stand for
 

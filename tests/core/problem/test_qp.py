@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 from hypothesis import example, given, settings
+from hypothesis import strategies as st
 from kkt_truth import OF_PROGRAM as NAMES
 from kkt_truth import of_program as kkt
 from random_problems import seeds
@@ -142,6 +143,102 @@ def test_sparse_and_dense_matrices_are_the_same_problem(seed):
     assert lv.Problem.from_qp(**fortran) == dense
 
 
+# -- rows that do not act --------------------------------------------------------------------------
+
+
+def with_far_rows(qp, seed, far):
+    """The program with more rows of G that are satisfied by far, of any direction."""
+    rng, n = np.random.default_rng(seed), len(qp["q"])
+    more = rng.normal(size=(3, n)) * 10.0 ** rng.uniform(-3.0, 3.0, (3, 1))
+    G, h = (np.zeros((0, n)), []) if qp["G"] is None else (qp["G"], qp["h"])
+    return qp | {"G": np.vstack([G, more]), "h": np.concatenate([h, far * rng.uniform(1.0, 2.0, 3)])}
+
+
+@given(seed=seeds, far=st.integers(4, 19), off=st.sampled_from([0.0, 1e-6, 1e-2]))
+def test_rows_that_do_not_act_change_no_error(seed, far, off):
+    """An unsatisfied equation was hidden by a bound of 1e9: the largest target of any row was what errors were over."""
+    qp = drawn(seed)
+    one, two = lv.Problem.from_qp(**qp), lv.Problem.from_qp(**with_far_rows(qp, seed, 10.0**far))
+    impulse = lv.solve_qp(one).impulse
+    impulse = impulse * (1.0 + off) + (off if len(impulse) else 0.0)
+    kept = one.qp.n_inequalities or 0 if one.qp.kept is None else len(one.qp.kept)
+    end = one.qp.free + kept
+    more = np.concatenate([impulse[:end], np.zeros(3), impulse[end:]])
+    here, there = one.qp.solution(impulse), two.qp.solution(more)
+    np.testing.assert_array_equal(here.x, there.x)
+    assert there.error == pytest.approx(here.error, rel=1e-9, abs=1e-15)
+
+
+PLACEHOLDERS = [1e4, 1e7, 1e9, 1e12, 1e15, 1e17, 9e19]
+
+
+@pytest.mark.parametrize("name", lv.available(lv.Problem.from_qp(np.eye(2), np.zeros(2), lb=np.zeros(2))))
+@pytest.mark.parametrize("tol", [1e-6, 1e-9])
+def test_placeholder_bounds_hide_no_equation(name, tol):
+    """(x - 2)^2 + (y - 1)^2 with x + y = 1 is least at (1, 0); (2, 1) was found, or x off by 1.7."""
+    for far in PLACEHOLDERS:
+        problem = lv.Problem.from_qp(
+            2.0 * np.eye(2), [-4.0, -2.0], A=[[1.0, 1.0]], b=[1.0], ub=[far, far], lb=[-far, -far]
+        )
+        answer = lv.solve_qp(problem, name, tol=tol)
+        if answer.found:
+            np.testing.assert_allclose(answer.x, [1.0, 0.0], atol=10.0 * tol)
+        # quadprog needs a definite A; rounding of a bound of 1e9 is 1e-7.
+        if name != "quadprog" and far <= (1e12 if lv.get(name).external else 1e7):
+            assert answer.found, str(answer)
+
+
+def test_a_multiplier_of_a_row_that_is_far_is_a_gap_of_the_objective():
+    """The gap was over |lambda| times the largest bound: 1e-8 of an objective hidden by a bound of 1e6."""
+    problem = lv.Problem.from_qp(2.0 * np.eye(2), [-4.0, -2.0], A=[[1.0, 1.0]], b=[1.0], ub=[1e6, 1e6])
+    impulse = lv.solve_qp(problem, "newton", tol=1e-12).impulse.copy()
+    impulse[-1] = 1e-10
+    answer = problem.qp.solution(impulse, 1e-6)
+    assert answer.duality_gap == pytest.approx(1e-4, rel=1e-3)
+    assert answer.error == pytest.approx(1e-4 / 4.0, rel=1e-3) and not answer.found  # |q.x| = 4
+
+
+def test_found_is_not_said_of_a_claim_that_is_contradicted(plug_in):
+    def run(problem, impulse):
+        impulse[:] = 0.5 * lv.solve(problem, "newton", tol=1e-12).impulse
+        return lv.Claim(lv.Status.CONVERGED, 1)
+
+    problem = lv.Problem.from_qp(2.0 * np.eye(2), [-4.0, -2.0], A=[[1.0, 1.0]], b=[1.0], ub=[1e9, 1e9])
+    answer = lv.solve_qp(problem, plug_in(run))
+    assert answer.solution.claim_check == "contradicted" and "CONTRADICTED" in str(answer)
+    assert not answer.found and not str(answer).startswith("solved")
+
+
+def test_an_answer_within_the_programs_tolerance_has_converged(plug_in):
+    """Residuals of the constraint problem are relative to its own start; those of the program decide."""
+
+    def run(problem, impulse):
+        impulse[:] = (1.0 + 1e-7) * lv.solve(problem, "newton", tol=1e-12).impulse
+        return lv.Claim(lv.Status.STALLED, 1, message="its last digits")
+
+    # v* is far from x, so that the program's error is larger than the residual.
+    problem = lv.Problem.from_qp(2.0 * np.eye(2), [-4.0, -2.0], A=[[1.0, 1.0]], b=[1.0], ub=[5.0, 5.0])
+    answer = lv.solve_qp(problem, plug_in(run), tol=1e-6)
+    assert answer.found and answer.solution.status is lv.Status.CONVERGED and answer.solution.success
+
+
+def test_the_times_of_an_answer_add_up_to_its_call(monkeypatch):
+    """Only those of the last step were told: 9 ms of 350."""
+    from lavender.solving import quadratic
+
+    clock = [100.0]
+
+    def read():
+        clock.append(clock[-1] + 1.0)
+        return clock[-1]
+
+    monkeypatch.setattr(quadratic, "perf_counter", read)
+    problem = lv.Problem.from_qp(np.diag([1.0, 0.0]), [1.0, 1.0], lb=[-4.0, -4.0])
+    solution = lv.solve_qp(problem, "newton").solution
+    assert solution.setup_time + solution.solve_time == pytest.approx(clock[-1] - clock[1])
+    assert clock[-1] - clock[1] >= 1.0
+
+
 # -- what has no solution --------------------------------------------------------------------------
 
 
@@ -157,6 +254,61 @@ def test_rows_that_contradict_each_other_are_proven_infeasible(hessian):
     assert box.max() <= 0.0  # Farkas: no x has G x <= h and x >= lb
     np.testing.assert_allclose(G.T @ z + box, 0.0, atol=1e-9 * z.max())
     assert h @ z + np.array([-5.0, -5.0]) @ box < 0.0
+
+
+def contradicting(seed, kind):
+    """A program whose rows contradict each other: of A, of G, of both, or of G and the box."""
+    rng, n = np.random.default_rng(seed), 4
+    root, A, G = rng.normal(size=(n, n)), rng.normal(size=(3, n)), rng.normal(size=(5, n))
+    b, h, q = rng.normal(size=3), rng.normal(size=5), rng.normal(size=n)
+    rows = {
+        "A": {"A": np.vstack([A, A[0] + A[1]]), "b": [*b, b[0] + b[1] + 1.0]},
+        "G": {"G": np.vstack([G, -G[0]]), "h": [*h, -h[0] - 1.0]},
+        "G and A": {"A": A[:2], "b": b[:2], "G": [-A[0] - A[1]], "h": [-b[0] - b[1] - 1.0]},
+        "box": {"G": -np.ones((1, n)), "h": [-100.0], "lb": np.zeros(n), "ub": np.ones(n)},
+    }[kind]
+    return lv.Problem.from_qp(root.T @ root + np.eye(n), q, **rows)
+
+
+# Of solvers that have a proof: sweeps and ADMM have none, quadprog needs a definite A, highs says "Optimal", and
+# clarabel once in 40 "almost infeasible".
+PROVES = [
+    name
+    for name in lv.available(lv.Problem.from_qp(np.eye(2), np.zeros(2), lb=np.zeros(2)))
+    if name in {"auto", "newton", "direct", "lemke", "osqp", "piqp", "qpalm", "daqp", "scs"}
+]
+
+
+@pytest.mark.parametrize("name", PROVES)
+@pytest.mark.parametrize("kind", ["A", "G", "G and A", "box"])
+def test_contradicting_rows_are_infeasible_with_a_certificate_by_every_solver_that_proves_it(name, kind):
+    for seed in range(5):
+        solution = lv.solve_qp(contradicting(seed, kind), name).solution
+        assert solution.status is lv.Status.INFEASIBLE, str(solution)
+        assert solution.claim_check == "confirmed" and solution.certificate is not None
+
+
+def test_the_residual_of_an_infeasible_program_is_that_of_its_impulse():
+    """Of more than 64 rows an interior point proves it; impulses are within their bounds and judged as they are."""
+    rng, n = np.random.default_rng(0), 40
+    root, G = rng.normal(size=(n, n)), rng.normal(size=(120, n))
+    h = G @ rng.normal(size=n)
+    problem = lv.Problem.from_qp(
+        root.T @ root, rng.normal(size=n), G=np.vstack([G, -G[0]]), h=[*h, -h[0] - 1.0]
+    )
+    solution = lv.solve_qp(problem).solution
+    assert solution.status is lv.Status.INFEASIBLE and solution.claim_check == "confirmed"
+    assert (solution.impulse >= 0.0).all()
+    assert solution.residual.relative == lv.residual(problem, solution.impulse).relative
+
+
+def test_bounds_in_the_wrong_order_are_refused_and_not_infeasible():
+    with pytest.raises(lv.InputError, match="variable 1"):
+        lv.Problem.from_qp(np.eye(2), np.zeros(2), lb=[0.0, 1.0], ub=[1.0, 0.5])
+    with pytest.raises(lv.InputError, match="lower"):
+        lv.Problem.lcp(np.eye(2), np.zeros(2), lower=[0.0, 1.0], upper=[1.0, 0.5])
+    with pytest.raises(lv.InputError, match="lower"):
+        lv.Cones.bounded([0.0, 1.0], [1.0, 0.5])
 
 
 @pytest.mark.parametrize(

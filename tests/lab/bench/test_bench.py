@@ -140,7 +140,7 @@ def test_a_solver_that_raises_costs_its_own_record(plug_in):
         assert by[case, "fake_raise"].message == "RuntimeError: of the backend"
         assert by[case, "fake_nan"].status == "NUMERICAL_ERROR"
         assert by[case, "fake_nan"].relative == math.inf
-        assert by[case, "fake_lie"].contradicted
+        assert by[case, "fake_lie"].claim_check == "contradicted"
         assert not by[case, "fake_exit"].success
         assert by[case, "pgs"].status == "MAX_ITERATIONS"  # the last: a budget
     assert sum(r.solver == "fake_raise" for r in records) == 2  # one each: no level after it can be better
@@ -357,6 +357,34 @@ def test_json_and_csv_hold_every_number(tmp_path):
         assert tuple(json.loads(row["times"])) == r.times
         assert row["cpu"] == bench.cpu_name()
         assert json.loads(row["versions"])["numpy"] == np.__version__
+
+
+@pytest.mark.parametrize(
+    ("status", "conflict", "check", "kept"),
+    [
+        ("CONVERGED", "", "confirmed", ""),
+        (
+            "CONVERGED",
+            "says CONVERGED, relative residual 1e-2",
+            "contradicted",
+            "says CONVERGED, relative residual 1e-2",
+        ),
+        ("INFEASIBLE", "says INFEASIBLE, no certificate was given", "not proven", ""),
+    ],
+)
+def test_records_of_earlier_versions_keep_their_verdict(status, conflict, check, kept):
+    """They had one field, `contradicted`, for what was contradicted and for what was not proven."""
+    line = to_json(
+        Record(
+            run="r", case="c", sha="s", solver="x", options={}, start="cold", mode="tol", tol=1e-3,
+            max_iter=1, time_limit=1.0, order="given", seed=3, status=status,
+        )
+    )  # fmt: skip
+    del line["claim_check"], line["status_conflict"]
+    found = from_json(line | {"contradicted": conflict})
+    assert (found.claim_check, found.status_conflict) == (check, kept)
+    again = from_json(to_json(found))
+    assert (again.claim_check, again.status_conflict) == (check, kept)
 
 
 def test_infinite_and_undefined_numbers_survive_json():

@@ -60,7 +60,7 @@ def test_motions_are_measured_from_an_exact_solution_and_a_claim_beyond_its_resi
     pytest.importorskip("flint", reason="python-flint (extra proof) is not installed")
     plan = bench.Plan(levels=(1e-6,), prove=True, **SHORT)
     records = bench.run(["granular(n=2)", "threshold"], ["newton"], plan)
-    assert plan.motion and [r.contradicted for r in records] == ["", ""]
+    assert plan.motion and {r.claim_check for r in records} == {"confirmed"}
     near, border = (records.cases[name].proof for name in ("granular(n=2)", "threshold"))
     assert near.startswith("within ") and float(near.split()[1]) < 1e-9
     assert border.startswith("none: contact 0, normal")
@@ -71,13 +71,13 @@ def test_motions_are_measured_from_an_exact_solution_and_a_claim_beyond_its_resi
     enclosed(problem)
     wrong = 0.9 * lv.solve(problem, tol=1e-9).impulse
     record = next(r for r in records if r.case == "granular(n=2)")
-    assert not with_motion(record, problem, wrong).contradicted  # its residual says so
+    assert with_motion(record, problem, wrong).claim_check == "confirmed"  # its residual says so
     blind = as_reference(problem, wrong)
     monkeypatch.setattr(
         "lavender.lab.bench.running.runner.as_reference",
         lambda *_: replace(blind, residual=replace(blind.residual, error=0.0 * wrong)),
     )
-    assert "from the exact solution" in with_motion(record, problem, wrong).contradicted
+    assert "from the exact solution" in with_motion(record, problem, wrong).status_conflict
 
 
 def test_a_case_has_its_difficulty_and_who_gave_the_same_answer_without_an_iteration(tmp_path):

@@ -248,7 +248,9 @@ def test_a_whole_run_survives_its_backends(hostile, watchdog, monkeypatch):
     records = bench.run([stack(4)], ["x_talk", "x_hang", "x_segfault", "x_leave", "pgs"], plan)
     said = [r.status for r in records]
     assert said == ["CONVERGED", "KILLED", "CRASHED (SIGSEGV)", "CRASHED (exit status 3)", "CONVERGED"]
-    assert records.records[0].contradicted  # its diagonal step does not solve a stack, and it says so
+    assert (
+        records.records[0].claim_check == "contradicted"
+    )  # its diagonal step does not solve a stack, and it says so
     assert int(records.records[0].message) != os.getpid()
 
 
@@ -300,7 +302,7 @@ def test_a_worker_says_what_this_process_says_and_judges_a_problem_that_no_backe
     with Worker() as worker:
         record, _ = worker.measure(p, task(p, "x_lie"))
         assert record.relative == lv.residual(p, np.zeros(p.m)).relative == 1.0
-        assert "says CONVERGED" in record.contradicted
+        assert "says CONVERGED" in record.status_conflict
         for solver, more in (("pgs", {}), ("direct", {}), ("pgs", {"start": "carried"})):
             asked = task(p, solver, **more)
             far, there = worker.measure(p, asked, start)

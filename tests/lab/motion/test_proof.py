@@ -33,6 +33,28 @@ def test_a_linear_problem_beside_rational_numbers():
         assert found.proven and off <= Fraction(found.impulse_radius) <= off * 2 + Fraction(1, 10**25)
 
 
+@pytest.mark.parametrize("name", ["auto", "pgs", "direct"])
+def test_a_problem_without_a_solution_is_proven_to_have_none(name):
+    """With a certificate of the answer, or of `auto` if the solver gives none; it was "not proven"."""
+    for seed in range(5):
+        rows = np.random.default_rng(seed).integers(-3, 4, (2, 4)).astype(float)
+        jac = np.vstack([rows, -rows[:1]])  # the last row contradicts the first
+        problem = lv.Problem.from_jacobian(
+            jac,
+            np.eye(4),
+            np.zeros(4),
+            target=[1.0, 0.5, 1.0],
+            cones=lv.Cones.bounded(np.zeros(3), np.full(3, np.inf)),
+        )
+        found = lv.prove(problem, lv.solve(problem, name, max_iter=100))
+        assert found.infeasible and not found.proven and found.impulse is None
+        assert str(found) == "no solution, proved: rows 0 and 2"
+    nearly = lv.Problem.lcp([[1.0, -1.0], [-1.0, 1.0 + 2.0**-52]], [1.0, 1.0])
+    lost = lv.solve(nearly)
+    assert lost.status is lv.Status.INFEASIBLE  # for data within rounding
+    assert not lv.prove(nearly, lost).infeasible
+
+
 CASES = (
     "stack(n=8)", "box_stack(n=4)", "pyramid(k=4)", "pyramid(k=16)", "box_stackF(n=4)", "slabF(n=4, sliding=0.5)",
     "four_bar", "big_boxF(mass_ratio=1, sliding=0.5)", "granular(n=2, friction=cone)", "granularF(n=2, sliding=0.5)",

@@ -25,6 +25,7 @@ from lavender.lab.report.text import percent, residual, times
 from lavender.lab.report.verdict import verdict
 
 LEVELS = (1e-3, 1e-6)
+FALSE_CLAIM = {"claim_check": "contradicted", "status_conflict": "says CONVERGED"}
 
 
 def info(case, law="lcp", structure=("stack",)):
@@ -90,13 +91,31 @@ def test_time_to_a_level_is_that_of_the_cheapest_run_that_reached_it():
         ),
         record("a", "x", 0.1, 1e-9, order="reverse", mode="budget"),  # another order does not count
         record("a", "y", 2.0, 2e-3, tol=1e-3, status="STALLED", claims=False),
-        record("a", "y", 3.0, 0.5, tol=1e-3, contradicted="says CONVERGED"),
+        record("a", "y", 3.0, 0.5, tol=1e-3, **FALSE_CLAIM),
     )
     x, y = report.reaches(found)
     assert dict(x.times) == {1e-3: 1.0, 1e-6: 9.0}
     assert (x.best, x.status) == (1e-8, "CONVERGED")
     assert dict(y.times) == {1e-3: math.inf, 1e-6: math.inf}
-    assert (y.best, y.contradicted) == (2e-3, "says CONVERGED")
+    assert (y.best, y.status_conflict) == (2e-3, "says CONVERGED")
+
+
+@pytest.mark.parametrize(
+    ("check", "conflict", "mark", "wrong"),
+    [
+        ("confirmed", "", "", 0),
+        ("not proven", "", "not proven", 0),
+        ("contradicted", "says INFEASIBLE, auto found a solution", "✗ contradicted", 1),
+    ],
+)
+def test_a_claim_that_is_not_proven_is_neither_a_proof_nor_a_false_claim(check, conflict, mark, wrong):
+    claim = {"status": "INFEASIBLE", "claim_check": check, "status_conflict": conflict}
+    found = records_of(record("a", "x", 1.0, 0.5, **claim))
+    assert len(report.failures(found)) == (0 if check == "confirmed" else 1)
+    assert [c.wrong for c in report.claims(found)] == [wrong]
+    table = contents.reach_table(report.reaches(found), LEVELS)
+    assert str(table.rows[0][table.heads.index("claim")]) == mark
+    assert table.marks == ["bad" if wrong else ""]
 
 
 def test_profiles_count_misses_and_refusals_at_infinity():
@@ -127,7 +146,7 @@ def test_advice_puts_who_solves_most_first_and_false_claims_last():
     found = records_of(
         record("a", "quick", 0.1, 1e-7), record("b", "quick", 0.1, 1e-1),
         record("a", "sure", 1.0, 1e-7), record("b", "sure", 1.0, 1e-7),
-        record("a", "liar", 0.1, 1e-7), record("b", "liar", 0.1, 1e-7, contradicted="says CONVERGED"),
+        record("a", "liar", 0.1, 1e-7), record("b", "liar", 0.1, 1e-7, **FALSE_CLAIM),
         structure={"a": ("stack",), "b": ("stack", "redundant")},
     )  # fmt: skip
     by = {(a.family, a.target): a for a in by_level(found)}
@@ -289,7 +308,7 @@ def test_time_budgets_are_those_given_and_the_sweeps_are_named(tmp_path):
 
 def test_claims_failures_and_spreads():
     found = records_of(
-        record("a", "x", 1.0, 1e-7), record("a", "x", 1.0, 1e-2, contradicted="says CONVERGED"),
+        record("a", "x", 1.0, 1e-7), record("a", "x", 1.0, 1e-2, **FALSE_CLAIM),
         record("a", "y", math.nan, math.inf, status="CRASHED (SIGSEGV)", claims=False, success=False, message="died"),
         record("a", "z", 1.0, 1e-5, status="FLOOR", floor=1e-5),  # excused
         record("a", "w", 1.0, math.inf, status="INFEASIBLE", floor=math.nan, success=False, worst_name="row 3"),
@@ -302,10 +321,20 @@ def test_claims_failures_and_spreads():
     # Of what was run again in turns the first run counts; a run to a limit of time is in turns alone.
     for mode, wrong in (("tol", 1), ("time", 2)):
         more = records_of(
-            *found, record("a", "x", 1.0, 1e-2, mode=mode, turns="one", contradicted="says CONVERGED")
+            *found,
+            record(
+                "a",
+                "x",
+                1.0,
+                1e-2,
+                mode=mode,
+                turns="one",
+                claim_check="contradicted",
+                status_conflict="says CONVERGED",
+            ),
         )
         assert next(c.wrong for c in report.claims(more) if c.solver == "x") == wrong
-        assert sum(bool(f.contradicted) for f in report.failures(more)) == wrong
+        assert sum(bool(f.status_conflict) for f in report.failures(more)) == wrong
         counted = f", the first of {wrong}" if wrong > 1 else ""
         assert f"false claim{counted}: a, x: says CONVERGED" in shown(Report(more))
     assert [(f.solver, f.status) for f in report.failures(found)] == [

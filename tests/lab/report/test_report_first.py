@@ -78,7 +78,11 @@ def test_in_short_the_terminal_shows_25_lines_within_its_width(cases, width):
     made, names = [], [f"case {i} of a folder with a long name" for i in range(cases)]
     for name in names:
         for j in range(30):
-            more = {"contradicted": "says CONVERGED " * 9} if j > 27 else {"load": 9.0}
+            more = (
+                {"claim_check": "contradicted", "status_conflict": "says CONVERGED " * 9}
+                if j > 27
+                else {"load": 9.0}
+            )
             made.append(record(name, f"solver_{j}", 1e-3 * (1 + j), 1e-7, **more))
     found = records_of(*made, structure={name: (f"structure {i}",) for i, name in enumerate(names)})
     for name in names:

@@ -12,6 +12,7 @@ from typing import Any
 
 from lavender.base.arrays import FloatArray, several
 from lavender.base.errors import LavenderError
+from lavender.judge.solution import CONTRADICTED
 from lavender.judge.states import states_of
 from lavender.lab import motion
 from lavender.lab.bench import machine
@@ -80,7 +81,8 @@ def with_motion(record: Record, problem: Problem, impulse: Any) -> Record:
             words = (
                 f"says {record.status}, {apart:.1e} sqrt(J) from the exact solution, {allowed:.1e} allowed"
             )
-            return replace(told, contradicted=record.contradicted or words)
+            conflict = record.status_conflict or words
+            return replace(told, claim_check=CONTRADICTED, status_conflict=conflict)
     return told
 
 

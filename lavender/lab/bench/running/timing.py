@@ -154,6 +154,7 @@ class Outcome:
     pace: float | None  # s
     own: float | None = None  # s, in the backend's own solve
     reached: tuple[float, ...] = ()  # relative residual of each repeat, in mode "time"
+    status_conflict: str = ""  # as in a Solution
 
 
 def measure(problem: Problem, task: Task, impulse: Any = None) -> tuple[Record, FloatArray | None]:
@@ -234,6 +235,7 @@ def outcome_of(
         work=solution.work,
         message=solution.message,
         form=solution.solver.form,
+        status_conflict=solution.status_conflict[:500],
         setups=tuple(s.setup_time for s in made),
         solves=tuple(s.solve_time for s in made),
         times=tuple(times),
@@ -315,6 +317,7 @@ def solution_of(problem: Problem, task: Task, found: Outcome) -> Solution:
         found.setups[-1],
         found.solves[-1],
         None,
+        refutation=found.status_conflict.removeprefix("says INFEASIBLE, "),
     )
 
 
@@ -351,7 +354,8 @@ def record_of(task: Task, s: Solution, found: Outcome) -> Record:
         worst_row=int(r.worst_row),
         worst_name=r.worst_name,
         success=bool(s.success) and task.mode == "tol",
-        contradicted=s.contradicted,
+        claim_check=s.claim_check,
+        status_conflict=s.status_conflict,
         claims=s.status in CLAIMS,
         iterations=int(s.iterations),
         work={k: int(v) for k, v in s.work.items()},
