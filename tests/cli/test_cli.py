@@ -375,7 +375,6 @@ def _must_not_begin(*_, **__):
         ("phenomena lift --out {}/x.json", "lavender.lab.phenomena.run"),
         ("web build {}/x.wasm", "lavender.sim.web.compile.build"),
         ("export c {}/sub", "lavender.out.library.source"),
-        ("export npm {}/sub", "lavender.out.library.source"),
         ("web page {}/sub", "lavender.sim.web.pages.module"),
         ("report toy_stack --out {}/sub", "lavender.lab.bench.resolve"),
         ("report toy_stack --campaign --out {}/sub", "lavender.lab.bench.resolve"),
