@@ -10,9 +10,9 @@ from strategies import plain
 from worked import after
 
 import lavender as lv
+from benchmarks.random_families import wild
 from lavender import suite
 from lavender.lab.suite import hard
-from lavender.lab.suite.lots import wild
 
 SCENES = (
     ("stack", {"n": (3, 6, 10)}),
