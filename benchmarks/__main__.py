@@ -11,26 +11,16 @@ for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(variable, "1")  # before NumPy is imported
 
 NAMES = (
-    "auto",
-    "branches",
+    "calibration",
     "derivatives",
-    "engine",
-    "film",
-    "float32",
     "gallery",
     "kernels",
     "limits",
-    "motions",
-    "newton",
     "original",
     "page",
     "peers",
-    "piles",
-    "planted",
-    "shapes",
     "stability",
     "stand",
-    "steppers",
     "worlds",
 )
 

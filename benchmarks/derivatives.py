@@ -24,6 +24,7 @@ import numpy as np
 
 import lavender as lv
 from benchmarks.output import markdown
+from benchmarks.random_families import wild
 from lavender import suite
 
 STEPS = 10.0 ** -np.arange(3.0, 10.5, 0.5)
@@ -33,7 +34,6 @@ SOLVED = 1e-12
 ROWS = 300
 REFUSED = "refused"
 AGAIN = 8  # further calls, timed together: one is little more than the clock
-DRAWS = "wild(seed={}, rows=300)"
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ def robots(models: tuple[str, ...], steps: int) -> Iterator[lv.Problem]:
 def sources(draws: int, steps: int, models: tuple[str, ...]) -> Iterator[tuple[str, lv.Problem]]:
     """(source, problem) of at most ROWS rows."""
     for seed in range(draws):
-        problem = suite.case(DRAWS.format(seed)).problem
+        problem = wild(seed=seed, rows=ROWS).problem
         if 0 < problem.m <= ROWS:
             yield "drawn", problem
     for case in (*suite.cases("default"), *suite.cases("hard")):

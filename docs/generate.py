@@ -31,7 +31,7 @@ from panels import save
 
 import lavender as lv
 import lavender_ext
-from benchmarks import motions, stability
+from benchmarks import calibration, stability
 from benchmarks.output import markdown as table
 from lavender import bench, registry, suite
 from lavender.base.deadline import seconds
@@ -525,11 +525,11 @@ def calibration_part(site):
     seen = []
     for name in CASES:
         case = suite.case(name)
-        seen += motions.samples(name, case.problem, " + ".join(structure_of(case.problem)))
-    motions.figure(seen, site.path("figures/calibration.svg"))
+        seen += calibration.samples(name, case.problem, " + ".join(structure_of(case.problem)))
+    calibration.figure(seen, site.path("figures/calibration.svg"))
     site.write(
         "parts/calibration.md",
-        f"{motions.table(seen)}\n\n{image('generated/figures/calibration.svg', 'Motion error over residual')}",
+        f"{calibration.table(seen)}\n\n{image('generated/figures/calibration.svg', 'Motion error over residual')}",
     )
 
 

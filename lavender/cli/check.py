@@ -8,13 +8,11 @@ import click
 
 from lavender.base.errors import InputError
 from lavender.cli.options import (
-    EXIT_UNMET,
     Listed,
     ManyValues,
     Reading,
     one_thread,
     precision_option,
-    refuse_unused,
     say,
     threshold_option,
     was_given,
@@ -49,13 +47,8 @@ def check(
     A solution stored in a file is judged too: is it at the floor of its precision, close enough (--threshold), or did
     its solver stop early?
 
-    A records.jsonl of a report is verified: each run is repeated on the problems named after it (default: where the
-    records say). Verdicts must agree; times are shown side by side.
-
-    Exit code 1: a claim is contradicted; none of the solvers takes a problem; a verdict or problem differs from the
-    records.jsonl, or nothing of one of its solvers could be verified (--solvers names those that count); a file in a
-    folder cannot be read; or, with --precision or --threshold, a stored solution is neither at its floor nor close
-    enough.
+    Exit code 1: a claim is contradicted; none of the solvers takes a problem; a file in a folder cannot be read; or,
+    with --precision or --threshold, a stored solution is neither at its floor nor close enough.
     Exit code 2: a named file cannot be read, or these options find no stored solution.
     """
     from lavender.base.arrays import number
@@ -65,12 +58,11 @@ def check(
     from lavender.solving.solve import seconds_of
 
     one_thread()
-    if files and files[0].endswith(".jsonl"):
-        unused = ["reference", "tol", "time_limit", "precision", "threshold"]
-        refuse_unused(context, unused, "with a records.jsonl, which has its own")
-        submission = bench.verify(bench.read(files[0]), files[1:], solvers)
-        say(str(submission))
-        raise click.exceptions.Exit(0 if submission.ok else EXIT_UNMET)
+    for name in files:
+        if name.endswith(".jsonl"):
+            raise InputError(
+                f"{name}: problems are checked, not records; `lavender report {name}` shows them again"
+            )
     contradicted = untaken = answers = above = unmet = 0
     reading = Reading(partial(say, style="yellow"))
     asked = precision is not None or was_given(context, "threshold")

@@ -13,11 +13,11 @@ VECTORS = 4  # problems in the test vectors, at most
 
 
 @click.command()
-@click.argument("kind", type=click.Choice(["c", "npm"]))
+@click.argument("kind", type=click.Choice(["c"]))
 @click.argument("folder", type=FOLDER)
 @click.option(
     "--for", "records", type=click.Path(exists=True, path_type=Path), metavar="RECORDS",
-    help="records.jsonl of a report or its folder: add the recommended solver, settings and test vectors (c only).",
+    help="records.jsonl of a report or its folder: add the recommended solver, settings and test vectors.",
 )  # fmt: skip
 @click.option("--solver", help="With --for: use this solver of the records, not the recommended one.")
 @click.option("--replace", is_flag=True, help="Overwrite files of an earlier export that differ.")
@@ -30,14 +30,12 @@ def export(
     solver: str | None,
     replace: bool,
 ) -> None:
-    """Write the kernels for use without Python: a C library with one header, or an npm package."""
+    """Write the kernels for use without Python: a C library with one header."""
     from lavender.out import library, vectors
 
     if records is None:
         refuse_unused(context, ["solver"], "without --for")
-    elif kind != "c":
-        raise click.UsageError("--for goes with c: test vectors are checked by a C program")
     context.with_resource(lock_output(folder, folder=True))  # before the vectors are solved for
     more = vectors.made(records, solver, VECTORS) if records is not None else {}
-    written = library.write(kind, folder, more=more, replace=replace)
+    written = library.write(folder, more=more, replace=replace)
     say(f"{len(written)} files in {folder}: {', '.join(p.name for p in written)}")

@@ -18,10 +18,6 @@ from lavender.io.stored import lock_output, writable, write_text
     "--check", is_flag=True, help="Make every problem again and compare its numbers with the manifest."
 )
 @click.option(
-    "--secret", help="Problems drawn by seeds of this word instead: whoever knows it makes the same."
-)
-@click.option("--count", default=50, show_default=True, help="How many a secret draws.")
-@click.option(
     "--certify",
     type=FILE,
     help="Prove what can be proved of each and write this manifest: minutes, with the extra `proof`.",
@@ -33,8 +29,6 @@ def problems(
     groups: tuple[str, ...],
     out: Path | None,
     check: bool,
-    secret: str | None,
-    count: int,
     certify: Path | None,
     page: Path | None,
 ) -> None:
@@ -51,15 +45,9 @@ def problems(
 
     one_thread()
     if certify is not None:
-        refuse_unused(context, ["out", "check", "secret", "count", "page"], "with --certify")
-    elif secret is not None:
-        refuse_unused(context, ["check", "page"], "with --secret")
-        if groups:
-            raise InputError(f"{groups[0]} has no effect with --secret: leave it out")
-    else:
-        refuse_unused(context, ["count"], "without --secret")
-        if check:
-            refuse_unused(context, ["out"], "with --check")
+        refuse_unused(context, ["out", "check", "page"], "with --certify")
+    elif check:
+        refuse_unused(context, ["out"], "with --check")
     if out is not None:
         context.with_resource(lock_output(out, folder=True))
     for path in (certify, page):
@@ -80,31 +68,25 @@ def problems(
             made.append(entry)
         collection.save(made, certify)
         return
-    if secret is not None:
-        chosen = collection.hidden(secret, count)
-    else:
-        found = [e for e in collection.load() if not names or e.group in names]
-        if page is not None:
-            write_text(page, collection.page(found, collection.load(collection.RECORDED)))
-        here, missing = collection.makeable(found)
-        chosen = [e.name for e in here]
-        for line in missing if check or out is not None else ():
-            click.echo(f"left out: {line}", err=True)
-        if check:
-            wrong = list(collection.changed(here))
-            for line in wrong:
-                click.echo(line)
-            click.echo(f"{len(here) - len(wrong)} of {len(here)} problems are the same")
-            if wrong:
-                raise click.exceptions.Exit(EXIT_UNMET)
-            return
+    found = [e for e in collection.load() if not names or e.group in names]
+    if page is not None:
+        write_text(page, collection.page(found, collection.load(collection.RECORDED)))
+    here, missing = collection.makeable(found)
+    for line in missing if check or out is not None else ():
+        click.echo(f"left out: {line}", err=True)
+    if check:
+        wrong = list(collection.changed(here))
+        for line in wrong:
+            click.echo(line)
+        click.echo(f"{len(here) - len(wrong)} of {len(here)} problems are the same")
+        if wrong:
+            raise click.exceptions.Exit(EXIT_UNMET)
+        return
     if out is not None:
-        for name in chosen:
-            (case,) = suite.cases(name)
-            case.problem.save(out / f"{file_name(name)}.npz")
-        say(f"{len(chosen)} problems in {out}")
-    elif secret is not None:
-        click.echo("\n".join(chosen))
+        for entry in here:
+            (case,) = suite.cases(entry.name)
+            case.problem.save(out / f"{file_name(entry.name)}.npz")
+        say(f"{len(here)} problems in {out}")
     elif page is None:
         for e in found:
             say(f"@{e.group} {e.name}: {e.rows} rows, {e.law}, {collection.told(e)}")

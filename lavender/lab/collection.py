@@ -5,13 +5,11 @@
     open        neither: `reason` says what is in the way
 
 `manifest.json` beside this file has a line for each problem; its `sha` is of all numbers, so that anybody can make the
-problem from its name and see that it is the same. A hidden set is drawn by seeds that a secret gives: whoever is told
-the secret after a comparison makes the same problems.
+problem from its name and see that it is the same.
 """
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
@@ -108,24 +106,6 @@ def difficulty(problem: Problem) -> int | None:
     except CapabilityError:
         return None
     return found.iterations if found.success else None
-
-
-def hidden(secret: str, count: int) -> list[str]:
-    """Names of `count` problems drawn by seeds of SHA-256 over the secret and a number.
-
-    Raises
-    ------
-    InputError
-        An empty secret, or a count below 1.
-    """
-    if not secret or count < 1:
-        raise InputError(f"secret is {secret!r} and count {count}; a word and at least 1 are needed")
-    seeds = [
-        int.from_bytes(hashlib.sha256(f"{secret}/{i}".encode()).digest()[:4], "big") % suite.MAX_SIZE
-        for i in range(count)
-    ]
-    families = ("wild", "drawn", "drawn_rolling")
-    return [f"{families[i % 3]}(seed={seed}, rows=3000)" for i, seed in enumerate(seeds)]
 
 
 def entries(groups: Iterable[str]) -> Iterator[Entry]:

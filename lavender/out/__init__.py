@@ -1,7 +1,7 @@
 """The way out: the kernels as a C library with one header, for engines that are not written in Python.
 
-`lavender export c DIR` writes it, `npm` the same as a module of JavaScript. From Python `write`, `source`, `HEADER`,
-and `engine_image`, a simulation as `lav_engine_open` reads it.
+`lavender export c DIR` writes it. From Python `write`, `source`, `HEADER`, and `engine_image`, a simulation as
+`lav_engine_open` reads it.
 """
 
 from lavender.out.library import HEADER, source, write

@@ -1,25 +1,20 @@
-"""The C library as a folder: its one source, its header, and how it is built; the package of npm likewise."""
+"""The C library as a folder: its one source, its header, and how it is built."""
 
 from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import lavender_ext
 from lavender.base.errors import InputError, LavenderError
 from lavender.io.stored import kept, make_folder, writable, write_bytes
 from lavender.out.amalgamate import CutFailed, amalgamate, source_hash
-from lavender.out.header import functions, javascript
-from lavender.sim.web import compile as wasm
 
 HERE = Path(__file__).resolve().parent
 ROOT = Path(lavender_ext.__file__).resolve().parent.parent  # the folder that holds lavender_ext
 HEADER = HERE / "c" / "lavender.h"
-TEXTS = (".h", ".c", ".txt", ".in", ".mjs", ".mts", ".json")
-#: Folders of what can be written, by name.
-KINDS = {"c": "c", "npm": "js"}
+TEXTS = (".h", ".c", ".txt", ".in")
 
 
 def source() -> str:
@@ -50,14 +45,11 @@ def _files(folder: Path) -> Iterator[Path]:
     )
 
 
-def write(
-    kind: str, out: Path, *, more: Mapping[str, str | bytes] | None = None, replace: bool = False
-) -> list[Path]:
-    """Write a folder: the C library, or the npm package.
+def write(out: Path, *, more: Mapping[str, str | bytes] | None = None, replace: bool = False) -> list[Path]:
+    """Write the C library into a folder.
 
     Parameters
     ----------
-    kind : {"c", "npm"}
     out : Path
         A folder; made where it is not there. Files of other names in it stay.
     more : mapping, optional
@@ -68,7 +60,7 @@ def write(
     Returns
     -------
     list of Path
-        What was written; SHA256SUMS, the module of npm and `more` last.
+        The files written; SHA256SUMS and `more` last.
 
     Raises
     ------
@@ -78,36 +70,12 @@ def write(
         As `source`.
     """
     writable(out, folder=True)
-    folder, header = HERE / KINDS[kind], HEADER.read_text(encoding="utf-8")
+    folder = HERE / "c"
     made = {p.relative_to(folder).as_posix(): p.read_text(encoding="utf-8") for p in _files(folder)}
-    if kind == "npm":
-        made["header.mjs"], made["header.d.mts"] = javascript(header)
-    else:
-        made["lavender.c"] = source()
+    made["lavender.c"] = source()
     sums = "".join(f"{hashlib.sha256(made[name].encode()).hexdigest()}  {name}\n" for name in sorted(made))
     made["SHA256SUMS"] = sums
-    module = {"liblavender.wasm": _module(header)} if kind == "npm" else {}
-    return _put(out, {**made, **module, **(more or {})}, replace)
-
-
-def _module(header: str) -> bytes:
-    """The library as a WebAssembly module: the one made of this source before, or a new one, kept beside it."""
-    path, text = HERE / "js" / "liblavender.wasm", source()
-    stamp = wasm.section(wasm.SECTION, hashlib.sha256(text.encode()).hexdigest().encode())
-
-    def make() -> bytes:
-        with TemporaryDirectory() as folder:
-            work = Path(folder)
-            (work / "lavender.c").write_text(text, encoding="utf-8")
-            (work / "lavender.h").write_text(header, encoding="utf-8")
-            names = [name for _, name, _ in functions(header)]
-            try:
-                wasm.build_library(work / path.name, work / "lavender.c", names)
-            except wasm.BuildFailed as error:
-                raise LavenderError(str(error)) from None
-            return (work / path.name).read_bytes() + stamp
-
-    return kept(path, lambda module: module.endswith(stamp), make)
+    return _put(out, {**made, **(more or {})}, replace)
 
 
 def _put(out: Path, made: Mapping[str, str | bytes], replace: bool) -> list[Path]:

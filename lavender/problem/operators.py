@@ -92,7 +92,7 @@ class Operators(ProblemData):
             return False
         with np.errstate(all="ignore"):  # what overflows warns nobody
             scale = sp.diags_array(1.0 / np.sqrt(self.d))
-            return semidefinite(scale @ (0.5 * (self.csr + self.csr.T)) @ scale)
+            return semidefinite(scale @ self.csr @ scale)
 
     @once
     def data(self) -> Data:
@@ -310,18 +310,36 @@ def _read_only(matrix: sp.csr_array) -> sp.csr_array:
 
 
 def semidefinite(a: Any) -> bool:
-    """Whether a sparse symmetric matrix of unit diagonal, + SHIFT, has a Cholesky factor (few) or positive pivots."""
-    shifted: Any = a + SHIFT * sp.eye_array(a.shape[0])
-    if a.shape[0] <= 400:
+    """Return whether a sparse symmetric matrix of unit diagonal, plus SHIFT, has a Cholesky factor.
+
+    Raises
+    ------
+    TooLarge
+        The factor would have 2^31 entries or more.
+    """
+    n = a.shape[0]
+    if n <= 400:
         try:
-            np.linalg.cholesky(shifted.toarray())
+            np.linalg.cholesky((a + SHIFT * sp.eye_array(n)).toarray())
         except np.linalg.LinAlgError:
             return False
         return True
-    import qdldl
+    panels, values = panels_of(a)
+    return bool(panels.factor(values, np.ones(n), SHIFT, 0.0) == 0)
 
+
+def panels_of(a: Any) -> tuple[sparse.SparsePanels, FloatArray]:
+    """Analyse a sparse symmetric matrix with a full diagonal: what factors it as L L^T, and its entries.
+
+    Raises
+    ------
+    TooLarge
+        The factor would have 2^31 entries or more.
+    """
+    a = sp.csr_array(0.5 * (a + a.T))  # entries that differ by rounding, and a symmetric pattern
+    a.sort_indices()
     try:
-        _, pivot, _ = qdldl.Solver(sp.csc_matrix(sp.triu(shifted)), upper=True).factors()
-    except (ValueError, RuntimeError):  # a pivot of zero
-        return False
-    return bool(np.all(pivot > 0.0))
+        panels = sparse.SparsePanels(a.indptr.astype(np.int32), a.indices.astype(np.int32), False)
+    except OverflowError as error:
+        raise TooLarge(f"A cannot be factored: {error}") from None
+    return panels, a.data

@@ -7,8 +7,8 @@ m rows; e multiply-adds of a sweep or entries of A, which one step reads; w mult
 solution, as the solver's own analysis tells them (`NewtonState.count`); n factorisations, by law. Over generalised
 velocities all is compiled: no start, nothing for a row, and n, whatever the law, is that of bounded rows, STEPS times
 as large where a row has no compliance and not all are bounded, SOFT times where every row has enough and not all are
-free. No clock is read: the same problem has the same counts on every machine. The twelve rates of `rates.json` are
-written by `python -m benchmarks auto --fit`.
+free. No clock is read: the same problem has the same counts on every machine. The twelve rates of `rates.json` were
+fitted on measured times of random problems (docs/method.md, "Figures without a command").
 """
 
 from __future__ import annotations

@@ -350,6 +350,20 @@ cdef class SparsePanels:
         """(n,) row eliminated first, second, ..."""
         return self.keep[0][:self.f.n]
 
+    def lost_rows(self):
+        """Rows whose pivots the last factor did not take, in ascending order; their columns of L are 0."""
+        cdef int32_t i, k
+        cdef int64_t rows
+        if self.numbers is None:
+            raise ValueError("before a factor")
+        found = []
+        for i in range(self.f.panels):
+            rows = self.f.first[i + 1] - self.f.first[i] + self.f.rptr[i + 1] - self.f.rptr[i]
+            for k in range(self.f.first[i], self.f.first[i + 1]):
+                if self.f.val[self.f.at[i] + (k - self.f.first[i]) * (rows + 1)] == 0.0:
+                    found.append(self.f.order[k])
+        return np.sort(np.array(found, np.intp))
+
 
 cdef class FullCholesky:
     """L L^T of a full symmetric matrix (`dense.pxd`).

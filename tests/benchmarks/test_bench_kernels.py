@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import lavender as lv
-from benchmarks import engine, made
+from benchmarks import made
 from benchmarks.clock import least
 from benchmarks.kernels import microbenchmarks, problems
 from benchmarks.kernels.cases import job, run
@@ -71,16 +71,3 @@ def test_what_is_counted_runs(name):
     made = job(name)
     made.call()
     assert made.work >= 1.0
-
-
-def test_steps_by_what_a_scene_declares():
-    levels = [line.split("|") for line in engine.detail(steps=5).splitlines()[2:]]
-    assert [int(cells[2]) for cells in levels] == [1, 3, 4, 1, 3, 4]  # rows of a contact
-    text = engine.models(("tower of 6", "chain of 6"), steps=5, seconds=0.0)
-    assert len(text.splitlines()) == 2 + 2 * 3
-    assert all(
-        float(cell.split()[0]) > 0.0
-        for line in text.splitlines()[2:]
-        for cell in line.split("|")[3:4]
-        if cell.strip()
-    )

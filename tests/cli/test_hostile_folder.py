@@ -47,7 +47,7 @@ def test_what_commands_print_of_paths_is_text(lavender, tmp_path):
     for line in (
         ["bench", "mujoco", path, "--steps", "1"],
         ["record", path, "--steps", "15", "--every", "15", "--out", to],
-        ["problems", "--secret", "word", "--count", "1", "--out", f"{to}1"],
+        ["problems", "@walking", "--out", f"{to}1"],
         ["run", "stack", "--set", "n=1", "--steps", "2", "--trace", f"{to}.csv", "--record", f"{to}2"],
         ["solve", "stack(n=2)", "--output", f"{to}.npz"],
     ):
@@ -234,7 +234,7 @@ WRITE_A_FOLDER = {
     "report": ("report", "stack(n=2)", *QUICK, "--out", "OUT"),
     "records shown again": ("report", "records.jsonl", "--out", "OUT"),
     "campaign": ("report", "--campaign", "stack(n=2)", *QUICK[:6], "--out", "OUT"),
-    "problems": ("problems", "--secret", "word", "--count", 1, "--out", "OUT"),
+    "problems": ("problems", "@walking", "--out", "OUT"),
     "run": ("run", "stack", "--steps", 1, "--record", "OUT"),
     "export": ("export", "c", "OUT"),
     "web": ("web", "page", "OUT"),

@@ -6,10 +6,15 @@ so are warnings that reach the caller.
 
 import base64
 import contextlib
+import faulthandler
 import hashlib
+import json
 import math
 import os
+import resource
+import signal
 import tempfile
+import time
 import traceback
 import warnings
 from pathlib import Path
@@ -26,9 +31,7 @@ import scenes
 import lavender as lv
 
 REFUSED = (lv.LavenderError,)
-COUNTS = {"solves": 0, "refused": 0, "files": 0, "loaded": 0, "steps": 0, "scenes": 0, "snapshots": 0, "restored": 0,
-          "folders": 0, "doors": 0, "judged": 0, "repeated": 0, "lost": 0, "promises": 0, "stalled": 0,
-          "stalled_wrongly": 0, "lost_its_way": 0}  # fmt: skip
+COUNTS = {"refused": 0}  # inputs that lavender refused
 # Below this, numbers on the way are far from the edges of float64, and both judges must say the same.
 MODERATE = 90.0
 
@@ -50,6 +53,14 @@ def run(spec):
             name = os.path.basename(warning.filename)
             found.append(("warning", f"{spec.get('solver', '')} {name}:{warning.lineno}: {warning.message}"))
         return found
+
+
+def watch(spec, path, limit):
+    """Write an input to a file; end the process if checking it takes more than `limit` seconds of processor time."""
+    Path(path).write_text(json.dumps(spec), encoding="utf-8")
+    faulthandler.register(signal.SIGXCPU, all_threads=True, chain=True)
+    end = int(time.process_time() + limit) + 1
+    resource.setrlimit(resource.RLIMIT_CPU, (end, resource.RLIM_INFINITY))
 
 
 def place(error):
@@ -117,19 +128,15 @@ def solved(spec, problem):
         prepared = lv.prepare(problem, spec["solver"], **mine)
         first = prepared.solve(**rest)
         solution = prepared.solve(problem, **rest)
-        COUNTS["solves"] += 1
         if "time_limit" not in options and bits(first) != bits(solution):
             yield "changed bits", f"{spec['solver']}: solved twice by one Prepared"
     else:
         solution = lv.solve(problem, spec["solver"], **options)
-    COUNTS["solves"] += 1
     yield from claims(spec, problem, solution)
     if "others" in spec:
         yield from together(spec, problem, solution)
     if spec["again"]:
         yield from states(spec, problem, solution)
-        COUNTS["repeated"] += 1
-        COUNTS["solves"] += 1
         if data_of(problem) != before:
             yield "changed data", f"{spec['solver']} changed the problem that it was given"
         if "time_limit" not in options:
@@ -156,7 +163,6 @@ def together(spec, problem, solution):
         if bits(lv.solve(other, spec["solver"], **spec["options"])) != bits(found):
             yield "changed bits", f"{spec['solver']}: solve_many and solve, other right side"
         yield from claims({**spec, "problem": {**spec["problem"], "b": b}}, other, found)
-    COUNTS["solves"] += 2 * len(problems_of) - 1
 
 
 def claims(spec, problem, solution):
@@ -189,7 +195,6 @@ def claims(spec, problem, solution):
     wanted = claimed or spec["again"]
     if not wanted:
         return
-    COUNTS["judged"] += 1
     twin = judge_twin.Problem(spec["problem"])
     j = twin.judge(solution.impulse)
     slop = 1.0 + 1e-6
@@ -262,7 +267,6 @@ FOLDER = tempfile.TemporaryDirectory(prefix="fuzz-")
 def check_file(spec):
     path = Path(FOLDER.name, f"{os.getpid()}{spec['suffix']}")
     path.write_bytes(base64.b64decode(spec["data"]))
-    COUNTS["files"] += 1
     try:
         stored = lv.io.read(path, max_bytes=spec.get("max_bytes", 10**7))
     except REFUSED as error:
@@ -270,7 +274,6 @@ def check_file(spec):
             yield "unnamed file", str(error)
         COUNTS["refused"] += 1
         return
-    COUNTS["loaded"] += 1
     problem = stored.problem
     for x in (problem.b, problem.cones.mu, *stored.guesses):
         if not np.isfinite(x).all():
@@ -288,13 +291,10 @@ def check_file(spec):
 
 def check_steps(spec):
     scene = scenes.build(spec)
-    COUNTS["scenes"] += 1
     found, first = play(scene, spec)
     yield from found
-    if spec["again"]:
-        COUNTS["repeated"] += 1
-        if play(scenes.build(spec), spec, quiet=True)[1] != first:
-            yield "changed bits", "stepped twice, without looking between steps"
+    if spec["again"] and play(scenes.build(spec), spec, quiet=True)[1] != first:
+        yield "changed bits", "stepped twice, without looking between steps"
 
 
 def play(scene, spec, quiet=False):
@@ -311,13 +311,11 @@ def play(scene, spec, quiet=False):
                 except REFUSED as error:
                     seen.update(type(error).__name__.encode())
                     return found, seen.digest()
-                COUNTS["steps"] += 1
                 look(observation, terminated, info, found)
                 for key in ("positions", "quaternions", "velocities", "joint_impulses", "solver"):
                     seen.update(observation[key].tobytes())
                 seen.update(observation["contacts"]["impulses"].tobytes())
                 if terminated:
-                    COUNTS["lost"] += 1
                     if spec.get("lasts"):
                         found.append(
                             ("false claim", f"{info['lost_body']} is lost, which nothing throws away")
@@ -381,7 +379,6 @@ def look(observation, terminated, info, found):
 
 
 def check_snapshot(spec):
-    COUNTS["snapshots"] += 1
     simulation = lv.Simulation(lv.Scene(spec["name"], **spec["parameters"]))
     for _ in range(spec["steps"]):
         simulation.step()
@@ -389,13 +386,11 @@ def check_snapshot(spec):
     simulation.save(path)
     path.write_bytes(scenes.tampered(path.read_bytes(), spec))
     simulation.load(path)
-    COUNTS["restored"] += 1
     for _ in range(4):  # what a forged state says of itself is not promised; that nothing breaks is
         try:
             terminated = simulation.step()[2]
         except REFUSED:
             return ()
-        COUNTS["steps"] += 1
         if terminated:
             return ()
     simulation.constraint_problem()
@@ -406,12 +401,10 @@ def check_snapshot(spec):
 
 
 def check_folder(spec):
-    COUNTS["folders"] += 1
     yield from folders.check(spec)
 
 
 def check_door(spec):
-    COUNTS["doors"] += 1
     yield from doors.check(spec)
 
 

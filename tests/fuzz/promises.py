@@ -10,9 +10,9 @@ from strategies import plain
 from worked import after
 
 import lavender as lv
+from benchmarks.random_families import wild
 from lavender import suite
 from lavender.lab.suite import hard
-from lavender.lab.suite.lots import wild
 
 SCENES = (
     ("stack", {"n": (3, 6, 10)}),
@@ -72,25 +72,15 @@ def build(spec):
 
 
 def check(spec, counts):
-    """No claim is contradicted; STALLED is counted, and counted as wrong where the budget ends below half of it."""
+    """No claim is contradicted, and the number of sweeps per decade is a number."""
     problem, name = build(spec), spec["solver"]
     if problem.m == 0 or problem.m > 700 or lv.get(name).refuses(problem):
         counts["refused"] += 1
         return
     more = {} if spec["max_iter"] is None else {"max_iter": spec["max_iter"]}
     solution = lv.solve(problem, name, tol=spec["tol"], **more)
-    counts["promises"] += 1
-    counts["solves"] += 1
     if solution.claim_check != "confirmed":
         yield "contradicted", f"{name}: {solution.claim_check}, {solution.status_conflict}"
     slope = solution.sweeps_per_decade
     if not (np.isnan(slope) or 0.0 < slope < np.inf):
         yield "wrong number", f"{name}: sweeps_per_decade is {slope}"
-    if solution.status is not lv.Status.STALLED:
-        return
-    counts["stalled"] += 1
-    whole = lv.solve(problem, name, tol=0.0, **more).residual.relative
-    again = lv.solve(problem, name, tol=spec["tol"], impulse=solution.impulse, **more).residual.relative
-    counts["solves"] += 2
-    counts["stalled_wrongly"] += whole < 0.5 * solution.residual.relative
-    counts["lost_its_way"] += again < 0.5 * solution.residual.relative

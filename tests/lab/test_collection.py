@@ -77,16 +77,6 @@ def test_a_manifest_comes_back_as_it_was_written(tmp_path):
             collection.load(tmp_path / "m.json")
 
 
-def test_a_secret_draws_the_same_problems_and_another_word_others():
-    names = collection.hidden("apple", 6)
-    assert collection.hidden("apple", 9)[:6] == names
-    assert not set(names) & set(collection.hidden("pear", 6))
-    assert all(suite.case(name).problem.m > 0 for name in names)
-    for bad in (("", 3), ("apple", 0)):
-        with pytest.raises(lv.InputError, match="at least 1"):
-            collection.hidden(*bad)
-
-
 def test_a_set_is_named_by_its_sign_wherever_cases_are():
     assert [item.name for item in resolve("@walking")] == [e.name for e in ENTRIES if e.group == "walking"]
     with pytest.raises(lv.UnknownName, match=r"unknown set .*did you mean .walking"):

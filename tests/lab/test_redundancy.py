@@ -150,7 +150,26 @@ def test_a_large_island_is_decomposed_as_sparse():
     found = redundancy(lv.Problem.linear(sp.csr_array(grid), np.zeros(m)))
     assert found.rank == m - 1
     assert found.tol == pytest.approx(1e-6 * m**0.5)
-    assert "LDL^T" in found.method
+    assert "sparse Cholesky" in found.method
+
+
+@pytest.mark.parametrize("n", [447, 820, 1221])
+def test_the_rank_of_a_large_island_is_that_of_its_eigenvalues(n):
+    """Rows of a sparse J of fewer columns: small pivots that stay in a factor cost up to 32 of the rank."""
+    rng, m = np.random.default_rng(1), 1500
+    jac = sp.csr_array(sp.random_array((m, n), density=4.0 / n, rng=rng))
+    jac = jac[np.diff(jac.indptr) > 0]
+    a = sp.csr_array(jac @ jac.T)
+    unit = sp.diags_array(1.0 / np.sqrt(a.diagonal()))
+    values = np.linalg.eigvalsh((unit @ a @ unit).toarray())
+    found = redundancy(lv.Problem.linear(a, np.zeros(a.shape[0])))
+    assert found.method.count("sparse Cholesky") == 1
+    assert not ((values > 1e-13) & (values < 1e-7)).any()  # zeros are roundings, all others far above
+    assert found.rank == np.count_nonzero(values > 1e-7)
+    kept = np.delete(np.arange(a.shape[0]), found.rows)
+    assert (
+        np.linalg.eigvalsh((unit @ a @ unit).toarray()[np.ix_(kept, kept)])[0] > 1e-12
+    )  # and they are independent
 
 
 def test_a_share_that_is_none_is_refused():

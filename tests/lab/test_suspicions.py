@@ -4,11 +4,11 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
+from ball_pile import Pile
 from random_problems import as_matrix, general, touching
 from worked import after
 
 import lavender as lv
-from benchmarks.piles import Pile
 from lavender import suite
 from lavender.judge.certificates import fighting
 from lavender.solvers.certify import conflict_of

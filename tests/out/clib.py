@@ -1,15 +1,17 @@
 """lavender.h through ctypes: structs field by field, problems of the package as problems of the library."""
 
 import ctypes as ct
+import re
 import subprocess
 from pathlib import Path
 
 import numpy as np
 
 from lavender.out import HEADER
-from lavender.out.header import struct_fields
+from lavender.out.header import strip_comments, struct_fields
 from lavender.out.view import METHODS, view
 
+STRUCTS = ("lav_problem", "lav_options", "lav_budget", "lav_verdict", "lav_motion", "lav_result")
 SWEEPS = ("sequential_impulses", "pgs", "block_gauss_seidel", "anderson", "nncg")  # under friction too
 COUNTS = (
     "form",
@@ -22,6 +24,15 @@ COUNTS = (
     "n_velocities",
     "n_mass_entries",
 )
+
+
+def functions(header):
+    """Return (type, name, arguments) of every function of the header."""
+    found = re.findall(r"LAV_API ((?:const )?\w+ \*?)(\w+)\((.*?)\);", strip_comments(header), re.DOTALL)
+    return [
+        (kind.strip(), name, [] if args.strip() == "void" else [" ".join(a.split()) for a in args.split(",")])
+        for kind, name, args in found
+    ]
 
 
 def _struct(name):

@@ -8,30 +8,18 @@ from clib import Library, run
 
 from lavender import out as export
 from lavender.base.errors import LavenderError
-from lavender.sim.web.compile import why_not
 
 
 @pytest.fixture(scope="session")
 def folder(tmp_path_factory):
     out = tmp_path_factory.mktemp("library")
     try:
-        export.write("c", out)
+        export.write(out)
     except LavenderError as error:
         if find_spec("Cython") is not None:  # what it is made with is there: it must be made
             raise
         pytest.skip(str(error))
     return out
-
-
-@pytest.fixture
-def javascript(tmp_path):
-    """A folder with the npm package; skips without Node or what makes it, never because it cannot be made."""
-    if shutil.which("node") is None:
-        pytest.skip("node is not installed")
-    if reason := why_not():
-        pytest.skip(reason)
-    export.write("npm", tmp_path / "js")
-    return tmp_path / "js"
 
 
 @pytest.fixture(scope="session")

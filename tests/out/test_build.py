@@ -1,4 +1,4 @@
-"""What is written builds: as C11 and C++17 without a warning, by CMake, and in JavaScript, with one hash."""
+"""What is written builds: as C11 and C++17 without a warning, and by CMake."""
 
 import os
 import platform
@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import random_problems as rp
-from clib import run
+from clib import functions, run
 from test_same_bits import kinds_of, of_matrix
 from tower import self_test_problem
 
@@ -20,7 +20,6 @@ from lavender import bench
 from lavender import out as export
 from lavender.base.errors import LavenderError
 from lavender.out import vectors
-from lavender.out.header import constants, functions, javascript
 from lavender.sim.web import cut
 
 WARNINGS = ["-Wall", "-Wextra", "-Wpedantic", "-Werror"]
@@ -96,19 +95,8 @@ def test_checksums_are_of_the_files(folder):
 def test_what_is_there_and_is_another_is_not_replaced_unasked(tmp_path, folder):
     (tmp_path / "lavender.h").write_text("mine")
     with pytest.raises(LavenderError, match="--replace"):
-        export.write("c", tmp_path)
+        export.write(tmp_path)
     assert [p.name for p in tmp_path.iterdir()] == ["lavender.h"]
-
-
-def tower(*command, **more):
-    return run(*command, **more).split()[-1]
-
-
-@pytest.mark.slow
-def test_javascript_has_the_hash_of_c(folder, shared, compiler, tmp_path, javascript):
-    link = [shared, f"-Wl,-rpath,{shared.parent}", *WARNINGS]
-    run(compiler, "-std=c11", folder / "tower.c", *link, "-o", tmp_path / "tower_c")
-    assert tower("node", javascript / "tower.mjs") == tower(tmp_path / "tower_c")
 
 
 @pytest.mark.slow
@@ -257,13 +245,6 @@ def test_what_auto_did_is_steps_with_their_work_that_c_runs(folder, shared, comp
     run(compiler, "-std=c11", *WARNINGS, "-I", folder, tmp_path / "check.c", *link)
     said = run(tmp_path / "check", cwd=tmp_path).splitlines()
     assert len(said) == 3 and all(line.startswith("met ") for line in said)
-
-
-def test_bindings_have_every_name_of_the_header():
-    header = export.HEADER.read_text()
-    module, types = javascript(header)
-    for name, value in constants(header).items():
-        assert f"export const {name} = {value};" in module and f"export const {name}: {value};" in types
 
 
 KERNEL = """

@@ -1,14 +1,12 @@
 """What is wrong comes back as a number with a text, and nothing is written where it must not be."""
 
 import ctypes as ct
-import json
 import re
-import subprocess
 from pathlib import Path
 
 import numpy as np
 import pytest
-from clib import COUNTS, SWEEPS, Options, Problem, Result, Verdict
+from clib import COUNTS, STRUCTS, SWEEPS, Options, Problem, Result, Verdict, functions
 from hypothesis import given as drawn
 from hypothesis import settings
 from hypothesis import strategies as st
@@ -16,9 +14,8 @@ from random_problems import as_matrix, random_contact_problem, random_lcp, seeds
 from tower import self_test_problem
 
 import lavender as lv
-from lavender import out as export
 from lavender.out import HEADER
-from lavender.out.header import constants
+from lavender.out.header import constants, struct_fields
 from lavender.out.view import ARRAYS, METHODS
 
 ERRORS = {
@@ -272,58 +269,6 @@ def test_to_count_memory_no_array_is_read_but_where_joints_end(library, form, me
     assert Guarded(library, problem, options, library.room(problem, options).value).code == 0
 
 
-SCRIPT = """
-import { readFileSync } from 'node:fs';
-const [folder, given] = [process.argv[1], JSON.parse(process.argv[2])], lav = await import(`${folder}/index.mjs`);
-const library = await lav.load(readFileSync(`${folder}/liblavender.wasm`)), solver = library.solver(lav.LAV_PGS);
-const value = [2, 0, 0, 0, 2, 0, 0, 0, 2];
-const whole = { form: 1, n_blocks: 3, n_rows: 3, n_entries: 9, value, b: [1, 2, 3], lower: [0, 0, 0] };
-const fails = (call) => { try { return call(library.solver(lav.LAV_PGS)); } catch (error) { return error.message; } };
-const named = () => library.solver('pgs');
-const early = [(s) => s.run(), (s) => s.impulse(), (s) => s.velocity(), (s) => s.set(), named].map(fails);
-const said = given.map(([problem, budget]) => {
-  try { solver.set({ ...whole, ...problem }); solver.run(budget); return [...solver.impulse()]; }
-  catch (error) { return error.message; }
-});
-console.log(JSON.stringify([early, ...said]));
-"""
-
-
-def test_javascript_reads_nothing_behind_an_array_and_ignores_nothing(javascript):
-    mistakes = [
-        ({"b": [1]}, {}, "b has 1 numbers; 3 are needed"),  # the other two stood there from the problem before
-        ({"value": [[2, 0, 0], [0, 2, 0], [0, 0, 2]]}, {}, "value has 3 numbers; 9"),
-        ({"index_ptr": [0, 3, 6], "index": [0] * 9}, {}, "index_ptr has 3 numbers; 4"),
-        ({"kind": [0.7, 0, 0]}, {}, "no whole number"),
-        ({"b": {}}, {}, "an array of numbers is needed"),
-        ({"lower": True}, {}, "an array of numbers is needed"),
-        ({"b": [1, None, 3]}, {}, "b holds what is no number"),  # NaN on its way through JSON
-        ({"b": [1, "2", 3]}, {}, "b holds what is no number"),
-        ({"key": [1, 2, 3]}, {}, "key holds what is no BigInt"),
-        ({"n_rows": 2.5}, {}, "n_rows is 2.5"),
-        ({"rows": 3}, {}, "there is no rows"),
-        ({}, {"max_iter": 5}, "there is no max_iter"),
-        ({}, {"iterations": 1e12}, "iterations is 1000000000000"),
-        ({}, {"seconds": 1, "clock": 5}, "clock is of C alone"),
-        ({}, 5, "5 is no table of fields"),
-    ]  # fmt: skip
-    asked = [[{}, {}], *([problem, budget] for problem, budget, _ in mistakes), [{"b": [3, 2, 1, 9]}, {}]]
-    words = ["node", "--input-type=module", "-e", SCRIPT, str(javascript), json.dumps(asked)]
-    done = subprocess.run(words, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    early, first, *said, last = json.loads(done.stdout)
-    assert all("no problem is set" in text for text in early[:3]) and "no table of fields" in early[3]
-    assert "method is pgs" in early[4]
-    assert (first, last) == ([0.5, 1.0, 1.5], [1.5, 1.0, 0.5])  # whole ones, before and after
-    for (_, _, sign), text in zip(mistakes, said, strict=True):
-        assert isinstance(text, str) and sign in text
-    module = javascript / "liblavender.wasm"
-    module.write_bytes(b"mine")
-    with pytest.raises(lv.InputError, match="is there and is another"):
-        export.write("npm", javascript)
-    assert module.read_bytes() == b"mine"
-
-
 def stack_of(n):
     """n unit boxes on one another, by a contact each."""
     z = np.tile([0.0, 0.0, 1.0], (n, 1))
@@ -427,8 +372,6 @@ def test_a_budget_that_ends_within_tol_between_two_checks_has_converged(library,
 
 
 def test_structs_lie_as_python_reads_them_and_grow_only_at_the_end(library, folder):
-    from lavender.out.header import STRUCTS, functions, struct_fields
-
     header = HEADER.read_text()
     made = [f"{kind} {name}({', '.join(arguments)})" for kind, name, arguments in functions(header)]
     made += [f"{name} = {value}" for name, value in constants(header).items()]

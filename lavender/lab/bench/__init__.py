@@ -15,7 +15,6 @@ from lavender.lab.bench.running.plan import Plan
 from lavender.lab.bench.running.runner import Event, carry, run, solver_names
 from lavender.lab.bench.running.timing import Ask, Task, measure, one_thread
 from lavender.lab.bench.store import Records, Store, read, write_csv, write_json
-from lavender.lab.bench.submitted import Submission, Verified, verify
 
 __all__ = [
     "Ask",
@@ -29,9 +28,7 @@ __all__ = [
     "Run",
     "Skip",
     "Store",
-    "Submission",
     "Task",
-    "Verified",
     "campaign",
     "carry",
     "cpu_name",
@@ -47,7 +44,6 @@ __all__ = [
     "solver_names",
     "steps_in",
     "structure_of",
-    "verify",
     "write_csv",
     "write_json",
 ]

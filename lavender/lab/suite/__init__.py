@@ -30,7 +30,6 @@ from lavender.lab.suite.families import (
     toy_stack,
     two_particles,
 )
-from lavender.lab.suite.lots import drawn, wild
 from lavender.lab.suite.steps import LICENCES, engine_step, missing, package_of, robot, versions, walking
 
 __all__ = [
@@ -46,7 +45,6 @@ __all__ = [
     "cases",
     "chain",
     "default",
-    "drawn",
     "engine_step",
     "families",
     "friction",
@@ -65,7 +63,6 @@ __all__ = [
     "two_particles",
     "versions",
     "walking",
-    "wild",
 ]
 
 ROBOTS = {
@@ -105,11 +102,6 @@ SETS: dict[str, tuple[str, ...]] = {
         "granular(n=4, friction=cone)",
     ),
     "hard": hard.SET,
-    "drawn": (
-        *(f"wild(seed={i}, rows=600)" for i in range(24)),
-        *(f"drawn_judged(seed={i}, rows=600)" for i in range(24)),
-    ),
-    "rolling": tuple(f"drawn_rolling(seed={i}, rows=300)" for i in range(12)),
     "engine": tuple(
         f"engine_step(scene={scene}, at={at})"
         for scene in ("stack", "pyramid", "bridge", "four_bar", "heavy_on_light", "table")

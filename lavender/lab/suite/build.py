@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -24,11 +23,6 @@ FRICTIONS = ("none", "coulomb", "cone")
 def each(function: Callable[[float], float], x: Any) -> FloatArray:
     """A function of `math` of every number: the last bits of NumPy's own hang on the processor's vectors."""
     return np.array([function(value) for value in x.ravel().tolist()]).reshape(x.shape)
-
-
-def tenfold(exponent: Any) -> FloatArray:
-    """10 to the power of every number, by the same."""
-    return each(partial(pow, 10.0), exponent)
 
 
 class Bodies:

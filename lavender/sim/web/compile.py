@@ -74,9 +74,9 @@ class Built:
     compiler: str
 
 
-def why_not(of_kernels: bool = True) -> str:
-    """Why no module can be built here, of kernels or of C that is there; empty when it can."""
-    if of_kernels and importlib.util.find_spec("Cython") is None:
+def why_not() -> str:
+    """Why no module can be built here; empty when it can."""
+    if importlib.util.find_spec("Cython") is None:
         return "Cython is not installed (pip install 'lavender-contact[wasm]')"
     named = os.environ.get("LAVENDER_WASM_CC", "")
     if named and shutil.which(shlex.split(named)[0]) is None:
@@ -190,20 +190,6 @@ def _tools() -> tuple[list[str], list[str], bool]:
     named = shlex.split(os.environ.get("LAVENDER_WASM_CC", ""))
     linker = shlex.split(os.environ.get("LAVENDER_WASM_LD", "")) or [*zig, "wasm-ld"]
     return named or [*zig, "cc", "-target", "wasm32-wasi"], linker, bool(named)
-
-
-def build_library(out: Path, source: Path, names: Iterable[str]) -> None:
-    """A module of one C file, its functions exported with the memory, nothing imported; works in the file's folder.
-
-    Raises
-    ------
-    BuildFailed
-        No compiler, or the file needs a function that is not in it.
-    """
-    reason = why_not(of_kernels=False)
-    if reason:
-        raise BuildFailed(reason)
-    out.write_bytes(_compiled(source, names))
 
 
 def _run(command: list[str], folder: Path) -> None:

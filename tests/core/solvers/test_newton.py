@@ -7,6 +7,7 @@ from unittest import mock
 import numpy as np
 import pytest
 import scipy.sparse as sp
+from ball_pile import Pile
 from calls import dense_h, system_in
 from hypothesis import given, settings
 from random_problems import FORMS, as_matrix, good, random_contact_problem, seeds
@@ -15,7 +16,6 @@ from twins import block_diagonal
 from worked import python
 
 import lavender as lv
-from benchmarks.piles import Pile
 from lavender.judge.solution import Status
 from lavender.problem.cones import ROW
 from lavender.solvers.newton import Newton, NewtonState

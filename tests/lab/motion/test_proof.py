@@ -10,6 +10,7 @@ import pytest
 import scipy.sparse as sp
 
 import lavender as lv
+from benchmarks.random_families import wild
 from lavender import suite
 from lavender.lab import proof
 from lavender.lab.proof import dependence, island, operator, search
@@ -97,7 +98,7 @@ def test_every_kind_of_contact_and_form(friction, rolling):
 
 
 def test_an_answer_at_the_edge_of_a_family_of_impulses_is_proven_from_inside_of_it(monkeypatch):
-    problem = suite.case("wild(seed=0, rows=600)").problem
+    problem = wild(seed=0, rows=600).problem
     edge = lv.solve(problem, "admm", tol=1e-12)
     found = lv.prove(problem, edge)
     assert found.proven and found.velocity_radius < 1e-9

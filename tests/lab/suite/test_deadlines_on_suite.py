@@ -9,6 +9,7 @@ from random_problems import as_matrix
 
 import lavender as lv
 from benchmarks.made import fresh
+from benchmarks.random_families import drawn
 from lavender import registry, suite
 from lavender.judge import residuals
 from lavender.judge.residuals import judging_time
@@ -85,7 +86,7 @@ def test_more_time_is_never_worse(name, pace, clock, monkeypatch):
 @pytest.mark.parametrize("limit", [1e-3, 1.5e-3])
 def test_sweeps_that_cost_more_than_they_are_counted_for_end_in_time(limit, clock, monkeypatch):
     """Contacts that roll, each solved exactly: half of the time was begun in one call by a count of a quarter."""
-    problem = as_matrix(suite.case("drawn_rolling(seed=97112)").problem)
+    problem = as_matrix(drawn(seed=97112, part="rolling").problem)
     sweep, each = Swept.run, 4.5e-9 * sweep_cost(problem)
 
     def swept(*of):
@@ -102,7 +103,7 @@ def test_sweeps_that_cost_more_than_they_are_counted_for_end_in_time(limit, cloc
 @pytest.mark.parametrize("limit", [0.02, 0.1, 0.4])
 def test_no_factor_of_the_augmented_system_ends_late(limit, clock, monkeypatch):
     """Bodies that roll: one turn went over to it, and the clock was asked again after its last step."""
-    problem = suite.case("drawn_rolling(seed=95402)").problem
+    problem = drawn(seed=95402, part="rolling").problem
     monkeypatch.setattr(augmented, "loading", lambda *of: 0.0)
     made, factor, each = [], augmented.sparse_lu, 0.01
 

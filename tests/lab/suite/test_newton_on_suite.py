@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from random_problems import as_matrix, good, seeds
 
 import lavender as lv
+from benchmarks.random_families import wild
 from lavender import registry, suite
 from lavender.base.deadline import Deadline
 from lavender.lab.suite import box_stack
-from lavender.lab.suite.lots import wild
 from lavender.solvers.newton import SPEC, Newton
 from lavender.solvers.newton_systems.systems import make_system
 

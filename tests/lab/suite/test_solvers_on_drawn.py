@@ -1,4 +1,4 @@
-"""Solvers on problems of structures drawn by lot (`lavender.lab.suite.lots`)."""
+"""Solvers on problems of structures drawn by lot (`benchmarks.random_families`)."""
 
 import re
 from dataclasses import replace
@@ -10,8 +10,8 @@ from calls import REACHED, check, driven, facts
 from random_problems import as_matrix, good
 
 import lavender as lv
+from benchmarks.random_families import drawn, wild
 from lavender import registry
-from lavender.lab.suite.lots import drawn, wild
 from lavender.problem.rows import Rows
 from lavender.solvers.certify import certify
 from lavender.solvers.newton_systems import general, systems

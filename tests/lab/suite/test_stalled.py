@@ -8,9 +8,9 @@ from random_problems import warmed
 from worked import after
 
 import lavender as lv
+from benchmarks.random_families import wild
 from lavender import registry, suite
 from lavender.lab.suite import hard
-from lavender.lab.suite.lots import wild
 
 ITERATE = lv.available(external=False, resumable=True)
 ROWS = 150  # at most: the set of all tests here takes seconds

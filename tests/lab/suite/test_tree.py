@@ -1,6 +1,7 @@
 """The tree of `auto`: each line is reached and named, counts are what Newton does, the best of all goes back."""
 
 import json
+from functools import partial
 from itertools import islice
 
 import numpy as np
@@ -11,6 +12,7 @@ from random_problems import as_matrix, general, random_lcp
 from random_trees import random_general
 
 import lavender as lv
+from benchmarks.random_families import drawn, wild
 from lavender import registry, suite
 from lavender.base.deadline import Deadline
 from lavender.judge.residuals import reference
@@ -65,8 +67,8 @@ FIRST = {
     "a loose pile": (lambda: suite.granular(n=4, friction="coulomb").problem, LOOSE),
     "a loose pile, a matrix": (lambda: as_matrix(suite.case("granularF(n=6, seed=2)").problem), LOOSE),
     "a loose pile, J and M": (lambda: general(suite.case("granularF(n=6, seed=2)").problem), LOOSE),
-    "a pile that rolls": (lambda: suite.case("drawn_rolling(seed=98103)").problem, LOOSE),
-    "a pile that rolls, a matrix": (lambda: as_matrix(suite.case("drawn_rolling(seed=98103)").problem), LOOSE),
+    "a pile that rolls": (lambda: drawn(seed=98103, part="rolling").problem, LOOSE),
+    "a pile that rolls, a matrix": (lambda: as_matrix(drawn(seed=98103, part="rolling").problem), LOOSE),
     "a tight pile": (lambda: suite.pyramid(k=6, friction="coulomb").problem, ["anderson", "anderson", "newton"]),
 }  # fmt: skip
 
@@ -234,10 +236,14 @@ def test_sweeps_that_promise_little_give_way():
     assert not sweeps.over and log.iterations < 1000
 
 
-@pytest.mark.parametrize("name", ["wild(seed=12)", "wild(seed=24)", "wild(seed=3)", "granularF(n=9)"])
-def test_what_would_not_end_in_time_is_neither_counted_nor_begun(name):
+@pytest.mark.parametrize(
+    "make",
+    [*(partial(wild, seed) for seed in (12, 24, 3)), partial(suite.granular, n=9, friction="coulomb")],
+    ids=lambda make: f"{make.func.__name__}{make.args}",
+)
+def test_what_would_not_end_in_time_is_neither_counted_nor_begun(make):
     """With the least of time sweeps have all of it."""
-    problem = suite.case(name).problem
+    problem = make().problem
     reference(problem)
     tree = Tree(problem, Deadline(1e-4))
     assert tree.is_late and not tree.states
@@ -249,16 +255,19 @@ def test_what_would_not_end_in_time_is_neither_counted_nor_begun(name):
 
 
 @pytest.mark.parametrize(
-    "name",
+    "make",
     [
-        "wild(seed=99750)",  # newton stalls from what sweeps leave, and not from nothing
-        "drawn_judged(seed=99529)",  # the second turn brings admm on the way
-        "drawn_judged(seed=99860)",  # newton gains nothing in hundreds of factorisations
-        "drawn_judged(seed=102121)",  # rows of A from where velocities stall, for more than what is left as counted
+        partial(wild, 99750),  # newton stalls from what sweeps leave, and not from nothing
+        partial(drawn, 99529, part="judged"),  # the second turn brings admm on the way
+        partial(drawn, 99860, part="judged"),  # newton gains nothing in hundreds of factorisations
+        partial(
+            drawn, 102121, part="judged"
+        ),  # rows of A after velocities stall, for more than is left as counted
     ],
+    ids=lambda make: f"{make.func.__name__}{make.args}",
 )
-def test_what_only_late_turns_solve_is_solved(name):
-    solution = lv.solve(suite.case(name).problem, tol=1e-6)
+def test_what_only_late_turns_solve_is_solved(make):
+    solution = lv.solve(make().problem, tol=1e-6)
     assert solution.success, solution.turns
 
 

@@ -87,20 +87,20 @@ def test_a_kernel_that_needs_more_does_not_link(tmp_path, kind):
     assert not (tmp_path / "bad.wasm").exists()
 
 
+GOOD = (
+    HEAD
+    + "cdef public int32_t lav_good(int32_t x) noexcept nogil:\n    return 2 * x + <int32_t>sizeof(void*)\n"
+)
+
+
 @needs_compiler
 def test_a_home_that_nobody_may_write_into_is_not_needed(tmp_path, monkeypatch):
     monkeypatch.setenv("HOME", os.devnull)
     monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
     monkeypatch.delenv("ZIG_GLOBAL_CACHE_DIR", raising=False)
-    (tmp_path / "a.c").write_text("int lav_a(int x) { return 2 * x; }\n")
-    wasm.build_library(tmp_path / "a.out", tmp_path / "a.c", ["lav_a"])
-    assert (tmp_path / "a.out").read_bytes().startswith(b"\0asm")
-
-
-GOOD = (
-    HEAD
-    + "cdef public int32_t lav_good(int32_t x) noexcept nogil:\n    return 2 * x + <int32_t>sizeof(void*)\n"
-)
+    (tmp_path / "good.pyx").write_text(GOOD)
+    wasm.build(tmp_path / "good.wasm", ROOT, [tmp_path / "good.pyx"])
+    assert (tmp_path / "good.wasm").read_bytes().startswith(b"\0asm")
 
 
 @needs_compiler

@@ -1,17 +1,15 @@
-"""Piles of balls that creep, as a small engine steps them: `python -m benchmarks piles OUT 201 202 203 204 205`.
+"""Piles of balls that creep, as a small engine steps them.
 
-Balls of drawn number, sizes, masses and friction fall into an open box and are pressed together for 260 steps of
-1/60 s, each solved by `newton` to 1e-4 from the impulses of the last; every 20th from the 60th on is kept as a file. On
-these problems contacts under load are between sticking and slipping (docs/newton.md).
+Balls of random number, sizes, masses and friction fall into an open box and are pressed together in steps of 1/60 s,
+each solved by `newton` to 1e-4 from the impulses of the last step. On these problems contacts under load are between
+sticking and slipping (docs/newton.md).
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
-import click
 import numpy as np
 
 import lavender as lv
@@ -83,19 +81,3 @@ class Pile:
             impulse = lv.solve(problem, "newton", tol=1e-4, max_iter=60, impulse=start).impulse
             self.velocity, last = problem.velocity(impulse).reshape(-1, 6), (problem, impulse)
             self.place += DT * self.velocity[:, :3]
-
-
-@click.command("piles")
-@click.argument("out", type=click.Path(path_type=Path, file_okay=False))
-@click.argument("seeds", type=int, nargs=-1, required=True)
-@click.option("--steps", default=260, show_default=True)
-@click.option("--every", default=20, show_default=True)
-def command(out: Path, seeds: tuple[int, ...], steps: int, every: int) -> None:
-    """Step piles of balls and keep problems of theirs as files OUT/pileSEED_STEP.npz."""
-    out.mkdir(parents=True, exist_ok=True)
-    for seed in seeds:
-        pile = Pile(seed)
-        for step, problem in pile.problems(steps):
-            if step >= 60 and step % every == 0:
-                problem.save(out / f"pile{seed}_{step:04d}.npz")
-        click.echo(f"pile{seed}: {len(pile.mass)} balls, mu {pile.mu}, {problem.m} rows in the last step")

@@ -13,17 +13,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from lavender.base.errors import check_name
-from lavender.base.later import sparse as sp
-from lavender.base.later import spatial
-from lavender.lab.suite.build import Bodies, Contacts, each, sideways, tenfold
-from lavender.lab.suite.case import Draft, family
-from lavender.lab.suite.families import BOX, SPHERE, at_least
-from lavender.lab.suite.lots.wild import (
+from benchmarks.random_families.wild import (
     FORMS,
     LARGEST_DENSE,
     LAWS,
@@ -35,7 +30,14 @@ from lavender.lab.suite.lots.wild import (
     masses_of,
     on_floor,
     problem_of,
+    tenfold,
 )
+from lavender.base.errors import check_name
+from lavender.base.later import sparse as sp
+from lavender.base.later import spatial
+from lavender.lab.suite.build import Bodies, Contacts, each, sideways
+from lavender.lab.suite.case import Draft
+from lavender.lab.suite.families import BOX, SPHERE, at_least
 from lavender.problem import Problem
 from lavender.problem.cones import Cones
 
@@ -316,7 +318,6 @@ JUDGED = frozenset(
 TUNED = frozenset(STRUCTURES) - JUDGED
 
 
-@family(drawn_tuned={"part": "tuned"}, drawn_judged={"part": "judged"}, drawn_rolling={"part": "rolling"})
 def drawn(seed: int = 0, rows: int = 3000, part: str = "all") -> Draft:
     """A problem drawn by `seed` of some 8 to `rows` rows; `part`: all, tuned or judged structures.
 
@@ -324,6 +325,7 @@ def drawn(seed: int = 0, rows: int = 3000, part: str = "all") -> Draft:
     """
     at_least(8, rows=rows)
     check_name("part", part, PART)
+    title = f"drawn(seed={seed}, rows={rows}, part={part})"
     rng = np.random.default_rng([seed, 0x647261, PART.index(part)])
     rolls = part == "rolling"
     lot = {"all": frozenset(STRUCTURES), "judged": JUDGED}.get(part, TUNED)
@@ -331,6 +333,7 @@ def drawn(seed: int = 0, rows: int = 3000, part: str = "all") -> Draft:
     wanted = 8.0 * (rows / 8.0) ** rng.random()
     if name in MATRICES:
         problem = MATRICES[name](rng, max(4, round(wanted)))
+        problem = replace(problem, name=title, copy=False)
         return Draft(problem, f"{name}, {problem.law}, given as {problem.operator}: drawn, not chosen")
     law, masses, form = (str(rng.choice(words)) for words in (LAWS, MASSES, FORMS))
     world = WORLDS[name](rng, max(2, round(wanted / (5 if rolls else 1 if law == "none" else 3))))
@@ -347,4 +350,5 @@ def drawn(seed: int = 0, rows: int = 3000, part: str = "all") -> Draft:
         problem = Problem.from_rows(made, mu=rng.uniform(0.2, 0.9), **more)
     else:
         problem, form = given_as(rng, problem_of(rng, world, bodies, law, soft), form)
+    problem = replace(problem, name=title, copy=False)
     return Draft(problem, f"{name}, masses {masses}, friction {law}, given as {form}: drawn, not chosen")

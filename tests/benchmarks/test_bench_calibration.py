@@ -1,36 +1,35 @@
-"""`python -m benchmarks motions`: what its tables count."""
+"""`python -m benchmarks calibration`: what its tables count."""
 
-import numpy as np
 import pytest
 from click.testing import CliRunner
 
 import lavender as lv
-from benchmarks import motions
+from benchmarks import calibration
 from lavender import suite
 
 
 def sample(relative, motion, law="lcp", structure="stack + redundant"):
-    return motions.Sample(
+    return calibration.Sample(
         "c", law, structure, "pgs", 4, relative, relative, relative / 2, relative, motion, 0.1, motion, motion
     )
 
 
 def test_factors_are_those_of_the_samples():
     found = [sample(1e-3, 2e-3), sample(1e-3, 4e-3), sample(1e-2, 9e-2, structure="stack")]
-    rows = {row.structure: row for row in motions.calibration(found)}
+    rows = {row.structure: row for row in calibration.calibration(found)}
     assert set(rows) == {"stack", "redundant", "law lcp", "all"}
     assert rows["all"].iterates == 3
     assert rows["all"].median == pytest.approx(4.0)
     assert rows["all"].largest == pytest.approx(9.0)
     assert rows["redundant"].iterates == 2
-    names = {name: (median, spread) for name, _, median, spread in motions.predictors(found)}
+    names = {name: (median, spread) for name, _, median, spread in calibration.predictors(found)}
     assert names["V / V0 alone"][0] == pytest.approx(2 * names["E / E0 alone"][0])
-    assert "median 1" in motions.table(found)
+    assert "median 1" in calibration.table(found)
 
 
 def test_samples_are_iterates_with_both_errors():
     p = suite.case("stack(n=8)").problem
-    found = list(motions.samples("stack", p, "stack"))
+    found = list(calibration.samples("stack", p, "stack"))
     assert {s.solver for s in found} >= {"pgs", "jacobi"}
     for s in found:
         again = lv.solve(p, s.solver, tol=0.0, max_iter=s.iterations)
@@ -40,19 +39,10 @@ def test_samples_are_iterates_with_both_errors():
         assert s.found <= s.bound
 
 
-def test_a_problem_with_several_motions_is_counted_as_one():
-    p = suite.case("granularF(n=3, sliding=0.5)").problem
-    found = motions.branches("granular", p, "pile", 6)
-    assert found.motions >= 2
-    assert found.sliding > 0.0
-    assert found.friction == np.max(p.cones.mu)
-
-
-def test_the_command_writes_both_tables(tmp_path):
+def test_the_command_writes_the_table_and_the_figure(tmp_path):
     path = tmp_path / "figure.png"
-    args = ["stack(n=8)", "box_stackF(n=2)", "--runs", "3"]
-    result = CliRunner().invoke(motions.command, [*args, "--figure", str(path)])
+    args = ["stack(n=8)", "box_stackF(n=2)"]
+    result = CliRunner().invoke(calibration.command, [*args, "--figure", str(path)])
     assert result.exit_code == 0, result.output
     assert path.read_bytes().startswith(b"\x89PNG")
     assert "| all |" in result.output
-    assert "| Coulomb problems |" in result.output

@@ -1,4 +1,4 @@
-"""Stops before convergence of a float32 Newton, planted in steps of robots: `python -m benchmarks float32 MODEL...`.
+"""Stops before convergence planted in a float32 Newton over steps of robots, and what the judge says of them.
 
 Two Newton's methods of this file alone, all of them in float32, on bounded soft rows (pyramidal friction).
 **velocities** goes over x = v+ - v* and reads impulses off it, as engines do:
@@ -14,17 +14,14 @@ drawn from each step, and last steps of which a line search left a share out.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
-import click
 import numpy as np
 
-from benchmarks.output import markdown
 from lavender.base.errors import InputError
-from lavender.judge.residuals import AT_FLOOR, Residual, nothing_to_do, residual
+from lavender.judge.residuals import Residual, nothing_to_do, residual
 from lavender.problem import Problem
 from lavender.problem.cones import ROW
 
@@ -155,55 +152,3 @@ def _unfinished(problem: Problem, impulses: Sequence[Any], exact: Any, last: int
 def _judged(problem: Problem, kind: str, impulse: Any) -> Stop:
     r: Residual = residual(problem, impulse, precision="float32")
     return Stop(problem.name, kind, r.relative, r.floor, r.verdict)
-
-
-def robot_steps(model: Path, steps: int, every: int, seed: int) -> Iterator[Problem]:
-    """Problems of a MuJoCo model under random controls, with pyramidal friction cones."""
-    import mujoco as mj
-
-    from lavender.io import from_mujoco
-
-    try:
-        made = mj.MjModel.from_xml_path(str(model))
-    except ValueError as error:
-        raise InputError(f"{model}: {error}") from None
-    made.opt.cone = mj.mjtCone.mjCONE_PYRAMIDAL
-    data, rng = mj.MjData(made), np.random.default_rng(seed)
-    for step in range(steps * every):
-        data.ctrl[:] = rng.uniform(-1.0, 1.0, made.nu)
-        mj.mj_step(made, data)
-        if (step + 1) % every == 0:
-            mj.mj_forward(made, data)
-            if data.nefc:
-                yield from_mujoco(made, data, name=f"{model.stem}[{step + 1}]")
-
-
-def table(stops: Sequence[Stop]) -> str:
-    """By kind: how many, what the judge said, and the range of residual over floor."""
-    rows = []
-    for kind in dict.fromkeys(s.kind for s in stops):
-        some = [s for s in stops if s.kind == kind]
-        early = sum(s.verdict != AT_FLOOR for s in some)
-        over = np.percentile([s.relative / s.floor for s in some], [0, 50, 100])
-        share = f"{100.0 * early / len(some):.1f} %"
-        rows.append((kind, len(some), len(some) - early, early, share, *(f"{x:.2g}" for x in over)))
-    head = ("answer", "steps", AT_FLOOR, "above it", "share", "least over floor", "median", "most")
-    return markdown(head, rows)
-
-
-@click.command()
-@click.argument(
-    "models", nargs=-1, required=True, type=click.Path(exists=True, dir_okay=False, path_type=Path)
-)
-@click.option("--steps", default=100, show_default=True, help="Problems of each model.")
-@click.option("--every", default=5, show_default=True, help="Steps of the simulation between two.")
-@click.option("--seed", default=0, show_default=True)
-def command(models: tuple[Path, ...], steps: int, every: int, seed: int) -> None:
-    """Plant stops before convergence in a float32 Newton over steps of MuJoCo models, and judge them."""
-    rng, stops = np.random.default_rng(seed), []
-    for model in models:
-        for problem in robot_steps(model, steps, every, seed):
-            stops += planted(problem, rng)
-    if not stops:
-        raise InputError("no step had a constraint: more steps, or other models")
-    click.echo(table(stops))

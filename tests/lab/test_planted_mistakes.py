@@ -1,16 +1,13 @@
-"""Mistakes planted in good problems and in float32 engines' answers: what is told of them, and of nothing else."""
+"""Mistakes planted in good problems: what `diagnose` tells of them, and of nothing else."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from calls import robot
+from planted_mistakes import planted, scenes, shares
 from worked import ROOT
 
 import lavender as lv
-from benchmarks import float32
-from benchmarks.float32 import CUT, FLOOR, exchange, newton, table
-from benchmarks.planted import planted, scenes, shares
 
 
 def kinds(problem):
@@ -76,24 +73,3 @@ def test_the_state_before_the_step_tells_what_the_problem_alone_does_not():
             for mistake, wrong in planted(x):
                 kinds = {s.kind for s in lv.diagnose(wrong.problem, **wrong.state)}
                 assert STATE.get(mistake) is None or STATE[mistake] in kinds, (name, mistake)
-
-
-def test_early_stops_are_found_and_no_answer_at_its_floor_is_called_early():
-    rng = np.random.default_rng(0)
-    stops = [stop for seed in range(20) for stop in float32.planted(robot(seed), rng)]
-    for method in ("velocities", "impulses"):
-        ended = [s for s in stops if s.kind == f"{method}: {FLOOR}"]
-        cut = [s for s in stops if s.kind == f"{method}: {CUT}"]
-        assert len(ended) == 20
-        assert len(cut) > 15
-        assert all(s.verdict == "at its floor" for s in ended)
-        assert sum(s.verdict != "at its floor" for s in cut) >= 0.95 * len(cut)
-    assert table(stops).count("\n") == 1 + len({s.kind for s in stops})
-
-
-def test_the_newtons_of_the_benchmark_solve_in_float64_what_lavender_solves():
-    p = robot(11)
-    want = lv.solve(p, tol=1e-11).impulse
-    np.testing.assert_allclose(newton(p, np.float64)[-1][1], want, rtol=0, atol=1e-8 * abs(want).max())
-    np.testing.assert_allclose(exchange(p)[-1], want, rtol=0, atol=1e-4 * abs(want).max())
-    assert newton(p, np.float32)[-1][1].dtype == np.float32

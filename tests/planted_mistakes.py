@@ -1,23 +1,17 @@
-"""Mistakes planted in problems that hold none, and the share that `lv.diagnose` finds: `python -m benchmarks planted`.
+"""Mistakes planted in problems that have none, and the share that `lv.diagnose` finds.
 
-30 steps of the gallery's scenes, of bodies and with the same J and M; contacts overlap by up to 1 mm or have a gap. Of
-MuJoCo models that are named (`--models`), states of random controls with J, M, v* = v + dt a and targets as above. A
-mistake that changes nothing in a problem (a sign of gaps where there are none) is not counted.
+The problems are 30 steps of the gallery's scenes, as bodies and with the same J and M; contacts overlap by up to 1 mm
+or have a gap. A mistake that changes nothing in a problem (the sign of gaps if there are none) is not counted.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
-from pathlib import Path
 from typing import Any
 
-import click
 import numpy as np
 
-from benchmarks.output import markdown
-from lavender.base.errors import LavenderError
-from lavender.io import from_mujoco
 from lavender.lab.suspicions import diagnose
 from lavender.problem import Problem
 from lavender.problem.cones import ROW, Cones
@@ -44,9 +38,7 @@ SCENES: tuple[tuple[str, dict[str, Any]], ...] = (
 )
 STEPS = (2, 45)
 DEPTH, SHARE = 1e-3, 0.2  # m, the deepest overlap; - of it that one step takes back
-STATES = (60, 150, 300, 500, 700, 900, 1200, 1500)  # steps of a MuJoCo model
 NONE = "none"
-MARGIN = 0.02  # m, a gap from which it reports contacts
 
 
 @dataclass
@@ -162,51 +154,13 @@ def scenes() -> Iterator[tuple[str, Given]]:
         yield f"{name} {steps}", Given(p.jacobian.toarray(), mass, v, fall, dt, target, p.cones, gap, rows)
 
 
-def robots(models: tuple[str, ...]) -> Iterator[tuple[str, Given]]:
-    """States of MuJoCo models under random controls, each with contacts at once and from a gap of MARGIN on."""
-    for path, margin in ((m, g) for m in models for g in (0.0, MARGIN)):
-        import mujoco as mj
-
-        model = mj.MjModel.from_xml_path(path)
-        model.geom_margin[:] = margin
-        data, rng, dt = mj.MjData(model), np.random.default_rng(1), float(model.opt.timestep)
-        low, high = np.where(model.actuator_ctrllimited[:, None], model.actuator_ctrlrange, [-1.0, 1.0]).T
-        for step in range(STATES[-1] + 1):
-            if step % 20 == 0:
-                data.ctrl[:] = rng.uniform(low, np.maximum(low, high))
-            mj.mj_step(model, data)
-            mj.mj_forward(model, data)
-            if step not in STATES or not data.ncon:
-                continue
-            try:
-                general = from_mujoco(model, data).generalized
-            except LavenderError:
-                continue
-            assert general is not None
-            jac, target, mu, gap = [], [], [], []
-            for contact in data.contact:
-                bodies = model.geom_bodyid[contact.geom]
-                at = [np.zeros((3, model.nv)) for _ in bodies]
-                for x, body in zip(at, bodies, strict=True):
-                    mj.mj_jac(model, data, x, None, contact.pos, body)
-                jac.append(contact.frame.reshape(3, 3) @ (at[1] - at[0]))
-                target += [-contact.dist / dt * (1.0 if contact.dist > 0.0 else SHARE), 0.0, 0.0]
-                mu.append(contact.friction[0])
-                gap.append(contact.dist)
-            mass, cones = general.mass.toarray(), Cones.contacts(np.array(mu))
-            acceleration = (general.v_free - data.qvel) / dt
-            given = np.concatenate(jac), mass, data.qvel.copy(), acceleration, dt, np.array(target), cones
-            yield f"{Path(path).stem} {step}", Given(*given, np.array(gap))
-
-
-def shares(models: tuple[str, ...] = ()) -> dict[str, dict[str, tuple[int, int]]]:
+def shares() -> dict[str, dict[str, tuple[int, int]]]:
     """For each form the problems with each mistake in which something was found, and their number."""
     found: dict[str, dict[str, tuple[int, int]]] = {}
     of_bodies = list(scenes())
     forms = {
         "bodies": of_bodies,
         "the same, J and M": [(name, replace(x, rows=None)) for name, x in of_bodies],
-        "robots, J and M": list(robots(models)),
     }
     for form, problems in forms.items():
         rights: dict[str, set[str]] = {}
@@ -221,18 +175,3 @@ def shares(models: tuple[str, ...] = ()) -> dict[str, dict[str, tuple[int, int]]
                     all_ + 1,
                 )
     return found
-
-
-def table(found: dict[str, dict[str, tuple[int, int]]]) -> str:
-    """As docs/failures.md shows it."""
-    lines = [["mistake", *found]]
-    for mistake in found["bodies"]:
-        lines.append([mistake, *("{} of {}".format(*of.get(mistake, (0, 0))) for of in found.values())])
-    return markdown(lines[0], lines[1:])
-
-
-@click.command("planted")
-@click.option("--models", multiple=True, type=click.Path(exists=True, dir_okay=False), help="A MuJoCo model.")
-def command(models: tuple[str, ...]) -> None:
-    """Mistakes planted in good problems: in how many of them `lv.diagnose` finds something."""
-    click.echo(table(shares(models)))

@@ -1,8 +1,7 @@
-"""What a residual tells of the motion, and how many motions a problem has: `python -m benchmarks motions`.
+"""Relative motion error over relative residual: `python -m benchmarks calibration`.
 
-Two lists over problems of any source. **Calibration**: iterates of several solvers at several budgets, each with
-its relative residual and its relative motion error; their ratio says what a residual is worth. **Several
-motions**: how often a search finds more than one, how far apart, by law, structure, friction and sliding.
+Iterates of several solvers at several budgets, each with its relative residual and its relative motion error; their
+ratio says how much a residual hides.
 """
 
 from __future__ import annotations
@@ -22,7 +21,6 @@ from lavender.io.stored import write_figure
 from lavender.judge.measures import natural_map, siconos_error
 from lavender.lab.bench import resolve, structure_of
 from lavender.problem import Problem
-from lavender.problem.cones import ROW
 from lavender.solvers.registry import available, get
 from lavender.solving.solve import solve
 
@@ -50,24 +48,6 @@ class Sample:
     speed: float  # m/s, nan where bodies are not known
     bound: float  # sqrt J, nan under Coulomb's law
     found: float  # sqrt J, what the bound is of
-
-
-@dataclass(frozen=True)
-class Branches:
-    """How many motions a search found in one problem."""
-
-    case: str
-    law: str
-    structure: str
-    rows: int
-    friction: float  # -, largest coefficient
-    sliding: float  # m/s, fastest tangent of a contact that presses, at the first motion
-    motions: int  # 0 where no run ended at a solution
-    runs: int
-    spread: float  # m/s
-    share: float  # -, the spread over the fastest constraint motion of a row, w of doing nothing
-    unique: str  # criterion that proves one motion, or empty
-    warm: str  # several motions and a guess: sweeps from it end at the motion "nearest" to it or at "another"
 
 
 def samples(name: str, problem: Problem, structure: str) -> Iterator[Sample]:
@@ -123,46 +103,7 @@ def _plain(problem: Problem, impulse: np.ndarray) -> float:
     return one / two if two > 0.0 else math.nan
 
 
-def branches(name: str, problem: Problem, structure: str, runs: int) -> Branches:
-    """Search the motions of one problem."""
-    found = motion.motions(problem, runs)
-    c = problem.cones
-    contact = c.kind != ROW
-    sliding = 0.0
-    if len(found):
-        x, w = found[0].impulse, found[0].slack
-        for i in np.flatnonzero(contact & (np.diff(c.ptr) > 1)):
-            if x[c.ptr[i]] > 0.0:
-                t = w[c.ptr[i] + 1 : c.ptr[i] + 1 + c.n_tangents[i]]
-                sliding = max(sliding, float(np.linalg.norm(t)))
-    fastest = float(np.max(np.abs(problem.slack(problem.start())), initial=0.0))
-    return Branches(
-        case=name,
-        law=problem.law,
-        structure=structure,
-        rows=problem.m,
-        friction=float(np.max(c.mu[contact], initial=0.0)),
-        sliding=sliding,
-        motions=len(found),
-        runs=found.runs,
-        spread=found.spread,
-        share=found.spread / fastest if fastest > 0.0 else 0.0,
-        unique=found.unique,
-        warm=_warm(problem, found),
-    )
-
-
-def _warm(problem: Problem, found: motion.Motions) -> str:
-    if len(found) < 2 or problem.guess is None:
-        return ""
-    end = motion.branch(problem, problem.guess)
-    here = motion.distance(problem, end.impulse, problem.guess).energy
-    there = motion.distance(problem, found.nearest(problem.guess).impulse, problem.guess).energy
-    # Nothing that was found is nearer to the guess, to a hundredth of the way.
-    return "nearest" if here <= 1.01 * there else "another"
-
-
-def is_searched(problem: Problem, rows: int) -> bool:
+def is_measured(problem: Problem, rows: int) -> bool:
     """Whether a problem has rows, few enough of them, and a solver here."""
     return 0 < problem.m <= rows and bool(available(problem))
 
@@ -239,49 +180,6 @@ def table(found: Sequence[Sample]) -> str:
     return "\n".join(lines)
 
 
-def several_table(found: Sequence[Branches]) -> str:
-    """Share of Coulomb problems with several motions, by structure, friction and sliding, as markdown."""
-    coulomb = [b for b in found if b.law == "coulomb"]
-    groups: list[tuple[str, list[Branches]]] = [("all", coulomb)]
-    words = dict.fromkeys(word for b in coulomb for word in b.structure.split(" + "))
-    groups += [(word, [b for b in coulomb if word in b.structure.split(" + ")]) for word in words]
-    for low, high in ((0.0, 0.3), (0.3, 0.6), (0.6, math.inf)):
-        name = f"friction from {low:g}" + (f" to {high:g}" if high < math.inf else "")
-        groups.append((name, [b for b in coulomb if low <= b.friction < high]))
-    # Relative to nothing: m/s as they are; a thousandth of a millimetre per second is at rest.
-    for name, low, high in (
-        ("nothing slides", -1.0, 1e-6),
-        ("slides below 0.1 m/s", 1e-6, 0.1),
-        ("slides faster", 0.1, math.inf),
-    ):
-        groups.append((name, [b for b in coulomb if low < b.sliding <= high]))
-    rows = []
-    for name, group in groups:
-        if not group:
-            continue
-        proved = sum(bool(b.unique) for b in group)
-        several = [b for b in group if b.motions > 1]
-        one = sum(b.motions == 1 and not b.unique for b in group)
-        worst = max(several, key=lambda b: b.spread, default=None)
-        last = ("", "") if worst is None else (f"{worst.spread:.2g} m/s", worst.case)
-        rows.append(
-            (name, len(group), proved, one, f"{len(several)} ({len(several) / len(group):.0%})", *last)
-        )
-    head = ("Coulomb problems", "count", "proved unique", "one found", "several", "largest spread", "where")
-    lines = [markdown(head, rows)]
-    warm = [b.warm for b in coulomb if b.warm]
-    if warm:
-        stay = sum(word == "nearest" for word in warm)
-        lines += [
-            "",
-            f"Warm starts where there are several: sweeps from {stay} of {len(warm)} end at the motion nearest to it.",
-        ]
-    none = sum(b.motions == 0 for b in coulomb)
-    if none:
-        lines += ["", f"No run ended at a solution of {none} of them; they count in the first column alone."]
-    return "\n".join(lines)
-
-
 def figure(found: Sequence[Sample], path: str | Path) -> None:
     """Relative motion error over relative residual, a dot an iterate, a colour a law.
 
@@ -314,42 +212,26 @@ def figure(found: Sequence[Sample], path: str | Path) -> None:
     write_figure(canvas, path, dpi=150)
 
 
-@click.command("motions")
+@click.command("calibration")
 @click.argument("files", nargs=-1, metavar="[FILES | FOLDERS | NAMES]...")
-@click.option("--runs", type=click.IntRange(0), default=12, show_default=True, help="Runs of each search.")
 @click.option(
     "--rows", type=click.IntRange(1), default=3000, show_default=True, help="Leave larger problems out."
 )
 @click.option(
     "--figure", "picture", type=click.Path(path_type=Path), help="Residual against motion error, drawn."
 )
-def command(
-    files: tuple[str, ...],
-    runs: int,
-    rows: int,
-    picture: Path | None,
-) -> None:
-    """What a residual tells of the motion, and how many motions a problem has.
-
-    On FILES, or on the default set of the suite.
-    """
+def command(files: tuple[str, ...], rows: int, picture: Path | None) -> None:
+    """Compare residual and motion error on FILES, or on the default set of the suite."""
     seen: list[Sample] = []
-    found: list[Branches] = []
     left = 0
     for item in resolve(files or ["default"]):
-        problem = item.problem
-        if not is_searched(problem, rows):
+        if not is_measured(item.problem, rows):
             left += 1
             continue
-        structure = " + ".join(structure_of(problem))
-        found.append(branches(item.name, problem, structure, runs))
-        click.echo(f"{item.name}: {found[-1].motions} motions, {found[-1].spread:.2g} m/s apart", err=True)
-        seen += samples(item.name, problem, structure)
+        seen += samples(item.name, item.problem, " + ".join(structure_of(item.problem)))
         item.forget()
     if seen:
         click.echo(table(seen))
-    if found:
-        click.echo(("\n" if seen else "") + several_table(found))
     if left:
         click.echo(f"\n{left} problems left out: empty, above {rows} rows, or without a solver here.")
     if picture is not None:
