@@ -3,7 +3,9 @@
 With w = A lambda - b and d as docs/concepts.md defines them, E = sqrt(sum d e^2), V = max sqrt(nu d) |e|, and
 
     relative = max(E / E0, V / V0),   floor = 2^-53 (|A| |lambda| + |b|) in the same two norms, at least
-                                                2^-53 (d |lambda| + |b|) where a pair is cut to its bound.
+                                                2^-53 (d |lambda| + |b|) where a pair is cut to its bound
+
+of each island, and of all of them the largest.
 
 Long double has 11 more bits and 2^14 instead of 2^10 as its largest exponent, so nothing here overflows, and what
 it rounds is far below what float64 may round. `Judgement.allowed` is what float64 may add: each of the m + 20
@@ -34,6 +36,8 @@ class Judgement:
     velocity: float
     nothing: bool  # doing nothing is near the line below which the norms of b stand in
     range: float  # largest |log10| of the numbers on the way
+    relatives: np.ndarray  # (n,) of each island
+    floors: np.ndarray  # (n,)
 
 
 def norm(x, sqrt=np.sqrt):
@@ -113,9 +117,11 @@ class Problem:
             self.A = np.array(spec["A"], L).reshape(self.m, self.m)
             self.A *= np.outer(self.stretch, self.stretch)
             self.size = np.abs(self.A)
+            self.touches = self.A != 0  # (m, m) rows that a row's impulse changes
             self._of_matrix()
         self.b, self.b_size = self.stretch * self.b, self.stretch * self.b_size
         self._pairs()
+        self.islands = self._islands()
 
     def _stretch(self):
         """An ellipse is measured as the disk of its larger coefficient in rows that are so long (m,)."""
@@ -184,6 +190,9 @@ class Problem:
                         reach = np.sqrt(arm @ arm)
                         size[row, body, :3] = 1.0
                         size[row, body, 3:] = reach
+        self.touches = np.zeros((m, n), bool)  # bodies of each row
+        for k, pair in enumerate([*r["joint_body"].reshape(-1, 2), *r["contact_body"].reshape(-1, 2)]):
+            self.touches[ptr[k] : ptr[k + 1], [body for body in pair if body >= 0]] = True
         minv, minv_size = np.zeros((n, 6, 6), L), np.zeros((n, 6, 6), L)
         for i in range(n):
             minv[i, [0, 1, 2], [0, 1, 2]] = r["inv_mass"][i]
@@ -212,6 +221,10 @@ class Problem:
     def _of_general(self, jac, mass, soft):
         """M = C C^T, Y = J C^-T, A = Y Y^T + compliance; |Y| |Y|^T for the sums of absolute products."""
         n = len(mass)
+        tree = mass != 0
+        for _ in range(n.bit_length()):
+            tree = tree @ tree  # velocities that M connects, through at most 2, 4, 8, ... entries
+        self.touches = (jac != 0) @ tree
         jac = self.stretch[:, None] * jac
         soft = self.stretch**2 * soft
         lower, y = np.zeros((n, n), L), np.zeros((self.m, n), L)
@@ -274,6 +287,22 @@ class Problem:
         if kind == CONTACT_ROLLING:
             found.append(([size - 2, size - 1], L(c["rolling"][k])))
         return found
+
+    def _islands(self):
+        """Masks (n, m) of rows whose blocks share what they touch, directly or through others."""
+        ptr = self.cones["ptr"]
+        touch = np.array([self.touches[ptr[k] : ptr[k + 1]].any(axis=0) for k in range(len(ptr) - 1)])
+        label = np.full(len(ptr) - 1, -1)
+        for k in range(len(label)):
+            if label[k] >= 0:
+                continue
+            label[k] = label.max() + 1
+            reached = touch[k].copy()
+            while (found := (label < 0) & (touch & reached).any(axis=1)).any():
+                label[found] = label[k]
+                reached |= touch[found].any(axis=0)
+        rows = np.repeat(label, np.diff(ptr))
+        return [rows == i for i in range(label.max(initial=-1) + 1)]
 
     # -- the error of an impulse -------------------------------------------------------------------
 
@@ -376,7 +405,7 @@ class Problem:
         """Judgement of an impulse (m,) float64."""
         lam = np.array(impulse, L) / self.stretch
         if not np.isfinite(lam).all():
-            return Judgement(np.inf, 0.0, 0.0, np.inf, np.inf, False, np.inf)
+            return Judgement(np.inf, 0.0, 0.0, np.inf, np.inf, False, np.inf, np.zeros(0), np.zeros(0))
         with np.errstate(all="ignore"):
             return self._judge(lam)
 
@@ -387,25 +416,44 @@ class Problem:
         size = np.maximum(size, self._own(error, lam, w)) + self.b_size
         energy, velocity = self.norms(error)
         start = np.where(self._bounded(), np.clip(ZERO, self._low(), self._high()), ZERO).astype(L)
-        energy0, velocity0 = self.norms(self.error(start, self.slack(start)))
-        rhs_energy, rhs_velocity = self.norms(self.b / self.d)
-        line = L(2.0) ** -48 * rhs_energy
-        below = energy0 <= line
-        nothing = bool(line / 16 <= energy0 <= line * 16)
-        if below:
-            energy0, velocity0 = rhs_energy, rhs_velocity
-        # Where an error w / d of the start is dust, of bounds that are, there is nothing to be better than.
-        nothing |= bool(energy0 <= LEAST * np.sqrt(self.d.sum()))
-        nothing |= bool(velocity0 <= LEAST * np.sqrt(self.nu * self.d).max(initial=ZERO))
+        slack0 = self.slack(start)
+        error0 = self.error(start, slack0)
+        line = L(2.0) ** -48 * np.abs(self.b)
+        # Errors of the start at the line below which they are rounding, or so small that a product of them vanishes.
+        at_line = (self.d * np.abs(error0) >= line / 16) & (self.d * np.abs(error0) <= 16 * line) & (line > 0)
+        nothing = bool(at_line.any())
         f = L(2.0) ** -53 * size
+        held = self._held(lam, w, L(2.0) ** -53 * (self.size @ np.abs(lam) + np.abs(self.b)))
         rounded = L(2.0) ** -53 * self.d * np.abs(lam)  # of lambda - Pi, where d is not A_ii
         more = self.roundings * (f + rounded + DENORMAL * (1 + np.abs(lam).max(initial=ZERO)))
-        floor = self._ratio(*self._floor(f), energy0, velocity0)
-        allowed = self._ratio(*self._floor(more), energy0, velocity0)
-        relative = self._ratio(energy, velocity, energy0, velocity0)
-        if floor > max(relative, 1e-3) and np.isfinite(floor):
-            relative = floor  # rounding hides a thousandth of doing nothing
-        seen = np.abs(np.concatenate([lam, w, self.d, self.b, [energy, velocity, energy0, velocity0]]))
+        references = [self._reference(rows, start, slack0, error0) for rows in self.islands]
+        whole = (
+            np.sqrt(sum((x * x for x, _ in filter(None, references)), ZERO)),
+            max((y for _, y in filter(None, references)), default=ZERO),
+        )
+        relatives, floors, allows = [], [], []
+        for rows, reference in zip(self.islands, references, strict=True):
+            if not self.touches[rows].any():
+                reference = whole  # nothing moves it: it has no scale of its own
+            if reference is None:  # no row acts: each is compared with its own terms
+                own = (self._own_floor(~held * f, k, row, whole[0]) for k, row in self._rows_of(rows))
+                relatives.append(self._by_rows(rows, error, whole[0]))
+                floors.append(max(own, default=ZERO))
+                allows.append(self._by_rows(rows, more / self.d, whole[0]))
+                continue
+            nothing |= bool(0 < reference[0] <= LEAST * np.sqrt(self.d.sum()))
+            nothing |= bool(0 < reference[1] <= LEAST * np.sqrt(self.nu * self.d).max(initial=ZERO))
+            floor = self._ratio(*self._floor(rows * ~held * f), *reference)
+            relative = self._ratio(*self.norms(rows * error), *reference)
+            if floor > max(relative, 1e-3) and np.isfinite(floor):
+                relative = floor  # rounding hides a thousandth of the zero impulse's error
+            relatives.append(relative)
+            floors.append(floor)
+            allows.append(self._ratio(*self._floor(rows * more), *reference))
+        relative, allowed = max(relatives, default=ZERO), max(allows, default=ZERO)
+        floor = floors[int(np.argmax(relatives))] if relatives else ZERO
+        scales = [x for reference in references if reference is not None for x in reference]
+        seen = np.abs(np.concatenate([lam, w, self.d, self.b, [energy, velocity], scales]))
         seen = seen[(seen > 0) & np.isfinite(seen)]
         span = float(np.abs(np.log10(seen)).max(initial=0.0))
         return Judgement(
@@ -416,7 +464,77 @@ class Problem:
             float(velocity),
             nothing,
             span,
+            np.array(relatives, float),
+            np.array(floors, float),
         )
+
+    def _reference(self, rows, start, slack, error):
+        """(E0, V0) of the rows of an island from the zero impulse, its slack and error; None if no row acts."""
+        rounding = L(2.0) ** -48 * np.abs(self.b)
+        if not np.all(self.d[rows] * np.abs(error[rows]) <= rounding[rows]):
+            return self.norms(rows * error)
+        low, high = self._low(), self._high()
+        pushed = ((start == low) & (slack > rounding)) | ((start == high) & (-slack > rounding))
+        acts = rows & ~(self._bounded() & (pushed | (low == high)))
+        for part, parts in self._contacts():
+            gap, line = slack[part][0], np.abs(self.b[part][0])
+            if self.law == "cone":
+                gap -= sum(reach * norm(slack[part][at]) for at, reach in parts)
+                line += sum(reach * norm(self.b[part][at]) for at, reach in parts)
+            acts[part] &= not gap > L(2.0) ** -48 * line
+        found = self.norms(acts * self.b / self.d)
+        return found if found[0] > 0 else None
+
+    def _rows_of(self, rows):
+        """(row whose b counts, row) of the rows of an island: of a contact b of its normal."""
+        ptr, kind = self.cones["ptr"], self.cones["kind"]
+        for k in range(len(kind)):
+            for row in range(ptr[k], ptr[k + 1]) if rows[ptr[k]] else ():
+                yield (row if kind[k] == ROW else ptr[k]), row
+
+    def _own_floor(self, f, first, row, whole):
+        if self.b[first] != 0:
+            return f[row] * np.sqrt(self.d[first] / self.d[row]) / np.abs(self.b[first])
+        return ZERO if f[row] == 0 else f[row] / np.sqrt(self.d[row]) / whole if whole > 0 else L(np.inf)
+
+    def _held(self, lam, w, rounding):
+        """(m,) rows whose slack holds them at their bound, a contact at zero impulse, by more than its rounding."""
+        low, high = self._low(), self._high()
+        out = ((lam == low) & (w > rounding)) | ((lam == high) & (-w > rounding))
+        for part, parts in self._contacts():
+            gap, line = w[part][0], rounding[part][0]
+            if self.law == "cone":
+                gap -= sum(reach * norm(w[part][at]) for at, reach in parts)
+                line += sum(reach * rounding[part][at].sum() for at, reach in parts)
+            out[part] = gap > line and not lam[part].any()
+        return out
+
+    def _contacts(self):
+        """(rows, parts) of each contact; a round cone is one part."""
+        ptr = self.cones["ptr"]
+        for k in np.flatnonzero(self.cones["kind"] != ROW):
+            parts = self.parts(k)
+            if self.cones["kind"][k] == ROUND:
+                parts = [(list(range(1, ptr[k + 1] - ptr[k])), self.mu[k])]
+            yield slice(ptr[k], ptr[k + 1]), parts
+
+    def _by_rows(self, rows, error, whole):
+        """Largest error of the rows of an island, each over its own b, a contact's over that of its normal.
+
+        Without b sqrt(d) |e| over E0 of all rows.
+        """
+        ptr, kind, worst = self.cones["ptr"], self.cones["kind"], ZERO
+        for k in range(len(kind)):
+            part = slice(ptr[k], ptr[k + 1])
+            if not rows[ptr[k]]:
+                continue
+            size = np.sqrt(self.d[part]) * np.abs(error[part])
+            own = np.abs(self.b[part]) / np.sqrt(self.d[part])
+            if kind[k] != ROW:
+                size, own = np.sqrt((size**2).sum())[None], own[:1]
+            for x, y in zip(size, np.where(own > 0, own, whole), strict=True):
+                worst = max(worst, ZERO if x == 0 else x / y if y > 0 else L(np.inf))
+        return worst
 
     def _own(self, e, lam, w):
         """(m,) d |lambda| of pairs whose norm is cut to its bound."""

@@ -19,7 +19,7 @@ from lavender.base.deadline import Deadline
 from lavender.base.errors import InputError
 from lavender.external.as_qp import QP, target
 from lavender.judge.certificates import check_certificate
-from lavender.judge.residuals import at_floor, quick
+from lavender.judge.residuals import quick
 from lavender.judge.solution import Claim, Status, summed
 from lavender.problem import Problem
 from lavender.solvers.certify import check_infeasible
@@ -121,14 +121,13 @@ def ask(
     while limits:
         last = _once(qp, impulse, call, limits.pop(0), settings, noisy)
         work = summed((work, last.work))
-        relative, floor = quick(problem, impulse, w, e, floor=True)
+        relative, above = quick(problem, impulse, w, e, floor=True)
         if best is None or relative < best[0]:
-            best = (relative, last, impulse.copy(), floor)
+            best = (relative, last, impulse.copy(), above)
         left = max_iter - work.get("iterations", 0)
         if (
             last.status is not Status.CONVERGED
-            or relative <= tol
-            or at_floor(relative, floor)
+            or above <= tol
             or left <= 0
             or deadline.passed()
             or np.any(e[qp.assumed] != 0.0)  # another program is to be solved
@@ -144,7 +143,7 @@ def ask(
         infeasible, proved, _ = check_infeasible(problem, last, tol, deadline)
         if proved:
             return replace(infeasible, work=work, iterations=work.get("iterations", 0))
-    relative, claim, impulse[:], floor = best
+    relative, claim, impulse[:], above = best
     status, words = claim.status, claim.message
     if last is not claim and last.status is not Status.CONVERGED and relative > tol:
         # The best answer and its own claim are kept: a stricter call that fails says nothing about that answer.
@@ -155,7 +154,7 @@ def ask(
         status = Status.STALLED
     if tol == 0.0 and status is Status.CONVERGED:
         status, words = Status.STALLED, f"{words}; tol=0: ran at its tightest tolerance"
-    elif status is Status.CONVERGED and relative > tol and not at_floor(relative, floor):
+    elif status is Status.CONVERGED and relative > tol and not above <= tol:
         # Its tests are of other norms: it says nothing false where it could not be asked more closely.
         if limits:
             status = Status.TIME_LIMIT if deadline.passed() else Status.MAX_ITERATIONS

@@ -14,7 +14,7 @@ from lavender.base.later import above, issparse
 from lavender.gradient.chains import Bodies, Parts
 from lavender.gradient.result import BODIES, INPUTS, MATRICES, REACHES, Gradient
 from lavender.gradient.system import SMALL, System, prepared
-from lavender.judge.residuals import at_floor, residual
+from lavender.judge.residuals import residual
 from lavender.judge.states import States, linear_of, states_of
 from lavender.problem import Problem, check_problem
 from lavender.problem.derived import cached_property
@@ -563,7 +563,7 @@ def derivative(problem: Problem, solution: Any) -> Derivative:
     check_problem(problem)
     x = problem.impulse_array(getattr(solution, "impulse", solution))
     linear = linear_of(problem, x, SMALL)
-    if not (linear.relative <= ACCEPTED or at_floor(linear.relative, linear.floor)):
+    if not linear.above_floor <= ACCEPTED:
         found = residual(problem, x, "float64")
         if not (found.nothing_to_do and found.rounds):
             raise InputError(

@@ -289,7 +289,9 @@ class _Island:
         half = np.eye(1)
         for i in np.flatnonzero(uncertain & ~self.is_contact):
             p[i, i] = 0.5
-            groups.append(_Group(np.array([i]), half, np.array([i]), half, 0.5))
+            groups.append(
+                _Group(left_rows=np.array([i]), left=half, right_rows=np.array([i]), right=half, radius=0.5)
+            )
         for block, components in self.contacts:
             unit = np.eye(len(block))
             both = [c for c in components if uncertain[c.rows[0]]]
@@ -297,7 +299,7 @@ class _Island:
                 a = _norm([c.reach for c in components])
                 radius = 0.5 if self.is_cone else 0.5 * (a + np.sqrt(a * a + 1.0))
                 p[np.ix_(block, block)] = 0.5 * unit
-                groups.append(_Group(block, unit, block, unit, radius))
+                groups.append(_Group(left_rows=block, left=unit, right_rows=block, right=unit, radius=radius))
                 continue
             for c in components if self.case[block[0]] != CASES["open"] else ():
                 if uncertain[c.rows[0]]:
@@ -310,9 +312,25 @@ class _Island:
         """Group of (5)."""
         if self.is_cone:
             unit = np.eye(len(c.block))
-            return _Group(c.block, unit, c.block, unit, None, c, is_uncertain)
+            return _Group(
+                left_rows=c.block,
+                left=unit,
+                right_rows=c.block,
+                right=unit,
+                radius=None,
+                component=c,
+                is_uncertain=is_uncertain,
+            )
         right = np.concatenate([c.block[:1], c.rows])
-        return _Group(c.rows, np.eye(len(c.rows)), right, np.eye(len(right)), None, c, is_uncertain)
+        return _Group(
+            left_rows=c.rows,
+            left=np.eye(len(c.rows)),
+            right_rows=right,
+            right=np.eye(len(right)),
+            radius=None,
+            component=c,
+            is_uncertain=is_uncertain,
+        )
 
     def _make_stick_or_slide_groups(self, c: _Component, x: FloatArray, p: FloatArray) -> list[_Group]:
         """Groups of a component that sticks or slides, its contact closed; P0 into p."""
@@ -320,12 +338,18 @@ class _Island:
         if not _norm(x[c.rows]) < 0.5 * t:  # in no known direction
             if self.is_cone:
                 p[np.ix_(c.block, c.block)] = 0.5 * unit
-                return [_Group(c.block, unit, c.block, unit, 0.5)]
+                return [_Group(left_rows=c.block, left=unit, right_rows=c.block, right=unit, radius=0.5)]
             p[np.ix_(c.rows, c.block)] = 0.0
             p[c.rows, c.rows] = 0.5
             right = np.concatenate([c.block[:1], c.rows])
             return [
-                _Group(c.rows, np.eye(len(c.rows)), right, np.eye(len(right)), float(np.sqrt(a * a + 0.25)))
+                _Group(
+                    left_rows=c.rows,
+                    left=np.eye(len(c.rows)),
+                    right_rows=right,
+                    right=np.eye(len(right)),
+                    radius=float(np.sqrt(a * a + 0.25)),
+                )
             ]
         u, length = self.y[c.rows] / t, float(np.sqrt(1.0 + a * a))
         across = np.concatenate([[a], -u])[:, None] / length
@@ -334,11 +358,24 @@ class _Island:
         if self.is_cone:
             p[np.ix_(c.block, c.block)] = unit
             p[np.ix_(rows, rows)] -= 0.5 * across @ across.T
-            return [_Group(rows, across, rows, across, 0.5, c), *turning]
+            return [
+                _Group(left_rows=rows, left=across, right_rows=rows, right=across, radius=0.5, component=c),
+                *turning,
+            ]
         p[np.ix_(c.rows, c.block)] = 0.0
         p[c.rows, c.rows] = 1.0
         p[np.ix_(c.rows, rows)] += 0.5 * length * u[:, None] @ across.T
-        return [_Group(c.rows, u[:, None], rows, across, 0.5 * length, c), *turning]
+        return [
+            _Group(
+                left_rows=c.rows,
+                left=u[:, None],
+                right_rows=rows,
+                right=across,
+                radius=0.5 * length,
+                component=c,
+            ),
+            *turning,
+        ]
 
     def _compute_radius(self, group: _Group, x: FloatArray) -> float:
         """Bound E of a group, |dy| <= x (n,), if need be by (5); inf if the direction of sliding is not known."""

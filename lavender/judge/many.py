@@ -102,6 +102,7 @@ class Many:
         known = {
             "relative": found.relative, "energy": found.energy, "speed": found.velocity, "floor": found.floor,
             "start_energy": found.energy_start, "start_speed": found.velocity_start,
+            "above_floor": found.above_floor,
             "push": abs(found.error[found.worst_row]) if found.worst_row >= 0 else 0.0,
         }  # fmt: skip
         for name, x in known.items():
@@ -190,7 +191,7 @@ class Residuals(Many):
         nothing = (self._numbers("start_relative") < 0.5) | (self._numbers("start_speed") < AT_REST)
         for i, known in self._nothing.items():
             nothing[i] = known
-        names = "relative", "floor", "energy", "speed", "rhs_energy"
+        names = "relative", "floor", "above_floor", "energy", "speed", "rhs_energy"
         each = zip(
             *(self._numbers(name).tolist() for name in names), nothing.tolist(), self.precision, strict=True
         )

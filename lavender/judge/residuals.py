@@ -5,16 +5,18 @@ block (an inactive row: w / d, the step that is missing; formulas in `lavender_e
 
     energy    E = sqrt(sum d e^2)                    [sqrt J]
     velocity  V = max sqrt(nu d) |e|                 [m/s]
-    relative  max(E / E0, V / V0)                    [-]     E0, V0: E, V of doing nothing, lambda = Pi(0)
+    relative  max(E / E0, V / V0)                    [-]     E0, V0: E, V of the zero impulse, lambda = Pi(0)
     floor     2^-53 (|A| |lambda| + |b|) measured by the same two norms: the error of rounding lambda to
               float64; no solver can guarantee less than about twice that
     success   relative <= tol
 
-Where the floor is 1e-3 or more, rounding hides a thousandth of what doing nothing leaves: the floor is then the
-relative residual, unless that is more. An impulse that ran away is no solution.
+Relative residual and floor are those of the worst island: each island (blocks connected through moving bodies, trees of
+M or entries of A) has its own E, V, E0 and V0, so bodies that never meet do not change each other's verdict. E shows
+errors of heavy bodies, V those of light ones. If the zero impulse solves an island, row by row to rounding, its
+reference is the size of the terms of the rows that act (`lavender_ext/judge/reference.pxd`).
 
-If doing nothing already solves the problem to rounding (E0 <= 2^-48 of the energy norm of b), the norms of b replace E0
-and V0. E shows errors of heavy bodies, V those of light ones.
+If the floor is 1e-3 or more, rounding hides a thousandth of the zero impulse's error: the floor is then the relative
+residual, unless that is larger. An impulse that ran away is not a solution.
 
 A solution computed in float32 has a floor of its own. Each number is rounded independently by at most u = 2^-24 of
 itself, so the squares of the errors add up. Entry by entry (A^2 is A o A), with x = M^-1 J^T lambda, w^2 grows by
@@ -39,14 +41,16 @@ problem's rows.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from lavender.base.arrays import ArrayLike, FloatArray, as_array, number, one_of, read_only
+from lavender.base.arrays import ArrayLike, FloatArray, IntArray, as_array, number, one_of, read_only
 from lavender.base.errors import InputError
 from lavender.problem import PRECISIONS, Problem, check_problem
+from lavender.problem.derived import cached_property
 from lavender_ext.judge import measure
 
 FLOOR_MOST = 1e-5  # relative residual above which `at_floor` takes no floor of float64 for a reason
@@ -57,7 +61,7 @@ RESULT, PASS = 1e-4, 1.5e-9  # s of one result, and for each multiply-add of the
 WHITENED, READ = 4e-10, 5e-9  # s for each product that J L^-1 takes, and for each entry of it, or of a matrix
 OF_ROW = 32  # multiply-adds of that pass for each row on two bodies
 
-# (relative, floor): the test of every solver and of the judge, its reason with it
+# (relative, floor) of one island: the test of every solver and of the judge, its reason with it
 at_floor = measure.at_floor
 
 ENOUGH = 1e-6  # m/s, below which a robot's velocities are no further off than anybody measures
@@ -80,6 +84,17 @@ class Rounding:
         return f"impulse {self.impulse:.1e}, data {self.data:.1e}{more}"
 
 
+class Islands(NamedTuple):
+    """Errors of n islands, sets of blocks that share no moving body, tree of M or entry of A with other blocks."""
+
+    label: IntArray  # (k,) island of each block
+    relative: FloatArray  # (n,) -, larger of E / E0 and V / V0
+    energy: FloatArray  # (n,) sqrt J, E
+    velocity: FloatArray  # (n,) m/s, V
+    energy_start: FloatArray  # (n,) sqrt J, E0; -1 if no row acts: each row is then compared with its own b
+    velocity_start: FloatArray  # (n,) m/s, V0
+
+
 @dataclass(frozen=True, eq=False)
 class Residual:
     """Error of one impulse. `str()` is one line.
@@ -87,15 +102,21 @@ class Residual:
     Parameters
     ----------
     relative : float, -
-        max(energy / energy_start, velocity / velocity_start).
+        The larger of E / E0 and V / V0, of the island where it is largest.
     energy, energy_start : float, sqrt J
-        E of the impulse, and of doing nothing (or the norm of b).
+        E of the impulse and of the zero impulse, over all rows.
     velocity, velocity_start : float, m/s
-        V of the impulse, which is that of its worst row, and of doing nothing.
+        V of the impulse, which is that of its worst row, and of the zero impulse, over all rows.
     floor : float, -
-        Relative residual that rounding to `precision` alone costs.
+        Relative residual that rounding to `precision` alone costs, in the island of `relative`.
     worst_row : int
         Row of the largest velocity error, -1 for an empty problem; `worst_name` is its name.
+    above_floor : float, -
+        Largest relative residual of the islands whose residual rounding does not explain; 0 if there is none.
+    worst_island : int
+        Island of `relative` (see `islands`), -1 if all blocks are one island.
+    floor_energy : float, sqrt J
+        E that rounding of float64 alone costs, over all rows.
     error : (m,) N s
         e of each row; `velocity_by_row` has it in m/s.
     slack : (m,) m/s
@@ -118,6 +139,10 @@ class Residual:
     error: FloatArray = field(repr=False)
     slack: FloatArray = field(repr=False)
     _problem: Problem = field(repr=False)
+    _impulse: FloatArray = field(repr=False)
+    above_floor: float = 0.0
+    worst_island: int = -1
+    floor_energy: float = 0.0
     precision: str = "float64"
     rounding: Rounding | None = None
     threshold: float = ENOUGH
@@ -130,7 +155,7 @@ class Residual:
         times: there it is a root of squares that has each number at its worst, sqrt(3) standard deviations, and many
         rows have a largest one; rounding the data alone can come near what doing nothing is off.
         """
-        return _at_floor(self.relative, self.floor, self.precision)
+        return _at_floor(self.relative, self.above_floor, self.precision)
 
     @property
     def rounds(self) -> bool:
@@ -146,8 +171,8 @@ class Residual:
         convergence: another mu, say, leaves the same error.
         """
         return verdict_of(
-            self.relative, self.floor, self.energy, self.velocity, self.energy_rhs, self.nothing_to_do,
-            self.precision, self.threshold,
+            self.relative, self.floor, self.above_floor, self.energy, self.velocity, self.energy_rhs,
+            self.nothing_to_do, self.precision, self.threshold,
         )  # fmt: skip
 
     @property
@@ -184,6 +209,13 @@ class Residual:
         p = self._problem
         return p.disk.metric.weight * np.abs(p.on_disk(self.error))
 
+    @cached_property
+    def islands(self) -> Islands:
+        """Error of each island, in the order of their first blocks."""
+        problem = self._problem.disk
+        label, table = measure.by_island(problem.metric, self._impulse)
+        return Islands(label, *table.T)
+
     def __str__(self) -> str:
         worst = f", worst {self.worst_name} ({self.velocity:.2g} m/s)" if self.worst_row >= 0 else ""
         text = (
@@ -199,16 +231,15 @@ def _rounds(relative: float, floor: float, precision: str) -> bool:
     return relative <= (2.0 if precision == "float64" else 4.0) * floor < math.inf
 
 
-def _at_floor(relative: float, floor: float, precision: str) -> bool:
+def _at_floor(relative: float, above_floor: float, precision: str) -> bool:
     """`Residual.at_floor`, of numbers."""
-    if precision == "float64":
-        return bool(at_floor(relative, floor))
-    return _rounds(relative, floor, precision) and relative < 1.0
+    return above_floor == 0.0 and (precision == "float64" or relative < 1.0)
 
 
 def verdict_of(
     relative: float,
     floor: float,
+    above_floor: float,
     energy: float,
     velocity: float,
     energy_rhs: float,
@@ -217,7 +248,7 @@ def verdict_of(
     threshold: float,
 ) -> str:
     """`Residual.verdict`, of numbers; nothing: doing nothing is right; energy_rhs [sqrt J] is the norm of b."""
-    if _at_floor(relative, floor, precision):
+    if _at_floor(relative, above_floor, precision):
         return AT_FLOOR
     if nothing and _rounds(relative, floor, precision):
         # Relative to nothing 1 means nothing: an impulse that ran away has more error than b.
@@ -233,30 +264,27 @@ def relative_of(data: Any, energy: float, velocity: float) -> float:
 
 
 def reference(problem: Problem) -> tuple[float, float]:
-    """E0 [sqrt J] and V0 [m/s]; computed once per problem."""
+    """E0 [sqrt J] and V0 [m/s] over all rows; computed once per problem, with those of each island."""
     data = problem.metric
     if data.start_energy < 0.0:
         start = measure.begin(data)
         if problem.derived.start is None:
             problem.derived.start = start
         if problem.generalized is not None and "csr_data" in problem.__dict__:
-            problem.csr_data.set_start(data.start_energy, data.start_velocity)
+            problem.csr_data.share_reference(data)
     return data.start_energy, data.start_velocity
 
 
 def nothing_to_do(problem: Problem) -> bool:
-    """Whether doing nothing is right: E0 <= 2^-48 of the energy norm of b, or V0 < 1e-9 m/s.
+    """Whether the zero impulse solves every island (`lavender_ext/judge/reference.pxd`), or leaves less than 1e-9 m/s.
 
-    Such a problem is neither solved nor failed by anybody. Relative to nothing, rounding is everything: a residual of
-    it means something in units alone.
+    Such a problem is neither solved nor failed by a solver: its relative residual compares rounding with rounding, so
+    read its errors in units.
     """
     problem = problem.disk
-    kept = problem.derived
-    if kept.nothing is None:
-        m = problem.m
-        energy, velocity, *_ = measure.judge(problem.metric, problem._start, np.empty(m), np.empty(m), False)
-        kept.nothing = bool(energy <= 2.0**-48 * measure.rhs_norms(problem.metric)[0] or velocity < AT_REST)
-    return kept.nothing
+    reference(problem)
+    data = problem.metric
+    return bool(data.start_relative < 0.5 or data.start_velocity < AT_REST)
 
 
 def judged(problem: Problem, impulse: FloatArray) -> measure.Judged:
@@ -265,6 +293,19 @@ def judged(problem: Problem, impulse: FloatArray) -> measure.Judged:
     if data.start_energy < 0.0:
         reference(problem)
     return measure.Judged(data, impulse)
+
+
+def best_of_islands(
+    problem: Problem, starts: Sequence[FloatArray], impulses: Sequence[FloatArray], tol: float
+) -> FloatArray:
+    """Return the best of starts and impulses (m,) [N s] in each island (`lavender_ext/judge/best.pxd`).
+
+    Of the starts an island keeps the one with the lowest relative residual. An impulse replaces it if it solves the
+    island, or if its energy is lower there and its relative residual no larger.
+    """
+    reference(problem)
+    best: FloatArray = measure.best_of_islands(problem.metric, list(starts), list(impulses), tol)
+    return best
 
 
 def judging_time(problem: Problem) -> float:
@@ -325,10 +366,13 @@ def known(problem: Problem, impulse: FloatArray) -> float | None:
 def quick(
     problem: Problem, impulse: FloatArray, w: FloatArray, e: FloatArray, floor: bool = False
 ) -> tuple[float, float]:
-    """(relative, floor) with w, e as scratch (m,): the solvers' own stopping test, the judge's arithmetic."""
+    """Return (relative, above_floor) as `Residual` has them, with w, e as scratch (m,): a solver's stopping test.
+
+    Without `floor` both are the relative residual.
+    """
     reference(problem)
-    _, _, relative, left = measure.judge(problem.metric, impulse, w, e, floor)
-    return relative, left
+    _, _, relative, above = measure.judge(problem.metric, impulse, w, e, floor)
+    return relative, above
 
 
 def residual(
@@ -392,9 +436,15 @@ def _in_float32(problem: Problem, found: Residual, impulse: FloatArray) -> Resid
     """The same error beside the floor of float32."""
     with np.errstate(over="ignore", invalid="ignore"):  # an impulse that is not finite has no floor
         own, data, velocities = rounded(problem, impulse)
+        relative = [found.relative] if found.worst_island < 0 else found.islands.relative.tolist()
         squares = own, data, velocities, own + data + velocities
-    *parts, floor = (measure.size_of_square(problem.metric, x) for x in squares)
-    return replace(found, precision="float32", floor=floor, rounding=Rounding(*parts))
+    sizes = [measure.size_of_square(problem.metric, x) for x in squares]
+    *parts, floor = (x[max(found.worst_island, 0)] for x in sizes)
+    explained = [
+        _rounds(x, least, "float32") and x < 1.0 for x, least in zip(relative, sizes[-1], strict=True)
+    ]
+    above = max((x for x, rounds in zip(relative, explained, strict=True) if not rounds), default=0.0)
+    return replace(found, precision="float32", floor=floor, above_floor=above, rounding=Rounding(*parts))
 
 
 def rounded(problem: Problem, impulse: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -436,12 +486,16 @@ def told(problem: Problem, last: measure.Judged) -> Residual:
         "energy": last.energy,
         "velocity": last.velocity,
         "floor": last.floor,
+        "above_floor": last.above_floor,
+        "worst_island": last.island,
+        "floor_energy": last.floor_energy,
         "worst_row": last.worst,
         "energy_start": problem.metric.start_energy,
         "velocity_start": problem.metric.start_velocity,
         "error": read_only(last.error),
         "slack": read_only(last.slack),
         "_problem": problem,
+        "_impulse": last.impulse,
         "precision": "float64",
         "rounding": None,
     }

@@ -331,7 +331,7 @@ def _by_sparse_cholesky(a: sp.csr_array, limit: float) -> Places:
     block = block[np.ix_(block.diagonal() > limit, block.diagonal() > limit)]
     if not len(some):
         return left
-    dependent = _by_cholesky(np.asfortranarray(0.5 * (block + block.T)), limit)
+    dependent = _by_cholesky(np.asfortranarray(0.5 * (block + block.T)), math.sqrt(limit))
     return np.delete(left, np.delete(some, dependent))
 
 

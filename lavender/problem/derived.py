@@ -28,7 +28,6 @@ class Derived:
         "judged",
         "lock",
         "motion",
-        "nothing",
         "process",
         "proof",
         "small",
@@ -41,7 +40,6 @@ class Derived:
 
     def __init__(self) -> None:
         self.lock, self.process = RLock(), _process  # held while a `once` is worked out, in this process
-        self.nothing: bool | None = None  # whether doing nothing is right
         self.judged: Judged | None = None  # the judge's pass over a result that is about to be returned
         self.proof: Any = None  # the last certificate that was looked at, and what it proves
         self.view: Data | None = None  # in generalised coordinates: what kernels read, from the beginning

@@ -124,7 +124,7 @@ class Operators(ProblemData):
         if self.rows is not None:
             data.weigh_as(self.metric)
         if self.generalized is not None and self.metric.start_energy >= 0.0:
-            data.set_start(self.metric.start_energy, self.metric.start_velocity)
+            data.share_reference(self.metric)
         return data
 
     @once

@@ -43,6 +43,7 @@ import numpy as np
 from lavender.base.arrays import FloatArray
 from lavender.base.deadline import NEVER, Deadline, seconds
 from lavender.base.errors import BREAKDOWN, last_words
+from lavender.judge.residuals import best_of_islands
 from lavender.judge.solution import Claim, Status
 from lavender.problem import OPERATORS, Problem
 from lavender.problem.derived import cached_property
@@ -314,7 +315,10 @@ class Auto(Solver):
             log.interrupted = True  # the best impulse goes back all the same
         except BREAKDOWN as error:
             log.failure = last_words(error)
-        impulse[:] = log.impulse
+        if log.best > tol and log.result is not None:
+            impulse[:] = best_of_islands(problem, (impulse,), (log.result,), tol)
+        else:
+            impulse[:] = log.impulse
         return log.claim()
 
 

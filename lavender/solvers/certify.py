@@ -26,7 +26,7 @@ from lavender.base.deadline import Deadline
 from lavender.base.errors import InputError
 from lavender.base.later import sparse as sp
 from lavender.judge.certificates import Proof, fighting, prove
-from lavender.judge.residuals import quick, reference, residual
+from lavender.judge.residuals import residual
 from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
 from lavender.problem.ordering import blocks_of_each
@@ -36,6 +36,7 @@ from lavender.solvers.registry import get
 from lavender.solvers.setup_times import loading
 from lavender.solvers.solve_log import SolveLog
 from lavender_ext.core.checks import LEAST, MOST
+from lavender_ext.judge.measure import by_island
 
 CERTIFICATE_ROWS = (
     3000  # rows up to which a linear program is asked for a certificate, of all islands together
@@ -223,26 +224,17 @@ def _parts(log: SolveLog) -> Any:
         yield problem, slice(None)
         return
     blocks = blocks_of_each(count, label)
-    for i in sorted(_wrong(log, count, label), key=lambda i: len(blocks[i])):
+    for i in sorted(_wrong(log, label), key=lambda i: len(blocks[i])):
         rows = rows_of(problem, blocks[i])
         yield restrict(problem, blocks[i], rows), rows
 
 
-def _wrong(log: SolveLog, count: int, label: IntArray) -> IntArray:
-    """The islands that miss an equal share of the tolerance in energy, or the tolerance in velocity.
-
-    A pair of tangents counts by its norm, at most sqrt(2) times its larger entry.
-    """
-    problem = log.problem
-    energy, velocity = reference(problem)
-    gap, error = np.empty(problem.m), np.empty(problem.m)
-    quick(problem, log.impulse, gap, error)
-    of_row = np.repeat(label, np.diff(problem.cones.ptr))
-    own = np.bincount(of_row, problem.d * error**2, minlength=count)
-    fast = np.zeros(count)
-    np.maximum.at(fast, of_row, problem.metric.weight * np.abs(error))
-    wrong = ~(own <= (log.tol * energy) ** 2 / count) | ~(np.sqrt(2.0) * fast <= log.tol * velocity)
-    return np.flatnonzero(wrong).astype(np.int32)
+def _wrong(log: SolveLog, label: IntArray) -> IntArray:
+    """Return the islands whose relative residual is above the tolerance."""
+    own, table = by_island(log.problem.metric, log.impulse)
+    if len(table) == 1:
+        return np.unique(label) if table[0, 0] > log.tol else np.zeros(0, np.int32)
+    return np.unique(label[(table[:, 0] > log.tol)[own]])
 
 
 def _is_open(problem: Problem) -> bool:

@@ -29,7 +29,7 @@ import numpy as np
 from lavender.base.arrays import FloatArray
 from lavender.base.deadline import Deadline
 from lavender.judge.certificates import NEAR, check_certificate
-from lavender.judge.residuals import FLOOR_MOST, at_floor, judged, remember
+from lavender.judge.residuals import FLOOR_MOST, judged, remember
 from lavender.judge.solution import Claim, Status, summed
 from lavender.problem import Problem
 from lavender.solvers.factors import SMALL_SIZE, GeneralFactor, PanelsLU
@@ -205,7 +205,7 @@ class _Run:
         return self.best <= max(self.least, min(self.floor, FLOOR_MOST))
 
     def at_floor(self) -> bool:
-        return at_floor(self.best, self.floor)
+        return self.kept is not None and self.kept.above_floor <= self.tol
 
     @property
     def out_of_time(self) -> bool:

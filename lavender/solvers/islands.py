@@ -1,4 +1,4 @@
-"""Islands: blocks that share no moving body, no kinematic tree or no entry of A are problems of their own."""
+"""Islands of a problem (`lavender_ext/core/islands.pxd`) and the problems that they are on their own."""
 
 from __future__ import annotations
 
@@ -14,18 +14,13 @@ from lavender_ext.factor import graph
 
 
 def islands(problem: Problem) -> tuple[int, IntArray]:
-    """How many islands there are, and the island of each block (k,), numbered in block order.
+    """Return the number of islands and the island of each block (k,), numbered in block order.
 
     A block between static bodies alone, or with an empty row of A, is an island of its own.
     """
-    cones = problem.cones
-    if problem.rows is not None:
-        return graph.body_components(problem.rows.block_bodies, problem.rows.n_bodies)
-    if problem.generalized is not None:
-        return graph.tree_components(problem.derived.view)
-    block = np.repeat(np.arange(cones.n_blocks, dtype=np.int32), np.diff(cones.ptr))
-    indptr, indices, _ = problem._compressed
-    return graph.matrix_components(cones.ptr, block, indptr, indices)
+    view = problem.derived.view
+    count, label = (problem.data if view is None else view).islands()
+    return int(count), label
 
 
 def pairs(problem: Problem) -> int:

@@ -19,7 +19,7 @@ import numpy as np
 from lavender.base.arrays import FloatArray
 from lavender.base.deadline import CHUNK_TIME, Deadline
 from lavender.judge.certificates import check_certificate
-from lavender.judge.residuals import at_floor, remember
+from lavender.judge.residuals import remember
 from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
 from lavender.solvers.certify import CERTIFICATE_ROWS, LINEAR_PROGRAM, find_direction
@@ -110,7 +110,7 @@ class Lemke(Solver):
             elif code == DONE and rows.relative <= tol:
                 status, message = Status.CONVERGED, ""
             elif code == DONE:
-                status = Status.FLOOR if at_floor(rows.relative, rows.floor) else Status.STALLED
+                status = Status.FLOOR if rows.above_floor <= tol else Status.STALLED
             elif code == LATE or deadline.passed():
                 status = Status.TIME_LIMIT
             elif paths.pivots >= max_iter:

@@ -16,7 +16,7 @@ import numpy as np
 from lavender.base.arrays import FloatArray
 from lavender.base.deadline import CHUNK_TIME, Deadline, Stopwatch
 from lavender.base.errors import BREAKDOWN, last_words
-from lavender.judge.residuals import Residual, judged, known, remember, remembered, residual
+from lavender.judge.residuals import Residual, best_of_islands, judged, remember, remembered, residual
 from lavender.judge.solution import (
     INTERRUPTED,
     MAX_ITERATIONS,
@@ -28,14 +28,19 @@ from lavender.judge.solution import (
     summed,
 )
 from lavender.problem import Problem
+from lavender.problem.cones import project
 from lavender.solvers.registry import Solver, State
-from lavender_ext.judge.measure import all_finite
+from lavender_ext.judge.measure import same_bits
+from lavender_ext.judge.watch import Watch
 
 LEAST = 1e-6  # s, what is left of a limit for a solver that is called at all
 SHARE = 0.7  # of what is left, for a chunk at the pace of the last
 FIRST_CHUNK = 256  # iterations: 10 ms at 40 us each, slower than any compiled sweep of few rows
 Callback = Callable[[int, FloatArray, Residual], Any]
 Record = tuple[int, float, float, float, float]  # iterations, s, relative, energy, velocity
+BOUND_ROUNDING = (
+    1e-12  # Impulses closer to their bounds than this share are within them: projections round as much.
+)
 NOTHING_DONE = Claim(MAX_ITERATIONS, 0)
 
 
@@ -72,13 +77,8 @@ class Loop:
         except KeyboardInterrupt:
             claim = Claim(INTERRUPTED, 0, {}, "Ctrl-C")
         # It was in the middle of whatever it does.
-        if not all_finite(self.impulse) or self._is_worse_than(start_point):
-            self.impulse[:] = start_point
+        self.impulse[:] = best_of_islands(self.problem, (start_point,), (self.impulse,), self.tol)
         return claim
-
-    def _is_worse_than(self, impulse: FloatArray) -> bool:
-        last, other = (judged(self.problem, x.copy()) for x in (self.impulse, impulse))
-        return last.relative > other.relative
 
     def call(self, max_iter: int, time_limit: float | None) -> Claim:
         """Run at most so many iterations of the solver; an arithmetic breakdown becomes a claim."""
@@ -145,12 +145,15 @@ class Loop:
         left = self.deadline.left()
         return CHUNK_TIME if left is None else min(CHUNK_TIME, SHARE * left)
 
-    def not_worse(self, start: FloatArray) -> None:
-        """The best of what was found, where it began, and doing nothing."""
+    def not_worse(self, start: FloatArray, or_zero: bool = True) -> None:
+        """Keep the best of the result, the start and, with `or_zero`, the zero impulse in each island.
+
+        A result that meets tol stays as it is.
+        """
         problem = self.problem
         found = remembered(problem, self.impulse) or judged(problem, self.impulse.copy())
         if found.relative > self.tol:
-            found = best_of(problem, found, start)
+            found = best_of(problem, found, start, self.tol, or_zero)
         remember(problem, found)
         self.impulse[:] = found.impulse
 
@@ -159,14 +162,18 @@ class Loop:
         if self.tol == 0.0:
             return
         state: State = self.state
+        watch = getattr(state, "watch", None)
+        if isinstance(watch, Watch):
+            watch.keep_best(self.impulse, self.tol)
+            return
         best = getattr(state, "best", None)
         if best is None or best[1] is None:
             return
         last = remembered(self.problem, self.impulse) or judged(self.problem, self.impulse.copy())
-        if last.relative <= best[0]:
+        if last.relative <= self.tol:
             remember(self.problem, last)  # for the result
         else:
-            self.impulse[:] = best[1]
+            self.impulse[:] = best_of_islands(self.problem, (best[1],), (self.impulse,), self.tol)
 
     def _record(self) -> bool:
         r = residual(self.problem, self.impulse, "float64")
@@ -190,11 +197,17 @@ class Loop:
         return History(np.array(columns[0], np.int64), *(np.array(c, float) for c in columns[1:]))
 
 
-def best_of(problem: Problem, found: Any, start: FloatArray | None) -> Any:
-    """What the judge found, or what he finds of where it began (m,), or of doing nothing, if that is better."""
-    for other in (problem._start if start is None else start, problem._start):
-        relative = known(problem, other)
-        if relative is None or relative < found.relative:
-            last = judged(problem, other.copy())
-            found = last if last.relative < found.relative else found
-    return found
+def best_of(problem: Problem, found: Any, start: FloatArray | None, tol: float, or_zero: bool = True) -> Any:
+    """Return a pass of the judge over the best of `found`, the start (m,) and the zero impulse in each island.
+
+    What rounding alone keeps from tol is left as it is. An impulse outside its bounds is projected onto them first.
+    """
+    if found.above_floor <= tol:
+        return found
+    first, own = problem._start if start is None else start, found.impulse
+    with np.errstate(all="ignore"):  # impulses that overflow are judged below
+        inside = project(problem.cones, own)
+    if not np.allclose(inside, own, rtol=BOUND_ROUNDING, atol=0.0):
+        own = inside
+    best = best_of_islands(problem, (first, problem._start) if or_zero else (first,), (own,), tol)
+    return found if same_bits(best, found.impulse) else judged(problem, best)

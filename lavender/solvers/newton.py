@@ -37,7 +37,7 @@ from lavender.base.arrays import FloatArray, one_of
 from lavender.base.deadline import Deadline, Stopwatch, TooLate
 from lavender.base.errors import CapabilityError, InputError
 from lavender.judge.certificates import check_certificate
-from lavender.judge.residuals import at_floor, quick
+from lavender.judge.residuals import quick
 from lavender.judge.solution import Claim, Status, counted, summed
 from lavender.problem import OPERATORS, Problem
 from lavender.solvers.costs import SOFT, STEPS, Count, factorisations, newton_cost
@@ -235,8 +235,8 @@ class Newton(Solver):
         if bodies is None and (self.form == "velocity" or problem.m > ROWS or problem.cones.has_round):
             return claim
         w, e = np.empty(problem.m), np.empty(problem.m)
-        best, floor = quick(problem, impulse, w, e, True)
-        if at_floor(best, floor):
+        best, above = quick(problem, impulse, w, e, True)
+        if above <= tol:
             return claim
         before = impulse.copy()
         if not best <= WARM:

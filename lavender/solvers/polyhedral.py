@@ -25,7 +25,7 @@ from lavender.base.arrays import FloatArray
 from lavender.base.deadline import Deadline
 from lavender.base.later import sparse as sp
 from lavender.judge.certificates import check_certificate
-from lavender.judge.residuals import at_floor, quick
+from lavender.judge.residuals import quick
 from lavender.judge.solution import Claim, Status, summed
 from lavender.problem import Problem
 from lavender.problem.cones import project
@@ -214,11 +214,11 @@ class ThroughRows(Solver):
         if not np.isfinite(found).all():
             return replace(claim, status=Status.NUMERICAL_ERROR, certificate=None, dual=None)
         impulse[:] = found
-        relative, floor = quick(form.problem, impulse, np.empty_like(found), np.empty_like(found), floor=True)
+        relative, above = quick(form.problem, impulse, np.empty_like(found), np.empty_like(found), floor=True)
         status, words, proof = claim.status, claim.message, None
         if relative <= tol:
             status = Status.CONVERGED
-        elif at_floor(relative, floor):
+        elif above <= tol:
             status = Status.FLOOR
         elif status is Status.INFEASIBLE and claim.certificate is not None:
             proof = _whole(form.back @ claim.certificate)

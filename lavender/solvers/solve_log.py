@@ -9,7 +9,7 @@ import numpy as np
 from lavender.base.arrays import FloatArray
 from lavender.base.deadline import NEVER, Deadline
 from lavender.judge.certificates import check_certificate
-from lavender.judge.residuals import FLOOR_MOST, at_floor, judged, known, remember, remembered
+from lavender.judge.residuals import FLOOR_MOST, best_of_islands, judged, known, remember, remembered
 from lavender.judge.solution import Claim, Status, Turn, summed
 from lavender.problem import Problem
 from lavender.solvers.small import NO_TIME, NOTHING, told
@@ -27,7 +27,8 @@ class SolveLog:
         self.interrupted = False
         self.failure = ""  # what broke down, in words
         self.timed_out = False  # it ended a little before the deadline, as the rest of the time was too short
-        self.best, self.impulse = np.inf, problem._start  # least relative residual, (m,) N s
+        self.best, self.impulse = np.inf, problem._start  # lowest relative residual, (m,) N s
+        self.result: FloatArray | None = None  # (m,) N s, while nothing met tol: the best of each island
         self.given: FloatArray | None = None  # (m,) N s, a start that is worse than doing nothing
         self.turns: list[Turn] = []
         self.work: dict[str, int] = {}
@@ -37,7 +38,7 @@ class SolveLog:
         self.conflict: Any = None  # of `certify`: who fights in the convex relaxation, and what lifts it
 
     def offer(self, impulse: FloatArray) -> None:
-        """Judge an impulse (m,) and keep it if it is the best, also for the final judgement."""
+        """Judge an impulse (m,) and keep it in the islands where it is the best, also for the final judgement."""
         relative = known(self.problem, impulse)
         if relative is None:
             last = judged(self.problem, impulse.copy())
@@ -46,6 +47,9 @@ class SolveLog:
                 remember(self.problem, last)
         if relative < self.best:
             self.best, self.impulse = relative, impulse.copy()
+        if self.best > self.tol:
+            start = self.problem._start if self.result is None else self.result
+            self.result = best_of_islands(self.problem, (start,), (impulse,), self.tol)
 
     def note(self, name: str, claim: Claim, before: float) -> None:
         """Record a turn that has ended; the residual was `before`."""
@@ -89,7 +93,7 @@ class SolveLog:
         if self.best > FLOOR_MOST:
             return False
         last = remembered(self.problem, self.impulse) or judged(self.problem, self.impulse)
-        return at_floor(last.relative, last.floor)
+        return bool(last.above_floor <= self.tol)
 
     @property
     def status(self) -> Status:

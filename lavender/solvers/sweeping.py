@@ -51,9 +51,8 @@ class SweepState:
         self.problem = problem
         self.data = data  # lavender_ext.core.problem.Data that the kernel sweeps over, and that checks read
         self.order = self.plan = order  # `plan` is of the problem's own blocks
-        start = reference(problem)
-        if data is not problem.metric:
-            data.set_start(*start)  # the error of doing nothing is the judge's, in whatever form
+        reference(problem)
+        data.share_reference(problem.metric)  # residuals in any form are relative to the judge's reference
         self.watch = watch_over(problem, data, patience)
         # What the kernel runs over, a `lavender_ext.sweep.serial.Sweeps`; of blocks as they stand, relaxed, by default.
         self.sweeps = serial.Sweeps(data, *plan_of(order)) if sweeps is None else sweeps

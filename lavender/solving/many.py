@@ -17,7 +17,7 @@ from lavender.base.deadline import NEVER, Deadline
 from lavender.base.errors import InputError, LavenderError
 from lavender.judge.many import Many, given_problems, of_each
 from lavender.judge.residuals import judged, reading_time
-from lavender.judge.solution import Solution, Status, uninterrupted
+from lavender.judge.solution import CONTRADICTED, Solution, Status, uninterrupted
 from lavender.problem import Problem
 from lavender.problem.batch import Batch
 from lavender.problem.derived import cached_property
@@ -241,7 +241,8 @@ class Solutions(Many, Sequence[Solution]):
         rest = rest_of(problem, self._spec, found, counts, self.start(i), status)
         then = float(self._worlds.numbers[NUMBER["relative"], i])
         if status is Status.CONVERGED and found.relative != then:  # the same data have the same bits
-            rest["contradicted"] = (
+            rest["claim_check"] = CONTRADICTED
+            rest["status_conflict"] = (
                 f"says {status.name} of other data, with relative residual {then:.2e} (now {found.relative:.2e}): "
                 f"the arrays of world {i} were written over after the solve"
             )

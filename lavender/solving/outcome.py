@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from types import MappingProxyType
 from typing import Any
 
@@ -11,7 +12,7 @@ import numpy as np
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import InputError
 from lavender.judge.certificates import prove, rounded_down
-from lavender.judge.residuals import FLOOR_MOST, Residual, at_floor, reference, relative_of, residual
+from lavender.judge.residuals import best_of_islands, reference, relative_of, residual
 from lavender.judge.solution import (
     CONFIRMED,
     CONTRADICTED,
@@ -60,18 +61,15 @@ def finish(
 
     `refutation` says which solution the caller found if the solver claims that there is none.
     """
-    # In float64, in which solvers work, whatever the data were.
-    if claim.status is INFEASIBLE and all_finite(impulse):
-        impulse, judged = _within_bounds(problem, impulse)
-    else:
-        judged = residual(problem, impulse, "float64")
+    claim = name_lost_row(problem, impulse, claim)
+    if claim.status is INFEASIBLE and tol > 0.0:
+        # An engine that applies the impulse of an infeasible step must not pull at a contact.
+        impulse = best_of_islands(problem, (problem._start,), (project(problem.cones, impulse),), tol)
+    judged = residual(problem, impulse, "float64")  # in which solvers work, whatever the data were
     status, message = claim.status, claim.message
     relative = judged.relative
-    if status is not NUMERICAL_ERROR and not all_finite(impulse):
-        status, row = DIVERGED, int(np.argmin(np.isfinite(impulse)))
-        message = _joined(message, f"the impulse of {problem.row_name(row)} is {impulse[row]}")
-    elif (
-        status is CONVERGED
+    if (
+        status in (CONVERGED, STALLED)
         and tol < relative == judged.floor
         and relative_of(problem.metric, judged.energy, judged.velocity) <= tol
     ):
@@ -81,12 +79,12 @@ def finish(
         status = CONVERGED
     elif (
         problem.operator not in spec.operators
-        and ((status is CONVERGED and relative > tol) or (status is FLOOR and not judged.at_floor))
+        and ((status is CONVERGED and relative > tol) or (status is FLOOR and not judged.above_floor <= tol))
         and _holds_as_formed(problem, impulse, tol)
     ):
         status = STALLED
         message = _joined(message, "its test was met only on A as it was formed, not on the given data")
-    if status in (CONVERGED, STALLED) and tol < relative and judged.at_floor:
+    if status in (CONVERGED, STALLED) and judged.above_floor <= tol < relative:
         status = FLOOR
     certificate, bound, unproven, status_conflict = claim.certificate, None, "", ""
     if status is INFEASIBLE and relative <= tol:
@@ -111,9 +109,10 @@ def finish(
         status_conflict = f"says INFEASIBLE, {refutation}" if refutation else ""
     if status is CONVERGED and not relative <= tol:
         status_conflict = f"says CONVERGED, relative residual {relative:.2e} is above tol {tol:.1e}"
-    elif status is FLOOR and not judged.at_floor:
-        least = min(2.0 * judged.floor, FLOOR_MOST)
-        status_conflict = f"says FLOOR, relative residual {relative:.2e} is above {least:.2e}"
+    elif status is FLOOR and not judged.above_floor <= tol:
+        status_conflict = (
+            f"says FLOOR, rounding does not explain a relative residual of {judged.above_floor:.2e}"
+        )
     if status in (DIVERGED, STALLED) and not message and spec.resumable:
         message = describe_end(problem, status, claim.iterations)
     if status is MAX_ITERATIONS:
@@ -162,15 +161,13 @@ def describe_end(problem: Problem, status: Status, iterations: int) -> str:
     return words
 
 
-def _within_bounds(problem: Problem, impulse: FloatArray) -> tuple[FloatArray, Residual]:
-    """Project an impulse (m,) [N s] onto the bounds; take the zero impulse instead if its error has less energy.
-
-    An engine that applies the impulse of an infeasible step must not pull at a contact. The largest velocity error does
-    not decide: it is that of the rows that cannot be met, whatever the others gained.
-    """
-    candidates = project(problem.cones, impulse), problem.start()
-    results = [(lam, residual(problem, lam, "float64")) for lam in candidates]
-    return min(results, key=lambda result: result[1].energy)
+def name_lost_row(problem: Problem, impulse: FloatArray, claim: Claim) -> Claim:
+    """Return the claim as DIVERGED, with the first row whose impulse is not finite, if there is one."""
+    if claim.status is NUMERICAL_ERROR or all_finite(impulse):
+        return claim
+    row = int(np.argmin(np.isfinite(impulse)))
+    message = _joined(claim.message, f"the impulse of {problem.row_name(row)} is {impulse[row]}")
+    return replace(claim, status=DIVERGED, message=message)
 
 
 def _contradicting_impulse(problem: Problem) -> float:
@@ -189,9 +186,9 @@ def _holds_as_formed(problem: Problem, impulse: FloatArray, tol: float) -> bool:
         formed = problem.csr_data
     except InputError:  # too large to be formed: no solver has
         return False
-    formed.set_start(*reference(problem))
-    found = Judged(formed, impulse)
-    return found.relative <= tol or at_floor(found.relative, found.floor)
+    reference(problem)
+    formed.share_reference(problem.metric)
+    return bool(Judged(formed, impulse).above_floor <= tol)
 
 
 def _way_left(problem: Problem, relative: float, tol: float, done: int, per_decade: float) -> str:

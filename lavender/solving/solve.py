@@ -30,6 +30,7 @@ from lavender.judge.residuals import (
 from lavender.judge.solution import (
     CONFIRMED,
     CONVERGED,
+    FLOOR,
     INFEASIBLE,
     NUMERICAL_ERROR,
     TIME_LIMIT,
@@ -43,8 +44,9 @@ from lavender.solvers.certify import check_infeasible
 from lavender.solvers.loop import LEAST, Callback, Loop, Record, best_of
 from lavender.solvers.registry import SMALL_ROWS, Solver, SolverSpec, get
 from lavender.solvers.setup_times import SCIPY, estimate_disk_time, estimate_refusal_time, loading
-from lavender.solving.outcome import decide_empty_rows, finish
+from lavender.solving.outcome import decide_empty_rows, finish, name_lost_row
 from lavender_ext.judge.measure import all_finite
+from lavender_ext.judge.watch import Watch
 
 LATER = ("iterations", "work", "solver", "message", "history", "dual", "certificate", "impulse_bound",
          "claim_check", "status_conflict", "sweeps_per_decade", "turns")  # fmt: skip
@@ -341,12 +343,15 @@ class Prepared:
             claim = Claim(TIME_LIMIT, 0, {}, SET_UP_LATE)
             loop.not_worse(loop.impulse)
         else:
-            start = loop.impulse.copy() if loop.deadline.is_set else loop.impulse
+            start = loop.impulse.copy()
             claim = loop.run(max_iter) if spec.resumable else loop.run_once(max_iter)
-            if claim.status is TIME_LIMIT:
-                loop.not_worse(start)
-                if spec.delegates and problem.m > SMALL_ROWS and loading(*SCIPY):
-                    claim = replace(claim, message=f"{claim.message}; {WITHOUT_SCIPY}")
+            if loop.tol > 0.0 and claim.status not in (CONVERGED, FLOOR):
+                claim = name_lost_row(problem, loop.impulse, claim)
+                # The checks of sweeps keep the best of each island, from the start on.
+                if claim.status is TIME_LIMIT or not isinstance(getattr(self.state, "watch", None), Watch):
+                    loop.not_worse(start, or_zero=claim.status is TIME_LIMIT)
+            if claim.status is TIME_LIMIT and spec.delegates and problem.m > SMALL_ROWS and loading(*SCIPY):
+                claim = replace(claim, message=f"{claim.message}; {WITHOUT_SCIPY}")
         refutation = ""
         if claim.status is INFEASIBLE and (spec.external or not spec.own):
             claim, _, refutation = check_infeasible(problem, claim, loop.tol, loop.deadline)
@@ -518,7 +523,7 @@ def solve_small(
     if judged.relative > tol:
         if limit == math.inf or judged.relative == judged.floor:
             return None  # not the limit: beside such impulses rounding hides b
-        status, judged = TIME_LIMIT, best_of(problem, judged, given)
+        status, judged = TIME_LIMIT, best_of(problem, judged, given, tol)
     kept = given if given is None or impulse is None else given.copy()  # the caller may write into his own
     judged.impulse.setflags(write=False)
     return Solution.late(

@@ -21,7 +21,7 @@ At 20 iterations, then after every quarter more of them (20 at least), rho is we
 Where sqrt(primal / dual) is outside 1/3 .. 3 the kernel stops and asks for a factorisation with rho times
 that; u then becomes z + y / rho.
 """
-from libc.math cimport sqrt
+from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t, int64_t
 
 import numpy as np
@@ -34,6 +34,7 @@ from lavender_ext.factor.blocks cimport sparse_t
 from lavender_ext.factor.dense cimport dense_cholesky_solve
 from lavender_ext.factor.sparse cimport SparsePanels
 from lavender_ext.factor.supernodal cimport sparse_solve
+from lavender_ext.judge.reference cimport is_inactive_contact, is_inactive_row
 
 
 cdef enum:
@@ -44,6 +45,9 @@ cdef enum:
 cdef enum:
     RHO_EVERY = 20              # iterations between weighings of rho at first, later a quarter of those done
     CONVEX_AT_MOST = 200        # iterations without the shift
+    # Largest c of a block that its bounds hold at zero impulse, over the largest c of the others. Below, a block that the others
+    # can make act would keep a wrong c; above 1e6, rho and the mixing lose the digits of the others (|b| up to 1e60 tried).
+    MAX_INACTIVE_RATIO = 10000
 
 
 cdef struct factor_t:           # of B + rho, or of the body form
@@ -218,6 +222,41 @@ cdef public void lav_admm_lay(admm_t* c, const blocks_t* p, int32_t memory, doub
     for i in range(p.n_rows):
         c.root[i] = sqrt(p.d[i])
         c.c[i] = p.b[i] / c.root[i]
+        c.x[i] = -p.b[i]
+    limit_inactive(p, c.x, c.c)
+
+
+cdef inline bint is_inactive(const blocks_t* p, int32_t i, const double* w) noexcept nogil:
+    """Whether the bounds hold all rows of block i at zero impulse, slack w (m), by more than rounding."""
+    cdef int32_t k
+    if not is_rows(p, i):
+        return is_inactive_contact(p, i, w)
+    for k in range(p.ptr[i], p.ptr[i + 1]):
+        if not is_inactive_row(p, k, 0.0, w[k]):
+            return False
+    return True
+
+
+cdef inline void limit_inactive(const blocks_t* p, const double* w, double* c) noexcept nogil:
+    """Reduce c of blocks inactive at zero impulse, slack w, to MAX_INACTIVE_RATIO times the largest c of the others.
+
+    A far limit or a placeholder bound would otherwise take the digits of the rows that act, and rho with them.
+    """
+    cdef double size = 0.0, own
+    cdef int32_t i, k
+    for i in range(p.n_blocks):
+        if not is_inactive(p, i, w):
+            for k in range(p.ptr[i], p.ptr[i + 1]):
+                size = fabs(c[k]) if fabs(c[k]) > size else size
+    if not size > 0.0:
+        return
+    for i in range(p.n_blocks):
+        own = 0.0
+        for k in range(p.ptr[i], p.ptr[i + 1]):
+            own = fabs(c[k]) if fabs(c[k]) > own else own
+        if own > MAX_INACTIVE_RATIO * size and is_inactive(p, i, w):
+            for k in range(p.ptr[i], p.ptr[i + 1]):
+                c[k] *= MAX_INACTIVE_RATIO * size / own
 
 
 cdef public double lav_admm(admm_t* c, const factor_t* f, double* lam, int32_t* n) noexcept nogil:
@@ -271,6 +310,8 @@ cdef public void lav_admm_start(admm_t* c, const double* lam, const double* w) n
     cdef int32_t i
     for i in range(p.n_rows):
         c.y[i] = -w[i] / c.root[i]
+        if c.c[i] != p.b[i] / c.root[i]:                # of `limit_inactive`
+            c.y[i] = c.c[i] - (w[i] + p.b[i]) / c.root[i]
     for i in range(p.n_rows):
         c.u[i] = c.y[i]
     if p.law != CONE:

@@ -28,6 +28,15 @@ cdef enum:
     PARTS = 3                   # most of a contact
 
 
+cdef struct islands_t:          # sets of blocks that no other block can influence (core/islands.pxd)
+    int32_t n
+    const int32_t* label        # (k) island of each block
+    const int32_t* ptr          # (n + 1) places in `order` of each island's blocks
+    const int32_t* order        # (k) blocks by island, ascending in each
+    double* reference           # (2 n) E0 [sqrt J] and V0 [m/s] of each island (judge/reference.pxd)
+    double energy               # E0 of all rows, sqrt J: for rows without a scale of their own
+
+
 cdef struct blocks_t:
     int32_t n_blocks            # k
     int32_t n_rows              # m
@@ -43,6 +52,7 @@ cdef struct blocks_t:
     const double* nu            # (m) 1/kg, > 0: velocity error = sqrt(nu d) |e|
     const double* step          # (m) kg: 1/d, on two rows of a part 1/lambda_max of these two
     const double* rolling       # (k) m, >= 0: mu_r, read on CONTACT_ROLLING alone
+    const islands_t* islands    # NULL: one island, whose reference the caller passes
 
 
 cdef struct parts_t:            # of one contact

@@ -3,7 +3,7 @@ from libc.stdint cimport int32_t
 
 from lavender_ext.core.csr cimport csr_t
 from lavender_ext.core.generalized cimport generalized_t
-from lavender_ext.core.parts cimport blocks_t
+from lavender_ext.core.parts cimport blocks_t, islands_t
 from lavender_ext.core.rows cimport rows_t
 from lavender_ext.core.view cimport view_t
 
@@ -53,9 +53,11 @@ cdef class Data:
     cdef object _numbers, _d, _nu, _step
     cdef made_t made            # where is_general and ready
     cdef readonly double start_energy, start_velocity, start_relative   # negative where not known
+    cdef islands_t islands_at           # what blocks.islands points to, if it is not NULL
     cdef object _weight
     cdef list keep
 
     cdef view_t view(self) noexcept nogil
     cdef void adopt(self, made_t* made)
+    cdef void keep_reference(self, const islands_t* islands, const double* start)
     cdef object part(self, int which)

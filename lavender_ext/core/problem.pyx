@@ -20,7 +20,8 @@ from lavender_ext.core.blocks cimport Blocks
 from lavender_ext.core.csr cimport csr_t
 from lavender_ext.core.door cimport first_outside, least
 from lavender_ext.core.generalized cimport Operator, dot, generalized_t, panel_pattern, panel_whiten
-from lavender_ext.core.parts cimport CONE, COULOMB, blocks_t, is_box, n_directions, n_turns, parts_of, parts_t
+from lavender_ext.core.islands cimport find_islands, islands_index
+from lavender_ext.core.parts cimport CONE, COULOMB, blocks_t, is_box, islands_t, n_directions, n_turns, parts_of, parts_t
 from lavender_ext.core.rows cimport contact_diagonal, dot12, largest_eigenvalue, minv_times, rows_t, rows_times
 from lavender_ext.core.steps cimport block_steps, csr_largest, pair_means
 from lavender_ext.core.view cimport view_t
@@ -510,12 +511,48 @@ cdef class Data:
                 indptr[i + 1] = at
         return data_[:at], indices_[:at], indptr_
 
-    def set_start(self, double energy, double velocity):
-        """Error of doing nothing [sqrt J, m/s], once known; negative before. It cannot be changed."""
-        if self.start_energy >= 0.0 and (energy != self.start_energy or velocity != self.start_velocity):
-            raise ValueError("the error of doing nothing is known already, and is another")
-        self.start_energy = energy
-        self.start_velocity = velocity
+    cdef void keep_reference(self, const islands_t* islands, const double* start):
+        """Keep a copy of the islands with their references, or NULL, and (3) of `reference_of`, unless they are known."""
+        cdef Py_ssize_t k = self.blocks.n_blocks
+        cdef Room numbers, marks
+        cdef int32_t* at
+        with cython.critical_section(self):
+            if self.start_energy >= 0.0:
+                return
+            if islands != NULL:
+                numbers = room_for(2 * islands.n * sizeof(double))
+                marks = room_for((2 * k + islands.n + 1) * sizeof(int32_t))
+                memcpy(numbers.at, islands.reference, 2 * islands.n * sizeof(double))
+                at = <int32_t*>marks.at
+                memcpy(at, islands.label, k * sizeof(int32_t))
+                memcpy(at + k, islands.order, k * sizeof(int32_t))
+                memcpy(at + 2 * k, islands.ptr, (islands.n + 1) * sizeof(int32_t))
+                self.islands_at = islands_t(islands.n, at, at + 2 * k, at + k, <double*>numbers.at, islands.energy)
+                self.keep += [numbers, marks]
+                self.blocks.islands = &self.islands_at
+            self.start_velocity, self.start_relative = start[1], start[2]
+            self.start_energy = start[0]
+
+    def share_reference(self, Data other):
+        """Take islands and references of the same problem in another form, which must know them."""
+        cdef double start[3]
+        if other is not self:
+            start[0], start[1], start[2] = other.start_energy, other.start_velocity, other.start_relative
+            self.keep_reference(other.blocks.islands, start)
+
+    def islands(self):
+        """(number of islands, island of each block (k,)), as `find_islands` of core/islands.pxd."""
+        cdef view_t v = self.view()
+        cdef islands_t found
+        cdef Py_ssize_t i, k = self.blocks.n_blocks
+        cdef Room marks = room_for(islands_index(&v) * sizeof(int32_t))
+        cdef int32_t count = find_islands(&v, <int32_t*>marks.at, &found)
+        label_ = np.zeros(k, np.int32)
+        cdef int32_t[::1] label = label_
+        if count > 1:
+            for i in range(k):
+                label[i] = found.label[i]
+        return count if k else 0, label_
 
 
 def general_data(Blocks blocks, b, Operator operator, compliance, int law):

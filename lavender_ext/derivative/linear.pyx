@@ -28,8 +28,8 @@ from lavender_ext.derivative.natural cimport (CLOSED, FREE, HIGH, LOW, OPEN, SLI
                                               natural_all, natural_t, place_rows, scaled_csr, scaled_general, system_rows)
 from lavender_ext.factor.dense cimport PANEL, dense_lu, dense_lu_solve, dense_lu_solve_back
 from lavender_ext.factor.tiles cimport has_wide
-from lavender_ext.judge.measure cimport judge_view, relative_of, scratch_of
-from lavender_ext.judge.score cimport relative, score_t
+from lavender_ext.judge.measure cimport above_floor_of, floor_of, judge_view, relative_of, scratch_of
+from lavender_ext.judge.score cimport new_score, score_t
 
 cdef object empty = np.empty, ndarray = np.ndarray
 cdef object F8 = np.dtype(np.float64), I4 = np.dtype(np.int32), I1 = np.dtype(np.int8)
@@ -164,7 +164,7 @@ cdef void linearise(linear_t* a, const double* lam, double energy, double veloci
     cdef int32_t m = b.n_rows
     cdef ssize_t values = values_of(b)
     cdef int32_t* ptr = <int32_t*>(at + 5 * m + 2 * values)
-    cdef score_t s = score_t(0.0, 0.0, 0.0, 0.0, -1, 1)
+    cdef score_t s = new_score()
     if m == 0:
         a.regular = True
         return
@@ -175,7 +175,7 @@ cdef void linearise(linear_t* a, const double* lam, double energy, double veloci
     natural_all(b, a.lam, a.w, ptr, &a.x)
     a.rows = place_rows(b, &a.x, a.place)
     a.relative = relative_of(&s, a.w, m, energy, velocity)
-    a.floor = relative(s.floor_energy, s.floor_velocity, energy, velocity)
+    a.above_floor = above_floor_of(&s, a.relative, floor_of(&s, energy, velocity))
 
 
 cdef ssize_t room_of_factor(int32_t n) noexcept nogil:
@@ -279,9 +279,9 @@ cdef class Linear:
         return self.at.relative
 
     @property
-    def floor(self):
-        """What rounding leaves of it."""
-        return self.at.floor
+    def above_floor(self):
+        """What of it rounding does not explain."""
+        return self.at.above_floor
 
     def prepare(self, Data data, double shift=0.0):
         """Factor G of H + shift, A of the data in rows or J and M; whether it is regular."""

@@ -59,7 +59,7 @@ cdef struct linear_t:           # an answer, judged and linearised
     int32_t* place              # (m) row of G that each row is, -1 without one
     double* lu                  # (rows, rows) P G^T = L U
     int32_t* swap               # (rows)
-    double relative, floor      # of the judge
+    double relative, above_floor        # of the judge
     ssize_t first               # number of its own, among those of many
 
 

@@ -40,7 +40,7 @@ from lavender_ext.engine.soft_step cimport relax, restitute, soften
 from lavender_ext.engine.view cimport view
 from lavender_ext.engine.xpbd cimport correct_all
 from lavender_ext.judge.measure cimport rows_slack
-from lavender_ext.judge.score cimport score_rows, score_t
+from lavender_ext.judge.score cimport new_score, score_rows, score_t
 from lavender_ext.sweep.packed cimport MOST, room_for, sweep_packed
 
 
@@ -131,7 +131,7 @@ cdef inline void note_sweep(const engine_t* e, const blocks_t* p, const rows_t* 
                             double* scratch) noexcept nogil:
     # max |e_n| [N s] over the contacts, E = sqrt(sum d e^2) [sqrt J] over all rows; scratch (2 m)
     cdef double violation
-    cdef score_t s
+    cdef score_t s = new_score()
     measure(e, out, &violation)
     rows_slack(p, r, e.impulse, e.dv, scratch)
     score_rows(p, e.impulse, scratch, scratch + p.n_rows, &s)

@@ -20,6 +20,7 @@ cdef inline void view(const engine_t* e, blocks_t* p, rows_t* r) noexcept nogil:
     p.d = e.d
     p.nu = e.d
     p.step = e.step
+    p.islands = NULL                                    # the engine measures all bodies together
     r.n_bodies = e.size[N_DYNAMIC]
     r.n_joints = e.size[N_JOINT]
     r.n_contacts = e.head[H_CONTACTS]

@@ -10,14 +10,6 @@ from lavender_ext.factor.minimum_degree cimport degree_order
 from lavender_ext.factor.symbolic cimport postordered
 
 
-cdef inline int32_t root_of(int32_t* parent, int32_t i) noexcept nogil:
-    """Of i in a forest of sets, whose ways are halved as they are gone."""
-    while parent[i] != i:
-        parent[i] = parent[parent[i]]
-        i = parent[i]
-    return i
-
-
 cdef inline int64_t order_room(int64_t n, int64_t neighbours) noexcept nogil:
     """Whole numbers of scratch that `order_graph` takes, from a multiple of 8 bytes on."""
     return 13 * n + 2 + neighbours + neighbours // 4

@@ -2,13 +2,12 @@
 
 Panels that share a column, directly or through others, are an island: its velocities move no row of another.
 """
-from libc.math cimport sqrt
 from libc.stdint cimport int32_t
 
 from lavender_ext.core.generalized cimport generalized_t
 from lavender_ext.core.order cimport sort_by_level
 from lavender_ext.core.parts cimport CONE, COULOMB, blocks_t, has_friction, is_rows
-from lavender_ext.factor.graph cimport root_of
+from lavender_ext.core.roots cimport root_of
 from lavender_ext.generalized.flow cimport flow_t, row_end, row_from
 from lavender_ext.generalized.sparse cimport factor_work, find_pattern, pattern_marks
 
@@ -287,10 +286,8 @@ cdef inline void furnish(flow_t* f, const need_t* need, double* x) noexcept nogi
 
 
 cdef inline void aim_at(flow_t* f, double tol, int32_t steps, double start_energy, double start_velocity) noexcept nogil:
-    """What is asked of each island, beside the error of doing nothing; counts from nothing."""
-    cdef double share = 1.0 / <double>sqrt(<double>f.n_islands) if f.n_islands > 1 else 1.0
-    f.energy_limit = tol * start_energy * share
-    f.velocity_limit = tol * start_velocity
+    """The relative residual asked of each island, and the reference of a problem that is one; counts start at zero."""
+    f.tol, f.start_energy, f.start_velocity = tol, start_energy, start_velocity
     f.steps = steps
     f.wait.island = -1
     f.factorisations = f.rounds = f.evaluations = 0

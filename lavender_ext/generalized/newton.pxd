@@ -28,7 +28,7 @@ from lavender_ext.core.block cimport length
 from lavender_ext.core.generalized cimport dot, generalized_t
 from lavender_ext.core.method cimport BROKEN, LOST, MORE, REACHED, STUCK
 from lavender_ext.core.parts cimport CONE, COULOMB, blocks_t, is_rows, parts_of, parts_t
-from lavender_ext.core.start cimport is_nothing
+from lavender_ext.core.start cimport is_nothing, zero_impulse
 from lavender_ext.generalized.flow cimport (NOWHERE, blank, block_end, block_from, descent_t, flow_t, gather, keep,
                                             measure, renew, respond_all, row_end, row_from, wait_t)
 from lavender_ext.generalized.normal cimport factor, form, is_held, newton_step
@@ -502,9 +502,20 @@ cdef inline int32_t with_coulomb(flow_t* f, int32_t island, double* impulse) noe
     return STUCK
 
 
+cdef inline void set_limits(flow_t* f, int32_t island) noexcept nogil:
+    """Largest errors with which an island's relative residual is at most tol; 0 if each row is compared with its own terms."""
+    cdef const double* own
+    cdef double energy = f.start_energy, velocity = f.start_velocity
+    if f.p.islands != NULL:
+        own = f.p.islands.reference + 2 * f.p.islands.label[block_from(f, f.iptr[island])]
+        energy, velocity = max(own[0], 0.0), max(own[1], 0.0)
+    f.energy_limit, f.velocity_limit = f.tol * energy, f.tol * velocity
+
+
 cdef inline void enter(flow_t* f, int32_t island) noexcept nogil:
     """What y counts, velocities or rows, of which no column of A is known."""
     cdef int32_t a, k
+    set_limits(f, island)
     f.formed = f.few[island]
     f.own, f.n_own = f.icols + f.cptr[island], f.cptr[island + 1] - f.cptr[island]
     if not f.formed:
@@ -519,6 +530,17 @@ cdef inline void enter(flow_t* f, int32_t island) noexcept nogil:
     f.home[0] = NOWHERE
 
 
+cdef inline bint is_settled(flow_t* f, int32_t island, double* impulse) noexcept nogil:
+    """Whether no row of the island acts; the zero impulse, which solves it, is then its impulse."""
+    cdef int32_t a, k
+    if f.p.islands == NULL or f.p.islands.reference[2 * f.p.islands.label[block_from(f, f.iptr[island])]] >= 0.0:
+        return False
+    for a in range(f.iptr[island], f.iptr[island + 1]):
+        for k in range(row_from(f, a), row_end(f, a)):
+            impulse[k] = zero_impulse(&f.p, k)
+    return True
+
+
 cdef inline int32_t solve_island(flow_t* f, int32_t island, double* impulse) noexcept nogil:
     """One island from `impulse`, or from where it waits, into it; how it ended."""
     cdef int32_t end
@@ -526,6 +548,8 @@ cdef inline int32_t solve_island(flow_t* f, int32_t island, double* impulse) noe
     f.island = island
     if not waits:
         enter(f, island)
+        if is_settled(f, island, impulse):
+            return REACHED
         restart(f, island, impulse)
         level(f, island)
         f.wait.at, f.wait.rounds = BEGINS, 0

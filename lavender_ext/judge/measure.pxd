@@ -1,7 +1,8 @@
 """The judge's pass: w = A lam - b formed anew, error e of every block, their sums (score.pxd) and what rounding leaves.
 
     F_i = 2^-53 (|A| |lam| + |b|)_i             [m/s]; factored: |J| |M^-1| |J|^T |lam| + c |lam| for |A| |lam|;
-                                                at least d_i |lam_i| where a pair is cut to its bound
+                                                at least d_i |lam_i| if a pair is cut to its bound;
+                                                0 if w_i holds the row at its bound by more than F_i
     floor energy sqrt(sum F^2 / d), floor velocity max F sqrt(nu / d)
 
 A row's products serve w and F: A is read once. Factored, core/velocity.pxd forms M^-1 J^T lam, and a second loop reads
@@ -14,14 +15,56 @@ from lavender_ext.core.block cimport block_error
 from lavender_ext.core.csr cimport csr_dot, csr_dot_size, csr_t
 from lavender_ext.core.generalized cimport (generalized_t, jac_push, jac_row, panel_push_size, panel_size,
                                             tree_solve)
-from lavender_ext.core.parts cimport blocks_t, is_rows, n_directions, n_turns
+from lavender_ext.core.islands cimport find_islands, is_immovable, list_one_island
+from lavender_ext.core.parts cimport blocks_t, is_rows, islands_t, n_directions, n_turns
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.rows cimport contact_slack, cross, joint_velocity, rows_t, rows_times
 from lavender_ext.core.velocity cimport add6, rows_velocity
 from lavender_ext.core.view cimport view_t
-from lavender_ext.judge.score cimport (add_block_floor, add_floor, are_numbers, floor_from, floor_t, hides, no_floor,
-                                       norms_of_rhs, nothing, relative, score_from, score_rows, score_t, tally_block,
-                                       tally_t)
+from lavender_ext.judge.reference cimport needs_rows, reference_of
+from lavender_ext.judge.score cimport (above_floor, add_block_floor, add_row_floor, are_numbers, begin_islands, block_at,
+                                       close_island, floor_from, floor_t, hides, island_begin, island_end, new_score,
+                                       no_floor, nothing, relative, score_from, score_rows, score_t, tally_block, tally_t)
+
+
+# -- islands --------------------------------------------------------------------------------------------
+
+
+cdef inline void join_floor(const floor_t* own, floor_t* all_) noexcept nogil:
+    """Add an island's floor to that of all."""
+    all_.energy += own.energy
+    if own.fast > all_.fast:
+        all_.fast = own.fast
+
+
+cdef inline void score_with_floor(const blocks_t* p, const rows_t* r, const double* lam, const double* w, double* e,
+                                  const double* sizes, score_t* out) noexcept nogil:
+    """Errors from the slack w, sums and floors, island by island.
+
+    sizes: `velocity_size` over bodies r; r NULL: |A| |lam| of every row, or what is no less.
+    """
+    cdef int32_t island, a, i, end, n = begin_islands(p, out)
+    cdef const int32_t* order = p.islands.order if p.islands != NULL else NULL
+    cdef tally_t own, s = nothing()
+    cdef floor_t floor, f = no_floor()
+    for island in range(n):
+        own = nothing()
+        floor = no_floor()
+        end = island_end(p, island)
+        for a in range(island_begin(p, island), end):
+            i = block_at(order, a)
+            block_error(p, i, lam, w, e)
+            tally_block(p, i, e, &own)
+            if r == NULL:
+                add_block_floor(p, i, lam, w, e, sizes + p.ptr[i], &floor)
+            elif i < r.n_joints:
+                joint_floor(p, r, i, lam, w, sizes, &floor)
+            else:
+                contact_floor(p, r, i - r.n_joints, lam, w, e, sizes, &floor)
+        close_island(p, island, w, e, &own, &floor, &s, out)
+        join_floor(&floor, &f)
+    score_from(p, e, &s, out)
+    floor_from(&f, out)
 
 
 # -- A in compressed rows ----------------------------------------------------------------------------
@@ -33,32 +76,40 @@ cdef inline void csr_slack(const blocks_t* p, const csr_t* a, const double* lam,
         w[i] = csr_dot(a, i, lam) - p.b[i]
 
 
-cdef inline void csr_floor(const blocks_t* p, const csr_t* a, const double* lam, double* w, double* e, tally_t* s,
+cdef inline void csr_block(const blocks_t* p, const csr_t* a, int32_t i, const double* lam, double* w, double* e, tally_t* s,
                            floor_t* f) noexcept nogil:
-    """w, e and floor of every block."""
-    cdef int32_t i, j, k
+    """Slack, error and floor of block i."""
+    cdef int32_t j = p.ptr[i], k
     cdef double size[6]
-    for i in range(p.n_blocks):
-        j = p.ptr[i]
-        for k in range(j, p.ptr[i + 1]):
-            w[k] = csr_dot_size(a, k, lam, size + (0 if is_rows(p, i) else k - j)) - p.b[k]
-            if is_rows(p, i):                           # of any number
-                add_floor(p, k, size[0], f)
-        block_error(p, i, lam, w, e)
-        tally_block(p, i, e, s)
-        if not is_rows(p, i):
-            add_block_floor(p, i, lam, w, e, size, f)
+    for k in range(j, p.ptr[i + 1]):
+        w[k] = csr_dot_size(a, k, lam, size + (0 if is_rows(p, i) else k - j)) - p.b[k]
+        if is_rows(p, i):                               # of any number
+            add_row_floor(p, k, lam[k], w[k], size[0], f)
+    block_error(p, i, lam, w, e)
+    tally_block(p, i, e, s)
+    if not is_rows(p, i):
+        add_block_floor(p, i, lam, w, e, size, f)
 
 
 cdef inline void csr_judge(const blocks_t* p, const csr_t* a, const double* lam, double* w, double* e, bint floor,
                            score_t* out) noexcept nogil:
-    cdef tally_t s = nothing()
-    cdef floor_t f = no_floor()
+    cdef int32_t island, k, end, n
+    cdef const int32_t* order = p.islands.order if p.islands != NULL else NULL
+    cdef tally_t own, s = nothing()
+    cdef floor_t least, f = no_floor()
     if not floor:
         csr_slack(p, a, lam, w)
         score_rows(p, lam, w, e, out)
         return
-    csr_floor(p, a, lam, w, e, &s, &f)
+    n = begin_islands(p, out)
+    for island in range(n):
+        own = nothing()
+        least = no_floor()
+        end = island_end(p, island)
+        for k in range(island_begin(p, island), end):
+            csr_block(p, a, block_at(order, k), lam, w, e, &own, &least)
+        close_island(p, island, w, e, &own, &least, &s, out)
+        join_floor(&least, &f)
     score_from(p, e, &s, out)
     floor_from(&f, out)
 
@@ -235,45 +286,40 @@ cdef inline void contact_sizes(const rows_t* r, int32_t c, int32_t nt, int32_t t
                 out[roll + 1] += fabs(t2[k]) * x[3 + k]
 
 
-cdef inline void rows_floor(const blocks_t* p, const rows_t* r, const double* lam, const double* w, const double* e,
-                            const double* sizes, floor_t* f) noexcept nogil:
-    # (|J| |M^-1| |J|^T |lam| + c |lam|) of every row; sizes of `velocity_size`
-    cdef int32_t i, j, k, c, n, nt, turns, a, b
+cdef inline void joint_floor(const blocks_t* p, const rows_t* r, int32_t i, const double* lam, const double* w,
+                             const double* sizes, floor_t* f) noexcept nogil:
+    # (|J| |M^-1| |J|^T |lam| + c |lam|) of the rows of joint i; sizes of `velocity_size`
+    cdef int32_t j, a = r.joint_body[2 * i], b = r.joint_body[2 * i + 1]
+    for j in range(p.ptr[i], p.ptr[i + 1]):
+        add_row_floor(p, j, lam[j], w[j], r.compliance[j] * fabs(lam[j]) + joint_size(r.jac + 12 * j, sizes, a, b), f)
+
+
+cdef inline void contact_floor(const blocks_t* p, const rows_t* r, int32_t c, const double* lam, const double* w,
+                               const double* e, const double* sizes, floor_t* f) noexcept nogil:
+    # the same of contact c
+    cdef int32_t k, i = r.n_joints + c, j = p.ptr[i], n = p.ptr[i + 1] - j, nt = n_directions(p, i), turns = n_turns(p, i)
     cdef double size[6]
-    for i in range(r.n_joints):
-        a = r.joint_body[2 * i]
-        b = r.joint_body[2 * i + 1]
-        for j in range(p.ptr[i], p.ptr[i + 1]):
-            add_floor(p, j, r.compliance[j] * fabs(lam[j]) + joint_size(r.jac + 12 * j, sizes, a, b), f)
-    for c in range(r.n_contacts):
-        i = r.n_joints + c
-        j = p.ptr[i]
-        n = p.ptr[i + 1] - j
-        nt = n_directions(p, i)
-        turns = n_turns(p, i)
-        if turns or nt == 1:                            # the two common kinds with their sizes as constants
-            contact_sizes(r, c, nt, turns, sizes, size)
-        elif nt == 2:
-            contact_sizes(r, c, 2, 0, sizes, size)
-        else:
-            contact_sizes(r, c, 0, 0, sizes, size)
-        for k in range(n):
-            size[k] = r.compliance[j + k] * fabs(lam[j + k]) + size[k]
-        add_block_floor(p, i, lam, w, e, size, f)
+    if turns or nt == 1:                                # the two common kinds with their sizes as constants
+        contact_sizes(r, c, nt, turns, sizes, size)
+    elif nt == 2:
+        contact_sizes(r, c, 2, 0, sizes, size)
+    else:
+        contact_sizes(r, c, 0, 0, sizes, size)
+    for k in range(n):
+        size[k] = r.compliance[j + k] * fabs(lam[j + k]) + size[k]
+    add_block_floor(p, i, lam, w, e, size, f)
 
 
 cdef inline void rows_judge(const blocks_t* p, const rows_t* r, const double* lam, double* w, double* e, double* v,
                             bint floor, score_t* out) noexcept nogil:
     cdef double* sizes = v + 6 * <ssize_t>r.n_bodies
-    cdef floor_t f = no_floor()
     rows_velocity(p, r, lam, v)
     rows_slack(p, r, lam, v, w)
-    score_rows(p, lam, w, e, out)
     if not floor:
+        score_rows(p, lam, w, e, out)
         return
     velocity_size(p, r, lam, sizes)
-    rows_floor(p, r, lam, w, e, sizes, &f)
-    floor_from(&f, out)
+    score_with_floor(p, r, lam, w, e, sizes, out)
 
 
 # -- generalised coordinates ---------------------------------------------------------------------------
@@ -289,11 +335,9 @@ cdef inline void general_slack(const blocks_t* p, const generalized_t* g, const 
         w[i] = jac_row(g, i, x) + (g.compliance[i] * lam[i] - p.b[i])
 
 
-cdef inline void general_floor(const blocks_t* p, const generalized_t* g, const double* lam, const double* w,
-                               const double* e, double* x, score_t* out) noexcept nogil:
-    """The floor of that; |Y| |Y|^T |lam| + c |lam| stands for |A| |lam|. x (n + m) is scratch."""
+cdef inline const double* general_sizes(const blocks_t* p, const generalized_t* g, const double* lam, double* x) noexcept nogil:
+    """|Y| |Y|^T |lam| + c |lam| (m), a bound of |A| |lam|, in x (n + m)."""
     cdef int32_t i
-    cdef floor_t f = no_floor()
     cdef double* size = x + g.n
     for i in range(g.n):
         x[i] = 0.0
@@ -303,18 +347,23 @@ cdef inline void general_floor(const blocks_t* p, const generalized_t* g, const 
         panel_size(g, i, x, size)
     for i in range(p.n_rows):
         size[i] += g.compliance[i] * fabs(lam[i])
-    for i in range(p.n_blocks):
-        add_block_floor(p, i, lam, w, e, size + p.ptr[i], &f)
-    floor_from(&f, out)
+    return size
+
+
+cdef inline void general_score(const blocks_t* p, const generalized_t* g, const double* lam, const double* w, double* e,
+                               double* x, score_t* out) noexcept nogil:
+    """Errors from the slack w, their sums and the floor. x (n + m) is scratch."""
+    score_with_floor(p, NULL, lam, w, e, general_sizes(p, g, lam, x), out)
 
 
 cdef inline void general_judge(const blocks_t* p, const generalized_t* g, const double* lam, double* w, double* e,
                                double* x, bint floor, score_t* out) noexcept nogil:
     """The pass over J and M. x (n) is scratch, with the floor (n + m)."""
     general_slack(p, g, lam, x, w)
-    score_rows(p, lam, w, e, out)
     if floor:
-        general_floor(p, g, lam, w, e, x, out)
+        general_score(p, g, lam, w, e, x, out)
+    else:
+        score_rows(p, lam, w, e, out)
 
 
 # -- any form ------------------------------------------------------------------------------------------
@@ -325,18 +374,11 @@ cdef inline int64_t scratch_of(const view_t* v) noexcept nogil:
     return v.g.n + v.p.n_rows if v.g != NULL else 12 * <int64_t>v.r.n_bodies if v.r != NULL else 0
 
 
-cdef inline void judge_view(const view_t* v, const double* lam, double* w, double* e, double* scratch, bint floor,
-                            score_t* out) noexcept nogil:
-    """Slack into w (m), error into e (m), the sums into out; scratch: `scratch_of`, half of it over bodies without floor."""
-    if v.g != NULL:
-        general_judge(&v.p, v.g, lam, w, e, scratch, floor, out)
-    elif v.r != NULL:
-        rows_judge(&v.p, v.r, lam, w, e, scratch, floor, out)
-    else:
-        csr_judge(&v.p, v.a, lam, w, e, floor, out)
+cdef void judge_view(const view_t* v, const double* lam, double* w, double* e, double* scratch, bint floor,
+                     score_t* out) noexcept nogil
 
 
-# -- doing nothing, and what a pass over an impulse comes to beside it -----------------------------------
+# -- the zero impulse, and a pass over an impulse relative to it -----------------------------------------
 
 
 cdef inline bint do_nothing(const blocks_t* p, double* x, double* w) noexcept nogil:
@@ -354,31 +396,31 @@ cdef inline bint do_nothing(const blocks_t* p, double* x, double* w) noexcept no
     return moves
 
 
-cdef inline void reference_of(const blocks_t* p, const score_t* s, double* out) noexcept nogil:
-    """E0 [sqrt J], V0 [m/s] and the relative residual (3) of doing nothing, from its score."""
-    cdef double rhs_energy, rhs_velocity
-    norms_of_rhs(p, &rhs_energy, &rhs_velocity)
-    # The norms of b: sqrt(sum b^2 / d), max |b| sqrt(nu / d), |b| the pair's norm on tangents.
-    # 2^-48 of them is rounding. Of what is no number, 0 makes every error infinite.
-    if not s.finite:
-        out[0] = out[1] = 0.0
-    elif s.energy <= 3.5527136788005009e-15 * rhs_energy:
-        out[0], out[1] = rhs_energy, rhs_velocity
-    else:
-        out[0], out[1] = s.energy, s.velocity
-    out[2] = relative(s.energy, s.velocity, out[0], out[1]) if s.finite else 1.0 / 0.0
+cdef inline void judge_nothing(view_t* v, int32_t* index, islands_t* islands, double* reference, double* x, double* w,
+                               double* e, double* scratch, double* out) noexcept nogil:
+    """The zero impulse into x (m), and of it (3) of `reference_of`; with several islands v.p has them, and their references.
 
-
-cdef inline void judge_nothing(const view_t* v, double* x, double* w, double* e, double* scratch, double* out) noexcept nogil:
-    """Doing nothing into x (m), and of it (3) of `reference_of`; w, e (m) and scratch as `judge_view`, without floor."""
-    cdef score_t s = score_t(0.0, 0.0, 0.0, 0.0, -1, 1)
-    cdef bint moves = do_nothing(&v.p, x, w)
-    if not moves:
-        score_rows(&v.p, x, w, e, &s)
-    else:
+    index (`islands_index`), islands and reference (2 k) must live as long as v; w, e (m); scratch as `judge_view`, without floor.
+    """
+    cdef score_t s = new_score()
+    cdef int32_t i
+    v.p.islands = NULL
+    if do_nothing(&v.p, x, w):
         judge_view(v, x, w, e, scratch, False, &s)
-        s.finite = s.finite and are_numbers(w, v.p.n_rows)
-    reference_of(&v.p, &s, out)
+    else:
+        score_rows(&v.p, x, w, e, &s)
+    islands.reference = reference
+    if find_islands(v, index, islands) > 1:
+        v.p.islands = islands
+    reference_of(&v.p, x, w, e, out)
+    if needs_rows(&v.p, out):
+        list_one_island(v.p.n_blocks, index, islands)
+        v.p.islands = islands
+        reference_of(&v.p, x, w, e, out)
+    if v.p.islands != NULL:
+        for i in range(islands.n):
+            if is_immovable(v, islands.order[islands.ptr[i]]):
+                reference[2 * i], reference[2 * i + 1] = out[0], out[1]
 
 
 cdef inline double relative_of(const score_t* s, const double* w, int32_t m, double start_energy,
@@ -386,16 +428,28 @@ cdef inline double relative_of(const score_t* s, const double* w, int32_t m, dou
     """Relative residual of a pass, slack w (m); inf where a number of it is not finite.
 
     No less than a floor of 1e-3 and more, where the pass made one: the impulse is so large that rounding hides a thousandth
-    of what doing nothing leaves, and a slack that comes out as 0 says nothing.
+    of the zero impulse's error, and a slack that comes out as 0 says nothing.
     """
-    cdef double found, floor
+    cdef double now, floor
+    if s.relative >= 0.0:
+        return s.relative
     if m > 0 and not are_numbers(w, m):
         return 1.0 / 0.0
     if not s.finite:
         return relative(1.0 / 0.0, 1.0 / 0.0, start_energy, start_velocity)
-    found = relative(s.energy, s.velocity, start_energy, start_velocity)
+    now = relative(s.energy, s.velocity, start_energy, start_velocity)
     floor = relative(s.floor_energy, s.floor_velocity, start_energy, start_velocity)
-    return floor if hides(floor) and floor < 1.0 / 0.0 and floor > found else found
+    return floor if hides(floor) and floor < 1.0 / 0.0 and floor > now else now
+
+
+cdef inline double floor_of(const score_t* s, double start_energy, double start_velocity) noexcept nogil:
+    """Floor of a pass that made one, as a relative residual: with islands of the one with the largest residual."""
+    return s.floor if s.relative >= 0.0 else relative(s.floor_energy, s.floor_velocity, start_energy, start_velocity)
+
+
+cdef inline double above_floor_of(const score_t* s, double now, double floor) noexcept nogil:
+    """Relative residual that rounding does not explain, 0 if it explains all; now and floor of the functions before."""
+    return s.above_floor if s.relative >= 0.0 else above_floor(now, floor)
 
 
 cdef class Judged:
@@ -403,8 +457,11 @@ cdef class Judged:
     cdef readonly object impulse                        # (m,) N s
     cdef object both                                    # w (m,) m/s, then e (m,) N s
     cdef readonly double energy, velocity               # sqrt J, m/s; inf where e is not finite
+    cdef readonly double floor_energy                   # sqrt J, what rounding leaves
     cdef readonly double relative, floor                # -
+    cdef readonly double above_floor                    # - that rounding does not explain
     cdef readonly int worst                             # row of the largest velocity error, -1
+    cdef readonly int island                            # of the largest relative residual
 
 
 cdef Judged judged_from(Data p, object impulse, object both, const score_t* s, double relative_, double floor)

@@ -1,6 +1,6 @@
 """The judge for Python: thin entries of judge/measure.pxd, and the residuals of quadratic programs."""
-from libc.math cimport fabs
-from libc.stdint cimport int32_t
+from libc.math cimport fabs, sqrt
+from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memcmp
 
 import numpy as np
@@ -8,13 +8,29 @@ import numpy as np
 from lavender_ext.core cimport door
 from lavender_ext.core.arrays cimport doubles, ints
 from lavender_ext.core.generalized cimport whitened_gather
+from lavender_ext.core.islands cimport islands_index
+from lavender_ext.core.parts cimport islands_t
 from lavender_ext.core.problem cimport Data, Room, room_for
 from lavender_ext.core.velocity cimport rows_velocity
 from lavender_ext.core.view cimport view_t
-from lavender_ext.judge.measure cimport (csr_slack, general_slack, judge_nothing, judge_view, relative_of, rows_slack,
-                                         scratch_of)
+from lavender_ext.judge.best cimport best_room, best_t, bind_best, count_islands, note_score, see_impulse, see_start
+from lavender_ext.judge.measure cimport (above_floor_of, csr_judge, csr_slack, floor_of, general_judge, general_slack,
+                                         judge_nothing,
+                                         relative_of, rows_judge, rows_slack, scratch_of)
 from lavender_ext.judge.rounding cimport mass_t, relative_size, squares32
-from lavender_ext.judge.score cimport are_numbers, is_at_floor, norms_of_rhs, relative, score_rows, score_t
+from lavender_ext.judge.score cimport (are_numbers, is_at_floor, new_score, norms_of_rhs, nothing, relative,
+                                       score_rows, score_t, tally_block, tally_t)
+
+
+cdef void judge_view(const view_t* v, const double* lam, double* w, double* e, double* scratch, bint floor,
+                     score_t* out) noexcept nogil:
+    """Slack into w (m), error into e (m), the sums into out; scratch: `scratch_of`, half of it over bodies without floor."""
+    if v.g != NULL:
+        general_judge(&v.p, v.g, lam, w, e, scratch, floor, out)
+    elif v.r != NULL:
+        rows_judge(&v.p, v.r, lam, w, e, scratch, floor, out)
+    else:
+        csr_judge(&v.p, v.a, lam, w, e, floor, out)
 
 
 def slack(Data p, const double[::1] lam, double[::1] w):
@@ -42,8 +58,12 @@ def at_floor(double relative_, double floor):
 
 
 def judge(Data p, const double[::1] lam, double[::1] w, double[::1] e, bint floor=True):
-    """Slack into w, error into e, and (energy, velocity, relative residual, its floor); inf, inf, inf, 0 where not finite."""
-    cdef score_t s = score_t(0.0, 0.0, 0.0, 0.0, -1, 1)
+    """Slack into w, error into e; return (energy, velocity, relative residual, `above_floor_of` it).
+
+    inf, inf, inf, inf if a slack or an error is not finite; without the floor the last is the relative residual.
+    """
+    cdef score_t s = new_score()
+    cdef double now, above
     cdef view_t v = p.view()
     cdef double[::1] scratch
     if p.blocks.n_rows == 0:
@@ -52,9 +72,10 @@ def judge(Data p, const double[::1] lam, double[::1] w, double[::1] e, bint floo
     with nogil:
         judge_view(&v, &lam[0], &w[0], &e[0], &scratch[0], floor, &s)
     if not s.finite or not are_numbers(&w[0], p.blocks.n_rows):
-        return np.inf, np.inf, np.inf, 0.0
-    return (s.energy, s.velocity, relative_of(&s, &w[0], p.blocks.n_rows, p.start_energy, p.start_velocity),
-            relative(s.floor_energy, s.floor_velocity, p.start_energy, p.start_velocity))
+        return np.inf, np.inf, np.inf, np.inf
+    now = relative_of(&s, &w[0], p.blocks.n_rows, p.start_energy, p.start_velocity)
+    above = above_floor_of(&s, now, floor_of(&s, p.start_energy, p.start_velocity)) if floor else now
+    return s.energy, s.velocity, now, above
 
 
 cdef Judged judged_from(Data p, impulse, both, const score_t* s, double relative_, double floor):
@@ -63,8 +84,9 @@ cdef Judged judged_from(Data p, impulse, both, const score_t* s, double relative
     made.data, made.impulse, made.both = p, impulse, both
     made.energy = s.energy if s.finite else 1.0 / 0.0
     made.velocity = s.velocity if s.finite else 1.0 / 0.0
-    made.worst = s.worst
-    made.relative, made.floor = relative_, floor
+    made.floor_energy = s.floor_energy
+    made.worst, made.island = s.worst, s.island
+    made.relative, made.floor, made.above_floor = relative_, floor, above_floor_of(s, relative_, floor)
     return made
 
 
@@ -82,7 +104,7 @@ cdef class Judged:
         cdef double* e
         cdef Room room
         cdef view_t v = p.view()
-        cdef score_t s = score_t(0.0, 0.0, 0.0, 0.0, -1, 1)
+        cdef score_t s = new_score()
         self.data = p
         self.impulse = impulse
         self.both = both = np.empty(2 * m + 1)
@@ -94,9 +116,11 @@ cdef class Judged:
                 judge_view(&v, &lam[0], w, e, <double*>room.at, True, &s)
         self.energy = s.energy if s.finite else 1.0 / 0.0
         self.velocity = s.velocity if s.finite else 1.0 / 0.0
-        self.worst = s.worst
-        self.floor = relative(s.floor_energy, s.floor_velocity, p.start_energy, p.start_velocity)
+        self.floor_energy = s.floor_energy
+        self.worst, self.island = s.worst, s.island
+        self.floor = floor_of(&s, p.start_energy, p.start_velocity)
         self.relative = relative_of(&s, w, p.blocks.n_rows, p.start_energy, p.start_velocity)
+        self.above_floor = above_floor_of(&s, self.relative, self.floor)
 
     @property
     def slack(self):
@@ -135,7 +159,7 @@ def same_bits(const double[::1] x, const double[::1] y):
 
 def score(Data p, const double[::1] lam, const double[::1] w, double[::1] e):
     """Error of (lam, w) as they are, w given: (energy, velocity, worst row, finite)."""
-    cdef score_t s = score_t(0.0, 0.0, 0.0, 0.0, -1, 1)
+    cdef score_t s = new_score()
     if p.blocks.n_rows == 0:
         return 0.0, 0.0, -1, True
     with nogil:
@@ -144,20 +168,83 @@ def score(Data p, const double[::1] lam, const double[::1] w, double[::1] e):
 
 
 def begin(Data p):
-    """Judge doing nothing and keep E0, V0 and its own relative residual with the data: Pi(0) (m,), read-only."""
-    cdef Py_ssize_t m = p.blocks.n_rows
+    """Judge the zero impulse; keep islands, references and its relative residual with the data; return it (m,), read-only."""
+    cdef Py_ssize_t m = p.blocks.n_rows, k = p.blocks.n_blocks
     cdef view_t v = p.view()
     cdef double[::1] x
     cdef double out[3]
-    cdef Room room = room_for((2 * m + scratch_of(&v)) * sizeof(double))
+    cdef islands_t islands
+    cdef Room room = room_for((2 * m + 2 * k + scratch_of(&v)) * sizeof(double))
+    cdef Room marks = room_for(islands_index(&v) * sizeof(int32_t))
     cdef double* w = <double*>room.at
     start = np.zeros(m)
     x = start
-    judge_nothing(&v, &x[0] if m else NULL, w, w + m, w + 2 * m, out)
+    judge_nothing(&v, <int32_t*>marks.at, &islands, w + 2 * m, &x[0] if m else NULL, w, w + m, w + 2 * m + 2 * k, out)
     start.setflags(write=False)
-    p.set_start(out[0], out[1])
-    p.start_relative = out[2]
+    p.keep_reference(v.p.islands, out)
     return start
+
+
+def by_island(Data p, const double[::1] lam):
+    """(label (k,), table (n, 5)) of an impulse (m,) [N s], one row for each island.
+
+    Columns: relative residual, E [sqrt J], V [m/s] (worst row), E0 [sqrt J], V0 [m/s]; the last two -1 if no row acts.
+    """
+    cdef Py_ssize_t m = p.blocks.n_rows
+    cdef view_t v = p.view()
+    cdef const islands_t* s = p.blocks.islands
+    cdef int32_t i, a, n = s.n if s != NULL else 1
+    cdef score_t score = new_score()
+    cdef tally_t t
+    cdef double[::1] w = np.empty(2 * m + 2 * n + scratch_of(&v) + 1)
+    label_, table_ = np.zeros(p.blocks.n_blocks, np.int32), np.zeros((n, 5))
+    cdef int32_t[::1] label = label_
+    cdef double[:, ::1] table = table_
+    if m == 0:
+        return label_, table_[:0]
+    score.by_island = &w[2 * m]
+    judge_view(&v, &lam[0], &w[0], &w[m], &w[2 * m + 2 * n], False, &score)
+    if s == NULL:
+        table[0, 0] = relative_of(&score, &w[0], m, p.start_energy, p.start_velocity)
+        table[0, 1], table[0, 2] = score.energy, score.velocity
+        table[0, 3], table[0, 4] = p.start_energy, p.start_velocity
+        return label_, table_
+    for i in range(p.blocks.n_blocks):
+        label[i] = s.label[i]
+    for i in range(n):
+        t = nothing()
+        for a in range(s.ptr[i], s.ptr[i + 1]):
+            tally_block(&p.blocks, s.order[a], &w[m], &t)
+        table[i, 0], table[i, 1] = score.by_island[2 * i], score.by_island[2 * i + 1]
+        table[i, 2] = sqrt(t.fast) if t.fast > 0.0 else 0.0
+        table[i, 3], table[i, 4] = s.reference[2 * i], s.reference[2 * i + 1]
+    return label_, table_
+
+
+def best_of_islands(Data p, list starts, list impulses, double tol):
+    """The best of starts and impulses (m,) in each island, by `see_start` and `see_impulse` in this order: a new array."""
+    cdef Py_ssize_t m = p.blocks.n_rows
+    cdef view_t v = p.view()
+    cdef best_t best
+    cdef score_t s
+    cdef int64_t room = best_room(m, count_islands(&p.blocks))
+    cdef double[::1] x = np.empty(room + 2 * m + scratch_of(&v) + 1)
+    cdef double* w = &x[room]
+    cdef double now
+    cdef const double* lam
+    bind_best(&best, &p.blocks, &x[0])
+    for impulse in [*starts, *impulses] if m else []:
+        lam = doubles(impulse, m)
+        s = new_score()
+        s.by_island = best.now
+        judge_view(&v, lam, w, w + m, w + 2 * m, False, &s)
+        now = relative_of(&s, w, <int32_t>m, p.start_energy, p.start_velocity)
+        note_score(&best, &p.blocks, &s, now)
+        if best.seen < len(starts):
+            see_start(&best, &p.blocks, lam)
+        else:
+            see_impulse(&best, &p.blocks, lam, tol)
+    return np.array(x[:m])
 
 
 def velocity_change(Data p, const double[::1] lam, double[:, ::1] v):
@@ -197,8 +284,13 @@ def squares_of_float32(Data p, mass, const double[::1] free, const double[::1] l
 
 
 def size_of_square(Data p, const double[::1] square):
-    """Changes of w in the judge's two norms beside those of doing nothing; their squares (m) [m2/s2] given."""
-    return relative_size(&p.blocks, &square[0] if square.shape[0] else NULL, p.start_energy, p.start_velocity)
+    """Changes of w in the judge's two norms, relative to the zero impulse: (n,) of each island, from their squares (m) [m2/s2]."""
+    cdef const double* x = &square[0] if square.shape[0] else NULL
+    cdef const islands_t* s = p.blocks.islands
+    cdef int32_t i
+    if s == NULL:
+        return [relative_size(&p.blocks, -1, x, p.start_energy, p.start_velocity)]
+    return [relative_size(&p.blocks, i, x, s.reference[2 * i], s.reference[2 * i + 1]) for i in range(s.n)]
 
 
 cdef inline double max_nan(double s, double x) noexcept nogil:

@@ -7,12 +7,12 @@ squared entry by entry, and u = 2^-24 (the formulas of lavender/judge/residuals.
     data        u^2 (J^2 x^2 + z^2 f + theta^2 lambda^2 + target^2 + 2 J^2 v*^2),  target = b + J v*      (4)
     velocities  u^2 A^2 ((J^2 x^2 + b^2 + theta^2 lambda^2) / theta^2 on rows that act), 0 where one is rigid     (5)
 """
-from libc.math cimport sqrt
+from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
 
 from lavender_ext.core.generalized cimport generalized_t, jac_push, jac_row, tree_solve, whitened_push
 from lavender_ext.core.parts cimport blocks_t
-from lavender_ext.judge.score cimport relative
+from lavender_ext.judge.score cimport block_at, relative, score_t
 
 
 cdef struct mass_t:             # the lower triangle of M with its diagonal, columns ascending
@@ -106,13 +106,49 @@ cdef inline void squares32(const blocks_t* p, const generalized_t* g, const mass
                 velocities[j] += 0.0 if rigid else s * off[i]
 
 
-cdef inline double relative_size(const blocks_t* p, const double* square, double e0, double v0) noexcept nogil:
-    """Changes of w in the judge's two norms beside those of doing nothing; their squares (m) given."""
+cdef inline double relative_size(const blocks_t* p, int32_t island, const double* square, double e0, double v0) noexcept nogil:
+    """Changes of w over an island relative to E0 and V0, from their squares (m); island -1: over all rows."""
+    cdef int32_t a, i, k, first = 0, end = p.n_blocks
+    cdef const int32_t* order = NULL
+    cdef double energy = 0.0, velocity = 0.0, v, own = 0.0
+    if island >= 0:
+        order, first, end = p.islands.order, p.islands.ptr[island], p.islands.ptr[island + 1]
+    for a in range(first, end):
+        i = block_at(order, a)
+        for k in range(p.ptr[i], p.ptr[i + 1]):
+            energy += square[k] / p.d[k]
+            v = sqrt(p.nu[k]) * sqrt(p.d[k]) * sqrt(square[k]) / p.d[k]
+            if not v <= velocity:
+                velocity = v
+            v = sqrt(square[k])
+            if v > own * fabs(p.b[k]):                  # each row beside its own terms
+                own = v / fabs(p.b[k]) if p.b[k] != 0.0 else 1.0 / 0.0
+    return own if island >= 0 and e0 < 0.0 else relative(sqrt(energy), velocity, e0, v0)
+
+
+cdef inline bint rounds_in_float32(double residual, double floor) noexcept nogil:
+    """Whether rounding to float32 explains a relative residual: its floor is a root of squares, so four times that."""
+    return residual <= 4.0 * floor < 1.0 / 0.0 and residual < 1.0
+
+
+cdef inline double floor_in_float32(const blocks_t* p, const double* square, const score_t* s, double now, double e0, double v0,
+                                    double* above) noexcept nogil:
+    """The floor of float32 of a pass, with islands of the one with the largest residual; `above`: as `above_floor_of`.
+
+    With islands s.by_island must hold the relative residual of each.
+    """
     cdef int32_t i
-    cdef double energy = 0.0, velocity = 0.0, v
-    for i in range(p.n_rows):
-        energy += square[i] / p.d[i]
-        v = sqrt(p.nu[i]) * sqrt(p.d[i]) * sqrt(square[i]) / p.d[i]
-        if not v <= velocity:
-            velocity = v
-    return relative(sqrt(energy), velocity, e0, v0)
+    cdef double floor, worst = 0.0, own
+    if p.islands == NULL:
+        floor = relative_size(p, -1, square, e0, v0)
+        above[0] = 0.0 if rounds_in_float32(now, floor) else now
+        return floor
+    above[0] = 0.0
+    for i in range(p.islands.n):
+        floor = relative_size(p, i, square, p.islands.reference[2 * i], p.islands.reference[2 * i + 1])
+        own = s.by_island[2 * i]
+        if not rounds_in_float32(own, floor) and own > above[0]:
+            above[0] = own
+        if i == s.island:
+            worst = floor
+    return worst

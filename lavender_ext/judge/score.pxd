@@ -1,17 +1,17 @@
-"""Scores of an impulse: sums over the rows' errors, what rounding leaves of them, and both against doing nothing.
+"""Scores of an impulse: norms of the rows' errors, their round-off limits, and both relative to the zero impulse.
 
     E   = sqrt(sum d e^2)                       [sqrt J]
     V   = max sqrt(nu d) |e|                    [m/s], |e| the pair's norm on tangents
-    relative = max(E / E0, V / V0)              E0, V0 of doing nothing                            (1)
+    relative = max(E / E0, V / V0)              E0, V0 of the zero impulse (reference.pxd)         (1)
 
-The judge, the watch of a run of sweeps and warm starts score by these lines, and the polishes of Newton's method take (1)
-from here.
+With several islands (1) is the largest of all islands, E, V, E0, V0 of each taken over its own rows, and so is the floor.
+The judge, the stopping test of sweeps and warm starts use these functions, and Newton's refinement uses (1).
 """
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block cimport block_error
-from lavender_ext.core.parts cimport blocks_t, disk_of, groups_of, is_disk, is_rows, parts_t
+from lavender_ext.core.block cimport block_error, length
+from lavender_ext.core.parts cimport CONE, blocks_t, disk_of, groups_of, is_disk, is_rows, parts_of, parts_t
 
 
 cdef struct score_t:
@@ -21,6 +21,11 @@ cdef struct score_t:
     double floor_velocity       # m/s
     int32_t worst               # row of the largest velocity error, -1 where there is none
     int32_t finite              # 0 where e holds a NaN or an infinity
+    int32_t island              # with islands: the one with the largest relative residual; -1 without
+    double relative             # with islands: (1), infinite if a slack or an error is not finite; -1 without
+    double floor                # with islands: floor of `island`, as a relative residual
+    double above_floor          # with islands: largest (1) of those not at their floor
+    double* by_island           # NULL, or (n, 2): takes (1) and E of each island
 
 
 cdef struct tally_t:
@@ -32,6 +37,12 @@ cdef struct tally_t:
 cdef struct floor_t:            # of F, what rounding leaves of a slack
     double energy               # sum (F / d) F
     double fast                 # max nu (F / d) F
+    double own                  # max F / |b|, with islands, of a contact's rows over b of its normal
+
+
+cdef inline score_t new_score() noexcept nogil:
+    """The score of a problem without rows."""
+    return score_t(0.0, 0.0, 0.0, 0.0, -1, 1, -1, -1.0, 0.0, 0.0, NULL)
 
 
 cdef inline double unit_roundoff() noexcept nogil:
@@ -59,6 +70,37 @@ cdef inline double relative(double energy, double velocity, double start_energy,
     """(1)"""
     cdef double x = ratio(energy, start_energy), y = ratio(velocity, start_velocity)
     return x if x > y else y
+
+
+cdef inline int32_t block_at(const int32_t* order, int32_t a) noexcept nogil:
+    """Block number `a` of a list; NULL: of all blocks."""
+    return a if order == NULL else order[a]
+
+
+cdef inline double ratio_by_row(double size, double own, double scale) noexcept nogil:
+    """Size of an error [m/s] over the row's own terms; without these sqrt(d) |e| over the E0 of all rows (scale)."""
+    return ratio(size, own) if own > 0.0 or size == 0.0 else scale
+
+
+cdef inline double relative_by_rows(const blocks_t* p, const int32_t* order, int32_t first, int32_t end, const double* e,
+                                    double whole) noexcept nogil:
+    """(3) of judge/reference.pxd over blocks order[first:end]; order NULL: blocks first to end. whole: E0 of all rows."""
+    cdef int32_t a, i, j, k
+    cdef double r, worst = 0.0, s
+    for a in range(first, end):
+        i = block_at(order, a)
+        j = p.ptr[i]
+        if is_rows(p, i):
+            for k in range(j, p.ptr[i + 1]):
+                r = ratio_by_row(p.d[k] * fabs(e[k]), fabs(p.b[k]), ratio(sqrt(p.d[k]) * fabs(e[k]), whole))
+                worst = r if r > worst else worst
+            continue
+        s = 0.0
+        for k in range(j, p.ptr[i + 1]):
+            s += (p.d[k] * e[k]) * e[k]
+        r = ratio_by_row(sqrt(p.d[j]) * sqrt(s), fabs(p.b[j]), ratio(sqrt(s), whole))
+        worst = r if r > worst else worst
+    return worst
 
 
 cdef inline tally_t nothing() noexcept nogil:
@@ -128,16 +170,6 @@ cdef inline void score_from(const blocks_t* p, const double* e, const tally_t* s
             out.worst = s.worst
 
 
-cdef inline void score_rows(const blocks_t* p, const double* lam, const double* w, double* e, score_t* out) noexcept nogil:
-    """Errors e (m) of all blocks and their two sums; the floor entries are left alone."""
-    cdef int32_t i
-    cdef tally_t s = nothing()
-    for i in range(p.n_blocks):
-        block_error(p, i, lam, w, e)
-        tally_block(p, i, e, &s)
-    score_from(p, e, &s, out)
-
-
 cdef inline void norms_of_rhs(const blocks_t* p, double* energy, double* velocity) noexcept nogil:
     """sqrt(sum b^2 / d) and max |b| sqrt(nu / d), of two rows of a part by their norm."""
     cdef int32_t i, j, k, g
@@ -178,34 +210,82 @@ cdef inline bint is_at_floor(double relative, double floor) noexcept nogil:
     return relative <= 2.0 * floor and relative <= 1e-5 and not hides(floor)
 
 
+cdef inline double above_floor(double relative, double floor) noexcept nogil:
+    """0 if rounding explains a relative residual (`is_at_floor`), else that residual."""
+    return 0.0 if is_at_floor(relative, floor) else relative
+
+
 cdef inline floor_t no_floor() noexcept nogil:
-    return floor_t(0.0, 0.0)
+    return floor_t(0.0, 0.0, 0.0)
 
 
-cdef inline void add_floor(const blocks_t* p, int32_t k, double size, floor_t* s) noexcept nogil:
-    """What rounding leaves of row k, size = (|A| |lam|)_k."""
-    cdef double f = unit_roundoff() * (size + fabs(p.b[k])), t = f / p.d[k]
+cdef inline double row_rounding(const blocks_t* p, int32_t k, double size) noexcept nogil:
+    """F_k: rounding of the slack of row k, size = (|A| |lam|)_k."""
+    return unit_roundoff() * (size + fabs(p.b[k]))
+
+
+cdef inline void add_floor(const blocks_t* p, int32_t k, int32_t first, double f, floor_t* s) noexcept nogil:
+    """Add the rounding f of the slack of row k to the floor; first: the normal of a contact, else k."""
+    cdef double t = f / p.d[k]
     s.energy += t * f
     t = p.nu[k] * t * f
     if t > s.fast:
         s.fast = t
+    if p.islands != NULL:
+        t = ratio_by_row(f * sqrt(p.d[first] / p.d[k]), fabs(p.b[first]), ratio(f / sqrt(p.d[k]), p.islands.energy))
+        if t > s.own:
+            s.own = t
+
+
+cdef inline void add_row_floor(const blocks_t* p, int32_t k, double lam, double w, double size, floor_t* s) noexcept nogil:
+    """Add the rounding of the bounded row k, unless its slack holds it at a bound by more than that: its error is then 0."""
+    cdef double f = row_rounding(p, k, size)
+    # without branches: which rows are held is hard to predict
+    cdef bint held = ((lam == p.lower[k]) & (w > f)) | ((lam == p.upper[k]) & (-w > f))
+    add_floor(p, k, k, 0.0 if held else f, s)
+
+
+cdef inline bint holds_at_zero(const blocks_t* p, int32_t i, const double* lam, const double* w, const double* size) noexcept nogil:
+    """Whether contact i has no impulse, and its slack keeps it there by more than rounding: its error is then 0."""
+    cdef int32_t k, g, j = p.ptr[i], n = p.ptr[i + 1] - j
+    cdef double gap = w[j], rounding
+    cdef parts_t q
+    for k in range(n):
+        if lam[j + k] != 0.0:
+            return False
+    rounding = row_rounding(p, j, size[0])
+    if p.law == CONE:
+        parts_of(p, i, &q)
+        for g in range(q.n):
+            gap -= q.reach[g] * length(w + j + q.first[g], q.size[g])
+            for k in range(q.first[g], q.first[g] + q.size[g]):
+                rounding += q.reach[g] * row_rounding(p, j + k, size[k])
+    return gap > rounding
 
 
 cdef inline void add_block_floor(const blocks_t* p, int32_t i, const double* lam, const double* w, const double* e,
                                  const double* size, floor_t* s) noexcept nogil:
-    """`add_floor` of a block's rows; size from its first row on, of at least |A_kk| |lam_k|.
+    """Add the rounding of a block's rows, of those whose error it changes; size from its first row on, at least |A_kk| |lam_k|.
 
-    Where the norm of two rows is cut to its bound, e = lam - Pi has the rounding of lam itself, (2^-53 |lam_k|) d_k as a
+    If the norm of two rows is cut to its bound, e = lam - Pi has the rounding of lam itself, (2^-53 |lam_k|) d_k as a
     velocity; d_k, of both rows, may be far above A_kk.
     """
     cdef int32_t k, g, j = p.ptr[i], n = p.ptr[i + 1] - j
     cdef parts_t q
     cdef double x, own
+    cdef bint held
     if is_rows(p, i):
         for k in range(n):
-            add_floor(p, j + k, size[k], s)
+            add_row_floor(p, j + k, lam[j + k], w[j + k], size[k], s)
         return
-    add_floor(p, j, size[0], s)
+    if n == 1:
+        x = row_rounding(p, j, size[0])
+        held = (lam[j] == 0.0) & (w[j] > x)
+        add_floor(p, j, j, 0.0 if held else x, s)
+        return
+    if holds_at_zero(p, i, lam, w, size):
+        return
+    add_floor(p, j, j, row_rounding(p, j, size[0]), s)
     if is_disk(p, i):                                   # compiled apart
         disk_of(p, i, &q)
     else:
@@ -216,10 +296,99 @@ cdef inline void add_block_floor(const blocks_t* p, int32_t i, const double* lam
             if q.size[g] == 2 and e[j + k] != w[j + k] / p.d[j + k]:
                 own = p.d[j + k] * fabs(lam[j + k])
                 x = own if own > x else x
-            add_floor(p, j + k, x, s)
+            add_floor(p, j + k, j, row_rounding(p, j + k, x), s)
 
 
 cdef inline void floor_from(const floor_t* s, score_t* out) noexcept nogil:
     """The floor entries of out."""
     out.floor_energy = sqrt(s.energy)
     out.floor_velocity = sqrt(s.fast)
+
+
+cdef inline int32_t begin_islands(const blocks_t* p, score_t* out) noexcept nogil:
+    """Before the first `close_island`: the number of islands."""
+    if p.islands == NULL:
+        return 1
+    out.relative = out.floor = out.above_floor = 0.0
+    out.island = 0
+    return p.islands.n
+
+
+cdef inline int32_t island_begin(const blocks_t* p, int32_t island) noexcept nogil:
+    """Place in `order` of the first block of an island; without islands all blocks are one, in their order."""
+    return p.islands.ptr[island] if p.islands != NULL else 0
+
+
+cdef inline int32_t island_end(const blocks_t* p, int32_t island) noexcept nogil:
+    return p.islands.ptr[island + 1] if p.islands != NULL else p.n_blocks
+
+
+cdef inline double island_relative(const blocks_t* p, int32_t island, const double* e, const tally_t* s) noexcept nogil:
+    """(1) of one island."""
+    cdef const double* reference = p.islands.reference + 2 * island
+    cdef double energy = sqrt(s.energy), velocity = sqrt(s.fast) if s.fast > 0.0 else 0.0
+    if not energy + velocity < 1.0 / 0.0:
+        return 1.0 / 0.0
+    if reference[0] < 0.0:
+        return relative_by_rows(p, p.islands.order, p.islands.ptr[island], p.islands.ptr[island + 1], e,
+                                p.islands.energy)
+    return relative(energy, velocity, reference[0], reference[1])
+
+
+cdef inline double island_floor(const blocks_t* p, int32_t island, const floor_t* f) noexcept nogil:
+    """The floor of one island, as a relative residual."""
+    cdef const double* reference = p.islands.reference + 2 * island
+    if reference[0] < 0.0:
+        return f.own
+    return relative(sqrt(f.energy), sqrt(f.fast), reference[0], reference[1])
+
+
+cdef inline void close_island(const blocks_t* p, int32_t island, const double* w, const double* e, const tally_t* s,
+                              const floor_t* f, tally_t* total, score_t* out) noexcept nogil:
+    """Add an island's sums to those of all and its (1) to the score; f NULL: without its floor.
+
+    Of a problem that is one island the sums alone, from which callers make (1).
+    """
+    cdef double now, floor = 0.0
+    cdef double check = 0.0                             # stays 0, or becomes NaN
+    cdef int32_t a, i, k
+    if p.islands == NULL:
+        total[0] = s[0]
+        return
+    now = island_relative(p, island, e, s)
+    for a in range(p.islands.ptr[island], p.islands.ptr[island + 1]):
+        i = p.islands.order[a]
+        for k in range(p.ptr[i], p.ptr[i + 1]):
+            check += 0.0 * w[k]
+    if check != 0.0:
+        now = 1.0 / 0.0
+    if f != NULL:
+        floor = island_floor(p, island, f)
+        if hides(floor) and now < floor < 1.0 / 0.0:
+            now = floor
+        if not is_at_floor(now, floor) and now > out.above_floor:
+            out.above_floor = now
+    if out.by_island != NULL:
+        out.by_island[2 * island] = now
+        out.by_island[2 * island + 1] = sqrt(s.energy)
+    if now > out.relative or island == 0:
+        out.relative, out.floor, out.island = now, floor, island
+    total.energy += s.energy
+    if s.fast > total.fast:
+        total.fast, total.worst = s.fast, s.worst
+
+
+cdef inline void score_rows(const blocks_t* p, const double* lam, const double* w, double* e, score_t* out) noexcept nogil:
+    """Errors e (m) of all blocks and their two sums; the floor entries are left alone."""
+    cdef int32_t island, a, i, end, n = begin_islands(p, out)
+    cdef const int32_t* order = p.islands.order if p.islands != NULL else NULL
+    cdef tally_t own, s = nothing()
+    for island in range(n):
+        own = nothing()
+        end = island_end(p, island)
+        for a in range(island_begin(p, island), end):
+            i = block_at(order, a)
+            block_error(p, i, lam, w, e)
+            tally_block(p, i, e, &own)
+        close_island(p, island, w, e, &own, NULL, &s, out)
+    score_from(p, e, &s, out)

@@ -6,22 +6,25 @@ of the sweeps done so far, no further than as many again. A residual that does n
 that eighth. The relative residual r decides:
 
     r <= tol                                        CONVERGED
+    r of the best of each island (best.pxd) <= tol  CONVERGED, with these
     r not finite, or > 1e6 max(1, r of the first 8) DIVERGED
     no better than the best so far, and
         best <= 1e-6 and best <= 2 floor            AT_FLOOR
         sweeps > 32 * sweeps of the best + patience, and nothing
         better in sight (judge/progress.pxd)        STALLED
 
-On the last three the best iterate is put back. A check costs about one sweep.
+"Better": r is lower than ever, or E of an island that is not solved fell by 1 % since the last better check. Except at
+CONVERGED by r, the best impulse of each island is put back. A check costs about one sweep.
 """
-from libc.stdint cimport int32_t
+from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memcpy
 
 from lavender_ext.core.parts cimport blocks_t
 from lavender_ext.core.view cimport view_t
-from lavender_ext.judge.measure cimport judge_view, relative_of
+from lavender_ext.judge.best cimport best_room, best_t, bind_best, note_score, relative_of_best, see_impulse
+from lavender_ext.judge.measure cimport above_floor_of, floor_of, judge_view, relative_of
 from lavender_ext.judge.progress cimport keep, open_progress, progress_t, rests, see
-from lavender_ext.judge.score cimport is_at_floor, relative, score_t
+from lavender_ext.judge.score cimport new_score, relative, score_t
 
 
 cpdef enum:
@@ -40,15 +43,17 @@ cdef struct watch_t:
     int32_t total               # sweeps done
     int32_t check_at            # sweeps at the next check
     int32_t last_at             # sweeps at the last check
-    int32_t best_at             # sweeps at the best check, -1 before any
+    int32_t best_at             # sweeps at the last better check, -1 before any
     int32_t patience            # sweeps that may always pass without a better check
     int32_t again_at            # best_at of the iterate that was begun anew from, 0 before any
     double start                # largest relative residual of the first EARLY sweeps
     double last                 # at the last one
-    double best_relative        # of the best check
+    double best_relative        # of `best`
+    double lowest               # r of all checks
     double start_energy         # sqrt J, of doing nothing
     double start_velocity       # m/s
-    double* best                # (m) N s
+    best_t best
+    double* marked              # (n) sqrt J, E of each island's best at the last better check
     double* w                   # (m) scratch
     double* e                   # (m) scratch
     double* v                   # `scratch_of`
@@ -58,23 +63,37 @@ cdef struct watch_t:
 ctypedef void (*sweep_t)(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil
 
 
-cdef inline void begin_watch(watch_t* s, double start_energy, double start_velocity, int32_t patience, double* room,
-                       int32_t m) noexcept nogil:
-    """Before the first sweep; room (3 m) is for iterates."""
+cdef inline int64_t watch_room(int64_t m, int64_t n) noexcept nogil:
+    """Number of doubles that `begin_watch` needs for m rows in n islands."""
+    return best_room(m, n) + n + 2 * m
+
+
+cdef inline void begin_watch(watch_t* s, const blocks_t* p, double start_energy, double start_velocity, int32_t patience,
+                             double* room) noexcept nogil:
+    """Before the first sweep; room (`watch_room`)."""
     s.total = s.check_at = s.last_at = 0
     s.start = 0.0
-    s.last = s.best_relative = 1.0 / 0.0
+    s.last = s.best_relative = s.lowest = 1.0 / 0.0
     s.best_at = -1
     s.again_at = 0
     s.patience = patience
     s.start_energy = start_energy
     s.start_velocity = start_velocity
-    s.best = room
-    open_progress(&s.progress, room + m, m)
+    bind_best(&s.best, p, room)
+    s.marked = room + best_room(p.n_rows, s.best.n)
+    open_progress(&s.progress, s.marked + s.best.n, p.n_rows)
 
 
-cdef inline double against_start(const watch_t* s, double energy, double velocity) noexcept nogil:
-    return relative(energy, velocity, s.start_energy, s.start_velocity)
+cdef inline double relative_to_start(const watch_t* s, const score_t* x) noexcept nogil:
+    """Relative residual of a pass without floor; inf if an error is not finite."""
+    if x.relative >= 0.0:
+        return x.relative
+    return relative(x.energy, x.velocity, s.start_energy, s.start_velocity) if x.finite else 1.0 / 0.0
+
+
+cdef inline bint is_rounding(const watch_t* s, const score_t* x, double now, double tol) noexcept nogil:
+    """Whether rounding explains what a pass with its floor found above tol, in each island."""
+    return above_floor_of(x, now, floor_of(x, s.start_energy, s.start_velocity)) <= tol
 
 
 cdef inline int32_t until_next(const watch_t* s, double now, double tol) noexcept nogil:
@@ -94,14 +113,29 @@ cdef inline int32_t until_next(const watch_t* s, double now, double tol) noexcep
     return <int32_t>(n if n < most else most)
 
 
+cdef inline bint is_progress(watch_t* s, double now, double tol) noexcept nogil:
+    """Whether a check is better, after `see_impulse`."""
+    cdef bint better = now < s.lowest
+    cdef int32_t i
+    if better:
+        s.lowest = now
+    for i in range(s.best.n):
+        if s.best_at < 0 or s.best.energy[i] < 0.99 * s.marked[i]:
+            better = better or s.best_at < 0 or not s.best.relative[i] <= tol
+            s.marked[i] = s.best.energy[i]
+    return better
+
+
 cdef inline int32_t check(watch_t* s, const view_t* v, double* lam, double tol) noexcept nogil:
     """One check; sets the sweeps of the next."""
-    cdef score_t x
+    cdef score_t x = new_score()
     cdef const blocks_t* p = &v.p
-    cdef double now, floor, inf = 1.0 / 0.0
+    cdef double now, inf = 1.0 / 0.0
+    x.by_island = s.best.now
     judge_view(v, lam, s.w, s.e, s.v, False, &x)
-    now = against_start(s, x.energy, x.velocity) if x.finite else inf
-    if now <= tol:                                      # once more, beside what rounding hides
+    now = relative_to_start(s, &x)
+    note_score(&s.best, p, &x, now)
+    if now <= tol:                                      # once more, with what rounding hides
         judge_view(v, lam, s.w, s.e, s.v, True, &x)
         now = relative_of(&x, s.w, p.n_rows, s.start_energy, s.start_velocity)
     if s.total <= EARLY and s.start < now < inf:
@@ -112,24 +146,28 @@ cdef inline int32_t check(watch_t* s, const view_t* v, double* lam, double tol) 
     s.last_at = s.total
     if now <= tol:
         return CONVERGED
-    if now < s.best_relative:
-        s.best_relative = now
+    if now < inf or s.best.seen > 0:
+        see_impulse(&s.best, p, lam, tol)
+        s.best_relative = relative_of_best(&s.best)
+    if s.best_relative <= tol:                          # each island at another check
+        memcpy(lam, s.best.impulse, p.n_rows * sizeof(double))
+        return CONVERGED
+    if now < inf and is_progress(s, now, tol):
         s.best_at = s.total
-        memcpy(s.best, lam, p.n_rows * sizeof(double))
         keep(&s.progress, s.total, lam, p.n_rows)
         return RUNNING
     if not now < inf or now > 1e6 * (s.start if s.start > 1.0 else 1.0):
         if s.best_at >= 0:
-            memcpy(lam, s.best, p.n_rows * sizeof(double))
+            memcpy(lam, s.best.impulse, p.n_rows * sizeof(double))
         return DIVERGED
     if s.best_at >= 0 and s.best_relative <= 1e-6:
-        judge_view(v, s.best, s.w, s.e, s.v, True, &x)
-        floor = against_start(s, x.floor_energy, x.floor_velocity)
-        if is_at_floor(s.best_relative, floor):
-            memcpy(lam, s.best, p.n_rows * sizeof(double))
+        x = new_score()
+        judge_view(v, s.best.impulse, s.w, s.e, s.v, True, &x)
+        if is_rounding(s, &x, s.best_relative, tol):
+            memcpy(lam, s.best.impulse, p.n_rows * sizeof(double))
             return AT_FLOOR
-    if s.total > 32 * <double>s.best_at + s.patience and rests(&s.progress, p, lam, s.total, s.best_relative):
-        memcpy(lam, s.best, p.n_rows * sizeof(double))
+    if s.total > 32 * <double>s.best_at + s.patience and rests(&s.progress, p, lam, s.total, s.lowest):
+        memcpy(lam, s.best.impulse, p.n_rows * sizeof(double))
         return STALLED
     keep(&s.progress, s.total, lam, p.n_rows)
     return RUNNING
@@ -149,16 +187,15 @@ cdef inline bint begins_again(watch_t* s, int32_t patience) noexcept nogil:
 
 cdef inline int32_t confirmed(const watch_t* s, const view_t* v, const double* lam, double tol, int32_t status) noexcept nogil:
     """The claim `status`, judged in another form: what does not hold there goes on, or has stalled."""
-    cdef score_t x
-    cdef double now, floor
+    cdef score_t x = new_score()
+    cdef double now
     judge_view(v, lam, s.w, s.e, s.v, status == AT_FLOOR, &x)
-    now = against_start(s, x.energy, x.velocity) if x.finite else 1.0 / 0.0
+    now = relative_to_start(s, &x)
     if now <= tol:
         return CONVERGED
     if status == CONVERGED:
         return RUNNING
-    floor = against_start(s, x.floor_energy, x.floor_velocity)
-    return AT_FLOOR if is_at_floor(now, floor) else STALLED
+    return AT_FLOOR if is_rounding(s, &x, now, tol) else STALLED
 
 
 cdef inline int32_t due(watch_t* s, const view_t* v, const view_t* confirm, double* lam, double tol, int32_t* step) noexcept nogil:

@@ -1,13 +1,17 @@
 """The watch of judge/watch.pxd for Python: where a run of sweeps stands, and the loop of sweeps and checks."""
 from libc.math cimport NAN, log10
 from libc.stdint cimport int32_t
+from libc.string cimport memcpy
 
 import numpy as np
 
 from lavender_ext.core.problem cimport Data
 from lavender_ext.judge.measure cimport scratch_of
 from lavender_ext.judge.progress cimport envelope
-from lavender_ext.judge.watch cimport CONVERGED, RUNNING, begin_watch, due
+from lavender_ext.judge.best cimport count_islands, note_score, see_impulse
+from lavender_ext.judge.measure cimport judge_view
+from lavender_ext.judge.score cimport new_score, score_t
+from lavender_ext.judge.watch cimport CONVERGED, RUNNING, begin_watch, due, relative_to_start, watch_room, watch_t
 
 
 cdef class Watch:
@@ -17,18 +21,19 @@ cdef class Watch:
     """
 
     def __init__(self, Data data, int patience=64, Data confirm=None):
-        cdef Py_ssize_t m = data.blocks.n_rows
+        cdef Py_ssize_t m = data.blocks.n_rows, room
         cdef double[::1] scratch
         self.view = self.other = data.view()
         if confirm is not None:
             self.other = confirm.view()
             self.confirm = &self.other
-        scratch = np.empty(5 * m + scratch_of(&self.other) + 4)
+        room = watch_room(m, count_islands(&self.view.p))
+        scratch = np.empty(room + 2 * m + scratch_of(&self.other) + 4)
         self.keep = data, confirm, scratch
-        begin_watch(&self.state, data.start_energy, data.start_velocity, patience, &scratch[0], <int32_t>m)
-        self.state.w = &scratch[3 * m]
-        self.state.e = &scratch[4 * m]
-        self.state.v = &scratch[5 * m]
+        begin_watch(&self.state, &self.view.p, data.start_energy, data.start_velocity, patience, &scratch[0])
+        self.state.w = &scratch[room]
+        self.state.e = &scratch[room + m]
+        self.state.v = &scratch[room + 2 * m]
 
     @property
     def total(self):
@@ -37,10 +42,26 @@ cdef class Watch:
 
     @property
     def best(self):
-        """(relative residual, impulse) of the best check; (inf, None) before any."""
+        """(relative residual, impulse) of the best of each island; (inf, None) before any check."""
         if self.state.best_at < 0:
             return self.state.best_relative, None
         return self.state.best_relative, np.array(self.keep[2])[:self.view.p.n_rows]
+
+    def keep_best(self, double[::1] lam, double tol):
+        """Replace lam (m,), unless it meets tol, by the best of each island of it and of all checks."""
+        cdef watch_t* s = &self.state
+        cdef score_t x = new_score()
+        cdef double now
+        if s.best.seen == 0 or lam.shape[0] == 0:
+            return
+        x.by_island = s.best.now
+        with nogil:
+            judge_view(&self.view, &lam[0], s.w, s.e, s.v, False, &x)
+            now = relative_to_start(s, &x)
+            note_score(&s.best, &self.view.p, &x, now)
+            if not now <= tol:
+                see_impulse(&s.best, &self.view.p, &lam[0], tol)
+                memcpy(&lam[0], s.best.impulse, lam.shape[0] * sizeof(double))
 
     @property
     def sweeps_per_decade(self):

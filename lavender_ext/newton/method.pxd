@@ -4,14 +4,14 @@ The unit of work is a factorisation; a step may do one or two more than it was a
 = 1 ends it; without, the next step goes on.
 """
 from libc.stdint cimport int32_t, int64_t
-from libc.string cimport memset
+from libc.string cimport memcpy, memset
 
 from lavender_ext.core.method cimport CERTIFICATE, MORE, ROOM, grant, options_t, room_t, said_t
 from lavender_ext.core.view cimport view_t
 from lavender_ext.newton.bodies cimport body_room, furnish_bodies, index_room, lay_bodies, make_pattern, pattern_t
 from lavender_ext.newton.plan cimport newton_start, newton_step
 from lavender_ext.newton.run cimport (aim, furnish, impulse_of, judge_room, lay_index, lay_judge, newton_t, own_index,
-                                      own_room, proof_of)
+                                      own_room, proof_of, set_reference)
 from lavender_ext.newton.scaling cimport dense_matrix, find_elements, is_known
 from lavender_ext.newton.system cimport DENSE, dense_room
 
@@ -32,7 +32,8 @@ cdef inline newton_t* state_of(const room_t* r) noexcept nogil:
 
 cdef inline int32_t begin(newton_t* n, const options_t* o, const double* lam) noexcept nogil:
     """From lam (m), furnished."""
-    n.tol, n.budget, n.problem.e0, n.problem.v0 = o.tol, o.budget, o.e0, o.v0
+    n.tol, n.budget = o.tol, o.budget
+    set_reference(&n.problem, o.e0, o.v0)
     newton_start(n, lam)
     return MORE
 
@@ -43,7 +44,10 @@ cdef inline int32_t system_step(const view_t* v, const options_t* o, const room_
     cdef int32_t how
     n.budget, n.proven, n.stop = o.budget, o.proven, o.stop
     how = newton_step(n, work)
-    impulse_of(n, n.best_z, lam)
+    if n.best <= n.tol or n.kept.seen == 0:
+        impulse_of(n, n.best_z, lam)
+    else:
+        memcpy(lam, n.kept.impulse, v.p.n_rows * sizeof(double))
     said.work = said.factorisations = n.s.factorisations
     said.relative, said.tried = n.best, n.lam
     said.direction = proof_of(n) if how == CERTIFICATE else NULL

@@ -335,7 +335,8 @@ cdef inline void newton_start(newton_t* n, const double* lam) noexcept nogil:
     for i in range(N_COUNTED):
         n.counts[i] = 0
     n.best = 1.0 / 0.0
-    n.floor = 0.0
+    n.above_floor = 1.0 / 0.0
+    n.kept.seen = 0
     n.loops = n.s.form == BODIES and n.s.others != NULL and n.s.e.m <= LARGEST_AUGMENTED
     n.cold = is_nothing(&n.problem.p, lam)
     unknown_of(n, lam, n.trial)

@@ -12,8 +12,9 @@ from lavender_ext.core.parts cimport blocks_t
 from lavender_ext.core.rows cimport rows_t
 from lavender_ext.core.view cimport view_t
 from lavender_ext.factor.blocks cimport factor_t
-from lavender_ext.judge.measure cimport judge_view, relative_of
-from lavender_ext.judge.score cimport is_at_floor, relative, score_t
+from lavender_ext.judge.best cimport best_room, best_t, bind_best, note_score, relative_of_best, see_impulse
+from lavender_ext.judge.measure cimport above_floor_of, floor_of, judge_view, relative_of
+from lavender_ext.judge.score cimport new_score, relative, score_t
 from lavender_ext.newton.natural_map cimport convex_error
 from lavender_ext.newton.scaling cimport (lay_elements, lay_numbers, scale_elements, scaled_index, scaled_real, scaled_t)
 from lavender_ext.newton.system cimport system_t, system_times
@@ -57,8 +58,8 @@ cdef struct problem_t:          # as the judge reads it
     const csr_t* a              # or NULL,
     const rows_t* r             # or NULL,
     const generalized_t* g      # or NULL
-    double e0                   # errors of doing nothing
-    double v0
+    double e0                   # reference of the solver's own estimates, sqrt J: with islands the smallest of these
+    double v0                   # m/s
     double* w                   # (rows)
     double* error               # (rows)
     double* x                   # (12 bodies | velocities + rows)
@@ -208,12 +209,13 @@ cdef struct newton_t:           # may not move once it is furnished
     double best                 # relative residual of best_z
     double aside                # a best point that is no start for what comes
     double before               # the best point apart from that of a phase of its own
-    double floor
+    double above_floor          # of the point that was judged last: what of its residual rounding does not explain
     double relaxed              # residual at which the convex problem is given up
     double* best_z
     double* aside_z
     double* before_z
     double* direction
+    best_t kept                 # the best impulse of each island, of all that were scored
     double* lam                 # (rows)
     double* proof               # (rows) `direction` as an impulse
     double* f
@@ -249,17 +251,18 @@ cdef inline void aim(newton_t* n, const blocks_t* p, const csr_t* a, const rows_
 
 cdef inline int64_t judge_room(const blocks_t* p, const rows_t* r, const generalized_t* g) noexcept nogil:
     """Doubles that `lay_judge` hands out."""
-    cdef int64_t m = p.n_rows
+    cdef int64_t m = p.n_rows, own = 4 * m + best_room(m, <int64_t>p.n_blocks + 1)
     if r != NULL:
-        return 4 * m + 12 * <int64_t>r.n_bodies
-    return 4 * m + (g.n + m if g != NULL else 0)
+        return own + 12 * <int64_t>r.n_bodies
+    return own + (g.n + m if g != NULL else 0)
 
 
 cdef inline double* lay_judge(newton_t* n, double* room) noexcept nogil:
     """What the judge writes to, of `aim`; what is behind it."""
     cdef int64_t m = n.problem.p.n_rows
     n.lam, n.proof = room, room + m
-    n.problem.w, n.problem.error, n.problem.x = room + 2 * m, room + 3 * m, room + 4 * m
+    n.problem.w, n.problem.error, n.problem.x = room + 2 * m, room + 3 * m, room + 4 * m + best_room(m, n.problem.p.n_blocks + 1)
+    bind_best(&n.kept, &n.problem.p, room + 4 * m)
     return room + judge_room(&n.problem.p, n.problem.r, n.problem.g)
 
 
@@ -358,25 +361,46 @@ cdef inline const double* proof_of(newton_t* n) noexcept nogil:
     return n.proof
 
 
+cdef inline void set_reference(problem_t* o, double e0, double v0) noexcept nogil:
+    """The reference of estimates over all rows: e0, v0, or with islands the smallest of theirs, so that none looks solved early."""
+    cdef const double* own
+    cdef int32_t i
+    o.e0, o.v0 = e0, v0
+    if o.p.islands == NULL:
+        return
+    for i in range(o.p.islands.n):
+        own = o.p.islands.reference + 2 * i
+        if own[0] > 0.0:
+            o.e0 = own[0] if own[0] < o.e0 else o.e0
+            o.v0 = own[1] if own[1] < o.v0 else o.v0
+
+
 cdef inline double judged(newton_t* n, const double* z, bint floor) noexcept nogil:
-    """The judge's relative residual of z; what rounding leaves into n.floor."""
-    cdef score_t s = score_t(0.0, 0.0, 0.0, 0.0, -1, 1)
+    """The judge's relative residual of z; what of it rounding does not explain into n.above_floor."""
+    cdef score_t s = new_score()
     cdef const problem_t* o = &n.problem
     cdef view_t v = view_t(o.p, o.a, o.r, o.g)
     cdef double found
     impulse_of(n, z, n.lam)
+    s.by_island = n.kept.now
     judge_view(&v, n.lam, o.w, o.error, o.x, floor, &s)
     found = relative_of(&s, o.w, o.p.n_rows, o.e0, o.v0)
-    n.floor = relative(s.floor_energy, s.floor_velocity, o.e0, o.v0) if floor and s.finite else 0.0
+    note_score(&n.kept, &o.p, &s, found)
+    n.above_floor = above_floor_of(&s, found, floor_of(&s, o.e0, o.v0)) if floor and s.finite else found
     return found
 
 
 cdef inline double score(newton_t* n, const double* z) noexcept nogil:
-    """The same; the best point is kept."""
-    cdef double found = judged(n, z, False)
+    """The same; the best point is kept, and the best impulse of each island. Together these may be within tol sooner."""
+    cdef double found = judged(n, z, False), kept
     if found < n.best:
         n.best = found
         take(n, n.best_z, z)
+    if see_impulse(&n.kept, &n.problem.p, n.lam, n.tol) and n.kept.n > 1 and not n.best <= n.tol:
+        kept = relative_of_best(&n.kept)
+        if kept <= n.tol:
+            n.best = kept
+            unknown_of(n, n.kept.impulse, n.best_z)
     return found
 
 
@@ -396,12 +420,11 @@ cdef inline bint done(const newton_t* n) noexcept nogil:
 
 
 cdef inline bint at_floor(newton_t* n) noexcept nogil:
-    """The best point is within twice the floor."""
-    cdef double found
+    """Whether rounding explains what the best point is above tol, in each island."""
     if n.best > 1e-5:
         return False
-    found = judged(n, n.best_z, True)
-    return is_at_floor(found, n.floor)
+    judged(n, n.best_z, True)
+    return n.above_floor <= n.tol
 
 
 cdef inline void put_aside(newton_t* n, double best, const double* z) noexcept nogil:

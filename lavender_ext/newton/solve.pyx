@@ -24,7 +24,7 @@ from lavender_ext.newton.path cimport path_compliance, smooth
 from lavender_ext.newton.phases cimport begin_exchanges, exchange_once, sides
 from lavender_ext.newton.run cimport (APPROACH, DE_SAXCE, EXCHANGES, INTERIOR, N_COUNTED, PATH, POLISH, PROXIMAL, PURSUIT,
                                       RELAXED, aim, furnish, judge_room, lay_index, lay_judge, newton_t, own_index,
-                                      own_room, relative_at)
+                                      own_room, relative_at, set_reference)
 from lavender_ext.newton.scaling cimport find_elements
 from lavender_ext.newton.steps cimport begin_interior, duals, interior_step, slips, turn
 from lavender_ext.newton.system cimport (DENSE, OF_BARRIER, OF_NATURAL, OF_PAIR, SPARSE, dense_room,
@@ -153,7 +153,7 @@ cdef class Solve:
         self.space.index = <int32_t*>address(self.index)
         n = self.n = state_of(&self.space)
         aim(n, &self.view.p, self.view.a, self.view.r, self.view.g)
-        n.problem.e0, n.problem.v0 = data.start_energy, data.start_velocity
+        set_reference(&n.problem, data.start_energy, data.start_velocity)
         judge = zeros(judge_room(&n.problem.p, n.problem.r, n.problem.g))
         self.held = [matrix, judge]
         lay_judge(n, <double*>address(judge))

@@ -23,8 +23,8 @@ from lavender_ext.core.csr cimport csr_t
 from lavender_ext.core.parts cimport blocks_t
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.view cimport view_t
-from lavender_ext.judge.measure cimport judge_view, judged_from, relative_of, scratch_of
-from lavender_ext.judge.score cimport is_at_floor, relative, score_t
+from lavender_ext.judge.measure cimport above_floor_of, floor_of, judge_view, judged_from, relative_of, scratch_of
+from lavender_ext.judge.score cimport is_at_floor, new_score, score_t
 from lavender_ext.pivot.direct cimport CIRCLES, HALVED, PASSED, SPENT, direct_t
 from lavender_ext.pivot.principal cimport (INDEFINITE, ROUNDS, SMALL, SOLVED, STUCK, factor_free, pivots_solve,
                                            pivoting_t, pivots_correct, pivots_exchange, pivots_factor_all, pivots_on,
@@ -102,7 +102,7 @@ cdef inline void clip_rows(const direct_t* t, const double* x, double* out) noex
 
 cdef void judge_now(direct_t* t) noexcept nogil:
     """x within its bounds, judged; the best is kept."""
-    cdef score_t found = score_t(0.0, 0.0, 0.0, 0.0, -1, 1)
+    cdef score_t found = new_score()
     cdef double* x = t.x
     cdef double* w = x + t.s.n
     clip_rows(t, t.s.x, x)
@@ -110,7 +110,7 @@ cdef void judge_now(direct_t* t) noexcept nogil:
     t.now = relative_of(&found, w, t.s.n, t.e0, t.v0)
     if t.now < t.relative:
         t.relative = t.now
-        t.floor = relative(found.floor_energy, found.floor_velocity, t.e0, t.v0)
+        t.floor = floor_of(&found, t.e0, t.v0)
         t.score = found
         t.x, t.best = t.best, x
 
@@ -502,6 +502,11 @@ cdef class Pivoting:
     def floor(self):
         """What rounding alone costs it, relative."""
         return self.t.floor
+
+    @property
+    def above_floor(self):
+        """What of the relative residual of the best impulse rounding does not explain, inf before any."""
+        return above_floor_of(&self.t.score, self.t.relative, self.t.floor) if self.t.relative < INFINITY else INFINITY
 
     @property
     def changed(self):

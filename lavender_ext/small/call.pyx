@@ -4,15 +4,12 @@
                    where exchanges are stuck Lemke's path, if asked for                      (pivot/lemke.pyx)
     friction       accelerated sweeps and Newton's method in turns                                 (friction.pxd)
 
-Under friction a part is the whole, or each island in its turn, cut out of A or of the bodies. Part i of n has met its share where
-
-    E_i <= tol sqrt((E0_i^2 + E0^2 / n) / 2),   V_i <= tol V0                                              (1)
-
-which for all of them together is tol by both measures; E0 and E0_i are errors of doing nothing. An island with the bytes of the one
-before has its answer. What does not end below tol on the judge's own measure is nobody's result: the caller starts the long way.
+Under friction a part is the whole, or each island in turn, cut out of A or of the bodies and solved to its own relative residual
+(judge/score.pxd). An island with the bytes of the one before has the same answer. If the result does not end below tol on the
+judge's own measure, the call returns none and the caller starts the general solver.
 """
 from cpython.exc cimport PyErr_CheckSignals
-from libc.math cimport INFINITY, sqrt
+from libc.math cimport INFINITY
 from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memcmp, memcpy, memset
 
@@ -30,8 +27,8 @@ from lavender_ext.small.call cimport COUNTS, ENDED, FAILED, KEPT, Rules, few_rul
 from lavender_ext.small.friction cimport ask_t, part_t, solve_part, work_of
 from lavender_ext.small.limits cimport is_linear
 from lavender_ext.small.room cimport has_room, leave
-from lavender_ext.judge.measure cimport do_nothing, judge_view, judged_from, relative_of, scratch_of
-from lavender_ext.judge.score cimport relative
+from lavender_ext.judge.measure cimport do_nothing, floor_of, judge_view, judged_from, relative_of, scratch_of
+from lavender_ext.judge.score cimport new_score
 from lavender_ext.local.gauss_seidel cimport prepare_blocks, prepared_sizes
 from lavender_ext.pivot.direct cimport (HALVED, direct_begin, direct_begin_passes, direct_factor, direct_first,
                                         direct_index, direct_lay, direct_linear, direct_pass, direct_real, direct_t, is_end)
@@ -93,10 +90,9 @@ cdef bint has_call(const blocks_t* p) noexcept nogil:
 cdef void judge_few(few_t* s, const double* lam, double* both, double* scratch) noexcept nogil:
     """w and e into both (2 m); scratch as `judge_view`."""
     cdef int32_t m = s.v.p.n_rows
-    s.score.energy = s.score.velocity = s.score.floor_energy = s.score.floor_velocity = 0.0
-    s.score.worst, s.score.finite = -1, 1
+    s.score = new_score()
     judge_view(&s.v, lam, both, both + m, scratch, True, &s.score)
-    s.floor = relative(s.score.floor_energy, s.score.floor_velocity, s.begin[0], s.begin[1])
+    s.floor = floor_of(&s.score, s.begin[0], s.begin[1])
     s.relative = relative_of(&s.score, both, m, s.begin[0], s.begin[1])
 
 
@@ -216,12 +212,13 @@ cdef bint sweep_few(const few_t* s, double* own, double tol, int32_t swept, doub
     """Contacts, as one part; counts as `counted`. swept: at most, before its factors."""
     cdef int32_t m = s.v.p.n_rows, n = s.over.r.n_bodies if s.over.r != NULL else 0
     cdef part_t part
-    cdef ask_t o = ask_t(tol, s.begin[0], s.begin[1], swept, swept, has_wide(), 0, 0, 0, 0.0, most[0], 0, 0)
+    cdef ask_t o = ask_t(tol, swept, swept, has_wide(), 0, 0, 0, 0.0, most[0], 0, 0)
     cdef bint good
     if not has_room(&rooms.work, s.v.p.n_blocks, work_of(m, n) + m):
         return False
     part.v, part.lam, part.answer, part.split = s.over, own, rooms.work.real, s.split
     part.at, part.prepared, part.nothing = s.at, s.prepared, s.begin[2]
+    part.e0, part.v0 = s.begin[0], s.begin[1]
     good = solve_part(&part, &o, &rooms.more, rooms.work.real + m, rooms.work.index)
     memcpy(own, part.answer, m * sizeof(double))
     most[0] = o.left
@@ -289,7 +286,7 @@ cdef inline void lay(island_t* x, double* numbers, int32_t* marks, const int32_t
     cdef rows_t* r = &x.r
     cdef int32_t m = size[0], k = size[1], nnz = size[2], mj = size[3], c = k - size[4]
     x.numbers, x.marks = numbers, marks
-    p.n_blocks, p.n_rows = k, m
+    p.n_blocks, p.n_rows, p.islands = k, m, NULL
     p.lower, p.upper, p.b = after(&numbers, m), after(&numbers, m), after(&numbers, m)
     p.d, p.nu, p.step, x.s.lam = after(&numbers, m), after(&numbers, m), after(&numbers, m), after(&numbers, m)
     lay_frictions(p, after(&numbers, FRICTIONS * k), k)
@@ -512,8 +509,7 @@ cdef class Islands(Small):
     cdef int32_t end(self, few_t* s, const few_rules_t* rules, double* own, bint cold, double tol, double most, double* both,
                      rooms_t* rooms, int32_t* counts) except -1:
         cdef int64_t m = s.v.p.n_rows, scratch = m + scratch_of(&s.v)
-        cdef ask_t o = ask_t(tol, s.begin[0] / sqrt(<double>self.count), s.begin[1], rules.swept, rules.swept, has_wide(), 0, 0, 0,
-                             0.0, most, 0, 0)
+        cdef ask_t o = ask_t(tol, rules.swept, rules.swept, has_wide(), 0, 0, 0, 0.0, most, 0, 0)
         cdef bint good
         if not has_room(&rooms.work, 0, scratch):
             raise MemoryError(f"{m} rows")

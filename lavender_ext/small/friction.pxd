@@ -2,7 +2,6 @@
 
 One call solves a part over A or over bodies, in room that the caller has. Factors go on where they stood; so do sweeps.
 """
-from libc.math cimport sqrt
 from libc.stdint cimport int32_t, int64_t, uint64_t
 from libc.string cimport memcmp, memcpy, memset
 
@@ -14,8 +13,9 @@ from lavender_ext.core.parts cimport CONE, blocks_t
 from lavender_ext.core.view cimport view_t
 from lavender_ext.driver.driver cimport NEWTON, lav_room, lav_start, lav_step
 from lavender_ext.small.room cimport has_room
-from lavender_ext.judge.measure cimport do_nothing, judge_view, reference_of, relative_of
-from lavender_ext.judge.score cimport score_t
+from lavender_ext.judge.measure cimport do_nothing, judge_view, relative_of
+from lavender_ext.judge.reference cimport reference_of
+from lavender_ext.judge.score cimport new_score, score_t
 from lavender_ext.sweep.serial cimport context_t, form_velocity
 
 
@@ -39,13 +39,13 @@ cdef struct part_t:
     int32_t split               # blocks before it are swept before the others: joints, contacts
     const int32_t* at           # of blocks that are solved exactly, as gauss_seidel.prepare has them; else NULL
     const double* prepared
-    double nothing              # relative residual of doing nothing where the part is the whole, else -1
+    double nothing              # relative residual of the zero impulse if the part is the whole, else -1
+    double e0                   # and its reference, sqrt J
+    double v0                   # m/s
 
 
 cdef struct ask_t:
     double tol
-    double e0                   # of the whole: E0 / sqrt(n),
-    double v0
     int32_t most                # sweeps, an eighth of all,
     int32_t first               # and before the first factors
     int32_t wide
@@ -62,8 +62,8 @@ cdef struct turns_t:            # of one part
     part_t* s
     ask_t* o
     room_t* r                   # of Newton's method
-    double e0                   # the part's share
-    double v0
+    double e0                   # the part's reference, sqrt J
+    double v0                   # m/s
     double* swept               # (m) N s
     double* w                   # (m)
     double* error               # (m)
@@ -110,7 +110,7 @@ cdef inline double spent(const turns_t* t) noexcept nogil:
 
 cdef inline double found_at(turns_t* t, const double* lam) noexcept nogil:
     cdef const view_t* v = &t.s.v
-    cdef score_t found = score_t(0.0, 0.0, 0.0, 0.0, -1, 1)
+    cdef score_t found = new_score()
     judge_view(v, lam, t.w, t.error, t.scratch, False, &found)
     return relative_of(&found, t.w, v.p.n_rows, t.e0, t.v0)
 
@@ -183,30 +183,30 @@ cdef inline double factor_in_turns(turns_t* t) noexcept nogil:
 
 
 cdef inline bint solve_part(part_t* s, ask_t* o, room_t* r, double* work, int32_t* order) noexcept nogil:
-    """From `lam` into `answer`; has it met its share?"""
-    cdef score_t nothing = score_t(0.0, 0.0, 0.0, 0.0, -1, 1)
+    """From `lam` into `answer`; is its relative residual at most `tol`?"""
+    cdef score_t nothing = new_score()
     cdef turns_t t
     cdef uint64_t rng
-    cdef const blocks_t* p = &s.v.p
-    cdef double own = o.e0, fast = o.v0, less, now = s.nothing
+    cdef blocks_t* p = &s.v.p
+    cdef double now = s.nothing
     cdef double begun[3]
     t.s, t.o, t.r = s, o, r
     lay_turns(&t, work, order, &rng)
     do_nothing(p, s.answer, t.w)
+    begun[0], begun[1], begun[2] = s.e0, s.v0, now
     if now < 0.0:
         judge_view(&s.v, s.answer, t.w, t.error, t.scratch, False, &nothing)
-        own, fast = nothing.energy, nothing.velocity
-    if own == 0.0 and fast == 0.0:
-        return True     # doing nothing is right
-    less = own / o.e0 if own < o.e0 else o.e0 / own     # squares of what is far from 1 vanish
-    t.e0, t.v0 = (own if own > o.e0 else o.e0) * sqrt(0.5 * (1.0 + less * less)), o.v0
+        reference_of(p, s.answer, t.w, t.error, begun)
+        if begun[2] <= o.tol:
+            return True                                 # the zero impulse is a solution
+    t.e0, t.v0 = begun[0], begun[1]
     memcpy(t.swept, s.lam, p.n_rows * sizeof(double))
     form_velocity(&t.sweeps, t.swept)
     t.said.factorisations = 0
     if memcmp(t.swept, s.answer, p.n_rows * sizeof(double)) != 0:
         now = found_at(&t, t.swept)
-    elif now < 0.0:
-        now = relative_of(&nothing, t.w, p.n_rows, t.e0, t.v0)
+    else:
+        now = begun[2]
     t.sweep = SWEPT_ROW * p.n_rows + (s.v.a.indptr[p.n_rows] if s.v.a != NULL else SWEPT_BODIES * p.n_rows)
     t.factor = FACTOR_ROW * p.n_rows + <double>p.n_rows ** 3 / CUBED
     now = sweep_on(&t, now, o.first, True)
@@ -214,12 +214,7 @@ cdef inline bint solve_part(part_t* s, ask_t* o, room_t* r, double* work, int32_
         memcpy(s.answer, t.swept, p.n_rows * sizeof(double))
     if now > o.tol and spent(&t) < o.left:
         o.driven += 1
-        # Both measures of the part's own error of doing nothing are then below tol of its share.
-        now = t.e0 / own if t.e0 / own < t.v0 / fast else t.v0 / fast
-        begun[0], begun[1] = own, fast
-        if s.nothing < 0.0:
-            reference_of(p, &nothing, begun)
-        t.options = options_t(NEWTON, STEPS, 0, 0, o.wide, o.tol * now, begun[0], begun[1], 1.0 / 0.0)
+        t.options = options_t(NEWTON, STEPS, 0, 0, o.wide, o.tol, t.e0, t.v0, 1.0 / 0.0)
         now = factor_in_turns(&t)
     o.swept += t.c.turn
     o.undone += <int64_t>t.c.control[UNDONE]

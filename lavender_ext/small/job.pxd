@@ -13,15 +13,17 @@ from lavender_ext.core.csr cimport csr_t
 from lavender_ext.core.door cimport first_outside
 from lavender_ext.core.generalized cimport generalized_t
 from lavender_ext.core.method cimport MORE, REACHED, ROOM, options_t, room_t, said_t
-from lavender_ext.core.parts cimport CONE, blocks_t, is_rows
+from lavender_ext.core.islands cimport islands_index
+from lavender_ext.core.parts cimport CONE, blocks_t, is_rows, islands_t
 from lavender_ext.core.problem cimport MADE, lav_rows_diagonal, made_t, make_numbers, matrix_numbers
 from lavender_ext.core.rows cimport rows_t
 from lavender_ext.core.view cimport view_t
 from lavender_ext.driver.driver cimport NEWTON, lav_room, lav_start, lav_step
 from lavender_ext.factor.tiles cimport has_wide
 from lavender_ext.generalized.newton cimport is_soft
-from lavender_ext.judge.measure cimport do_nothing, general_floor, general_slack, judge_nothing, relative_of, scratch_of
-from lavender_ext.judge.score cimport relative, score_rows, score_t
+from lavender_ext.judge.measure cimport (above_floor_of, do_nothing, floor_of, general_score, general_slack, judge_nothing,
+                                         relative_of, scratch_of)
+from lavender_ext.judge.score cimport new_score, score_t
 from lavender_ext.small.call cimport (COUNTS, ENDED, KEPT, are_bounded, few_rules_t, few_t, has_call, lay_few, rooms_t,
                                       run_few)
 from lavender_ext.small.limits cimport allowed, cost_of, limits_t, step_cost, work_within
@@ -49,7 +51,9 @@ cdef struct job_t:
     int64_t row                 # numbers from one row of it to the next
     made_t made                 # of the data, or of this call
     bint known                  # it is this problem's
-    double begin[3]             # E0, V0, relative residual of doing nothing; E0 < 0 where not known
+    double begin[3]             # E0, V0, relative residual of the zero impulse; E0 < 0: not known
+    islands_t islands           # what p.islands points to, if this call found them
+    double* by_island           # NULL, or (n, 2) for `score_t.by_island`
     int32_t cold                # 1: from doing nothing, else from lam as it is
     double most                 # ns that it may cost as counted, then what it has come to is the result; inf: to the end
     bint solved
@@ -59,21 +63,28 @@ cdef struct job_t:
     double* both                # (2 m + 1) w, e
     const double* push          # (n) M^-1 J^T lam of the judge, not of A; in room that the next world takes
     score_t score
-    double relative, floor
+    double relative, floor, above_floor
 
 
 cdef struct few_rooms_t:        # of one thread
+    room_t islands              # of `begin`
     room_t made                 # A, d, nu and step
     room_t formed               # of `form_matrix`
     room_t kept                 # of `lay_few`
     rooms_t call
 
 
-cdef inline void begin(job_t* j, double* w) noexcept nogil:
-    """E0, V0 and the relative residual of doing nothing; w (3 m + n) is scratch."""
-    cdef view_t v = view_t(j.p, NULL, NULL, &j.g)
+cdef inline bint begin(job_t* j, view_t* v, room_t* islands, double* w) noexcept nogil:
+    """E0, V0 and the relative residual of the zero impulse, with islands in that workspace; False without memory for it.
+
+    v: the view of the job's data; w (3 m + `scratch_of`) is scratch.
+    """
     cdef ssize_t m = j.p.n_rows
-    judge_nothing(&v, w + 2 * m, w, w + m, w + 3 * m, j.begin)
+    if not has_room(islands, islands_index(v), 2 * <int64_t>j.p.n_blocks):
+        return False
+    judge_nothing(v, islands.index, &j.islands, islands.real, w + 2 * m, w, w + m, w + 3 * m, j.begin)
+    j.p.islands = v.p.islands
+    return True
 
 
 cdef inline double spent_by(const job_t* j, const limits_t* l, double work, int32_t factored, double lines) noexcept nogil:
@@ -128,13 +139,14 @@ cdef inline bint settle_empty_rows(const job_t* j, double tol) noexcept nogil:
 cdef inline void judge_job(job_t* j, double* x) noexcept nogil:
     """The judge's pass over lam, `general_judge` with what it pushes kept; x (2 n + m) is scratch."""
     cdef int32_t m = j.p.n_rows
-    j.score = score_t(0.0, 0.0, 0.0, 0.0, -1, 1)
+    j.score = new_score()
+    j.score.by_island = j.by_island
     general_slack(&j.p, &j.g, j.lam, x, j.both)
-    score_rows(&j.p, j.lam, j.both, j.both + m, &j.score)
-    general_floor(&j.p, &j.g, j.lam, j.both, j.both + m, x + j.g.n, &j.score)
+    general_score(&j.p, &j.g, j.lam, j.both, j.both + m, x + j.g.n, &j.score)
     j.push = x
     j.relative = relative_of(&j.score, j.both, m, j.begin[0], j.begin[1])
-    j.floor = relative(j.score.floor_energy, j.score.floor_velocity, j.begin[0], j.begin[1])
+    j.floor = floor_of(&j.score, j.begin[0], j.begin[1])
+    j.above_floor = above_floor_of(&j.score, j.relative, j.floor)
 
 
 cdef inline bint has_numbers(job_t* j) noexcept nogil:
@@ -144,7 +156,7 @@ cdef inline bint has_numbers(job_t* j) noexcept nogil:
     return j.known and first_outside(j.p.d, j.p.n_rows) < 0
 
 
-cdef inline void solve_job(job_t* j, room_t* room, const limits_t* limits, double tol) noexcept nogil:
+cdef inline void solve_job(job_t* j, room_t* room, room_t* islands, const limits_t* limits, double tol) noexcept nogil:
     cdef view_t v
     cdef options_t o = options_t(NEWTON, STEPS, 0, 0, has_wide(), tol, 0.0, 0.0, limits.values, 0.0)
     cdef room_t r
@@ -155,9 +167,9 @@ cdef inline void solve_job(job_t* j, room_t* room, const limits_t* limits, doubl
         return
     if not has_room(room, 0, 3 * <ssize_t>m + j.g.n):
         return
-    if j.begin[0] < 0.0:
-        begin(j, room.real)
     v = view_t(j.p, NULL, NULL, &j.g)
+    if j.begin[0] < 0.0 and not begin(j, &v, islands, room.real):
+        return
     soft = is_soft(&j.p, &j.g)
     o.work = work_within(&j.p, &j.g, limits, soft)
     if not o.work > 0.0:
@@ -262,23 +274,24 @@ cdef inline view_t view_of(job_t* j) noexcept nogil:
 cdef inline bint prepare_few(job_t* j, few_t* s, few_rooms_t* rooms) noexcept nogil:
     """What is worked out of A or bodies before a solve or the judge; False where it is left to the caller, as are empty rows."""
     cdef int64_t m = j.p.n_rows
-    cdef double* x
     if not j.known:
         j.known = make_bodies(j, &rooms.made) if j.factored else make_matrix(j, &rooms.made)
     if not j.known or j.made.n_empty:
         return False
-    s.v = s.over = view_of(j)
+    s.v = view_of(j)
     if j.begin[0] < 0.0:
         if not has_room(&rooms.call.work, 0, 3 * m + scratch_of(&s.v)):
             return False
-        x = rooms.call.work.real
-        judge_nothing(&s.v, x, x + m, x + 2 * m, x + 3 * m, j.begin)
+        if not begin(j, &s.v, &rooms.islands, rooms.call.work.real):
+            return False
+    s.over = s.v
     s.begin[0], s.begin[1], s.begin[2] = j.begin[0], j.begin[1], j.begin[2]
     return j.begin[2] >= 0.0
 
 
 cdef inline void found_by(job_t* j, const few_t* s) noexcept nogil:
     j.score, j.relative, j.floor = s.score, s.relative, s.floor
+    j.above_floor = above_floor_of(&s.score, s.relative, s.floor)
 
 
 cdef inline int32_t solve_few(job_t* j, few_rooms_t* rooms, const few_rules_t* rules, double tol) noexcept nogil:

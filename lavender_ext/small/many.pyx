@@ -16,6 +16,7 @@ from lavender_ext.core.blocks cimport Blocks
 from lavender_ext.core.method cimport room_t
 from lavender_ext.core.problem cimport Data, made_t
 from lavender_ext.core.problem import LAWS
+from lavender_ext.core.view cimport view_t
 from lavender_ext.generalized.newton cimport is_soft
 from lavender_ext.small.call cimport COUNTS, Rules, few_rules_t, few_t, judge_few
 from lavender_ext.small.job cimport (few_rooms_t, begin, found_by, has_numbers, job_t, judge_job, prepare_few, solve_few,
@@ -26,7 +27,7 @@ from lavender_ext.small.world cimport (BAD, BLOCK, BLOCKS, CONE_ROW, FREE, JAC, 
                                        READY, AT_ROW, FIELDS, ROWS, SOFT, STARTED, TARGET, TRIED, VELOCITIES, VELOCITY,
                                        desk_t, lay_bodies, lay_matrix, lay_world, worlds_t)
 from lavender_ext.judge.measure cimport do_nothing, judged_from, scratch_of
-from lavender_ext.judge.rounding cimport relative_size, squares32
+from lavender_ext.judge.rounding cimport floor_in_float32, squares32
 from lavender_ext.judge.score cimport norms_of_rhs
 
 cdef object new = np.empty
@@ -84,7 +85,7 @@ cdef int take(job_t* j, Data p, start, double* lam, double* both) except -1:
 cdef int take_start(job_t* j, start, double* lam, double* both) except -1:
     cdef const double[::1] given
     j.lam, j.both = lam, both
-    j.solved, j.spent, j.cold, j.most = False, False, start is None, INFINITY
+    j.solved, j.spent, j.cold, j.most, j.by_island = False, False, start is None, INFINITY, NULL
     if not j.cold:
         given = start
         if given.shape[0] != j.p.n_rows:
@@ -102,8 +103,7 @@ cdef result(job_t* j, Data p, impulse, both):
 
 cdef void remember(job_t* j, Data p):
     if p.start_energy < 0.0 and j.begin[0] >= 0.0:
-        p.set_start(j.begin[0], j.begin[1])
-        p.start_relative = j.begin[2]
+        p.keep_reference(j.p.islands, j.begin)
 
 
 cdef class Limits:
@@ -128,14 +128,14 @@ def solve_first(Data p, start, double tol, Limits limits, double most=INFINITY):
     is the result. d, Y and the error of doing nothing stay with the data.
     """
     cdef job_t j
-    cdef room_t room = room_t(0, 0, NULL, NULL, 0, 0, 0, 0.0)
+    cdef room_t room = room_t(0, 0, NULL, NULL, 0, 0, 0, 0.0), islands = room
     cdef Py_ssize_t m = p.blocks.n_rows
     cdef bint known = p.ready
     impulse, results = new(m), new(2 * m + 1)
     take(&j, p, start, doubles(impulse, m), doubles(results, 2 * m + 1))
     j.most = most
     with nogil:
-        solve_job(&j, &room, &limits.at, tol)
+        solve_job(&j, &room, &islands, &limits.at, tol)
         leave(&room)
     if not known and j.known:
         p.adopt(&j.made)
@@ -143,6 +143,7 @@ def solve_first(Data p, start, double tol, Limits limits, double most=INFINITY):
         free(j.made.marks)
         free(j.made.numbers)
     remember(&j, p)
+    leave(&islands)
     return result(&j, p, impulse, results)
 
 
@@ -156,7 +157,8 @@ cdef enum:                      # what is known of a world when it is done, rows
     START_RELATIVE = 6
     RHS_ENERGY = 7              # of b, where the judge alone was asked
     PUSH = 8                    # N s, |e| of the worst row
-    N_NUMBERS = 9
+    ABOVE_FLOOR = 9             # relative residual that rounding does not explain
+    N_NUMBERS = 10
 
 
 #: Columns of `at`, by their names.
@@ -166,7 +168,8 @@ PLACE = {"rows": ROWS, "velocities": VELOCITIES, "blocks": BLOCKS, "jac": JAC, "
 
 #: Rows of `Worlds.numbers` and codes of worlds by their names.
 NUMBER = {"relative": RELATIVE, "energy": ENERGY, "speed": SPEED, "floor": FLOOR, "start_energy": START_ENERGY,
-          "start_speed": START_SPEED, "start_relative": START_RELATIVE, "rhs_energy": RHS_ENERGY, "push": PUSH}
+          "start_speed": START_SPEED, "start_relative": START_RELATIVE, "rhs_energy": RHS_ENERGY, "push": PUSH,
+          "above_floor": ABOVE_FLOOR}
 CODE = {"left": LEFT, "ready": READY, "bad": BAD, "tried": TRIED, "late": LATE, "started": STARTED}
 
 
@@ -199,6 +202,13 @@ cdef struct hand_t:             # rooms of one thread
     made_t made
     desk_t desk
     few_rooms_t few
+    room_t by_island
+
+
+cdef inline bint begin_world(job_t* j, hand_t* h) noexcept nogil:
+    """`begin` of a world by J and M."""
+    cdef view_t v = view_t(j.p, NULL, NULL, &j.g)
+    return begin(j, &v, &h.few.islands, h.room.real)
 
 
 cdef class Worlds:
@@ -336,6 +346,7 @@ cdef class Worlds:
             else:
                 code = lay_matrix(&self.w, i, desk, &j.p, &j.dense, &j.row)
             j.begin[0] = -1.0
+            j.by_island = NULL
             j.solved, j.spent, j.cold, j.known, j.lam = False, False, self.cold, False, self.lam + at[AT_ROW]
         if not j.known and j.general:
             j.made = made[0]
@@ -352,6 +363,7 @@ cdef class Worlds:
         cdef int64_t n = self.w.n + 1
         cdef int32_t k
         self.number[RELATIVE * n + i], self.number[FLOOR * n + i] = j.relative, j.floor
+        self.number[ABOVE_FLOOR * n + i] = j.above_floor
         self.number[ENERGY * n + i] = j.score.energy if j.score.finite else INFINITY
         self.number[SPEED * n + i] = j.score.velocity if j.score.finite else INFINITY
         for k in range(3):
@@ -383,7 +395,7 @@ cdef class Worlds:
             return self.empty(i, &h.desk)
         known, j.most = j.known, most
         if j.general:
-            solve_job(&j, &h.room, limits, tol)
+            solve_job(&j, &h.room, &h.few.islands, limits, tol)
             if not known:
                 h.made = j.made                         # whose room the next one has
             code = READY if j.solved else TRIED
@@ -393,7 +405,7 @@ cdef class Worlds:
             self.keep_result(i, &j, &h.desk)
         if code != LEFT:
             memcpy(&self.count[COUNTS * i], j.counts, sizeof(j.counts))
-        if self.jobs != NULL:
+        if self.jobs != NULL and j.p.islands == NULL:   # islands are in memory that the next world uses
             self.jobs[i].begin[0], self.jobs[i].begin[1], self.jobs[i].begin[2] = j.begin[0], j.begin[1], j.begin[2]
         return code
 
@@ -424,18 +436,19 @@ cdef class Worlds:
             judge_few(&s, j.lam, j.both, h.few.call.work.real)
             found_by(&j, &s)
             j.push = h.few.call.work.real
-        elif has_numbers(&j) and j.made.n_empty == 0 and has_room(&h.room, 0, 4 * <int64_t>m + 5 * j.g.n):
+        elif (has_numbers(&j) and j.made.n_empty == 0 and has_room(&h.room, 0, 4 * <int64_t>m + 5 * j.g.n)
+              and has_room(&h.by_island, 0, 2 * <int64_t>j.p.n_blocks) and begin_world(&j, h)):
             code, x = READY, h.room.real
             if j.cold:
                 do_nothing(&j.p, j.lam, j.both)
-            begin(&j, x)
+            j.by_island = h.by_island.real
             judge_job(&j, x)
             if narrow:
                 x += j.g.n                              # behind what is pushed
                 squares32(&j.p, &j.g, &h.desk.mass, h.desk.free, j.lam, x, x + m, x + 2 * m, x + 3 * m)
                 for k in range(m):
                     x[k] = x[k] + x[m + k] + x[2 * m + k]
-                j.floor = relative_size(&j.p, x, j.begin[0], j.begin[1])
+                j.floor = floor_in_float32(&j.p, x, &j.score, j.relative, j.begin[0], j.begin[1], &j.above_floor)
         if code == READY:
             self.keep_result(i, &j, &h.desk)
             norms_of_rhs(&j.p, &self.number[RHS_ENERGY * (self.w.n + 1) + i], &size)
@@ -466,6 +479,8 @@ cdef class Hand:
         leave(&self.h.both)
         leave(&self.h.desk.room)
         leave(&self.h.desk.tree)
+        leave(&self.h.by_island)
+        leave(&self.h.few.islands)
         leave(&self.h.few.made)
         leave(&self.h.few.formed)
         leave(&self.h.few.kept)

@@ -19,7 +19,7 @@ from lavender_ext.core.start cimport is_nothing
 from lavender_ext.core.velocity cimport rows_velocity
 from lavender_ext.factor.band cimport ldl_factor, ldl_solve, pivots_t
 from lavender_ext.judge.measure cimport rows_slack
-from lavender_ext.judge.score cimport nothing, relative, score_rows, score_t, tally_row, tally_t
+from lavender_ext.judge.score cimport new_score, nothing, relative, score_rows, score_t, tally_row, tally_t
 
 
 cpdef enum:
@@ -130,11 +130,13 @@ cdef inline void note_score(const blocks_t* p, const rows_t* r, warm_t* s, doubl
 cdef inline double scored(const blocks_t* p, const rows_t* r, warm_t* s, const double* lam, const double* v, double e0,
                           double v0) noexcept nogil:
     """Relative residual of lam as the judge has it, v = M^-1 J^T lam; infinite where it is not finite."""
-    cdef score_t x
+    cdef score_t x = new_score()
     rows_slack(p, r, lam, v, s.slack)
     score_rows(p, lam, s.slack, s.error, &x)
     if s.trace != NULL:
         note_score(p, r, s, x.energy)
+    if x.relative >= 0.0:                               # of the worst island
+        return x.relative
     return relative(x.energy, x.velocity, e0, v0) if x.finite else 1.0 / 0.0
 
 

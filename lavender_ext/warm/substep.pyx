@@ -14,12 +14,15 @@ from libc.stdint cimport int32_t, int64_t, uint64_t
 import numpy as np
 
 from lavender_ext.core.method cimport CERTIFICATE, MORE, options_t, room_t, said_t
-from lavender_ext.core.parts cimport blocks_t
+from lavender_ext.core.islands cimport find_islands, islands_index
+from lavender_ext.core.parts cimport blocks_t, is_rows, islands_t
 from lavender_ext.core.rows cimport rows_t
 from lavender_ext.core.view cimport view_t
 from lavender_ext.core.weights cimport block_weights, joint_weights
 from lavender_ext.engine.arrays cimport S_OUT, bind, engine_t
 from lavender_ext.engine.view cimport view
+from lavender_ext.judge.reference cimport reference_of
+from lavender_ext.judge.score cimport new_score, score_rows, score_t
 from lavender_ext.newton.method cimport bodies_room, bodies_start, system_step
 from lavender_ext.warm.start cimport (FACTORED, JUDGED, MOST_TRACED, UNDECIDED, band_width, judged, lay_out,
                                       observe, room_of, start_errors, warm_solve, warm_t)
@@ -48,9 +51,11 @@ cdef public int32_t lav_newton_index_room(const int32_t* size, double* real, int
     cdef int64_t room
     cdef blocks_t p
     cdef rows_t r
+    cdef view_t v
     bind(size, real, index, keys, &e, used)
     view(&e, &p, &r)
-    room = HEAD + (method_room(&p, &r).n_index if turns else 0) + r.n_bodies + 2 * <int64_t>r.n_joints + 1
+    v = view_t(p, NULL, &r, NULL)
+    room = HEAD + (method_room(&p, &r).n_index if turns else 0) + r.n_bodies + 2 * <int64_t>r.n_joints + 1 + islands_index(&v)
     return <int32_t>room if room < MOST else -1
 
 
@@ -69,7 +74,7 @@ cdef public int32_t lav_newton_plan(const int32_t* size, double* real, int32_t* 
     n = method_room(&p, &r)
     scratch[1] = <int32_t>n.n_index if turns else 0
     scratch[0] = band_width(&p, &r, scratch + HEAD + scratch[1])
-    room = room_of(&p, scratch[0]) + p.n_rows
+    room = room_of(&p, scratch[0]) + p.n_rows + 2 * <int64_t>p.n_blocks
     if scratch[1] > 0:
         v = view_t(p, NULL, &r, NULL)
         n.index = scratch + HEAD
@@ -118,6 +123,29 @@ cdef inline int32_t newton_substep(const blocks_t* p, const rows_t* r, warm_t* s
     return solve_in_turns(&problem, &o, &n, s, lam, v)
 
 
+cdef inline void bind_islands(blocks_t* p, const rows_t* r, warm_t* s, int32_t* index, double* reference,
+                              islands_t* islands) noexcept nogil:
+    """Islands of the substep with their references, if there are several and all bounds hold 0; arrays of s are scratch.
+
+    Engine contacts have no bounds to be read.
+    """
+    cdef view_t v = view_t(p[0], NULL, r, NULL)
+    cdef score_t score = new_score()
+    cdef double start[3]
+    cdef int32_t i, j
+    if p.n_rows == 0 or find_islands(&v, index, islands) == 1:
+        return
+    for i in range(p.n_blocks):
+        for j in range(p.ptr[i], p.ptr[i + 1]):
+            s.kept[j], s.slack[j] = 0.0, -p.b[j]
+            if is_rows(p, i) and not p.lower[j] <= 0.0 <= p.upper[j]:
+                return
+    score_rows(p, s.kept, s.slack, s.error, &score)
+    islands.reference = reference
+    p.islands = islands
+    reference_of(p, s.kept, s.slack, s.error, start)
+
+
 cdef public int32_t lav_newton_substep(const int32_t* size, double* real, int32_t* index, uint64_t* keys, double tol,
                                        int32_t turns, int32_t* scratch, double* room, double* trace,
                                        double* said) noexcept nogil:
@@ -132,8 +160,9 @@ cdef public int32_t lav_newton_substep(const int32_t* size, double* real, int32_
     cdef blocks_t p
     cdef rows_t r
     cdef warm_t s
+    cdef islands_t islands
     cdef int64_t own
-    cdef int32_t how
+    cdef int32_t how, marks
     bind(size, real, index, keys, &e, used)
     view(&e, &p, &r)
     block_weights(&p, p.d, room)
@@ -143,7 +172,10 @@ cdef public int32_t lav_newton_substep(const int32_t* size, double* real, int32_
     s.trace = trace
     s.relative = 0.0
     own = room_of(&p, s.width) + p.n_rows
-    lay_out(&s, room + p.n_rows, scratch + HEAD + scratch[1], &p, &r)
+    marks = HEAD + scratch[1]
+    lay_out(&s, room + p.n_rows, scratch + marks, &p, &r)
+    bind_islands(&p, &r, &s, scratch + marks + r.n_bodies + 2 * r.n_joints + 1, room + own, &islands)
+    own += 2 * <int64_t>p.n_blocks
     how = newton_substep(&p, &r, &s, tol, turns, scratch, room + own, e.impulse, e.dv)
     if p.n_rows > 0 and (turns or how != UNDECIDED):
         observe(&p, &r, &s, e.setting + S_OUT + 5, e.setting + S_OUT + 7)
@@ -169,10 +201,8 @@ cdef class Substep:
         self.size, self.real, self.index, self.keys, self.turns = size, real, index, keys, turns
         self.scratch, self.room = np.empty(1), np.empty(1)
         self.noted = np.zeros((MOST_TRACED if turns else 0, 3))
-        self._make_scratch()
 
     cdef int _make_scratch(self) except -1:
-        # Of the first phase alone it is the same for every substep.
         cdef int32_t n = lav_newton_index_room(&self.size[0], &self.real[0], &self.index[0], &self.keys[0], self.turns)
         if n < 0:
             raise MemoryError("the substep needs more than 2^31 numbers of scratch")
@@ -184,9 +214,9 @@ cdef class Substep:
         """After `prepare` and `solve(False)`: (how it ended, sweeps, factorisations, relative residual)."""
         cdef int32_t how, n
         cdef double* trace = NULL
+        self._make_scratch()
         if self.turns:
             trace = &self.noted[0, 0]
-            self._make_scratch()
         n = lav_newton_plan(&self.size[0], &self.real[0], &self.index[0], &self.keys[0], self.turns,
                             <int32_t*>&self.scratch[0])
         if n < 0:

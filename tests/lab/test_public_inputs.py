@@ -261,7 +261,6 @@ CALLS |= {
     "bench.structure_of": (bench.structure_of, {"problem": LCP}),
     "phenomena.chosen": (phenomena.chosen, {"names": ["slide"]}),
     "suite.stack": (suite.stack, {"n": 3, "mass_ratio": 2.0, "friction": "none", "sliding": 0.5}),
-    "suite.drawn": (suite.drawn, {"seed": 1, "rows": 30, "part": "all"}),
     "suite.engine_step": (suite.engine_step, {"scene": "pyramid", "at": 3}),
     "suite.names": (suite.names, {"text": "@hard"}),
     "motion.adopt": (motion.adopt, {"problem": LCP, "impulse": B, "solver": "mine"}),
@@ -322,7 +321,7 @@ NOT_CALLED = {
     ),
     **dict.fromkeys(
         ("Batch.worlds", "Generalized.compressed", "Generalized.laid_out", "Generalized.restrict",
-         "Generalized.shifted",
+         "Generalized.shifted", "Generalized.with_scaled_rows", "Batch.start", "Solutions.mark_late",
          "Problem.on_disk", "Residuals.keep", "Simulation.end_film", "Simulation.write_problem", "Solution.late",
          "Solution.of", "Solution.unstretched", "Solutions.keep", "Solutions.late", "Solutions.start", "Batch.rows_of"),
         "for the package's own use, with arrays that it has checked",

@@ -110,7 +110,7 @@ def separation(problem: Problem, one: Any, two: Any) -> tuple[float, float]:
     a_delta, a_eps = _apply(problem, delta), _apply(problem, eps)
     apart = float(np.sqrt(max(delta @ a_delta, 0.0)))
     # The errors e themselves are known to the floor of both residuals, in the norm of D.
-    fuzz = float(sum(s.residual.floor * s.residual.energy_start for s in (one, two)))
+    fuzz = float(sum(s.residual.floor_energy for s in (one, two)))
     root = 1.0 / np.sqrt(d)
     stiff = float(np.sqrt(np.max(root * _apply(problem, root, abs), initial=0.0)))
     eps_d = float(np.sqrt(np.sum(d * eps * eps))) + fuzz

@@ -166,7 +166,9 @@ typedef struct lav_budget {
 typedef struct lav_verdict { /* the judge's, of any impulse */
   uint32_t size;
   int32_t worst;               /* row with the largest velocity error, -1 where there is none */
-  double relative;             /* error against that of doing nothing; infinite where a number is not finite */
+  int32_t island;              /* of `relative` and `floor`, as lav_islands numbers them; -1 if all blocks are one island */
+  int32_t unused;
+  double relative;             /* error relative to that of the zero impulse, of the worst island; infinite if not finite */
   double energy;               /* sqrt J */
   double velocity;             /* m/s, of the worst row */
   double floor;                /* what rounding of the impulse alone costs, relative */

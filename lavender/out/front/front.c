@@ -41,8 +41,10 @@ struct lav_solver {
   general_t g;
   uint64_t *key;
   double *impulse, *v_free, *score_room, *compare;
-  double start[3]; /* E0 [sqrt J], V0 [m/s], relative residual of doing nothing */
-  int32_t *order, *empty, *marks;
+  double start[3]; /* E0 [sqrt J], V0 [m/s], relative residual of the zero impulse */
+  struct core_parts_islands_t islands;
+  double *reference; /* E0, V0 of each island */
+  int32_t *order, *empty, *marks, *island_marks;
   int32_t split, mode;
   uint64_t rng;
   struct core_view_view_t read; /* as the judge reads it */

@@ -4,26 +4,14 @@
 
 int32_t lav_islands(lav_solver *solver, int32_t *label, int32_t n) {
   lav_solver *s = solver;
-  int32_t i, j, count, *parent, *first;
+  int32_t i;
   GIVE_BACK(enter(s));
   if (!s->ready) return leave(s, LAV_ERROR_NO_PROBLEM);
   if (n != s->p.n_blocks) return leave(s, LAV_ERROR_COUNT);
   if (n == 0) return leave(s, 0);
   if (!label) return leave(s, LAV_ERROR_NULL);
-  parent = s->marks;
-  first = s->marks + n;
-  if (s->form == LAV_VELOCITIES) count = k_tree_components(n, s->p.ptr, &s->g, parent, first, label);
-  else if (s->form == LAV_BODIES) {
-    int32_t *body = first + s->r.n_bodies;
-    for (i = 0; i < 2 * s->r.n_joints; i++) body[i] = s->r.joint_body[i];
-    for (i = 0; i < 2 * s->r.n_contacts; i++) body[2 * s->r.n_joints + i] = s->r.contact_body[i];
-    count = k_body_components(n, body, s->r.n_bodies, parent, first, label);
-  } else {
-    for (i = 0; i < n; i++)
-      for (j = s->p.ptr[i]; j < s->p.ptr[i + 1]; j++) first[j] = i;
-    count = k_matrix_components(n, s->p.ptr, first, s->a.indptr, s->a.indices, parent, label);
-  }
-  return leave(s, count);
+  for (i = 0; i < n; i++) label[i] = s->p.islands ? s->islands.label[i] : 0;
+  return leave(s, s->p.islands ? s->islands.n : 1);
 }
 
 /* -- the engine ------------------------------------------------------------------------------------------------------- */

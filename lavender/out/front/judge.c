@@ -8,13 +8,28 @@ static const general_t *general_of(const lav_solver *s) { return (void)s, (const
 #endif
 
 static void judge(lav_solver *s, const double *impulse, int32_t floor, lav_verdict *out) {
-  score_t t = {0.0, 0.0, 0.0, 0.0, -1, 1};
+  score_t t = judge_score_new_score();
   if (s->p.n_rows > 0) judge_measure_judge_view(&s->read, impulse, s->watch.w, s->watch.e, s->watch.v, floor, &t);
   out->worst = t.worst;
+  out->island = t.island;
+  out->unused = 0;
   out->energy = t.finite ? t.energy : INFINITY;
   out->velocity = t.finite ? t.velocity : INFINITY;
   out->relative = judge_measure_relative_of(&t, s->watch.w, s->p.n_rows, s->start[0], s->start[1]);
-  out->floor = floor ? judge_score_relative(t.floor_energy, t.floor_velocity, s->start[0], s->start[1]) : 0.0;
+  out->floor = floor ? judge_measure_floor_of(&t, s->start[0], s->start[1]) : 0.0;
+}
+
+/* Relative residual of an impulse, which is kept in the islands where it is better; a start if tol is negative. */
+static double see(lav_solver *s, struct judge_best_best_t *best, const double *impulse, double tol) {
+  score_t t = judge_score_new_score();
+  double relative;
+  t.by_island = best->now;
+  judge_measure_judge_view(&s->read, impulse, s->watch.w, s->watch.e, s->watch.v, 0, &t);
+  relative = judge_measure_relative_of(&t, s->watch.w, s->p.n_rows, s->start[0], s->start[1]);
+  judge_best_note_score(best, &s->p, &t, relative);
+  if (tol < 0.0) judge_best_see_start(best, &s->p, impulse);
+  else judge_best_see_impulse(best, &s->p, impulse, tol);
+  return relative;
 }
 
 static int32_t enter(lav_solver *s) {

@@ -69,7 +69,7 @@ static void run_sweeps(lav_solver *s, const lav_budget *budget, lav_result *out)
   const double begin = is_timed(budget) ? budget->clock(budget->clock_data) : 0.0;
   double now = begin, left;
   int32_t status = judge_watch_RUNNING, n = is_timed(budget) ? 1 : budget->iterations, done;
-  lav_verdict best;
+
 #ifndef LAV_SWEEPS_ONLY
   const int32_t before = s->options.method == LAV_BLOCK_GAUSS_SEIDEL || s->options.method == LAV_ADMM ? restarts_of(s) : 0;
 #endif
@@ -100,10 +100,9 @@ static void run_sweeps(lav_solver *s, const lav_budget *budget, lav_result *out)
   out->restarts = restarts_of(s) - before;
   if (s->mode == core_order_SYMMETRIC && is_accelerated(&s->options)) out->sweeps *= 2;
 #endif
-  if (budget->tol > 0.0 && s->watch.best_at >= 0 && out->outcome != LAV_CONVERGED) {
-    judge(s, s->impulse, 0, &best); /* a residual may rise: the best check counts */
-    if (!(best.relative <= s->watch.best_relative)) {
-      COPY(s->impulse, s->watch.best, s->p.n_rows);
+  if (budget->tol > 0.0 && s->watch.best_at >= 0 && out->outcome != LAV_CONVERGED) { /* a residual may rise: the best counts */
+    if (see(s, &s->watch.best, s->impulse, budget->tol) > budget->tol) {
+      COPY(s->impulse, s->watch.best.impulse, s->p.n_rows);
       sweep_serial_form_velocity(&s->swept.c, s->impulse);
     }
   }
@@ -184,18 +183,15 @@ static int32_t start_newton(lav_solver *s) {
   return LAV_OK;
 }
 
-/* A run that its budget ended is no worse than where it began, and no worse than doing nothing. */
-static void keep_better(lav_solver *s, const double *begin) {
-  lav_verdict now, then;
-  double nothing[3];
-  judge(s, s->impulse, 0, &now);
-  judge(s, begin, 0, &then);
-  if (!(now.relative <= then.relative)) {
-    COPY(s->impulse, begin, s->p.n_rows);
-    now = then;
-  }
-  if (!(now.relative <= 1.0))
-    judge_measure_judge_nothing(&s->read, s->impulse, s->watch.w, s->watch.e, s->watch.v, nothing);
+/* Of a run that its budget ended: in each island the better of its result, the start and the zero impulse. */
+static void keep_better(lav_solver *s, const double *begin, double tol) {
+  struct judge_best_best_t best;
+  judge_best_bind_best(&best, &s->p, s->score_room);
+  double *zero = s->compare + s->p.n_rows; /* behind `begin` */
+  judge_measure_do_nothing(&s->p, zero, s->watch.w);
+  see(s, &best, begin, -1.0);
+  see(s, &best, zero, -1.0);
+  if (see(s, &best, s->impulse, tol) > tol) COPY(s->impulse, best.impulse, s->p.n_rows);
 }
 
 static void run_newton(lav_solver *s, const lav_budget *budget, lav_result *out) {
@@ -224,7 +220,7 @@ static void run_newton(lav_solver *s, const lav_budget *budget, lav_result *out)
     else if (how != core_method_MORE && how != core_method_CERTIFICATE) out->outcome = LAV_STALLED;
     else if (is_late(s, budget)) out->outcome = LAV_TIME_LIMIT;
   }
-  if (out->outcome != LAV_CONVERGED && out->outcome != LAV_FLOOR) keep_better(s, s->compare);
+  if (out->outcome != LAV_CONVERGED && out->outcome != LAV_FLOOR) keep_better(s, s->compare, budget->tol);
   s->newton_options.tol = budget->tol;
   s->newton_options.budget = budget->iterations;
   out->restarts = out->iterations;

@@ -43,7 +43,9 @@ static void take_blocks(lav_solver *s, const lav_problem *q) {
   s->order = TAKE(s, int32_t, k);
   s->empty = TAKE(s, int32_t, m);
   s->marks = TAKE(s, int32_t, 4 * ((int64_t)s->kept.most_blocks + k) + m + 2 * n + 4 * nv + 16); /* scratch */
-  s->score_room = TAKE(s, double, 3 * m);
+  s->island_marks = TAKE(s, int32_t, 4 * k + 1 + (q->form == LAV_VELOCITIES ? 2 * nv : q->form == LAV_BODIES ? n : m));
+  s->reference = TAKE(s, double, 2 * k);
+  s->score_room = TAKE(s, double, judge_watch_watch_room(m, k + 1));
   s->watch.w = TAKE(s, double, m);
   s->watch.e = TAKE(s, double, m);
   s->form = q->form;

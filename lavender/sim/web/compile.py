@@ -52,7 +52,7 @@ class Part:
 
 
 #: Modules of the page by name; the first stands alone.
-PARTS = {"lavender": Part(MODULES), "newton": Part(("warm.substep",), beside=True)}
+PARTS = {"lavender": Part(MODULES), "newton": Part(("warm.substep", "judge.measure"), beside=True)}
 CUT: dict[str, Any] = runpy.run_path(str(Path(__file__).resolve().with_name("cut.py")))
 #: Name of the custom section with the hash of the sources, which ends the file.
 SECTION = "lavender.sources"

@@ -153,7 +153,8 @@ def test_the_impulse_of_an_infeasible_problem_is_within_its_bounds(name, seed, m
     assert not solution.success
     if solution.status is lv.Status.INFEASIBLE:
         assert (solution.impulse >= 0.0).all()
-        assert solution.residual.energy <= solution.residual.energy_start
+        # Sums over the rows in another order round differently.
+        assert solution.residual.energy <= solution.residual.energy_start * (1.0 + 1e-14)
         assert solution.claim_check == "confirmed" and solution.certificate is not None
 
 

@@ -48,7 +48,7 @@ def assert_same(many, i, single):
     assert many.iterations[i] == own.iterations == single.iterations
     assert (own.message, own.work) == (single.message, single.work)
     assert repr(own.turns) == repr(single.turns)  # what nobody judged in between is NaN
-    assert own.contradicted == single.contradicted
+    assert own.status_conflict == single.status_conflict
 
 
 @pytest.mark.parametrize("again", [copy.copy, copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))])
@@ -301,19 +301,19 @@ def test_arrays_of_results_cannot_be_written_to(listed):
     arrays = {name: x for name, x in arrays.items() if isinstance(x, np.ndarray) and name not in new}
     assert len(arrays) >= 16
     assert [name for name, x in arrays.items() if x.flags.writeable] == []
-    assert all(one.success and not one.contradicted for one in many)
+    assert all(one.success and not one.status_conflict for one in many)
 
 
 def test_a_world_written_over_before_it_is_read_contradicts_its_status():
     jac, mass, free = worlds(4)
     batch = lv.Batch(jac, mass, free, cones=DISKS)
     many = lv.solve_many(batch, tol=1e-9)
-    assert many[0].success and not many[0].contradicted
+    assert many[0].success and not many[0].status_conflict
     free[1:3] *= -2.0
     for i in (1, 2):
         assert many[i].residual.relative > 1e-3
-        assert "CONVERGED of other data" in many[i].contradicted and f"world {i}" in str(many[i])
-    assert many[3].success and not many[3].contradicted
+        assert "CONVERGED of other data" in many[i].status_conflict and f"world {i}" in str(many[i])
+    assert many[3].success and not many[3].status_conflict
 
 
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])

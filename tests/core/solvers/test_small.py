@@ -125,8 +125,9 @@ def test_most_of_them_do_take_the_short_way():
 
 @pytest.mark.parametrize("limit", [None, 10.0])
 def test_what_rounding_hides_is_no_matter_of_time(limit):
-    """A row that is held where 2^-53 A lambda is a thousandth of b: told as TIME_LIMIT, also where there was none."""
-    held = lv.Problem.lcp([[1e13]], [1.0], [1.5], [1.5])
+    """Two fixed impulses that cancel in a free row, whose b is 1000 times their rounding 2^-53 A lambda."""
+    low, high = [1.5, -1.5, -np.inf], [1.5, -1.5, np.inf]
+    held = lv.Problem.lcp(np.full((3, 3), 1e13), [0.0, 0.0, 1.0], low, high)
     solution = lv.solve(held, time_limit=limit)
     assert solution.residual.relative == solution.residual.floor > 1e-3
     assert solution.status is lv.Status.DIVERGED and "float64 loses b" in solution.message

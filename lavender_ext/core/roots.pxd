@@ -1,0 +1,10 @@
+"""Union-find forests."""
+from libc.stdint cimport int32_t
+
+
+cdef inline int32_t root_of(int32_t* parent, int32_t i) noexcept nogil:
+    """Return the root of i; paths are halved on the way."""
+    while parent[i] != i:
+        parent[i] = parent[parent[i]]
+        i = parent[i]
+    return i

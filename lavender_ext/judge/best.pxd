@@ -1,0 +1,106 @@
+"""The best impulse seen so far, island by island.
+
+An island's impulse is replaced by a later one
+
+    that solves it, relative residual r <= tol, unless it is solved already; or                            (1)
+    whose energy E of the island is lower, and r no larger than that of the start                          (2)
+
+(score.pxd has E and r.) So a row that no impulse can satisfy, which keeps r at 1, costs no other row its answer, and no
+island ends worse than it began.
+"""
+from libc.math cimport INFINITY
+from libc.stdint cimport int32_t, int64_t
+from libc.string cimport memcpy
+
+from lavender_ext.core.parts cimport blocks_t
+from lavender_ext.judge.score cimport score_t
+
+
+cdef struct best_t:
+    int32_t n                   # islands
+    int32_t seen                # impulses so far
+    double* impulse             # (m) N s
+    double* relative            # (n) -, of it
+    double* energy              # (n) sqrt J, of it
+    double* start               # (n) -, lowest relative residual of the impulses that a run may begin from
+    double* now                 # (n, 2) -, sqrt J, of the impulse to be seen next: for `score_t.by_island`
+
+
+cdef inline int32_t count_islands(const blocks_t* p) noexcept nogil:
+    return p.islands.n if p.islands != NULL else 1
+
+
+cdef inline int64_t best_room(int64_t m, int64_t n) noexcept nogil:
+    """Number of doubles for m rows in n islands."""
+    return m + 5 * n
+
+
+cdef inline void bind_best(best_t* s, const blocks_t* p, double* room) noexcept nogil:
+    """Before the first impulse; room (`best_room`)."""
+    cdef int32_t n = count_islands(p)
+    s.n, s.seen = n, 0
+    s.impulse, s.relative = room, room + p.n_rows
+    s.energy, s.start, s.now = s.relative + n, s.relative + 2 * n, s.relative + 3 * n
+
+
+cdef inline void note_score(best_t* s, const blocks_t* p, const score_t* x, double relative) noexcept nogil:
+    """Complete `now` after a pass with its relative residual: without islands nothing was written there."""
+    if p.islands == NULL:
+        s.now[0], s.now[1] = relative, x.energy if x.finite else INFINITY
+
+
+cdef inline void copy_island(const blocks_t* p, int32_t island, const double* lam, double* out) noexcept nogil:
+    """Copy the rows of an island from lam to out (m each)."""
+    cdef int32_t a, i
+    if p.islands == NULL:
+        memcpy(out, lam, p.n_rows * sizeof(double))
+        return
+    for a in range(p.islands.ptr[island], p.islands.ptr[island + 1]):
+        i = p.islands.order[a]
+        memcpy(out + p.ptr[i], lam + p.ptr[i], (p.ptr[i + 1] - p.ptr[i]) * sizeof(double))
+
+
+cdef inline bint is_better(const best_t* s, int32_t island, double tol) noexcept nogil:
+    """(1) or (2) for `now`."""
+    cdef double relative = s.now[2 * island]
+    if s.relative[island] <= tol:
+        return False
+    return relative <= tol or (relative <= s.start[island] and s.now[2 * island + 1] < s.energy[island])
+
+
+cdef inline void see_start(best_t* s, const blocks_t* p, const double* lam) noexcept nogil:
+    """Keep lam (m), scored in `now`, for the islands where no earlier start has a lower relative residual."""
+    cdef int32_t i
+    for i in range(s.n):
+        if s.seen == 0 or s.now[2 * i] < s.start[i]:
+            s.relative[i] = s.start[i] = s.now[2 * i]
+            s.energy[i] = s.now[2 * i + 1]
+            copy_island(p, i, lam, s.impulse)
+    s.seen += 1
+
+
+cdef inline bint see_impulse(best_t* s, const blocks_t* p, const double* lam, double tol) noexcept nogil:
+    """Keep lam (m), scored in `now`, for the islands where it is better; return whether there is one. The first is a start."""
+    cdef int32_t i
+    cdef bint changed = False
+    if s.seen == 0:
+        see_start(s, p, lam)
+        return True
+    for i in range(s.n):
+        if not is_better(s, i, tol):
+            continue
+        s.relative[i], s.energy[i] = s.now[2 * i], s.now[2 * i + 1]
+        copy_island(p, i, lam, s.impulse)
+        changed = True
+    s.seen += 1
+    return changed
+
+
+cdef inline double relative_of_best(const best_t* s) noexcept nogil:
+    """Relative residual of the best impulse: the largest of its islands."""
+    cdef double worst = 0.0
+    cdef int32_t i
+    for i in range(s.n):
+        if not s.relative[i] <= worst:
+            worst = s.relative[i]
+    return worst

@@ -1,0 +1,153 @@
+"""Reference errors E0 [sqrt J] and V0 [m/s] of an island: what its relative residual is divided by.
+
+They are E and V (score.pxd) of the zero impulse x = Pi(0), slack w = A x - b, error e, unless the zero impulse solves the island.
+It does if no row's error is more than the rounding of the row's own terms, s_k = |b_k|:
+
+    d_k |e_k| <= 2^-48 s_k                                  for each row k of the island                   (1)
+
+An island with (1) is at rest. Its references are the norms of s over the rows that act, those not strictly inactive:
+
+    E0 = sqrt(sum s_k^2 / d_k),   V0 = max s_k sqrt(nu_k / d_k)                                            (2)
+
+    strictly inactive   row       x_k at a bound, w_k pushes it there by more than 2^-48 s_k, or both bounds are equal
+                        contact   w_n > 2^-48 s_n; under the cone law w_n - sum a_g |w_g| > 2^-48 (s_n + sum a_g |s_g|)
+
+If (2) is zero, no row acts: each row is compared with its own terms, a contact with those of its normal (E0 = V0 = -1):
+
+    relative = max d_k |e_k| / s_k,   of a contact sqrt(d_n sum d_k e_k^2) / s_n       (3) `relative_by_rows`
+
+So a row that does not act changes no verdict about rows that do, however large its b is. Two kinds of rows have no scale of
+their own and are compared with all rows, sqrt(sum E0_i^2) and max V0_i: blocks that nothing moves, and, in (3), rows with
+b = 0 (there sqrt(d) |e| over the former).
+"""
+from libc.math cimport fabs, sqrt
+from libc.stdint cimport int32_t
+
+from lavender_ext.core.block cimport length
+from lavender_ext.core.parts cimport CONE, blocks_t, groups_of, is_rows, islands_t, parts_of, parts_t
+from lavender_ext.judge.score cimport block_at, nothing, relative, relative_by_rows, tally_block, tally_t
+
+
+cdef inline double reference_rounding() noexcept nogil:
+    """2^-48: largest error beside a row's own terms that counts as their rounding."""
+    return 3.5527136788005009e-15
+
+
+cdef inline bint is_inactive_row(const blocks_t* p, int32_t k, double x, double w) noexcept nogil:
+    """Whether the bounded row k is strictly inactive at x, slack w."""
+    cdef double rounding = reference_rounding() * fabs(p.b[k])
+    if p.lower[k] == p.upper[k]:
+        return True
+    return (x == p.lower[k] and w > rounding) or (x == p.upper[k] and -w > rounding)
+
+
+cdef inline bint is_inactive_contact(const blocks_t* p, int32_t i, const double* w) noexcept nogil:
+    """Whether contact i is strictly inactive at zero impulse, slack w (m)."""
+    cdef int32_t g, j = p.ptr[i]
+    cdef double gap = w[j], size = fabs(p.b[j])
+    cdef parts_t q
+    if p.law == CONE:
+        parts_of(p, i, &q)
+        for g in range(q.n):
+            gap -= q.reach[g] * length(w + j + q.first[g], q.size[g])
+            size += q.reach[g] * length(p.b + j + q.first[g], q.size[g])
+    return gap > reference_rounding() * size
+
+
+cdef inline bint is_at_rest(const blocks_t* p, int32_t i, const double* e) noexcept nogil:
+    """(1) for the rows of block i."""
+    cdef int32_t k
+    for k in range(p.ptr[i], p.ptr[i + 1]):
+        if not p.d[k] * fabs(e[k]) <= reference_rounding() * fabs(p.b[k]):
+            return False
+    return True
+
+
+cdef inline void add_terms(const blocks_t* p, int32_t k, int32_t n, double* energy, double* fast) noexcept nogil:
+    """Add n rows from k on to the sums of (2); the maximum takes the norm of the n rows."""
+    cdef int32_t i
+    cdef double t, both = 0.0
+    for i in range(k, k + n):
+        t = (p.b[i] / p.d[i]) * p.b[i]
+        energy[0] += t
+        both += t * p.nu[i]
+    if both > fast[0]:
+        fast[0] = both
+
+
+cdef inline void add_block_terms(const blocks_t* p, int32_t i, const double* x, const double* w, double* energy,
+                                 double* fast) noexcept nogil:
+    """Add the rows of block i that act to the sums of (2)."""
+    cdef int32_t k, g, j = p.ptr[i]
+    cdef parts_t q
+    if is_rows(p, i):
+        for k in range(j, p.ptr[i + 1]):
+            if not is_inactive_row(p, k, x[k], w[k]):
+                add_terms(p, k, 1, energy, fast)
+        return
+    if is_inactive_contact(p, i, w):
+        return
+    add_terms(p, j, 1, energy, fast)
+    groups_of(p, i, &q)
+    for g in range(q.n):
+        add_terms(p, j + q.first[g], q.size[g], energy, fast)
+
+
+cdef inline double set_reference(const blocks_t* p, const int32_t* order, int32_t first, int32_t end, const double* x,
+                                 const double* w, const double* e, double* out) noexcept nogil:
+    """E0 and V0 of blocks order[first:end] into out (2); return the relative residual of the zero impulse x.
+
+    Of errors that are not finite both are 0, which makes every relative residual infinite.
+    """
+    cdef int32_t a, i, k
+    cdef double energy = 0.0, fast = 0.0, check = 0.0       # check: 0, or NaN once a slack is not finite
+    cdef bint rest = True
+    cdef tally_t s = nothing()
+    for a in range(first, end):
+        i = block_at(order, a)
+        rest = rest and is_at_rest(p, i, e)
+        tally_block(p, i, e, &s)
+        for k in range(p.ptr[i], p.ptr[i + 1]):
+            check += 0.0 * w[k]
+    s.energy = sqrt(s.energy)
+    s.fast = sqrt(s.fast) if s.fast > 0.0 else 0.0
+    if not s.energy + s.fast < 1.0 / 0.0 or check != 0.0:
+        out[0] = out[1] = 0.0
+        return 1.0 / 0.0
+    if not rest:
+        out[0], out[1] = s.energy, s.fast
+        return relative(s.energy, s.fast, out[0], out[1])
+    for a in range(first, end):
+        add_block_terms(p, block_at(order, a), x, w, &energy, &fast)
+    if energy > 0.0:
+        out[0], out[1] = sqrt(energy), sqrt(fast)
+        return relative(s.energy, s.fast, out[0], out[1])
+    out[0] = out[1] = -1.0
+    return relative_by_rows(p, order, first, end, e, 0.0)   # 0, or as small as (1) says
+
+
+cdef inline void reference_of(blocks_t* p, const double* x, const double* w, const double* e, double* out) noexcept nogil:
+    """E0 [sqrt J], V0 [m/s] and the relative residual (3) of the zero impulse x, slack w, error e (m each).
+
+    With several islands their references are set, and the first two are sqrt(sum E0_i^2) and max V0_i over those that have one.
+    """
+    cdef islands_t* s = <islands_t*>p.islands
+    cdef int32_t i
+    cdef double r, sum_ = 0.0
+    if s == NULL:
+        out[2] = set_reference(p, NULL, 0, p.n_blocks, x, w, e, out)
+        return
+    out[1] = out[2] = 0.0
+    for i in range(s.n):
+        r = set_reference(p, s.order, s.ptr[i], s.ptr[i + 1], x, w, e, s.reference + 2 * i)
+        out[2] = r if r > out[2] else out[2]
+        if s.reference[2 * i] > 0.0:
+            sum_ += s.reference[2 * i] * s.reference[2 * i]
+            if s.reference[2 * i + 1] > out[1]:
+                out[1] = s.reference[2 * i + 1]
+    out[0] = s.energy = sqrt(sum_)
+
+
+cdef inline bint needs_rows(const blocks_t* p, const double* out) noexcept nogil:
+    """Whether (3) applies to a problem of one island, which then must be listed for it."""
+    return p.islands == NULL and out[0] < 0.0 and p.n_rows > 0

@@ -1,0 +1,216 @@
+"""The residual by islands: rows that do not act, and bodies that never meet, change no verdict about the others."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from random_problems import CONTACTS, FORMS, as_matrix, random_contact_problem, seeds, side_by_side, touching
+from random_trees import random_general
+
+import lavender as lv
+from lavender.solvers.islands import islands
+from lavender.solvers.registry import get
+
+# Sums over an island's rows alone and next to others add in the same order, but what is made of the data (M's factor, d
+# of two tangents) may round differently: a few dozen roundings of 2^-53.
+ROUNDING = 1e-13
+
+
+def rows_side_by_side(first, second):
+    """Two problems of bodies as one; joints come before contacts, so the block order is not that of the two."""
+    p, q, n = first.rows, second.rows, first.rows.n_bodies
+
+    def shifted(bodies):
+        return np.where(bodies < 0, -1, bodies + n).astype(np.int32)
+
+    rows = lv.Rows(
+        **{name: np.concatenate([getattr(p, name), getattr(q, name)])
+           for name in ("inv_mass", "inv_inertia", "v_free", "jac", "normal", "tangent", "arm_a", "arm_b")},
+        joint_ptr=np.concatenate([p.joint_ptr, p.joint_ptr[-1] + q.joint_ptr[1:]]).astype(np.int32),
+        joint_body=np.concatenate([p.joint_body, shifted(q.joint_body)]),
+        contact_body=np.concatenate([p.contact_body, shifted(q.contact_body)]),
+    )  # fmt: skip
+    j, k, c, d = p.n_joints, q.n_joints, p.n_contacts, q.n_contacts
+    cones = first.cones + second.cones
+    order = np.concatenate(
+        [np.arange(j), j + c + np.arange(k), j + np.arange(c), j + c + k + np.arange(d)]
+    ).astype(int)
+    size = np.diff(cones.ptr)
+    row_order = np.concatenate([np.arange(cones.ptr[i], cones.ptr[i] + size[i]) for i in order]).astype(int)
+    b = np.concatenate([first.b, second.b])[row_order]
+    compliance = np.concatenate([first.compliance, second.compliance])[row_order]
+    both = lv.Problem(b, cones.take(order), rows=rows, compliance=compliance, friction=first.friction)
+    return both, row_order
+
+
+def general_side_by_side(first, second):
+    """Two problems in generalised coordinates as one."""
+    p, q = first.generalized, second.generalized
+    cones = first.cones + second.cones
+    jac = sp.block_diag([p.jac, q.jac]).toarray()
+    both = lv.Problem.from_jacobian(
+        jac, sp.block_diag([p.mass, q.mass]).toarray(), np.concatenate([p.v_free, q.v_free]), cones=cones,
+        compliance=np.concatenate([first.compliance, second.compliance]), friction=first.friction,
+    )  # fmt: skip
+    return both.updated(b=np.concatenate([first.b, second.b])), np.arange(both.m)
+
+
+def together(first, second):
+    """(both as one problem, place of each row of the two in it)."""
+    if first.matrix is not None:
+        return side_by_side([first, second]), np.arange(first.m + second.m)
+    return (rows_side_by_side if first.rows is not None else general_side_by_side)(first, second)
+
+
+def scaled(problem, factor):
+    """The same problem with all velocities `factor` times as large, so that its impulses are."""
+    if problem.matrix is not None:
+        return replace(problem, b=factor * problem.b)
+    return problem.updated(b=factor * problem.b)
+
+
+@pytest.mark.parametrize("friction", ["coulomb", "cone"])
+@pytest.mark.parametrize("kind", CONTACTS)
+@pytest.mark.parametrize("form", FORMS)
+@settings(max_examples=5)
+@given(seed=seeds, power=st.integers(-6, 6))
+def test_the_residual_of_two_problems_side_by_side_is_the_larger_one(form, kind, friction, seed, power):
+    first, second = (
+        FORMS[form](CONTACTS[kind](seed + i, friction, bodies=3, joints=2, contacts=3)) for i in range(2)
+    )
+    second = scaled(second, 10.0**power)
+    both, rows = together(first, second)
+    rng = np.random.default_rng(seed)
+    lam = [rng.normal(size=first.m), 10.0**power * rng.normal(size=second.m)]
+    lam[seed % 2] = lv.solve((first, second)[seed % 2], tol=1e-9).impulse
+    alone = [lv.residual(p, x) for p, x in zip((first, second), lam, strict=True)]
+    found = lv.residual(both, np.concatenate(lam)[rows])
+    worst = max(r.relative for r in alone)
+    # The residual of a solved problem is rounding, which the order of additions changes: as much as its floor.
+    slack = ROUNDING * worst + 4.0 * max(r.floor for r in alone)
+    assert abs(found.relative - worst) <= slack
+    if kind != "ellipses":  # whose numbers are those of stretched rows
+        count = sum(islands(p)[0] for p in (first, second))
+        assert len(found.islands.relative) == islands(both)[0] == count
+        np.testing.assert_allclose(
+            np.sort(found.islands.relative),
+            np.sort(np.concatenate([r.islands.relative for r in alone])),
+            rtol=1e-9,
+            atol=slack,
+        )
+
+
+def test_a_fast_body_does_not_hide_a_stack_that_is_not_solved():
+    """32 boxes in a stack and one contact at 1000 m/s: the verdict is that of the stack alone."""
+    boxes = 32
+    stack = touching([[i - 1, i] for i in range(boxes)], v_free=np.tile([0, 0, -0.1, 0, 0, 0.0], (boxes, 1)))
+    fast = touching([[-1, 0]], v_free=[[0, 0, -1000.0, 0, 0, 0]])
+    alone = lv.Problem.from_rows(stack, tangents=0)
+    both, rows = rows_side_by_side(alone, lv.Problem.from_rows(fast, tangents=0))
+    for name in lv.available(both):
+        solution = lv.solve(both, name, tol=1e-6, max_iter=400)
+        own = lv.residual(alone, solution.impulse[rows < alone.m])
+        if solution.success:
+            assert own.relative <= 1e-6 * (1 + ROUNDING), name
+        assert solution.residual.relative >= own.relative * (1 - ROUNDING), name
+
+
+# -- rows that do not act ------------------------------------------------------------------------------
+
+
+def with_inactive_rows(problem, rng, sizes):
+    """A problem in generalised coordinates and more rows of every kind, whose bounds hold them at zero impulse.
+
+    Some touch nothing, the others a velocity that one of the problem's rows touches: no row connects two islands.
+    """
+    g = problem.generalized
+    n = len(sizes)
+    touched = np.flatnonzero(np.abs(g.jac.toarray()).any(axis=0))
+    jac = np.zeros((5 * n, g.nv))
+    at = np.concatenate([rng.choice(touched, 2 * n), np.repeat(rng.choice(touched, n), 3)])
+    jac[np.arange(5 * n), at] = rng.normal(size=5 * n) * (rng.random(5 * n) < 0.7)
+    inf = np.full(n, np.inf)
+    cones = problem.cones + lv.Cones.bounded(np.zeros(n), inf) + lv.Cones.bounded(-inf, np.zeros(n))
+    cones = cones + lv.Cones.contacts(0.5, 2, count=n)
+    b = np.concatenate([-sizes, sizes, np.stack([-sizes, 0.1 * sizes, 0 * sizes], axis=1).ravel()])
+    jac = np.concatenate([g.jac.toarray(), jac])
+    more = lv.Problem.from_jacobian(
+        jac, g.mass.toarray(), g.v_free, cones=cones,
+        compliance=np.concatenate([problem.compliance, np.zeros(len(b))]), friction=problem.friction,
+    )  # fmt: skip
+    return more.updated(b=np.concatenate([problem.b, b]))
+
+
+LARGE = st.lists(st.integers(3, 60), min_size=1, max_size=3).map(lambda powers: 10.0 ** np.array(powers))
+
+
+@pytest.mark.parametrize("friction", ["coulomb", "cone"])
+@pytest.mark.parametrize("form", ["matrix", "J and M"])
+@settings(max_examples=20)
+@given(seed=seeds, sizes=LARGE, still=st.booleans())
+def test_inactive_rows_change_no_relative_residual(form, friction, seed, sizes, still):
+    rng = np.random.default_rng(seed)
+    problem = random_general(seed, friction)
+    if still:  # the zero impulse is a solution
+        problem = problem.updated(b=np.where(problem.cones.lower == 0.0, -np.abs(problem.b), 0.0))
+    more = with_inactive_rows(problem, rng, sizes)
+    lam = rng.normal(size=problem.m)
+    convert = as_matrix if form == "matrix" else (lambda p: p)
+    for impulse in (lam, problem.start(), lv.solve(problem, tol=1e-9).impulse):
+        alone = lv.residual(convert(problem), impulse)
+        found = lv.residual(convert(more), np.concatenate([impulse, np.zeros(more.m - problem.m)]))
+        assert found.relative == pytest.approx(alone.relative, rel=1e-9, abs=4.0 * alone.floor)
+
+
+@pytest.mark.parametrize("form", ["matrix", "J and M"])
+@pytest.mark.parametrize("size", [1e3, 1e9, 1e15, 1e30, 1e60])
+@pytest.mark.parametrize("friction", ["coulomb", "cone"])
+def test_solvers_converge_beside_inactive_rows(friction, size, form):
+    """What converges without inactive rows converges with them, with the same velocities within the tolerance."""
+    tol, solved = 1e-6, 0
+    convert = as_matrix if form == "matrix" else (lambda p: p)
+    for seed in range(3):
+        problem = random_general(seed, friction, contacts=3)
+        more = with_inactive_rows(problem, np.random.default_rng(seed), np.array([size]))
+        for name in lv.available(more):
+            if get(name).external:
+                continue  # their own tests of a size are not ours
+            alone = lv.solve(convert(problem), name, tol=tol)
+            if not alone.success:
+                continue
+            solution = lv.solve(convert(more), name, tol=tol)
+            assert solution.success, (name, seed, str(solution))
+            own = lv.residual(problem, solution.impulse[: problem.m])
+            assert own.relative <= tol * (1 + 1e-9), (name, seed, str(own))
+            solved += 1
+    assert solved >= 15
+
+
+def test_a_placeholder_bound_does_not_satisfy_an_equality():
+    """min (x - 2)^2 + (y - 1)^2 with x + y = 1 and x, y <= 1e15: (2, 1) misses the equality by 2."""
+    for bound in (1e9, 1e12, 1e15, 1e30):
+        qp = lv.Problem.from_qp(2.0 * np.eye(2), [-4.0, -2.0], A=[[1.0, 1.0]], b=[1.0], ub=[bound, bound])
+        for name in ("auto", "newton", "pgs", "direct", "lemke"):
+            if name in lv.available(qp):
+                solution = lv.solve(qp, name, tol=1e-9)
+                assert solution.success, (name, bound)
+                np.testing.assert_allclose(
+                    qp.velocity(solution.impulse).sum(), 1.0, atol=1e-8, err_msg=f"{name} {bound}"
+                )
+
+
+def test_a_row_that_nothing_moves_has_no_scale_of_its_own():
+    """Its row of A is zero: b of 1e-17 beside numbers of 1 is rounding, b of 1e-3 has no solution."""
+    for b, status in ((1e-17, lv.Status.CONVERGED), (1e-3, lv.Status.INFEASIBLE)):
+        assert lv.solve(lv.Problem.lcp(np.diag([1.0, 0.0]), [1.0, b])).status is status
+
+
+def test_bodies_that_share_nothing_are_islands_in_every_form():
+    problem = random_contact_problem(3, tangents=2, spin=False)
+    both, _ = rows_side_by_side(problem, random_contact_problem(4, tangents=2, spin=False))
+    counts = [islands(convert(both))[0] for convert in FORMS.values()]
+    assert counts[0] > 1
+    assert len(set(counts)) == 1
