@@ -62,9 +62,9 @@ def finish(
     """
     # In float64, in which solvers work, whatever the data were.
     if claim.status is INFEASIBLE and all_finite(impulse):
-        impulse, judged = _within_bounds(problem, impulse)
+        impulse, judged = _within_bounds(problem, impulse, tol)
     else:
-        judged = residual(problem, impulse, "float64")
+        judged = residual(problem, impulse, "float64", tol=tol)
     status, message = claim.status, claim.message
     relative = judged.relative
     if status is not NUMERICAL_ERROR and not all_finite(impulse):
@@ -79,6 +79,15 @@ def finish(
         message = _joined(message, "beside such impulses float64 loses b")
     elif tol > 0.0 and relative <= tol and status in (MAX_ITERATIONS, TIME_LIMIT, STALLED):
         status = CONVERGED
+    elif tol < relative and (
+        (status in (CONVERGED, STALLED, MAX_ITERATIONS, TIME_LIMIT) and judged._float64_relative <= tol)
+        or (status is FLOOR and judged._float64_relative < math.inf)
+    ):  # the claim is true of the first pass in float64
+        status = STALLED
+        message = _joined(
+            message,
+            f"M is ill-conditioned: residuals below {judged.floor:.1e} are rounding errors of float64",
+        )
     elif (
         problem.operator not in spec.operators
         and ((status is CONVERGED and relative > tol) or (status is FLOOR and not judged.at_floor))
@@ -162,14 +171,14 @@ def describe_end(problem: Problem, status: Status, iterations: int) -> str:
     return words
 
 
-def _within_bounds(problem: Problem, impulse: FloatArray) -> tuple[FloatArray, Residual]:
+def _within_bounds(problem: Problem, impulse: FloatArray, tol: float) -> tuple[FloatArray, Residual]:
     """Project an impulse (m,) [N s] onto the bounds; take the zero impulse instead if its error has less energy.
 
     An engine that applies the impulse of an infeasible step must not pull at a contact. The largest velocity error does
     not decide: it is that of the rows that cannot be met, whatever the others gained.
     """
     candidates = project(problem.cones, impulse), problem.start()
-    results = [(lam, residual(problem, lam, "float64")) for lam in candidates]
+    results = [(lam, residual(problem, lam, "float64", tol=tol)) for lam in candidates]
     return min(results, key=lambda result: result[1].energy)
 
 

@@ -11,7 +11,7 @@ from libc.math cimport fabs
 from libc.stdint cimport int32_t, int64_t
 
 from lavender_ext.core.block cimport block_error
-from lavender_ext.core.csr cimport csr_dot, csr_dot_size, csr_t
+from lavender_ext.core.csr cimport csr_dot, csr_dot_long, csr_t
 from lavender_ext.core.generalized cimport (generalized_t, jac_push, jac_row, panel_push_size, panel_size,
                                             tree_solve)
 from lavender_ext.core.parts cimport blocks_t, is_rows, n_directions, n_turns
@@ -41,7 +41,7 @@ cdef inline void csr_floor(const blocks_t* p, const csr_t* a, const double* lam,
     for i in range(p.n_blocks):
         j = p.ptr[i]
         for k in range(j, p.ptr[i + 1]):
-            w[k] = csr_dot_size(a, k, lam, size + (0 if is_rows(p, i) else k - j)) - p.b[k]
+            w[k] = csr_dot_long(a, k, lam, size + (0 if is_rows(p, i) else k - j)) - p.b[k]
             if is_rows(p, i):                           # of any number
                 add_floor(p, k, size[0], f)
         block_error(p, i, lam, w, e)
@@ -290,8 +290,8 @@ cdef inline void general_slack(const blocks_t* p, const generalized_t* g, const 
 
 
 cdef inline void general_floor(const blocks_t* p, const generalized_t* g, const double* lam, const double* w,
-                               const double* e, double* x, score_t* out) noexcept nogil:
-    """The floor of that; |Y| |Y|^T |lam| + c |lam| stands for |A| |lam|. x (n + m) is scratch."""
+                               const double* e, double* x, const double* more, score_t* out) noexcept nogil:
+    """The floor of that; |Y| |Y|^T |lam| + c |lam| + more stands for |A| |lam|, `more` (m) or NULL. x (n + m) is scratch."""
     cdef int32_t i
     cdef floor_t f = no_floor()
     cdef double* size = x + g.n
@@ -303,6 +303,9 @@ cdef inline void general_floor(const blocks_t* p, const generalized_t* g, const 
         panel_size(g, i, x, size)
     for i in range(p.n_rows):
         size[i] += g.compliance[i] * fabs(lam[i])
+    if more != NULL:
+        for i in range(p.n_rows):
+            size[i] += more[i]
     for i in range(p.n_blocks):
         add_block_floor(p, i, lam, w, e, size + p.ptr[i], &f)
     floor_from(&f, out)
@@ -314,15 +317,15 @@ cdef inline void general_judge(const blocks_t* p, const generalized_t* g, const 
     general_slack(p, g, lam, x, w)
     score_rows(p, lam, w, e, out)
     if floor:
-        general_floor(p, g, lam, w, e, x, out)
+        general_floor(p, g, lam, w, e, x, NULL, out)
 
 
 # -- any form ------------------------------------------------------------------------------------------
 
 
 cdef inline int64_t scratch_of(const view_t* v) noexcept nogil:
-    """Numbers that `judge_view` needs besides w and e."""
-    return v.g.n + v.p.n_rows if v.g != NULL else 12 * <int64_t>v.r.n_bodies if v.r != NULL else 0
+    """Numbers that `judge_view` needs besides w and e, and over J and M what refines it (judge/refine.pxd)."""
+    return 6 * <int64_t>v.g.n + 2 * <int64_t>v.p.n_rows if v.g != NULL else 12 * <int64_t>v.r.n_bodies if v.r != NULL else 0
 
 
 cdef inline void judge_view(const view_t* v, const double* lam, double* w, double* e, double* scratch, bint floor,
@@ -404,7 +407,10 @@ cdef class Judged:
     cdef object both                                    # w (m,) m/s, then e (m,) N s
     cdef readonly double energy, velocity               # sqrt J, m/s; inf where e is not finite
     cdef readonly double relative, floor                # -
+    cdef readonly double float64_relative               # of the first pass, by float64 alone; NaN if it was not refined
+    cdef double known_loss                              # `loss`, negative before it is computed
     cdef readonly int worst                             # row of the largest velocity error, -1
 
 
-cdef Judged judged_from(Data p, object impulse, object both, const score_t* s, double relative_, double floor)
+cdef Judged judged_from(Data p, object impulse, object both, const score_t* s, double relative_, double floor,
+                        double float64_relative=*)

@@ -172,8 +172,8 @@ cdef inline bint is_at_floor(double relative, double floor) noexcept nogil:
     """Whether a relative residual is within twice its floor, and at most 1e-5; no floor hides it (`hides`).
 
     The floor grows with the impulse, so one that runs away, as where there is no solution, excuses any residual: it
-    says nothing of the problem. At 1e-5 A lambda is made of terms 1e11 times as large as what they leave; problems
-    with an M of condition 1e16 end below 1e-5.
+    says nothing of the problem. At 1e-5 A lambda is made of terms 1e11 times as large as what they leave, or what
+    float64 makes of M^-1 J^T lambda is off by as much, as with an M of condition 1e12 (judge/refine.pxd).
     """
     return relative <= 2.0 * floor and relative <= 1e-5 and not hides(floor)
 

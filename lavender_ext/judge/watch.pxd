@@ -7,6 +7,9 @@ that eighth. The relative residual r decides:
 
     r <= tol                                        CONVERGED
     r not finite, or > 1e6 max(1, r of the first 8) DIVERGED
+    first pass <= tol < refined one (judge/refine.pxd)
+        refined <= 2 floor and <= 1e-5              AT_FLOOR
+        else floor > tol                            STALLED
     no better than the best so far, and
         best <= 1e-6 and best <= 2 floor            AT_FLOOR
         sweeps > 32 * sweeps of the best + patience, and nothing
@@ -21,6 +24,7 @@ from lavender_ext.core.parts cimport blocks_t
 from lavender_ext.core.view cimport view_t
 from lavender_ext.judge.measure cimport judge_view, relative_of
 from lavender_ext.judge.progress cimport keep, open_progress, progress_t, rests, see
+from lavender_ext.judge.refine cimport refine_view
 from lavender_ext.judge.score cimport is_at_floor, relative, score_t
 
 
@@ -77,6 +81,29 @@ cdef inline double against_start(const watch_t* s, double energy, double velocit
     return relative(energy, velocity, s.start_energy, s.start_velocity)
 
 
+cdef inline double judge_closely(const watch_t* s, const view_t* v, const double* lam, double tol, double* floor,
+                                 bint* refined) noexcept nogil:
+    """The judge's relative residual and its floor, refined if an ill-conditioned M needs it."""
+    cdef score_t x
+    cdef double found
+    judge_view(v, lam, s.w, s.e, s.v, True, &x)
+    found = relative_of(&x, s.w, v.p.n_rows, s.start_energy, s.start_velocity)
+    refined[0] = refine_view(v, lam, s.w, s.e, s.v, s.start_energy, s.start_velocity, tol, found, &x)
+    if refined[0]:
+        found = relative_of(&x, s.w, v.p.n_rows, s.start_energy, s.start_velocity)
+    floor[0] = against_start(s, x.floor_energy, x.floor_velocity)
+    return found
+
+
+cdef inline int32_t end_refined(double found, double floor, double tol) noexcept nogil:
+    """The claim of an impulse whose first pass is within tol, by its refined residual: more sweeps reduce that to its floor."""
+    if found <= tol:
+        return CONVERGED
+    if is_at_floor(found, floor):
+        return AT_FLOOR
+    return STALLED if not floor <= tol else RUNNING
+
+
 cdef inline int32_t until_next(const watch_t* s, double now, double tol) noexcept nogil:
     """Sweeps until the next check."""
     cdef double least = s.total >> 3, most = s.total, n = 0.0, gap = s.total - s.last_at, fall, r = now
@@ -99,11 +126,12 @@ cdef inline int32_t check(watch_t* s, const view_t* v, double* lam, double tol) 
     cdef score_t x
     cdef const blocks_t* p = &v.p
     cdef double now, floor, inf = 1.0 / 0.0
+    cdef bint refined = False
+    cdef int32_t end
     judge_view(v, lam, s.w, s.e, s.v, False, &x)
     now = against_start(s, x.energy, x.velocity) if x.finite else inf
     if now <= tol:                                      # once more, beside what rounding hides
-        judge_view(v, lam, s.w, s.e, s.v, True, &x)
-        now = relative_of(&x, s.w, p.n_rows, s.start_energy, s.start_velocity)
+        now = judge_closely(s, v, lam, tol, &floor, &refined)
     if s.total <= EARLY and s.start < now < inf:
         s.start = now
     see(&s.progress, s.total, now)
@@ -112,6 +140,10 @@ cdef inline int32_t check(watch_t* s, const view_t* v, double* lam, double tol) 
     s.last_at = s.total
     if now <= tol:
         return CONVERGED
+    if refined:
+        end = end_refined(now, floor, tol)
+        if end != RUNNING:
+            return end
     if now < s.best_relative:
         s.best_relative = now
         s.best_at = s.total
@@ -123,9 +155,8 @@ cdef inline int32_t check(watch_t* s, const view_t* v, double* lam, double tol) 
             memcpy(lam, s.best, p.n_rows * sizeof(double))
         return DIVERGED
     if s.best_at >= 0 and s.best_relative <= 1e-6:
-        judge_view(v, s.best, s.w, s.e, s.v, True, &x)
-        floor = against_start(s, x.floor_energy, x.floor_velocity)
-        if is_at_floor(s.best_relative, floor):
+        now = judge_closely(s, v, s.best, tol, &floor, &refined)
+        if is_at_floor(now if refined else s.best_relative, floor):
             memcpy(lam, s.best, p.n_rows * sizeof(double))
             return AT_FLOOR
     if s.total > 32 * <double>s.best_at + s.patience and rests(&s.progress, p, lam, s.total, s.best_relative):
@@ -151,8 +182,14 @@ cdef inline int32_t confirmed(const watch_t* s, const view_t* v, const double* l
     """The claim `status`, judged in another form: what does not hold there goes on, or has stalled."""
     cdef score_t x
     cdef double now, floor
+    cdef bint within
     judge_view(v, lam, s.w, s.e, s.v, status == AT_FLOOR, &x)
     now = against_start(s, x.energy, x.velocity) if x.finite else 1.0 / 0.0
+    if refine_view(v, lam, s.w, s.e, s.v, s.start_energy, s.start_velocity, tol, now, &x):
+        within = now <= tol
+        now = relative_of(&x, s.w, v.p.n_rows, s.start_energy, s.start_velocity)
+        if within:
+            return end_refined(now, against_start(s, x.floor_energy, x.floor_velocity), tol)
     if now <= tol:
         return CONVERGED
     if status == CONVERGED:

@@ -101,7 +101,7 @@ static void run_sweeps(lav_solver *s, const lav_budget *budget, lav_result *out)
   if (s->mode == core_order_SYMMETRIC && is_accelerated(&s->options)) out->sweeps *= 2;
 #endif
   if (budget->tol > 0.0 && s->watch.best_at >= 0 && out->outcome != LAV_CONVERGED) {
-    judge(s, s->impulse, 0, &best); /* a residual may rise: the best check counts */
+    judge(s, s->impulse, 0, INFINITY, &best); /* a residual may rise: the best check counts */
     if (!(best.relative <= s->watch.best_relative)) {
       COPY(s->impulse, s->watch.best, s->p.n_rows);
       sweep_serial_form_velocity(&s->swept.c, s->impulse);
@@ -188,8 +188,8 @@ static int32_t start_newton(lav_solver *s) {
 static void keep_better(lav_solver *s, const double *begin) {
   lav_verdict now, then;
   double nothing[3];
-  judge(s, s->impulse, 0, &now);
-  judge(s, begin, 0, &then);
+  judge(s, s->impulse, 0, INFINITY, &now);
+  judge(s, begin, 0, INFINITY, &then);
   if (!(now.relative <= then.relative)) {
     COPY(s->impulse, begin, s->p.n_rows);
     now = then;
@@ -212,7 +212,7 @@ static void run_newton(lav_solver *s, const lav_budget *budget, lav_result *out)
     out->iterations = before + said.work;
     if (how == core_method_SPENT) break;
     if (how == core_method_REACHED) {
-      judge(s, s->impulse, 1, &now); /* over velocities sums are rounded in another order, and vanish where squares do */
+      judge(s, s->impulse, 1, INFINITY, &now); /* over velocities sums are rounded in another order, and vanish where squares do */
       if (now.relative <= budget->tol) out->outcome = LAV_CONVERGED;
       else if (closer <= CLOSEST || budget->iterations <= out->iterations) out->outcome = LAV_STALLED;
       else {
