@@ -10,6 +10,11 @@ of each island, and of all of them the largest.
 Long double has 11 more bits and 2^14 instead of 2^10 as its largest exponent, so nothing here overflows, and what
 it rounds is far below what float64 may round. `Judgement.allowed` is what float64 may add: each of the m + 20
 operations of a row rounds by 2^-53, or by the smallest denormal.
+
+Over J and M, columns of M^-1 J^T are refined with residuals in exact integers, so that A has 64 bits whatever M's
+condition is. The judge refines as well, unless its first pass is accurate to a tenth of the tolerance:
+`Judgement.unrefined` bounds the error of such a pass, 10 n cond(M) roundings, and `Judgement.floor_most` is the largest
+floor that such an M explains.
 """
 
 import itertools
@@ -32,16 +37,63 @@ class Judgement:
     relative: float
     floor: float
     allowed: float  # relative residual that float64 may add
+    unrefined: float  # and that a pass by the factor of M may add besides
+    floor_most: float  # at most what the judge may call its floor
     energy: float
     velocity: float
     nothing: bool  # doing nothing is near the line below which the norms of b stand in
     range: float  # largest |log10| of the numbers on the way
     relatives: np.ndarray  # (n,) of each island
     floors: np.ndarray  # (n,)
+    floors_most: np.ndarray  # (n,) `floor_most` of each
 
 
 def norm(x, sqrt=np.sqrt):
     return abs(x[0]) if len(x) == 1 else sqrt(np.sum(x**2))
+
+
+BITS = 1130  # of integers that hold any float64 exactly
+
+
+def as_integers(x):
+    """x 2^BITS as exact integers, x of float64 numbers or sums of two."""
+    high = x.astype(float)
+    out = np.zeros(x.shape, object)
+    for part in (high, (x - high).astype(float)):
+        digits, exponent = np.frexp(part)
+        whole = (digits * 2.0**53).astype(np.int64).astype(object)
+        out += whole << (exponent.astype(object) - 53 + BITS)
+    return out
+
+
+def as_long(whole):
+    """Integers over 2^(2 BITS) in long double, cut off at 64 bits."""
+    out = np.zeros(whole.shape, L)
+    for at, x in np.ndenumerate(whole):
+        cut = max(0, int(x).bit_length() - 64)
+        x >>= cut
+        out[at] = np.ldexp(L(x >> 32) * L(2.0) ** 32 + L(x & (2**32 - 1)), cut - 2 * BITS)
+    return out
+
+
+def refined_inverse(lower, mass, right):
+    """mass^-1 right in long double by mass = lower lower^T; residuals, in integers, are exact."""
+
+    def solve(r):
+        x = r.copy()
+        for i in range(len(x)):
+            x[i] = (x[i] - lower[i, :i] @ x[:i]) / lower[i, i]
+        for i in range(len(x) - 1, -1, -1):
+            x[i] = (x[i] - lower[i + 1 :, i] @ x[i + 1 :]) / lower[i, i]
+        return x
+
+    x = solve(right)
+    if not (np.isfinite(x).all() and np.abs(x).max(initial=ZERO) < 1e300):
+        return x
+    whole, given = as_integers(mass), as_integers(right) << BITS
+    for _ in range(3):
+        x += solve(as_long(given - whole @ as_integers(x)))
+    return x
 
 
 def project_cone(z, d, bounds, sqrt=np.sqrt):
@@ -106,7 +158,7 @@ class Problem:
         self.operator = "general" if general else "rows" if "rows" in spec else "matrix"
         self.m = len(self.b)
         self.stretch = self._stretch()
-        self.roundings = self.m + 20
+        self.roundings, self.of_factor = self.m + 20, ZERO
         if general:
             self._of_general(
                 jac, np.array(spec["M"], L), np.array(spec.get("compliance", np.zeros(self.m)), L)
@@ -234,16 +286,16 @@ class Problem:
             lower[i, i] = np.sqrt(mass[i, i] - lower[i, :i] @ lower[i, :i])
             y[:, i] = (jac[:, i] - y[:, :i] @ lower[i, :i]) / lower[i, i]
         self.half, self.soft = y, soft
-        self.A = y @ y.T + np.diag(soft)
+        unit = 1 / np.sqrt(np.diag(mass))
+        scaled = (unit[:, None] * mass * unit[None, :]).astype(float)
+        condition = np.linalg.cond(scaled) if np.isfinite(scaled).all() else np.inf
+        self.of_factor = 10 * n * L(condition)
+        inner = y @ y.T if condition < 1e3 else jac @ refined_inverse(lower, mass, jac.T)
+        self.A = inner + np.diag(soft)
         self.size = np.abs(y) @ np.abs(y.T) + np.diag(soft)
         d = np.diag(self.A).copy()
         self.d = self._filled(d, d >= LEAST)
         self.nu = self.d.copy()
-        # A solve by the factor of M is as exact as M in the best units of its velocities allows.
-        unit = 1 / np.sqrt(np.diag(mass))
-        scaled = (unit[:, None] * mass * unit[None, :]).astype(float)
-        condition = np.linalg.cond(scaled) if np.isfinite(scaled).all() else np.inf
-        self.roundings += 10 * n * L(condition)
         self.d_edge = not np.isfinite(self.A).all() or bool(
             np.any((d > 0) & (d < L(1e-12) * np.diag(self.size))) or self._at_least(d)
         )
@@ -405,7 +457,20 @@ class Problem:
         """Judgement of an impulse (m,) float64."""
         lam = np.array(impulse, L) / self.stretch
         if not np.isfinite(lam).all():
-            return Judgement(np.inf, 0.0, 0.0, np.inf, np.inf, False, np.inf, np.zeros(0), np.zeros(0))
+            return Judgement(
+                np.inf,
+                0.0,
+                0.0,
+                0.0,
+                np.inf,
+                np.inf,
+                np.inf,
+                False,
+                np.inf,
+                np.zeros(0),
+                np.zeros(0),
+                np.zeros(0),
+            )
         with np.errstate(all="ignore"):
             return self._judge(lam)
 
@@ -431,7 +496,7 @@ class Problem:
             np.sqrt(sum((x * x for x, _ in filter(None, references)), ZERO)),
             max((y for _, y in filter(None, references)), default=ZERO),
         )
-        relatives, floors, allows = [], [], []
+        relatives, floors, allows, losses = [], [], [], []
         for rows, reference in zip(self.islands, references, strict=True):
             if not self.touches[rows].any():
                 reference = whole  # nothing moves it: it has no scale of its own
@@ -440,6 +505,7 @@ class Problem:
                 relatives.append(self._by_rows(rows, error, whole[0]))
                 floors.append(max(own, default=ZERO))
                 allows.append(self._by_rows(rows, more / self.d, whole[0]))
+                losses.append(self._by_rows(rows, self.of_factor * (f + rounded) / self.d, whole[0]))
                 continue
             nothing |= bool(0 < reference[0] <= LEAST * np.sqrt(self.d.sum()))
             nothing |= bool(0 < reference[1] <= LEAST * np.sqrt(self.nu * self.d).max(initial=ZERO))
@@ -450,7 +516,8 @@ class Problem:
             relatives.append(relative)
             floors.append(floor)
             allows.append(self._ratio(*self._floor(rows * more), *reference))
-        relative, allowed = max(relatives, default=ZERO), max(allows, default=ZERO)
+            losses.append(self._ratio(*self._floor(rows * self.of_factor * (f + rounded)), *reference))
+        relative, allowed, unrefined = (max(x, default=ZERO) for x in (relatives, allows, losses))
         floor = floors[int(np.argmax(relatives))] if relatives else ZERO
         scales = [x for reference in references if reference is not None for x in reference]
         seen = np.abs(np.concatenate([lam, w, self.d, self.b, [energy, velocity], scales]))
@@ -460,12 +527,15 @@ class Problem:
             float(relative),
             float(floor),
             float(allowed),
+            float(unrefined),
+            float(100 * floor + unrefined),
             float(energy),
             float(velocity),
             nothing,
             span,
             np.array(relatives, float),
             np.array(floors, float),
+            np.array([100 * floor + loss for floor, loss in zip(floors, losses, strict=True)], float),
         )
 
     def _reference(self, rows, start, slack, error):

@@ -25,7 +25,7 @@ from lavender.base.arrays import (
 )
 from lavender.base.errors import InputError, LavenderError
 from lavender.base.threads import together
-from lavender.judge.residuals import AT_REST, ENOUGH, VERDICTS, Residual, residual, verdict_of
+from lavender.judge.residuals import AT_REST, ENOUGH, TOL, VERDICTS, Residual, residual, verdict_of
 from lavender.problem import PRECISIONS, Problem, check_problem
 from lavender.problem.batch import ERRORS, Batch
 from lavender.problem.derived import cached_property
@@ -287,7 +287,7 @@ def residual_many(
     def alone(i: int) -> None:
         made.keep(i, residual(given[i], made._impulse[made._rows(i)], words[i], threshold))
 
-    made._run(lambda hand: int(hand.judge(single)), alone, threads, errors)
+    made._run(lambda hand: int(hand.judge(TOL, single)), alone, threads, errors)
     return made
 
 

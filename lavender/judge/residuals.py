@@ -18,6 +18,11 @@ reference is the size of the terms of the rows that act (`lavender_ext/judge/ref
 If the floor is 1e-3 or more, rounding hides a thousandth of the zero impulse's error: the floor is then the relative
 residual, unless that is larger. An impulse that ran away is not a solution.
 
+In generalised coordinates w = J x + theta lambda - b with M x = J^T lambda, and a solve by the factor of an
+ill-conditioned M loses digits of x that no term above counts. If n 2^-53 cond(M) exceeds a tenth of the tolerance, the
+pass is repeated with x refined by residuals in twice the precision of float64. The floor then also contains the change
+of w and a bound of the error that remains (`lavender_ext/judge/refine.pxd`).
+
 A solution computed in float32 has a floor of its own. Each number is rounded independently by at most u = 2^-24 of
 itself, so the squares of the errors add up. Entry by entry (A^2 is A o A), with x = M^-1 J^T lambda, w^2 grows by
 
@@ -64,6 +69,7 @@ OF_ROW = 32  # multiply-adds of that pass for each row on two bodies
 # (relative, floor) of one island: the test of every solver and of the judge, its reason with it
 at_floor = measure.at_floor
 
+TOL = 1e-6  # -, the tolerance of `residual`, which is the default of `solve`
 ENOUGH = 1e-6  # m/s, below which a robot's velocities are no further off than anybody measures
 VERDICTS = AT_FLOOR, CLOSE, UNCONVERGED, WRONG = (
     "at its floor", "close enough", "stopped before convergence", "wrong",
@@ -146,6 +152,7 @@ class Residual:
     precision: str = "float64"
     rounding: Rounding | None = None
     threshold: float = ENOUGH
+    _float64_relative: float = field(default=math.nan, repr=False)  # before an ill-conditioned M was refined
 
     @property
     def at_floor(self) -> bool:
@@ -376,7 +383,11 @@ def quick(
 
 
 def residual(
-    problem: Problem, impulse: ArrayLike, precision: str | None = None, threshold: float = ENOUGH
+    problem: Problem,
+    impulse: ArrayLike,
+    precision: str | None = None,
+    threshold: float = ENOUGH,
+    tol: float = TOL,
 ) -> Residual:
     """Measure the error of an impulse (m,) [N s]: the judge that every solve uses, for any impulse.
 
@@ -390,11 +401,14 @@ def residual(
         `problem.precision`. The error itself is always measured in float64.
     threshold : float, default 1e-6, m/s
         Velocity error that is close enough for the verdict; rad/s on rows of rotations in generalised coordinates.
+    tol : float, default 1e-6
+        Size of a relative residual that must not be wrong. It matters only for J and an ill-conditioned M, whose factor
+        loses digits: if n 2^-53 cond(M) is above tol / 10, M^-1 J^T impulse is refined in twice that precision.
 
     Raises
     ------
     InputError
-        `impulse` has the wrong length or is not numeric, `precision` is another word, or `threshold` is negative.
+        `impulse` has the wrong length or is not numeric, `precision` is another word, `threshold` or `tol` is negative.
 
     Examples
     --------
@@ -414,11 +428,15 @@ def residual(
     if impulse.shape != (problem.m,):
         raise InputError(f"impulse has shape {impulse.shape}; ({problem.m},) is needed")
     if problem.cones.has_ellipse:
-        return unstretched(problem, residual(problem.disk, problem.on_disk(impulse), precision, threshold))
+        return unstretched(
+            problem, residual(problem.disk, problem.on_disk(impulse), precision, threshold, tol)
+        )
     last, problem.derived.judged = remembered(problem, impulse), None
     if last is None:
         last = judged(problem, impulse)
-    found = told(problem, last)
+    if tol != TOL and not (type(tol) is float and tol >= 0.0):
+        tol = number("tol", tol, low=0.0)
+    found = told(problem, last.refine(tol) if last.loss > 0.1 * tol else last)
     if type(threshold) is not float or threshold != ENOUGH:
         found = replace(found, threshold=number("threshold", threshold, low=0.0))
     return found if precision == "float64" else _in_float32(problem, found, impulse)
@@ -498,6 +516,7 @@ def told(problem: Problem, last: measure.Judged) -> Residual:
         "_impulse": last.impulse,
         "precision": "float64",
         "rounding": None,
+        "_float64_relative": last.float64_relative,
     }
     object.__setattr__(made, "__dict__", state)  # a quarter of the time of a frozen dataclass's __init__
     return made

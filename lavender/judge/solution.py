@@ -273,7 +273,7 @@ class Solution:
         s = problem.cones.stretch
         impulse, proof = read_only(s * self.impulse), self.certificate
         # Of the numbers that are handed out: s (lambda / s) rounds.
-        found = residual(problem, impulse, "float64")
+        found = residual(problem, impulse, "float64", tol=self.tol)
         return replace(
             self, impulse=impulse, residual=found, certificate=None if proof is None else read_only(s * proof)
         )

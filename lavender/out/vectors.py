@@ -211,7 +211,7 @@ def pack(
     impulse, relative = found.impulse, found.residual.relative
     if solver == "newton" and (problem.generalized is None or form == "velocity"):
         impulse = driven(problem, tol, max_iter)[0]
-        relative = lv.residual(problem, impulse).relative
+        relative = lv.residual(problem, impulse, tol=tol).relative
     is_met = solver in OTHER_BITS
     out = struct.pack("<q", len(steps)) + b"".join(step.packed() for step in steps) + given
     return out + struct.pack("<qd", is_met, tol if is_met else relative) + (

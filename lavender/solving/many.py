@@ -235,7 +235,7 @@ class Solutions(Many, Sequence[Solution]):
 
     def _rest(self, i: int, impulse: FloatArray, status: Status) -> dict[str, Any]:
         problem = self.problems[i]
-        found = judged(problem, impulse)
+        found = judged(problem, impulse).refine(self.tol)
         started = self._worlds.code[i] in (CODE["late"], CODE["started"])
         counts = None if started else self._counts(problem, i)
         rest = rest_of(problem, self._spec, found, counts, self.start(i), status)
@@ -327,7 +327,7 @@ def solve_many(
         if not deadline.is_set:
             return int(hand.solve(tol, *asked))
         if deadline.passed(0.0):
-            return int(hand.judge(False, True))
+            return int(hand.judge(tol, False, True))
         return int(hand.solve(tol, *asked, COUNTED * (deadline.left(LEAST) or LEAST)))
 
     def alone(i: int) -> None:

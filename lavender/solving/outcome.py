@@ -65,7 +65,7 @@ def finish(
     if claim.status is INFEASIBLE and tol > 0.0:
         # An engine that applies the impulse of an infeasible step must not pull at a contact.
         impulse = best_of_islands(problem, (problem._start,), (project(problem.cones, impulse),), tol)
-    judged = residual(problem, impulse, "float64")  # in which solvers work, whatever the data were
+    judged = residual(problem, impulse, "float64", tol=tol)  # in which solvers work, whatever the data were
     status, message = claim.status, claim.message
     relative = judged.relative
     if (
@@ -77,6 +77,15 @@ def finish(
         message = _joined(message, "beside such impulses float64 loses b")
     elif tol > 0.0 and relative <= tol and status in (MAX_ITERATIONS, TIME_LIMIT, STALLED):
         status = CONVERGED
+    elif tol < relative and (
+        (status in (CONVERGED, STALLED, MAX_ITERATIONS, TIME_LIMIT) and judged._float64_relative <= tol)
+        or (status is FLOOR and judged._float64_relative < math.inf)
+    ):  # the claim is true of the first pass in float64
+        status = STALLED
+        message = _joined(
+            message,
+            f"M is ill-conditioned: residuals below {judged.floor:.1e} are rounding errors of float64",
+        )
     elif (
         problem.operator not in spec.operators
         and ((status is CONVERGED and relative > tol) or (status is FLOOR and not judged.above_floor <= tol))

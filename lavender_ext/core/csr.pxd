@@ -3,6 +3,10 @@ from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
 
 
+cdef enum:
+    LONG_ROW = 128              # Entries that one running sum rounds to about the floor of the judge; longer rows are split.
+
+
 cdef struct csr_t:
     const int32_t* indptr       # (m + 1)
     const int32_t* indices      # (nnz)
@@ -30,9 +34,8 @@ cdef inline double csr_dot(const csr_t* a, int32_t i, const double* x) noexcept 
     return (s0 + s1) + (s2 + s3)
 
 
-cdef inline double csr_dot_size(const csr_t* a, int32_t i, const double* x, double* size) noexcept nogil:
-    # csr_dot, to the bit, and sum_j |A_ij x_j| into size.
-    cdef int32_t p = a.indptr[i], end = a.indptr[i + 1]
+cdef inline double range_dot_size(const csr_t* a, int32_t p, int32_t end, const double* x, double* size) noexcept nogil:
+    # The sum over entries [p, end) in the order of csr_dot; that of absolute values into size.
     cdef const int32_t* idx = a.indices
     cdef const double* val = a.data
     cdef double s0 = 0.0, s1 = 0.0, s2 = 0.0, s3 = 0.0, f0 = 0.0, f1 = 0.0, f2 = 0.0, f3 = 0.0, t
@@ -64,6 +67,30 @@ cdef inline double csr_dot_size(const csr_t* a, int32_t i, const double* x, doub
                 f2 += fabs(t)
     size[0] = (f0 + f1) + (f2 + f3)
     return (s0 + s1) + (s2 + s3)
+
+
+cdef inline double csr_dot_size(const csr_t* a, int32_t i, const double* x, double* size) noexcept nogil:
+    # csr_dot, to the bit, and sum_j |A_ij x_j| into size.
+    return range_dot_size(a, a.indptr[i], a.indptr[i + 1], x, size)
+
+
+cdef inline double csr_dot_long(const csr_t* a, int32_t i, const double* x, double* size) noexcept nogil:
+    # csr_dot_size; a row of more than LONG_ROW entries is summed in parts, and the sum of the parts is compensated.
+    cdef int32_t p = a.indptr[i], last = a.indptr[i + 1], end
+    cdef double high = 0.0, low = 0.0, term, part, total, back
+    if last - p <= LONG_ROW:
+        return range_dot_size(a, p, last, x, size)
+    size[0] = 0.0
+    while p < last:
+        end = p + LONG_ROW if last - p > LONG_ROW else last
+        term = range_dot_size(a, p, end, x, &part)
+        size[0] += part
+        total = high + term
+        back = total - high
+        low += (high - (total - back)) + (term - back)
+        high = total
+        p = end
+    return high + low if low == low else high          # what overflows is infinite
 
 
 cdef inline void by_columns(int32_t m, int32_t n, const int32_t* indptr, const int32_t* indices, const double* data,

@@ -7,7 +7,7 @@ import numpy as np
 
 from lavender_ext.core.arrays cimport doubles, ints
 from lavender_ext.core.door cimport is_beyond
-from lavender_ext.core.generalized cimport jac_push, jac_row, tree_solve
+from lavender_ext.core.generalized cimport estimate_condition, jac_push, jac_row, tree_solve
 from lavender_ext.core.tree cimport tree_factor, tree_pattern
 
 cdef object new = np.empty, I4 = np.dtype(np.int32)
@@ -48,7 +48,7 @@ cdef class Operator:
         cdef const int32_t* midx = ints(midx_, len(midx_))
         self.jac = (jptr_, jidx_, jval_)
         self.mass = (mptr_, midx_, mval_)
-        self.mptr, self.midx = mptr, midx
+        self.g.mptr, self.g.midx, self.g.mval = mptr, midx, doubles(mval_, len(mval_))
         self.g.n = n
         self.g.m = m
         self.g.jptr = ints(jptr_, m + 1)
@@ -67,9 +67,9 @@ cdef class Operator:
         self.keep, self.failed = [marks], -1
 
     def factor(self):
-        """L and D."""
+        """L and D, and the condition of M."""
         cdef int32_t n = self.g.n, i
-        cdef int64_t size = 2 * <int64_t>n + self.g.lptr[n] + 1
+        cdef int64_t used = 2 * <int64_t>n + self.g.lptr[n] + 1, size = used + 2 * <int64_t>n
         cdef double* numbers
         factor = new(size)
         numbers = doubles(factor, size)
@@ -78,10 +78,12 @@ cdef class Operator:
         self.g.inv_pivot = numbers
         self.g.root = numbers + n                       # the factor's pivots, until it is there
         if n:
-            self.failed = tree_factor(n, self.mptr, self.midx, doubles(self.mass[2], len(self.mass[2])), self.g.lptr,
-                                      self.g.lidx, numbers + 2 * n, numbers + n, numbers)
+            self.failed = tree_factor(n, self.g.mptr, self.g.midx, self.g.mval, self.g.lptr, self.g.lidx, numbers + 2 * n,
+                                      numbers + n, numbers)
         for i in range(n):
             numbers[n + i] = sqrt(numbers[i])
+        if self.failed < 0:
+            self.g.condition = estimate_condition(&self.g, numbers + used)
 
     def share_factor(self, Operator other):
         """Take L and D of another operator, whose M is the same and whose factor is known."""
@@ -90,8 +92,8 @@ cdef class Operator:
         self.failed = other.failed
 
     cdef bint has_pattern(self, int32_t n, const int32_t* mptr, const int32_t* midx):
-        return self.g.n == n and (self.mptr == mptr or memcmp(self.mptr, mptr, (n + 1) * sizeof(int32_t)) == 0) and (
-            self.midx == midx or memcmp(self.midx, midx, mptr[n] * sizeof(int32_t)) == 0)
+        return self.g.n == n and (self.g.mptr == mptr or memcmp(self.g.mptr, mptr, (n + 1) * sizeof(int32_t)) == 0) and (
+            self.g.midx == midx or memcmp(self.g.midx, midx, mptr[n] * sizeof(int32_t)) == 0)
 
     @property
     def n(self):
@@ -106,7 +108,12 @@ cdef class Operator:
     @property
     def fill(self):
         """Entries of L left of the diagonal that M does not have."""
-        return self.g.lptr[self.g.n] - (self.mptr[self.g.n] - self.g.n)
+        return self.g.lptr[self.g.n] - (self.g.mptr[self.g.n] - self.g.n)
+
+    @property
+    def condition(self):
+        """Estimate of |H^-1|, H = M scaled to a diagonal of ones."""
+        return self.g.condition
 
     @property
     def least_pivot(self):
@@ -161,18 +168,20 @@ cdef class Operator:
 
     def momentum(self, given):
         """M v (n,), a new array."""
-        cdef const double* mval = doubles(self.mass[2], self.mptr[self.g.n])
+        cdef const int32_t* mptr = self.g.mptr
+        cdef const int32_t* midx = self.g.midx
+        cdef const double* mval = self.g.mval
         cdef const double* v = doubles(given, self.g.n)
         cdef int32_t i, p
         cdef double* x
         made = new(self.g.n)
         x = doubles(made, self.g.n)
         for i in range(self.g.n):
-            p = self.mptr[i + 1] - 1
+            p = mptr[i + 1] - 1
             x[i] = mval[p] * v[i]
-            for p in range(self.mptr[i], p):
-                x[i] += mval[p] * v[self.midx[p]]
-                x[self.midx[p]] += mval[p] * v[i]
+            for p in range(mptr[i], p):
+                x[i] += mval[p] * v[midx[p]]
+                x[midx[p]] += mval[p] * v[i]
         return made
 
     def times(self, given):

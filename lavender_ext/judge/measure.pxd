@@ -12,7 +12,7 @@ from libc.math cimport fabs
 from libc.stdint cimport int32_t, int64_t
 
 from lavender_ext.core.block cimport block_error
-from lavender_ext.core.csr cimport csr_dot, csr_dot_size, csr_t
+from lavender_ext.core.csr cimport csr_dot, csr_dot_long, csr_t
 from lavender_ext.core.generalized cimport (generalized_t, jac_push, jac_row, panel_push_size, panel_size,
                                             tree_solve)
 from lavender_ext.core.islands cimport find_islands, is_immovable, list_one_island
@@ -82,7 +82,7 @@ cdef inline void csr_block(const blocks_t* p, const csr_t* a, int32_t i, const d
     cdef int32_t j = p.ptr[i], k
     cdef double size[6]
     for k in range(j, p.ptr[i + 1]):
-        w[k] = csr_dot_size(a, k, lam, size + (0 if is_rows(p, i) else k - j)) - p.b[k]
+        w[k] = csr_dot_long(a, k, lam, size + (0 if is_rows(p, i) else k - j)) - p.b[k]
         if is_rows(p, i):                               # of any number
             add_row_floor(p, k, lam[k], w[k], size[0], f)
     block_error(p, i, lam, w, e)
@@ -335,8 +335,9 @@ cdef inline void general_slack(const blocks_t* p, const generalized_t* g, const 
         w[i] = jac_row(g, i, x) + (g.compliance[i] * lam[i] - p.b[i])
 
 
-cdef inline const double* general_sizes(const blocks_t* p, const generalized_t* g, const double* lam, double* x) noexcept nogil:
-    """|Y| |Y|^T |lam| + c |lam| (m), a bound of |A| |lam|, in x (n + m)."""
+cdef inline const double* general_sizes(const blocks_t* p, const generalized_t* g, const double* lam, const double* more,
+                                        double* x) noexcept nogil:
+    """|Y| |Y|^T |lam| + c |lam| + more (m), a bound of |A| |lam|, in x (n + m); more: (m) or NULL."""
     cdef int32_t i
     cdef double* size = x + g.n
     for i in range(g.n):
@@ -347,13 +348,16 @@ cdef inline const double* general_sizes(const blocks_t* p, const generalized_t* 
         panel_size(g, i, x, size)
     for i in range(p.n_rows):
         size[i] += g.compliance[i] * fabs(lam[i])
+    if more != NULL:
+        for i in range(p.n_rows):
+            size[i] += more[i]
     return size
 
 
 cdef inline void general_score(const blocks_t* p, const generalized_t* g, const double* lam, const double* w, double* e,
-                               double* x, score_t* out) noexcept nogil:
-    """Errors from the slack w, their sums and the floor. x (n + m) is scratch."""
-    score_with_floor(p, NULL, lam, w, e, general_sizes(p, g, lam, x), out)
+                               double* x, const double* more, score_t* out) noexcept nogil:
+    """Errors from the slack w, their sums and the floor; more as `general_sizes`. x (n + m) is scratch."""
+    score_with_floor(p, NULL, lam, w, e, general_sizes(p, g, lam, more, x), out)
 
 
 cdef inline void general_judge(const blocks_t* p, const generalized_t* g, const double* lam, double* w, double* e,
@@ -361,7 +365,7 @@ cdef inline void general_judge(const blocks_t* p, const generalized_t* g, const 
     """The pass over J and M. x (n) is scratch, with the floor (n + m)."""
     general_slack(p, g, lam, x, w)
     if floor:
-        general_score(p, g, lam, w, e, x, out)
+        general_score(p, g, lam, w, e, x, NULL, out)
     else:
         score_rows(p, lam, w, e, out)
 
@@ -370,8 +374,8 @@ cdef inline void general_judge(const blocks_t* p, const generalized_t* g, const 
 
 
 cdef inline int64_t scratch_of(const view_t* v) noexcept nogil:
-    """Numbers that `judge_view` needs besides w and e."""
-    return v.g.n + v.p.n_rows if v.g != NULL else 12 * <int64_t>v.r.n_bodies if v.r != NULL else 0
+    """Numbers that `judge_view` needs besides w and e, and over J and M what refines it (judge/refine.pxd)."""
+    return 6 * <int64_t>v.g.n + 2 * <int64_t>v.p.n_rows if v.g != NULL else 12 * <int64_t>v.r.n_bodies if v.r != NULL else 0
 
 
 cdef void judge_view(const view_t* v, const double* lam, double* w, double* e, double* scratch, bint floor,
@@ -460,8 +464,11 @@ cdef class Judged:
     cdef readonly double floor_energy                   # sqrt J, what rounding leaves
     cdef readonly double relative, floor                # -
     cdef readonly double above_floor                    # - that rounding does not explain
+    cdef readonly double float64_relative               # of the first pass, by float64 alone; NaN if it was not refined
+    cdef double known_loss                              # `loss`, negative before it is computed
     cdef readonly int worst                             # row of the largest velocity error, -1
     cdef readonly int island                            # of the largest relative residual
 
 
-cdef Judged judged_from(Data p, object impulse, object both, const score_t* s, double relative_, double floor)
+cdef Judged judged_from(Data p, object impulse, object both, const score_t* s, double relative_, double floor,
+                        double float64_relative=*)

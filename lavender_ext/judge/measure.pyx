@@ -1,7 +1,7 @@
 """The judge for Python: thin entries of judge/measure.pxd, and the residuals of quadratic programs."""
-from libc.math cimport fabs, sqrt
+from libc.math cimport NAN, fabs, sqrt
 from libc.stdint cimport int32_t, int64_t
-from libc.string cimport memcmp
+from libc.string cimport memcmp, memcpy
 
 import numpy as np
 
@@ -15,8 +15,8 @@ from lavender_ext.core.velocity cimport rows_velocity
 from lavender_ext.core.view cimport view_t
 from lavender_ext.judge.best cimport best_room, best_t, bind_best, count_islands, note_score, see_impulse, see_start
 from lavender_ext.judge.measure cimport (above_floor_of, csr_judge, csr_slack, floor_of, general_judge, general_slack,
-                                         judge_nothing,
-                                         relative_of, rows_judge, rows_slack, scratch_of)
+                                         judge_nothing, relative_of, rows_judge, rows_slack, scratch_of)
+from lavender_ext.judge.refine cimport loss_by_factor, refine_general
 from lavender_ext.judge.rounding cimport mass_t, relative_size, squares32
 from lavender_ext.judge.score cimport (are_numbers, is_at_floor, new_score, norms_of_rhs, nothing, relative,
                                        score_rows, score_t, tally_block, tally_t)
@@ -78,7 +78,17 @@ def judge(Data p, const double[::1] lam, double[::1] w, double[::1] e, bint floo
     return s.energy, s.velocity, now, above
 
 
-cdef Judged judged_from(Data p, impulse, both, const score_t* s, double relative_, double floor):
+cdef double loss_of(Data p, impulse, both) except -1.0:
+    """What M's factor may lose of the slack in `both`, as a relative residual."""
+    cdef const double[::1] lam = impulse, w = both
+    cdef Room room
+    if p.blocks.n_rows == 0:
+        return 0.0
+    room = room_for(2 * <Py_ssize_t>p.general.n * sizeof(double))
+    return loss_by_factor(&p.blocks, &p.general, &lam[0], &w[0], <double*>room.at, p.start_energy, p.start_velocity, 0.0)
+
+
+cdef Judged judged_from(Data p, impulse, both, const score_t* s, double relative_, double floor, double float64_relative=NAN):
     """What a pass over `impulse` found, w and e in `both` (2 m + 1)."""
     cdef Judged made = Judged.__new__(Judged)
     made.data, made.impulse, made.both = p, impulse, both
@@ -87,6 +97,8 @@ cdef Judged judged_from(Data p, impulse, both, const score_t* s, double relative
     made.floor_energy = s.floor_energy
     made.worst, made.island = s.worst, s.island
     made.relative, made.floor, made.above_floor = relative_, floor, above_floor_of(s, relative_, floor)
+    made.float64_relative = float64_relative
+    made.known_loss = -1.0 if p.is_general and float64_relative != float64_relative else 0.0
     return made
 
 
@@ -121,6 +133,40 @@ cdef class Judged:
         self.floor = floor_of(&s, p.start_energy, p.start_velocity)
         self.relative = relative_of(&s, w, p.blocks.n_rows, p.start_energy, p.start_velocity)
         self.above_floor = above_floor_of(&s, self.relative, self.floor)
+        self.float64_relative, self.known_loss = NAN, 0.0
+        if p.is_general and m > 0:
+            self.known_loss = loss_by_factor(&p.blocks, &p.general, &lam[0], w, <double*>room.at, p.start_energy,
+                                             p.start_velocity, 0.0)
+
+    @property
+    def loss(self):
+        """What M's factor may lose of it, as a relative residual (judge/refine.pxd (2)); 0 after it was refined."""
+        if self.known_loss < 0.0:
+            self.known_loss = loss_of(self.data, self.impulse, self.both)
+        return self.known_loss
+
+    def refine(self, double tol):
+        """Return the refined pass if a residual of `tol` needs one (judge/refine.pxd (2)), or this one."""
+        cdef Data p = self.data
+        cdef int32_t m = p.blocks.n_rows
+        cdef view_t v = p.view()
+        cdef score_t s = new_score()
+        cdef const double[::1] lam
+        cdef const double[::1] first
+        cdef double[::1] both
+        cdef Room room
+        if not (self.relative < 1.0 / 0.0 and self.loss > 0.1 * max(tol, self.relative)):
+            return self
+        lam, first = self.impulse, self.both
+        room = room_for((2 * m + scratch_of(&v)) * sizeof(double))
+        memcpy(room.at, &first[0], m * sizeof(double))
+        with nogil:
+            refine_general(&p.blocks, &p.general, &lam[0], <double*>room.at, <double*>room.at + m, <double*>room.at + 2 * m, &s)
+        results = both = np.empty(2 * m + 1)
+        memcpy(&both[0], room.at, 2 * m * sizeof(double))
+        return judged_from(p, self.impulse, results, &s,
+                           relative_of(&s, &both[0], m, p.start_energy, p.start_velocity),
+                           floor_of(&s, p.start_energy, p.start_velocity), self.relative)
 
     @property
     def slack(self):

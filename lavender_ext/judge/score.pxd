@@ -204,8 +204,8 @@ cdef inline bint is_at_floor(double relative, double floor) noexcept nogil:
     """Whether a relative residual is within twice its floor, and at most 1e-5; no floor hides it (`hides`).
 
     The floor grows with the impulse, so one that runs away, as where there is no solution, excuses any residual: it
-    says nothing of the problem. At 1e-5 A lambda is made of terms 1e11 times as large as what they leave; problems
-    with an M of condition 1e16 end below 1e-5.
+    says nothing of the problem. At 1e-5 A lambda is made of terms 1e11 times as large as what they leave, or what
+    float64 makes of M^-1 J^T lambda is off by as much, as with an M of condition 1e12 (judge/refine.pxd).
     """
     return relative <= 2.0 * floor and relative <= 1e-5 and not hides(floor)
 
@@ -303,6 +303,19 @@ cdef inline void floor_from(const floor_t* s, score_t* out) noexcept nogil:
     """The floor entries of out."""
     out.floor_energy = sqrt(s.energy)
     out.floor_velocity = sqrt(s.fast)
+
+
+cdef inline void smallest_reference(const blocks_t* p, double* energy, double* velocity) noexcept nogil:
+    """Replace E0 and V0 of all rows by the smallest of an island, for estimates over all rows that no island may exceed."""
+    cdef const double* own
+    cdef int32_t i
+    if p.islands == NULL:
+        return
+    for i in range(p.islands.n):
+        own = p.islands.reference + 2 * i
+        if own[0] > 0.0:
+            energy[0] = own[0] if own[0] < energy[0] else energy[0]
+            velocity[0] = own[1] if own[1] < velocity[0] else velocity[0]
 
 
 cdef inline int32_t begin_islands(const blocks_t* p, score_t* out) noexcept nogil:

@@ -8,6 +8,9 @@ that eighth. The relative residual r decides:
     r <= tol                                        CONVERGED
     r of the best of each island (best.pxd) <= tol  CONVERGED, with these
     r not finite, or > 1e6 max(1, r of the first 8) DIVERGED
+    first pass <= tol < refined one (judge/refine.pxd)
+        refined <= 2 floor and <= 1e-5              AT_FLOOR
+        else floor > tol                            STALLED
     no better than the best so far, and
         best <= 1e-6 and best <= 2 floor            AT_FLOOR
         sweeps > 32 * sweeps of the best + patience, and nothing
@@ -24,6 +27,7 @@ from lavender_ext.core.view cimport view_t
 from lavender_ext.judge.best cimport best_room, best_t, bind_best, note_score, relative_of_best, see_impulse
 from lavender_ext.judge.measure cimport above_floor_of, floor_of, judge_view, relative_of
 from lavender_ext.judge.progress cimport keep, open_progress, progress_t, rests, see
+from lavender_ext.judge.refine cimport refine_view
 from lavender_ext.judge.score cimport new_score, relative, score_t
 
 
@@ -96,6 +100,27 @@ cdef inline bint is_rounding(const watch_t* s, const score_t* x, double now, dou
     return above_floor_of(x, now, floor_of(x, s.start_energy, s.start_velocity)) <= tol
 
 
+cdef inline double judge_closely(const watch_t* s, const view_t* v, const double* lam, double tol, score_t* x,
+                                 bint* refined) noexcept nogil:
+    """The judge's relative residual with its floor, refined if an ill-conditioned M needs it."""
+    cdef double now
+    judge_view(v, lam, s.w, s.e, s.v, True, x)
+    now = relative_of(x, s.w, v.p.n_rows, s.start_energy, s.start_velocity)
+    refined[0] = refine_view(v, lam, s.w, s.e, s.v, s.start_energy, s.start_velocity, tol, now, x)
+    if refined[0]:
+        now = relative_of(x, s.w, v.p.n_rows, s.start_energy, s.start_velocity)
+    return now
+
+
+cdef inline int32_t end_refined(const watch_t* s, const score_t* x, double now, double tol) noexcept nogil:
+    """The claim of an impulse whose first pass is within tol, by its refined residual: more sweeps reduce that to its floor."""
+    if now <= tol:
+        return CONVERGED
+    if is_rounding(s, x, now, tol):
+        return AT_FLOOR
+    return STALLED if not floor_of(x, s.start_energy, s.start_velocity) <= tol else RUNNING
+
+
 cdef inline int32_t until_next(const watch_t* s, double now, double tol) noexcept nogil:
     """Sweeps until the next check."""
     cdef double least = s.total >> 3, most = s.total, n = 0.0, gap = s.total - s.last_at, fall, r = now
@@ -130,14 +155,15 @@ cdef inline int32_t check(watch_t* s, const view_t* v, double* lam, double tol) 
     """One check; sets the sweeps of the next."""
     cdef score_t x = new_score()
     cdef const blocks_t* p = &v.p
-    cdef double now, inf = 1.0 / 0.0
+    cdef double now, last, inf = 1.0 / 0.0
+    cdef bint refined = False
+    cdef int32_t end
     x.by_island = s.best.now
     judge_view(v, lam, s.w, s.e, s.v, False, &x)
     now = relative_to_start(s, &x)
-    note_score(&s.best, p, &x, now)
     if now <= tol:                                      # once more, with what rounding hides
-        judge_view(v, lam, s.w, s.e, s.v, True, &x)
-        now = relative_of(&x, s.w, p.n_rows, s.start_energy, s.start_velocity)
+        now = judge_closely(s, v, lam, tol, &x, &refined)
+    note_score(&s.best, p, &x, now)
     if s.total <= EARLY and s.start < now < inf:
         s.start = now
     see(&s.progress, s.total, now)
@@ -146,12 +172,20 @@ cdef inline int32_t check(watch_t* s, const view_t* v, double* lam, double tol) 
     s.last_at = s.total
     if now <= tol:
         return CONVERGED
+    if refined:
+        end = end_refined(s, &x, now, tol)
+        if end != RUNNING:
+            return end
     if now < inf or s.best.seen > 0:
         see_impulse(&s.best, p, lam, tol)
         s.best_relative = relative_of_best(&s.best)
     if s.best_relative <= tol:                          # each island at another check
-        memcpy(lam, s.best.impulse, p.n_rows * sizeof(double))
-        return CONVERGED
+        x = new_score()
+        last = judge_closely(s, v, s.best.impulse, tol, &x, &refined)
+        end = CONVERGED if last <= tol else end_refined(s, &x, last, tol) if refined else RUNNING
+        if end != RUNNING:
+            memcpy(lam, s.best.impulse, p.n_rows * sizeof(double))
+            return end
     if now < inf and is_progress(s, now, tol):
         s.best_at = s.total
         keep(&s.progress, s.total, lam, p.n_rows)
@@ -162,8 +196,8 @@ cdef inline int32_t check(watch_t* s, const view_t* v, double* lam, double tol) 
         return DIVERGED
     if s.best_at >= 0 and s.best_relative <= 1e-6:
         x = new_score()
-        judge_view(v, s.best.impulse, s.w, s.e, s.v, True, &x)
-        if is_rounding(s, &x, s.best_relative, tol):
+        last = judge_closely(s, v, s.best.impulse, tol, &x, &refined)
+        if is_rounding(s, &x, last if refined else s.best_relative, tol):
             memcpy(lam, s.best.impulse, p.n_rows * sizeof(double))
             return AT_FLOOR
     if s.total > 32 * <double>s.best_at + s.patience and rests(&s.progress, p, lam, s.total, s.lowest):
@@ -189,8 +223,14 @@ cdef inline int32_t confirmed(const watch_t* s, const view_t* v, const double* l
     """The claim `status`, judged in another form: what does not hold there goes on, or has stalled."""
     cdef score_t x = new_score()
     cdef double now
+    cdef bint within
     judge_view(v, lam, s.w, s.e, s.v, status == AT_FLOOR, &x)
     now = relative_to_start(s, &x)
+    if refine_view(v, lam, s.w, s.e, s.v, s.start_energy, s.start_velocity, tol, now, &x):
+        within = now <= tol
+        now = relative_of(&x, s.w, v.p.n_rows, s.start_energy, s.start_velocity)
+        if within:
+            return end_refined(s, &x, now, tol)
     if now <= tol:
         return CONVERGED
     if status == CONVERGED:

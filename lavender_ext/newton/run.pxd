@@ -14,7 +14,7 @@ from lavender_ext.core.view cimport view_t
 from lavender_ext.factor.blocks cimport factor_t
 from lavender_ext.judge.best cimport best_room, best_t, bind_best, note_score, relative_of_best, see_impulse
 from lavender_ext.judge.measure cimport above_floor_of, floor_of, judge_view, relative_of
-from lavender_ext.judge.score cimport new_score, relative, score_t
+from lavender_ext.judge.score cimport new_score, relative, score_t, smallest_reference
 from lavender_ext.newton.natural_map cimport convex_error
 from lavender_ext.newton.scaling cimport (lay_elements, lay_numbers, scale_elements, scaled_index, scaled_real, scaled_t)
 from lavender_ext.newton.system cimport system_t, system_times
@@ -363,16 +363,8 @@ cdef inline const double* proof_of(newton_t* n) noexcept nogil:
 
 cdef inline void set_reference(problem_t* o, double e0, double v0) noexcept nogil:
     """The reference of estimates over all rows: e0, v0, or with islands the smallest of theirs, so that none looks solved early."""
-    cdef const double* own
-    cdef int32_t i
     o.e0, o.v0 = e0, v0
-    if o.p.islands == NULL:
-        return
-    for i in range(o.p.islands.n):
-        own = o.p.islands.reference + 2 * i
-        if own[0] > 0.0:
-            o.e0 = own[0] if own[0] < o.e0 else o.e0
-            o.v0 = own[1] if own[1] < o.v0 else o.v0
+    smallest_reference(&o.p, &o.e0, &o.v0)
 
 
 cdef inline double judged(newton_t* n, const double* z, bint floor) noexcept nogil:

@@ -5,7 +5,7 @@ What does not end below tol on the judge's own measure, has an empty row that b 
 asked for, is left to the caller.
 """
 from libc.stdint cimport int32_t, int64_t
-from libc.math cimport INFINITY, fabs, sqrt
+from libc.math cimport INFINITY, NAN, fabs, sqrt
 from libc.string cimport memset
 
 from lavender_ext.core.assemble cimport lav_assemble, lav_body_blocks, lav_expand_rows
@@ -23,6 +23,7 @@ from lavender_ext.factor.tiles cimport has_wide
 from lavender_ext.generalized.newton cimport is_soft
 from lavender_ext.judge.measure cimport (above_floor_of, do_nothing, floor_of, general_score, general_slack, judge_nothing,
                                          relative_of, scratch_of)
+from lavender_ext.judge.refine cimport refine_view
 from lavender_ext.judge.score cimport new_score, score_t
 from lavender_ext.small.call cimport (COUNTS, ENDED, KEPT, are_bounded, few_rules_t, few_t, has_call, lay_few, rooms_t,
                                       run_few)
@@ -64,6 +65,7 @@ cdef struct job_t:
     const double* push          # (n) M^-1 J^T lam of the judge, not of A; in room that the next world takes
     score_t score
     double relative, floor, above_floor
+    double float64_relative     # of the first pass; NaN if it was not refined
 
 
 cdef struct few_rooms_t:        # of one thread
@@ -136,15 +138,26 @@ cdef inline bint settle_empty_rows(const job_t* j, double tol) noexcept nogil:
     return True
 
 
-cdef inline void judge_job(job_t* j, double* x) noexcept nogil:
-    """The judge's pass over lam, `general_judge` with what it pushes kept; x (2 n + m) is scratch."""
+cdef inline int64_t judging_size(const job_t* j) noexcept nogil:
+    """Numbers of scratch of `judge_job`."""
+    cdef view_t v = view_t(j.p, NULL, NULL, &j.g)
+    return j.g.n + scratch_of(&v)
+
+
+cdef inline void judge_job(job_t* j, double tol, double* x) noexcept nogil:
+    """The judge's pass over lam, refined for `tol`, with what it pushes kept; x (`judging_size`) is scratch."""
+    cdef view_t v = view_t(j.p, NULL, NULL, &j.g)
     cdef int32_t m = j.p.n_rows
     j.score = new_score()
     j.score.by_island = j.by_island
     general_slack(&j.p, &j.g, j.lam, x, j.both)
-    general_score(&j.p, &j.g, j.lam, j.both, j.both + m, x + j.g.n, &j.score)
+    general_score(&j.p, &j.g, j.lam, j.both, j.both + m, x + j.g.n, NULL, &j.score)
     j.push = x
     j.relative = relative_of(&j.score, j.both, m, j.begin[0], j.begin[1])
+    j.float64_relative = NAN
+    if refine_view(&v, j.lam, j.both, j.both + m, x + j.g.n, j.begin[0], j.begin[1], tol, j.relative, &j.score):
+        j.float64_relative = j.relative
+        j.relative = relative_of(&j.score, j.both, m, j.begin[0], j.begin[1])
     j.floor = floor_of(&j.score, j.begin[0], j.begin[1])
     j.above_floor = above_floor_of(&j.score, j.relative, j.floor)
 
@@ -195,9 +208,9 @@ cdef inline void solve_job(job_t* j, room_t* room, room_t* islands, const limits
     code = step_within(j, &v, &o, &r, limits)
     if code != REACHED and not j.spent:
         return
-    if not has_room(room, 0, 2 * <ssize_t>j.g.n + m):
+    if not has_room(room, 0, judging_size(j)):
         return
-    judge_job(j, room.real)
+    judge_job(j, tol, room.real)
     j.solved = j.relative <= tol
 
 
@@ -290,7 +303,7 @@ cdef inline bint prepare_few(job_t* j, few_t* s, few_rooms_t* rooms) noexcept no
 
 
 cdef inline void found_by(job_t* j, const few_t* s) noexcept nogil:
-    j.score, j.relative, j.floor = s.score, s.relative, s.floor
+    j.score, j.relative, j.floor, j.float64_relative = s.score, s.relative, s.floor, NAN
     j.above_floor = above_floor_of(&s.score, s.relative, s.floor)
 
 

@@ -19,8 +19,8 @@ from lavender_ext.core.problem import LAWS
 from lavender_ext.core.view cimport view_t
 from lavender_ext.generalized.newton cimport is_soft
 from lavender_ext.small.call cimport COUNTS, Rules, few_rules_t, few_t, judge_few
-from lavender_ext.small.job cimport (few_rooms_t, begin, found_by, has_numbers, job_t, judge_job, prepare_few, solve_few,
-                                     solve_job)
+from lavender_ext.small.job cimport (few_rooms_t, begin, found_by, has_numbers, job_t, judge_job, judging_size, prepare_few,
+                                     solve_few, solve_job)
 from lavender_ext.small.limits cimport allowed, cost_of, limits_t
 from lavender_ext.small.room cimport has_room, leave
 from lavender_ext.small.world cimport (BAD, BLOCK, BLOCKS, CONE_ROW, FREE, JAC, LATE, LEFT, MASS, MU, N_ARRAYS, PLACES,
@@ -97,7 +97,9 @@ cdef int take_start(job_t* j, start, double* lam, double* both) except -1:
 
 cdef result(job_t* j, Data p, impulse, both):
     """(What the judge found, None where nobody asked him, counts as of `Newton.run`)."""
-    found = judged_from(p, impulse, both, &j.score, j.relative, j.floor) if j.solved or j.spent else None
+    found = None
+    if j.solved or j.spent:
+        found = judged_from(p, impulse, both, &j.score, j.relative, j.floor, j.float64_relative)
     return found, (j.counts[0], j.counts[1], j.counts[2], j.counts[3])
 
 
@@ -409,8 +411,8 @@ cdef class Worlds:
             self.jobs[i].begin[0], self.jobs[i].begin[1], self.jobs[i].begin[2] = j.begin[0], j.begin[1], j.begin[2]
         return code
 
-    cdef int32_t judge(self, int64_t i, hand_t* h, bint narrow, bint late) noexcept nogil:
-        """The judge alone, beside the floor of float32 where `narrow`; empty rows are left to the caller.
+    cdef int32_t judge(self, int64_t i, hand_t* h, double tol, bint narrow, bint late) noexcept nogil:
+        """The judge alone, refined for `tol`, beside the floor of float32 where `narrow`; empty rows are left to the caller.
 
         late: so are problems of A and of bodies, whose numbers wait until they are read.
         """
@@ -436,13 +438,14 @@ cdef class Worlds:
             judge_few(&s, j.lam, j.both, h.few.call.work.real)
             found_by(&j, &s)
             j.push = h.few.call.work.real
-        elif (has_numbers(&j) and j.made.n_empty == 0 and has_room(&h.room, 0, 4 * <int64_t>m + 5 * j.g.n)
+        elif (has_numbers(&j) and j.made.n_empty == 0
+              and has_room(&h.room, 0, max(judging_size(&j), 4 * <int64_t>m + 5 * j.g.n))
               and has_room(&h.by_island, 0, 2 * <int64_t>j.p.n_blocks) and begin_world(&j, h)):
             code, x = READY, h.room.real
             if j.cold:
                 do_nothing(&j.p, j.lam, j.both)
             j.by_island = h.by_island.real
-            judge_job(&j, x)
+            judge_job(&j, tol, x)
             if narrow:
                 x += j.g.n                              # behind what is pushed
                 squares32(&j.p, &j.g, &h.desk.mass, h.desk.free, j.lam, x, x + m, x + 2 * m, x + 3 * m)
@@ -497,12 +500,12 @@ cdef class Hand:
         """
         return self.run(tol, limits, rules, most, 0, False)
 
-    def judge(self, bint narrow, bint late=False):
+    def judge(self, double tol, bint narrow, bint late=False):
         """Judge the impulses of worlds until one is left to the caller; narrow: beside the floor of float32.
 
         late: as what they keep where there was no time to solve.
         """
-        return self.run(0.0, None, None, INFINITY, LATE if late else READY, narrow)
+        return self.run(tol, None, None, INFINITY, LATE if late else READY, narrow)
 
     cdef int64_t run(self, double tol, Limits limits, Rules rules, double most, int32_t judges, bint narrow) except? -3:
         cdef Worlds w = self.worlds
@@ -516,7 +519,7 @@ cdef class Hand:
                 if i >= n:
                     return DONE_ALL
                 if judges:
-                    code = w.judge(i, &self.h, narrow, judges == LATE)
+                    code = w.judge(i, &self.h, tol, narrow, judges == LATE)
                     if code == READY:
                         code = judges
                 else:

@@ -340,6 +340,7 @@ cdef inline int32_t lay_world(const worlds_t* w, int64_t i, desk_t* d, blocks_t*
         return BAD
     for j in range(n):
         (<double*>g.root)[j] = sqrt(g.inv_pivot[j])
+    g.mptr, g.midx, g.mval, g.condition = d.mass.ptr, d.mass.idx, d.mass.val, 0.0
     x += half + 2 * n
     d.free, b, g.compliance = x, x + n, x + n + m
     widen(w, 2, at[FREE], n, d.free)

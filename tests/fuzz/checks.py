@@ -209,8 +209,9 @@ def claims(spec, problem, solution):
                 yield "false claim", f"{name}: INFEASIBLE, {wrong}"
     if j.nothing or twin.d_edge:
         return
-    within = solution.tol * slop + j.allowed
-    floor = 2.0 * j.floor * slop + j.allowed
+    first = min(j.unrefined, 0.1 * max(solution.tol, j.relative))  # of a pass that need not be refined
+    within = solution.tol * slop + j.allowed + first
+    floor = 2.0 * max(j.floor, min(r.floor, j.floor_most)) * slop + j.allowed + first
     if (
         solution.success or (status == "CONVERGED" and solution.claim_check == "confirmed")
     ) and not j.relative <= within:
@@ -228,7 +229,7 @@ def claims(spec, problem, solution):
     ):
         yield "false claim", f"{name}: {status} accepted with relative {r.relative} and floor {r.floor}"
     if finite and j.range < MODERATE:
-        if not abs(r.relative - j.relative) <= 1e-6 * j.relative + j.allowed:
+        if not abs(r.relative - j.relative) <= 1e-6 * j.relative + j.allowed + first:
             yield (
                 "wrong number",
                 f"{name}: relative {r.relative:.6e}, in long double {j.relative:.6e}, {j.allowed:.1e} allowed",

@@ -35,8 +35,19 @@ def problems():
         jac = rng.normal(size=(9, 4))
         cones = lv.Cones.contacts(0.5, count=3)
         yield lv.Problem.from_jacobian(jac, root, rng.normal(size=4), cones=cones, friction=friction)
+        yield ill_conditioned(7, friction)
         yield from kinds_of(friction)
         yield from kinds_of(friction, mu=0.0)  # the law is what sweeps know, not how rough a contact is
+
+
+def ill_conditioned(seed, friction):
+    """J and an M of condition 1e10, whose factor loses what is asked for."""
+    rng = np.random.default_rng(seed)
+    basis = np.linalg.qr(rng.normal(size=(4, 4)))[0]
+    mass = basis @ np.diag(np.geomspace(1.0, 1e10, 4)) @ basis.T
+    cones = lv.Cones.contacts(0.5, count=2)
+    jac, v = rng.normal(size=(6, 4)), rng.normal(size=4)
+    return lv.Problem.from_jacobian(jac, 0.5 * (mass + mass.T), v, cones=cones, friction=friction)
 
 
 def kinds_of(friction, mu=0.4):
@@ -140,6 +151,34 @@ def test_every_method_has_the_bits_of_the_package(library, at):
         if (tol or name == "lemke") and name not in ("newton", "direct"):
             assert said.iterations == found.iterations, case
     assert ran >= 4 and (formed or at < len(GIVEN))
+
+
+@pytest.mark.parametrize(
+    ("name", "friction"),
+    [
+        ("pgs", "coulomb"),
+        ("block_gauss_seidel", "cone"),
+        ("anderson", "coulomb"),
+        ("nncg", "cone"),
+        ("newton", "cone"),
+    ],
+)
+def test_what_float64_loses_by_an_ill_conditioned_m_is_no_claim(library, name, friction):
+    """The residual is refined in the library as well: with the package's status, and at its floor where it is."""
+    count = 0
+    for seed in range(8):
+        given = ill_conditioned(seed, friction)
+        problem = library.problem(given, impulse=given.start())
+        solver = library.open(problem, library.options(name))
+        said = solver.run(100_000, 1e-9)
+        judged = lv.residual(given, solver.impulse(), tol=1e-9)
+        assert (said.verdict.relative, said.verdict.floor) == (judged.relative, judged.floor)
+        if said.outcome == 4:
+            assert judged.relative > 1e-9 and judged.at_floor
+            count += 1
+        else:
+            assert said.outcome != 1 or judged.relative <= 1e-9
+    assert count >= 3
 
 
 def test_vectors_are_of_methods_that_the_library_takes(library):

@@ -171,7 +171,7 @@ typedef struct lav_verdict { /* the judge's, of any impulse */
   double relative;             /* error relative to that of the zero impulse, of the worst island; infinite if not finite */
   double energy;               /* sqrt J */
   double velocity;             /* m/s, of the worst row */
-  double floor;                /* what rounding of the impulse alone costs, relative */
+  double floor;                /* what rounding of the impulse costs, and a factor of an ill-conditioned M, relative */
 } lav_verdict;
 
 typedef struct lav_motion { /* how far an impulse's motion is from that of a reference */
@@ -233,7 +233,7 @@ LAV_API int32_t lav_run_many(lav_solver *const *solvers, int32_t n, int32_t firs
 
 LAV_API int32_t lav_impulse(lav_solver *solver, double *out, int32_t n);  /* (m) N s */
 LAV_API int32_t lav_velocity(lav_solver *solver, double *out, int32_t n); /* v+, (6 n_bodies) or (nv), with v* as given */
-/* The judge on any impulse (m): slack w and error e (m) where not null. */
+/* The judge on any impulse (m): slack w and error e (m) where not null. An ill-conditioned M hides no residual above 1e-6. */
 LAV_API int32_t lav_judge(lav_solver *solver, const double *impulse, int32_t n, double *slack, double *error,
                           lav_verdict *out);
 /* How wrong the motion of an impulse (m) is, beside a reference (m) that was solved further. */

@@ -7,9 +7,19 @@ static const general_t *general_of(const lav_solver *s) { return s->form == LAV_
 static const general_t *general_of(const lav_solver *s) { return (void)s, (const general_t *)NULL; }
 #endif
 
-static void judge(lav_solver *s, const double *impulse, int32_t floor, lav_verdict *out) {
+/* tol: the residual that an ill-conditioned M must not hide; INFINITY: as the first pass finds it. Returns the residual of the first pass, or NAN if it was not refined. */
+static double judge(lav_solver *s, const double *impulse, int32_t floor, double tol, lav_verdict *out) {
   score_t t = judge_score_new_score();
+  double first = NAN, found;
   if (s->p.n_rows > 0) judge_measure_judge_view(&s->read, impulse, s->watch.w, s->watch.e, s->watch.v, floor, &t);
+#ifndef LAV_SWEEPS_ONLY
+  found = judge_measure_relative_of(&t, s->watch.w, s->p.n_rows, s->start[0], s->start[1]);
+  if (floor && judge_refine_refine_view(&s->read, impulse, s->watch.w, s->watch.e, s->watch.v, s->start[0], s->start[1], tol,
+                                        found, &t))
+    first = found;
+#else
+  (void)tol, (void)found;
+#endif
   out->worst = t.worst;
   out->island = t.island;
   out->unused = 0;
@@ -17,6 +27,7 @@ static void judge(lav_solver *s, const double *impulse, int32_t floor, lav_verdi
   out->velocity = t.finite ? t.velocity : INFINITY;
   out->relative = judge_measure_relative_of(&t, s->watch.w, s->p.n_rows, s->start[0], s->start[1]);
   out->floor = floor ? judge_measure_floor_of(&t, s->start[0], s->start[1]) : 0.0;
+  return first;
 }
 
 /* Relative residual of an impulse, which is kept in the islands where it is better; a start if tol is negative. */
@@ -61,7 +72,7 @@ int32_t lav_judge(lav_solver *solver, const double *impulse, int32_t n, double *
   if (!out || (!impulse && n > 0)) return leave(solver, LAV_ERROR_NULL);
   if (out->size != sizeof *out) return leave(solver, LAV_ERROR_VERSION);
   found.size = out->size;
-  judge(solver, impulse, 1, &found);
+  judge(solver, impulse, 1, 1e-6, &found);
   *out = found;
   if (slack && n > 0) COPY(slack, solver->watch.w, n);
   if (error && n > 0) COPY(error, solver->watch.e, n);
@@ -120,7 +131,7 @@ int32_t lav_motion_error(lav_solver *solver, const double *impulse, const double
   found.size = out->size;
   found.row = found.body = -1;
   delta = s->compare, slope = delta + n, v = slope + n;
-  judge(s, reference, 0, &verdict);
+  judge(s, reference, 0, INFINITY, &verdict);
   for (i = 0; i < n; i++) delta[i] = impulse[i] - reference[i];
   if (n > 0) {
     wrong = energy_of(s, s->watch.e, v, slope, &y);

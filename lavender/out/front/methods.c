@@ -208,7 +208,7 @@ static void run_newton(lav_solver *s, const lav_budget *budget, lav_result *out)
     out->iterations = before + said.work;
     if (how == core_method_SPENT) break;
     if (how == core_method_REACHED) {
-      judge(s, s->impulse, 1, &now); /* over velocities sums are rounded in another order, and vanish where squares do */
+      judge(s, s->impulse, 1, INFINITY, &now); /* over velocities sums are rounded in another order, and vanish where squares do */
       if (now.relative <= budget->tol) out->outcome = LAV_CONVERGED;
       else if (closer <= CLOSEST || budget->iterations <= out->iterations) out->outcome = LAV_STALLED;
       else {

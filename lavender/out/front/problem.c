@@ -52,7 +52,7 @@ static void take_blocks(lav_solver *s, const lav_problem *q) {
   s->n_v = q->form == LAV_BODIES ? 6 * q->n_bodies : q->form == LAV_VELOCITIES ? q->n_velocities : 0;
   s->v_free = TAKE(s, double, s->n_v);
   s->compare = TAKE(s, double, 2 * m + s->n_v);
-  s->watch.v = TAKE(s, double, q->form == LAV_BODIES ? 12 * n : q->form == LAV_VELOCITIES ? nv + m : 0);
+  s->watch.v = TAKE(s, double, q->form == LAV_BODIES ? 12 * n : q->form == LAV_VELOCITIES ? 6 * nv + 2 * m : 0);
 }
 
 /* Rows of joints, and of contacts, of bodies: as block_ptr says, else so many at most. */
@@ -226,11 +226,10 @@ static void fill_bodies(lav_solver *s, const lav_problem *q) {
 }
 
 #ifndef LAV_SWEEPS_ONLY
-/* M = L^T D L; its own rows stand behind L only until then. */
+/* M, its factor L^T D L and its condition. */
 static int32_t factor_mass(lav_solver *s, const lav_problem *q) {
   const int32_t n = q->n_velocities;
   const int64_t most = (int64_t)n * n / 2 + 1;
-  const uint64_t begin = s->used;
   int32_t *mptr = TAKE(s, int32_t, n + 1), *midx = TAKE(s, int32_t, q->n_mass_entries), *columns = NULL, *lidx, count, i;
   double *mval = TAKE(s, double, q->n_mass_entries), *pivot = (double *)(uintptr_t)s->g.root, *values, *lval;
   const uint64_t from = s->used;
@@ -252,11 +251,13 @@ static int32_t factor_mass(lav_solver *s, const lav_problem *q) {
                                    (double *)(uintptr_t)s->g.inv_pivot) >= 0)
     return LAV_ERROR_MASS;
   for (i = 0; i < n; i++) pivot[i] = sqrt(s->g.inv_pivot[i]);
-  s->used = begin; /* L to where M was */
+  s->g.mptr = mptr, s->g.midx = midx, s->g.mval = mval;
+  s->used = from; /* L behind M, no longer than it must be */
   s->g.lidx = lidx = TAKE(s, int32_t, count);
   s->g.lval = lval = TAKE(s, double, count);
   memmove(lidx, columns, (size_t)count * sizeof *lidx);
   memmove(lval, values, (size_t)count * sizeof *lval);
+  s->g.condition = core_generalized_estimate_condition(&s->g, s->watch.v);
   return LAV_OK;
 }
 

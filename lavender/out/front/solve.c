@@ -165,7 +165,7 @@ int32_t lav_room(const lav_problem *problem, const lav_options *options, uint64_
   numbers = 0;
   if (problem->form == LAV_VELOCITIES) { /* M's factor without fill, Y with a quarter more than J, its columns once a block */
     const int64_t filled = (int64_t)problem->n_entries + problem->n_entries / 4 + 256;
-    numbers += nv + 2 * (int64_t)problem->n_mass_entries + 2 * k + problem->n_entries / 4 + (m * nv < filled ? m * nv : filled);
+    numbers += 2 * nv + 4 * (int64_t)problem->n_mass_entries + 2 * k + problem->n_entries / 4 + (m * nv < filled ? m * nv : filled);
   }
   numbers += row_of(options->method)->room(problem, options, s.n_v);
   *bytes = s.used + 8 * (uint64_t)numbers + 4096;
@@ -291,6 +291,7 @@ int32_t lav_set(lav_solver *solver, const lav_problem *problem) {
 
 static int32_t run(lav_solver *s, const lav_budget *budget, lav_result *out) {
   const method_t *row = row_of(s->options.method);
+  double first; /* residual of the answer before it was refined */
   if (!s->ready) return LAV_ERROR_NO_PROBLEM;
   if (budget->size != sizeof *budget || out->size != sizeof *out) return LAV_ERROR_VERSION;
   if (budget->iterations < 0 || !(budget->tol >= 0.0 && budget->tol < INFINITY)) return LAV_ERROR_OPTION;
@@ -307,10 +308,15 @@ static int32_t run(lav_solver *s, const lav_budget *budget, lav_result *out) {
   }
   else row->step(s, budget, out);
   out->verdict.size = (uint32_t)sizeof out->verdict;
-  judge(s, s->impulse, 1, &out->verdict);
+  first = judge(s, s->impulse, 1, budget->tol, &out->verdict);
   if (budget->tol > 0.0 && out->verdict.relative <= budget->tol
       && (out->outcome == LAV_MAX_ITERATIONS || out->outcome == LAV_TIME_LIMIT || out->outcome == LAV_STALLED))
     out->outcome = LAV_CONVERGED; /* between two checks of its own */
+  if (budget->tol > 0.0 && budget->tol < out->verdict.relative /* a claim that held in float64 alone */
+      && (out->outcome == LAV_FLOOR ? first == first
+          : first <= budget->tol && (out->outcome == LAV_CONVERGED || out->outcome == LAV_STALLED
+                                     || out->outcome == LAV_MAX_ITERATIONS || out->outcome == LAV_TIME_LIMIT)))
+    out->outcome = judge_score_is_at_floor(out->verdict.relative, out->verdict.floor) ? LAV_FLOOR : LAV_STALLED;
   return LAV_OK;
 }
 

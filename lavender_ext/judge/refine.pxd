@@ -1,0 +1,194 @@
+"""Refinement of the judge's pass over J and M, for an M so ill-conditioned that its factor loses what the judge measures.
+
+With H = S M S of unit diagonal, S = diag(M)^-1/2, and u = 2^-53, a solve by the factor of M computes x' for x = M^-1 J^T lam with
+
+    |x - x'|_M  <=  n u |H^-1| |x|_M,        |x|_M^2 = x.M x = lam.J x                                        (1)
+
+and the slack of row i, w = J x + c lam - b, has an error of at most sqrt(d_i) |x - x'|_M. Therefore the pass is repeated if
+
+    n u |H^-1| max(1, k / 10)  >  0.1 max(tol, r)                                                             (2)
+
+where k is |x|_M as a relative residual, and r the residual of the first pass. (A bound by k itself is 40 to 2,000 times
+too large on random M and on chains of hinges, (2) is 3 to 1,000 times.) The correction is x <- x + M^-1 (J^T lam - M x). Its
+residual and x are sums of two float64 (Dekker 1971; the halves of a factor are cut off, so that every step is exact, with
+and without fused multiply-adds). It is repeated until
+
+    |dx|_M q <= u |x|_M,      q = max(n u |H^-1|, largest ratio of two corrections so far)                     (3)
+
+The floor of row i then also contains |w - w'| + sqrt(2 d_i) |dx|_M q, where w' is the slack of the first pass: a solver that
+computes in float64 cannot reduce it. If the corrections do not shrink, twice the last one replaces |dx|_M q. That is 2 |x|_M
+if the first correction already fails, so that no small residual is reported.
+"""
+from libc.math cimport fabs, sqrt
+from libc.stdint cimport int32_t, uint64_t
+from libc.string cimport memcpy
+
+from lavender_ext.core.generalized cimport bound_condition, dot, generalized_t, get_condition, tree_solve
+from lavender_ext.core.parts cimport blocks_t
+from lavender_ext.core.view cimport view_t
+from lavender_ext.judge.measure cimport general_score
+from lavender_ext.judge.score cimport relative, score_t, smallest_reference, unit_roundoff
+
+
+cdef enum:
+    MAX_CORRECTIONS = 16        # After so many the last correction enters the floor: each is less than half of the one before.
+
+
+# -- sums of two float64 -----------------------------------------------------------------------------
+
+
+cdef inline double upper_half(double x) noexcept nogil:
+    """The first 26 bits of x."""
+    cdef uint64_t bits
+    memcpy(&bits, &x, sizeof(bits))
+    bits &= <uint64_t>0xFFFFFFFFF8000000
+    memcpy(&x, &bits, sizeof(bits))
+    return x
+
+
+cdef inline void add_product(double x, double y, double* high, double* low) noexcept nogil:
+    """high + low += x y"""
+    cdef double a = upper_half(x), b = upper_half(y), c = x - a, d = y - b, product = x * y
+    cdef double rest = ((a * b - product) + a * d + c * b) + c * d
+    cdef double total = high[0] + product, part = total - high[0]
+    low[0] += ((high[0] - (total - part)) + (product - part)) + rest
+    high[0] = total
+
+
+cdef inline void add_number(double x, double* high, double* low) noexcept nogil:
+    """high + low += x"""
+    cdef double total = high[0] + x, part = total - high[0]
+    low[0] += (high[0] - (total - part)) + (x - part)
+    high[0] = total
+
+
+cdef inline void add_force(const generalized_t* g, const double* lam, double* high, double* low) noexcept nogil:
+    """high + low (n) = J^T lam."""
+    cdef int32_t i, q
+    for i in range(g.n):
+        high[i] = 0.0
+        low[i] = 0.0
+    for i in range(g.m):
+        if lam[i] != 0.0:
+            for q in range(g.jptr[i], g.jptr[i + 1]):
+                add_product(g.jval[q], lam[i], high + g.jidx[q], low + g.jidx[q])
+
+
+cdef inline void subtract_momentum(const generalized_t* g, const double* x, const double* x_low, double* high,
+                                   double* low) noexcept nogil:
+    """high + low (n) -= M (x + x_low)"""
+    cdef int32_t i, j, q
+    cdef double a
+    for i in range(g.n):
+        for q in range(g.mptr[i], g.mptr[i + 1]):
+            j = g.midx[q]
+            a = -g.mval[q]
+            add_product(a, x[j], high + i, low + i)
+            low[i] += a * x_low[j]
+            if j != i:
+                add_product(a, x[i], high + j, low + j)
+                low[j] += a * x_low[i]
+
+
+# -- the pass ----------------------------------------------------------------------------------------
+
+
+cdef inline double loss_by_factor(const blocks_t* p, const generalized_t* g, const double* lam, const double* w, double* x,
+                                  double start_energy, double start_velocity, double enough) noexcept nogil:
+    """The left of (2), or 0 if it is at most `enough`; w (m) is the slack of the first pass, x (2 n) scratch."""
+    cdef int32_t i = 0
+    cdef double energy = 0.0, other = 0.0, nu = 0.0, size
+    while i + 2 <= p.n_rows:                            # two sums: half of the time that their additions wait
+        energy += lam[i] * (w[i] + (p.b[i] - g.compliance[i] * lam[i]))
+        other += lam[i + 1] * (w[i + 1] + (p.b[i + 1] - g.compliance[i + 1] * lam[i + 1]))
+        nu = p.nu[i] if p.nu[i] > nu else nu
+        nu = p.nu[i + 1] if p.nu[i + 1] > nu else nu
+        i += 2
+    if i < p.n_rows:
+        energy += lam[i] * (w[i] + (p.b[i] - g.compliance[i] * lam[i]))
+        nu = p.nu[i] if p.nu[i] > nu else nu
+    energy += other
+    if g.n == 0 or energy == 0.0:                       # no impulse, or none that moves anything
+        return 0.0
+    energy = sqrt(fabs(energy))                         # negative only by rounding
+    smallest_reference(p, &start_energy, &start_velocity)
+    size = 0.1 * relative(energy, sqrt(nu) * energy, start_energy, start_velocity)
+    size = g.n * unit_roundoff() * (size if size > 1.0 else 1.0)
+    if g.condition == 0.0 and size * bound_condition(g) <= enough:
+        return 0.0
+    size *= get_condition(g, x)
+    return size if size > enough else 0.0
+
+
+cdef inline double refine_change(const generalized_t* g, const double* lam, double loss, double* x) noexcept nogil:
+    """x + x_low (n each, the first of x (6 n)) = M^-1 J^T lam by (3); what may remain of it, in the norm of M.
+
+    loss: n u |H^-1|.
+    """
+    cdef int32_t i, step, n = g.n
+    cdef double* x_low = x + n
+    cdef double* force = x + 2 * n
+    cdef double* force_low = x + 3 * n
+    cdef double* r = x + 4 * n
+    cdef double* r_low = x + 5 * n
+    cdef double whole, last, size, rate = loss if loss < 0.5 else 0.5
+    add_force(g, lam, force, force_low)
+    for i in range(n):
+        x[i] = force[i]
+        x_low[i] = 0.0
+    tree_solve(g, x)
+    whole = dot(force, x, n)
+    whole = last = sqrt(fabs(whole))                    # negative only by rounding
+    for step in range(MAX_CORRECTIONS):
+        memcpy(r, force, n * sizeof(double))
+        memcpy(r_low, force_low, n * sizeof(double))
+        subtract_momentum(g, x, x_low, r, r_low)
+        for i in range(n):
+            r[i] += r_low[i]
+            r_low[i] = r[i]
+        tree_solve(g, r_low)                            # the correction
+        size = sqrt(fabs(dot(r, r_low, n)))
+        if not size < 0.5 * last:
+            return 2.0 * last
+        for i in range(n):
+            add_number(r_low[i], x + i, x_low + i)
+        if size > rate * last:
+            rate = size / last
+        last = size
+        if size * rate <= unit_roundoff() * whole:
+            return size * rate
+    return last
+
+
+cdef inline void refine_general(const blocks_t* p, const generalized_t* g, const double* lam, double* w, double* e,
+                                double* scratch, score_t* out) noexcept nogil:
+    """w (m) of the first pass becomes that of the refined one, with its errors e (m), sums and floor; scratch (6 n + 2 m)."""
+    cdef int32_t i, q, n = g.n
+    cdef double* more = scratch
+    cdef double* x = scratch + p.n_rows
+    cdef double left = refine_change(g, lam, n * unit_roundoff() * get_condition(g, x), x), high, low
+    for i in range(p.n_rows):
+        high = -p.b[i]
+        low = 0.0
+        add_product(g.compliance[i], lam[i], &high, &low)
+        for q in range(g.jptr[i], g.jptr[i + 1]):
+            add_product(g.jval[q], x[g.jidx[q]], &high, &low)
+            low += g.jval[q] * x[n + g.jidx[q]]
+        high += low
+        more[i] = (fabs(high - w[i]) + sqrt(2.0 * p.d[i]) * left) / unit_roundoff()
+        w[i] = high
+    general_score(p, g, lam, w, e, x, more, out)
+
+
+cdef inline bint refine_view(const view_t* v, const double* lam, double* w, double* e, double* scratch, double start_energy,
+                             double start_velocity, double tol, double found, score_t* out) noexcept nogil:
+    """The refined pass in place of that of `judge_view` if (2) asks for it; w, e and out are of that, found its residual.
+
+    scratch: `scratch_of`. Nothing is written if the pass is not repeated; A and bodies have no factor that loses anything.
+    """
+    if v.g == NULL or v.p.n_rows == 0 or not found < 1.0 / 0.0:
+        return False
+    if loss_by_factor(&v.p, v.g, lam, w, scratch, start_energy, start_velocity, 0.1 * (tol if tol > found else found)) == 0.0:
+        return False
+    refine_general(&v.p, v.g, lam, w, e, scratch, out)
+    return True
