@@ -78,10 +78,7 @@ class Redundancy:
     @property
     def block_names(self) -> tuple[str, ...]:
         """Names of those blocks."""
-        given, ptr = self.problem.names, self.problem.cones.ptr
-        if given is not None:
-            return tuple(given[i] for i in self.blocks)
-        return tuple(self.problem.row_name(int(ptr[i])).rsplit(", ", 1)[0] for i in self.blocks)
+        return tuple(map(self.problem.block_name, self.blocks))
 
     @property
     def slack_is_unique(self) -> bool:

@@ -240,6 +240,19 @@ class ProblemData:
         row = whole_number("row", row, high=self.m - 1)
         return int(np.searchsorted(self.cones.ptr, row, side="right")) - 1
 
+    def block_name(self, block: int) -> str:
+        """Name of a block, e.g. "hinge 7" or "contact 3".
+
+        Raises
+        ------
+        InputError
+            No such block.
+        """
+        block = whole_number("block", block, high=self.n_blocks - 1)
+        return (
+            self.names[block] if self.names else self.row_name(int(self.cones.ptr[block])).rsplit(", ", 1)[0]
+        )
+
     def row_name(self, row: int) -> str:
         """Name of a row, e.g. "hinge 7, axis 2" or "contact 3, tangent 1".
 

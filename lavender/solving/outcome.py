@@ -12,7 +12,7 @@ import numpy as np
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import InputError
 from lavender.judge.certificates import prove, rounded_down
-from lavender.judge.residuals import best_of_islands, reference, relative_of, residual
+from lavender.judge.residuals import Residual, best_of_islands, reference, relative_of, residual
 from lavender.judge.solution import (
     CONFIRMED,
     CONTRADICTED,
@@ -127,6 +127,9 @@ def finish(
     if status is MAX_ITERATIONS:
         way = _way_left(problem, relative, tol, claim.iterations, sweeps_per_decade)
         message = _joined(message, way)
+    unfinished = status not in (CONVERGED, FLOOR, NUMERICAL_ERROR) and judged.worst_island >= 0
+    if tol > 0.0 and unfinished and not relative <= tol:
+        message = _joined(message, describe_islands(judged, tol))
     order = order_name(options.get("order", "given")) if spec.order else ""
     impulse.setflags(write=False)
     return Solution.of(
@@ -170,6 +173,18 @@ def describe_end(problem: Problem, status: Status, iterations: int) -> str:
     return words
 
 
+def describe_islands(found: Residual, tol: float) -> str:
+    """Return how many islands meet tol, with the worst one's first and last block; empty for a problem of one island."""
+    label, relative = found.islands[:2]
+    if len(relative) < 2:
+        return ""
+    problem, blocks = found._problem, np.flatnonzero(label == found.worst_island)
+    first, last = (problem.block_name(int(i)) for i in blocks[[0, -1]])
+    where = first if len(blocks) == 1 else f"{first} to {last}"
+    solved = int(np.count_nonzero(relative <= tol))
+    return f"{solved} of {len(relative)} islands meet tol, island {found.worst_island} ({where}) does not"
+
+
 def name_lost_row(problem: Problem, impulse: FloatArray, claim: Claim) -> Claim:
     """Return the claim as DIVERGED, with the first row whose impulse is not finite, if there is one."""
     if claim.status is NUMERICAL_ERROR or all_finite(impulse):
@@ -211,9 +226,18 @@ def _way_left(problem: Problem, relative: float, tol: float, done: int, per_deca
     )
 
 
-def decide_empty_rows(problem: Problem, impulse: FloatArray, tol: float) -> tuple[str, FloatArray] | None:
-    """Rows of A that are all zero: put on the bound that b asks for, or prove that there is none to `tol`."""
-    cones, worst, empty = problem.cones, -1, problem.metric.empty
+def decide_empty_rows(
+    problem: Problem, impulse: FloatArray, tol: float
+) -> tuple[str, FloatArray, list[int]] | None:
+    """Put the impulses of rows of A that are all zero on the bound that b asks for, in place.
+
+    Returns
+    -------
+    tuple or None
+        If b of such a row asks for what no impulse can give to `tol`: a message, the certificate y (m,), and all rows
+        whose b nothing can meet. None otherwise.
+    """
+    cones, impossible, empty = problem.cones, list[int](), problem.metric.empty
     if not len(empty):
         return None
     # What is behind a normal is bounded by its impulse.
@@ -227,12 +251,14 @@ def decide_empty_rows(problem: Problem, impulse: FloatArray, tol: float) -> tupl
         bound = cones.upper[i] if b > 0.0 else cones.lower[i]
         if np.isfinite(bound):
             impulse[i] = bound
-        elif worst < 0 or abs(b) > abs(problem.b[worst]):
-            worst = i
-    if worst < 0:
+        else:
+            impossible.append(i)
+    if not impossible:
         return None
+    worst = max(impossible, key=lambda i: abs(problem.b[i]))
     y, b = np.zeros(problem.m), problem.b[worst]
     y[worst] = math.copysign(1.0, b)
     if prove(problem, y, tol).reason:
         return None  # b is dust
-    return f"{problem.row_name(worst)}: its row of A is zero, so nothing can meet b = {b:.3g} m/s", y
+    message = f"{problem.row_name(worst)}: its row of A is zero, so nothing can meet b = {b:.3g} m/s"
+    return message, y, impossible

@@ -330,7 +330,7 @@ class Prepared:
         setup_time, self.setup_time = self.setup_time, 0.0
         proof = decide_empty_rows(problem, loop.impulse, loop.tol)
         if proof is not None:
-            claim = Claim(INFEASIBLE, 0, {}, proof[0], certificate=proof[1])
+            claim = self._solve_other_rows(loop, *proof, max_iter)
         elif self._broken:
             claim = Claim(NUMERICAL_ERROR, 0, {}, self._broken)
         elif self._late or (loop.deadline.passed() and not spec.external):
@@ -360,6 +360,29 @@ class Prepared:
             float(getattr(self.state, "sweeps_per_decade", math.nan)), refutation,
         )  # fmt: skip
         return solution if self._given is problem else solution.unstretched(self._given)
+
+    def _solve_other_rows(
+        self, loop: Loop, message: str, certificate: FloatArray, impossible: list[int], max_iter: int
+    ) -> Claim:
+        """Solve with b = 0 on rows that nothing can meet, which then cost no other row its impulse; claim INFEASIBLE."""
+        if loop.tol == 0.0 or loop.deadline.passed():
+            return Claim(INFEASIBLE, 0, {}, message, certificate=certificate)
+        b = self.problem.b.copy()
+        b[impossible] = 0.0
+        others = Prepared(self.problem.updated(b=b), self.spec, self.options)
+        found = others.solve(
+            impulse=loop.impulse, tol=loop.tol, max_iter=max_iter, time_limit=loop.deadline.left(LEAST)
+        )
+        loop.impulse[:] = found.impulse
+        loop.time += found.setup_time + found.solve_time
+        return Claim(
+            INFEASIBLE,
+            found.iterations,
+            dict(found.work),
+            message,
+            certificate=certificate,
+            turns=found.turns,
+        )
 
     def _refresh(self, problem: Problem | None, deadline: Deadline) -> None:
         if problem is None or problem is self._given:

@@ -139,7 +139,7 @@ cdef inline double refine_change(const generalized_t* g, const double* lam, doub
     tree_solve(g, x)
     whole = dot(force, x, n)
     whole = last = sqrt(fabs(whole))                    # negative only by rounding
-    for step in range(MAX_CORRECTIONS):
+    for _step in range(MAX_CORRECTIONS):
         memcpy(r, force, n * sizeof(double))
         memcpy(r_low, force_low, n * sizeof(double))
         subtract_momentum(g, x, x_low, r, r_low)

@@ -184,6 +184,7 @@ CALLS |= {
     ),
     "Problem.block_of": (LCP.block_of, {"row": 1}),
     "Problem.row_name": (LCP.row_name, {"row": 1}),
+    "Problem.block_name": (LCP.block_name, {"block": 1}),
     "Problem.boxed": (CONTACT.boxed, {"normal_impulse": np.ones(len(ROWS.normal))}),
     "Problem.carry": (LCP.carry, {"previous": (LCP, B), "keys": np.array([4, 5])}),
     "Problem.carry, impulse": (lambda impulse: LCP.carry((LCP, impulse)), {"impulse": B}),
