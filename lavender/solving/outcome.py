@@ -174,7 +174,7 @@ def describe_end(problem: Problem, status: Status, iterations: int) -> str:
 
 
 def describe_islands(found: Residual, tol: float) -> str:
-    """Return how many islands meet tol, with the worst one's first and last block; empty for a problem of one island."""
+    """Return how many islands meet tol, with the worst one's first and last block; empty for one island."""
     label, relative = found.islands[:2]
     if len(relative) < 2:
         return ""

@@ -364,7 +364,7 @@ class Prepared:
     def _solve_other_rows(
         self, loop: Loop, message: str, certificate: FloatArray, impossible: list[int], max_iter: int
     ) -> Claim:
-        """Solve with b = 0 on rows that nothing can meet, which then cost no other row its impulse; claim INFEASIBLE."""
+        """Solve with b = 0 on rows that nothing can meet, so that the other rows keep an impulse; claim INFEASIBLE."""
         if loop.tol == 0.0 or loop.deadline.passed():
             return Claim(INFEASIBLE, 0, {}, message, certificate=certificate)
         b = self.problem.b.copy()

@@ -125,7 +125,7 @@ cdef inline double refine_change(const generalized_t* g, const double* lam, doub
 
     loss: n u |H^-1|.
     """
-    cdef int32_t i, step, n = g.n
+    cdef int32_t i, n = g.n
     cdef double* x_low = x + n
     cdef double* force = x + 2 * n
     cdef double* force_low = x + 3 * n
