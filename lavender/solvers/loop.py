@@ -164,7 +164,8 @@ class Loop:
         state: State = self.state
         watch = getattr(state, "watch", None)
         if isinstance(watch, Watch):
-            watch.keep_best(self.impulse, self.tol)
+            # The rows of a state may be in another order than those of its problem.
+            getattr(state, "keep_best", watch.keep_best)(self.impulse, self.tol)
             return
         best = getattr(state, "best", None)
         if best is None or best[1] is None:

@@ -54,6 +54,15 @@ class ImpulseState(SweepState):
         self.layout.put(laid, impulse)
         return relative, impulse
 
+    def keep_best(self, impulse: FloatArray, tol: float) -> None:
+        """Replace `impulse` (m,), unless it meets tol, by the best of each island of it and of all checks."""
+        if self.layout is None:
+            self.watch.keep_best(impulse, tol)
+            return
+        laid = self.layout.take(impulse)
+        self.watch.keep_best(laid, tol)
+        self.layout.put(laid, impulse)
+
 
 @dataclass(frozen=True)
 class SequentialImpulses(Threaded):

@@ -8,7 +8,7 @@ import numpy as np
 from lavender_ext.core.problem cimport Data
 from lavender_ext.judge.measure cimport scratch_of
 from lavender_ext.judge.progress cimport envelope
-from lavender_ext.judge.best cimport count_islands, note_score, see_impulse
+from lavender_ext.judge.best cimport count_islands, note_score, relative_of_best, see_impulse
 from lavender_ext.judge.measure cimport judge_view
 from lavender_ext.judge.score cimport new_score, score_t
 from lavender_ext.judge.watch cimport CONVERGED, RUNNING, begin_watch, due, relative_to_start, watch_room, watch_t
@@ -61,6 +61,7 @@ cdef class Watch:
             note_score(&s.best, &self.view.p, &x, now)
             if not now <= tol:
                 see_impulse(&s.best, &self.view.p, &lam[0], tol)
+                s.best_relative = relative_of_best(&s.best)
                 memcpy(&lam[0], s.best.impulse, lam.shape[0] * sizeof(double))
 
     @property

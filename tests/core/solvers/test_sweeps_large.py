@@ -57,6 +57,15 @@ def test_a_stalled_run_gives_its_best_iterate_in_the_problems_order(pile, monkey
     assert lv.residual(pile, impulse).relative == pytest.approx(relative, rel=1e-9)
 
 
+@pytest.mark.parametrize("order", ORDERS)
+def test_a_run_that_ends_before_its_tolerance_gives_its_impulses_in_the_problems_order(order, pile, monkeypatch):
+    plain = lv.solve(pile, NAME, order=order, tol=1e-9, max_iter=60)
+    monkeypatch.setattr(layout, "LARGE", 1)
+    copied = lv.solve(pile, NAME, order=order, tol=1e-9, max_iter=60)
+    assert copied.status is plain.status is lv.Status.MAX_ITERATIONS
+    np.testing.assert_array_equal(copied.impulse, plain.impulse)
+
+
 def test_an_array_that_mixes_joints_and_contacts_is_not_written_out(monkeypatch):
     monkeypatch.setattr(layout, "LARGE", 1)
     problem = random_contact_problem(1, bodies=6, joints=3, contacts=9)
