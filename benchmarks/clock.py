@@ -4,23 +4,17 @@ from __future__ import annotations
 
 import gc
 from collections.abc import Callable
-from time import perf_counter, perf_counter_ns, process_time_ns
+from time import perf_counter, process_time_ns
 from typing import Any
 
-wall = perf_counter_ns  # for `least`, where several threads run
 
-
-def least(
-    *calls: Callable[[], Any], seconds: float = 0.2, clock: Callable[[], int] = process_time_ns
-) -> list[float]:
-    """Least time [s] of one call of each, in turns, in batches of about a millisecond.
+def least(*calls: Callable[[], Any], seconds: float = 0.2) -> list[float]:
+    """Least CPU time [s] of one call of each, in turns, in batches of about a millisecond.
 
     Parameters
     ----------
     seconds : float, s
         Time for all; each is called at least three times.
-    clock : callable
-        Nanoseconds.
     """
     counts = []
     for call in calls:
@@ -34,10 +28,10 @@ def least(
     try:
         while rounds < 3 or perf_counter() - begun < seconds:
             for i, call in enumerate(calls):
-                start = clock()
+                start = process_time_ns()
                 for _ in range(counts[i]):
                     call()
-                best[i] = min(best[i], (clock() - start) / counts[i])
+                best[i] = min(best[i], (process_time_ns() - start) / counts[i])
             rounds += 1
     finally:
         if collects:

@@ -195,7 +195,6 @@ def abilities(spec):
         "impulse": "starts from `impulse=`",
         "order": "`order=`, `ground=`",
         "seed": "`seed=`",
-        "threads": '`threads=` (with `order="colored"`)',
         "callback": "`callback=`",
         "history": "`history=True`",
     }

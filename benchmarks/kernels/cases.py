@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.clock import least, wall
+from benchmarks.clock import least
 from benchmarks.kernels import microbenchmarks
 from benchmarks.kernels.problems import bare_contacts, raw_bytes, tridiagonal
 from benchmarks.made import lattice_pile
@@ -31,7 +31,7 @@ class Row:
     size: str  # what it ran on
     unit: str  # what `work` counts
     work: float  # units of one call
-    seconds: float  # s, of one call: least CPU time (of the wall where several threads run)
+    seconds: float  # s, of one call: least CPU time
     beside: str = ""  # what was timed in turns with it
     limit: float = float("nan")  # s, of one call of that
     residual: float = float("nan")  # -, the judge's, of what came out
@@ -60,12 +60,11 @@ class Job:
     beside: str = ""
     limit: Callable[[], Any] | None = None
     relative: Callable[[], float] | None = None  # residual of what came out
-    clock: Callable[[], int] = process_time_ns
 
     def row(self, seconds: float) -> Row:
         """Time it for so long [s]."""
         both = [self.call] if self.limit is None else [self.call, self.limit]
-        time, *other = least(*both, seconds=seconds, clock=self.clock)
+        time, *other = least(*both, seconds=seconds)
         return Row(
             case=self.case,
             size=self.size,
@@ -111,24 +110,6 @@ def _impulses(contacts: int, shuffle: bool = False, **options: Any) -> Job:
         beside="bare",
         limit=partial(microbenchmarks.contact, *raw, n),
         relative=lambda: residual(problem, lam).relative,
-    )
-
-
-def _threads(contacts: int, threads: int = 2) -> Job:
-    problem = lattice_pile(contacts)
-    c = problem.n_blocks
-    n = max(1, int(1e-2 / (c * 25e-9)))  # about 10 ms: what the front door hands over at once is 25
-    one, many = (sweeps(problem, "sequential_impulses", n, order="colored", threads=t) for t in (1, threads))
-    return Job(
-        case=f"colored, {threads} threads (wall)",
-        size=f"{c} contacts",
-        unit="contact",
-        work=n * c,
-        call=many[0],
-        beside="one thread",
-        limit=one[0],
-        relative=lambda: residual(problem, many[1]).relative,
-        clock=wall,
     )
 
 
@@ -193,8 +174,6 @@ _JOBS: dict[str, Callable[[], Job]] = {
     "impulses-shuffled": partial(_impulses, 100_000, shuffle=True),
     "impulses-local": partial(_impulses, 100_000, shuffle=True, order="local"),
     "impulses-colored": partial(_impulses, 100_000, order="colored"),
-    "threads-10k": partial(_threads, 10_000),
-    "threads-100k": partial(_threads, 100_000),
     "pgs": lambda: _matrix(frictionless(1_000)),
     "pgs-100k": lambda: _matrix(frictionless(100_000)),
     "pgs-tridiagonal": lambda: _matrix(tridiagonal(2_000)),

@@ -31,7 +31,6 @@ def solvers() -> None:
                 ("budget", spec.resumable),
                 ("order", spec.order),
                 ("seed", spec.seed),
-                ("threads", spec.threads),
                 ("history", spec.history),
             )
             if has

@@ -22,8 +22,8 @@ from lavender.problem.ordering import Order
 from lavender.solvers.registry import SolverSpec
 from lavender.solvers.setup_times import forming
 from lavender.solvers.sweeping import (
+    Sweeping,
     SweepState,
-    Threaded,
     over,
     plan_of,
     reads_whitened,
@@ -34,8 +34,8 @@ _NONE = np.empty(0, np.int32)
 
 
 @dataclass(frozen=True)
-class PGS(Threaded):
-    """Projected Gauss-Seidel; `order`, `ground`, `seed` as in `lavender.problem.ordering`; `threads` with "colored"."""
+class PGS(Sweeping):
+    """Projected Gauss-Seidel; `order`, `ground`, `seed` as in `lavender.problem.ordering`."""
 
     def _told(self, state: SweepState, claim: Claim, again: int) -> Claim:
         return replace(claim, form=over(state.data)) if state.data.is_general else claim
@@ -60,7 +60,6 @@ SPEC = SolverSpec(
     operators=frozenset({"matrix", "generalized"}),
     order=True,
     seed=True,
-    threads=True,
     parts=True,
     max_iter=1000,
     summary="projected Gauss-Seidel on the rows of A, or on J and M",

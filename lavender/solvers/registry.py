@@ -145,7 +145,6 @@ class SolverSpec:
     impulse: bool = True  # uses a warm start
     order: bool = False  # takes order= and ground=
     seed: bool = False  # takes seed=
-    threads: bool = False  # takes threads=
     callback: bool = True  # takes callback=; needs resumable
     history: bool = True  # records history; needs resumable
     delegates: bool = False  # calls other solvers: only "auto"
@@ -205,7 +204,7 @@ class SolverSpec:
     @property
     def accepts(self) -> frozenset[str]:
         """Options beyond those of the front door."""
-        shared = {"order": ("order", "ground"), "seed": ("seed",), "threads": ("threads",)}
+        shared = {"order": ("order", "ground"), "seed": ("seed",)}
         return frozenset(self.options) | {
             o for flag, names in shared.items() if getattr(self, flag) for o in names
         }

@@ -21,7 +21,7 @@ from lavender.problem.ordering import Order
 from lavender.solvers.layout import Layout, lay_out
 from lavender.solvers.layout import pays as layout_pays
 from lavender.solvers.registry import SolverSpec
-from lavender.solvers.sweeping import SweepState, Threaded, plan_of
+from lavender.solvers.sweeping import Sweeping, SweepState, plan_of
 from lavender_ext.sweep import serial
 
 
@@ -65,10 +65,8 @@ class ImpulseState(SweepState):
 
 
 @dataclass(frozen=True)
-class SequentialImpulses(Threaded):
-    """Matrix-free projected Gauss-Seidel; `order`, `ground`, `seed` as in `lavender.problem.ordering`;
-    `threads` with "colored".
-    """
+class SequentialImpulses(Sweeping):
+    """Matrix-free projected Gauss-Seidel; `order`, `ground`, `seed` as in `lavender.problem.ordering`."""
 
     def _forming(self, problem: Problem) -> float:
         return 0.0
@@ -103,7 +101,6 @@ SPEC = SolverSpec(
     operators=frozenset({"rows"}),
     order=True,
     seed=True,
-    threads=True,
     parts=True,
     max_iter=1000,
     summary="projected Gauss-Seidel on body velocities, matrix-free",

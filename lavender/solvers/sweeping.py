@@ -9,9 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from lavender.base.arrays import FloatArray, whole_number
-from lavender.base.errors import InputError
-from lavender.base.threads import helpers
+from lavender.base.arrays import FloatArray
 from lavender.judge.residuals import reference
 from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
@@ -19,7 +17,7 @@ from lavender.problem.ordering import Order, block_order
 from lavender.solvers.registry import Solver
 from lavender.solvers.setup_times import forming, ordered
 from lavender_ext.judge.watch import AT_FLOOR, CONVERGED, DIVERGED, RUNNING, STALLED, Watch
-from lavender_ext.sweep import serial, threaded
+from lavender_ext.sweep import serial
 
 STATUS = {
     RUNNING: Status.MAX_ITERATIONS,
@@ -28,9 +26,6 @@ STATUS = {
     STALLED: Status.STALLED,
     AT_FLOOR: Status.FLOOR,
 }
-# Multiply-adds per colour from which a second thread gains (measured: where both take the same time).
-GRAIN = 20_000
-LEAST = 400_000  # multiply-adds of a sweep: 4,000 contacts, below which starting threads costs what they save
 PATIENCE = 64  # sweeps that may always pass without a better check
 
 
@@ -42,8 +37,6 @@ def watch_over(problem: Problem, data: Any, patience: int) -> Watch:
 
 class SweepState:
     """State of a run; the watch counts sweeps and keeps the best checked iterate."""
-
-    alone: dict[str, Any] | None = None  # how long the leader of several threads goes on alone
 
     def __init__(
         self, problem: Problem, data: Any, order: Order, sweeps: Any = None, patience: int = PATIENCE
@@ -76,25 +69,6 @@ def claim(status: int, done: int) -> Claim:
 def plan_of(order: Order) -> tuple[Any, ...]:
     """(blocks, split, mode, rng) of an order, as kernels take it."""
     return order.blocks, order.split, order.mode, order.rng
-
-
-def gains_from_threads(state: SweepState) -> bool:
-    """Colours are large enough for more than one thread."""
-    ptr, work = state.order.color_ptr, state.data.work
-    if state.data.is_general:
-        return False
-    return ptr is not None and len(ptr) > 1 and work >= LEAST and work >= GRAIN * (len(ptr) - 1)
-
-
-def run_threads(state: SweepState, impulse: FloatArray, max_iter: int, tol: float, threads: int) -> Claim:
-    """Coloured sweeps on several threads: the bits of one thread."""
-    alone = state.alone or {}
-    team = threaded.Team(state.sweeps, state.watch, impulse, state.order.color_ptr, threads, **alone)
-    for thread in range(1, threads):
-        helpers().submit(team.help, thread)  # one that begins late finds nothing left to do
-    result = claim(*team.lead(max_iter, tol))
-    state.alone = {"alone": team.alone}
-    return result
 
 
 def reads_whitened(problem: Problem) -> bool:
@@ -164,30 +138,3 @@ class Sweeping(Swept):
     def _state(self, problem: Problem, order: Order, before: Any) -> SweepState:
         """`before`: the state of a problem of the same structure and order, None the first time."""
         return SweepState(problem, problem.csr_data, order)
-
-
-@dataclass(frozen=True)
-class Threaded(Sweeping):
-    """A sweep solver that can share each colour's blocks among threads."""
-
-    threads: int = 1
-
-    def __post_init__(self) -> None:
-        if whole_number("threads", self.threads, 1) > 1 and not (
-            isinstance(self.order, str) and self.order == "colored"
-        ):
-            raise InputError(
-                f"threads={self.threads} needs order='colored': only blocks of one colour share nothing"
-            )
-
-    def run(
-        self,
-        state: Any,
-        impulse: FloatArray,
-        max_iter: int,
-        tol: float,
-        time_limit: float | None = None,
-    ) -> Claim:
-        if self.threads > 1 and gains_from_threads(state):
-            return run_threads(state, impulse, max_iter, tol, self.threads)
-        return super().run(state, impulse, max_iter, tol)

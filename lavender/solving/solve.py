@@ -97,7 +97,7 @@ def solve(
     callback : callable (iterations, impulse, residual), optional
         Called whenever history would be recorded; the solve stops if it returns a true value.
     **options
-        `order`, `ground`, `seed`, `threads` and the solver's own options, as listed by its spec.
+        `order`, `ground`, `seed` and the solver's own options, as listed by its spec.
 
     Returns
     -------
@@ -190,7 +190,7 @@ class Prepared:
                     raise CapabilityError(
                         f"prepare does not take {name}=: give it to the solve of what it returns"
                     )
-                if name in ("order", "ground", "seed", "threads"):
+                if name in ("order", "ground", "seed"):
                     raise CapabilityError(
                         f"solver {spec.name!r} does not take {name}=; it takes: "
                         f"{', '.join(sorted(spec.accepts)) or 'no options'}"

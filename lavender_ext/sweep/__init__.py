@@ -1,1 +1,1 @@
-"""Sweeps of Gauss-Seidel and Jacobi type: one thread, several threads, contacts packed in lanes."""
+"""Sweeps of Gauss-Seidel and Jacobi type: blocks one after the other, contacts packed in lanes."""

@@ -123,7 +123,7 @@ def solved(spec, problem):
         problem.csr  # noqa: B018 - formed before it is compared
     before = data_of(problem) if spec["again"] else None
     if spec.get("prepared"):
-        mine = {k: v for k, v in options.items() if k in ("order", "seed", "threads")}
+        mine = {k: v for k, v in options.items() if k in ("order", "seed")}
         rest = {k: v for k, v in options.items() if k not in mine}
         prepared = lv.prepare(problem, spec["solver"], **mine)
         first = prepared.solve(**rest)
@@ -149,7 +149,6 @@ def together(spec, problem, solution):
     """The same structure with other right sides: solved in one call as one by one, and each claim is judged."""
     options = dict(spec["options"])
     start = options.pop("impulse", None)
-    options.pop("threads", None)  # within one problem; the bits are those of any number
     taken = []
     for b in spec["others"]:
         with contextlib.suppress(lv.InputError):  # numbers that the door refuses, it refuses here, too

@@ -367,8 +367,6 @@ def solve_specs(draw):
         options["order"] = draw(st.sampled_from(ORDERS))
         if s.seed and options["order"] == "random":
             options["seed"] = draw(st.integers(0, 2**32))
-        if s.threads and options["order"] == "colored":
-            options |= draw(optional(0.1, threads=st.just(2)))
     if s.history:
         options |= draw(optional(0.05, history=st.just(True)))
     options |= draw(optional(0.02, time_limit=st.sampled_from((0.0, 1e-6, 1e-3, 1.0))))

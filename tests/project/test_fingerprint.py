@@ -17,7 +17,7 @@ def test_the_same_in_another_process_and_a_change_is_named(tmp_path):
     before = file.read_text()
     items = [line.split("\t")[1] for line in before.splitlines()]
     assert items[1:] == sorted(items[1:]) or items == sorted(items)
-    for word in ("problem box_stackF(n=10)", "solve box_stackF(n=10) | newton", "| random", "2 threads"):
+    for word in ("problem box_stackF(n=10)", "solve box_stackF(n=10) | newton", "| random", "| colored"):
         assert any(word in item for item in items), word
     lines, named = before.splitlines(keepends=True), []
     for word in ("| pgs | random", "| newton"):  # the second goes through LAPACK

@@ -68,6 +68,6 @@ def test_keeps_the_contract_of_every_solver(environment):
     report = python(
         "-m", "pytest", "-q", "-p", "no:cacheprovider", contract, "-k", "apgd", env=environment
     ).stdout
-    # Each general property of a resumable solver that takes a start; the spec declares no order, seed or threads.
+    # Each general property of a resumable solver that takes a start; the spec declares no order or seed.
     assert "passed" in report
     assert int(report.split(" passed")[0].split()[-1]) >= 15

@@ -151,7 +151,7 @@ def test_an_option_that_is_not_honoured_is_refused(name):
     problem = next(examples(spec))
     with pytest.raises(lv.UnknownName, match="no_such_option"):
         lv.solve(problem, name, no_such_option=1)
-    for flag, option in (("order", {"order": "reverse"}), ("seed", {"seed": 3}), ("threads", {"threads": 1})):
+    for flag, option in (("order", {"order": "reverse"}), ("seed", {"seed": 3})):
         if not getattr(spec, flag):
             with pytest.raises(lv.CapabilityError, match=flag):
                 lv.solve(problem, name, **option)

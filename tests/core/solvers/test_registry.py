@@ -52,7 +52,7 @@ def test_specs_are_copied_and_pickled(again):
         {"max_iter": -1},
         {"max_iter": "7"},
         {"resumable": "no"},
-        {"threads": 2},
+        {"seed": 2},
     ],
     ids=lambda wrong: next(iter(wrong)),
 )

@@ -39,11 +39,10 @@ REFUSED = {
     "many of a name": (lambda: lv.solve_many([TINY], "pgss"), lv.UnknownName, "pgs"),
     "many numbers": (lambda: lv.solve_many([3]), lv.InputError, "Problem"),
     "many by no thread": (lambda: lv.solve_many([TINY], threads=0), lv.InputError, "threads is 0"),
-    "threads without colours": (lambda: lv.solve(TINY, "pgs", threads=2), lv.InputError, "colored"),
-    "no thread": (
-        lambda: lv.solve(TINY, "pgs", order="colored", threads=0),
-        lv.InputError,
-        "whole number from 1",
+    "threads of a sweep": (
+        lambda: lv.solve(TINY, "pgs", order="colored", threads=2),
+        lv.UnknownName,
+        "threads",
     ),
     **{
         f"{name} with {option} {x}": (

@@ -1,16 +1,15 @@
-"""Large piles: threads, written-out orders and neighbours in space change speed, never the answer."""
+"""Large piles: written-out orders and neighbours in space change speed, never the answer."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from random_problems import random_contact_problem, sweeps
+from random_problems import as_matrix, random_contact_problem, sweeps
 
 import lavender as lv
 from benchmarks.made import lattice_pile
-from lavender.problem.ordering import block_order, body_ranks
+from lavender.problem.ordering import block_order, body_ranks, colors
 from lavender.solvers import layout, sweeping
-from lavender_ext.sweep.threaded import Team
 
 NAME = "sequential_impulses"
 ORDERS = ("reverse", "colored", "bottom_up", "top_down", "local")
@@ -58,7 +57,7 @@ def test_a_stalled_run_gives_its_best_iterate_in_the_problems_order(pile, monkey
 
 
 @pytest.mark.parametrize("order", ORDERS)
-def test_a_run_that_ends_before_its_tolerance_gives_its_impulses_in_the_problems_order(order, pile, monkeypatch):
+def test_an_unfinished_run_gives_its_impulses_in_the_problems_order(order, pile, monkeypatch):
     plain = lv.solve(pile, NAME, order=order, tol=1e-9, max_iter=60)
     monkeypatch.setattr(layout, "LARGE", 1)
     copied = lv.solve(pile, NAME, order=order, tol=1e-9, max_iter=60)
@@ -74,32 +73,24 @@ def test_an_array_that_mixes_joints_and_contacts_is_not_written_out(monkeypatch)
     assert state.layout is None
 
 
-@pytest.mark.parametrize("name", lv.available(threads=True))
+@pytest.mark.parametrize("name", lv.available(order=True))
 @pytest.mark.parametrize("large", [1, 10**9])
-def test_threads_change_no_bit(name, large, pile, monkeypatch):
-    """Small problems fall back to one thread; here they may not."""
+def test_orders_within_a_colour_have_the_same_bits(name, large, pile, monkeypatch):
+    """Blocks of one colour do not read what others of it write: contacts, joints and rows, packed and copied or not."""
     monkeypatch.setattr(layout, "LARGE", large)
-    monkeypatch.setattr(sweeping, "GRAIN", 0)
-    monkeypatch.setattr(sweeping, "LEAST", 0)
-    for problem in (pile, random_contact_problem(3, bodies=40, joints=20, contacts=200)):
-        results = [
-            lv.solve(problem, name, order="colored", threads=t, tol=1e-6, max_iter=60) for t in (1, 2, 3, 5)
-        ]
-        assert len({s.impulse.tobytes() for s in results}) == 1
-        assert len({(s.iterations, s.status) for s in results}) == 1
-
-
-def test_a_leader_needs_no_helper(pile):
-    """Helpers that never come, or come when all is done, change nothing."""
-    prepared = lv.prepare(pile, "sequential_impulses", order="colored")
-    state, lam = prepared.state, pile.start()
-    team = Team(state.sweeps, state.watch, lam, state.order.color_ptr, 8)
-    assert team.lead(5, 0.0) == (0, 5)
-    np.testing.assert_array_equal(lam, sweeps(pile, NAME, 5, order="colored"))
-    before = lam.copy()
-    for thread in (-1, 0, 1, 7, 8, 100):
-        team.help(thread)
-    np.testing.assert_array_equal(lam, before)
+    rng = np.random.default_rng(5)
+    jointed = random_contact_problem(3, bodies=40, joints=20, contacts=200)
+    matrix = as_matrix(jointed)
+    free = replace(matrix, cones=lv.Cones.free(matrix.m))
+    for problem in (pile, jointed, matrix, free):
+        if lv.get(name).refuses(problem) is None:
+            color = colors(problem)
+            is_contact = np.arange(problem.n_blocks) >= block_order(problem).split
+            orders = [np.lexsort((rng.random(len(color)), color, is_contact)) for _ in range(3)]
+            for budget in ({"tol": 0.0, "max_iter": 3}, {"tol": 1e-6, "max_iter": 60}):
+                results = [lv.solve(problem, name, order=order, **budget) for order in ("colored", *orders)]
+                assert len({s.impulse.tobytes() for s in results}) == 1
+                assert len({(s.iterations, s.status) for s in results}) == 1
 
 
 def test_local_brings_bodies_that_touch_together(pile, monkeypatch):
