@@ -1,4 +1,4 @@
-"""Sweep orders of blocks, by name, and colours for threads.
+"""Sweep orders of blocks, by name, with their levels and colours.
 
     given       as they stand                    bottom_up   by level from the ground, breadth first
     reverse     backwards                        top_down    the levels backwards
@@ -44,7 +44,6 @@ class Order:
     split: int  # blocks[:split] and blocks[split:] are permuted apart: joints, contacts
     mode: int  # given, symmetric or random
     rng: np.ndarray  # (1,) uint64, state of the generator
-    color_ptr: IntArray | None = None  # first place of each colour in `blocks`, then k
     is_given: bool = False  # every sweep runs over the blocks as they stand
 
     @property
@@ -101,24 +100,19 @@ def block_order(
         level = levels(problem, ground)
         if order == "top_down":
             level = level.max(initial=0) - level
-        blocks = _by_key(level, split)[0]
+        blocks = _sort_by_key(level, split)
     elif order == "local":
         blocks = local_order(problem)
     elif order == "colored":
-        blocks, ptr = _by_key(colors(problem), split)
-        return Order(blocks, split, GIVEN, rng, ptr)
+        blocks = _sort_by_key(colors(problem), split)
     mode = SYMMETRIC if order == "symmetric" else RANDOM if order == "random" else GIVEN
     return Order(np.ascontiguousarray(blocks, np.int32), split, mode, rng)
 
 
-def _by_key(key: IntArray, split: int) -> tuple[IntArray, IntArray]:
-    # Stable order by key within joints and within contacts; first place of each key, then k.
-    parts, starts, base = list[Any](), list[Any]([[0]]), 0
-    for part in (key[:split], key[split:]):
-        parts.append(np.argsort(part, kind="stable") + base)
-        starts.append(np.cumsum(np.unique(part, return_counts=True)[1]) + base)
-        base += len(part)
-    return np.concatenate(parts).astype(np.int32), np.concatenate(starts).astype(np.int32)
+def _sort_by_key(key: IntArray, split: int) -> IntArray:
+    """Sort blocks (k,) by key: joints first, equal keys in the given order."""
+    is_contact = np.arange(len(key)) >= split
+    return np.lexsort((key, is_contact)).astype(np.int32)
 
 
 def levels(problem: Problem, ground: Any = None) -> IntArray:

@@ -23,14 +23,14 @@ def test_named_orders_are_permutations_with_joints_first(order, seed):
 @given(seed=seeds)
 def test_colors_share_no_moving_body(seed):
     problem = random_contact_problem(seed, bodies=6, contacts=20)
-    o = block_order(problem, "colored")
+    o, color = block_order(problem, "colored"), colors(problem)
     body = np.concatenate([problem.rows.joint_body, problem.rows.contact_body])
-    assert o.color_ptr[0] == 0
-    assert o.color_ptr[-1] == problem.n_blocks
-    for first, end in zip(o.color_ptr[:-1], o.color_ptr[1:], strict=True):
-        moving = body[o.blocks[first:end]].ravel()
+    for c in range(color.max() + 1):
+        moving = body[color == c].ravel()
         moving = moving[moving >= 0]
         assert len(moving) == len(set(moving.tolist()))
+    for part in (o.blocks[: o.split], o.blocks[o.split :]):
+        assert (np.diff(color[part]) >= 0).all()
 
 
 @given(seed=seeds)
