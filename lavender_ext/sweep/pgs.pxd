@@ -73,9 +73,7 @@ cdef inline void relax_general_block(const blocks_t* p, const generalized_t* g, 
         relax_general_disk(p, g, b, j + part.first[k], part.size[k], part.reach[k] * lam[j], lam, u)
 
 
-cdef void relax_matrix(const blocks_t* p, const csr_t* a, const int32_t* order, int32_t first, int32_t end,
-                       double* lam) noexcept nogil
-cdef void relax_bodies(const blocks_t* p, const rows_t* r, const int32_t* order, int32_t first, int32_t end, double* lam,
-                       double* v) noexcept nogil
-cdef void relax_general(const blocks_t* p, const generalized_t* g, const int32_t* order, int32_t first, int32_t end,
-                        double* lam, double* u) noexcept nogil
+cdef void relax_matrix(const blocks_t* p, const csr_t* a, const int32_t* order, double* lam) noexcept nogil
+cdef void relax_bodies(const blocks_t* p, const rows_t* r, const int32_t* order, double* lam, double* v) noexcept nogil
+cdef void relax_general(const blocks_t* p, const generalized_t* g, const int32_t* order, double* lam,
+                        double* u) noexcept nogil

@@ -1,4 +1,4 @@
-"""Blocks of an order relaxed one after the other, order[first:end], each loop with the update of a block inlined whole.
+"""One sweep over the blocks (n_blocks) of an order, each loop with the update of a block inlined whole.
 
 A module of their own, since that is what a compiler has room for: beside other loops it would call the updates.
 """
@@ -12,29 +12,27 @@ from lavender_ext.core.rows cimport relax_rows_block, rows_t
 from lavender_ext.sweep.pgs cimport relax_csr_block, relax_general_block
 
 
-cdef void relax_matrix(const blocks_t* p, const csr_t* a, const int32_t* order, int32_t first, int32_t end,
-                       double* lam) noexcept nogil:
+cdef void relax_matrix(const blocks_t* p, const csr_t* a, const int32_t* order, double* lam) noexcept nogil:
     """Over A; no order: every block is one row, as it stands."""
     cdef int32_t i
     if order == NULL:                                   # without the lookups
-        for i in range(first, end):
+        for i in range(p.n_blocks):
             lam[i] = relax_row(lam[i], csr_dot(a, i, lam) - p.b[i], p.step[i], p.lower[i], p.upper[i])
         return
-    for i in range(first, end):
+    for i in range(p.n_blocks):
         relax_csr_block(p, a, order[i], lam)
 
 
-cdef void relax_bodies(const blocks_t* p, const rows_t* r, const int32_t* order, int32_t first, int32_t end, double* lam,
-                       double* v) noexcept nogil:
+cdef void relax_bodies(const blocks_t* p, const rows_t* r, const int32_t* order, double* lam, double* v) noexcept nogil:
     """Over bodies, v (n_bodies, 6) = M^-1 J^T lam."""
     cdef int32_t i
-    for i in range(first, end):
+    for i in range(p.n_blocks):
         relax_rows_block(p, r, order[i], lam, v)
 
 
-cdef void relax_general(const blocks_t* p, const generalized_t* g, const int32_t* order, int32_t first, int32_t end,
-                        double* lam, double* u) noexcept nogil:
+cdef void relax_general(const blocks_t* p, const generalized_t* g, const int32_t* order, double* lam,
+                        double* u) noexcept nogil:
     """Over J and M, u (nv) = Y^T lam."""
     cdef int32_t i
-    for i in range(first, end):
+    for i in range(p.n_blocks):
         relax_general_block(p, g, order[i], lam, u)

@@ -32,13 +32,13 @@ cdef void sweep(context_t* c, const blocks_t* p, bint exact, double* lam, bint f
     if WHOLE and exact:
         c.fallbacks += solve_blocks(p, c.csr, c.rows, c.general, c.start, c.g, c.order, lam, c.v)
     elif WHOLE and c.general != NULL:
-        relax_general(p, c.general, c.order, 0, p.n_blocks, lam, c.v)
+        relax_general(p, c.general, c.order, lam, c.v)
     elif c.csr != NULL:
-        relax_matrix(p, c.csr, c.order, 0, p.n_blocks, lam)
+        relax_matrix(p, c.csr, c.order, lam)
     elif WHOLE and c.packing != NULL and c.packing.single and c.packing.status == READY:
         sweep_levels(p, c.rows, &c.packing.packed, c.packing.backwards, lam, c.v)
     else:
-        relax_bodies(p, c.rows, c.order, 0, p.n_blocks, lam, c.v)
+        relax_bodies(p, c.rows, c.order, lam, c.v)
 
 
 cdef void sweep_step(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:
