@@ -128,7 +128,8 @@ def draw_sweeps(axes, found):
     for i, row in enumerate(found["systems"].values()):
         for solver, style in zip(SOLVERS, ("-", "--"), strict=True):
             h = row[solver].history
-            label = f"{SOLVERS[solver]},\ncondition {row['condition']:,.0f}"
+            rounded = float(f"{row['condition']:.2g}")
+            label = f"{SOLVERS[solver]},\ncondition {rounded:,g}"
             axes.loglog(h.iterations[1:], h.relative[1:], style, color=f"C{i}", label=label)
         axes.axhline(row["direct"].residual.relative, color=f"C{i}", linestyle=":", linewidth=0.8)
     axes.set(title="dotted: direct, one factorisation", xlabel="sweeps", ylabel="relative residual [-]")

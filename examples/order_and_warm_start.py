@@ -2,9 +2,13 @@
 
 Eight boxes are on each other, solved by projected Gauss-Seidel. b is not zero where bodies approach: at the ground if
 all boxes fall, at the top if only the top box comes down. A sweep that starts there carries the impulse through all
-contacts in one pass. A sweep in the opposite direction carries it one contact further. If each box stands on a
-heavier one, the contact above returns little, and a few sweeps are enough. Equal boxes return half, and the order
-matters little. A random order carries the impulse piece by piece, differently for every seed.
+contacts in one pass. A sweep in the opposite direction carries it one contact further. A random order carries the
+impulse piece by piece, differently for every seed. If each box stands on a heavier one, the slowest part of the error
+shrinks by 0.676 per sweep in every order, and a few sweeps are enough. Of equal boxes it shrinks by 0.962 per sweep
+in every order, and the order matters little.
+
+Which order is ahead, and by how much, depends on the measure of the error. The relative residual is the larger of an
+energy and a velocity; r_p, max |e_n| and the distance to the solution, sqrt(x.A x), are printed beside it.
 
 Warm start: if the load changes by 5 %, a solve that starts from the exact impulses before the change starts 20 times
 closer than from zero.
@@ -27,6 +31,7 @@ import numpy as np
 from panels import Numbers, put_legend_right, show
 
 import lavender as lv
+from lavender.judge.measures import natural_map
 
 N = 8
 BUDGET = 8  # sweeps
@@ -72,10 +77,54 @@ def measure_error(problem, impulse=None, sweeps=BUDGET, solver="pgs", **order):
     return lv.solve(problem, solver, tol=0.0, max_iter=sweeps, impulse=impulse, **order).residual.relative
 
 
+def measure_slowest_factors():
+    """Return the factors by which a sweep shrinks the slowest part, of the orders above, by case [-]."""
+    orders = [
+        np.arange(N),
+        np.arange(N)[::-1],
+        *(np.random.default_rng(seed).permutation(N) for seed in SEEDS),
+    ]
+
+    def factor(a):
+        return np.abs(np.linalg.eigvals(np.eye(N) - np.linalg.solve(np.tril(a), a))).max()
+
+    return {
+        name: [factor(problem.dense()[np.ix_(order, order)]) for order in orders]
+        for name, problem in make_cases().items()
+    }
+
+
+def measure_all(problem, order):
+    """Return the error after BUDGET sweeps over that of zero impulses, by measure [-]."""
+    a, exact = problem.dense(), lv.solve(problem, "direct", tol=1e-12).impulse
+    swept = lv.solve(problem, "pgs", tol=0.0, max_iter=BUDGET, order=order).impulse
+
+    def measure(impulse):
+        error = impulse - np.maximum(0.0, impulse - problem.slack(impulse) / problem.d)
+        distance = impulse - exact
+        return {
+            "energy": np.sqrt(problem.d @ error**2),
+            "velocity": np.abs(problem.d * error).max(),
+            "r_p": natural_map(problem, impulse),
+            "max |e_n|": np.abs(error).max(),
+            "distance": np.sqrt(distance @ a @ distance),
+        }
+
+    start = measure(np.zeros(N))
+    return {name: size / start[name] for name, size in measure(swept).items()}
+
+
+def compare_measures(problem):
+    """Return the error of sweeps from the top over that of sweeps from the bottom, by measure [-]."""
+    up, down = (measure_all(problem, order) for order in ("given", "reverse"))
+    return {name: down[name] / up[name] for name in up}
+
+
 def measure_slow_part(problem, impulse, exact):
     """Return the slowest part of an impulse's error over that of the zero impulse [-].
 
-    A sweep from the bottom up multiplies the error by G = I - (L + D)^-1 A; a left eigenvector of G selects one part.
+    A sweep from the bottom up multiplies the error by G = I - L^-1 A, L the lower triangle of A with its diagonal. The
+    left eigenvector of G for its largest eigenvalue selects the slowest part.
     """
     a = problem.dense()
     values, vectors = np.linalg.eig((np.eye(N) - np.linalg.solve(np.tril(a), a)).T)
@@ -140,6 +189,8 @@ def numbers():
     """Return residuals by order for three stacks, histories of one of them, and the starts over the sweeps."""
     return Numbers(
         orders=measure_orders,
+        factors=measure_slowest_factors,
+        measures=lambda: {name: compare_measures(problem) for name, problem in make_cases().items()},
         lighter=lambda: measure_histories(make_cases()["falling, lighter above"]),
         starts=measure_starts,
     )
@@ -196,6 +247,12 @@ def print_numbers(found):
         f"if boxes fall, lighter above,\n{100 * (equal['top down'] / equal['bottom up'] - 1):.1f} % if they are equal; "
         f"struck from above, top down is {struck['bottom up'] / struck['top down']:.1f} times closer"
     )
+    print()
+    for name, by in found["factors"].items():
+        print(f"{name:<23} a sweep shrinks the slowest part by {min(by):.3f} to {max(by):.3f}, by the order")
+    print("\nerror of top down over that of bottom up, by measure")
+    for name, by in found["measures"].items():
+        print(f"{name:<23}" + "".join(f"   {measure} {ratio:.2f}" for measure, ratio in by.items()))
     starts = found["starts"]["residual"]
     print(f"\n{'sweeps':>9}" + "".join(f"{name:>16}" for name in starts))
     for i, n in enumerate(SWEEPS):
