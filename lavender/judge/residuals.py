@@ -220,6 +220,7 @@ class Residual:
     def islands(self) -> Islands:
         """Error of each island, in the order of their first blocks."""
         problem = self._problem.disk
+        reference(problem)
         label, table = measure.by_island(problem.metric, self._impulse)
         return Islands(label, *table.T)
 

@@ -17,8 +17,10 @@ from lavender.base.deadline import NEVER, Deadline, Stopwatch
 from lavender.base.errors import BREAKDOWN, CapabilityError, InputError, InUse, UnknownName, last_words
 from lavender.base.later import load
 from lavender.external.foreign import Foreign
+from lavender.judge.certificates import prove
 from lavender.judge.residuals import (
     Residual,
+    best_of_islands,
     judging_time,
     known,
     reference,
@@ -38,14 +40,16 @@ from lavender.judge.solution import (
     Solution,
     SolverRun,
     Status,
+    summed,
 )
 from lavender.problem import Problem, check_problem
 from lavender.solvers.certify import check_infeasible
+from lavender.solvers.islands import islands
 from lavender.solvers.loop import LEAST, Callback, Loop, Record, best_of
 from lavender.solvers.registry import SMALL_ROWS, Solver, SolverSpec, get
 from lavender.solvers.setup_times import SCIPY, estimate_disk_time, estimate_refusal_time, loading
 from lavender.solving.outcome import decide_empty_rows, finish, name_lost_row
-from lavender_ext.judge.measure import all_finite
+from lavender_ext.judge.measure import all_finite, by_island
 from lavender_ext.judge.watch import Watch
 
 LATER = ("iterations", "work", "solver", "message", "history", "dual", "certificate", "impulse_bound",
@@ -330,7 +334,9 @@ class Prepared:
         setup_time, self.setup_time = self.setup_time, 0.0
         proof = decide_empty_rows(problem, loop.impulse, loop.tol)
         if proof is not None:
-            claim = self._solve_other_rows(loop, *proof, max_iter)
+            message, certificate, impossible = proof
+            claim = Claim(INFEASIBLE, 0, {}, message, certificate=certificate)
+            claim = self._solve_with_zero_b(loop, claim, impossible, max_iter)
         elif self._broken:
             claim = Claim(NUMERICAL_ERROR, 0, {}, self._broken)
         elif self._late or (loop.deadline.passed() and not spec.external):
@@ -355,33 +361,44 @@ class Prepared:
         refutation = ""
         if claim.status is INFEASIBLE and (spec.external or not spec.own):
             claim, _, refutation = check_infeasible(problem, claim, loop.tol, loop.deadline)
+        if claim.status is INFEASIBLE and claim.certificate is not None and loop.tol > 0.0 and proof is None:
+            claim = self._without_infeasible_islands(loop, claim, max_iter)
         solution = finish(
             problem, spec, self.options, loop.impulse, claim, loop.tol, setup_time, loop.time, loop.recorded(),
             float(getattr(self.state, "sweeps_per_decade", math.nan)), refutation,
         )  # fmt: skip
         return solution if self._given is problem else solution.unstretched(self._given)
 
-    def _solve_other_rows(
-        self, loop: Loop, message: str, certificate: FloatArray, impossible: list[int], max_iter: int
-    ) -> Claim:
-        """Solve with b = 0 on rows that nothing can meet, so that the other rows keep an impulse; claim INFEASIBLE."""
+    def _without_infeasible_islands(self, loop: Loop, claim: Claim, max_iter: int) -> Claim:
+        """Solve the islands that an INFEASIBLE claim's certificate says nothing about, unless they meet tol."""
+        assert claim.certificate is not None
+        count, label = islands(self.problem)
+        if count < 2:
+            return claim
+        proof = prove(self.problem, claim.certificate, loop.tol)
+        if proof.reason:
+            return claim
+        _, table = by_island(self.problem.metric, loop.impulse)
+        row_label = np.repeat(label, np.diff(self.problem.cones.ptr))
+        infeasible = np.bincount(row_label, proof.y != 0.0, minlength=count) > 0
+        if np.all(infeasible | (table[:, 0] <= loop.tol)):
+            return claim
+        return self._solve_with_zero_b(loop, claim, infeasible[row_label], max_iter)
+
+    def _solve_with_zero_b(self, loop: Loop, claim: Claim, rows: Any, max_iter: int) -> Claim:
+        """Solve with b = 0 on rows that nothing can meet, so that other islands keep an impulse; the same claim."""
         if loop.tol == 0.0 or loop.deadline.passed():
-            return Claim(INFEASIBLE, 0, {}, message, certificate=certificate)
-        b = self.problem.b.copy()
-        b[impossible] = 0.0
+            return claim
+        b, start = self.problem.b.copy(), loop.impulse.copy()
+        b[rows] = start[rows] = 0.0
         others = Prepared(self.problem.updated(b=b), self.spec, self.options)
         found = others.solve(
-            impulse=loop.impulse, tol=loop.tol, max_iter=max_iter, time_limit=loop.deadline.left(LEAST)
+            impulse=start, tol=loop.tol, max_iter=max_iter, time_limit=loop.deadline.left(LEAST)
         )
-        loop.impulse[:] = found.impulse
+        loop.impulse[:] = best_of_islands(self.problem, (loop.impulse,), (found.impulse,), loop.tol)
         loop.time += found.setup_time + found.solve_time
-        return Claim(
-            INFEASIBLE,
-            found.iterations,
-            dict(found.work),
-            message,
-            certificate=certificate,
-            turns=found.turns,
+        return replace(
+            claim, iterations=claim.iterations + found.iterations, work=summed((claim.work, found.work))
         )
 
     def _refresh(self, problem: Problem | None, deadline: Deadline) -> None:

@@ -7,7 +7,7 @@ that eighth. The relative residual r decides:
 
     r <= tol                                        CONVERGED
     r of the best of each island (best.pxd) <= tol  CONVERGED, with these
-    r not finite, or > 1e6 max(1, r of the first 8) DIVERGED
+    r not finite, or > 1e6 max(1, r of the first 8) DIVERGED; where E0 = 0 (r = 0 or inf), E not finite
     first pass <= tol < refined one (judge/refine.pxd)
         refined <= 2 floor and <= 1e-5              AT_FLOOR
         else floor > tol                            STALLED
@@ -28,7 +28,7 @@ from lavender_ext.judge.best cimport best_room, best_t, bind_best, note_score, r
 from lavender_ext.judge.measure cimport above_floor_of, floor_of, judge_view, relative_of
 from lavender_ext.judge.progress cimport keep, open_progress, progress_t, rests, see
 from lavender_ext.judge.refine cimport refine_view
-from lavender_ext.judge.score cimport new_score, relative, score_t
+from lavender_ext.judge.score cimport new_score, relative, score_t, smallest_reference
 
 
 cpdef enum:
@@ -100,16 +100,30 @@ cdef inline bint is_rounding(const watch_t* s, const score_t* x, double now, dou
     return above_floor_of(x, now, floor_of(x, s.start_energy, s.start_velocity)) <= tol
 
 
+cdef inline double judge_with_floor(const watch_t* s, const view_t* v, const double* lam, score_t* x) noexcept nogil:
+    """The judge's relative residual with its floor."""
+    judge_view(v, lam, s.w, s.e, s.v, True, x)
+    return relative_of(x, s.w, v.p.n_rows, s.start_energy, s.start_velocity)
+
+
 cdef inline double judge_closely(const watch_t* s, const view_t* v, const double* lam, double tol, score_t* x,
                                  bint* refined) noexcept nogil:
     """The judge's relative residual with its floor, refined if an ill-conditioned M needs it."""
-    cdef double now
-    judge_view(v, lam, s.w, s.e, s.v, True, x)
-    now = relative_of(x, s.w, v.p.n_rows, s.start_energy, s.start_velocity)
+    cdef double now = judge_with_floor(s, v, lam, x)
     refined[0] = refine_view(v, lam, s.w, s.e, s.v, s.start_energy, s.start_velocity, tol, now, x)
     if refined[0]:
         now = relative_of(x, s.w, v.p.n_rows, s.start_energy, s.start_velocity)
     return now
+
+
+cdef inline bint rounds_much(const watch_t* s, const blocks_t* p, const double* lam) noexcept nogil:
+    """Whether rounding of so large an impulse may hide the residual: 2^-53 sqrt(sum d lam^2) > 1e-7 E0 of some island."""
+    cdef double size = 0.0, energy = s.start_energy, velocity = s.start_velocity
+    cdef int32_t k
+    for k in range(p.n_rows):
+        size += p.d[k] * lam[k] * lam[k]
+    smallest_reference(p, &energy, &velocity)
+    return size > 8e17 * energy * energy and energy > 0.0
 
 
 cdef inline int32_t end_refined(const watch_t* s, const score_t* x, double now, double tol) noexcept nogil:
@@ -156,14 +170,17 @@ cdef inline int32_t check(watch_t* s, const view_t* v, double* lam, double tol) 
     cdef score_t x = new_score()
     cdef const blocks_t* p = &v.p
     cdef double now, last, inf = 1.0 / 0.0
-    cdef bint refined = False
+    cdef bint refined = False, lost
     cdef int32_t end
     x.by_island = s.best.now
     judge_view(v, lam, s.w, s.e, s.v, False, &x)
     now = relative_to_start(s, &x)
     if now <= tol:                                      # once more, with what rounding hides
         now = judge_closely(s, v, lam, tol, &x, &refined)
+    elif rounds_much(s, p, lam):
+        now = judge_with_floor(s, v, lam, &x)
     note_score(&s.best, p, &x, now)
+    lost = not now < inf and (s.start_energy > 0.0 or not x.finite)
     if s.total <= EARLY and s.start < now < inf:
         s.start = now
     see(&s.progress, s.total, now)
@@ -176,7 +193,7 @@ cdef inline int32_t check(watch_t* s, const view_t* v, double* lam, double tol) 
         end = end_refined(s, &x, now, tol)
         if end != RUNNING:
             return end
-    if now < inf or s.best.seen > 0:
+    if not lost or s.best.seen > 0:
         see_impulse(&s.best, p, lam, tol)
         s.best_relative = relative_of_best(&s.best)
     if s.best_relative <= tol:                          # each island at another check
@@ -186,11 +203,11 @@ cdef inline int32_t check(watch_t* s, const view_t* v, double* lam, double tol) 
         if end != RUNNING:
             memcpy(lam, s.best.impulse, p.n_rows * sizeof(double))
             return end
-    if now < inf and is_progress(s, now, tol):
+    if not lost and is_progress(s, now, tol):
         s.best_at = s.total
         keep(&s.progress, s.total, lam, p.n_rows)
         return RUNNING
-    if not now < inf or now > 1e6 * (s.start if s.start > 1.0 else 1.0):
+    if lost or 1e6 * (s.start if s.start > 1.0 else 1.0) < now < inf:
         if s.best_at >= 0:
             memcpy(lam, s.best.impulse, p.n_rows * sizeof(double))
         return DIVERGED

@@ -11,7 +11,8 @@ from lavender_ext.judge.progress cimport envelope
 from lavender_ext.judge.best cimport count_islands, note_score, relative_of_best, see_impulse
 from lavender_ext.judge.measure cimport judge_view
 from lavender_ext.judge.score cimport new_score, score_t
-from lavender_ext.judge.watch cimport CONVERGED, RUNNING, begin_watch, due, relative_to_start, watch_room, watch_t
+from lavender_ext.judge.watch cimport (CONVERGED, RUNNING, begin_watch, due, judge_with_floor, relative_to_start, rounds_much,
+                                       watch_room, watch_t)
 
 
 cdef class Watch:
@@ -58,6 +59,8 @@ cdef class Watch:
         with nogil:
             judge_view(&self.view, &lam[0], s.w, s.e, s.v, False, &x)
             now = relative_to_start(s, &x)
+            if rounds_much(s, &self.view.p, &lam[0]):
+                now = judge_with_floor(s, &self.view, &lam[0], &x)
             note_score(&s.best, &self.view.p, &x, now)
             if not now <= tol:
                 see_impulse(&s.best, &self.view.p, &lam[0], tol)

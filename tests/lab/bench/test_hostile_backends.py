@@ -201,10 +201,11 @@ def test_a_worker_ends_when_its_parent_is_killed(hostile):
 
 LONG = """
 import sys, numpy as np, lavender as lv
+from scipy.sparse import diags_array
 from lavender import bench
 def hard(i):
-    a = np.kron(np.eye(200), [[1.0, -1.0], [-1.0, 1.0]]) + 1e-9 * np.eye(400)
-    return lv.Problem.lcp(a, np.random.default_rng(i).standard_normal(400), name=f"hard {i}")
+    chain = diags_array([2.0, -1.0, -1.0], offsets=[0, 1, -1], shape=(3000, 3000))  # condition 4e6
+    return lv.Problem.lcp(chain.tocsr(), (1.0 + i) * np.eye(1, 3000)[0], name=f"hard {i}")
 plan = bench.CampaignPlan(levels=(1e-9,), budgets=(), cap=10_000_000)
 bench.campaign([hard(i) for i in range(4)], ["pgs"], plan, workers=2)
 """
