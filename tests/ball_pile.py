@@ -15,7 +15,7 @@ import numpy as np
 import lavender as lv
 
 DT = 1 / 60  # s
-NEAR = 0.02  # m, a gap that is a contact already
+CONTACT_GAP = 0.02  # m, a gap that is a contact already
 WALLS = ((1, 1), (0, 1), (0, -1), (2, 1), (2, -1))  # axis and side: floor, and four walls
 
 
@@ -36,15 +36,15 @@ class Pile:
         self.velocity = np.zeros((n, 6))
 
     def contacts(self) -> tuple[Any, Any, Any]:
-        """Bodies (c, 2), normals (c, 3) and gaps (c,) of all pairs nearer than NEAR."""
+        """Bodies (c, 2), normals (c, 3) and gaps (c,) of all pairs nearer than CONTACT_GAP."""
         out = []
         for axis, sign in WALLS:
             gap = sign * self.place[:, axis] + (self.side if sign < 0 else 0.0) - self.radius
-            out += [(-1, i, sign * np.eye(3)[axis], gap[i]) for i in np.flatnonzero(gap < NEAR)]
+            out += [(-1, i, sign * np.eye(3)[axis], gap[i]) for i in np.flatnonzero(gap < CONTACT_GAP)]
         apart = self.place[None] - self.place[:, None]
         length = np.sqrt((apart**2).sum(axis=-1))
         gap = length - self.radius - self.radius[:, None]
-        pairs = np.argwhere(np.triu(gap < NEAR, 1))
+        pairs = np.argwhere(np.triu(gap < CONTACT_GAP, 1))
         out += [(i, j, apart[i, j] / length[i, j], gap[i, j]) for i, j in pairs]
         a, b, normal, gap = zip(*out, strict=True)
         return np.column_stack([a, b]).astype(np.int32), np.array(normal), np.array(gap)

@@ -179,8 +179,8 @@ def page(found: list[Entry], recorded: Sequence[Entry] = ()) -> str:
     near = sum(e.radius is not None and e.radius <= NEAR for e in found)
     unique = sum(e.unique for e in found)
     first = (
-        f"Of these {len(found)} contact problems {count['enclosed']} have an exact solution that is proved to stand "
-        f"beside a known answer, {near} within {NEAR:.0e} m/s of it; for {unique} no other motion exists; "
+        f"Of these {len(found)} contact problems {count['enclosed']} have an exact solution that is proved to lie "
+        f"near a known answer, {near} within {NEAR:.0e} m/s of it; for {unique} no other motion exists; "
         f"{count['infeasible']} have no solution, with a certificate."
     )
     how = (

@@ -26,7 +26,7 @@ SLIDING = lv.Cones.contacts(0.5, tangents=1)
 GENERAL = lv.Problem.from_jacobian(np.eye(2), A, B, cones=lv.Cones.bounded([0.0, 0.0], [1.0, 1.0]))
 JAC, MASS, FREE = np.array([np.eye(2)] * 2), np.array([A] * 2), np.ones((2, 2))
 BATCH = lv.Batch(JAC, MASS, FREE, cones=SLIDING)
-MANY = lv.solve_many(BATCH)
+BATCH_SOLUTION = lv.solve_many(BATCH)
 PROGRAM = lv.Problem.from_qp(A, B, lb=np.zeros(2))
 EXACT = lv.solve(GENERAL, tol=1e-12)
 DERIVATIVE = lv.derivative(GENERAL, EXACT)
@@ -112,7 +112,7 @@ CALLS = {
 }
 CALLS |= {
     "Batch.__getitem__": (BATCH.__getitem__, {"i": np.array([0, 1])}),
-    "Solutions.__getitem__": (MANY.__getitem__, {"i": np.array([0, 1])}),
+    "Solutions.__getitem__": (BATCH_SOLUTION.__getitem__, {"i": np.array([0, 1])}),
     "Residuals.__getitem__": (lv.residual_many(BATCH, FREE).__getitem__, {"i": np.array([True, False])}),
     "Cones": (
         lv.Cones,
