@@ -41,7 +41,7 @@ DEBUG = MODE not in ("", "0")
 OPTIONS = runpy.run_path("lavender_ext/build_options.py")
 WASM = runpy.run_path("lavender/sim/web/compile.py")
 put = WASM["put"]
-LIBRARY = runpy.run_path("lavender/out/amalgamate.py")
+LIBRARY = runpy.run_path("lavender/export/amalgamate.py")
 DIRECTIVES = OPTIONS["directives"](debug=DEBUG)
 #: Holds what Cython would otherwise write into every module (memoryviews): half of all that is compiled.
 SHARED = "lavender_ext._utility"
@@ -109,7 +109,7 @@ class BuildKernels(build_ext):
         if not current:
             self.force = True  # file times do not tell
         # A build that is killed leaves torn files, newer than their sources; and who reads translations while they are
-        # written makes his own (lavender/sim/web/cut.py).
+        # written makes his own (lavender/sim/web/extract_c.py).
         stamp.unlink(missing_ok=True)
         if self.force:
             for translated in out.rglob("*.c"):
@@ -210,7 +210,7 @@ class BuildWasm(Command):
 
 
 class BuildLibrary(Command):
-    """Makes the C library of the kernels (lavender/out/amalgamate.py); into a wheel with all of it."""
+    """Makes the C library of the kernels (lavender/export/amalgamate.py); into a wheel with all of it."""
 
     user_options = [("build-lib=", None, "folder of what is installed")]  # noqa: RUF012 - as the base class asks
 
@@ -228,7 +228,7 @@ class BuildLibrary(Command):
         """One source from the translations of this build, and everything that lies beside it."""
         if self.editable_mode:
             return  # `lavender export` makes it when it is first needed
-        for path in [*sorted(Path("lavender/out").rglob("*.*")), make_library()]:
+        for path in [*sorted(Path("lavender/export").rglob("*.*")), make_library()]:
             if path.is_file() and path.suffix not in (".py", ".pyc", ".part"):
                 out = Path(self.build_lib, path)
                 out.parent.mkdir(parents=True, exist_ok=True)
@@ -249,8 +249,8 @@ class BuildLibrary(Command):
 
 
 def make_library():
-    """lavender/out/c/lavender.c of the kernels as they are, its path."""
-    out = Path("lavender", "out", "c", "lavender.c")
+    """lavender/export/c/lavender.c of the kernels as they are, its path."""
+    out = Path("lavender", "export", "c", "lavender.c")
     if not (out.exists() and LIBRARY["source_hash"](Path()) in out.read_text(encoding="utf-8")[:1000]):
         put(out, LIBRARY["amalgamate"](Path().resolve(), Path("build", "cython")).encode())
     return out

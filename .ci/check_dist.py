@@ -51,15 +51,18 @@ def problems(in_sdist: set[str], in_wheel: set[str]) -> list[str]:
         found += [] if name in in_sdist else [f"sdist lacks {name}"]
     found += [f"wheel lacks {name}" for name in sorted(sources - in_wheel)]
     found += [f"wheel lacks the compiled module {name}" for name in sorted(kernels - modules)]
-    for path in ("lavender/out/c/lavender.c", *(f"lavender/sim/web/{name}.wasm" for name in WASM["PARTS"])):
+    for path in (
+        "lavender/export/c/lavender.c",
+        *(f"lavender/sim/web/{name}.wasm" for name in WASM["PARTS"]),
+    ):
         found += [] if path in in_sdist else [f"sdist lacks {path}"]
         found += [] if path in in_wheel else [f"wheel lacks {path}"]
     if not any(name.endswith("/licenses/LICENSE") for name in in_wheel):
         found.append("wheel lacks LICENSE")
     ours = (
-        "lavender/out/",
+        "lavender/export/",
         "examples/",
-        "tests/out/parity/scenes.c",
+        "tests/export/parity/scenes.c",
     )  # C that is written by hand, and the library
     built = {name for name in in_sdist if not name.startswith(ours)}
     left = [f"sdist holds {name}" for name in built if name.endswith((".c", ".h", ".so", ".pyc", ".o"))]

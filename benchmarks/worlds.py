@@ -32,7 +32,7 @@ import lavender as lv
 from benchmarks.made import fresh
 from benchmarks.output import markdown
 from lavender.base.errors import LavenderError
-from lavender.lab.worlds import Runs, simulate_world
+from lavender.lab.simulated_worlds import Runs, simulate_world
 
 TOL = 1e-6
 TOLERANCES = (1e-2, 1e-4, 1e-6, 1e-8, 1e-10, 1e-12, 1e-15)  # of the engine

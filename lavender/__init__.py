@@ -51,52 +51,52 @@ from lavender.solving.solve import prepare, solve
 
 if TYPE_CHECKING:
     from lavender import io
+    from lavender.batch.data import Batch
+    from lavender.batch.residuals import Residuals, residual_many
+    from lavender.batch.solve import Solutions, solve_many
     from lavender.gradient import Derivative, derivative, derivatives
     from lavender.io import load
-    from lavender.judge.many import Residuals, residual_many
     from lavender.lab import bench, motion, phenomena, report, suite
     from lavender.lab.check import CrossCheck, cross_check
+    from lavender.lab.diagnostics import Suspicion, diagnose
+    from lavender.lab.diagnostics.redundancy import Redundancy, redundancy
     from lavender.lab.motion import MotionError, Motions, motion_error, motions
     from lavender.lab.proof import Enclosure, prove
-    from lavender.lab.redundancy import Redundancy, redundancy
-    from lavender.lab.suspicions import Suspicion, diagnose
-    from lavender.problem.batch import Batch
     from lavender.sim import engine, scene
     from lavender.sim.engine import SOLVER_FIELDS, Simulation, Snapshot
     from lavender.sim.scene import Scene
-    from lavender.solving.many import Solutions, solve_many
     from lavender.solving.plan import Plan, explain
     from lavender.solving.quadratic import solve_qp
 
 # Public name -> module that holds it, imported at the first use of the name.
 _LATER = {
-    "Batch": "lavender.problem.batch",
+    "Batch": "lavender.batch.data",
     "CrossCheck": "lavender.lab.check",
     "Derivative": "lavender.gradient",
     "Enclosure": "lavender.lab.proof",
     "MotionError": "lavender.lab.motion",
     "Motions": "lavender.lab.motion",
     "Plan": "lavender.solving.plan",
-    "Redundancy": "lavender.lab.redundancy",
-    "Residuals": "lavender.judge.many",
+    "Redundancy": "lavender.lab.diagnostics.redundancy",
+    "Residuals": "lavender.batch.residuals",
     "SOLVER_FIELDS": "lavender.sim.engine",
     "Scene": "lavender.sim.scene",
     "Simulation": "lavender.sim.engine",
     "Snapshot": "lavender.sim.engine",
-    "Solutions": "lavender.solving.many",
-    "Suspicion": "lavender.lab.suspicions",
+    "Solutions": "lavender.batch.solve",
+    "Suspicion": "lavender.lab.diagnostics",
     "cross_check": "lavender.lab.check",
     "derivative": "lavender.gradient",
     "derivatives": "lavender.gradient",
-    "diagnose": "lavender.lab.suspicions",
+    "diagnose": "lavender.lab.diagnostics",
     "explain": "lavender.solving.plan",
     "load": "lavender.io",
     "motion_error": "lavender.lab.motion",
     "motions": "lavender.lab.motion",
     "prove": "lavender.lab.proof",
-    "redundancy": "lavender.lab.redundancy",
-    "residual_many": "lavender.judge.many",
-    "solve_many": "lavender.solving.many",
+    "redundancy": "lavender.lab.diagnostics.redundancy",
+    "residual_many": "lavender.batch.residuals",
+    "solve_many": "lavender.batch.solve",
     "solve_qp": "lavender.solving.quadratic",
 }
 
@@ -106,7 +106,7 @@ _MODULES = {
     "cones": "lavender.problem.cones",
     "engine": "lavender.sim.engine",
     "errors": "lavender.base.errors",
-    "export": "lavender.out",
+    "export": "lavender.export",
     "io": "lavender.io",
     "motion": "lavender.lab.motion",
     "phenomena": "lavender.lab.phenomena",

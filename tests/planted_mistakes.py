@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from lavender.lab.suspicions import diagnose
+from lavender.lab.diagnostics import diagnose
 from lavender.problem import Problem
 from lavender.problem.cones import ROW, Cones
 from lavender.problem.rows import Rows

@@ -47,7 +47,7 @@ def doctor(files: tuple[str, ...], as_json: bool) -> None:
 
 def _suspect(files: tuple[str, ...], as_json: bool) -> None:
     from lavender.lab import bench
-    from lavender.lab.suspicions import diagnose
+    from lavender.lab.diagnostics import diagnose
 
     found, reading = {}, Reading()
     for item in bench.resolve(files):

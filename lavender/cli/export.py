@@ -31,7 +31,7 @@ def export(
     replace: bool,
 ) -> None:
     """Write the kernels for use without Python: a C library with one header."""
-    from lavender.out import library, vectors
+    from lavender.export import library, vectors
 
     if records is None:
         refuse_unused(context, ["solver"], "without --for")

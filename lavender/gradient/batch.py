@@ -9,13 +9,13 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray, IntArray, places, several
 from lavender.base.errors import InputError
+from lavender.batch.solve import Solutions
 from lavender.gradient.derivative import ACCEPTED, Derivative, derivative
 from lavender.gradient.result import INPUTS, MATRICES, Gradient
 from lavender.gradient.system import SMALL
 from lavender.judge.residuals import reference
 from lavender.problem import Problem
 from lavender.problem.derived import cached_property
-from lavender.solving.many import Solutions
 from lavender_ext.derivative.linear import Linears
 
 

@@ -16,10 +16,10 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import InputError
+from lavender.batch.solve import solve_many
 from lavender.gradient import derivatives
 from lavender.problem import Problem
 from lavender.problem.cones import Cones
-from lavender.solving.many import solve_many
 
 NAMES = ("J", "M", "v_free", "mu", "target", "compliance")
 SIZES = (2, 2, 1, 1, 1, 1)  # axes of each that are no batch

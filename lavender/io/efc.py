@@ -30,8 +30,8 @@ from lavender.base.arrays import (
 )
 from lavender.base.errors import CapabilityError, InputError
 from lavender.base.threads import together
+from lavender.batch.data import ERRORS, Batch, check_counts, check_triangle
 from lavender.io import mujoco as single
-from lavender.problem.batch import ERRORS, Batch, check_counts, check_triangle
 from lavender.problem.cones import Cones, kinds_of
 from lavender_ext.judge.measure import all_finite
 

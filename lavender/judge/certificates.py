@@ -100,13 +100,13 @@ def prove(problem: Problem, y: Any, tol: float = 0.0, deadline: Deadline | None 
     y = np.array(y, float)
     y.setflags(write=False)
     asked = tol, y.shape, y.tobytes()
-    last: tuple[Any, Proof] | None = problem.derived.proof
+    last: tuple[Any, Proof] | None = problem.derived.cache.get(__name__)
     if last is not None and last[0] == asked:
         skipped = last[1].skipped
         if not skipped or deadline is None or deadline.passed(skipped):
             return last[1]
     found = _prove(problem, y, tol, deadline or NEVER)
-    problem.derived.proof = asked, found
+    problem.derived.cache[__name__] = asked, found
     return found
 
 

@@ -59,6 +59,9 @@ from lavender.problem.derived import cached_property
 from lavender_ext.judge import measure
 
 FLOOR_MOST = 1e-5  # relative residual above which `at_floor` takes no floor of float64 for a reason
+JUDGED_KEY = (
+    "lavender.judge.residuals: judged"  # in `Derived.cache`: the residual of a result about to be returned
+)
 AT_REST = 1e-9  # m/s, V0 below which doing nothing counts as a solution
 UNIT32 = 2.0**-24  # u of float32: half its spacing at 1
 # As `solvers/setup_times.py`, by the same command:
@@ -351,12 +354,12 @@ def _read(problem: Problem) -> tuple[float, float]:
 
 def remember(problem: Problem, last: measure.Judged) -> None:
     """Leave a result for the next `residual` of this problem, which takes it for the same impulse, bit for bit."""
-    problem.derived.judged = last
+    problem.derived.cache[JUDGED_KEY] = last
 
 
 def remembered(problem: Problem, impulse: FloatArray) -> measure.Judged | None:
     """What `remember` was given, if that is of `impulse`, bit for bit, and judged by the problem itself."""
-    last = problem.derived.judged
+    last: measure.Judged | None = problem.derived.cache.get(JUDGED_KEY)
     if last is None or last.data is not problem.metric or not measure.same_bits(last.impulse, impulse):
         return None
     return last
@@ -432,7 +435,8 @@ def residual(
         return unstretched(
             problem, residual(problem.disk, problem.on_disk(impulse), precision, threshold, tol)
         )
-    last, problem.derived.judged = remembered(problem, impulse), None
+    last = remembered(problem, impulse)
+    problem.derived.cache.pop(JUDGED_KEY, None)
     if last is None:
         last = judged(problem, impulse)
     if tol != TOL and not (type(tol) is float and tol >= 0.0):

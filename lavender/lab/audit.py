@@ -28,12 +28,13 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray, number
 from lavender.base.errors import InputError, check_name
+from lavender.batch.data import Batch
+from lavender.batch.residuals import residual_many
 from lavender.io import npz
 from lavender.io.efc import from_mujoco_many
 from lavender.io.recording import Control
 from lavender.io.states import VECTOR
 from lavender.io.stored import folder_for_steps, write_arrays
-from lavender.judge.many import residual_many
 from lavender.judge.residuals import AT_FLOOR, CLOSE, ENOUGH, UNCONVERGED, WRONG
 from lavender.judge.residuals import VERDICTS as JUDGED
 from lavender.lab.bench.running.campaign import check_workers, connected, hand_out
@@ -43,7 +44,7 @@ from lavender.lab.report.sheet import Part as Section
 from lavender.lab.report.sheet import Sheet
 from lavender.lab.report.table import Cell, Table
 from lavender.lab.report.text import NONE, count, percent, size
-from lavender.lab.worlds import (
+from lavender.lab.simulated_worlds import (
     ENGINES,
     Divergence,
     Runs,
@@ -54,7 +55,6 @@ from lavender.lab.worlds import (
     simulate_world,
 )
 from lavender.problem import PRECISIONS, Problem
-from lavender.problem.batch import Batch
 
 VERDICTS = (*JUDGED, "not judged")
 NOT_JUDGED = len(JUDGED)

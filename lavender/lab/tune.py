@@ -32,9 +32,9 @@ import numpy as np
 from lavender.base.arrays import FloatArray, number, whole_number
 from lavender.base.deadline import seconds
 from lavender.base.errors import InputError
+from lavender.batch.residuals import residual_many
 from lavender.io.efc import from_mujoco_many
 from lavender.io.recording import Control
-from lavender.judge.many import residual_many
 from lavender.judge.residuals import ENOUGH
 from lavender.lab.audit import AT_ONCE
 from lavender.lab.bench.running.runner import Event
@@ -42,7 +42,7 @@ from lavender.lab.report.curves import Curve, Figure
 from lavender.lab.report.sheet import Part, Sheet
 from lavender.lab.report.table import Table
 from lavender.lab.report.text import size, times
-from lavender.lab.worlds import Runs, StepSizes, can_touch, has_diverged, simulate_world
+from lavender.lab.simulated_worlds import Runs, StepSizes, can_touch, has_diverged, simulate_world
 from lavender.problem.derived import cached_property
 
 WORST = 0.99  # quantile of the error by which settings are compared

@@ -1,4 +1,4 @@
-"""What is worked out of a problem once: by one thread, while the others wait, and kept in one declared place."""
+"""Values computed once per problem and shared between threads: `Derived`, `cached_property`, `once`."""
 
 from __future__ import annotations
 
@@ -10,48 +10,28 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar, overload
 if TYPE_CHECKING:
     from lavender.base.arrays import FloatArray
     from lavender_ext.core.problem import Data
-    from lavender_ext.judge.measure import Judged
 
 T = TypeVar("T")
 
 
 class Derived:
-    """Numbers that a problem keeps beside its data; a field is None until it is first needed.
+    """Hold what is computed from a problem's data; copies of a problem do not share it.
 
-    Every field is written whole and read once, so threads that share a problem see a value or None; two that find
-    None work out the same numbers, to the bit.
+    Every entry is written whole and read once, so a thread that shares the problem sees a complete value or none; two
+    threads that find none compute the same bits.
     """
 
-    __slots__ = (
-        "bodies",
-        "factor",
-        "judged",
-        "lock",
-        "motion",
-        "process",
-        "proof",
-        "small",
-        "spread",
-        "start",
-        "suspicions",
-        "vain",
-        "view",
-    )
+    __slots__ = ("cache", "lock", "process", "start", "view")
 
     def __init__(self) -> None:
-        self.lock, self.process = RLock(), _process  # held while a `once` is worked out, in this process
-        self.judged: Judged | None = None  # the judge's pass over a result that is about to be returned
-        self.proof: Any = None  # the last certificate that was looked at, and what it proves
-        self.view: Data | None = None  # in generalised coordinates: what kernels read, from the beginning
-        self.spread: int | None = None  # how far apart blocks that share a body stand
-        self.small: Any = None  # the compiled call of a problem of few rows, False where it has none
-        self.factor: Any = None  # the factorisation that suits A: its name, half bandwidth, order
-        # Whose one compiled call did not end, to what tol and from where, and what it did (`SmallCall.in_vain`).
-        self.vain: tuple[tuple[str, float, bytes], tuple[int, ...]] | None = None
-        self.start: FloatArray | None = None  # (m,) N s, doing nothing
-        self.bodies: Any = None  # `bodies_of` of lavender.lab.suspicions, in a tuple
-        self.suspicions: Any = None  # what its checks found of the problem alone
-        self.motion: Any = None  # `Kept` of lavender.lab.motion: the reference of motion errors, its operator
+        self.lock, self.process = RLock(), _process  # held while a `once` is computed in this process
+        self.view: Data | None = (
+            None  # arrays that kernels read in generalised coordinates, set with the problem
+        )
+        self.start: FloatArray | None = None  # (m,) N s, the zero impulse clipped to the bounds
+        self.cache: dict[
+            str, Any
+        ] = {}  # values of other modules; the key begins with the owner's module name
 
 
 _process = object()  # another one in a fork's child, where no thread is left to give a lock back

@@ -43,9 +43,9 @@ GENERAL_LIMIT = 2000  # rows up to which a singular matrix that is not symmetric
 
 def choose(problem: Problem) -> tuple[str, int, IntArray | None]:
     """Factorisation, half bandwidth and order of elimination (None: as given) for a symmetric A; by structure alone."""
-    kept: tuple[str, int, IntArray | None] | None = problem.derived.factor
+    kept: tuple[str, int, IntArray | None] | None = problem.derived.cache.get(__name__)
     if kept is None:
-        kept = problem.derived.factor = _choose(problem)
+        kept = problem.derived.cache[__name__] = _choose(problem)
     return kept
 
 

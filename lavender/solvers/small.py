@@ -29,6 +29,13 @@ from lavender.solvers.setup_times import forming
 from lavender_ext.small.call import Islands, Rules, Small
 from lavender_ext.small.many import Limits, solve_first
 
+# Keys of `Derived.cache`.
+COMPILED_CALL_KEY = (
+    "lavender.solvers.small: compiled call"  # a `Small` or `Islands`; False if the problem has none
+)
+# (solver, tol, start) of a compiled call that did not converge, and its counts: it is not repeated.
+FAILED_CALL_KEY = "lavender.solvers.small: failed call"
+
 #: Why nothing ran, by the status of a start.
 NOTHING = {
     Status.CONVERGED: "the start is a solution",
@@ -75,9 +82,9 @@ def call_ends_within(problem: Problem, seconds: float | None) -> bool:
 
 def prepared(problem: Problem) -> Any:
     """The compiled call of a small problem or of small islands, kept with the problem; None if it has none."""
-    kept = problem.derived.small
+    kept = problem.derived.cache.get(COMPILED_CALL_KEY)
     if kept is None:
-        kept = problem.derived.small = _make(problem) or False
+        kept = problem.derived.cache[COMPILED_CALL_KEY] = _make(problem) or False
     return kept or None
 
 
@@ -155,17 +162,18 @@ class SmallCall:
         Where it does not converge the judge finds nothing, None, and counts are of what was done in vain: () where no
         call was made. most: counted cost [ns] at which it ends with what was found by then, above tol.
         """
-        kept = problem.derived
+        cache = problem.derived.cache
         if not tol > 0.0 or not len(problem.b):
             return None, ()
-        if kept.vain is not None and kept.vain[0] == self._call(problem, impulse, tol):
-            return None, kept.vain[1]
+        call, failed_counts = cache.get(FAILED_CALL_KEY, (None, ()))
+        if call is not None and call == self._call(problem, impulse, tol):
+            return None, failed_counts
         if problem.generalized is not None:
             if self.limits is None:
                 return None, ()
-            found = solve_first(kept.view, impulse, tol, self.limits, most)
+            found = solve_first(problem.derived.view, impulse, tol, self.limits, most)
         else:
-            small = kept.small
+            small = cache.get(COMPILED_CALL_KEY)
             if small is None and (problem.m <= SMALL_ROWS or self.hands_over):
                 small = prepared(problem)
             if not small or not (self.pivots if pivots(problem) else self.hands_over):
@@ -180,7 +188,7 @@ class SmallCall:
         self, problem: Problem, impulse: FloatArray | None, tol: float, counts: tuple[int, ...]
     ) -> None:
         """The call from there left it after these counts: it need not be made again before the full solver."""
-        problem.derived.vain = self._call(problem, impulse, tol), counts
+        problem.derived.cache[FAILED_CALL_KEY] = self._call(problem, impulse, tol), counts
 
     def _call(self, problem: Problem, impulse: FloatArray | None, tol: float) -> tuple[str, float, bytes]:
         return self.name, tol, (problem._start if impulse is None else impulse).tobytes()

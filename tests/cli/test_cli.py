@@ -374,7 +374,7 @@ def _must_not_begin(*_, **__):
         ("solve toy_stack --output {}/x.npz", "lavender.lab.bench.resolve"),
         ("phenomena lift --out {}/x.json", "lavender.lab.phenomena.run"),
         ("web build {}/x.wasm", "lavender.sim.web.compile.build"),
-        ("export c {}/sub", "lavender.out.library.source"),
+        ("export c {}/sub", "lavender.export.library.source"),
         ("web page {}/sub", "lavender.sim.web.pages.module"),
         ("report toy_stack --out {}/sub", "lavender.lab.bench.resolve"),
         ("report toy_stack --campaign --out {}/sub", "lavender.lab.bench.resolve"),

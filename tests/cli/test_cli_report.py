@@ -17,15 +17,15 @@ from worked import python
 
 import lavender as lv
 from lavender import bench, cli, io, suite
-from lavender import out as export
+from lavender import export as export
 from lavender.base.errors import InputError
 from lavender.cli import measuring
 from lavender.cli.bench import mujoco
+from lavender.export import vectors
 from lavender.lab.bench import Event, simulators
 from lavender.lab.phenomena import PHENOMENA
 from lavender.lab.report import moved
 from lavender.lab.suite import steps
-from lavender.out import vectors
 
 
 def test_the_command_writes_a_table_and_says_what_it_left_out(boxes, tmp_path):

@@ -12,7 +12,7 @@ import lavender as lv
 from lavender.io.efc import from_efc
 from lavender.lab import audit as module
 from lavender.lab.audit import VERDICTS, audit
-from lavender.lab.worlds import Frame, Runs
+from lavender.lab.simulated_worlds import Frame, Runs
 
 
 def own_errors(path, world, steps, seed=0, spread=0.1):

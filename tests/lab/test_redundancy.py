@@ -12,7 +12,7 @@ from kkt_truth import eliminate
 from random_problems import as_matrix, random_contact_problem, seeds, touching
 
 import lavender as lv
-from lavender.lab.redundancy import redundancy
+from lavender.lab.diagnostics.redundancy import redundancy
 from lavender.problem import operators
 
 

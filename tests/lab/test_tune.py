@@ -10,8 +10,8 @@ from calls import EARLY_BOXES as EARLY
 import lavender as lv
 from lavender.lab import tune as module
 from lavender.lab.audit import audit
+from lavender.lab.simulated_worlds import Runs, StepSizes
 from lavender.lab.tune import Measured, Setting, Stage, Tuning, grid, tune
-from lavender.lab.worlds import Runs, StepSizes
 
 mj = pytest.importorskip("mujoco", reason="needs MuJoCo: pip install 'lavender-contact[mujoco]'")
 

@@ -5,7 +5,7 @@ import importlib.util
 import pytest
 from worked import ROOT
 
-from lavender.sim.web import cut
+from lavender.sim.web import extract_c as cut
 
 SPEC = importlib.util.spec_from_file_location("check_kernels", ROOT / ".ci" / "check_kernels.py")
 check_kernels = importlib.util.module_from_spec(SPEC)

@@ -115,9 +115,9 @@ def test_the_page_on_architecture_lists_floors_and_rooms_in_the_order_of_their_c
         ]
 
     floors = [name for (name,) in listed("## Five floors", "## The flow")]
-    assert floors == [*(f"lavender.{floor}" for floor in ("cli", "out", "lab", "sim", "io")), "lavender"]
+    assert floors == [*(f"lavender.{floor}" for floor in ("cli", "export", "lab", "sim", "io")), "lavender"]
     rooms = listed("## The rooms\n", "## The rooms of `lavender_ext`")
-    assert {room for row in rooms for room in row} == set(height) - {"cli", "out"}
+    assert {room for row in rooms for room in row} == set(height) - {"cli", "export"}
     highest = [max(height[room] for room in row) for row in rooms]
     assert highest == sorted(highest, reverse=True)
 

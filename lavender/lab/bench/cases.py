@@ -24,8 +24,8 @@ from lavender.io.stored import ENGINE, SUFFIXES, whole_file
 from lavender.judge.residuals import ENOUGH, Residual, nothing_to_do, residual
 from lavender.lab import suite
 from lavender.lab.bench.record import CaseInfo, file_name, printable
+from lavender.lab.diagnostics import diagnose
 from lavender.lab.suite import Case
-from lavender.lab.suspicions import diagnose
 from lavender.problem import Problem, check_problem
 from lavender.problem.derived import cached_property
 

@@ -26,13 +26,13 @@ from typing import Any
 
 import numpy as np
 
+from lavender.batch.solve import solve_many
 from lavender.io import mujoco as adapter
 from lavender.io.recording import drive_of
 from lavender.judge.residuals import reference, residual
 from lavender.judge.solution import Solution
 from lavender.lab.bench.running.runner import carry
 from lavender.problem import Problem
-from lavender.solving.many import solve_many
 from lavender.solving.solve import solve
 
 TARGET = 1e-6  # judged relative residual that both sides must reach

@@ -9,8 +9,7 @@ lv.motions(problem).spread                             # m/s that Coulomb's law 
 
 from lavender.lab.motion.bound import Witness
 from lavender.lab.motion.error import MotionError, measure
-from lavender.lab.motion.reference import Reference, adopt, load_reference, reference, save_reference
-from lavender.lab.motion.several import (
+from lavender.lab.motion.multiple_solutions import (
     Motion,
     Motions,
     branch,
@@ -20,6 +19,7 @@ from lavender.lab.motion.several import (
     motions_of,
     nearest,
 )
+from lavender.lab.motion.reference import Reference, adopt, load_reference, reference, save_reference
 from lavender.lab.motion.unique import uniqueness
 
 __all__ = [

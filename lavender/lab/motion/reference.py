@@ -84,10 +84,10 @@ def kept(problem: Problem) -> Kept:
             "the motions of ellipses are those of problem.disk: give that, and impulses as problem.on_disk(impulse)"
         )
     with problem.derived.lock:
-        own = problem.derived.motion
+        own = problem.derived.cache.get(__name__)
         if own is None:
             operator = operators.make(problem)
-            own = problem.derived.motion = Kept(operator, operator.refusal() or "")
+            own = problem.derived.cache[__name__] = Kept(operator, operator.refusal() or "")
         return own
 
 

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from lavender.base.arrays import FloatArray
+from lavender.lab.phenomena.analytic_solutions import flip_period, pendulum_period
 from lavender.lab.phenomena.parts import GRAVITY, Parameter, Phenomenon, Quantity, Track, Values
-from lavender.lab.phenomena.truths import flip_period, pendulum_period
 from lavender.sim.scene import Scene
 from lavender.sim.scene.parts import quaternion
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from lavender.lab.phenomena.analytic_solutions import thinnest_arch, tipping_time
 from lavender.lab.phenomena.parts import (
     GRAVITY,
     Parameter,
@@ -18,7 +19,6 @@ from lavender.lab.phenomena.parts import (
     crossing,
     has_fallen,
 )
-from lavender.lab.phenomena.truths import thinnest_arch, tipping_time
 from lavender.sim.scene import Scene
 from lavender.sim.scene.parts import quaternion
 

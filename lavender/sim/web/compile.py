@@ -1,4 +1,4 @@
-"""The kernels as WebAssembly modules without Python: what cut.py takes out of Cython's C, a compiler for wasm32.
+"""The kernels as WebAssembly modules without Python: what extract_c.py takes out of Cython's C, a compiler for wasm32.
 
     python lavender/sim/web/compile.py FOLDER          from the root of the project, or wherever lavender_ext lies
 
@@ -53,7 +53,7 @@ class Part:
 
 #: Modules of the page by name; the first stands alone.
 PARTS = {"lavender": Part(MODULES), "newton": Part(("warm.substep", "judge.measure"), beside=True)}
-CUT: dict[str, Any] = runpy.run_path(str(Path(__file__).resolve().with_name("cut.py")))
+EXTRACT_C: dict[str, Any] = runpy.run_path(str(Path(__file__).resolve().with_name("extract_c.py")))
 #: Name of the custom section with the hash of the sources, which ends the file.
 SECTION = "lavender.sources"
 DATA = 11  # number of the section of static data
@@ -91,7 +91,7 @@ def why_not() -> str:
 
 def source_hash(root: Path, modules: Iterable[str | Path] = MODULES) -> str:
     """Hash of everything that a build of these modules reads; arguments as for `build`."""
-    return str(CUT["source_hash"](root, modules))
+    return str(EXTRACT_C["source_hash"](root, modules))
 
 
 def is_current(path: Path, root: Path, part: Part) -> bool:
@@ -135,13 +135,13 @@ def build(
     if reason:
         raise BuildFailed(reason)
     modules = list(modules)
-    names = CUT["core_functions"](root, modules)
+    names = EXTRACT_C["core_functions"](root, modules)
     with tempfile.TemporaryDirectory(prefix="lavender-wasm-") as folder:
         source = Path(folder, "module.c")
         try:
-            parts = CUT["translate"](root, modules, source.parent, root / "build" / "cython")
-            source.write_text(CUT["cut"](parts, roots=names), encoding="utf-8")
-        except CUT["CutFailed"] as error:
+            parts = EXTRACT_C["translate"](root, modules, source.parent, root / "build" / "cython")
+            source.write_text(EXTRACT_C["extract_c"](parts, roots=names), encoding="utf-8")
+        except EXTRACT_C["ExtractionError"] as error:
             raise BuildFailed(str(error)) from None
         data = _compiled(source, names, ["--import-memory"] if beside else [])
     _check(data, LARGEST if largest is None else largest)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import lavender as lv
-from lavender.solving import many as many_module
+from lavender.batch import solve as many_module
 
 DISKS = lv.Cones.contacts(0.5, count=4)
 

@@ -12,8 +12,8 @@ import pytest
 from random_problems import random_contact_problem
 
 import lavender as lv
-from lavender.judge import many as loop
-from lavender.solving import many
+from lavender.batch import residuals as loop
+from lavender.batch import solve as many
 
 TINY = lv.Problem.lcp([[2.0, 1.0], [1.0, 2.0]], [1.0, -1.0])
 

@@ -16,7 +16,7 @@ from random_trees import random_general
 import lavender as lv
 from lavender import suite
 from lavender.lab.motion.modes import enumerated
-from lavender.lab.motion.several import distance, search
+from lavender.lab.motion.multiple_solutions import distance, search
 
 LAWS = ("linear", "lcp", "cone")
 

@@ -9,8 +9,8 @@ from scipy.optimize import linprog
 
 import lavender as lv
 from lavender.lab.phenomena import PHENOMENA
+from lavender.lab.phenomena.analytic_solutions import tipping_time
 from lavender.lab.phenomena.joints import flip_of, moments_of_inertia, period_of, spin_of
-from lavender.lab.phenomena.truths import tipping_time
 
 G = 9.81
 

@@ -13,6 +13,7 @@ from statistics import median
 from time import perf_counter
 from typing import Any
 
+from lavender.batch.solve import solve_many
 from lavender.lab.bench.cases import Item, Source, resolve
 from lavender.lab.bench.record import CaseInfo, Record
 from lavender.lab.bench.running.plan import Plan
@@ -20,7 +21,6 @@ from lavender.lab.bench.running.runner import Runner, Watch, is_foreign
 from lavender.lab.bench.running.timing import Ask, Task, just_written, one_thread, outcome_of, pace, record_of
 from lavender.lab.bench.running.worker import Worker
 from lavender.lab.bench.store import Records, Store, opened
-from lavender.solving.many import solve_many
 
 ROUNDS, LEAST_ROUNDS, MOST_ROUNDS = 7, 3, 41
 SPARE = 3.0  # s, for more repetitions than usual where they are cheap

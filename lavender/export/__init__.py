@@ -4,7 +4,7 @@
 `lav_engine_open` reads it.
 """
 
-from lavender.out.library import HEADER, source, write
-from lavender.out.view import engine_image
+from lavender.export.library import HEADER, source, write
+from lavender.export.view import engine_image
 
 __all__ = ["HEADER", "engine_image", "source", "write"]

@@ -1,6 +1,6 @@
 /* Scenes of a data file stepped through lavender.h: one line for each, with a hash of every bit that was made.
  *
- *     scenes DATA        DATA is written by tests/out/parity/export.py: numbers of 8 bytes, arrays after their bytes
+ *     scenes DATA        DATA is written by tests/export/parity/export.py: numbers of 8 bytes, arrays after their bytes
  *
  * A line is a hash, "same" or where the first bit differs from what the package made, and the scene. The hash runs over
  * the eight values of every step and over places and turns of all bodies after it.

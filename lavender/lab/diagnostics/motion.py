@@ -10,8 +10,8 @@ import numpy.typing as npt
 
 from lavender.base.arrays import FloatArray, as_array, number
 from lavender.base.errors import InputError
-from lavender.lab.suspicions.bodies import LARGE, bodies_of, free_bodies
-from lavender.lab.suspicions.suspicion import Suspicion, suspect
+from lavender.lab.diagnostics.bodies import LARGE, bodies_of, free_bodies
+from lavender.lab.diagnostics.diagnostic import Suspicion, suspect
 from lavender.problem import Problem
 from lavender.problem.rows import Rows
 

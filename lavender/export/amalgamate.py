@@ -1,4 +1,4 @@
-"""lavender.c: the kernels that the functions of lavender.h use, then those functions (front/).
+"""lavender.c: the kernels that the functions of lavender.h use, then those functions (capi/).
 
 Only the standard library is imported, so that setup.py can run this before anything is built.
 """
@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 HERE = Path(__file__).resolve().parent
-CUT: dict[str, Any] = runpy.run_path(str(HERE.parent / "sim" / "web" / "cut.py"))
-CutFailed: type[Exception] = CUT["CutFailed"]
+EXTRACT_C: dict[str, Any] = runpy.run_path(str(HERE.parent / "sim" / "web" / "extract_c.py"))
+ExtractionError: type[Exception] = EXTRACT_C["ExtractionError"]
 #: Modules of lavender_ext that the library reaches into.
 MODULES = (
     "core.assemble",
@@ -39,14 +39,14 @@ MODULES = (
 )
 HEADER = HERE / "c" / "lavender.h"
 FRONT = [
-    HERE / "front" / f"{name}.c"
+    HERE / "capi" / f"{name}.c"
     for name in ("front", "problem", "judge", "methods", "pivots", "solve", "full")
 ]
 
 
 def source_hash(root: Path) -> str:
     """Hash of everything that the library is made of."""
-    return str(CUT["source_hash"](root, MODULES, [HEADER, Path(__file__), *FRONT]))
+    return str(EXTRACT_C["source_hash"](root, MODULES, [HEADER, Path(__file__), *FRONT]))
 
 
 def words(header: str) -> str:
@@ -70,14 +70,14 @@ def amalgamate(root: Path, made: Path | None = None) -> str:
 
     Raises
     ------
-    CutFailed
+    ExtractionError
         The kernels cannot be translated, or need Python.
     """
     front = "".join(path.read_text(encoding="utf-8") for path in FRONT)
     front += words(HEADER.read_text(encoding="utf-8"))
     version = runpy.run_path(str(HERE.parent / "_version.py"))["__version__"]
     with tempfile.TemporaryDirectory() as work:
-        kernels = CUT["cut"](CUT["translate"](root, MODULES, Path(work), made), front)
+        kernels = EXTRACT_C["extract_c"](EXTRACT_C["translate"](root, MODULES, Path(work), made), front)
     return (
         f"/* liblavender of lavender {version}: the kernels without Python, then the functions of lavender.h.\n"
         f" * Made, not written: changes belong into the kernels. Sources {source_hash(root)}\n */\n"

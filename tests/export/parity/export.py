@@ -1,6 +1,6 @@
 """What the parity table runs through lavender.h: scenes and problems, with what the installed extension made of them.
 
-    python tests/out/parity/export.py FOLDER [STEPS]
+    python tests/export/parity/export.py FOLDER [STEPS]
 
 The scenes are those of the WebAssembly build (tests/sim/web/record.py). Starts and problems are recorded as
 numbers, so that nothing that builds them is part of what is compared. Scenes start from the same bits everywhere (but
@@ -21,8 +21,8 @@ from random_problems import as_matrix, random_contact_problem, random_lcp  # noq
 from record import SCENES, STEPS  # noqa: E402
 
 import lavender as lv  # noqa: E402
-from lavender.out import engine_image, vectors  # noqa: E402
-from lavender.out.view import NotTaken  # noqa: E402
+from lavender.export import engine_image, vectors  # noqa: E402
+from lavender.export.view import NotTaken  # noqa: E402
 from lavender_ext.engine.arrays import views  # noqa: E402
 
 ORDERS = ("symmetric", "random", "reverse")

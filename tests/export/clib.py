@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from lavender.out import HEADER
-from lavender.out.header import strip_comments, struct_fields
-from lavender.out.view import METHODS, view
+from lavender.export import HEADER
+from lavender.export.header import strip_comments, struct_fields
+from lavender.export.view import METHODS, view
 
 STRUCTS = ("lav_problem", "lav_options", "lav_budget", "lav_verdict", "lav_motion", "lav_result")
 SWEEPS = ("sequential_impulses", "pgs", "block_gauss_seidel", "anderson", "nncg")  # under friction too

@@ -14,9 +14,9 @@ from random_problems import as_matrix, random_contact_problem, random_lcp, seeds
 from tower import self_test_problem
 
 import lavender as lv
-from lavender.out import HEADER
-from lavender.out.header import constants, struct_fields
-from lavender.out.view import ARRAYS, METHODS
+from lavender.export import HEADER
+from lavender.export.header import constants, struct_fields
+from lavender.export.view import ARRAYS, METHODS
 
 ERRORS = {
     value: name for name, value in constants(HEADER.read_text()).items() if name.startswith("LAV_ERROR")

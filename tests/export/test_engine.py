@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import lavender as lv
-from lavender.out import engine_image
+from lavender.export import engine_image
 from lavender_ext.engine.arrays import views
 
 

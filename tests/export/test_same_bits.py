@@ -11,8 +11,8 @@ from clib import METHODS, Motion, Refused, run
 from tower import self_test_hash, self_test_problem
 
 import lavender as lv
-from lavender.out.vectors import driven, pack
-from lavender.out.view import OTHER_BITS, NotTaken, takes
+from lavender.export.vectors import driven, pack
+from lavender.export.view import OTHER_BITS, NotTaken, takes
 
 
 def problems():

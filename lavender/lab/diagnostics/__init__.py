@@ -23,8 +23,8 @@ from typing import Any
 
 import numpy as np
 
-from lavender.lab.suspicions import blocks, bodies, motion
-from lavender.lab.suspicions.suspicion import Suspicion
+from lavender.lab.diagnostics import blocks, bodies, motion
+from lavender.lab.diagnostics.diagnostic import Suspicion
 from lavender.problem import Problem, check_problem
 
 __all__ = ["Suspicion", "diagnose"]
@@ -78,9 +78,9 @@ def diagnose(
     state = motion.state_before(problem, velocity, gap, dt)
     given = problem.guess if impulse is None else problem.impulse_array(impulse)
     with np.errstate(all="ignore"):  # what is beyond float64 is no larger and no smaller than anything
-        known = problem.derived.suspicions
+        known = problem.derived.cache.get(__name__)
         if known is None:
-            known = problem.derived.suspicions = tuple(s for check in CHECKS for s in check(problem))
+            known = problem.derived.cache[__name__] = tuple(s for check in CHECKS for s in check(problem))
         found = [replace(s, data=dict(s.data)) for s in known]
         found += motion.stepped(problem, *state)
         if given is not None:

@@ -6,7 +6,7 @@ from importlib.util import find_spec
 import pytest
 from clib import Library, run
 
-from lavender import out as export
+from lavender import export as export
 from lavender.base.errors import LavenderError
 
 

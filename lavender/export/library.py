@@ -8,8 +8,8 @@ from pathlib import Path
 
 import lavender_ext
 from lavender.base.errors import InputError, LavenderError
+from lavender.export.amalgamate import ExtractionError, amalgamate, source_hash
 from lavender.io.stored import kept, make_folder, writable, write_bytes
-from lavender.out.amalgamate import CutFailed, amalgamate, source_hash
 
 HERE = Path(__file__).resolve().parent
 ROOT = Path(lavender_ext.__file__).resolve().parent.parent  # the folder that holds lavender_ext
@@ -30,7 +30,7 @@ def source() -> str:
     def make() -> bytes:
         try:
             return amalgamate(ROOT, ROOT / "build" / "cython").encode()
-        except CutFailed as error:
+        except ExtractionError as error:
             raise LavenderError(
                 f"lavender.c does not lie in {HERE / 'c'} and cannot be made: {str(error)[-500:]}; "
                 "install a wheel, or Cython"

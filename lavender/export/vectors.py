@@ -18,6 +18,8 @@ import numpy as np
 import lavender as lv
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import InputError
+from lavender.export.library import HERE
+from lavender.export.view import METHODS, OTHER_BITS, NotTaken, choices, takes, view
 from lavender.lab import bench
 from lavender.lab.bench.cases import fingerprint
 from lavender.lab.bench.record import Record
@@ -25,8 +27,6 @@ from lavender.lab.bench.store import Records, read
 from lavender.lab.report import tables
 from lavender.lab.report.moved import working
 from lavender.lab.report.verdict import verdict
-from lavender.out.library import HERE
-from lavender.out.view import METHODS, OTHER_BITS, NotTaken, choices, takes, view
 from lavender.solvers import registry
 from lavender.solvers.steps import METHODS as CANDIDATES
 from lavender_ext.core.method import OUTCOMES
@@ -143,7 +143,7 @@ def made(path: Path, solver: str | None, most: int) -> dict[str, str | bytes]:
         raise InputError(
             f"no problem of {measured[0].solver} in {path} makes a test vector: {'; '.join(left[:3])}"
         )
-    check = (HERE / "front" / "check.c").read_text(encoding="utf-8")
+    check = (HERE / "capi" / "check.c").read_text(encoding="utf-8")
     lines = ",\n".join(f"  {step.text()}" for step in steps.values())
     header = CHOSEN.format(solver=measured[0].solver, tol=measured[0].tol, count=len(steps), lines=lines)
     return {"vectors.bin": file_of(packed[:most]), "check.c": check, "chosen.h": header}

@@ -17,10 +17,10 @@ from tower import self_test_problem
 
 import lavender as lv
 from lavender import bench
-from lavender import out as export
+from lavender import export as export
 from lavender.base.errors import LavenderError
-from lavender.out import vectors
-from lavender.sim.web import cut
+from lavender.export import vectors
+from lavender.sim.web import extract_c
 
 WARNINGS = ["-Wall", "-Wextra", "-Wpedantic", "-Werror"]
 # The first and the last that are promised; the library is compiled as C11 wherever it is run.
@@ -141,7 +141,7 @@ def test_sanitizers_have_nothing_to_say(folder, tmp_path, name, what):
         pytest.skip(f"no {name} with -fsanitize={what}")
     write_vectors(tmp_path)
     run(name, *flags, "-c", folder / "lavender.c", "-o", tmp_path / "lavender.o")
-    for source in (folder / "tower.c", export.library.HERE / "front" / "check.c"):
+    for source in (folder / "tower.c", export.library.HERE / "capi" / "check.c"):
         run(name, *flags, source, tmp_path / "lavender.o", "-lm", "-o", tmp_path / source.stem)
         run(tmp_path / source.stem, cwd=tmp_path, env={"ASAN_OPTIONS": "detect_leaks=0"})
 
@@ -163,7 +163,7 @@ def write_vectors(out):
 
 def test_test_vectors_are_met_and_a_changed_bit_is_seen(folder, shared, compiler, tmp_path):
     count = write_vectors(tmp_path)
-    check = export.library.HERE / "front" / "check.c"
+    check = export.library.HERE / "capi" / "check.c"
     link = [check, shared, f"-Wl,-rpath,{shared.parent}"]
     run(compiler, "-std=c11", *WARNINGS, "-I", folder, *link, "-o", tmp_path / "check")
     said = run(tmp_path / "check", cwd=tmp_path)
@@ -262,8 +262,8 @@ double lav_pong(double x) { return lav_round(x); }
 
 @pytest.mark.parametrize("used, sign", [("k_bad()", "Python's side"), ("k_round(1)", "comes round")])
 def test_a_cut_that_needs_python_or_itself_is_refused(used, sign):
-    with pytest.raises(cut.CutFailed, match=sign):
-        cut.cut([("a", KERNEL)], f"double lav_use(double x) {{ {used}; return x; }}")
+    with pytest.raises(extract_c.ExtractionError, match=sign):
+        extract_c.extract_c([("a", KERNEL)], f"double lav_use(double x) {{ {used}; return x; }}")
 
 
 @pytest.mark.slow

@@ -22,12 +22,12 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray, IntArray, number, whole_number
 from lavender.base.errors import CapabilityError, InputError
+from lavender.batch.data import Batch
 from lavender.io.efc import from_efc
 from lavender.io.recording import Control, control_of, drive_of, model_of
 from lavender.io.states import StartStates, read_states
 from lavender.lab.report.table import Table
 from lavender.lab.report.text import percent
-from lavender.problem.batch import Batch
 
 ENGINES = ("mujoco", "mjx", "mujoco_warp")
 BEGIN = ("qpos", "qvel", "act", "qacc_warmstart", "mocap_pos", "mocap_quat")  # what MJX and Warp start from

@@ -1,7 +1,7 @@
 """C without Python, cut out of the C that Cython writes: what given functions reach, and nothing else.
 
     translate(root, modules, work)      the C of modules of lavender_ext
-    cut(translations, front, roots)     one C file of what `front` (C of ours, at its end) and `roots` use
+    extract_c(translations, front, roots)     one C file of what `front` (C of ours, at its end) and `roots` use
 
 Cython writes a module's core (`cdef ... noexcept nogil`) and its Python part into one file, and what several modules
 cimport into each of them. Every file is read token by token into its declarations (structs, enums, typedefs, functions,
@@ -103,7 +103,7 @@ OPENING = ("if", "ifdef", "ifndef")
 MANGLED = re.compile(r"__pyx_(?:f|t|e|fuse_\d+)_(?=\d)")
 
 
-class CutFailed(Exception):
+class ExtractionError(Exception):
     """The C of the kernels could not be made, or needs Python; the message says where."""
 
 
@@ -336,14 +336,14 @@ class _Table:
         if id(item) in done:
             return
         if name in path:
-            raise CutFailed(f"{' > '.join(path)} > {name} comes round")
+            raise ExtractionError(f"{' > '.join(path)} > {name} comes round")
         for other in every:
             if other.kind == item.kind == "function" and other.part != item.part and other.text != item.text:
-                raise CutFailed(f"{name} is not the same in {item.origin} and {other.origin}")
+                raise ExtractionError(f"{name} is not the same in {item.origin} and {other.origin}")
         if item.kind in ("variable", "prototype"):
             if item.kind == "prototype" and item.text.startswith(("struct", "union")):
                 return
-            raise CutFailed(
+            raise ExtractionError(
                 f"{path[-1] if path else 'somebody'} needs {name}, which only Python's side has ({item.origin})"
             )
         for used in sorted(item.uses - item.makes):
@@ -351,7 +351,7 @@ class _Table:
         done[id(item)] = item
 
 
-def cut(translations: Iterable[tuple[str, str]], front: str = "", roots: Iterable[str] = ()) -> str:
+def extract_c(translations: Iterable[tuple[str, str]], front: str = "", roots: Iterable[str] = ()) -> str:
     """One C file without Python.
 
     Parameters
@@ -379,7 +379,7 @@ def cut(translations: Iterable[tuple[str, str]], front: str = "", roots: Iterabl
     reached = table.reach(set().union(*(item.uses for item in own), kept) - made)
     missing = sorted(kept - set(table.by_name))
     if missing:
-        raise CutFailed(f"no such core functions: {', '.join(missing)}")
+        raise ExtractionError(f"no such core functions: {', '.join(missing)}")
     return "\n\n".join([PROLOGUE, *(_private(item, kept) for item in reached), front])
 
 
@@ -482,7 +482,7 @@ def translate(
             cwd=root, capture_output=True, encoding="utf-8", errors="replace", check=False,
         )  # fmt: skip
         if done.returncode:
-            raise CutFailed(f"Cython cannot translate {source}:\n{(done.stdout + done.stderr)[-4000:]}")
+            raise ExtractionError(f"Cython cannot translate {source}:\n{(done.stdout + done.stderr)[-4000:]}")
         return name, out.read_text(encoding="utf-8")
 
     with ThreadPoolExecutor(2) as pool:

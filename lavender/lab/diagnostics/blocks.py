@@ -8,8 +8,8 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray
 from lavender.judge.residuals import residual
-from lavender.lab.suspicions.bodies import are_grouped
-from lavender.lab.suspicions.suspicion import Suspicion, suspect
+from lavender.lab.diagnostics.bodies import are_grouped
+from lavender.lab.diagnostics.diagnostic import Suspicion, suspect
 from lavender.problem import Problem
 from lavender.solvers.certify import conflict_of
 

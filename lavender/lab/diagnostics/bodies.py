@@ -11,7 +11,7 @@ import numpy.typing as npt
 from lavender.base.arrays import FloatArray
 from lavender.base.later import sparse as sp
 from lavender.base.lu import sparse_lu
-from lavender.lab.suspicions.suspicion import Suspicion, suspect
+from lavender.lab.diagnostics.diagnostic import Suspicion, suspect
 from lavender.problem import Problem
 from lavender.problem.rows import Rows
 
@@ -25,9 +25,9 @@ FAR = 0.25  # -, of the arms: bodies further off each other than another contact
 
 def bodies_of(p: Problem) -> Rows | None:
     """The rows, or contacts of J and M as rows; None where these are of something else than rigid bodies."""
-    if p.derived.bodies is None:
-        p.derived.bodies = (_bodies_of(p),)
-    return p.derived.bodies[0]
+    if __name__ not in p.derived.cache:
+        p.derived.cache[__name__] = _bodies_of(p)
+    return p.derived.cache[__name__]
 
 
 def _bodies_of(p: Problem, rows: npt.NDArray[np.intp] | None = None) -> Rows | None:

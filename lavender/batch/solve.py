@@ -1,7 +1,7 @@
 """Many problems in one call: the results of `solve` on each, with the same bits, in arrays.
 
-By the loop of `lavender/judge/many.py`. What it does not solve goes the way of a single solve. A `Solution` is made
-when it is first asked for.
+The compiled loop of `lavender/batch/residuals.py` solves what it can; a single `solve` handles every other problem. A
+`Solution` is built at its first access.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ import numpy as np
 from lavender.base.arrays import FloatArray, read_only, whole_number
 from lavender.base.deadline import NEVER, Deadline
 from lavender.base.errors import InputError, LavenderError
-from lavender.judge.many import Many, given_problems, of_each
+from lavender.batch.data import Batch
+from lavender.batch.residuals import Many, given_problems, of_each
 from lavender.judge.residuals import judged, reading_time
 from lavender.judge.solution import CONTRADICTED, Solution, Status, uninterrupted
 from lavender.problem import Problem
-from lavender.problem.batch import Batch
 from lavender.problem.derived import cached_property
 from lavender.solvers.loop import LEAST
 from lavender.solvers.registry import SolverSpec, get

@@ -1,8 +1,8 @@
-"""Verdicts of many worlds in one call: what the judge finds of each, with the same bits, in arrays.
+"""Residuals of many worlds in one call, bit-identical to single calls of `residual`, in arrays.
 
-One compiled loop takes one world after the other, by an atomic counter, from the arrays of a `Batch` or from problems
-in generalised coordinates. What it leaves, and every other problem, is handed back to the thread that took it and goes
-the way of a single one. `lavender/solving/many.py` solves by the same loop.
+One compiled loop processes the worlds of a `Batch`, or problems in generalised coordinates; threads share the worlds by
+an atomic counter. A single call handles every other problem. `lavender/batch/solve.py`
+solves with the same loop.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from lavender.base.arrays import (
 )
 from lavender.base.errors import InputError, LavenderError
 from lavender.base.threads import together
+from lavender.batch.data import ERRORS, Batch
 from lavender.judge.residuals import AT_REST, ENOUGH, TOL, VERDICTS, Residual, residual, verdict_of
 from lavender.problem import PRECISIONS, Problem, check_problem
-from lavender.problem.batch import ERRORS, Batch
 from lavender.problem.derived import cached_property
 from lavender_ext.small.many import CODE, NUMBER, PLACE, Hand, Worlds, data_of
 

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from lavender.base.errors import InputError
-from lavender.out.header import constants, struct_fields
-from lavender.out.library import HEADER
+from lavender.export.header import constants, struct_fields
+from lavender.export.library import HEADER
 from lavender.problem import Problem
 from lavender.sim.engine.simulation import Simulation
 from lavender.solvers import registry
