@@ -1,8 +1,8 @@
-"""Solvers by name. Each has a `SolverSpec`, which lists its capabilities as data; the tests check every one of them.
+"""Registry of solvers by name. A `SolverSpec` lists the capabilities of a solver as data; tests check each of them.
 
-A solver is an object that holds only its options; `SolverSpec.factory(**options)` makes it. `Solver` has all that is
-asked of one. Third parties register through the entry point group "lavender.solvers" (an object that is a `SolverSpec`,
-or a function that returns one) or with `register`.
+A solver is an object that holds only its options; `SolverSpec.factory(**options)` creates it. `Solver` defines the
+interface. Other packages register solvers through the entry point group "lavender.solvers" (a `SolverSpec`, or a
+function that returns one) or with `register`.
 """
 
 from __future__ import annotations
@@ -25,164 +25,228 @@ from lavender.problem.derived import cached_property
 __all__ = ["Solver", "SolverSpec", "State", "available", "get", "known", "register"]
 
 
-# Modules whose SPECS are registered first, by name: they import this one.
-SMALL_ROWS = 64  # rows up to which Python's share decides what a solve costs: a spec's `small` is tried first
+# Up to this many rows, the overhead of Python dominates a solve: the compiled call `SolverSpec.small` is tried first.
+SMALL_ROWS = 64
+# Modules whose SPECS are registered first. They are named by strings because they import this module.
 TABLES = ("lavender.solvers", "lavender.external")
 
 
 class SmallCall(Protocol):
-    """Solves a problem of few rows to tol with the bits of `run`, or leaves it to `run`."""
+    """Compiled call that solves a small problem with the bits of `run`, or leaves it to `run`."""
 
     def in_vain(
         self, problem: Problem, impulse: FloatArray | None, tol: float, counts: tuple[int, ...]
     ) -> None:
-        """The call from there left it after these counts: it need not be made again before `run`."""
+        """Record that the call from `impulse` failed after work `counts`, so that it is not repeated before `run`."""
 
     @property
     def limits(self) -> Any:
-        """What it may cost over generalised velocities."""
+        """Limits of its cost in generalised coordinates; None if it does not accept this form."""
 
     @property
     def rules(self) -> Any:
-        """What is asked for of few rows of A or of bodies."""
+        """Options of the compiled call for matrices and bodies."""
 
     def attempt(
         self, problem: Problem, impulse: FloatArray | None, tol: float, most: float = ...
     ) -> tuple[Any, Any]:
-        """(what the judge finds, None where it is left, and counts) from an impulse (m,) or from doing nothing."""
+        """Return (judged result or None, work counts), from `impulse` (m,) [N s] or from the zero impulse.
+
+        The result is None if the call did not converge; `most` [ns] limits its estimated cost.
+        """
 
     def claim(
         self, problem: Problem, counts: Any, start: FloatArray | None, after: float, status: Status
     ) -> Claim:
-        """What counts come to, from a start (m,) or from none to the residual `after`, with its turns."""
+        """Build the claim of a call from its counts, its start (m,) and its final relative residual `after`."""
 
 
 class State(Protocol):
-    """What `prepare` returns: any object. `lavender.solve` reads these attributes of a resumable solver, if present."""
+    """State of one solve, as `Solver.prepare` returns it. Both attributes are optional, for resumable solvers."""
 
     @property
     def best(self) -> tuple[float, FloatArray | None]:
-        """(relative residual, impulse (m,)) of the best iterate that the solver has checked; (inf, None) before.
+        """(relative residual, impulse (m,)) of the best iterate that the solver has checked; (inf, None) at first.
 
-        Optional, for solvers whose residual may rise: this is the result if the last iterate is worse.
+        A solver whose residual may rise provides it: it becomes the result if the last iterate is worse.
         """
 
     @property
     def sweeps_per_decade(self) -> float:
-        """Iterations in which the relative residual falls tenfold, by the last checks; NaN if it does not fall.
+        """Iterations in which the relative residual fell tenfold, from the last checks; NaN if it did not fall.
 
-        Optional, for solvers whose iterations cost the same.
+        A solver whose iterations all cost the same provides it.
         """
 
 
 class Solver:
-    """What a factory returns: `prepare` and `run`, and what it does otherwise than here.
+    """Interface of a solver: `prepare` and `run` are required, the other methods have defaults.
 
-    A plug-in may return any object with `prepare` and `run` (`external/foreign.py`).
+    A plug-in may return any object with `prepare` and `run` (`external/foreign.py` wraps it).
     """
 
     def prepare(self, problem: Problem) -> Any:
-        """The state: factor, colour, allocate."""
+        """Build the state of a solve: factor, colour, allocate."""
         raise NotImplementedError
 
     def update(self, state: Any, problem: Problem) -> Any:
-        """The state of a problem of the same structure with new numbers, and a fresh start."""
+        """Return the state for a problem of the same structure with new numbers, without a warm start."""
         return self.prepare(problem)
 
     def run(
         self, state: Any, impulse: FloatArray, max_iter: int, tol: float, time_limit: float | None
     ) -> Claim:
-        """`max_iter` more iterations on `impulse` (m,) in place, fewer only if its own convergence test is met.
+        """Run `max_iter` more iterations on `impulse` (m,) in place; fewer only if the solver's own test is met.
 
-        If `resumable`, n1 and then n2 iterations give the bits of n1 + n2, and time_limit is None.
+        If the solver is `resumable`, n1 and then n2 iterations give the bits of n1 + n2, and time_limit is None.
         """
         raise NotImplementedError
 
-    needs_scipy = False  # `setup_time` may count parts of SciPy that are not loaded yet
+    needs_scipy = False  # whether `prepare` uses parts of SciPy that may not be imported yet
 
     def setup_time(self, problem: Problem) -> float:
-        """What `prepare` takes [s], counted from the size of the problem: begun only if that fits in a time limit."""
+        """Estimate the time of `prepare` [s] from the size of the problem; a time limit decides whether it starts."""
         return 0.0
 
     def ready(self, state: Any, time_limit: float) -> None:
-        """A limit [s] was given, and its clock stands still: start processes."""
+        """Start worker processes for a solve with a limit [s]; this time does not count."""
 
     def until(self, state: Any, deadline: Deadline) -> None:
-        """Before `run`, where it is resumable: begin no long step (a factorisation) that would end after that."""
+        """Set the deadline of the next `run` of a resumable solver: it starts no long step that would end later."""
 
     def turn(
         self, state: Any, impulse: FloatArray, n: int, tol: float, time_limit: float | None, left: int | None
     ) -> Claim:
-        """For `auto`: n iterations or a few more, up to `left`, on from where the last turn ended."""
+        """Run about `n` iterations for `auto`, at most `left`, continuing where the last call ended."""
         return self.run(state, impulse, n, tol, time_limit)
 
     def otherwise(self) -> Solver | None:
-        """Who follows where this one stalls on friction as bounded rows (`polyhedral.py`)."""
+        """Return the solver that continues if this one stalls on friction as bounded rows (`polyhedral.py`)."""
         return None
 
 
 @dataclass(frozen=True)
 class SolverSpec:
-    """One solver: its name, where its code is, and what it can do.
+    """Name, code and capabilities of one solver.
+
+    Parameters
+    ----------
+    name : str
+        Name for `lavender.solve(problem, name)`.
+    factory : str or callable
+        Callable that returns a `Solver` (or any object with its methods) from keyword options; "module:attribute" is
+        imported at first use.
+    laws : set of str
+        Laws that the solver accepts, of "linear", "lcp", "coulomb", "cone".
+    summary : str
+        One line for tables.
+    reference : str
+        Paper or manual.
+    operators : set of str
+        Forms of A that the solver reads as given, of "rows", "matrix", "generalized"; with "matrix", A is formed from
+        any other form.
+    exact : bool
+        It ends after finitely many steps or at rounding accuracy, independent of `tol`.
+    resumable : bool
+        It can continue after `max_iter` iterations with the same bits as one longer run.
+    impulse : bool
+        It uses a warm start.
+    order : bool
+        It accepts the options `order` and `ground`.
+    seed : bool
+        It accepts the option `seed`.
+    callback : bool
+        It accepts a `callback`; requires `resumable`.
+    history : bool
+        It records `history`; requires `resumable`.
+    delegates : bool
+        It calls other solvers (only "auto" does).
+    round_cones : bool
+        It accepts contacts of more than two tangents in one cone.
+    boxes : set of str
+        Laws, of "coulomb" and "cone", under which it accepts boxes: contacts that bound each tangent separately. A law
+        that is not in `laws` is accepted only without disks (own solvers solve boxes as bounded rows:
+        solvers/polyhedral.py).
+    parts : bool
+        It accepts contacts with rolling friction, or with torsional friction beside several tangents.
+    external : bool
+        The code of another project solves; its claims are not ours.
+    max_iter : int
+        Default iteration budget.
+    options : mapping of str to str
+        Options of this solver: name and one line of description.
+    requires : tuple of str
+        Modules that must be importable.
+    install : str
+        Arguments of `pip install` if they are not.
+    bounded : str
+        For a solver of free rows: what the error message recommends for bounded rows.
+    with_bounds : str
+        Name of the same method with bounds; `standing_in` uses it.
+    refusal : callable, optional
+        Returns a reason not to accept a problem, or None; called after all other checks.
+    small : SmallCall, optional
+        Compiled call for small problems with default options; only for built-in solvers.
+
+    Attributes
+    ----------
+    plugged : bool
+        Found by its entry point, so that another process finds it, too.
+    own : bool
+        Part of this package. Other solvers get copies of the data, and their results are checked
+        (`external/foreign.py`).
 
     Raises
     ------
     InputError
-        A law or operator that does not exist, none at all, an empty name, options that are no table, requires that
-        is no tuple of names, a capability that is neither True nor False, or a max_iter that is no whole number.
+        An unknown law or operator, an empty set of them, an empty name, `options` that are not a mapping, `requires`
+        that is not a tuple of names, a capability that is not a bool, or a `max_iter` that is not an integer.
     """
 
     name: str
-    # Of a Solver, or of an object with its methods; "module:attribute" is imported at first use.
     factory: str | Callable[..., Any]
-    laws: frozenset[str]  # of LAWS: "linear", "lcp", "coulomb", "cone"
+    laws: frozenset[str]
     summary: str
-    reference: str = ""  # paper or manual
-    # Forms of A (of OPERATORS) that it reads as given; with "matrix", A is formed from any other form.
+    reference: str = ""
     operators: frozenset[str] = frozenset({"rows", "matrix"})
-    exact: bool = False  # ends after finitely many steps or at rounding accuracy, not at tol
+    exact: bool = False
     resumable: bool = True
-    impulse: bool = True  # uses a warm start
-    order: bool = False  # takes order= and ground=
-    seed: bool = False  # takes seed=
-    callback: bool = True  # takes callback=; needs resumable
-    history: bool = True  # records history; needs resumable
-    delegates: bool = False  # calls other solvers: only "auto"
-    round_cones: bool = False  # takes contacts of more than two tangents in one cone
-    # Of "coulomb" and "cone", the laws under which it takes boxes: contacts whose tangents are bounded each by
-    # itself. A law that is not in `laws` is taken only without disks (by our own solvers as bounded rows:
-    # solvers/polyhedral.py).
+    impulse: bool = True
+    order: bool = False
+    seed: bool = False
+    callback: bool = True
+    history: bool = True
+    delegates: bool = False
+    round_cones: bool = False
     boxes: frozenset[str] = frozenset()
-    parts: bool = False  # takes contacts of more parts than tangents and one row that spins
-    external: bool = False  # another project's code solves; its claims are its own
-    max_iter: int = 1000  # default budget
-    options: Mapping[str, str] = field(default_factory=dict)  # own options: name -> one line
-    requires: tuple[str, ...] = ()  # modules that must be importable
-    install: str = ""  # what to install where they are not
-    bounded: str = ""  # of a solver for free rows: what to use for bounded rows
-    with_bounds: str = ""  # the solver that is this very method with bounds, for `standing_in`
-    refusal: Callable[[Problem], str | None] | None = None  # more reasons against a problem
-    small: SmallCall | None = (
-        None  # problems of few rows with default options, in one compiled call; asked of our own alone
-    )
-    plugged = False  # found by its entry point, as another process finds it
-    own = False  # of this package; other solvers get copies, and what they return is checked (`external/foreign.py`)
+    parts: bool = False
+    external: bool = False
+    max_iter: int = 1000
+    options: Mapping[str, str] = field(default_factory=dict)
+    requires: tuple[str, ...] = ()
+    install: str = ""
+    bounded: str = ""
+    with_bounds: str = ""
+    refusal: Callable[[Problem], str | None] | None = None
+    small: SmallCall | None = None
+    plugged = False
+    own = False
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name:
             raise InputError(f"a solver's name is {self.name!r}; a text that is not empty is needed")
         if not isinstance(self.summary, str):
             raise InputError(f"summary of solver {self.name!r} is {self.summary!r:.80}; a text is needed")
-        for what, names in (("laws", LAWS), ("operators", OPERATORS), ("boxes", ("coulomb", "cone"))):
-            given = getattr(self, what)
-            is_some = isinstance(given, Collection) and not isinstance(given, (str, bytes))
-            if not is_some or not all(isinstance(name, str) and name in names for name in given):
+        for name, choices in (("laws", LAWS), ("operators", OPERATORS), ("boxes", ("coulomb", "cone"))):
+            values = getattr(self, name)
+            is_set = isinstance(values, Collection) and not isinstance(values, (str, bytes))
+            if not is_set or not all(isinstance(value, str) and value in choices for value in values):
                 raise InputError(
-                    f"{what} of solver {self.name!r} are {given!r:.80}; a set of {', '.join(names)} is needed"
+                    f"{name} of solver {self.name!r} are {values!r:.80}; a set of {', '.join(choices)} is needed"
                 )
-            if not given and what != "boxes":
-                raise InputError(f"solver {self.name!r} has no {what}; of {', '.join(names)} one is needed")
-            object.__setattr__(self, what, frozenset(given))
+            if not values and name != "boxes":
+                raise InputError(f"solver {self.name!r} has no {name}; of {', '.join(choices)} one is needed")
+            object.__setattr__(self, name, frozenset(values))
         if not isinstance(self.requires, (tuple, list)) or not all(isinstance(n, str) for n in self.requires):
             raise InputError(
                 f"requires of solver {self.name!r} is {self.requires!r:.80}; a tuple of names of modules is needed"
@@ -203,14 +267,14 @@ class SolverSpec:
 
     @property
     def accepts(self) -> frozenset[str]:
-        """Options beyond those of the front door."""
+        """Names of the options that `lavender.solve` passes on to the factory."""
         shared = {"order": ("order", "ground"), "seed": ("seed",)}
         return frozenset(self.options) | {
             o for flag, names in shared.items() if getattr(self, flag) for o in names
         }
 
     def missing(self) -> str | None:
-        """None when the solver can run here, else what to install."""
+        """Return None if the solver can run here, else the reason and what to install."""
         if not self.requires:
             return None
         absent = [m for m in self.requires if not _importable(m)]
@@ -220,15 +284,19 @@ class SolverSpec:
 
     @cached_property
     def takes_all(self) -> bool:
-        """No problem is refused."""
+        """Whether the solver accepts every problem."""
         kinds = self.boxes == {"coulomb", "cone"} and self.round_cones and self.parts
         return kinds and self.laws == set(LAWS) and "matrix" in self.operators and self.refusal is None
 
     def refuses(self, problem: Problem, kind_alone: bool = False) -> str | None:
-        """None when the solver takes this problem, else the reason.
+        """Return None if the solver accepts this problem, else the reason why not.
 
-        kind_alone: Compare the problem's kind with the spec alone, for which nothing of the problem is worked out, and
-        do not call `refusal`.
+        Parameters
+        ----------
+        problem : Problem
+        kind_alone : bool
+            Compare only the kind of the problem with the spec: nothing is computed from its data, and `refusal` is not
+            called.
         """
         if self.takes_all:
             return None
@@ -243,7 +311,7 @@ class SolverSpec:
             )
         if law not in self.laws and not (law in self.boxes and problem.cones.is_polyhedral):
             takes = ", ".join(law for law in LAWS if law in self.laws)
-            way = _way_round(law, self.laws)
+            way = _alternative_for(law, self.laws)
             if law == "coulomb" and "cone" in self.boxes and problem.cones.is_polyhedral:
                 way = ": pass problem.relaxed('cone'), or use a solver for Coulomb friction"
             return f"takes laws {takes}, not {law!r}{self.bounded or way}"
@@ -274,19 +342,19 @@ class SolverSpec:
             return f"cannot say whether it takes the problem: {last_words(error)}"
 
     def standing_in(self, problem: Problem) -> SolverSpec | None:
-        """The same method with bounds, where a problem's bounds are what this one refuses; else None."""
+        """Return the variant of this method with bounds if the problem has bounds and this one refuses them; else None."""
         check_problem(problem)
         other = specs().get(self.with_bounds)
         bounds = other is not None and problem.law not in self.laws and other.refuses(problem) is None
         return other if bounds else None
 
     def load(self) -> Callable[..., Solver]:
-        """The factory, imported now if it was not before.
+        """Return the factory; import it if necessary.
 
         Raises
         ------
         SolverUnavailable
-            There is none where the spec says.
+            The module or attribute does not exist.
         """
         if not isinstance(self.factory, str):
             return self.factory
@@ -299,7 +367,8 @@ class SolverSpec:
             ) from error
 
 
-def _way_round(law: str, laws: frozenset[str]) -> str:
+def _alternative_for(law: str, laws: frozenset[str]) -> str:
+    """Return the part of an error message that says how to solve a problem of an unsupported law."""
     if law == "coulomb" and "cone" in laws:
         return ": pass problem.relaxed('cone'), or use a solver for Coulomb friction"
     if law in ("coulomb", "cone") and "lcp" in laws:
@@ -311,6 +380,7 @@ def _way_round(law: str, laws: frozenset[str]) -> str:
 
 @cache
 def _importable(module: str) -> bool:
+    """Return whether a module can be found, without importing it."""
     try:
         return importlib.util.find_spec(module) is not None
     except (ImportError, ValueError):
@@ -323,7 +393,9 @@ registered: dict[str, SolverSpec] = {}
 def load_table(table: str) -> None:
     """Fill `registered` with the SPECS of a module."""
     for spec in imported(table).SPECS:
-        registered.pop(spec.name, None)  # those that were asked for by name go to their places, too
+        registered.pop(
+            spec.name, None
+        )  # a solver that `get` registered by name moves to its place in the table
         _add_own(spec)
 
 
@@ -333,15 +405,15 @@ def _add_own(spec: SolverSpec) -> None:
 
 
 def load() -> None:
-    """Have `registered` filled, by one thread while the others wait."""
+    """Fill `registered` once; other threads wait meanwhile."""
     with loading():
         fill()
 
 
 @cache
 def fill() -> None:
-    """Fill `registered` once, with the built-in solvers and those of plug-ins."""
-    from importlib.metadata import entry_points  # a tenth of `import lavender`, needed only here
+    """Fill `registered` with the built-in solvers and the plug-ins."""
+    from importlib.metadata import entry_points  # takes a tenth of the time of `import lavender`
 
     for table in TABLES:
         load_table(table)
@@ -358,12 +430,12 @@ def fill() -> None:
 
 
 def register(spec: SolverSpec, *, replace: bool = False) -> None:
-    """Add a solver; `replace=True` to put it in the place of one of the same name.
+    """Add a solver; `replace=True` replaces a solver of the same name.
 
     Raises
     ------
     InputError
-        Not a SolverSpec, or the name is taken.
+        `spec` is not a SolverSpec, or the name is in use.
     """
     load()
     _add(spec, flag("replace", replace))
@@ -380,13 +452,13 @@ def _add(spec: SolverSpec, replace: bool) -> None:
 
 
 def specs() -> dict[str, SolverSpec]:
-    """Every registered solver by name, installed or not."""
+    """Return all registered solvers by name, installed or not."""
     load()
     return dict(registered)
 
 
 def get(name: str) -> SolverSpec:
-    """The solver of that name, ready to run.
+    """Return the spec of an installed solver.
 
     Raises
     ------
@@ -397,7 +469,7 @@ def get(name: str) -> SolverSpec:
     """
     spec = registered.get(name) if isinstance(name, str) else None
     if spec is None and isinstance(name, str):
-        spec = _found(name)
+        spec = _register_by_name(name)
     if spec is None:
         raise UnknownName("solver", name, specs())
     reason = spec.requires and spec.missing()
@@ -406,8 +478,11 @@ def get(name: str) -> SolverSpec:
     return spec
 
 
-def _found(name: str) -> SolverSpec | None:
-    """One that is not registered yet: of ours its file alone is imported, for which a time limit has room."""
+def _register_by_name(name: str) -> SolverSpec | None:
+    """Register and return a solver that is not registered yet, or None.
+
+    The file of a built-in solver is imported alone, which takes less time than the whole table.
+    """
     own: SolverSpec | None = imported(TABLES[0]).spec_of(name)
     if own is not None:
         _add_own(own)
@@ -417,7 +492,7 @@ def _found(name: str) -> SolverSpec | None:
 
 
 def known(problem: Problem | None = None) -> dict[str, str | None]:
-    """Each solver's name with None if it is installed (and accepts `problem`), otherwise with the reason why not."""
+    """Return {name: None if the solver is installed and accepts `problem`, else the reason}."""
     if problem is not None:
         check_problem(problem)
     return {
@@ -427,7 +502,7 @@ def known(problem: Problem | None = None) -> dict[str, str | None]:
 
 
 def available(problem: Problem | None = None, *, law: str | None = None, **capabilities: bool) -> list[str]:
-    """Names of the installed solvers that accept `problem`, accept the law, and have the capabilities.
+    """Return the names of installed solvers that accept `problem` and the law, and have the capabilities.
 
     >>> from lavender.solvers.registry import available
     >>> "pgs" in available(law="lcp", order=True)
@@ -436,7 +511,7 @@ def available(problem: Problem | None = None, *, law: str | None = None, **capab
     Raises
     ------
     InputError
-        A capability that no spec has.
+        A capability is not a field of `SolverSpec`.
     """
     flags = {n for n, f in SolverSpec.__dataclass_fields__.items() if f.type == "bool"}
     for name in capabilities:
@@ -457,6 +532,6 @@ def available(problem: Problem | None = None, *, law: str | None = None, **capab
 
 
 def in_one_call(problem: Problem) -> list[str]:
-    """Names of this project's solvers that take `problem` and do not go on iteration by iteration to a budget."""
+    """Return the names of built-in solvers that accept `problem` and are not resumable."""
     kind = (s for s in specs().values() if not (s.resumable or s.external))
     return [s.name for s in kind if not s.missing() and not s.refuses(problem)]
