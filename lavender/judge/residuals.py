@@ -1,7 +1,7 @@
-"""The judge: measures the error of an impulse, in physical units and row by row, independently of the solvers.
+"""The judge: measure the error of an impulse in physical units, row by row, independently of the solvers.
 
-With w = A lambda - b recomputed from the problem's data, d = diag(A) (`Problem.d`), e the error of a
-block (an inactive row: w / d, the step that is missing; formulas in `lavender_ext/core/block.pxd`):
+With w = A lambda - b recomputed from the problem's data, d = diag(A) (`Problem.d`), and e the error of a block, which is
+the step of one more projected update (w / d strictly inside the bounds; formulas in `lavender_ext/core/block.pxd`):
 
     energy    E = sqrt(sum d e^2)                    [sqrt J]
     velocity  V = max sqrt(nu d) |e|                 [m/s]
@@ -12,18 +12,18 @@ block (an inactive row: w / d, the step that is missing; formulas in `lavender_e
 
 Relative residual and floor are those of the worst island: each island (blocks connected through moving bodies, trees of
 M or entries of A) has its own E, V, E0 and V0, so bodies that never meet do not change each other's verdict. E shows
-errors of heavy bodies, V those of light ones. If the zero impulse solves an island, row by row to rounding, its
-reference is the size of the terms of the rows that act (`lavender_ext/judge/reference.pxd`).
+errors of heavy bodies, V errors of light bodies. If the zero impulse solves an island, row by row to rounding, the
+reference is the size of the terms of its active rows (`lavender_ext/judge/reference.pxd`).
 
-If the floor is 1e-3 or more, rounding hides a thousandth of the zero impulse's error: the floor is then the relative
-residual, unless that is larger. An impulse that ran away is not a solution.
+A floor of at least 1e-3 means that rounding hides a thousandth of the zero impulse's error. The relative residual is
+then at least the floor, so that a diverged impulse does not count as a solution.
 
 In generalised coordinates w = J x + theta lambda - b with M x = J^T lambda, and a solve by the factor of an
 ill-conditioned M loses digits of x that no term above counts. If n 2^-53 cond(M) exceeds a tenth of the tolerance, the
 pass is repeated with x refined by residuals in twice the precision of float64. The floor then also contains the change
 of w and a bound of the error that remains (`lavender_ext/judge/refine.pxd`).
 
-A solution computed in float32 has a floor of its own. Each number is rounded independently by at most u = 2^-24 of
+A solution computed in float32 has a different floor. Each number is rounded independently by at most u = 2^-24 of
 itself, so the squares of the errors add up. Entry by entry (A^2 is A o A), with x = M^-1 J^T lambda, w^2 grows by
 
     lambda rounded         u^2 A^2 lambda^2                                                                        (1)
@@ -58,35 +58,45 @@ from lavender.problem import PRECISIONS, Problem, check_problem
 from lavender.problem.derived import cached_property
 from lavender_ext.judge import measure
 
-FLOOR_MOST = 1e-5  # relative residual above which `at_floor` takes no floor of float64 for a reason
+FLOOR_MOST = 1e-5  # -, above this relative residual, rounding to float64 does not excuse a solver
 JUDGED_KEY = (
     "lavender.judge.residuals: judged"  # in `Derived.cache`: the residual of a result about to be returned
 )
-AT_REST = 1e-9  # m/s, V0 below which doing nothing counts as a solution
+AT_REST = 1e-9  # m/s, below this V0 a problem is reported as at rest: the zero impulse counts as its solution
 UNIT32 = 2.0**-24  # u of float32: half its spacing at 1
-# As `solvers/setup_times.py`, by the same command:
-RESULT, PASS = 1e-4, 1.5e-9  # s of one result, and for each multiply-add of the judge's pass
-WHITENED, READ = 4e-10, 5e-9  # s for each product that J L^-1 takes, and for each entry of it, or of a matrix
-OF_ROW = 32  # multiply-adds of that pass for each row on two bodies
+# Times of the judge, fitted by the command that `solvers/setup_times.py` names.
+RESULT, PASS = 1e-4, 1.5e-9  # s to build one result; s for each multiply-add of a pass
+WHITENED, READ = 4e-10, 5e-9  # s for each product of J L^-1; s for each entry of J L^-1 or of a matrix
+OF_ROW = 32  # multiply-adds of a pass for each row between two bodies
 
-# (relative, floor) of one island: the test of every solver and of the judge, its reason with it
+# at_floor(relative, floor) of one island; solvers and the judge share this test, its reason is in the kernel.
 at_floor = measure.at_floor
 
-TOL = 1e-6  # -, the tolerance of `residual`, which is the default of `solve`
-ENOUGH = 1e-6  # m/s, below which a robot's velocities are no further off than anybody measures
+TOL = 1e-6  # -, default tolerance of `residual` and `solve`
+ENOUGH = 1e-6  # m/s, default of `threshold`: smaller than any velocity error that a robot's sensors measure
 VERDICTS = AT_FLOOR, CLOSE, UNCONVERGED, WRONG = (
     "at its floor", "close enough", "stopped before convergence", "wrong",
 )  # fmt: skip
-VERDICTS_OF_OLD = {"stopped early": UNCONVERGED}  # words in files of earlier versions
+VERDICTS_OF_OLD = {"stopped early": UNCONVERGED}  # verdicts as files of earlier versions have them
 
 
 @dataclass(frozen=True)
 class Rounding:
-    """What float32 costs an answer, as relative residuals, one by one (module, 1 to 5)."""
+    """Contributions of float32 to the round-off floor, as relative residuals.
 
-    impulse: float  # -, (1): rounding the impulse
-    data: float  # -, (2, 3, 4): rounding what the problem is made of, or forming A and b of it
-    velocities: float  # -, (5): reading impulses off rounded velocities; 0 where a row that acts is rigid
+    Parameters
+    ----------
+    impulse : float, -
+        Rounding of the impulse, (1) of the module.
+    data : float, -
+        Rounding of the problem's data, or of A and b formed from it, (2, 3, 4).
+    velocities : float, -
+        Impulses computed from rounded velocities, (5); 0 if an active row is rigid.
+    """
+
+    impulse: float
+    data: float
+    velocities: float
 
     def __str__(self) -> str:
         more = f", velocities {self.velocities:.1e}" if self.velocities else ""
@@ -94,14 +104,30 @@ class Rounding:
 
 
 class Islands(NamedTuple):
-    """Errors of n islands, sets of blocks that share no moving body, tree of M or entry of A with other blocks."""
+    """Errors of n islands: sets of blocks that share no moving body, tree of M or entry of A with other blocks.
 
-    label: IntArray  # (k,) island of each block
-    relative: FloatArray  # (n,) -, larger of E / E0 and V / V0
-    energy: FloatArray  # (n,) sqrt J, E
-    velocity: FloatArray  # (n,) m/s, V
-    energy_start: FloatArray  # (n,) sqrt J, E0; -1 if no row acts: each row is then compared with its own b
-    velocity_start: FloatArray  # (n,) m/s, V0
+    Parameters
+    ----------
+    label : (k,)
+        Island of each block.
+    relative : (n,), -
+        Larger of E / E0 and V / V0.
+    energy : (n,), sqrt J
+        E.
+    velocity : (n,), m/s
+        V.
+    energy_start : (n,), sqrt J
+        E0; -1 if no row is active: each row is then compared with its own b.
+    velocity_start : (n,), m/s
+        V0.
+    """
+
+    label: IntArray
+    relative: FloatArray
+    energy: FloatArray
+    velocity: FloatArray
+    energy_start: FloatArray
+    velocity_start: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,31 +137,31 @@ class Residual:
     Parameters
     ----------
     relative : float, -
-        The larger of E / E0 and V / V0, of the island where it is largest.
+        Larger of E / E0 and V / V0, maximum over the islands.
     energy, energy_start : float, sqrt J
         E of the impulse and of the zero impulse, over all rows.
     velocity, velocity_start : float, m/s
-        V of the impulse, which is that of its worst row, and of the zero impulse, over all rows.
+        V of the impulse (the error of its worst row) and of the zero impulse, over all rows.
     floor : float, -
-        Relative residual that rounding to `precision` alone costs, in the island of `relative`.
+        Relative residual that rounding to `precision` alone can cause, in the island of `relative`.
     worst_row : int
         Row of the largest velocity error, -1 for an empty problem; `worst_name` is its name.
     above_floor : float, -
-        Largest relative residual of the islands whose residual rounding does not explain; 0 if there is none.
+        Largest relative residual of the islands whose residual rounding does not explain; 0 if there are none.
     worst_island : int
         Island of `relative` (see `islands`), -1 if all blocks are one island.
     floor_energy : float, sqrt J
-        E that rounding of float64 alone costs, over all rows.
-    error : (m,) N s
-        e of each row; `velocity_by_row` has it in m/s.
-    slack : (m,) m/s
+        E that rounding to float64 alone can cause, over all rows.
+    error : (m,), N s
+        e of each row; `velocity_by_row` has the same error in m/s.
+    slack : (m,), m/s
         w of each row.
     precision : {"float64", "float32"}
-        In which the answer was made.
+        Precision in which the impulse was computed.
     rounding : Rounding or None
-        In float32: the parts of the floor.
+        With float32: contributions to the floor.
     threshold : float, m/s
-        Largest velocity error of an answer that is close enough.
+        Largest velocity error of an answer whose verdict is "close enough".
     """
 
     relative: float
@@ -159,26 +185,27 @@ class Residual:
 
     @property
     def at_floor(self) -> bool:
-        """No further off than rounding explains, and better than doing nothing: in float64 by far, 1e5 times.
+        """Whether rounding explains the residual, and the impulse is better than the zero impulse (float64: 1e5 times).
 
-        In float64 twice the floor, which is a sum of absolute values (see `at_floor` of this module). In float32 four
-        times: there it is a root of squares that has each number at its worst, sqrt(3) standard deviations, and many
-        rows have a largest one; rounding the data alone can come near what doing nothing is off.
+        The limit is twice the floor in float64, where the floor is a sum of absolute values (see `at_floor` of this
+        module), and four times in float32: there the floor is a root of squares that takes each number at its worst,
+        sqrt(3) standard deviations, and the maximum over many rows is larger. In float32, rounding of the data alone
+        can be almost as large as the error of the zero impulse.
         """
         return _at_floor(self.relative, self.above_floor, self.precision)
 
     @property
     def rounds(self) -> bool:
-        """Rounding explains the residual, whatever it is beside doing nothing."""
+        """Whether rounding explains the residual, also if the impulse is no better than the zero impulse."""
         return _rounds(self.relative, self.floor, self.precision)
 
     @property
     def verdict(self) -> str:
-        """The judgement: "at its floor", "close enough", "stopped before convergence" (by `excess`) or "wrong".
+        """Verdict: "at its floor", "close enough", "stopped before convergence" (see `excess`) or "wrong".
 
-        At its floor: within `at_floor`. Close enough: above it, and no row is further off than `threshold`. Wrong: not
-        finite, or as far off as doing nothing. A residual cannot tell a smaller mistake from a stop before
-        convergence: another mu, say, leaves the same error.
+        At its floor: `at_floor` holds. Close enough: it does not, but no row's velocity error exceeds `threshold`.
+        Wrong: not finite, or an error as large as that of the zero impulse. A residual cannot distinguish a smaller
+        mistake from a stop before convergence: a different mu, for example, leaves the same error.
         """
         return verdict_of(
             self.relative, self.floor, self.above_floor, self.energy, self.velocity, self.energy_rhs,
@@ -187,25 +214,25 @@ class Residual:
 
     @property
     def verdict_in_words(self) -> str:
-        """The verdict; of an answer that stopped before convergence also the factor over its floor."""
+        """The verdict, with the factor over the floor if the solve stopped before convergence."""
         verdict = self.verdict
         return f"{verdict}, {self.excess:.2g} times its floor" if verdict == UNCONVERGED else verdict
 
     @property
     def excess(self) -> float:
-        """The relative residual over its floor [-]; 0 of an exact answer."""
+        """Relative residual divided by its floor [-]; 0 for an exact answer."""
         if self.relative == 0.0:
             return 0.0
         return self.relative / self.floor if self.floor > 0.0 else math.inf
 
     @property
     def nothing_to_do(self) -> bool:
-        """Doing nothing is right (see `nothing_to_do`): neither solved nor failed, read `energy` and `velocity`."""
+        """Whether the zero impulse is a solution (see `nothing_to_do`): read `energy` and `velocity` instead."""
         return nothing_to_do(self._problem)
 
     @property
     def energy_rhs(self) -> float:
-        """The energy norm of b [sqrt J]."""
+        """Energy norm of b [sqrt J]."""
         return float(measure.rhs_norms(self._problem.disk.metric)[0])
 
     @property
@@ -215,7 +242,7 @@ class Residual:
 
     @property
     def velocity_by_row(self) -> FloatArray:
-        """sqrt(nu d) |e| (m,) [m/s]; each tangent of a pair alone."""
+        """Velocity error sqrt(nu d) |e| of each row (m,) [m/s]; the tangents of a pair are separate."""
         p = self._problem
         return p.disk.metric.weight * np.abs(p.on_disk(self.error))
 
@@ -238,12 +265,12 @@ class Residual:
 
 
 def _rounds(relative: float, floor: float, precision: str) -> bool:
-    """`Residual.rounds`, of numbers."""
+    """Compute `Residual.rounds` from numbers."""
     return relative <= (2.0 if precision == "float64" else 4.0) * floor < math.inf
 
 
 def _at_floor(relative: float, above_floor: float, precision: str) -> bool:
-    """`Residual.at_floor`, of numbers."""
+    """Compute `Residual.at_floor` from numbers."""
     return above_floor == 0.0 and (precision == "float64" or relative < 1.0)
 
 
@@ -258,11 +285,14 @@ def verdict_of(
     precision: str,
     threshold: float,
 ) -> str:
-    """`Residual.verdict`, of numbers; nothing: doing nothing is right; energy_rhs [sqrt J] is the norm of b."""
+    """Compute `Residual.verdict` from numbers.
+
+    `nothing`: the zero impulse is a solution; `energy_rhs` [sqrt J] is the norm of b.
+    """
     if _at_floor(relative, above_floor, precision):
         return AT_FLOOR
     if nothing and _rounds(relative, floor, precision):
-        # Relative to nothing 1 means nothing: an impulse that ran away has more error than b.
+        # The reference is rounding noise, so compare with b: a diverged impulse has a larger error.
         return AT_FLOOR if energy <= energy_rhs else WRONG
     if velocity <= threshold:
         return CLOSE
@@ -270,12 +300,12 @@ def verdict_of(
 
 
 def relative_of(data: Any, energy: float, velocity: float) -> float:
-    """The relative residual of two errors [sqrt J, m/s]; inf where one is not finite, or has no reference."""
+    """Compute the relative residual of two errors [sqrt J, m/s]; inf if one is not finite or has no reference."""
     return measure.compare(energy, velocity, data.start_energy, data.start_velocity)
 
 
 def reference(problem: Problem) -> tuple[float, float]:
-    """E0 [sqrt J] and V0 [m/s] over all rows; computed once per problem, with those of each island."""
+    """Return E0 [sqrt J] and V0 [m/s] over all rows; the references of all islands are computed once per problem."""
     data = problem.metric
     if data.start_energy < 0.0:
         start = measure.begin(data)
@@ -287,10 +317,9 @@ def reference(problem: Problem) -> tuple[float, float]:
 
 
 def nothing_to_do(problem: Problem) -> bool:
-    """Whether the zero impulse solves every island (`lavender_ext/judge/reference.pxd`), or leaves less than 1e-9 m/s.
+    """Return whether the zero impulse solves every island (`lavender_ext/judge/reference.pxd`), or V0 < 1e-9 m/s.
 
-    Such a problem is neither solved nor failed by a solver: its relative residual compares rounding with rounding, so
-    read its errors in units.
+    The relative residual of such a problem compares rounding with rounding, so read its errors in units.
     """
     problem = problem.disk
     reference(problem)
@@ -299,7 +328,7 @@ def nothing_to_do(problem: Problem) -> bool:
 
 
 def judged(problem: Problem, impulse: FloatArray) -> measure.Judged:
-    """The judge's pass over an impulse (m,) [N s], which is kept as it is: it must not change any more."""
+    """Judge an impulse (m,) [N s]. The result refers to the array, which must not change afterwards."""
     data = problem.metric
     if data.start_energy < 0.0:
         reference(problem)
@@ -320,30 +349,31 @@ def best_of_islands(
 
 
 def judging_time(problem: Problem) -> float:
-    """What a pass of the judge takes [s] and the result made of it, counted of what he reads, set up or not."""
+    """Estimate the time [s] of one pass of the judge and of building its result, from the size of its data."""
     return RESULT + PASS * (float(problem.metric.work) if _is_set_up(problem) else _read(problem)[0])
 
 
 def setup_time(problem: Problem) -> float:
-    """What the judge sets up before his first pass takes [s], as counted: A in rows, J L^-1, or numbers of bodies."""
+    """Estimate the time [s] to set up the judge's first pass: A by rows, J L^-1, or the arrays of bodies."""
     return 0.0 if _is_set_up(problem) else _read(problem)[1]
 
 
 def reading_time(problem: Problem) -> float:
-    """What he sets up and one pass take [s], counted, without a result made of it."""
+    """Estimate the time [s] to set up and run one pass without building a result."""
     return setup_time(problem) + judging_time(problem) - RESULT
 
 
 def _is_set_up(problem: Problem) -> bool:
+    """Return whether the data that the judge reads are set up."""
     view = problem.derived.view
     return "metric" in problem.__dict__ or (view is not None and view.ready)
 
 
 def _read(problem: Problem) -> tuple[float, float]:
-    """Multiply-adds of a pass at most, and what setting it up takes [s]."""
+    """Return the maximum multiply-adds of a pass and the time to set it up [s]."""
     general = problem.generalized
     if general is not None:
-        # A row of Y has at most the entries of J's with all that L reaches from them, by the mean of L's rows.
+        # A row of J L^-1 has at most as many entries as the row of J, times the mean length of the rows of L.
         reached = (len(general.operator.mass[1]) + general.operator.fill) / max(general.nv, 1)
         entries = min(len(general.operator.jac[1]) * reached, float(general.m) * general.nv)
         return 2.0 * entries, (READ + WHITENED * reached) * entries
@@ -353,12 +383,12 @@ def _read(problem: Problem) -> tuple[float, float]:
 
 
 def remember(problem: Problem, last: measure.Judged) -> None:
-    """Leave a result for the next `residual` of this problem, which takes it for the same impulse, bit for bit."""
+    """Store a result for the next call of `residual` with the same impulse, bit for bit."""
     problem.derived.cache[JUDGED_KEY] = last
 
 
 def remembered(problem: Problem, impulse: FloatArray) -> measure.Judged | None:
-    """What `remember` was given, if that is of `impulse`, bit for bit, and judged by the problem itself."""
+    """Return the stored result if it belongs to `impulse`, bit for bit, and to this problem; else None."""
     last: measure.Judged | None = problem.derived.cache.get(JUDGED_KEY)
     if last is None or last.data is not problem.metric or not measure.same_bits(last.impulse, impulse):
         return None
@@ -366,7 +396,7 @@ def remembered(problem: Problem, impulse: FloatArray) -> measure.Judged | None:
 
 
 def known(problem: Problem, impulse: FloatArray) -> float | None:
-    """Relative residual of doing nothing, or of what is `remembered`, where `impulse` is that, bit for bit."""
+    """Return the relative residual if `impulse` is the stored or the zero impulse, bit for bit; else None."""
     last = remembered(problem, impulse)
     if last is not None:
         return float(last.relative)
@@ -377,7 +407,7 @@ def known(problem: Problem, impulse: FloatArray) -> float | None:
 def quick(
     problem: Problem, impulse: FloatArray, w: FloatArray, e: FloatArray, floor: bool = False
 ) -> tuple[float, float]:
-    """Return (relative, above_floor) as `Residual` has them, with w, e as scratch (m,): a solver's stopping test.
+    """Compute (relative, above_floor) of `Residual` for a solver's stopping test, with w, e as scratch (m,).
 
     Without `floor` both are the relative residual.
     """
@@ -393,26 +423,30 @@ def residual(
     threshold: float = ENOUGH,
     tol: float = TOL,
 ) -> Residual:
-    """Measure the error of an impulse (m,) [N s]: the judge that every solve uses, for any impulse.
+    """Measure the error of any impulse (m,) [N s] with the judge that every solve uses.
 
     Parameters
     ----------
     problem : Problem
-    impulse : (m,) N s
+    impulse : (m,), N s
         Entries that are not finite are allowed and give an infinite relative residual.
     precision : {"float64", "float32"}, optional
-        Precision in which the impulse was computed. It decides the floor, and with it the verdict. Default:
+        Precision in which the impulse was computed. It determines the floor and therefore the verdict. Default:
         `problem.precision`. The error itself is always measured in float64.
     threshold : float, default 1e-6, m/s
-        Velocity error that is close enough for the verdict; rad/s on rows of rotations in generalised coordinates.
+        Velocity error up to which the verdict is "close enough"; rad/s on angular rows in generalised coordinates.
     tol : float, default 1e-6
-        Size of a relative residual that must not be wrong. It matters only for J and an ill-conditioned M, whose factor
+        Relative residual that must be computed correctly. It matters only for J and an ill-conditioned M, whose factor
         loses digits: if n 2^-53 cond(M) is above tol / 10, M^-1 J^T impulse is refined in twice that precision.
+
+    Returns
+    -------
+    Residual
 
     Raises
     ------
     InputError
-        `impulse` has the wrong length or is not numeric, `precision` is another word, `threshold` or `tol` is negative.
+        `impulse` has the wrong length or is not numeric, `precision` is unknown, `threshold` or `tol` is negative.
 
     Examples
     --------
@@ -448,7 +482,7 @@ def residual(
 
 
 def unstretched(problem: Problem, found: Residual) -> Residual:
-    """The residual of a problem with ellipses, from that of its disks."""
+    """Convert the residual of `problem.disk` to one of `problem`, which has ellipses."""
     s = problem.cones.stretch
     with np.errstate(over="ignore"):
         error, slack = read_only(s * found.error), read_only(found.slack / s)
@@ -456,7 +490,7 @@ def unstretched(problem: Problem, found: Residual) -> Residual:
 
 
 def _in_float32(problem: Problem, found: Residual, impulse: FloatArray) -> Residual:
-    """The same error beside the floor of float32."""
+    """Replace the floor of a residual by the floor of float32."""
     with np.errstate(over="ignore", invalid="ignore"):  # an impulse that is not finite has no floor
         own, data, velocities = rounded(problem, impulse)
         relative = [found.relative] if found.worst_island < 0 else found.islands.relative.tolist()
@@ -471,7 +505,7 @@ def _in_float32(problem: Problem, found: Residual, impulse: FloatArray) -> Resid
 
 
 def rounded(problem: Problem, impulse: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """What float32 makes of w (m,), three squares [m2/s2]: by (1), by (2, 3 or 4), by (5) of the module."""
+    """Return the squared changes of w (m,) [m2/s2] that float32 causes by (1), by (2, 3 or 4), by (5) of the module."""
     general = problem.generalized
     if general is not None:
         free = general.v_free if general.order is None else general.v_free[general.order]
@@ -497,12 +531,12 @@ def rounded(problem: Problem, impulse: FloatArray) -> tuple[FloatArray, FloatArr
 
 
 def _squared(a: Any) -> Any:
-    """Every entry of a sparse matrix squared."""
+    """Square every entry of a sparse matrix."""
     return a.multiply(a).tocsr()
 
 
 def told(problem: Problem, last: measure.Judged) -> Residual:
-    """What the judge found, with its names and units."""
+    """Build a `Residual` from a raw judge pass."""
     made: Residual = object.__new__(Residual)
     state = {
         "relative": last.relative,
@@ -523,5 +557,7 @@ def told(problem: Problem, last: measure.Judged) -> Residual:
         "rounding": None,
         "_float64_relative": last.float64_relative,
     }
-    object.__setattr__(made, "__dict__", state)  # a quarter of the time of a frozen dataclass's __init__
+    object.__setattr__(
+        made, "__dict__", state
+    )  # takes a quarter of the time of the __init__ of a frozen dataclass
     return made

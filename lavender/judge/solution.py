@@ -21,24 +21,24 @@ if TYPE_CHECKING:
 
 
 class Status(str, Enum):
-    """The solver's claim about how a solve ended; the value is its meaning in words."""
+    """The solver's claim about how a solve ended; the value describes it."""
 
-    CONVERGED = "its own test at tol was met"
-    FLOOR = "above tol, within twice what rounding to float64 allows"
+    CONVERGED = "the solver's own test at tol was met"
+    FLOOR = "above tol, but within twice the error of rounding to float64"
     MAX_ITERATIONS = "the iteration budget was used up"
     TIME_LIMIT = "the time limit was reached"
-    STALLED = "no progress any more"
+    STALLED = "no further progress"
     DIVERGED = "the iterate grew, or is not finite"
     INFEASIBLE = "no solution exists; `certificate` proves it, unless `claim_check` says otherwise"
     NUMERICAL_ERROR = "a factorisation or the backend failed"
     INTERRUPTED = "stopped by Ctrl-C or by the callback"
-    REFUSED = "of one world of many: its data are no problem's"
+    REFUSED = "the data of one world of a batch are not a valid problem"
 
     def __str__(self) -> str:
         return self.name
 
 
-# Looked up once: a member reached through its class costs 600 instructions, a dozen times a solve.
+# Module names of the members: access through the class costs 600 instructions, a dozen times per solve.
 CONVERGED = Status.CONVERGED
 DIVERGED = Status.DIVERGED
 FLOOR = Status.FLOOR
@@ -55,44 +55,85 @@ CLAIM_CHECKS = CONFIRMED, NOT_PROVEN, CONTRADICTED = "confirmed", "not proven", 
 
 @dataclass(frozen=True)
 class Turn:
-    """What one solver did in one turn of `auto`."""
+    """One stage of `auto`: the solver that ran, its work and the residual before and after.
+
+    Parameters
+    ----------
+    solver : str
+    work : mapping of str to int
+        Counts of sweeps, factorisations, pivots, ...
+    before, after : float, -
+        Smallest relative residual so far; NaN if it was not computed.
+    """
 
     solver: str
-    work: Mapping[str, int]  # sweeps, factorisations, pivots, ...
-    before: float  # - least relative residual so far, nan if it was not computed
+    work: Mapping[str, int]
+    before: float
     after: float
 
 
 @dataclass(frozen=True, eq=False)
 class Claim:
-    """What one call of a solver's `run` says of itself."""
+    """Result of one call of a solver's `run`, as the solver reports it.
 
-    status: Status  # MAX_ITERATIONS: exactly the n iterations asked for
-    iterations: int  # done in this call
-    work: Mapping[str, int] = field(default_factory=dict)  # of this call: sweeps, factorisations, ...
+    Parameters
+    ----------
+    status : Status
+        MAX_ITERATIONS means that exactly the requested iterations were done.
+    iterations : int
+        Iterations of this call.
+    work : mapping of str to int
+        Counts of sweeps, factorisations, ... of this call.
+    message : str
+    form : str
+        Formulation that ran, if the solver has several.
+    dual : object
+        A backend's multipliers as it returned them.
+    certificate : (m,) array, optional
+        With INFEASIBLE: proof that no solution exists. With STALLED: a direction that bounds the impulse of every
+        solution.
+    turns : tuple of Turn
+        Stages of a solver that calls others.
+    """
+
+    status: Status
+    iterations: int
+    work: Mapping[str, int] = field(default_factory=dict)
     message: str = ""
-    form: str = ""  # which formulation ran, where there is a choice
-    dual: Any = None  # the backend's own multipliers, as it returned them
-    certificate: FloatArray | None = None  # (m,), with INFEASIBLE; with STALLED a direction that is none
-    turns: tuple[Turn, ...] = ()  # of a solver that hands over to others
+    form: str = ""
+    dual: Any = None
+    certificate: FloatArray | None = None
+    turns: tuple[Turn, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
 class History:
-    """Recorded at fixed iteration counts, never at times; arrays of one length."""
+    """Residuals at fixed iteration counts (`lavender.solve(..., history=True)`), in arrays of one length k.
 
-    iterations: np.ndarray  # int64
-    time: FloatArray  # s, solver time alone
-    relative: FloatArray  # -
-    energy: FloatArray  # sqrt J
-    velocity: FloatArray  # m/s
+    Parameters
+    ----------
+    iterations : (k,) int64
+    time : (k,), s
+        Time of the solver alone, without the judge.
+    relative : (k,), -
+    energy : (k,), sqrt J
+    velocity : (k,), m/s
+        Relative residual, energy error and largest velocity error, as in `Residual`.
+    """
+
+    iterations: np.ndarray
+    time: FloatArray
+    relative: FloatArray
+    energy: FloatArray
+    velocity: FloatArray
 
     def plot(self, against: str = "iterations") -> Any:
-        """The relative residual on the way, as a figure of matplotlib.
+        """Plot the relative residual and return the matplotlib figure.
 
         Parameters
         ----------
         against : {"iterations", "time"}
+            Horizontal axis.
         """
         one_of("against", against, ("iterations", "time"))
         from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -112,51 +153,68 @@ class History:
 
 @dataclass(frozen=True)
 class SolverRun:
-    """Which solver ran, how."""
+    """Name, options, formulation and sweep order of the solver that ran.
+
+    Parameters
+    ----------
+    name : str
+    options : mapping of str to object
+    form : str
+        Formulation that was solved, if the solver has several.
+    order : str
+        Name of the order in which a sweep visits the blocks; empty if the solver has no order.
+    """
 
     name: str
     options: Mapping[str, Any]
     form: str = ""
-    order: str = ""  # in which a sweep visits the blocks, by name; empty if the solver takes no order
+    order: str = ""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Solution:
-    """Result of `solve`, for every status; it always holds the last iterate. `str()` is a summary on one line.
+    """Result of `solve` for every status. `str()` is a summary in one line.
 
     Parameters
     ----------
-    impulse : (m,) N s
-        The answer, in the order of the problem's rows.
+    impulse : (m,), N s
+        The answer, in the order of the problem's rows. It is the best iterate of each island; with tol=0 the last
+        iterate.
     residual : Residual
-        Its error, measured by the judge: `relative` [-], `energy` [sqrt J], `velocity` [m/s], the worst row.
+        Error of the answer, measured by the judge: `relative` [-], `energy` [sqrt J], `velocity` [m/s], worst row.
     status : Status
         The solver's claim. `success` and `claim_check` are the judge's findings.
     tol : float, -
-        The relative residual that was asked for.
+        Requested relative residual.
     iterations : int
-        In the solver's own unit.
-    work : mapping
+        Iterations in the solver's own unit.
+    work : mapping of str to int
         Counts of sweeps, products, factorisations, pivots, ... that were done.
     setup_time, solve_time : float, s
+        Time to prepare (factor, colour, allocate) and to iterate.
     solver : SolverRun
-        Name, options, the form of the problem that was solved, and the sweep order of a solver that takes one.
+        Name, options, formulation and sweep order.
     message : str
+        Explanation of the status.
     history : History or None
-        With `history=True`.
+        With `history=True`: arrays `iterations`, `time` [s], `relative` [-], `energy` [sqrt J] and `velocity` [m/s].
     dual : object
-        A backend's own multipliers.
-    certificate : (m,), or None
-        With INFEASIBLE: the proof that there is no solution, if the claim is confirmed.
+        A backend's multipliers as it returned them.
+    certificate : (m,) or None
+        With INFEASIBLE: the proof that no solution exists, if the claim is confirmed.
     impulse_bound : float or None, N s
-        With a certificate: the least sum of |impulse| of every solution of the problem as it was given; inf where it
-        has none. Also of STALLED, where a solver met a direction that shows such a bound.
+        With a certificate: lower bound of sum |impulse| over all solutions of the given problem; inf if there are
+        none. Also with STALLED, if the solver found a direction that shows such a bound.
     claim_check : {"confirmed", "not proven", "contradicted"}
         Result of comparing `status` with the judge's residual and certificate. "confirmed": they agree, or the status
         claims nothing that can be checked. "not proven": the status is INFEASIBLE, and no certificate proves it.
         "contradicted": the judge's figures exclude what the status claims.
     status_conflict : str
         Reason if the claim is contradicted, else empty.
+    sweeps_per_decade : float
+        Sweeps in which the residual fell tenfold at the last checks; NaN if it did not fall or was not checked.
+    turns : tuple of Turn
+        Stages of `auto` in the order in which they ran; empty for other solvers.
 
     Examples
     --------
@@ -169,29 +227,28 @@ class Solution:
     (True, 'CONVERGED', True)
     """
 
-    impulse: FloatArray  # (m,) N s
+    impulse: FloatArray
     residual: Residual
-    status: Status  # the solver's claim
-    tol: float  # - relative residual asked for
+    status: Status
+    tol: float
     iterations: int
-    work: Mapping[str, int]  # sweeps, matvecs, factorisations, pivots, ...: what ran
-    setup_time: float  # s, preparing (factor, colour, allocate)
-    solve_time: float  # s, iterating
+    work: Mapping[str, int]
+    setup_time: float
+    solve_time: float
     solver: SolverRun
     message: str
     history: History | None
     dual: Any
-    certificate: FloatArray | None  # (m,), with INFEASIBLE
-    impulse_bound: float | None  # N s, with a certificate: the least sum |impulse| of every solution
-    claim_check: str  # CONFIRMED, NOT_PROVEN or CONTRADICTED
-    status_conflict: str  # why the judge's figures exclude what `status` claims; empty if they do not
-    # of the last checks, in which the residual falls tenfold; NaN where it did not fall, or no sweeps were checked
+    certificate: FloatArray | None
+    impulse_bound: float | None
+    claim_check: str
+    status_conflict: str
     sweeps_per_decade: float
-    turns: tuple[Turn, ...]  # of `auto`: who ran, in order, and what came of it; () of other solvers
+    turns: tuple[Turn, ...]
 
     @classmethod
     def of(cls, values: dict[str, Any]) -> Solution:
-        """The solution of all its fields by name, kept as they are."""
+        """Build a solution from all its fields by name, without copying or checking them."""
         made: Solution = object.__new__(cls)
         made.__dict__.update(values)
         return made
@@ -206,7 +263,7 @@ class Solution:
         rest: tuple[Callable[..., dict[str, Any]], tuple[Any, ...]],
         setup_time: float = 0.0,
     ) -> Solution:
-        """Fields that are known; `rest`, a function and its arguments, are the others for the first who asks."""
+        """Build a solution whose other fields `rest` (a function and its arguments) computes at their first access."""
         made: Solution = object.__new__(cls)
         kept = made.__dict__
         kept["impulse"], kept["status"], kept["tol"] = impulse, status, tol
@@ -214,19 +271,19 @@ class Solution:
         return made
 
     def __getattr__(self, name: str) -> Any:
-        # Only what is not there comes here: the first of the fields that `late` left for later, or no field at all.
+        # Called only for missing names: a field that `late` postponed, or an unknown attribute.
         kept = self.__dict__
         rest = kept.get("_rest")
         if rest is not None:
             function, arguments = rest
-            kept.update(function(*arguments))  # two threads write the same
+            kept.update(function(*arguments))  # two threads write equal values
             kept.pop("_rest", None)
         if name in kept:
             return kept[name]
         raise AttributeError(f"{type(self).__name__!r} has no attribute {name!r}")
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # A read-only view of a dict has no pickle.
+        # A read-only view of a dict cannot be pickled.
         values = {f.name: getattr(self, f.name) for f in fields(self)}
         return _restored, (values | {"work": dict(self.work)},)
 
@@ -237,7 +294,7 @@ class Solution:
 
     @property
     def states(self) -> States:
-        """What each block does (open, sticks, slides, at a bound or free), and which states are not certain."""
+        """State of each block (open, sticks, slides, at a bound or free), and which states are uncertain."""
         kept = self.__dict__
         if "_states" not in kept:
             from lavender.judge.states import states_of
@@ -247,55 +304,55 @@ class Solution:
         return found
 
     def state(self, i: int) -> State:
-        """What block i does (see `states`).
+        """Return the state of block i (see `states`).
 
         Raises
         ------
         IndexError
-            No such block.
+            The problem has no block i.
         """
         found: State = self.states[i]
         return found
 
     @property
     def is_contradicted(self) -> bool:
-        """The judge's figures exclude what `status` claims."""
-        # Fields that `late` left for later belong to claims that were checked: they are not made for this.
+        """Whether the judge's figures exclude what `status` claims."""
+        # Fields that `late` postponed belong to claims that were checked: they need not be computed here.
         return self.__dict__.get("claim_check") == CONTRADICTED
 
     @property
     def success(self) -> bool:
-        """The judge's relative residual is at most `tol`."""
+        """Whether the judge's relative residual is at most `tol`."""
         return self.residual.relative <= self.tol
 
     def unstretched(self, problem: Problem) -> Solution:
-        """The same of a problem with ellipses, from that of its disks."""
+        """Convert the solution of `problem.disk` to one of `problem`, which has ellipses."""
         s = problem.cones.stretch
         impulse, proof = read_only(s * self.impulse), self.certificate
-        # Of the numbers that are handed out: s (lambda / s) rounds.
+        # The residual of the returned numbers, since s (lambda / s) rounds.
         found = residual(problem, impulse, "float64", tol=self.tol)
         return replace(
             self, impulse=impulse, residual=found, certificate=None if proof is None else read_only(s * proof)
         )
 
     def motion_error(self, reference: Any = None) -> Any:
-        """How wrong the motion is, in units, with a bound: see `lavender.motion_error`."""
+        """Return the error of the motion in units, with a bound: see `lavender.motion_error`."""
         return above("lavender.lab.motion").motion_error(self.residual._problem, self.impulse, reference)
 
     def raise_for_status(self) -> Solution:
-        """Return self when the judge accepts the result (within tol, or at the floor of float64).
+        """Return self if the judge accepts the result (within tol, or at the round-off floor of float64).
 
         Raises
         ------
         SolveFailed
-            Otherwise, with the one-line summary.
+            The judge does not accept the result; the message is the one-line summary.
         """
         if self.success or self.residual.at_floor:
             return self
         raise SolveFailed(str(self))
 
     def _repr_html_(self) -> str:
-        """For notebooks: what came of it, as a small table."""
+        """Return a small HTML table of the result for notebooks."""
         facts = {
             "status": self.status.name,
             "relative residual": f"{self.residual.relative:.2e} (asked for {self.tol:.0e})",
@@ -313,11 +370,13 @@ class Solution:
 
     @property
     def _done(self) -> str:
+        """Work that was done, in words."""
         done = ", ".join(counted(n, k) for k, n in (self.work or {"iterations": self.iterations}).items())
         return f"{done}, order {self.solver.order}" if self.solver.order else done
 
     @property
     def _took(self) -> str:
+        """Time that the solve took, in words."""
         t = self.setup_time + self.solve_time
         return f"{1e3 * t:.3g} ms" if t < 0.9995 else f"{t:.3g} s"
 
@@ -335,14 +394,14 @@ def order_name(order: Any) -> str:
     return order if isinstance(order, str) else "permutation"
 
 
-def counted(n: int, what: str) -> str:
-    """1 sweep, 2 sweeps: a count of `work` with its name in words."""
-    what = what.replace("_", " ")
-    return f"{n} {what.removesuffix('s') if n == 1 else what}"
+def counted(n: int, kind: str) -> str:
+    """Format a count of `work` with its name: 1 sweep, 2 sweeps."""
+    kind = kind.replace("_", " ")
+    return f"{n} {kind.removesuffix('s') if n == 1 else kind}"
 
 
 def summed(works: Iterable[Mapping[str, int]]) -> dict[str, int]:
-    """The work of several claims or turns, kind by kind."""
+    """Add the work of several claims or stages, kind by kind."""
     out: dict[str, int] = {}
     for work in works:
         for kind, count in work.items():
@@ -351,11 +410,12 @@ def summed(works: Iterable[Mapping[str, int]]) -> dict[str, int]:
 
 
 def uninterrupted(solution: Solution) -> Solution:
-    """The solution, for callers that go on with it or to the next: KeyboardInterrupt where Ctrl-C ended its solve."""
+    """Return the solution to a caller that continues; raise KeyboardInterrupt if Ctrl-C ended its solve."""
     if solution.status is Status.INTERRUPTED:
         raise KeyboardInterrupt
     return solution
 
 
 def _restored(values: dict[str, Any]) -> Solution:
+    """Rebuild a pickled solution."""
     return Solution.of(values | {"work": MappingProxyType(values["work"])})

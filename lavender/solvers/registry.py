@@ -342,7 +342,7 @@ class SolverSpec:
             return f"cannot say whether it takes the problem: {last_words(error)}"
 
     def standing_in(self, problem: Problem) -> SolverSpec | None:
-        """Return the variant of this method with bounds if the problem has bounds and this one refuses them; else None."""
+        """Return the variant of this method with bounds if this one refuses the problem only for its bounds."""
         check_problem(problem)
         other = specs().get(self.with_bounds)
         bounds = other is not None and problem.law not in self.laws and other.refuses(problem) is None
