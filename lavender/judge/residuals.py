@@ -1,7 +1,7 @@
 """The judge: measure the error of an impulse in physical units, row by row, independently of the solvers.
 
-With w = A lambda - b recomputed from the problem's data, d = diag(A) (`Problem.d`), and e the error of a block: the step
-of one more projected update (w / d strictly inside the bounds; formulas in `lavender_ext/core/block.pxd`):
+With w = A lambda - b recomputed from the problem's data, d = diag(A) (`Problem.d`), and e the error of a block: the
+step of one more projected update (w / d strictly inside the bounds; formulas in `lavender_ext/core/block.pxd`):
 
     energy    E = sqrt(sum d e^2)                    [sqrt J]
     velocity  V = max sqrt(nu d) |e|                 [m/s]

@@ -1,7 +1,7 @@
-"""What each block of a problem does at an answer: open, sticks, slides, at a bound or free, and how certain that is.
+"""State of each block at an answer (open, sticks, slides, at a bound or free), and whether this state is certain.
 
-The cases are those of the judge's map (`lavender_ext/derivative/natural.pxd`): y = lambda - w / d decides. The distance
-between the answer and an exact solution is bounded by `lavender.judge.error_bound`.
+y = lambda - w / d determines the case of a row, as in the judge's map (`lavender_ext/derivative/natural.pxd`). The
+distance between the answer and an exact solution is bounded by `lavender.judge.error_bound`.
 """
 
 from __future__ import annotations
@@ -19,19 +19,38 @@ from lavender.problem import Problem
 from lavender.problem.derived import cached_property
 from lavender_ext.derivative.linear import CASES, Linear, Linears
 
-NAMES = ("open", "closed", "sticks", "slides", "free", "at a bound", "at a bound")  # by the kernels' numbers
+NAMES = (
+    "open",
+    "closed",
+    "sticks",
+    "slides",
+    "free",
+    "at a bound",
+    "at a bound",
+)  # indexed by the case numbers of the kernels
 assert tuple(CASES.values()) == tuple(range(len(NAMES)))
 
 
 @dataclass(frozen=True)
 class State:
-    """What one block does; `str()` is a short sentence."""
+    """State of one block; `str()` is a short sentence.
 
-    name: str  # open, closed (no friction), sticks, slides (some component does), free, at a bound (some row is)
-    rows: tuple[str, ...]  # of each row; that of a contact's normal is open or closed
-    margin: float  # N s (N m s on angular rows), distance to the nearest other state; inf without one
-    # N s: an exact solution exists at which this block's impulse (by the norm of its rows) and its margin differ from
-    # those of the answer by at most this; inf if no bound is known.
+    Parameters
+    ----------
+    name : {"open", "closed", "sticks", "slides", "free", "at a bound"}
+        "closed" is a contact without friction; "slides" and "at a bound" mean that at least one component or row is.
+    rows : tuple of str
+        State of each row; the normal of a contact is open or closed.
+    margin : float, N s (N m s on angular rows)
+        Distance to the nearest other state; inf if there is none.
+    tolerance : float, N s
+        Error bound: an exact solution exists at which the block's impulse (by the norm of its rows) and margin differ
+        from the answer's by at most this; inf if no bound is known.
+    """
+
+    name: str
+    rows: tuple[str, ...]
+    margin: float
     tolerance: float
 
     @property
@@ -41,7 +60,7 @@ class State:
 
     @property
     def is_known(self) -> bool:
-        """Whether there is a bound of the error: `tolerance` is finite."""
+        """Whether the error has a bound: `tolerance` is finite."""
         return self.tolerance < np.inf
 
     def __str__(self) -> str:
@@ -54,21 +73,21 @@ class State:
 
 
 class States(Sequence[State]):
-    """States of all k blocks of an answer, and the same in arrays.
+    """States of all k blocks of an answer: a sequence of `State`, and arrays.
 
     Parameters
     ----------
     problem : Problem
-    impulse : (m,) N s
+    impulse : (m,), N s
     linear : Linear
-        `linear_of` these two.
+        Result of `linear_of(problem, impulse)`.
 
     Attributes
     ----------
     case : (m,) int8
-        Case of each row by the kernels' numbers.
-    margin : (k,) N s
-        As of `State`.
+        Case number of each row (`lavender_ext.derivative.linear.CASES`).
+    margin : (k,), N s
+        `State.margin` of each block.
     """
 
     def __init__(self, problem: Problem, impulse: FloatArray, linear: Linear) -> None:
@@ -77,7 +96,7 @@ class States(Sequence[State]):
         first = problem.cones.ptr[:-1]
         if len(first):
             self.margin: FloatArray = np.minimum.reduceat(linear.margin, first)
-            # A contact slides where some component does, a joint is at a bound where some row is.
+            # A contact slides if any component slides; a joint is at a bound if any row is.
             self._code = np.maximum.reduceat(self.case, first)
         else:
             self.margin, self._code = np.zeros(0), np.zeros(0, np.int8)
@@ -87,7 +106,7 @@ class States(Sequence[State]):
 
     @cached_property
     def tolerance(self) -> FloatArray:
-        """(k,) N s: as of `State`, by `lavender.judge.error_bound` when it is first read."""
+        """`State.tolerance` of each block (k,) [N s], computed at first access."""
         first = self._problem.cones.ptr[:-1]
         if not len(first):
             return np.zeros(0)
@@ -98,22 +117,22 @@ class States(Sequence[State]):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """(k,) the name of each block's state."""
+        """Name of the state of each block (k,)."""
         return tuple(NAMES[code] for code in self._code)
 
     @property
     def boundary(self) -> tuple[int, ...]:
-        """Blocks whose state is not certain: `State.at_boundary`. Those without a bound are among them."""
+        """Blocks whose state is not certain (`State.at_boundary`), including blocks without an error bound."""
         return tuple(int(i) for i in np.flatnonzero((self.margin <= self.tolerance) & (self.margin < np.inf)))
 
     @property
     def unknown(self) -> tuple[int, ...]:
-        """Blocks whose error has no known bound: they share a load, or the answer is far from a solution."""
+        """Blocks without an error bound: several of them share a load, or the answer is far from a solution."""
         return tuple(int(i) for i in np.flatnonzero(self.tolerance == np.inf))
 
     @property
     def boundary_fraction(self) -> float | None:
-        """Share of blocks at a boundary among those whose error has a bound; None if none has one, 0 without blocks."""
+        """Fraction of the blocks with an error bound that are at a boundary; None if no block has one, 0 without blocks."""
         known = self.tolerance < np.inf
         if not known.any():
             return None if len(known) else 0.0
@@ -138,7 +157,7 @@ class States(Sequence[State]):
 
 
 def linear_of(problem: Problem, impulse: FloatArray, most: int = 0) -> Linear:
-    """An impulse (m,) [N s], judged and linearised; of ellipses as their disks. With a factor as `Linears` has one."""
+    """Judge and linearise an impulse (m,) [N s]; ellipses are treated as disks. `most` is as in `Linears`."""
     data = problem.disk.metric
     if data.start_energy < 0.0:
         reference(problem.disk)
@@ -146,5 +165,5 @@ def linear_of(problem: Problem, impulse: FloatArray, most: int = 0) -> Linear:
 
 
 def states_of(problem: Problem, impulse: FloatArray, linear: Linear | None = None) -> States:
-    """Return the states at an impulse (m,) [N s]; `linear`: `linear_of` that, if it is known."""
+    """Return the states at an impulse (m,) [N s]; `linear` is `linear_of(problem, impulse)` if it is known."""
     return States(problem, impulse, linear_of(problem, impulse) if linear is None else linear)
