@@ -132,7 +132,7 @@ class States(Sequence[State]):
 
     @property
     def boundary_fraction(self) -> float | None:
-        """Fraction of the blocks with an error bound that are at a boundary; None if no block has one, 0 without blocks."""
+        """Fraction of the blocks with an error bound that are at a boundary; None without bounds, 0 without blocks."""
         known = self.tolerance < np.inf
         if not known.any():
             return None if len(known) else 0.0
