@@ -12,9 +12,9 @@ from lavender.base.arrays import FloatArray, flag
 from lavender.base.deadline import Deadline
 from lavender.base.errors import CapabilityError, InputError
 from lavender.base.later import load
-from lavender.external import apart
 from lavender.external.as_qp import QP, impulse_form, pick_form, velocity_form
 from lavender.external.backend import Backend
+from lavender.external.isolated import ENTRY_SIZE, TRANSFER_RATE, IsolatedBackend, start_process
 from lavender.external.running import ask
 from lavender.judge.residuals import quick
 from lavender.judge.solution import Claim, Status, summed
@@ -24,7 +24,7 @@ from lavender.solvers.registry import Solver
 DENSE_LIMIT = 2**30  # bytes of one dense matrix; beyond, a dense backend is refused
 START, PROGRAM = 1e-3, 1.2e-7  # s, of a program, and for each entry of A: half as much again as measured
 OPTIONS = {
-    "isolate": "where a time_limit is given, the backend runs in a process of its own, which is ended; default True",
+    "isolate": "if a time_limit is given, the backend runs in another process, which is killed at the limit; default True",
     "form": "'impulse', 'velocity' (needs rows) or 'auto' (default): by size, mass ratio and backend",
     "unit_diagonal": "impulse form: scale A to a unit diagonal, default True",
     "settings": "mapping passed to the backend, over those that tol gives",
@@ -49,8 +49,8 @@ class QPSolver(Solver):
         flag("isolate", self.isolate)
 
     def setup_time(self, problem: Problem) -> float:
-        """What forming the program takes [s], and handing it over where it runs elsewhere, as counted."""
-        entry = PROGRAM + (apart.ENTRY / apart.HAND_OVER if self.isolate else 0.0)
+        """Estimate the time [s] to form the program, and to send it if the backend runs in another process."""
+        entry = PROGRAM + (ENTRY_SIZE / TRANSFER_RATE if self.isolate else 0.0)
         return START + entry * problem.most_entries
 
     @np.errstate(all="ignore")  # what overflows is judged
@@ -95,26 +95,26 @@ class QPSolver(Solver):
         if not qp.fits:
             words = "as a quadratic program the problem has numbers that overflow; the backend was not called"
             return Claim(Status.NUMERICAL_ERROR, 0, none, words, qp.form)
-        elsewhere = apart.Elsewhere(b) if self.isolate and time_limit is not None else None
+        isolated = IsolatedBackend(b) if self.isolate and time_limit is not None else None
         deadline, start = Deadline(time_limit), impulse.copy()
-        claim = ask(qp, impulse, elsewhere or b.run, max_iter, tol, time_limit, self.settings, b.noisy)
+        claim = ask(qp, impulse, isolated or b.run, max_iter, tol, time_limit, self.settings, b.noisy)
         if len(qp.assumed) and not deadline.passed() and _assumption_fails(qp, impulse, claim):
             before, impulse[:] = claim, start
             left = max(1, max_iter - before.iterations)
             qp = self._form(qp.problem, False)
-            call = elsewhere or b.run
+            call = isolated or b.run
             claim = ask(qp, impulse, call, left, tol, deadline.left(), self.settings, b.noisy)
             work = summed((before.work, claim.work))
             claim = replace(claim, work=work, iterations=before.iterations + claim.iterations)
         if time_limit is None or b.stoppable:
             return claim
-        where = "to its end" if elsewhere is None else elsewhere.where
-        return replace(claim, message=f"{claim.message}; takes no time limit and ran {where}")
+        place = "to its end" if isolated is None else isolated.place
+        return replace(claim, message=f"{claim.message}; takes no time limit and ran {place}")
 
     def ready(self, qp: QP, time_limit: float) -> None:
-        """A time limit was given, and its clock has not begun: have the backend imported, in that process or here."""
+        """Import the backend's code, in the process that runs it, before the clock of a time limit starts."""
         if self.isolate:
-            apart.ready(self.backend.name)
+            start_process(self.backend)
         else:
             load(*self.backend.modules)
 
