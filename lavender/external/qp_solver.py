@@ -24,7 +24,7 @@ from lavender.solvers.registry import Solver
 DENSE_LIMIT = 2**30  # bytes of one dense matrix; beyond, a dense backend is refused
 START, PROGRAM = 1e-3, 1.2e-7  # s, of a program, and for each entry of A: half as much again as measured
 OPTIONS = {
-    "isolate": "if a time_limit is given, the backend runs in another process, which is killed at the limit; default True",
+    "isolate": "given a time_limit, run the backend in another process, which is killed at the limit; default True",
     "form": "'impulse', 'velocity' (needs rows) or 'auto' (default): by size, mass ratio and backend",
     "unit_diagonal": "impulse form: scale A to a unit diagonal, default True",
     "settings": "mapping passed to the backend, over those that tol gives",
