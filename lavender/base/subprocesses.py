@@ -21,17 +21,22 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from concurrent import futures
 from typing import IO, Any
 
 import numpy as np
 
-START_TIMEOUT = 60.0  # s. A loaded machine may need this long to import a function with everything that it uses.
+START_TIMEOUT = (
+    60.0  # s. A loaded machine may need this long to import a function with everything that it uses.
+)
 KILL_TIMEOUT = 10.0  # s. The system may need longer to end a killed process that waits for a broken disk.
-PIPE_TIMEOUT = 0.1  # s. A pipe that is still open so long after the process was killed is left to its other holder.
+PIPE_TIMEOUT = (
+    0.1  # s. A pipe that is still open so long after the process was killed is left to its other holder.
+)
 MAX_TEXT_SIZE = 2**20  # bytes. An answer that announces more JSON than this is invalid.
 MAX_ERROR_LENGTH = 500  # characters. Longer texts of errors are cut.
-PROCESS_GROUPS = os.name == "posix"  # If set, a process is killed together with the processes that it started.
+PROCESS_GROUPS = (
+    os.name == "posix"
+)  # If set, a process is killed together with the processes that it started.
 SCRIPT = (  # Not `-m`: it puts the current folder first, and in a checkout the sources hide the installed package.
     "import sys; sys.path[:] = filter(None, sys.path); from lavender.base.subprocesses import serve; "
     "serve(*map(int, sys.argv[1:]))"
@@ -157,7 +162,7 @@ class ProcessBackend:
         request = pickle.dumps(arguments, pickle.HIGHEST_PROTOCOL)
         process = self.popen
         assert process is not None
-        answer: futures.Future[tuple[bytes, bytes]] = futures.Future()
+        received: list[tuple[bytes, bytes] | BaseException] = []
 
         # If a process that left the group holds a pipe, this thread waits alone.
         def exchange() -> None:
@@ -169,20 +174,23 @@ class ProcessBackend:
                 text_size, array_size = struct.unpack("<QQ", _read(process.stdout, 16))
                 if text_size > MAX_TEXT_SIZE or array_size > max_bytes:
                     raise InvalidAnswer(f"answers of {text_size} and {array_size} bytes are too large")
-                answer.set_result((_read(process.stdout, text_size), _read(process.stdout, array_size)))
+                received.append((_read(process.stdout, text_size), _read(process.stdout, array_size)))
             except BaseException as error:
                 _close_streams(process)
-                answer.set_exception(error)
+                received.append(error)
 
         self._exchange_thread = threading.Thread(target=exchange, daemon=True)
         self._exchange_thread.start()
         try:
-            return unpack_answer(*answer.result(min(timeout, threading.TIMEOUT_MAX)))
-        except futures.TimeoutError:
-            self.close()
-            raise TimeoutError from None
-        except (OSError, EOFError):
-            raise ProcessEnded(self._end()) from None
+            self._exchange_thread.join(min(timeout, threading.TIMEOUT_MAX))
+            if not received:
+                raise TimeoutError
+            answer = received[0]
+            if isinstance(answer, OSError | EOFError):
+                raise ProcessEnded(self._end())
+            if isinstance(answer, BaseException):
+                raise answer
+            return unpack_answer(*answer)
         except RemoteError:
             raise
         except BaseException:
@@ -296,7 +304,9 @@ def serve(lifeline: int, memory: int) -> None:
                 text, numbers = _pack_answer({}, ())
             else:
                 text, numbers = _pack_answer(*function(*arguments))
-        except BaseException as error:  # Third-party code raises anything; a panic of Rust is not an Exception.
+        except (
+            BaseException
+        ) as error:  # Third-party code raises anything; a panic of Rust is not an Exception.
             failure = {"error": str(error)[:MAX_ERROR_LENGTH], "kind": type(error).__name__}
             text, numbers = json.dumps(failure).encode(), b""
         answers.write(struct.pack("<QQ", len(text), len(numbers)) + text + numbers)
@@ -345,7 +355,9 @@ def _end_with_parent(lifeline: int) -> None:
 
 def limit_cpu_time(extra: float) -> None:
     """Have the system kill this process after `extra` more CPU time [s], in case the parent no longer can."""
-    with contextlib.suppress(ImportError, ValueError, OSError, OverflowError):  # OverflowError: inf is no limit.
+    with contextlib.suppress(
+        ImportError, ValueError, OSError, OverflowError
+    ):  # OverflowError: inf is no limit.
         import resource
 
         hard = resource.getrlimit(resource.RLIMIT_CPU)[1]

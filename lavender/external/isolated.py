@@ -24,13 +24,23 @@ from lavender.external.running import Answer, Failed, Limits, quiet
 from lavender.judge.solution import Status
 from lavender.problem import Problem
 
-ARRAYS = ("x", "zeta", "xi", "direction", "contradiction")  # fields of `Answer`, in the order in which they are sent
+ARRAYS = (
+    "x",
+    "zeta",
+    "xi",
+    "direction",
+    "contradiction",
+)  # fields of `Answer`, in the order in which they are sent
 MAX_MESSAGE_LENGTH = 500  # characters. Longer messages of backends are cut.
 STOPPABLE_LIMIT_RATIO = 2.0  # A backend that accepts a time limit is killed after this multiple of its limit.
 ENTRY_SIZE = 12.0  # bytes that one matrix entry of a program needs in a request
-TRANSFER_RATE = 3e8  # bytes/s. Pickling, sending and unpickling are at least this fast; larger programs time out.
+TRANSFER_RATE = (
+    3e8  # bytes/s. Pickling, sending and unpickling are at least this fast; larger programs time out.
+)
 
-_idle: list[ProcessBackend] = []  # running processes that have no call; a thread that takes one is its only user
+idle_processes: list[
+    ProcessBackend
+] = []  # running processes that have no call; a thread that takes one is its only user
 
 
 def start_process(backend: Backend) -> None:
@@ -40,7 +50,7 @@ def start_process(backend: Backend) -> None:
         process.start()
         with suppress(TimeoutError, InvalidAnswer, RemoteError):  # The call itself reports them.
             process.call(backend, timeout=subprocesses.START_TIMEOUT, max_bytes=0)
-        _idle.append(process)
+        idle_processes.append(process)
 
 
 class IsolatedBackend:
@@ -91,7 +101,7 @@ def call_backend(
     except TimeoutError:
         return Answer(Status.TIME_LIMIT, "ended at the time limit")
     except (pickle.PicklingError, TypeError, AttributeError) as error:
-        _idle.append(process)
+        idle_processes.append(process)
         raise InputError(
             f"settings cannot be sent to another process ({error}); isolate=False runs the backend in this one"
         ) from None
@@ -100,11 +110,11 @@ def call_backend(
     except InvalidAnswer as error:
         raise Failed(f"the process of the backend sent what is no answer ({error})") from None
     except RemoteError as error:
-        _idle.append(process)
+        idle_processes.append(process)
         raise (
             InputError(str(error)) if error.kind == "InputError" else Failed(f"{error.kind}: {error}")
         ) from None
-    _idle.append(process)
+    idle_processes.append(process)
     try:  # The backend may have written anything.
         work = {str(kind): int(count) for kind, count in fields["work"].items()}
         by_name = dict(zip(ARRAYS, arrays, strict=True))
@@ -117,7 +127,7 @@ def _take() -> ProcessBackend | None:
     """Return a process that runs and has no call; None if there is none."""
     while True:
         try:
-            process = _idle.pop()
+            process = idle_processes.pop()
         except IndexError:
             return None
         if process.alive:
@@ -127,12 +137,12 @@ def _take() -> ProcessBackend | None:
 
 @atexit.register
 def _close_idle() -> None:
-    while _idle:
-        _idle.pop().close()
+    while idle_processes:
+        idle_processes.pop().close()
 
 
 if hasattr(os, "register_at_fork"):  # Windows has none. A forked process must not use its parent's processes.
-    os.register_at_fork(after_in_child=_idle.clear)
+    os.register_at_fork(after_in_child=idle_processes.clear)
 
 
 # -- in the other process -----------------------------------------------------------------------------

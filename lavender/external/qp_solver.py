@@ -11,7 +11,7 @@ import numpy as np
 from lavender.base.arrays import FloatArray, flag
 from lavender.base.deadline import Deadline
 from lavender.base.errors import CapabilityError, InputError
-from lavender.base.later import load
+from lavender.base.lazy_import import import_numerics
 from lavender.external.as_qp import QP, impulse_form, pick_form, velocity_form
 from lavender.external.backend import Backend
 from lavender.external.isolated import ENTRY_SIZE, TRANSFER_RATE, IsolatedBackend, start_process
@@ -116,7 +116,7 @@ class QPSolver(Solver):
         if self.isolate:
             start_process(self.backend)
         else:
-            load(*self.backend.modules)
+            import_numerics(*self.backend.modules)
 
 
 def _assumption_fails(qp: QP, impulse: FloatArray, claim: Claim) -> bool:

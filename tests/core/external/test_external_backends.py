@@ -368,18 +368,18 @@ def test_a_backend_that_does_not_end_is_ended_and_the_next_call_finds_another():
 
 @pytest.mark.skipif(not APART, reason="no backend without a time limit is installed")
 def test_the_process_is_kept_and_its_death_costs_one_call_at_most():
-    from lavender.external.isolated import _idle
+    from lavender.external.isolated import idle_processes
 
     problem = lv.Problem.lcp(*spd(5))
     lv.solve(problem, APART[0], time_limit=600.0)
-    before = list(_idle)
+    before = list(idle_processes)
     assert len(before) == 1
     lv.solve(problem, APART[0], time_limit=600.0)
-    assert _idle == before
+    assert idle_processes == before
     before[0].popen.kill()
     before[0].popen.wait()
     assert lv.solve(problem, APART[0], time_limit=600.0).success
-    assert _idle != before
+    assert idle_processes != before
 
 
 @pytest.mark.skipif(not APART, reason="no backend without a time limit is installed")

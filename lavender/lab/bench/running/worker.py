@@ -14,7 +14,7 @@ from typing import Any
 from lavender.base import subprocesses
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import LavenderError
-from lavender.base.later import load
+from lavender.base.lazy_import import import_numerics
 from lavender.base.subprocesses import ProcessBackend, ProcessEnded, RemoteError
 from lavender.judge.solution import Solution, Status
 from lavender.lab.bench.cases import fingerprint
@@ -26,7 +26,9 @@ from lavender.solvers import registry
 from lavender.solving.solve import Prepared, seconds_of, solve
 
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
-ORPHAN_CPU_TIME = 60.0  # s. A worker whose parent cannot kill it is killed this CPU time after its task's limit.
+ORPHAN_CPU_TIME = (
+    60.0  # s. A worker whose parent cannot kill it is killed this CPU time after its task's limit.
+)
 OUTCOME_ARRAYS = ("impulse", "certificate")  # fields of `Outcome`, in the order in which they are sent
 DIED_MESSAGE = "its code ended the process that it ran in; tell its authors, and leave it out (--solvers)"
 GRACE = 2.0  # s. A worker has this time for set-up and judging, beyond the limits of the repeats, before it is killed.
@@ -91,9 +93,7 @@ class Worker:
         new_problem = None if self._problem_hash == task.sha else problem
         self._problem_hash = ""
         try:
-            answer, arrays = process.call(
-                new_problem, task, impulse, timeout=limit, max_bytes=16 * problem.m
-            )
+            answer, arrays = process.call(new_problem, task, impulse, timeout=limit, max_bytes=16 * problem.m)
             elapsed = time.monotonic() - start_time
             self._problem_hash = task.sha
             return parse_outcome(answer, arrays, problem.m, elapsed, task.lead)
@@ -138,7 +138,7 @@ def solve_isolated(
     """
     spec = registry.get(name)
     if not spec.plugged or max_iter == 0:  # In a task, 0 means the solver's own max_iter.
-        load(*spec.requires)  # otherwise a part of the time of a first solve
+        import_numerics(*spec.requires)  # otherwise a part of the time of a first solve
         return solve(problem, name, tol=tol, max_iter=max_iter, time_limit=time_limit, **options)
     Prepared(problem, spec, options, begin=False)  # raises if the solver rejects the problem or an option
     task = Task(
@@ -170,7 +170,9 @@ def run_task(problem: Problem | None, task: Task, impulse: Any) -> subprocesses.
         return {"error": outcome[: subprocesses.MAX_ERROR_LENGTH]}, ()
     message, form = (str(x)[: subprocesses.MAX_ERROR_LENGTH] for x in (outcome.message, outcome.form))
     outcome = replace(outcome, message=message, form=form)
-    answer = {f.name: plain(getattr(outcome, f.name)) for f in fields(outcome) if f.name not in OUTCOME_ARRAYS}
+    answer = {
+        f.name: plain(getattr(outcome, f.name)) for f in fields(outcome) if f.name not in OUTCOME_ARRAYS
+    }
     return answer, [getattr(outcome, name) for name in OUTCOME_ARRAYS]
 
 
