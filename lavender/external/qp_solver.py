@@ -1,4 +1,4 @@
-"""A QP backend as a solver: its problem in the form that suits it, and one run of it."""
+"""Run a QP backend as a solver: write the problem as a program in the form that suits the backend, and run it."""
 
 from __future__ import annotations
 
@@ -21,8 +21,9 @@ from lavender.judge.solution import Claim, Status, summed
 from lavender.problem import Problem
 from lavender.solvers.registry import Solver
 
-DENSE_LIMIT = 2**30  # bytes of one dense matrix; beyond, a dense backend is refused
-START, PROGRAM = 1e-3, 1.2e-7  # s, of a program, and for each entry of A: half as much again as measured
+MAX_DENSE_SIZE = 2**30  # bytes. A backend for dense matrices rejects a problem with a larger matrix.
+FORM_TIME = 1e-3  # s. Forming any program takes up to this, 1.5 times the measured time.
+FORM_TIME_PER_ENTRY = 1.2e-7  # s. Additional time for each entry of A, 1.5 times the measured time.
 OPTIONS = {
     "isolate": "given a time_limit, run the backend in another process, which is killed at the limit; default True",
     "form": "'impulse', 'velocity' (needs rows) or 'auto' (default): by size, mass ratio and backend",
@@ -33,7 +34,7 @@ OPTIONS = {
 
 @dataclass(frozen=True)
 class QPSolver(Solver):
-    """A backend with its options, which OPTIONS says in words."""
+    """A backend with its options; `OPTIONS` describes them."""
 
     backend: Backend
     form: str = "auto"
@@ -50,10 +51,10 @@ class QPSolver(Solver):
 
     def setup_time(self, problem: Problem) -> float:
         """Estimate the time [s] to form the program, and to send it if the backend runs in another process."""
-        entry = PROGRAM + (ENTRY_SIZE / TRANSFER_RATE if self.isolate else 0.0)
-        return START + entry * problem.most_entries
+        entry = FORM_TIME_PER_ENTRY + (ENTRY_SIZE / TRANSFER_RATE if self.isolate else 0.0)
+        return FORM_TIME + entry * problem.most_entries
 
-    @np.errstate(all="ignore")  # what overflows is judged
+    @np.errstate(all="ignore")  # The judge finds overflows.
     def prepare(self, problem: Problem) -> QP:
         return self._form(problem, True)
 
@@ -75,14 +76,14 @@ class QPSolver(Solver):
                 f"solver {b.name!r} takes no problem without inequalities, and qpsolvers would hand it to LSQR; "
                 "use direct or another backend"
             )
-        if b.dense and 8 * qp.n * max(qp.n, len(qp.b)) > DENSE_LIMIT:
+        if b.dense and 8 * qp.n * max(qp.n, len(qp.b)) > MAX_DENSE_SIZE:
             raise CapabilityError(
                 f"solver {b.name!r} takes dense matrices only: {max(qp.n, len(qp.b))} x {qp.n} would need more "
-                f"than {DENSE_LIMIT >> 20} MiB; use a sparse backend (osqp, piqp, clarabel)"
+                f"than {MAX_DENSE_SIZE >> 20} MiB; use a sparse backend (osqp, piqp, clarabel)"
             )
         return qp
 
-    @np.errstate(all="ignore")  # what overflows is judged
+    @np.errstate(all="ignore")  # The judge finds overflows.
     def run(
         self, state: QP, impulse: FloatArray, max_iter: int, tol: float, time_limit: float | None = None
     ) -> Claim:
@@ -120,7 +121,7 @@ class QPSolver(Solver):
 
 
 def _assumption_fails(qp: QP, impulse: FloatArray, claim: Claim) -> bool:
-    """Whether a row that was assumed to stay at its bound does not, or may be what makes the others contradict."""
+    """Return whether a row assumed to stay at its bound leaves it, or may cause a proof of infeasibility."""
     if claim.status is Status.INFEASIBLE:
         return True
     w, error = np.empty(len(impulse)), np.empty(len(impulse))
@@ -129,7 +130,7 @@ def _assumption_fails(qp: QP, impulse: FloatArray, claim: Claim) -> bool:
 
 
 def refusal(problem: Problem) -> str | None:
-    """Why no QP backend can take this problem, before any conversion; a factorisation sees the rest."""
+    """Return why no QP backend accepts this problem, before any conversion; a factorisation finds other causes."""
     if not problem.is_symmetric:
         return (
             f"needs a symmetric A; here A - A^T is {problem.asymmetry:.1e} of A "

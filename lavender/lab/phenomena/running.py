@@ -1,4 +1,4 @@
-"""Phenomenon by engine by case: engines of others in a process of their own, whose end is a note."""
+"""Measure phenomena in engines. Third-party engines run in another process, whose end is a note in the record."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from lavender.sim.scene import Scene
 
 #: Name -> phenomenon, in the order of the table.
 PHENOMENA: dict[str, Phenomenon] = {p.name: p for p in (*FRICTION, *JOINTS, *STACKS)}
-LIMIT = 120.0  # s of wall time for one case
+LIMIT = 120.0  # s. A third-party engine that takes longer for one case is killed.
 MAX_TRACK_SIZE = 2**30  # bytes. A process that sends a larger track is killed.
 
 
@@ -74,12 +74,12 @@ def simulate(name: str, scene: Scene, seconds: float, interval: float) -> subpro
 
 
 def chosen(names: Sequence[str] = ()) -> list[Phenomenon]:
-    """Phenomena by name, all without one.
+    """Return phenomena by name, all of them if no name is given.
 
     Raises
     ------
     UnknownName
-        No such phenomenon.
+        There is no such phenomenon.
     """
     names = several("names", names, "phenomena")
     for name in names:
@@ -88,12 +88,12 @@ def chosen(names: Sequence[str] = ()) -> list[Phenomenon]:
 
 
 def ways(steppers: Sequence[str] | None = None, engines: Sequence[str] | None = None) -> list[Way]:
-    """Ways by name of stepper or engine, or of one setting of them; of both all without a list.
+    """Return ways by the names of steppers and engines, or of one setting of them; None selects all.
 
     Raises
     ------
     UnknownName
-        No such stepper or engine.
+        There is no such stepper or engine.
     """
     found: list[Way] = []
     for what, given, own in (("stepper", steppers, True), ("engine", engines, False)):
@@ -121,18 +121,18 @@ def run(
     Parameters
     ----------
     names : sequence of str
-        Of `PHENOMENA`; all without one.
+        Keys of `PHENOMENA`; all of them if empty.
     steppers, engines : sequence of str, optional
-        Of `WAYS`; None: all. An engine that is missing, crashes, cannot build the scene or does not answer is a note
-        in its record.
+        Names in `WAYS`; None: all. If an engine is missing, crashes, cannot build the scene or does not answer, its
+        record has a note.
     parameters : mapping, optional
-        One case in the place of each phenomenon's own.
+        One case that replaces the cases of each phenomenon.
     limit : float
-        Wall time of one case in an engine of others [s].
+        Wall time [s] of one case in a third-party engine.
     show : callable
-        Called with every record as it comes.
+        Called with every record when it is complete.
     keep : callable
-        Called with a record and the finite motion that it was measured of.
+        Called with a record and the finite motion from which it was measured.
 
     Returns
     -------
@@ -141,7 +141,7 @@ def run(
     Raises
     ------
     UnknownName
-        No such phenomenon, stepper, engine or parameter.
+        There is no such phenomenon, stepper, engine or parameter.
     InputError
         A parameter or limit outside its range, or neither stepper nor engine; nothing has run.
     """
@@ -193,5 +193,5 @@ def _one(way: Way, phenomenon: Phenomenon, case: dict[str, float], process: Engi
         if way.module != "own":
             return process.track(way, scene, seconds, phenomenon.interval)
         return follow(make(way, scene), seconds, phenomenon.interval)
-    except (InputError, CapabilityError) as error:  # a stepper that does not take the scene
+    except (InputError, CapabilityError) as error:  # The stepper does not support the scene.
         return str(error)

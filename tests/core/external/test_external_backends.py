@@ -551,7 +551,7 @@ def test_tol_zero_runs_at_the_tightest_tolerance():
 
 
 def test_dense_backends_refuse_what_would_not_fit(monkeypatch):
-    monkeypatch.setattr(qp_solver, "DENSE_LIMIT", 8 * 10 * 10)
+    monkeypatch.setattr(qp_solver, "MAX_DENSE_SIZE", 8 * 10 * 10)
     problem = lv.Problem.lcp(*spd(11))
     with pytest.raises(lv.CapabilityError, match="dense matrices only"):
         lv.solve(problem, "daqp")

@@ -159,7 +159,10 @@ def test_a_backend_that_forks_and_hangs_keeps_nobody_waiting(hostile, watchdog, 
     monkeypatch.setattr(bench_worker, "GRACE", 0.5)
     p = stack()
     with Worker() as worker:
+        worker.measure(p, task(p, "pgs"))  # starts the process
+        start_time = time.monotonic()
         assert worker.measure(p, task(p, f"x_{how}", time_limit=1.5))[0].status == "KILLED"
+        assert time.monotonic() - start_time <= 1.1 * (3.0 * 1.5 + bench_worker.GRACE)
         pids = list(map(int, hostile.read_text().split()))
         assert how == "escape" or (len(pids) == 2 and wait_until(lambda: not any(map(runs, pids))))
         assert worker.measure(p, task(p, "pgs"))[0].status == "CONVERGED"  # and another worker goes on
@@ -178,11 +181,13 @@ Worker().measure(p, task(p, "x_fork", time_limit=600.0))
 """
 
 
-def test_what_says_nothing_is_told_by_its_kind(hostile, watchdog):
+def test_an_exception_is_named_by_its_type_and_text(hostile, watchdog):
     p = stack()
     with Worker() as worker:
         record, _ = worker.measure(p, task(p, "x_quit"))
-    assert (record.status, record.message) == ("ERROR", "KeyboardInterrupt")
+        assert (record.status, record.message) == ("ERROR", "KeyboardInterrupt")
+        record, _ = worker.measure(p, task(p, "direct", options={"nonsense": 1}))
+    assert record.status == "ERROR" and record.message.startswith("UnknownName: unknown option 'nonsense'")
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""Engines that npm installs, under Node: `served.mjs` steps them, each with a file of its own beside it."""
+"""Run engines that npm installs: the Node program `served.mjs` steps them, each by its own file in this folder."""
 
 from __future__ import annotations
 
@@ -52,14 +52,14 @@ class JsonLines:
 
 
 class Engine(Stepping):
-    """Steps in the other process; a state comes back with each answer."""
+    """An engine under Node, which returns its state with each answer."""
 
     def __init__(self, scene: Scene, engine: str, dt: float = 1.0 / 60.0, **options: float) -> None:
-        parents(scene, engine)  # what trees do not have is refused
+        parents(scene, engine)  # raises if the scene is not a tree
         self.dt, self.spent = dt, 0.0
         self.setting = f"{1e3 * dt:.3g} ms, {', '.join(f'{k} {v}' for k, v in options.items())}"
         p = scene.parameters
-        told = {
+        request = {
             "gravity": list(p.gravity),
             "friction": p.friction,
             "bodies": [_body(body, engine) for body in scene.bodies],
@@ -71,11 +71,11 @@ class Engine(Stepping):
                 for j in scene.joints
             ],
         }  # fmt: skip
-        place = node_folder(PACKAGES_OF_NODE[engine])
-        if place is None:
+        folder = node_folder(PACKAGES_OF_NODE[engine])
+        if folder is None:
             raise LavenderError(f"{engine}: {missing_in_node(PACKAGES_OF_NODE[engine])}")
-        self.program = JsonLines(["node", str(SCRIPT), engine, str(place)])
-        self._call({"scene": told, "options": {"dt": self.dt, **options}})
+        self.program = JsonLines(["node", str(SCRIPT), engine, str(folder)])
+        self._call({"scene": request, "options": {"dt": self.dt, **options}})
         self.spent = 0.0
 
     def _call(self, message: Any) -> None:
@@ -97,7 +97,7 @@ class Engine(Stepping):
         self._call({"steps": steps})
 
     def clock(self) -> float:
-        """See `Stepping.clock`: of the other process."""
+        """See `Stepping.clock`: the time of the other process."""
         return self.spent
 
     def state(self) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -112,19 +112,19 @@ class Engine(Stepping):
 def _body(body: Body, engine: str) -> dict[str, Any]:
     shape = collision_shape(body, engine, static=False)
     if isinstance(shape, Plane):
-        told: dict[str, Any] = {"kind": "plane", "normal": list(shape.normal), "offset": shape.offset}
+        shape_data: dict[str, Any] = {"kind": "plane", "normal": list(shape.normal), "offset": shape.offset}
     elif isinstance(shape, Sphere):
-        told = {"kind": "sphere", "radius": shape.radius}
+        shape_data = {"kind": "sphere", "radius": shape.radius}
     else:
-        told = {"kind": "box", "size": list(shape.size)}
+        shape_data = {"kind": "box", "size": list(shape.size)}
     position, quaternion = body.position.tolist(), body.quaternion.tolist()
     return {
-        "shape": told,
+        "shape": shape_data,
         "mass": body.mass,
         "inertia": np.diag(body.inertia).tolist(),
         "position": position,
         "quaternion": quaternion,
         "velocity": body.velocity.tolist(),
         "spin": body.angular_velocity.tolist(),
-        "still": [*position, *quaternion, *[0.0] * 6],  # of what does not move
+        "still": [*position, *quaternion, *[0.0] * 6],  # the state of a body that does not move
     }
