@@ -26,18 +26,16 @@ from typing import IO, Any
 import numpy as np
 
 START_TIMEOUT = (
-    60.0  # s. A loaded machine may need this long to import a function with everything that it uses.
+    60.0  # s. A loaded machine may need this long to import a function and the modules that it uses.
 )
 KILL_TIMEOUT = 10.0  # s. The system may need longer to end a killed process that waits for a broken disk.
-PIPE_TIMEOUT = (
-    0.1  # s. A pipe that is still open so long after the process was killed is left to its other holder.
-)
+PIPE_TIMEOUT = 0.1  # s. A pipe that stays open for longer after the kill is held by another process.
 MAX_TEXT_SIZE = 2**20  # bytes. An answer that announces more JSON than this is invalid.
 MAX_ERROR_LENGTH = 500  # characters. Longer texts of errors are cut.
-PROCESS_GROUPS = (
-    os.name == "posix"
-)  # If set, a process is killed together with the processes that it started.
-SCRIPT = (  # Not `-m`: it puts the current folder first, and in a checkout the sources hide the installed package.
+#: If set, a process is killed together with the processes that it started.
+PROCESS_GROUPS = os.name == "posix"
+#: Not `-m`: it puts the current folder first, and in a checkout the sources hide the installed package.
+SCRIPT = (
     "import sys; sys.path[:] = filter(None, sys.path); from lavender.base.subprocesses import serve; "
     "serve(*map(int, sys.argv[1:]))"
 )

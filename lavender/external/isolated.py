@@ -24,23 +24,15 @@ from lavender.external.running import Answer, Failed, Limits, quiet
 from lavender.judge.solution import Status
 from lavender.problem import Problem
 
-ARRAYS = (
-    "x",
-    "zeta",
-    "xi",
-    "direction",
-    "contradiction",
-)  # fields of `Answer`, in the order in which they are sent
+#: Fields of `running.Answer`, in the order in which they are sent.
+ARRAYS = ("x", "zeta", "xi", "direction", "contradiction")
 MAX_MESSAGE_LENGTH = 500  # characters. Longer messages of backends are cut.
 STOPPABLE_LIMIT_RATIO = 2.0  # A backend that accepts a time limit is killed after this multiple of its limit.
 ENTRY_SIZE = 12.0  # bytes that one matrix entry of a program needs in a request
-TRANSFER_RATE = (
-    3e8  # bytes/s. Pickling, sending and unpickling are at least this fast; larger programs time out.
-)
+TRANSFER_RATE = 3e8  # bytes/s. Programs that would take longer to send than the limit time out.
 
-idle_processes: list[
-    ProcessBackend
-] = []  # running processes that have no call; a thread that takes one is its only user
+#: Running processes that have no call. A thread that takes one is its only user.
+idle_processes: list[ProcessBackend] = []
 
 
 def start_process(backend: Backend) -> None:

@@ -26,9 +26,7 @@ from lavender.solvers import registry
 from lavender.solving.solve import Prepared, seconds_of, solve
 
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
-ORPHAN_CPU_TIME = (
-    60.0  # s. A worker whose parent cannot kill it is killed this CPU time after its task's limit.
-)
+ORPHAN_CPU_TIME = 60.0  # s. A worker without a parent is killed this CPU time after its task's limit.
 OUTCOME_ARRAYS = ("impulse", "certificate")  # fields of `Outcome`, in the order in which they are sent
 DIED_MESSAGE = "its code ended the process that it ran in; tell its authors, and leave it out (--solvers)"
 GRACE = 2.0  # s. A worker has this time for set-up and judging, beyond the limits of the repeats, before it is killed.
@@ -86,7 +84,7 @@ class Worker:
             except ProcessEnded as error:
                 cause = f"the worker process ended: {error}"
                 raise TaskFailed(f"{CRASHED} (did not start)", cause) from None
-        # The repeats end when their sum reaches the limit, so at most two take all of it; some backends read the
+        # The repeats end when their sum reaches the limit, so no more than two take all of it; some backends read the
         # clock only every few seconds.
         limit = 3.0 * task.time_limit + GRACE
         start_time = time.monotonic()
