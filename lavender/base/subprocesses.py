@@ -25,9 +25,7 @@ from typing import IO, Any
 
 import numpy as np
 
-START_TIMEOUT = (
-    60.0  # s. A loaded machine may need this long to import a function and the modules that it uses.
-)
+START_TIMEOUT = 60.0  # s. On a loaded machine, importing a function and its modules may take this long.
 KILL_TIMEOUT = 10.0  # s. The system may need longer to end a killed process that waits for a broken disk.
 PIPE_TIMEOUT = 0.1  # s. A pipe that stays open for longer after the kill is held by another process.
 MAX_TEXT_SIZE = 2**20  # bytes. An answer that announces more JSON than this is invalid.
