@@ -26,7 +26,7 @@ import lavender as lv
 from benchmarks.made import forms, fresh
 from benchmarks.output import markdown
 from lavender import suite
-from lavender.base import later as _later
+from lavender.base import lazy_import as _lazy_import
 from lavender.judge import residuals
 from lavender.problem import Problem
 from lavender.solvers import setup_times
@@ -168,7 +168,7 @@ def command(names: tuple[str, ...], solvers: tuple[str, ...], repeats: int, rate
     """Calls under time limits, or what set-ups are counted for."""
     lv.solve(problem_of("dense 30 x 20")(), time_limit=1e-2)
     if rates:
-        _later.load()
+        _lazy_import.import_numerics()
         show_rates(names or MEASURED)
         return
     head = [

@@ -15,12 +15,12 @@ Measuring  `bench`, `report`, `suite` (built-in problems), `io` (files and other
 Submodules and the engine are imported at their first use.
 """
 
-import lavender.base.starting  # noqa: I001 - first: Ctrl-C from here on
+import lavender.base.early_sigint  # noqa: I001 - first: handles Ctrl-C from here on
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-import lavender.base.built
-from lavender.base.later import imported
+import lavender.base.check_build
+from lavender.base.lazy_import import import_locked
 from lavender._version import __version__
 from lavender.problem.cones import (
     CONTACT,
@@ -50,7 +50,9 @@ from lavender.judge.solution import Claim, Solution, Status, Turn
 from lavender.solving.solve import prepare, solve
 
 if TYPE_CHECKING:
+    from lavender import export as export
     from lavender import io
+    from lavender.base import errors as errors
     from lavender.batch.data import Batch
     from lavender.batch.residuals import Residuals, residual_many
     from lavender.batch.solve import Solutions, solve_many
@@ -62,46 +64,35 @@ if TYPE_CHECKING:
     from lavender.lab.diagnostics.redundancy import Redundancy, redundancy
     from lavender.lab.motion import MotionError, Motions, motion_error, motions
     from lavender.lab.proof import Enclosure, prove
+    from lavender.problem import cones as cones
     from lavender.sim import engine, scene
     from lavender.sim.engine import SOLVER_FIELDS, Simulation, Snapshot
     from lavender.sim.scene import Scene
+    from lavender.solvers import registry as registry
     from lavender.solving.plan import Plan, explain
     from lavender.solving.quadratic import solve_qp
 
-# Public name -> module that holds it, imported at the first use of the name.
-_LATER = {
-    "Batch": "lavender.batch.data",
-    "CrossCheck": "lavender.lab.check",
-    "Derivative": "lavender.gradient",
-    "Enclosure": "lavender.lab.proof",
-    "MotionError": "lavender.lab.motion",
-    "Motions": "lavender.lab.motion",
-    "Plan": "lavender.solving.plan",
-    "Redundancy": "lavender.lab.diagnostics.redundancy",
-    "Residuals": "lavender.batch.residuals",
-    "SOLVER_FIELDS": "lavender.sim.engine",
-    "Scene": "lavender.sim.scene",
-    "Simulation": "lavender.sim.engine",
-    "Snapshot": "lavender.sim.engine",
-    "Solutions": "lavender.batch.solve",
-    "Suspicion": "lavender.lab.diagnostics",
-    "cross_check": "lavender.lab.check",
-    "derivative": "lavender.gradient",
-    "derivatives": "lavender.gradient",
-    "diagnose": "lavender.lab.diagnostics",
-    "explain": "lavender.solving.plan",
-    "load": "lavender.io",
-    "motion_error": "lavender.lab.motion",
-    "motions": "lavender.lab.motion",
-    "prove": "lavender.lab.proof",
-    "redundancy": "lavender.lab.diagnostics.redundancy",
-    "residual_many": "lavender.batch.residuals",
-    "solve_many": "lavender.batch.solve",
-    "solve_qp": "lavender.solving.quadratic",
+# Module -> public names in it, imported when a name is first used.
+_LAZY_NAMES = {
+    "lavender.batch.data": ("Batch",),
+    "lavender.batch.residuals": ("Residuals", "residual_many"),
+    "lavender.batch.solve": ("Solutions", "solve_many"),
+    "lavender.gradient": ("Derivative", "derivative", "derivatives"),
+    "lavender.io": ("load",),
+    "lavender.lab.check": ("CrossCheck", "cross_check"),
+    "lavender.lab.diagnostics": ("Suspicion", "diagnose"),
+    "lavender.lab.diagnostics.redundancy": ("Redundancy", "redundancy"),
+    "lavender.lab.motion": ("MotionError", "Motions", "motion_error", "motions"),
+    "lavender.lab.proof": ("Enclosure", "prove"),
+    "lavender.sim.engine": ("SOLVER_FIELDS", "Simulation", "Snapshot"),
+    "lavender.sim.scene": ("Scene",),
+    "lavender.solving.plan": ("Plan", "explain"),
+    "lavender.solving.quadratic": ("solve_qp",),
 }
+_MODULE_OF_NAME = {name: module for module, names in _LAZY_NAMES.items() for name in names}
 
-# Public module -> where it stands.
-_MODULES = {
+# Public module -> its full name.
+_LAZY_MODULES = {
     "bench": "lavender.lab.bench",
     "cones": "lavender.problem.cones",
     "engine": "lavender.sim.engine",
@@ -189,21 +180,23 @@ __all__ = [
 ]
 
 
-def __getattr__(name: str) -> Any:
-    if name in _MODULES:
-        value = imported(_MODULES[name])
-    elif name in _LATER:
-        value = getattr(imported(_LATER[name]), name)
-    else:
-        raise AttributeError(f"module 'lavender' has no attribute {name!r}")
-    globals()[name] = value
-    return value
+if not TYPE_CHECKING:  # Type checkers report unknown names.
+
+    def __getattr__(name):
+        if name in _LAZY_MODULES:
+            value = import_locked(_LAZY_MODULES[name])
+        elif name in _MODULE_OF_NAME:
+            value = getattr(import_locked(_MODULE_OF_NAME[name]), name)
+        else:
+            raise AttributeError(f"module 'lavender' has no attribute {name!r}")
+        globals()[name] = value
+        return value
 
 
 def __dir__() -> list[str]:
     return sorted(__all__)
 
 
-for _name in ("auto", "admm", "anderson", "direct", "newton", "nncg"):  # and whom `auto` asks
-    get(_name)  # with the package: the first solve may have a time limit
-lavender.base.starting.end()
+for _name in ("auto", "admm", "anderson", "direct", "newton", "nncg"):  # and the solvers that `auto` runs
+    get(_name)  # imported with the package, because the first solve may have a time limit
+lavender.base.early_sigint.restore_handler()

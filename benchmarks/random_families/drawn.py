@@ -33,8 +33,8 @@ from benchmarks.random_families.wild import (
     tenfold,
 )
 from lavender.base.errors import check_name
-from lavender.base.later import sparse as sp
-from lavender.base.later import spatial
+from lavender.base.lazy_import import sparse as sp
+from lavender.base.lazy_import import spatial
 from lavender.lab.suite.build import Bodies, Contacts, each, sideways
 from lavender.lab.suite.case import Draft
 from lavender.lab.suite.families import BOX, SPHERE, at_least

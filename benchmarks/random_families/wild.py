@@ -22,8 +22,8 @@ from functools import partial
 import numpy as np
 
 from lavender.base.arrays import FloatArray
-from lavender.base.later import sparse as sp
-from lavender.base.later import spatial
+from lavender.base.lazy_import import sparse as sp
+from lavender.base.lazy_import import spatial
 from lavender.lab.suite.build import Bodies, Contacts, each, manifold, sideways, static_loads
 from lavender.lab.suite.case import Draft
 from lavender.lab.suite.families import BOX, ROD, SPHERE, at_least, ball_joints

@@ -1,1 +1,1 @@
-"""What every room stands on: arrays, errors, deadlines, child processes, modules loaded later."""
+"""Modules that every layer uses: arrays, errors, deadlines, calls in other processes, lazy imports."""

@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 
 from lavender.base.errors import InputError
-from lavender.base.later import issparse
-from lavender.base.later import sparse as sp
+from lavender.base.lazy_import import issparse
+from lavender.base.lazy_import import sparse as sp
 from lavender_ext.core import checks
 from lavender_ext.core.checks import LEAST, MOST
 from lavender_ext.judge.measure import all_finite

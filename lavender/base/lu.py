@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from lavender.base.later import sparse as sp
+from lavender.base.lazy_import import sparse as sp
 
 
 def sparse_lu(matrix: Any, **options: Any) -> Any:

@@ -15,7 +15,7 @@ from typing import Any
 import click
 
 from lavender._version import __version__
-from lavender.base import starting as _starting
+from lavender.base import early_sigint as _early_sigint
 from lavender.base.errors import LavenderError, UnknownName
 from lavender.cli.options import EXIT_BAD_INPUT, EXIT_INTERRUPTED, say, unheard
 
@@ -64,7 +64,7 @@ def main(args: Sequence[str] | None = None) -> None:
 
     SIGTERM, of a queue whose time is over or of `timeout`, is as Ctrl-C, with 143; a second one ends it at once.
     """
-    _starting.end()
+    _early_sigint.restore_handler()
     with _interruptions() as came:
         try:
             code = _code_of(args)

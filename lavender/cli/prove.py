@@ -24,7 +24,7 @@ def prove(files: tuple[str, ...], solver: str, tol: float) -> None:
     """
     from lavender.base.arrays import number
     from lavender.lab.bench.cases import resolve
-    from lavender.lab.bench.running.worker import Worker, solved
+    from lavender.lab.bench.running.worker import Worker, solve_isolated
     from lavender.lab.proof import prove as enclose
     from lavender.lab.proof import require
     from lavender.solvers.registry import get
@@ -38,7 +38,7 @@ def prove(files: tuple[str, ...], solver: str, tol: float) -> None:
     unmet, reading = False, Reading()
     for item in resolve(list(files)):
         with reading(item), Worker() as worker:
-            solution = solved(worker, item.problem, solver, tol=tol)
+            solution = solve_isolated(worker, item.problem, solver, tol=tol)
             found = enclose(item.problem, solution)
             short = "" if solution.success else f"; {solver}: {solution.status.name}"
             say(f"{item.name}: {found}{short}")

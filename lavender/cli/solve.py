@@ -48,7 +48,7 @@ def solve(
     """
     from lavender.judge.residuals import WRONG
     from lavender.lab import bench
-    from lavender.lab.bench.running.worker import Worker, solved
+    from lavender.lab.bench.running.worker import Worker, solve_isolated
 
     one_thread()
     if output is not None:
@@ -60,7 +60,7 @@ def solve(
         raise InputError(f"--output {output} is the problem itself, which would be lost: give another file")
     options: dict[str, Any] = {k: v for k, v in (("order", order), ("seed", seed)) if v is not None}
     with Worker() as worker:
-        solution = solved(
+        solution = solve_isolated(
             worker, item.problem, solver, tol=tol, max_iter=max_iter, time_limit=time_limit, **options
         )
     if output is not None:

@@ -40,7 +40,7 @@ import numpy.typing as npt
 
 from lavender.base.arrays import FloatArray, one_of
 from lavender.base.errors import CapabilityError
-from lavender.base.later import sparse as sp
+from lavender.base.lazy_import import sparse as sp
 from lavender.judge.residuals import reference
 from lavender.problem import Problem
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from lavender.base.arrays import FloatArray
-from lavender.base.later import sparse as sp
+from lavender.base.lazy_import import sparse as sp
 from lavender.external.as_qp import QP, bound_multipliers, bound_rows
 from lavender.external.running import Answer, Call, Limits, at_least, proof, quiet
 from lavender.judge.solution import Status

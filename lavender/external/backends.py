@@ -12,19 +12,11 @@ certificates, warm start) are called by their own interface (`native.py`), the o
 
 from __future__ import annotations
 
-from contextlib import suppress
-from functools import cache, partial
-from typing import Any
+from functools import partial
 
-import numpy as np
-
-from lavender.base.apart import served
 from lavender.external import native
-from lavender.external.apart import ARRAYS, WORDS
 from lavender.external.backend import Backend
 from lavender.external.qp_solver import OPTIONS, QPSolver, refusal
-from lavender.external.running import quiet
-from lavender.problem import Problem
 from lavender.solvers.registry import SolverSpec
 
 #: Settings of those that go through qpsolvers, by their names there: a word is a field of `Limits`, all else is fixed.
@@ -135,33 +127,3 @@ def _spec(backend: Backend) -> SolverSpec:
 
 
 SPECS: tuple[SolverSpec, ...] = tuple(map(_spec, BACKENDS))
-
-
-def serve(lifeline: int) -> None:
-    """In a process of its own: answer the calls of `apart.call`, until they end."""
-    served.serve(lifeline, _runner)
-
-
-def _runner() -> served.Handler:
-    by_name = {backend.name: backend for backend in BACKENDS}
-
-    @cache
-    def warm_up(name: str) -> tuple[dict[str, Any], list[Any]]:
-        # Backends import their own code when they first solve.
-        solver = QPSolver(by_name[name])
-        with suppress(Exception):
-            solver.run(solver.prepare(Problem.lcp(np.eye(1), np.ones(1))), np.zeros(1), 100, 1e-3)
-        return {}, []
-
-    def run(message: Any) -> tuple[dict[str, Any], list[Any]]:
-        if isinstance(message, str):
-            return warm_up(message)
-        name, qp, impulse, limit, settings = message
-        with quiet(by_name[name].noisy) as said:
-            found = by_name[name].run(qp, impulse, limit, settings)
-        work = {str(kind): int(count) for kind, count in found.work.items()}
-        words = str(found.words or "; ".join(said))[:WORDS]
-        arrays = [getattr(found, name) for name in ARRAYS]
-        return {"status": found.status.name, "words": words, "work": work}, arrays
-
-    return run

@@ -12,7 +12,7 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import InputError
-from lavender.base.later import sparse as sp
+from lavender.base.lazy_import import sparse as sp
 from lavender.external.as_qp import QP, bound_multipliers, bound_rows, two_sided
 from lavender.external.running import EPS_MIN, Answer, Limits, at_least, certificate, proof, quiet, set_all
 from lavender.judge.solution import Status

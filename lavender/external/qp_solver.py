@@ -1,4 +1,4 @@
-"""A QP backend as a solver: its problem in the form that suits it, and one run of it."""
+"""Run a QP backend as a solver: write the problem as a program in the form that suits the backend, and run it."""
 
 from __future__ import annotations
 
@@ -11,20 +11,21 @@ import numpy as np
 from lavender.base.arrays import FloatArray, flag
 from lavender.base.deadline import Deadline
 from lavender.base.errors import CapabilityError, InputError
-from lavender.base.later import load
-from lavender.external import apart
+from lavender.base.lazy_import import import_numerics
 from lavender.external.as_qp import QP, impulse_form, pick_form, velocity_form
 from lavender.external.backend import Backend
+from lavender.external.isolated import ENTRY_SIZE, TRANSFER_RATE, IsolatedBackend, start_process
 from lavender.external.running import ask
 from lavender.judge.residuals import quick
 from lavender.judge.solution import Claim, Status, summed
 from lavender.problem import Problem
 from lavender.solvers.registry import Solver
 
-DENSE_LIMIT = 2**30  # bytes of one dense matrix; beyond, a dense backend is refused
-START, PROGRAM = 1e-3, 1.2e-7  # s, of a program, and for each entry of A: half as much again as measured
+MAX_DENSE_SIZE = 2**30  # bytes. A backend for dense matrices rejects a problem with a larger matrix.
+FORM_TIME = 1e-3  # s. Forming any program takes up to this, 1.5 times the measured time.
+FORM_TIME_PER_ENTRY = 1.2e-7  # s. Additional time for each entry of A, 1.5 times the measured time.
 OPTIONS = {
-    "isolate": "where a time_limit is given, the backend runs in a process of its own, which is ended; default True",
+    "isolate": "given a time_limit, run the backend in another process, which is killed at the limit; default True",
     "form": "'impulse', 'velocity' (needs rows) or 'auto' (default): by size, mass ratio and backend",
     "unit_diagonal": "impulse form: scale A to a unit diagonal, default True",
     "settings": "mapping passed to the backend, over those that tol gives",
@@ -33,7 +34,7 @@ OPTIONS = {
 
 @dataclass(frozen=True)
 class QPSolver(Solver):
-    """A backend with its options, which OPTIONS says in words."""
+    """A backend with its options; `OPTIONS` describes them."""
 
     backend: Backend
     form: str = "auto"
@@ -49,11 +50,11 @@ class QPSolver(Solver):
         flag("isolate", self.isolate)
 
     def setup_time(self, problem: Problem) -> float:
-        """What forming the program takes [s], and handing it over where it runs elsewhere, as counted."""
-        entry = PROGRAM + (apart.ENTRY / apart.HAND_OVER if self.isolate else 0.0)
-        return START + entry * problem.most_entries
+        """Estimate the time [s] to form the program, and to send it if the backend runs in another process."""
+        entry = FORM_TIME_PER_ENTRY + (ENTRY_SIZE / TRANSFER_RATE if self.isolate else 0.0)
+        return FORM_TIME + entry * problem.most_entries
 
-    @np.errstate(all="ignore")  # what overflows is judged
+    @np.errstate(all="ignore")  # The judge finds overflows.
     def prepare(self, problem: Problem) -> QP:
         return self._form(problem, True)
 
@@ -75,14 +76,14 @@ class QPSolver(Solver):
                 f"solver {b.name!r} takes no problem without inequalities, and qpsolvers would hand it to LSQR; "
                 "use direct or another backend"
             )
-        if b.dense and 8 * qp.n * max(qp.n, len(qp.b)) > DENSE_LIMIT:
+        if b.dense and 8 * qp.n * max(qp.n, len(qp.b)) > MAX_DENSE_SIZE:
             raise CapabilityError(
                 f"solver {b.name!r} takes dense matrices only: {max(qp.n, len(qp.b))} x {qp.n} would need more "
-                f"than {DENSE_LIMIT >> 20} MiB; use a sparse backend (osqp, piqp, clarabel)"
+                f"than {MAX_DENSE_SIZE >> 20} MiB; use a sparse backend (osqp, piqp, clarabel)"
             )
         return qp
 
-    @np.errstate(all="ignore")  # what overflows is judged
+    @np.errstate(all="ignore")  # The judge finds overflows.
     def run(
         self, state: QP, impulse: FloatArray, max_iter: int, tol: float, time_limit: float | None = None
     ) -> Claim:
@@ -95,32 +96,32 @@ class QPSolver(Solver):
         if not qp.fits:
             words = "as a quadratic program the problem has numbers that overflow; the backend was not called"
             return Claim(Status.NUMERICAL_ERROR, 0, none, words, qp.form)
-        elsewhere = apart.Elsewhere(b) if self.isolate and time_limit is not None else None
+        isolated = IsolatedBackend(b) if self.isolate and time_limit is not None else None
         deadline, start = Deadline(time_limit), impulse.copy()
-        claim = ask(qp, impulse, elsewhere or b.run, max_iter, tol, time_limit, self.settings, b.noisy)
+        claim = ask(qp, impulse, isolated or b.run, max_iter, tol, time_limit, self.settings, b.noisy)
         if len(qp.assumed) and not deadline.passed() and _assumption_fails(qp, impulse, claim):
             before, impulse[:] = claim, start
             left = max(1, max_iter - before.iterations)
             qp = self._form(qp.problem, False)
-            call = elsewhere or b.run
+            call = isolated or b.run
             claim = ask(qp, impulse, call, left, tol, deadline.left(), self.settings, b.noisy)
             work = summed((before.work, claim.work))
             claim = replace(claim, work=work, iterations=before.iterations + claim.iterations)
         if time_limit is None or b.stoppable:
             return claim
-        where = "to its end" if elsewhere is None else elsewhere.where
-        return replace(claim, message=f"{claim.message}; takes no time limit and ran {where}")
+        place = "to its end" if isolated is None else isolated.place
+        return replace(claim, message=f"{claim.message}; takes no time limit and ran {place}")
 
     def ready(self, qp: QP, time_limit: float) -> None:
-        """A time limit was given, and its clock has not begun: have the backend imported, in that process or here."""
+        """Import the backend's code, in the process that runs it, before the clock of a time limit starts."""
         if self.isolate:
-            apart.ready(self.backend.name)
+            start_process(self.backend)
         else:
-            load(*self.backend.modules)
+            import_numerics(*self.backend.modules)
 
 
 def _assumption_fails(qp: QP, impulse: FloatArray, claim: Claim) -> bool:
-    """Whether a row that was assumed to stay at its bound does not, or may be what makes the others contradict."""
+    """Return whether a row assumed to stay at its bound leaves it, or may cause a proof of infeasibility."""
     if claim.status is Status.INFEASIBLE:
         return True
     w, error = np.empty(len(impulse)), np.empty(len(impulse))
@@ -129,7 +130,7 @@ def _assumption_fails(qp: QP, impulse: FloatArray, claim: Claim) -> bool:
 
 
 def refusal(problem: Problem) -> str | None:
-    """Why no QP backend can take this problem, before any conversion; a factorisation sees the rest."""
+    """Return why no QP backend accepts this problem, before any conversion; a factorisation finds other causes."""
     if not problem.is_symmetric:
         return (
             f"needs a symmetric A; here A - A^T is {problem.asymmetry:.1e} of A "

@@ -24,7 +24,7 @@ from lavender.judge.solution import Claim, Status, summed
 from lavender.problem import Problem
 from lavender.solvers.certify import check_infeasible
 
-EPS_MIN = 1e-14  # asked of a backend at the least: its own arithmetic stops there
+EPS_MIN = 1e-14  # Smallest tolerance passed to a backend; its own arithmetic stops there.
 GAP_MIN = 1e-18
 # Of the objective: what the sums of a gap lose to rounding at a large mass ratio; and when asked again.
 GAP_RELATIVE, GAP_RELATIVE_MIN = 1e-13, 1e-16

@@ -8,7 +8,7 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import CapabilityError
-from lavender.base.later import sparse as sp
+from lavender.base.lazy_import import sparse as sp
 from lavender.gradient.result import BODIES, Gradient
 from lavender.problem import Problem
 

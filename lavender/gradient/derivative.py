@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from lavender.base.arrays import FloatArray, as_array, as_csr
 from lavender.base.errors import CapabilityError, InputError
-from lavender.base.later import above, issparse
+from lavender.base.lazy_import import issparse, lazy_module
 from lavender.gradient.chains import Bodies, Parts
 from lavender.gradient.result import BODIES, INPUTS, MATRICES, REACHES, Gradient
 from lavender.gradient.system import SMALL, System, prepared
@@ -506,7 +506,7 @@ class Derivative:
 
         Under Coulomb's law there may be several: a gradient is then of this one, whose choice it does not know.
         """
-        return above("lavender.lab.motion").motions_of(self.problem.disk)
+        return lazy_module("lavender.lab.motion").motions_of(self.problem.disk)
 
     def __repr__(self) -> str:
         return f"<Derivative of {self.m} rows: {self}>"

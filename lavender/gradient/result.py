@@ -8,8 +8,8 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import CapabilityError, InputError
-from lavender.base.later import issparse
-from lavender.base.later import sparse as sp
+from lavender.base.lazy_import import issparse
+from lavender.base.lazy_import import sparse as sp
 from lavender.problem import OPERATORS
 from lavender.problem.derived import cached_property
 

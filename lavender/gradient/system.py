@@ -9,7 +9,7 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import CapabilityError
-from lavender.base.later import sparse as sp
+from lavender.base.lazy_import import sparse as sp
 from lavender.base.lu import sparse_lu
 from lavender.problem import Problem
 from lavender.solvers.factors import WIDE

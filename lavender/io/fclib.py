@@ -22,7 +22,7 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray, as_array, one_of
 from lavender.base.errors import CapabilityError, InputError
-from lavender.base.later import sparse as sp
+from lavender.base.lazy_import import sparse as sp
 from lavender.io.condensed import ENTRY, condensed
 from lavender.io.npz import compressed
 from lavender.io.stored import MAX_BYTES, NUMBER, Budget, Stored, write_bytes

@@ -53,7 +53,7 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray, IntArray, as_array, read_only
 from lavender.base.errors import CapabilityError, InputError
-from lavender.base.later import sparse as sp
+from lavender.base.lazy_import import sparse as sp
 from lavender.problem import Names, Problem
 from lavender.problem.cones import Cones
 from lavender.problem.generalized import Generalized

@@ -24,8 +24,8 @@ from numpy.lib import format as npy
 
 from lavender.base.arrays import FloatArray, as_array
 from lavender.base.errors import InputError
-from lavender.base.later import issparse
-from lavender.base.later import sparse as sp
+from lavender.base.lazy_import import issparse
+from lavender.base.lazy_import import sparse as sp
 from lavender.io.stored import MAX_BYTES, NUMBER, Budget, Stored, write_arrays
 from lavender.problem import PRECISIONS, Problem, check_problem
 from lavender.problem.cones import Cones, kinds_of

@@ -12,7 +12,7 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray, one_of, read_only, table_of
 from lavender.base.errors import SolveFailed
-from lavender.base.later import above
+from lavender.base.lazy_import import lazy_module
 from lavender.judge.residuals import Residual, residual
 from lavender.problem import Problem
 
@@ -337,7 +337,9 @@ class Solution:
 
     def motion_error(self, reference: Any = None) -> Any:
         """Return the error of the motion in units, with a bound: see `lavender.motion_error`."""
-        return above("lavender.lab.motion").motion_error(self.residual._problem, self.impulse, reference)
+        return lazy_module("lavender.lab.motion").motion_error(
+            self.residual._problem, self.impulse, reference
+        )
 
     def raise_for_status(self) -> Solution:
         """Return self if the judge accepts the result (within tol, or at the round-off floor of float64).

@@ -18,7 +18,7 @@ from lavender.base.arrays import several
 from lavender.base.errors import InputError, LavenderError, last_words
 from lavender.judge.residuals import FLOOR_MOST, WRONG
 from lavender.judge.solution import CONTRADICTED, NOT_PROVEN, Solution, Status, uninterrupted
-from lavender.lab.bench.running.worker import Lost, Worker, solved
+from lavender.lab.bench.running.worker import TaskFailed, Worker, solve_isolated
 from lavender.lab.motion.bound import separation
 from lavender.problem import Problem, check_problem
 from lavender.solvers.registry import available, get, known, specs
@@ -196,7 +196,7 @@ def cross_check(
         if not isinstance(name, str) or name not in reasons:
             get(name)  # raises UnknownName with the nearest names
     with Worker() as worker:
-        solver = partial(solved, worker, problem, time_limit=time_limit)
+        solver = partial(solve_isolated, worker, problem, time_limit=time_limit)
         optimum, chosen, note = _reference(problem, reference, reasons, solver)
         solver = partial(solver, tol=tol, max_iter=max_iter)
         rows = [_row(problem, name, reasons[name], optimum, solver) for name in names]
@@ -215,7 +215,7 @@ def _row(
     try:
         solution = uninterrupted(solver(run))
     except Exception as error:
-        if isinstance(error, Lost):
+        if isinstance(error, TaskFailed):
             return CrossCheckRow(name, NOT_SOLVED, error.status, note=error.text)
         if isinstance(error, LavenderError) and not isinstance(error, InputError):
             return CrossCheckRow(name, REFUSED, note=str(error))  # only after a look at the numbers

@@ -25,7 +25,7 @@ from lavender.base.arrays import (
     words_for,
 )
 from lavender.base.errors import InputError
-from lavender.base.later import issparse
+from lavender.base.lazy_import import issparse
 from lavender.problem.cones import Cones
 from lavender.problem.derived import Derived, cached_property
 from lavender.problem.generalized import Generalized

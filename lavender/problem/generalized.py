@@ -27,8 +27,8 @@ from lavender.base.arrays import (
     words_for,
 )
 from lavender.base.errors import InputError
-from lavender.base.later import issparse
-from lavender.base.later import sparse as sp
+from lavender.base.lazy_import import issparse
+from lavender.base.lazy_import import sparse as sp
 from lavender.problem.derived import cached_property
 from lavender_ext.core import generalized as kernels
 from lavender_ext.core.assemble import dense_to_csr, mirrored, stacked

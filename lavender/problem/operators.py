@@ -8,8 +8,8 @@ import numpy as np
 
 from lavender.base.arrays import ArrayLike, FloatArray, IntArray, read_only
 from lavender.base.errors import CapabilityError, InputError, TooLarge
-from lavender.base.later import issparse
-from lavender.base.later import sparse as sp
+from lavender.base.lazy_import import issparse
+from lavender.base.lazy_import import sparse as sp
 from lavender.problem.data import ProblemData
 from lavender.problem.derived import Derived, cached_property, once
 from lavender_ext.core import assemble

@@ -19,7 +19,7 @@ import numpy as np
 
 from lavender.base.arrays import IntArray, as_array, whole_number
 from lavender.base.errors import CapabilityError, InputError, UnknownName
-from lavender.base.later import sparse as sp
+from lavender.base.lazy_import import sparse as sp
 from lavender.problem import Problem
 from lavender_ext.core.order import (
     GIVEN,

@@ -10,8 +10,8 @@ import numpy as np
 
 from lavender.base.arrays import ArrayLike, FloatArray, as_array, check_not_negative
 from lavender.base.errors import InputError
-from lavender.base.later import above
-from lavender.base.later import sparse as sp
+from lavender.base.lazy_import import lazy_module
+from lavender.base.lazy_import import sparse as sp
 from lavender.problem.builders import Builders
 from lavender.problem.cones import Cones
 from lavender.problem.derived import once
@@ -261,4 +261,4 @@ class Problem(Builders):
 
     def save(self, path: str | PathLike[str], **more: Any) -> None:
         """Write the problem to a file; `lavender.io.save`, whose options `more` are."""
-        above("lavender.io").save(self, path, **more)
+        lazy_module("lavender.io").save(self, path, **more)

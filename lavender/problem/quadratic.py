@@ -38,7 +38,7 @@ from lavender.base.arrays import (
     shape_of,
 )
 from lavender.base.errors import InputError
-from lavender.base.later import issparse
+from lavender.base.lazy_import import issparse
 from lavender.problem.cones import Cones
 from lavender.problem.derived import cached_property
 from lavender.problem.generalized import Compressed, Generalized, compressed, lower_of

@@ -19,7 +19,7 @@ from lavender.base.arrays import (
     shape_of,
 )
 from lavender.base.errors import InputError
-from lavender.base.later import sparse as sp
+from lavender.base.lazy_import import sparse as sp
 from lavender.problem.cones import Cones
 from lavender_ext.core import checks
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from lavender.base.later import imported
+from lavender.base.lazy_import import import_locked
 from lavender.solvers.registry import SolverSpec
 
 __all__ = ["SPECS", "spec_of"]
@@ -31,7 +31,7 @@ SPECS: tuple[SolverSpec, ...]  # of all, imported when they are first asked for
 
 def spec_of(name: str) -> SolverSpec | None:
     """The spec of one solver, whose file is imported now if it was not before; None if it is not in the table."""
-    return imported(f"{__name__}.{name}").SPEC if name in _TABLE else None
+    return import_locked(f"{__name__}.{name}").SPEC if name in _TABLE else None
 
 
 def __getattr__(name: str) -> Any:

@@ -21,8 +21,8 @@ import numpy as np
 from lavender.base.arrays import FloatArray
 from lavender.base.deadline import Deadline, Stopwatch, TooLate
 from lavender.base.errors import BREAKDOWN, InputError
-from lavender.base.later import load
-from lavender.base.later import sparse as sp
+from lavender.base.lazy_import import import_numerics
+from lavender.base.lazy_import import sparse as sp
 from lavender.judge.residuals import reference
 from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
@@ -250,7 +250,7 @@ class ADMM(Solver):
 
     def prepare(self, problem: Problem) -> AdmmState:
         """Scale, where that takes little."""
-        load()
+        import_numerics()
         return AdmmState(problem, self.memory, self.relaxation)
 
     @np.errstate(all="ignore")  # what overflows is judged

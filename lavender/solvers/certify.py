@@ -24,7 +24,7 @@ import numpy as np
 from lavender.base.arrays import FloatArray, IntArray
 from lavender.base.deadline import Deadline
 from lavender.base.errors import InputError
-from lavender.base.later import sparse as sp
+from lavender.base.lazy_import import sparse as sp
 from lavender.judge.certificates import Proof, fighting, prove
 from lavender.judge.residuals import residual
 from lavender.judge.solution import Claim, Status

@@ -18,8 +18,8 @@ from typing import Any, Protocol
 import numpy as np
 
 from lavender.base.arrays import FloatArray, IntArray
-from lavender.base.later import lapack, load
-from lavender.base.later import sparse as sp
+from lavender.base.lazy_import import import_numerics, lapack
+from lavender.base.lazy_import import sparse as sp
 from lavender.base.lu import sparse_lu
 from lavender.problem import Problem
 from lavender.solvers.setup_times import dense_work
@@ -217,7 +217,7 @@ class LUFactor:
         self.sparse = problem.csr.nnz < DENSE_SHARE * m * m or m > DENSE_LIMIT
         self.a: Any = scaled if self.sparse else scaled.toarray()
         if self.sparse:
-            load("scipy.sparse.linalg")
+            import_numerics("scipy.sparse.linalg")
 
     def factor(self, place: IntArray, n_free: int, shift: float) -> int:
         self.free = np.flatnonzero(place >= 0)

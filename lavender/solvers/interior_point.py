@@ -21,7 +21,7 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray
 from lavender.base.deadline import Deadline, Stopwatch
-from lavender.base.later import sparse as sp
+from lavender.base.lazy_import import sparse as sp
 from lavender.problem.generalized import Compressed
 from lavender.problem.quadratic import QPSolution, QuadraticProgram
 from lavender.solvers.factors import TINY, WIDE, Panels

@@ -6,7 +6,7 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray, IntArray
 from lavender.base.deadline import Deadline, Stopwatch
-from lavender.base.later import load
+from lavender.base.lazy_import import import_numerics
 from lavender.judge.residuals import reference
 from lavender.problem import Problem
 from lavender.solvers.factors import (
@@ -63,7 +63,7 @@ class PivotState:
         self.problem = problem
         self.symmetric = problem.is_symmetric
         if problem.m > SMALL_SIZE:
-            load()  # for factors, and for proofs that there is no solution
+            import_numerics()  # for factors, and for proofs that there is no solution
         factor: Factor | None = None
         if self.symmetric:
             same = like is not None and like.symmetric and _same_pattern(like.problem, problem)

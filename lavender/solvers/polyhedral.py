@@ -23,7 +23,7 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray
 from lavender.base.deadline import Deadline
-from lavender.base.later import sparse as sp
+from lavender.base.lazy_import import sparse as sp
 from lavender.judge.certificates import check_certificate
 from lavender.judge.residuals import quick
 from lavender.judge.solution import Claim, Status, summed

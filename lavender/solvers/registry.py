@@ -17,7 +17,7 @@ from typing import Any, Protocol
 from lavender.base.arrays import FloatArray, flag, whole_number
 from lavender.base.deadline import Deadline
 from lavender.base.errors import InputError, SolverUnavailable, UnknownName, check_name, last_words
-from lavender.base.later import imported, loading
+from lavender.base.lazy_import import import_lock, import_locked
 from lavender.judge.solution import Claim, Status
 from lavender.problem import LAWS, OPERATORS, Problem, check_problem
 from lavender.problem.derived import cached_property
@@ -360,7 +360,7 @@ class SolverSpec:
             return self.factory
         module, _, attribute = self.factory.partition(":")
         try:
-            return getattr(imported(module), attribute)
+            return getattr(import_locked(module), attribute)
         except Exception as error:
             raise SolverUnavailable(
                 f"solver {self.name!r} cannot be imported from {self.factory!r}: {last_words(error)}"
@@ -392,7 +392,7 @@ registered: dict[str, SolverSpec] = {}
 
 def load_table(table: str) -> None:
     """Fill `registered` with the SPECS of a module."""
-    for spec in imported(table).SPECS:
+    for spec in import_locked(table).SPECS:
         registered.pop(
             spec.name, None
         )  # a solver that `get` registered by name moves to its place in the table
@@ -406,7 +406,7 @@ def _add_own(spec: SolverSpec) -> None:
 
 def load() -> None:
     """Fill `registered` once; other threads wait meanwhile."""
-    with loading():
+    with import_lock():
         fill()
 
 
@@ -483,7 +483,7 @@ def _register_by_name(name: str) -> SolverSpec | None:
 
     The file of a built-in solver is imported alone, which takes less time than the whole table.
     """
-    own: SolverSpec | None = imported(TABLES[0]).spec_of(name)
+    own: SolverSpec | None = import_locked(TABLES[0]).spec_of(name)
     if own is not None:
         _add_own(own)
         return own

@@ -21,7 +21,7 @@ import numpy as np
 from lavender.base.arrays import FloatArray, number, read_only
 from lavender.base.deadline import Deadline, Stopwatch
 from lavender.base.errors import InputError
-from lavender.base.later import sparse as sp
+from lavender.base.lazy_import import sparse as sp
 from lavender.judge.certificates import prove
 from lavender.judge.residuals import Residual, residual
 from lavender.judge.solution import CONFIRMED, CONVERGED, Claim, Solution, Status, Turn

@@ -15,7 +15,7 @@ import numpy as np
 from lavender.base.arrays import ArrayLike, FloatArray, equal, flag, number, read_only, whole_number
 from lavender.base.deadline import NEVER, Deadline, Stopwatch
 from lavender.base.errors import BREAKDOWN, CapabilityError, InputError, InUse, UnknownName, last_words
-from lavender.base.later import load
+from lavender.base.lazy_import import import_numerics
 from lavender.external.foreign import Foreign
 from lavender.judge.certificates import prove
 from lavender.judge.residuals import (
@@ -428,7 +428,7 @@ class Prepared:
             if self._late and self.solver.needs_scipy and loading(*SCIPY):
                 # As processes are started: else no call within the limit would ever have what it needs.
                 watch = Stopwatch()
-                load()
+                import_numerics()
                 deadline.keep(-watch.seconds)
                 self._late = deadline.passed(self.solver.setup_time(problem))
             if self._late:
@@ -630,7 +630,7 @@ def comes_too_late(problem: Problem, spec: SolverSpec, deadline: Deadline) -> bo
     needed = estimate_disk_time(problem) + estimate_refusal_time(problem, spec)
     if needed > 0.0 and problem.generalized is None and deadline.passed(needed) and loading("scipy.sparse"):
         watch = Stopwatch()
-        load()
+        import_numerics()
         deadline.keep(
             -watch.seconds
         )  # as processes are started: else no call within the limit would ever have it
@@ -659,7 +659,7 @@ def _deadline(spec: SolverSpec, limit: float, begun: float | None = None) -> Dea
         return NEVER
     if spec.external or not spec.own:
         spec.load()
-        load(*(() if spec.external else spec.requires))
+        import_numerics(*(() if spec.external else spec.requires))
         begun = None
     return Deadline(limit, begun)
 

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lavender.base.arrays import FloatArray
-from lavender.base.later import sparse as sp
+from lavender.base.lazy_import import sparse as sp
 from lavender.base.lu import sparse_lu
 from lavender.lab.diagnostics.diagnostic import Suspicion, suspect
 from lavender.problem import Problem

@@ -21,8 +21,8 @@ import numpy.typing as npt
 
 from lavender.base.arrays import FloatArray, number
 from lavender.base.errors import CapabilityError, InputError
-from lavender.base.later import lapack
-from lavender.base.later import sparse as sp
+from lavender.base.lazy_import import lapack
+from lavender.base.lazy_import import sparse as sp
 from lavender.problem import Problem, check_problem
 from lavender.problem.derived import cached_property
 from lavender.problem.operators import panels_of, semidefinite

@@ -17,7 +17,7 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import CapabilityError
-from lavender.base.later import sparse as sp
+from lavender.base.lazy_import import sparse as sp
 from lavender.problem import Problem
 
 U = 2.0**-53

@@ -1,4 +1,4 @@
-"""Phenomenon by engine by case: engines of others in a process of their own, whose end is a note."""
+"""Measure phenomena in engines. Third-party engines run in another process, whose end is a note in the record."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
-from lavender.base.apart import served
-from lavender.base.apart.process import Ended, NoAnswer, Process, Raised
+from lavender.base import subprocesses
 from lavender.base.arrays import number, several
 from lavender.base.errors import CapabilityError, InputError, UnknownName, check_name
+from lavender.base.subprocesses import ProcessBackend, ProcessEnded, RemoteError
 from lavender.lab.phenomena.engines import WAYS, Way, follow, make
 from lavender.lab.phenomena.friction import FRICTION
 from lavender.lab.phenomena.joints import JOINTS
@@ -19,26 +19,26 @@ from lavender.sim.scene import Scene
 
 #: Name -> phenomenon, in the order of the table.
 PHENOMENA: dict[str, Phenomenon] = {p.name: p for p in (*FRICTION, *JOINTS, *STACKS)}
-MODULE = __name__  # whose `serve` the other process runs
-LIMIT = 120.0  # s of wall time for one case
-ROOM = 2**30  # bytes of one track
+LIMIT = 120.0  # s. A third-party engine that takes longer for one case is killed.
+MAX_TRACK_SIZE = 2**30  # bytes. A process that sends a larger track is killed.
 
 
-class Apart(Process):
-    """A process that steps scenes; a new one after each that ended."""
+class EngineProcess(ProcessBackend):
+    """Steps scenes in another process, and in a new one after it ended; `limit` [s] is for one track."""
 
     def __init__(self, limit: float = LIMIT) -> None:
-        super().__init__(MODULE)
+        super().__init__(simulate)
         self.limit = limit
 
     def track(self, way: Way, scene: Scene, seconds: float, interval: float) -> Track | str:
-        """What the engine did, or why there is nothing."""
-        cause = self.start()
-        if cause:
-            return f"its process does not start: {cause}"
+        """Return the motion that the engine computes, or why there is none."""
         try:
-            said, (time, place, turn, speed) = self.ask(
-                [(way.name, scene, seconds, interval)], self.limit, ROOM
+            self.start()
+        except ProcessEnded as error:
+            return f"its process does not start: {error}"
+        try:
+            answer, (time, place, turn, speed) = self.call(
+                way.name, scene, seconds, interval, timeout=self.limit, max_bytes=MAX_TRACK_SIZE
             )
             k, n = len(time), len(scene.bodies)
             return Track(
@@ -46,45 +46,40 @@ class Apart(Process):
                 positions=place.reshape(k, n, 3),
                 quaternions=turn.reshape(k, n, 4),
                 velocities=speed.reshape(k, n, 6),
-                force=float(said["force"]),
-                cpu=float(said["cpu"]),
-                setting=str(said["setting"]),
+                force=float(answer["force"]),
+                cpu=float(answer["cpu"]),
+                setting=str(answer["setting"]),
             )
-        except (NoAnswer, ValueError, KeyError, TypeError, AttributeError) as error:
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
             return f"its answer is no track: {error}"
-        except Raised as error:
+        except RemoteError as error:
             return (
                 str(error) if error.kind == CapabilityError.__name__ else f"it failed: {error.kind}: {error}"
             )
         except TimeoutError:
             return f"no answer within {self.limit:g} s"
-        except Ended as end:
-            return f"its process ended: {end}"
+        except ProcessEnded as error:
+            return f"its process ended: {error}"
 
 
-def serve(lifeline: int) -> None:
-    """The other process: answer the questions of `Apart.track`, until they end."""
-    served.serve(lifeline, lambda: _answer)
-
-
-def _answer(message: Any) -> tuple[dict[str, Any], list[Any]]:
-    name, scene, seconds, interval = message
+def simulate(name: str, scene: Scene, seconds: float, interval: float) -> subprocesses.Answer:
+    """Step a scene with the engine of that name, in the process of `EngineProcess`."""
     engine = make(WAYS[name], scene)
     try:
-        found = follow(engine, seconds, interval)
+        track = follow(engine, seconds, interval)
     finally:
         engine.close()
-    said = {"force": found.force, "cpu": found.cpu, "setting": found.setting}
-    return said, [found.time, found.positions, found.quaternions, found.velocities]
+    answer = {"force": track.force, "cpu": track.cpu, "setting": track.setting}
+    return answer, [track.time, track.positions, track.quaternions, track.velocities]
 
 
 def chosen(names: Sequence[str] = ()) -> list[Phenomenon]:
-    """Phenomena by name, all without one.
+    """Return phenomena by name, all of them if no name is given.
 
     Raises
     ------
     UnknownName
-        No such phenomenon.
+        There is no such phenomenon.
     """
     names = several("names", names, "phenomena")
     for name in names:
@@ -93,12 +88,12 @@ def chosen(names: Sequence[str] = ()) -> list[Phenomenon]:
 
 
 def ways(steppers: Sequence[str] | None = None, engines: Sequence[str] | None = None) -> list[Way]:
-    """Ways by name of stepper or engine, or of one setting of them; of both all without a list.
+    """Return ways by the names of steppers and engines, or of one setting of them; None selects all.
 
     Raises
     ------
     UnknownName
-        No such stepper or engine.
+        There is no such stepper or engine.
     """
     found: list[Way] = []
     for what, given, own in (("stepper", steppers, True), ("engine", engines, False)):
@@ -126,18 +121,18 @@ def run(
     Parameters
     ----------
     names : sequence of str
-        Of `PHENOMENA`; all without one.
+        Keys of `PHENOMENA`; all of them if empty.
     steppers, engines : sequence of str, optional
-        Of `WAYS`; None: all. An engine that is missing, crashes, cannot build the scene or does not answer is a note
-        in its record.
+        Names in `WAYS`; None: all. If an engine is missing, crashes, cannot build the scene or does not answer, its
+        record has a note.
     parameters : mapping, optional
-        One case in the place of each phenomenon's own.
+        One case that replaces the cases of each phenomenon.
     limit : float
-        Wall time of one case in an engine of others [s].
+        Wall time [s] of one case in a third-party engine.
     show : callable
-        Called with every record as it comes.
+        Called with every record when it is complete.
     keep : callable
-        Called with a record and the finite motion that it was measured of.
+        Called with a record and the finite motion from which it was measured.
 
     Returns
     -------
@@ -146,7 +141,7 @@ def run(
     Raises
     ------
     UnknownName
-        No such phenomenon, stepper, engine or parameter.
+        There is no such phenomenon, stepper, engine or parameter.
     InputError
         A parameter or limit outside its range, or neither stepper nor engine; nothing has run.
     """
@@ -161,27 +156,27 @@ def run(
     if not chosen_ways:
         raise InputError("no stepper and no engine to measure; name one, or leave steppers to its default")
     found = []
-    apart = Apart(limit)
+    process = EngineProcess(limit)
     try:
         for way in chosen_ways:
-            for record in _measure(way, plan, apart, keep):
+            for record in _measure(way, plan, process, keep):
                 found.append(record)
                 show(record)
     finally:
-        apart.end()
+        process.close()
     return found
 
 
 def _measure(
     way: Way,
     plan: list[tuple[Phenomenon, dict[str, float]]],
-    apart: Apart,
+    process: EngineProcess,
     keep: Callable[[Record, Track], None],
 ) -> Iterator[Record]:
     lack = way.missing()
     for phenomenon, case in plan:
         note = lack or next((way.cannot[x] for x in sorted(phenomenon.needs) if x in way.cannot), "")
-        found = note or _one(way, phenomenon, case, apart)
+        found = note or _one(way, phenomenon, case, process)
         if isinstance(found, str):
             yield Record(phenomenon.name, way.name, case, note=found)
         else:
@@ -191,12 +186,12 @@ def _measure(
             yield record
 
 
-def _one(way: Way, phenomenon: Phenomenon, case: dict[str, float], apart: Apart) -> Track | str:
+def _one(way: Way, phenomenon: Phenomenon, case: dict[str, float], process: EngineProcess) -> Track | str:
     seconds = phenomenon.seconds(case)
     try:
         scene = phenomenon.scene(case, **way.scene)
         if way.module != "own":
-            return apart.track(way, scene, seconds, phenomenon.interval)
+            return process.track(way, scene, seconds, phenomenon.interval)
         return follow(make(way, scene), seconds, phenomenon.interval)
-    except (InputError, CapabilityError) as error:  # a stepper that does not take the scene
+    except (InputError, CapabilityError) as error:  # The stepper does not support the scene.
         return str(error)

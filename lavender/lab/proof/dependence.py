@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from lavender.base.arrays import FloatArray
-from lavender.base.later import lapack
-from lavender.base.later import sparse as sp
+from lavender.base.lazy_import import lapack
+from lavender.base.lazy_import import sparse as sp
 from lavender.base.lu import sparse_lu
 
 

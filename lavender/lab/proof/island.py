@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from lavender.base.arrays import FloatArray
-from lavender.base.later import sparse as sp
+from lavender.base.lazy_import import sparse as sp
 from lavender.base.lu import sparse_lu
 from lavender.lab.proof.numbers import UNIT, largest, upper_end
 from lavender.lab.proof.operator import DENSE, Part, Rounded, wider

@@ -9,7 +9,7 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import CapabilityError
-from lavender.base.later import sparse as sp
+from lavender.base.lazy_import import sparse as sp
 from lavender.lab.proof.numbers import UNIT, Balls, matrix, times, upper_end
 from lavender.problem import Problem
 from lavender.problem.derived import cached_property

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from lavender.base.arrays import FloatArray, read_only
-from lavender.base.later import sparse as sp
+from lavender.base.lazy_import import sparse as sp
 from lavender.lab.motion import uniqueness
 from lavender.lab.proof.dependence import Tangled, dependencies, pivots
 from lavender.lab.proof.island import Island, NoZero, Sticks

@@ -18,7 +18,7 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray, IntArray
 from lavender.base.errors import InputError
-from lavender.base.later import sparse as sp
+from lavender.base.lazy_import import sparse as sp
 from lavender.base.lu import sparse_lu
 from lavender.problem import Problem
 from lavender_ext.core.checks import LEAST

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from lavender.base.arrays import FloatArray
-from lavender.base.later import above
+from lavender.base.lazy_import import lazy_module
 from lavender.judge.residuals import Residual, residual
 from lavender.problem import Problem
 from lavender.problem.cones import Cones
@@ -17,7 +17,7 @@ from lavender.sim.engine.layout import HEAD, SIZE
 from lavender.sim.engine.state import State
 from lavender.sim.scene.arithmetic import norm
 
-motion = above("lavender.lab.motion")
+motion = lazy_module("lavender.lab.motion")
 
 PARTS = ("joint", "normal", "disk", "spin", "rolling")
 

@@ -9,7 +9,7 @@ from typing import Any
 from lavender import io
 from lavender.base.arrays import read_only, whole_number
 from lavender.base.errors import InputError, LavenderError, check_name
-from lavender.base.later import above
+from lavender.base.lazy_import import lazy_module
 from lavender.io.stored import folder_for_steps
 from lavender.problem import Problem
 from lavender.sim.engine.check import same_scene, well_formed, whole_state
@@ -265,7 +265,7 @@ class Simulation(Stepping):
             self.end_film(film)
 
         try:
-            viewer = above("lavender.sim.web.view").Viewer(film, port=port, browser=browser, end=end)
+            viewer = lazy_module("lavender.sim.web.view").Viewer(film, port=port, browser=browser, end=end)
         except BaseException:
             self.end_film(film)
             raise

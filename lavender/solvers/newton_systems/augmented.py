@@ -21,7 +21,7 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray
 from lavender.base.deadline import NEVER, Deadline, Stopwatch, TooLate
-from lavender.base.later import sparse as sp
+from lavender.base.lazy_import import sparse as sp
 from lavender.base.lu import sparse_lu
 from lavender.solvers.setup_times import CALLS, SPARSE, loading, sparse_work
 from lavender_ext.newton.solve import WHATS, Layout, Solve

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from lavender.base.arrays import FloatArray, IntArray
-from lavender.base.later import sparse as sp
+from lavender.base.lazy_import import sparse as sp
 from lavender.base.lu import sparse_lu
 from lavender.solvers.factors import TINY, Panels
 from lavender_ext.factor.sparse import is_mirrored

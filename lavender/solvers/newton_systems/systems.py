@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from lavender.base.arrays import IntArray
 from lavender.base.deadline import Deadline
-from lavender.base.later import sparse as sp
+from lavender.base.lazy_import import sparse as sp
 from lavender.judge.residuals import reference
 from lavender.problem import Problem
 from lavender.solvers.factors import DENSE_LIMIT, WIDE

@@ -330,21 +330,21 @@ APART = [b.name for b in backends.BACKENDS if not b.stoppable and b.name in BACK
 
 @pytest.mark.parametrize("name", BACKENDS)
 def test_under_a_time_limit_a_backend_runs_in_a_process_of_its_own(name, monkeypatch):
-    from lavender.external import apart
+    from lavender.external import isolated
 
     problem = lv.Problem.lcp(*spd(12, seed=3))
     plain = lv.solve(problem, name)
-    calls, call = [], apart.call
-    monkeypatch.setattr(apart, "call", lambda *a: calls.append(call(*a)) or calls[-1])
-    apart = lv.solve(problem, name, time_limit=600.0)
+    calls, call = [], isolated.call_backend
+    monkeypatch.setattr(isolated, "call_backend", lambda *a: calls.append(call(*a)) or calls[-1])
+    there = lv.solve(problem, name, time_limit=600.0)
     assert calls and all(answer is not None for answer in calls)
     calls.clear()
     here = lv.solve(problem, name, time_limit=600.0, isolate=False)
     assert not calls
     if name in APART:
-        assert "ran in a process of its own" in apart.message and "ran to its end" in here.message
+        assert "ran in a process of its own" in there.message and "ran to its end" in here.message
     assert plain.success and "time limit" not in plain.message
-    for other in (apart, here):
+    for other in (there, here):
         assert ("takes no time limit" in other.message) == (name in APART)
         assert other.status is plain.status
         assert other.work == plain.work
@@ -368,18 +368,18 @@ def test_a_backend_that_does_not_end_is_ended_and_the_next_call_finds_another():
 
 @pytest.mark.skipif(not APART, reason="no backend without a time limit is installed")
 def test_the_process_is_kept_and_its_death_costs_one_call_at_most():
-    from lavender.external import apart
+    from lavender.external.isolated import idle_processes
 
     problem = lv.Problem.lcp(*spd(5))
     lv.solve(problem, APART[0], time_limit=600.0)
-    kept = list(apart.idle)
-    assert len(kept) == 1
+    before = list(idle_processes)
+    assert len(before) == 1
     lv.solve(problem, APART[0], time_limit=600.0)
-    assert apart.idle == kept
-    kept[0].popen.kill()
-    kept[0].popen.wait()
+    assert idle_processes == before
+    before[0].popen.kill()
+    before[0].popen.wait()
     assert lv.solve(problem, APART[0], time_limit=600.0).success
-    assert apart.idle != kept
+    assert idle_processes != before
 
 
 @pytest.mark.skipif(not APART, reason="no backend without a time limit is installed")
@@ -391,9 +391,9 @@ def test_errors_of_a_process_of_its_own_are_told():
         lv.solve(problem, APART[0], time_limit=600.0, settings={"verbose": lambda: None})
     wrong = {"settings": {"bogus": 1}}
     here = lv.solve(problem, APART[0], time_limit=600.0, isolate=False, **wrong)
-    apart = lv.solve(problem, APART[0], time_limit=600.0, **wrong)
-    assert apart.status is here.status
-    assert apart.message.split(";")[0] == here.message.split(";")[0]
+    there = lv.solve(problem, APART[0], time_limit=600.0, **wrong)
+    assert there.status is here.status
+    assert there.message.split(";")[0] == here.message.split(";")[0]
 
 
 # -- options ------------------------------------------------------------------------------------------
@@ -551,7 +551,7 @@ def test_tol_zero_runs_at_the_tightest_tolerance():
 
 
 def test_dense_backends_refuse_what_would_not_fit(monkeypatch):
-    monkeypatch.setattr(qp_solver, "DENSE_LIMIT", 8 * 10 * 10)
+    monkeypatch.setattr(qp_solver, "MAX_DENSE_SIZE", 8 * 10 * 10)
     problem = lv.Problem.lcp(*spd(11))
     with pytest.raises(lv.CapabilityError, match="dense matrices only"):
         lv.solve(problem, "daqp")

@@ -99,3 +99,10 @@ def test_empty_lists_are_no_contacts_joints_or_bodies(bodies: int) -> None:
         lv.Rows(
             mass, inertia, free, contact_body=[(-1, 0)], normal=NONE, tangent=NONE, arm_a=NONE, arm_b=NONE
         )
+
+
+def test_an_unknown_name_is_an_error_for_mypy_and_has_a_hint() -> None:
+    with pytest.raises(AttributeError) as error:
+        _ = lv.sove  # type: ignore[attr-defined]
+    # Python finds "Did you mean: 'solve'?" from these.
+    assert (error.value.name, error.value.obj) == ("sove", lv)

@@ -15,7 +15,7 @@ from worked import python
 import lavender as lv
 from benchmarks.made import fresh, stacks
 from lavender import registry
-from lavender.base.later import load
+from lavender.base.lazy_import import import_numerics
 from lavender.judge import residuals
 from lavender.judge.residuals import judging_time
 from lavender.problem.derived import once
@@ -74,7 +74,7 @@ def test_nothing_runs_after_a_set_up_that_took_the_whole_limit(name, clock, monk
 @pytest.fixture
 def panels(clock, monkeypatch):
     """Sparse factors whose parts take what is counted, by a clock that is played; what was done, in turn."""
-    load()  # of SciPy, which is counted, too
+    import_numerics()  # of SciPy, which is counted, too
     done, made = SimpleNamespace(names=[], entry=9e-8, first=0.0, flop=0.0), factors.SparsePanels
 
     class Played(made):

@@ -16,12 +16,12 @@ from stacks import stack
 
 import lavender as lv
 from lavender import bench, registry
-from lavender.base.apart.process import opened
+from lavender.base.subprocesses import unpack_answer
 from lavender.lab.bench import cases as bench_cases
 from lavender.lab.bench import machine
 from lavender.lab.bench.running import timing
 from lavender.lab.bench.running import worker as bench_worker
-from lavender.lab.bench.running.worker import DIED, Worker, outcome_in
+from lavender.lab.bench.running.worker import DIED_MESSAGE, Worker, parse_outcome
 
 POSIX = pytest.mark.skipif(os.name != "posix", reason="processes and file names of POSIX")
 BACKENDS = """
@@ -159,7 +159,10 @@ def test_a_backend_that_forks_and_hangs_keeps_nobody_waiting(hostile, watchdog, 
     monkeypatch.setattr(bench_worker, "GRACE", 0.5)
     p = stack()
     with Worker() as worker:
+        worker.measure(p, task(p, "pgs"))  # starts the process
+        start_time = time.monotonic()
         assert worker.measure(p, task(p, f"x_{how}", time_limit=1.5))[0].status == "KILLED"
+        assert time.monotonic() - start_time <= 1.1 * (3.0 * 1.5 + bench_worker.GRACE)
         pids = list(map(int, hostile.read_text().split()))
         assert how == "escape" or (len(pids) == 2 and wait_until(lambda: not any(map(runs, pids))))
         assert worker.measure(p, task(p, "pgs"))[0].status == "CONVERGED"  # and another worker goes on
@@ -170,7 +173,7 @@ def test_a_backend_that_forks_and_hangs_keeps_nobody_waiting(hostile, watchdog, 
 HANGS = """
 import sys
 from lavender import bench
-from lavender.lab.bench.running.worker import Worker, outcome_in
+from lavender.lab.bench.running.worker import Worker
 sys.path[:0] = [sys.argv[1]]
 from test_hostile_backends import stack, task
 p = stack()
@@ -178,11 +181,13 @@ Worker().measure(p, task(p, "x_fork", time_limit=600.0))
 """
 
 
-def test_what_says_nothing_is_told_by_its_kind(hostile, watchdog):
+def test_an_exception_is_named_by_its_type_and_text(hostile, watchdog):
     p = stack()
     with Worker() as worker:
         record, _ = worker.measure(p, task(p, "x_quit"))
-    assert (record.status, record.message) == ("ERROR", "KeyboardInterrupt")
+        assert (record.status, record.message) == ("ERROR", "KeyboardInterrupt")
+        record, _ = worker.measure(p, task(p, "direct", options={"nonsense": 1}))
+    assert record.status == "ERROR" and record.message.startswith("UnknownName: unknown option 'nonsense'")
 
 
 @pytest.mark.slow
@@ -259,8 +264,8 @@ def test_a_check_survives_what_ends_its_process(hostile, watchdog, monkeypatch):
     died = ["CRASHED (exit status 3)", "CRASHED (SIGSEGV)", "CONVERGED"]
     table = lv.cross_check(stack(4), ["x_leave", "x_segfault", "pgs"], "x_leave")
     assert [row.status for row in table] == died
-    assert table["x_leave"].note == DIED and table.reference_note.endswith(
-        f"(x_leave: Lost: {died[0]}: {DIED})"
+    assert table["x_leave"].note == DIED_MESSAGE and table.reference_note.endswith(
+        f"(x_leave: TaskFailed: {died[0]}: {DIED_MESSAGE})"
     )
     monkeypatch.setattr("lavender.lab.bench.running.worker.GRACE", 0.5)
     (row,) = lv.cross_check(stack(4), "x_hang", time_limit=0.1)
@@ -356,9 +361,9 @@ def test_an_answer_that_is_none_is_refused(said):
         "setups": [0.01], "solves": [0.02], "times": [0.04], "pace": 1e-4, "sizes": [4, None],
     }  # fmt: skip
     numbers = np.ones(4).tobytes()
-    assert outcome_in(*opened((json.dumps(good).encode(), numbers)), 4, 1.0).iterations == 3
+    assert parse_outcome(*unpack_answer(json.dumps(good).encode(), numbers), 4, 1.0).iterations == 3
     wrong = {} if not said else good | said
     with pytest.raises(ValueError, match=r".+"):
-        outcome_in(*opened((json.dumps(wrong).encode(), numbers)), 4, 1.0)
+        parse_outcome(*unpack_answer(json.dumps(wrong).encode(), numbers), 4, 1.0)
     with pytest.raises(ValueError, match=r".+"):
-        opened((pickle.dumps(good), numbers))
+        unpack_answer(pickle.dumps(good), numbers)

@@ -1,29 +1,26 @@
-"""Processes in the place of an engine's: each answers once, that it is there, and then fails in its own way."""
+"""Functions in the place of `simulate`: each name fails in its own way."""
 
 import os
 import sys
 import time
 from pathlib import Path
 
-from lavender.base.apart.lines import Lines
-from lavender.base.apart.served import answer, begin, receive
+import numpy as np
+
+from lavender.lab.phenomena.engines.node import JsonLines
 
 
-def serve(lifeline):
-    requests, answers = begin(lifeline)
-    answer(answers, "{}", b"")
-    name, _, _, _ = receive(requests)
+def simulate(name, scene, seconds, interval):
     if name == "dies":
         os.abort()
     if name == "sleeps":
         time.sleep(600)
-    if name.startswith("waits"):  # for a program of its own, whose number it leaves in a file
-        lines = Lines(
+    if name.startswith("waits"):  # for a program of its own, whose process id it writes to a file
+        program = JsonLines(
             [sys.executable, "-c", "import os, time; print(os.getpid(), flush=True); time.sleep(600)"]
         )
-        Path(name.removeprefix("waits ")).write_text(str(lines.ask(None)))
-        lines.ask(None)
+        Path(name.removeprefix("waits ")).write_text(str(program.call(None)))
+        program.call(None)
     if name == "babbles":
-        answer(answers, '{"samples": 3, "bodies": 1, "setting": ""}', b"12345678")
-        time.sleep(600)
-    sys.exit(0)
+        return {"samples": 3, "bodies": 1, "setting": ""}, [np.ones(1)]
+    os._exit(0)

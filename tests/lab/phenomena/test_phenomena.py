@@ -11,16 +11,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from broken_engines import simulate as simulate_broken
 
 import lavender as lv
-from lavender.base.apart.lines import Lines
 from lavender.base.errors import LavenderError
 from lavender.lab.phenomena import PHENOMENA, WAYS, Record, Track, chosen, run, ways
 from lavender.lab.phenomena import table as tables
 from lavender.lab.phenomena.engines import PACKAGES_OF_NODE, follow, make, versions_of_node
+from lavender.lab.phenomena.engines.node import JsonLines
 from lavender.lab.phenomena.engines.tree import collision_shape
 from lavender.lab.phenomena.parts import crossing, judged
-from lavender.lab.phenomena.running import Apart
+from lavender.lab.phenomena.running import EngineProcess
 from lavender.sim.scene.steppers import STEPPERS
 
 NAMES = tuple(PHENOMENA)
@@ -35,18 +36,18 @@ def first(name):
 
 
 @pytest.fixture
-def apart():
-    """A process for engines that is ended whatever became of it."""
-    made = Apart(limit=600.0)
-    yield made
-    made.end()
+def process():
+    """A process for engines, killed at the end of the test."""
+    process = EngineProcess(limit=600.0)
+    yield process
+    process.close()
 
 
 @pytest.fixture
 def broken(request, monkeypatch):
     """The same for engines that fail."""
-    monkeypatch.setattr("lavender.lab.phenomena.running.MODULE", "broken_engines")
-    return request.getfixturevalue("apart")
+    monkeypatch.setattr("lavender.lab.phenomena.running.simulate", simulate_broken)
+    return request.getfixturevalue("process")
 
 
 # -- phenomena ------------------------------------------------------------------------------------
@@ -281,21 +282,21 @@ def test_a_program_that_an_engine_waits_for_ends_with_it(broken, tmp_path):
     pytest.fail("it runs on")
 
 
-def test_a_system_that_starts_no_process_is_a_note(apart, monkeypatch):
+def test_a_system_that_starts_no_process_is_a_note(process, monkeypatch):
     def refuse(*_, **__):
         raise OSError(11, "no more processes")
 
-    monkeypatch.setattr("lavender.base.apart.process.subprocess.Popen", refuse)
-    found = apart.track(OTHERS[0], PHENOMENA["stick"].scene(), 1.0, 0.1)
+    monkeypatch.setattr("lavender.base.subprocesses.subprocess.Popen", refuse)
+    found = process.track(OTHERS[0], PHENOMENA["stick"].scene(), 1.0, 0.1)
     assert found == "its process does not start: [Errno 11] no more processes"
 
 
-def test_what_an_engine_raises_is_told_and_its_process_stays(apart):
+def test_what_an_engine_raises_is_told_and_its_process_stays(process):
     scene = PHENOMENA["stick"].scene()
     for _ in range(2):
-        found = apart.track(dataclasses.replace(OTHERS[0], name="nobody's"), scene, 1.0, 0.1)
+        found = process.track(dataclasses.replace(OTHERS[0], name="nobody's"), scene, 1.0, 0.1)
         assert found == 'it failed: KeyError: "nobody\'s"'
-        assert apart.alive
+        assert process.alive
 
 
 def test_an_engine_that_is_missing_is_a_note(monkeypatch):
@@ -309,7 +310,7 @@ def test_an_engine_that_is_missing_is_a_note(monkeypatch):
 def test_an_engine_without_what_a_scene_needs_is_a_note_and_starts_no_process(monkeypatch):
     bare = dataclasses.replace(OTHERS[0], package="", cannot={"hinge": "it has no hinges"})
     monkeypatch.setitem(WAYS, bare.name, bare)
-    monkeypatch.setattr("lavender.lab.phenomena.running.Process.start", None)  # a start would fail
+    monkeypatch.setattr("lavender.lab.phenomena.running.ProcessBackend.start", None)  # a start would fail
     (record,) = run(["pendulum"], steppers=[], engines=[bare.name], parameters={})
     assert (record.note, record.values, record.passed) == ("it has no hinges", {}, False)
 
@@ -325,11 +326,11 @@ class Answers:
     def __init__(self, command):
         self.command, self.left = command, list(self.said)
 
-    def ask(self, message):
+    def call(self, message):
         assert json.loads(json.dumps(message, allow_nan=False)) == message  # a line of JSON
         return self.left.pop(0)
 
-    def end(self):
+    def close(self):
         self.left = None
 
 
@@ -341,7 +342,7 @@ def under_node(monkeypatch, tmp_path):
         (tmp_path / package).mkdir(parents=True)
         (tmp_path / package / "package.json").write_text('{"version": "1.2.3"}')
     monkeypatch.setenv("NODE_PATH", f"{tmp_path / 'nowhere'}{os.pathsep}{tmp_path}")
-    monkeypatch.setattr(node, "Lines", Answers)
+    monkeypatch.setattr(node, "JsonLines", Answers)
 
     def made(*said):
         monkeypatch.setattr(Answers, "said", said)
@@ -383,17 +384,17 @@ def test_packages_of_node_are_found_or_what_to_install_is_said(under_node, monke
 
 def test_a_program_is_asked_by_lines_and_its_end_is_told():
     echo = "import sys\nfor line in sys.stdin:\n    if '7' in line: sys.exit(3)\n    print(line, flush=True, end='')"
-    lines = Lines([sys.executable, "-c", echo])
+    program = JsonLines([sys.executable, "-c", echo])
     try:
-        assert lines.ask({"a": [1.5, "ü"]}) == {"a": [1.5, "ü"]}
+        assert program.call({"a": [1.5, "ü"]}) == {"a": [1.5, "ü"]}
         with pytest.raises(EOFError, match="status 3"):
-            lines.ask(7)
+            program.call(7)
     finally:
-        lines.end()
+        program.close()
     sleeper = "import os, time; input(); print(os.getpid(), flush=True); time.sleep(60)"
-    lines = Lines([sys.executable, "-c", sleeper])
-    pid = lines.ask({})
-    lines.end()
+    program = JsonLines([sys.executable, "-c", sleeper])
+    pid = program.call({})
+    program.close()
     with pytest.raises(ProcessLookupError):
         os.kill(pid, 0)
 

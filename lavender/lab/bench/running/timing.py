@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from lavender.base.arrays import FloatArray
-from lavender.base.later import load
+from lavender.base.lazy_import import import_numerics
 from lavender.external.stopwatch import own_time
 from lavender.judge.residuals import reference
 from lavender.judge.solution import Claim, Solution, Status, uninterrupted
@@ -113,7 +113,7 @@ def _thread_pools(solver: str) -> Any:
     # Looking for the libraries reads /proc, a few milliseconds: once a solver, when its own are loaded, and SciPy's.
     from threadpoolctl import ThreadpoolController
 
-    load()
+    import_numerics()
     return ThreadpoolController()
 
 

@@ -1,10 +1,7 @@
-"""A process of its own for code that is not ours: it may hang, eat memory or die, and costs one record.
+"""Run tasks of third-party solvers in another process: code that hangs, exhausts memory or dies costs one record.
 
-The parent starts another Python (`serve`), sends a problem once and tasks after it, and gets answers back. What
-comes back is data, numbers and words of a stated form and size, never an object that is unpickled; the verdict on it
-is computed here, from a problem that the process never held. What a backend prints goes to nowhere. A worker that
-does not answer in time is killed with everything that it started, and the next task starts another; when this process
-dies, the system ends its workers.
+The process gets a problem once and tasks after it. The verdict on an answer is computed here, from a problem that the
+process never held.
 """
 
 from __future__ import annotations
@@ -14,11 +11,11 @@ import time
 from dataclasses import fields, replace
 from typing import Any
 
-from lavender.base.apart import served
-from lavender.base.apart.process import Ended, Process, Raised
+from lavender.base import subprocesses
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import LavenderError
-from lavender.base.later import load
+from lavender.base.lazy_import import import_numerics
+from lavender.base.subprocesses import ProcessBackend, ProcessEnded, RemoteError
 from lavender.judge.solution import Solution, Status
 from lavender.lab.bench.cases import fingerprint
 from lavender.lab.bench.machine import memory_share
@@ -28,15 +25,15 @@ from lavender.problem import Problem
 from lavender.solvers import registry
 from lavender.solving.solve import Prepared, seconds_of, solve
 
-_ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
-ORPHAN = 60.0  # s of CPU, beyond what any task may take
-ARRAYS = ("impulse", "certificate")  # of an outcome
-DIED = "its code ended the process that it ran in; tell its authors, and leave it out (--solvers)"
-GRACE = 2.0  # s, beyond the repeats' own limits, for set-up and judging, before the worker is killed
+ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+ORPHAN_CPU_TIME = 60.0  # s. A worker without a parent is killed this CPU time after its task's limit.
+OUTCOME_ARRAYS = ("impulse", "certificate")  # fields of `Outcome`, in the order in which they are sent
+DIED_MESSAGE = "its code ended the process that it ran in; tell its authors, and leave it out (--solvers)"
+GRACE = 2.0  # s. A worker has this time for set-up and judging, beyond the limits of the repeats, before it is killed.
 
 
-class Lost(LavenderError):
-    """A task brought no solution back; `status` is what its record says, the text why."""
+class TaskFailed(LavenderError):
+    """A task returned no solution; `status` is the status of its record, the text says why."""
 
     def __init__(self, status: str, text: str) -> None:
         super().__init__(f"{status}: {text}")
@@ -44,71 +41,74 @@ class Lost(LavenderError):
 
 
 class Worker:
-    """One worker process at a time, started when needed; `close` ends it.
+    """One worker process at a time, started when it is needed; `close` kills it.
 
     Parameters
     ----------
     memory : int, optional, bytes
-        Limit of the worker's address space, where the system has one; `machine.memory_share()` if None.
+        Limit of the worker's address space if the system has one; `machine.memory_share()` if None.
     """
 
     def __init__(self, memory: int | None = None) -> None:
         self.memory = memory_share() if memory is None else memory
-        self._process = Process(__name__, self.memory or 0, environment=_ONE_THREAD)
-        self._holds = ""
+        self._process = ProcessBackend(run_task, memory=self.memory or 0, environment=ONE_THREAD)
+        self._problem_hash = ""  # of the problem that the process holds
 
     def measure(self, problem: Problem, task: Task, impulse: Any = None) -> tuple[Record, FloatArray | None]:
-        """As `lavender.lab.bench.running.timing.measure`, in the worker."""
+        """Equivalent to `lavender.lab.bench.running.timing.measure`, in the worker."""
         try:
-            return judged(problem, task, self._outcome(problem, task, impulse))
-        except Lost as lost:
-            return task.record(status=lost.status, message=lost.text), None
+            return judged(problem, task, self._run(problem, task, impulse))
+        except TaskFailed as failure:
+            return task.record(status=failure.status, message=failure.text), None
 
     def solve(self, problem: Problem, task: Task) -> Solution:
-        """The solution of a task, judged here.
+        """Return the solution of a task, judged in this process.
 
         Raises
         ------
-        Lost
-            The solver raised something, or did not end, or ended the worker.
+        TaskFailed
+            The solver raised an exception, did not end, or ended the worker.
         """
-        found = self._outcome(problem, task, None)
-        if isinstance(found, str):
-            raise Lost(ERROR, found)
-        return solution_of(problem, task, found)
+        outcome = self._run(problem, task, None)
+        if isinstance(outcome, str):
+            raise TaskFailed(ERROR, outcome)
+        return solution_of(problem, task, outcome)
 
-    def _outcome(self, problem: Problem, task: Task, impulse: Any) -> Outcome | str:
+    def _run(self, problem: Problem, task: Task, impulse: Any) -> Outcome | str:
+        """Return the outcome of a task, or the text of the exception that the solver raised."""
         process = self._process
         if not process.alive:
-            self._holds = ""
-            cause = process.start()
-            if cause:
-                raise Lost(f"{CRASHED} (did not start)", f"the worker process ended: {cause}")
-        # Repeats end once they took the limit together, so at most two can take it; backends look at the clock
-        # now and then.
+            self._problem_hash = ""
+            try:
+                process.start()
+            except ProcessEnded as error:
+                cause = f"the worker process ended: {error}"
+                raise TaskFailed(f"{CRASHED} (did not start)", cause) from None
+        # The repeats end when their sum reaches the limit, so no more than two take all of it; some backends read the
+        # clock only every few seconds.
         limit = 3.0 * task.time_limit + GRACE
-        begun = time.monotonic()
-        messages: list[Any] = [("task", task, impulse)]
-        if self._holds != task.sha:
-            messages.insert(0, ("problem", problem))
-        self._holds = task.sha
+        start_time = time.monotonic()
+        new_problem = None if self._problem_hash == task.sha else problem
+        self._problem_hash = ""
         try:
-            said, arrays = process.ask(messages, limit, 16 * problem.m)
-            return outcome_in(said, arrays, problem.m, time.monotonic() - begun, task.lead)
+            answer, arrays = process.call(new_problem, task, impulse, timeout=limit, max_bytes=16 * problem.m)
+            elapsed = time.monotonic() - start_time
+            self._problem_hash = task.sha
+            return parse_outcome(answer, arrays, problem.m, elapsed, task.lead)
         except TimeoutError:
-            raise Lost(KILLED, f"did not stop; its process was killed after {limit:.3g} s") from None
-        except Ended as end:
-            raise Lost(f"{CRASHED} ({end})", DIED) from None
-        except Raised as error:
-            return f"{error.kind}: {error}".removesuffix(": ")
+            raise TaskFailed(KILLED, f"did not stop; its process was killed after {limit:.3g} s") from None
+        except ProcessEnded as error:
+            raise TaskFailed(f"{CRASHED} ({error})", DIED_MESSAGE) from None
+        except RemoteError as error:
+            return ": ".join(filter(None, (error.kind, str(error))))
         except ValueError as error:
-            process.end()
+            process.close()
             text = f"the process of the backend sent what is no answer ({error}); it was killed"
-            raise Lost(f"{CRASHED} (no answer)", text) from None
+            raise TaskFailed(f"{CRASHED} (no answer)", text) from None
 
     def close(self) -> None:
-        """End the process and what it started."""
-        self._process.end()
+        """Kill the process and the processes that it started."""
+        self._process.close()
 
     def __enter__(self) -> Worker:
         return self
@@ -117,7 +117,7 @@ class Worker:
         self.close()
 
 
-def solved(
+def solve_isolated(
     worker: Worker,
     problem: Problem,
     name: str,
@@ -127,18 +127,18 @@ def solved(
     time_limit: float | None = None,
     **options: Any,
 ) -> Solution:
-    """As `lv.solve`; a solver that another process finds by its entry point is run by the worker.
+    """Solve as `lv.solve` does; the worker runs a solver that another process can find by its entry point.
 
     Raises
     ------
-    Lost
-        It raised something, did not end, or ended the worker.
+    TaskFailed
+        The solver raised an exception, did not end, or ended the worker.
     """
     spec = registry.get(name)
-    if not spec.plugged or max_iter == 0:  # which is none; of a task it is the solver's own
-        load(*spec.requires)  # what the time of a first solve would hold besides
+    if not spec.plugged or max_iter == 0:  # In a task, 0 means the solver's own max_iter.
+        import_numerics(*spec.requires)  # otherwise a part of the time of a first solve
         return solve(problem, name, tol=tol, max_iter=max_iter, time_limit=time_limit, **options)
-    Prepared(problem, spec, options, begin=False)  # what is refused, is refused here
+    Prepared(problem, spec, options, begin=False)  # raises if the solver rejects the problem or an option
     task = Task(
         run="",
         case=problem.name,
@@ -154,56 +154,59 @@ def solved(
     return worker.solve(problem, task)
 
 
-def serve(memory: int, lifeline: int) -> None:
-    """The other process: answer tasks, until they end; `memory`: bytes of address space, 0 for no limit."""
-    served.serve(lifeline, _runner, memory)
+_problem: Problem | None = None  # in the worker process: the problem of the last task
 
 
-def _runner() -> served.Handler:
-    problem: Any = None
-
-    def run(message: Any) -> tuple[dict[str, Any], list[Any]] | None:
-        nonlocal problem
-        if message[0] == "problem":
-            problem = message[1]
-            return None
-        served.limit_cpu(3.0 * message[1].time_limit + ORPHAN)
-        found = attempt(problem, message[1], message[2])
-        if isinstance(found, str):
-            return {"error": found[:500]}, []
-        found = replace(found, message=str(found.message)[:500], form=str(found.form)[:500])
-        said = {f.name: plain(getattr(found, f.name)) for f in fields(found) if f.name not in ARRAYS}
-        return said, [getattr(found, name) for name in ARRAYS]
-
-    return run
+def run_task(problem: Problem | None, task: Task, impulse: Any) -> subprocesses.Answer:
+    """Run a task, in the worker process, on `problem` or, if it is None, on the problem of the last task."""
+    global _problem
+    _problem = _problem if problem is None else problem
+    assert _problem is not None
+    subprocesses.limit_cpu_time(3.0 * task.time_limit + ORPHAN_CPU_TIME)
+    outcome = attempt(_problem, task, impulse)
+    if isinstance(outcome, str):
+        return {"error": outcome[: subprocesses.MAX_ERROR_LENGTH]}, ()
+    message, form = (str(x)[: subprocesses.MAX_ERROR_LENGTH] for x in (outcome.message, outcome.form))
+    outcome = replace(outcome, message=message, form=form)
+    answer = {
+        f.name: plain(getattr(outcome, f.name)) for f in fields(outcome) if f.name not in OUTCOME_ARRAYS
+    }
+    return answer, [getattr(outcome, name) for name in OUTCOME_ARRAYS]
 
 
-def outcome_in(said: dict[str, Any], arrays: list[Any], m: int, took: float, lead: float = 0.0) -> Outcome:
-    """What an answer says, every part of it checked.
+def parse_outcome(
+    answer: dict[str, Any], arrays: list[Any], m: int, elapsed: float, lead: float = 0.0
+) -> Outcome:
+    """Check every part of an answer and return its outcome.
 
-    `took` [s] is what the whole took here. `lead` [s] passed before, in this process, and is in each time of a line.
+    Parameters
+    ----------
+    elapsed : float, s
+        Time that the call took, measured here.
+    lead : float, s
+        Time that each of `Outcome.times` contains and that passed here before the call.
 
     Raises
     ------
     ValueError
-        It is none: other words, counts or sizes, times longer than the whole took.
+        The answer has other fields, counts or sizes, or times longer than `elapsed`.
     """
-    values = values_in(Outcome, said)
+    values = values_in(Outcome, answer)
     if values.get("status") not in Status.__members__:
         raise ValueError("no status")
     if len(arrays) != 2 or arrays[0] is None or any(x is not None and len(x) != m for x in arrays):
         raise ValueError("impulses of another length")
     try:
-        found = Outcome(*arrays, **values)
+        outcome = Outcome(*arrays, **values)
     except TypeError as error:
         raise ValueError(str(error)) from None
-    parts = (*found.setups, *found.solves)
-    if not parts or len(found.setups) != len(found.solves):
+    parts = (*outcome.setups, *outcome.solves)
+    if not parts or len(outcome.setups) != len(outcome.solves):
         raise ValueError("no times")
-    lines = [t - lead for t in found.times]
-    known = all(t >= 0.0 for t in (*parts, *lines))
-    if not known or not max(math.fsum(parts), math.fsum(lines)) <= took:
+    times = [t - lead for t in outcome.times]
+    valid = all(t >= 0.0 for t in (*parts, *times))
+    if not valid or not max(math.fsum(parts), math.fsum(times)) <= elapsed:
         raise ValueError("times that did not pass")
-    if not all(t is None or t <= took for t in (found.pace, found.own)):
+    if not all(t is None or t <= elapsed for t in (outcome.pace, outcome.own)):
         raise ValueError("a pace, or a time of its own, that did not pass")
-    return found
+    return outcome

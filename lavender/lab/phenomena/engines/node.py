@@ -1,13 +1,16 @@
-"""Engines that npm installs, under Node: `served.mjs` steps them, each with a file of its own beside it."""
+"""Run engines that npm installs: the Node program `served.mjs` steps them, each by its own file in this folder."""
 
 from __future__ import annotations
 
+import contextlib
+import json
+import subprocess
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from lavender.base.apart.lines import Lines
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import CapabilityError, LavenderError
 from lavender.lab.phenomena.engines import PACKAGES_OF_NODE, Stepping, missing_in_node, node_folder
@@ -17,15 +20,46 @@ from lavender.sim.scene import Body, Plane, Scene, Sphere
 SCRIPT = Path(__file__).with_name("served.mjs")
 
 
+class JsonLines:
+    """A program that answers each line of JSON with one.
+
+    It has no time limit: its parent is a `ProcessBackend`, which is killed together with it.
+    """
+
+    def __init__(self, command: Sequence[str]) -> None:
+        self._name = command[0]
+        self._process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, encoding="utf-8"
+        )
+
+    def call(self, message: Any) -> Any:
+        """Return the answer to a message; EOFError if the program ended, ValueError if the answer is not JSON."""
+        requests, answers = self._process.stdin, self._process.stdout
+        assert requests is not None and answers is not None
+        with contextlib.suppress(OSError):  # The program ended; there is no answer.
+            requests.write(json.dumps(message) + "\n")
+            requests.flush()
+        line = answers.readline()
+        if not line:
+            raise EOFError(f"{self._name} ended with status {self._process.wait()}")
+        return json.loads(line)
+
+    def close(self) -> None:
+        """Kill the program: it has nothing to lose."""
+        self._process.kill()
+        with contextlib.suppress(OSError):  # It closed a pipe itself.
+            self._process.communicate()
+
+
 class Engine(Stepping):
-    """Steps in the other process; a state comes back with each answer."""
+    """An engine under Node, which returns its state with each answer."""
 
     def __init__(self, scene: Scene, engine: str, dt: float = 1.0 / 60.0, **options: float) -> None:
-        parents(scene, engine)  # what trees do not have is refused
+        parents(scene, engine)  # raises if the scene is not a tree
         self.dt, self.spent = dt, 0.0
         self.setting = f"{1e3 * dt:.3g} ms, {', '.join(f'{k} {v}' for k, v in options.items())}"
         p = scene.parameters
-        told = {
+        request = {
             "gravity": list(p.gravity),
             "friction": p.friction,
             "bodies": [_body(body, engine) for body in scene.bodies],
@@ -37,22 +71,22 @@ class Engine(Stepping):
                 for j in scene.joints
             ],
         }  # fmt: skip
-        place = node_folder(PACKAGES_OF_NODE[engine])
-        if place is None:
+        folder = node_folder(PACKAGES_OF_NODE[engine])
+        if folder is None:
             raise LavenderError(f"{engine}: {missing_in_node(PACKAGES_OF_NODE[engine])}")
-        self.lines = Lines(["node", str(SCRIPT), engine, str(place)])
-        self._ask({"scene": told, "options": {"dt": self.dt, **options}})
+        self.program = JsonLines(["node", str(SCRIPT), engine, str(folder)])
+        self._call({"scene": request, "options": {"dt": self.dt, **options}})
         self.spent = 0.0
 
-    def _ask(self, message: Any) -> None:
-        said = self.lines.ask(message)
-        if "cannot" in said:
-            raise CapabilityError(str(said["cannot"]))
-        if "error" in said:
-            raise LavenderError(str(said["error"]))
-        self.spent += float(said["cpu"])
+    def _call(self, message: Any) -> None:
+        answer = self.program.call(message)
+        if "cannot" in answer:
+            raise CapabilityError(str(answer["cannot"]))
+        if "error" in answer:
+            raise LavenderError(str(answer["error"]))
+        self.spent += float(answer["cpu"])
         # null, for what is not finite, becomes nan
-        self.seen = np.array(said["state"], float).reshape(-1, 13)
+        self.seen = np.array(answer["state"], float).reshape(-1, 13)
 
     def step(self) -> None:
         """See `Stepping.step`."""
@@ -60,10 +94,10 @@ class Engine(Stepping):
 
     def advance(self, steps: int) -> None:
         """See `Stepping.advance`."""
-        self._ask({"steps": steps})
+        self._call({"steps": steps})
 
     def clock(self) -> float:
-        """See `Stepping.clock`: of the other process."""
+        """See `Stepping.clock`: the time of the other process."""
         return self.spent
 
     def state(self) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -72,25 +106,25 @@ class Engine(Stepping):
 
     def close(self) -> None:
         """See `Stepping.close`."""
-        self.lines.end()
+        self.program.close()
 
 
 def _body(body: Body, engine: str) -> dict[str, Any]:
     shape = collision_shape(body, engine, static=False)
     if isinstance(shape, Plane):
-        told: dict[str, Any] = {"kind": "plane", "normal": list(shape.normal), "offset": shape.offset}
+        shape_data: dict[str, Any] = {"kind": "plane", "normal": list(shape.normal), "offset": shape.offset}
     elif isinstance(shape, Sphere):
-        told = {"kind": "sphere", "radius": shape.radius}
+        shape_data = {"kind": "sphere", "radius": shape.radius}
     else:
-        told = {"kind": "box", "size": list(shape.size)}
+        shape_data = {"kind": "box", "size": list(shape.size)}
     position, quaternion = body.position.tolist(), body.quaternion.tolist()
     return {
-        "shape": told,
+        "shape": shape_data,
         "mass": body.mass,
         "inertia": np.diag(body.inertia).tolist(),
         "position": position,
         "quaternion": quaternion,
         "velocity": body.velocity.tolist(),
         "spin": body.angular_velocity.tolist(),
-        "still": [*position, *quaternion, *[0.0] * 6],  # of what does not move
+        "still": [*position, *quaternion, *[0.0] * 6],  # the state of a body that does not move
     }

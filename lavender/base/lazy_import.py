@@ -1,0 +1,92 @@
+"""Import modules at their first use, in any thread.
+
+`from lavender.base.lazy_import import sparse as sp` replaces `import scipy.sparse as sp`: these parts of SciPy would
+double the time of `import lavender`. `import_numerics` imports them before the clock of a solve starts.
+
+`lazy_loader` (SPEC 1) is not used because it is not thread-safe. Four threads used three lazy modules of SciPy at once:
+8 of 12 processes on Python 3.11 got an AttributeError. Its `attach` for names of a package deadlocked in one of 12.
+"""
+
+from __future__ import annotations
+
+import os
+from importlib import import_module
+from threading import RLock
+from typing import TYPE_CHECKING, Any
+
+__all__ = [
+    "import_lock",
+    "import_locked",
+    "import_numerics",
+    "issparse",
+    "lapack",
+    "lazy_module",
+    "sparse",
+    "spatial",
+]
+
+_lock = RLock()
+
+
+def import_lock() -> RLock:
+    """Return the lock under which one thread at a time imports modules and fills tables from them."""
+    return _lock
+
+
+def import_locked(name: str) -> Any:
+    """Import a module, under the lock, and return it.
+
+    Python locks each module separately, a file before its package. Of two threads that enter a package by different
+    files, one would get an incomplete module.
+    """
+    with import_lock():
+        return import_module(name)
+
+
+def _replace_lock() -> None:
+    global _lock
+    _lock = RLock()  # In a forked process, the thread that may hold the old lock does not exist.
+
+
+if hasattr(os, "register_at_fork"):  # Windows has none.
+    os.register_at_fork(after_in_child=_replace_lock)
+
+
+class _LazyModule:
+    """A module that is imported when its first attribute is read."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def __getattr__(self, name: str) -> Any:
+        if name == "_name" or name.startswith("__"):  # `copy` reads these before `__init__` has run.
+            raise AttributeError(name)
+        value = getattr(import_locked(self._name), name)
+        setattr(self, name, value)
+        return value
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _LazyModule, (self._name,)
+
+
+if TYPE_CHECKING:
+    from scipy import sparse, spatial
+    from scipy.linalg import lapack
+else:
+    sparse, spatial, lapack = map(_LazyModule, ("scipy.sparse", "scipy.spatial", "scipy.linalg.lapack"))
+
+
+def lazy_module(name: str) -> Any:
+    """Return a module of a higher layer, for a method that only calls a function there."""
+    return _LazyModule(name)
+
+
+def import_numerics(*names: str) -> None:
+    """Import SciPy's sparse arrays, their graphs and LAPACK, and the modules `names`."""
+    for name in ("scipy.sparse", "scipy.sparse.csgraph", "scipy.linalg.lapack", *names):
+        import_locked(name)
+
+
+def issparse(value: object) -> bool:
+    """Return whether `value` is a sparse array or matrix of SciPy, without importing SciPy if it cannot be one."""
+    return hasattr(type(value), "tocsr") and bool(sparse.issparse(value))

@@ -1,0 +1,360 @@
+"""Run functions on third-party code in another Python process, which can be killed.
+
+Code that hangs, calls `os._exit`, starts processes or exhausts memory ends only its own call. Requests are pickled.
+Answers are JSON and float64 arrays of a bounded size, and are never unpickled.
+
+No process pool of a library gives this (pebble 5.2.3 was measured): if the code handles SIGTERM or does not return to
+the interpreter, the pool kills it 3 s after its limit; processes that the code started run on; the parent unpickles
+what the code writes; and a script without `if __name__ == "__main__"` cannot use the pool.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import pickle
+import signal
+import struct
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from typing import IO, Any
+
+import numpy as np
+
+START_TIMEOUT = 60.0  # s. On a loaded machine, importing a function and its modules may take this long.
+KILL_TIMEOUT = 10.0  # s. The system may need longer to end a killed process that waits for a broken disk.
+PIPE_TIMEOUT = 0.1  # s. A pipe that stays open for longer after the kill is held by another process.
+MAX_TEXT_SIZE = 2**20  # bytes. An answer that announces more JSON than this is invalid.
+MAX_ERROR_LENGTH = 500  # characters. Longer texts of errors are cut.
+#: If set, a process is killed together with the processes that it started.
+PROCESS_GROUPS = os.name == "posix"
+#: Not `-m`: it puts the current folder first, and in a checkout the sources hide the installed package.
+SCRIPT = (
+    "import sys; sys.path[:] = filter(None, sys.path); from lavender.base.subprocesses import serve; "
+    "serve(*map(int, sys.argv[1:]))"
+)
+
+#: The JSON object and the arrays (None: not given) of an answer.
+Answer = tuple[dict[str, Any], Sequence[Any]]
+
+
+class ProcessEnded(Exception):
+    """The process ended before it answered; the text says how."""
+
+
+class InvalidAnswer(ValueError):
+    """The process sent bytes that are not an answer; the text says why."""
+
+
+class RemoteError(Exception):
+    """The function raised an exception; `kind` is the name of its type."""
+
+    def __init__(self, text: str, kind: str) -> None:
+        super().__init__(text)
+        self.kind = kind
+
+
+class ProcessBackend:
+    """Calls one function in a process that is started by `start` and kept between calls.
+
+    When this process ends, the system kills the other one.
+
+    Parameters
+    ----------
+    function : callable
+        A function at the top level of a module; it returns an `Answer`.
+    memory : int, bytes
+        Limit of the address space if the system has one; 0 for no limit.
+    environment : mapping, optional
+        Environment variables in addition to those of this process.
+    """
+
+    def __init__(
+        self,
+        function: Callable[..., Answer],
+        *,
+        memory: int = 0,
+        environment: Mapping[str, str] | None = None,
+    ) -> None:
+        self._function, self._memory, self._environment = function, memory, environment or {}
+        self.popen: subprocess.Popen[bytes] | None = None
+        self._lifeline = -1  # writing end of a pipe that the system closes when this process ends
+        self._exchange_thread: threading.Thread | None = None
+
+    @property
+    def alive(self) -> bool:
+        """Whether the process runs."""
+        return self.popen is not None and self.popen.poll() is None
+
+    def start(self) -> None:
+        """Start the process unless it runs, and wait until it has imported the function.
+
+        Raises
+        ------
+        ProcessEnded
+            The system starts no process, or the function cannot be imported.
+        """
+        if self.alive:
+            return
+        self.close()
+        try:
+            self._start()
+            self.call(self._function, timeout=START_TIMEOUT, max_bytes=0)
+        except (OSError, InvalidAnswer) as error:
+            raise ProcessEnded(str(error) or "no answer") from None
+        except RemoteError as error:
+            self.close()
+            raise ProcessEnded(f"{error.kind}: {error}") from None
+
+    def _start(self) -> None:
+        path = os.pathsep.join(p or os.getcwd() for p in sys.path)
+        options: dict[str, Any] = {}
+        lifeline = -1
+        if PROCESS_GROUPS:
+            lifeline, self._lifeline = os.pipe()
+            options = {"start_new_session": True, "pass_fds": (lifeline,)}
+        try:
+            self.popen = subprocess.Popen(
+                [sys.executable, "-c", SCRIPT, str(lifeline), str(self._memory)],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.DEVNULL,
+                env={**os.environ, **self._environment, "PYTHONPATH": path},
+                **options,
+            )
+        except BaseException:
+            self._close_lifeline()
+            raise
+        finally:
+            if lifeline >= 0:
+                os.close(lifeline)
+
+    def call(self, *arguments: Any, timeout: float, max_bytes: int) -> tuple[dict[str, Any], list[Any]]:
+        """Call the function, and return the JSON object and the arrays of its answer.
+
+        Parameters
+        ----------
+        timeout : float, s
+            Time to send the arguments, call the function and receive the answer.
+        max_bytes : int
+            Maximum size of all arrays together.
+
+        Raises
+        ------
+        pickle.PicklingError, TypeError, AttributeError
+            An argument cannot be pickled; the process runs on.
+        RemoteError
+            The function raised; the process runs on.
+        TimeoutError
+            The process was killed. It is also killed by Ctrl-C.
+        ProcessEnded
+        InvalidAnswer
+            The process was killed.
+        """
+        request = pickle.dumps(arguments, pickle.HIGHEST_PROTOCOL)
+        process = self.popen
+        assert process is not None
+        received: list[tuple[bytes, bytes] | BaseException] = []
+
+        # If a process that left the group holds a pipe, this thread waits alone.
+        def exchange() -> None:
+            try:
+                assert process.stdin is not None and process.stdout is not None
+                process.stdin.write(struct.pack("<Q", len(request)))
+                process.stdin.write(request)
+                process.stdin.flush()
+                text_size, array_size = struct.unpack("<QQ", _read(process.stdout, 16))
+                if text_size > MAX_TEXT_SIZE or array_size > max_bytes:
+                    raise InvalidAnswer(f"answers of {text_size} and {array_size} bytes are too large")
+                received.append((_read(process.stdout, text_size), _read(process.stdout, array_size)))
+            except BaseException as error:
+                _close_streams(process)
+                received.append(error)
+
+        self._exchange_thread = threading.Thread(target=exchange, daemon=True)
+        self._exchange_thread.start()
+        try:
+            self._exchange_thread.join(min(timeout, threading.TIMEOUT_MAX))
+            if not received:
+                raise TimeoutError
+            answer = received[0]
+            if isinstance(answer, OSError | EOFError):
+                raise ProcessEnded(self._end())
+            if isinstance(answer, BaseException):
+                raise answer
+            return unpack_answer(*answer)
+        except RemoteError:
+            raise
+        except BaseException:
+            self.close()
+            raise
+
+    def _end(self) -> str:
+        """Kill the process and return how it ended."""
+        process = self.popen
+        assert process is not None
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(1.0)
+        code = process.returncode
+        self.close()
+        if code is None:
+            return "no answer"
+        if code < 0:
+            with contextlib.suppress(ValueError):
+                return signal.Signals(-code).name
+        return f"exit status {code}"
+
+    def close(self) -> None:
+        """Kill the process and the processes that it started."""
+        process, self.popen = self.popen, None
+        if process is None:
+            return
+        if PROCESS_GROUPS:
+            # The group keeps the number of its first process as long as another process of the group runs.
+            with contextlib.suppress(OSError):
+                os.killpg(process.pid, signal.SIGKILL)
+        self._close_lifeline()
+        process.kill()
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(KILL_TIMEOUT)
+        if self._exchange_thread is not None:
+            self._exchange_thread.join(PIPE_TIMEOUT)
+            if self._exchange_thread.is_alive():
+                return  # It closes the streams.
+        _close_streams(process)
+
+    def _close_lifeline(self) -> None:
+        if self._lifeline >= 0:
+            os.close(self._lifeline)
+            self._lifeline = -1
+
+
+def _close_streams(process: subprocess.Popen[bytes]) -> None:
+    for stream in (process.stdin, process.stdout):
+        with contextlib.suppress(OSError):
+            assert stream is not None
+            stream.close()
+
+
+def _read(stream: IO[bytes], size: int) -> bytes:
+    """Read `size` bytes; EOFError if the stream ends before."""
+    data = stream.read(size)
+    if len(data) < size:
+        raise EOFError
+    return data
+
+
+def unpack_answer(text: bytes, numbers: bytes) -> tuple[dict[str, Any], list[Any]]:
+    """Return the JSON object and copies of the arrays of an answer, which may hold anything.
+
+    Raises
+    ------
+    RemoteError
+    InvalidAnswer
+        The text is not a JSON object, or the arrays have other sizes than it says.
+    """
+    try:
+        fields = json.loads(text)
+        if "error" in fields:
+            raise RemoteError(str(fields["error"]), str(fields.get("kind", "")))
+        values, start, arrays = np.frombuffer(numbers, float), 0, []
+        for size in fields.pop("sizes"):
+            if size is not None and not 0 <= size <= len(values) - start:
+                raise ValueError("arrays of another length")
+            arrays.append(None if size is None else values[start : start + size].copy())
+            start += size or 0
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+        raise InvalidAnswer(f"{type(error).__name__}: {error}") from None
+    return fields, arrays
+
+
+# -- in the other process -----------------------------------------------------------------------------
+
+
+def serve(lifeline: int, memory: int) -> None:
+    """Answer requests until the pipe ends: the first names the function, the others hold its arguments."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # The parent decides what Ctrl-C does.
+    if lifeline >= 0:
+        _end_with_parent(lifeline)
+    requests, answers = _take_streams()
+    if memory:
+        with contextlib.suppress(ImportError, ValueError, OSError):
+            import resource
+
+            resource.setrlimit(resource.RLIMIT_AS, (memory, memory))
+    function: Callable[..., Answer] | None = None
+    while True:
+        try:
+            (size,) = struct.unpack("<Q", _read(requests, 8))
+            request = _read(requests, size)
+        except EOFError:
+            return
+        try:
+            arguments = pickle.loads(request)  # from the parent
+            if function is None:
+                (function,) = arguments
+                text, numbers = _pack_answer({}, ())
+            else:
+                text, numbers = _pack_answer(*function(*arguments))
+        except (
+            BaseException
+        ) as error:  # Third-party code raises anything; a panic of Rust is not an Exception.
+            failure = {"error": str(error)[:MAX_ERROR_LENGTH], "kind": type(error).__name__}
+            text, numbers = json.dumps(failure).encode(), b""
+        answers.write(struct.pack("<QQ", len(text), len(numbers)) + text + numbers)
+        answers.flush()
+
+
+def _pack_answer(fields: dict[str, Any], arrays: Sequence[Any]) -> tuple[bytes, bytes]:
+    sizes = [None if x is None else int(np.size(x)) for x in arrays]
+    numbers = b"".join(np.ascontiguousarray(x, float).tobytes() for x in arrays if x is not None)
+    return json.dumps({**fields, "sizes": sizes}).encode(), numbers
+
+
+def _take_streams() -> tuple[IO[bytes], IO[bytes]]:
+    """Return the streams of requests and answers; discard what is printed from now on."""
+    requests, answers = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
+    null = os.open(os.devnull, os.O_RDWR)
+    os.dup2(null, 0)
+    os.dup2(null, 1)
+    return requests, answers
+
+
+def _end_with_parent(lifeline: int) -> None:
+    """Have this process and those that it starts killed when the parent ends.
+
+    On Linux the kernel sends the signal when the last writing end of the pipe closes, so code that never returns to
+    the interpreter is killed, too. On other systems a thread waits for the end of the pipe.
+    """
+    os.set_inheritable(lifeline, False)
+    with contextlib.suppress(ImportError, AttributeError):  # Only Linux has F_SETSIG.
+        import fcntl
+        import select
+
+        fcntl.fcntl(lifeline, fcntl.F_SETSIG, signal.SIGKILL)
+        fcntl.fcntl(lifeline, fcntl.F_SETOWN, -os.getpgrp())
+        fcntl.fcntl(lifeline, fcntl.F_SETFL, fcntl.fcntl(lifeline, fcntl.F_GETFL) | os.O_ASYNC)
+        if select.select([lifeline], [], [], 0.0)[0]:  # The parent ended before this was set up.
+            os.killpg(0, signal.SIGKILL)
+        return
+
+    def wait() -> None:
+        os.read(lifeline, 1)
+        os.killpg(0, signal.SIGKILL)
+
+    threading.Thread(target=wait, daemon=True).start()
+
+
+def limit_cpu_time(extra: float) -> None:
+    """Have the system kill this process after `extra` more CPU time [s], in case the parent no longer can."""
+    with contextlib.suppress(
+        ImportError, ValueError, OSError, OverflowError
+    ):  # OverflowError: inf is no limit.
+        import resource
+
+        hard = resource.getrlimit(resource.RLIMIT_CPU)[1]
+        resource.setrlimit(resource.RLIMIT_CPU, (int(time.process_time() + extra) + 1, hard))

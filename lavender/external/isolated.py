@@ -1,0 +1,165 @@
+"""Run backends under a time limit in other processes, which are kept from call to call.
+
+A process that does not answer in time is killed, and the next call starts another. Backends that accept a time limit
+get it and have as long again to return what they have; some read the clock only every few seconds.
+"""
+
+from __future__ import annotations
+
+import atexit
+import os
+import pickle
+from contextlib import suppress
+from typing import Any
+
+import numpy as np
+
+from lavender.base import subprocesses
+from lavender.base.arrays import FloatArray
+from lavender.base.errors import InputError
+from lavender.base.subprocesses import InvalidAnswer, ProcessBackend, ProcessEnded, RemoteError
+from lavender.external.as_qp import QP, impulse_form
+from lavender.external.backend import Backend
+from lavender.external.running import Answer, Failed, Limits, quiet
+from lavender.judge.solution import Status
+from lavender.problem import Problem
+
+#: Fields of `running.Answer`, in the order in which they are sent.
+ARRAYS = ("x", "zeta", "xi", "direction", "contradiction")
+MAX_MESSAGE_LENGTH = 500  # characters. Longer messages of backends are cut.
+STOPPABLE_LIMIT_RATIO = 2.0  # A backend that accepts a time limit is killed after this multiple of its limit.
+ENTRY_SIZE = 12.0  # bytes that one matrix entry of a program needs in a request
+TRANSFER_RATE = 3e8  # bytes/s. Programs that would take longer to send than the limit time out.
+
+#: Running processes that have no call. A thread that takes one is its only user.
+idle_processes: list[ProcessBackend] = []
+
+
+def start_process(backend: Backend) -> None:
+    """Have a process ready that has imported the backend's code, before the clock of a time limit starts."""
+    process = _take() or ProcessBackend(run_backend)
+    with suppress(ProcessEnded):  # If the system starts no process, the backend runs in this one.
+        process.start()
+        with suppress(TimeoutError, InvalidAnswer, RemoteError):  # The call itself reports them.
+            process.call(backend, timeout=subprocesses.START_TIMEOUT, max_bytes=0)
+        idle_processes.append(process)
+
+
+class IsolatedBackend:
+    """Runs a backend under a time limit in another process, or in this one if the system starts none."""
+
+    def __init__(self, backend: Backend) -> None:
+        self.backend = backend
+        self.place = "to its end"
+
+    def __call__(self, qp: QP, impulse: FloatArray, limit: Limits, settings: dict[str, Any]) -> Answer:
+        answer = call_backend(self.backend, qp, impulse, limit, settings)
+        if answer is None:
+            return self.backend.run(qp, impulse, limit, settings)
+        self.place = "in a process of its own"
+        return answer
+
+
+def call_backend(
+    backend: Backend, qp: QP, impulse: FloatArray, limit: Limits, settings: dict[str, Any]
+) -> Answer | None:
+    """Run the backend in another process, which is killed at the time limit; None if no process is ready.
+
+    Raises
+    ------
+    InputError
+        The backend does not know a setting, or a setting cannot be pickled.
+    Failed
+        The backend raised an exception, or its process died.
+    """
+    assert limit.time_limit is not None
+    if qp.nbytes > TRANSFER_RATE * limit.time_limit:
+        return Answer(
+            Status.TIME_LIMIT, "ended at the time limit: to hand the program over would take longer"
+        )
+    process = _take()
+    if process is None:
+        return None
+    try:
+        fields, arrays = process.call(
+            backend,
+            qp,
+            impulse,
+            limit,
+            settings,
+            timeout=limit.time_limit * (STOPPABLE_LIMIT_RATIO if backend.stoppable else 1.0),
+            max_bytes=8 * (4 * qp.n + 2 * len(qp.b)),
+        )
+    except TimeoutError:
+        return Answer(Status.TIME_LIMIT, "ended at the time limit")
+    except (pickle.PicklingError, TypeError, AttributeError) as error:
+        idle_processes.append(process)
+        raise InputError(
+            f"settings cannot be sent to another process ({error}); isolate=False runs the backend in this one"
+        ) from None
+    except ProcessEnded as error:
+        raise Failed(f"the process of the backend died ({error})") from None
+    except InvalidAnswer as error:
+        raise Failed(f"the process of the backend sent what is no answer ({error})") from None
+    except RemoteError as error:
+        idle_processes.append(process)
+        raise (
+            InputError(str(error)) if error.kind == "InputError" else Failed(f"{error.kind}: {error}")
+        ) from None
+    idle_processes.append(process)
+    try:  # The backend may have written anything.
+        work = {str(kind): int(count) for kind, count in fields["work"].items()}
+        by_name = dict(zip(ARRAYS, arrays, strict=True))
+        return Answer(status=Status[fields["status"]], words=str(fields["words"]), work=work, **by_name)
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
+        raise Failed(f"the process of the backend sent what is no answer ({error})") from None
+
+
+def _take() -> ProcessBackend | None:
+    """Return a process that runs and has no call; None if there is none."""
+    while True:
+        try:
+            process = idle_processes.pop()
+        except IndexError:
+            return None
+        if process.alive:
+            return process
+        process.close()
+
+
+@atexit.register
+def _close_idle() -> None:
+    while idle_processes:
+        idle_processes.pop().close()
+
+
+if hasattr(os, "register_at_fork"):  # Windows has none. A forked process must not use its parent's processes.
+    os.register_at_fork(after_in_child=idle_processes.clear)
+
+
+# -- in the other process -----------------------------------------------------------------------------
+
+_warm: set[str] = set()  # names of the backends that were warmed up
+
+
+def run_backend(
+    backend: Backend,
+    qp: QP | None = None,
+    impulse: FloatArray | None = None,
+    limit: Limits | None = None,
+    settings: dict[str, Any] | None = None,
+) -> subprocesses.Answer:
+    """Run a backend; without a program, solve a tiny one, because backends import their code when they first solve."""
+    if qp is None or impulse is None or limit is None or settings is None:
+        if backend.name not in _warm:
+            _warm.add(backend.name)
+            with suppress(Exception), quiet(backend.noisy):
+                tiny = impulse_form(Problem.lcp(np.eye(1), np.ones(1)))
+                backend.run(tiny, np.zeros(1), Limits(1e-3, 1e-3, 1e-3, 100, None), {})
+        return {}, ()
+    with quiet(backend.noisy) as printed:
+        answer = backend.run(qp, impulse, limit, settings)
+    work = {str(kind): int(count) for kind, count in answer.work.items()}
+    message = str(answer.words or "; ".join(printed))[:MAX_MESSAGE_LENGTH]
+    fields = {"status": answer.status.name, "words": message, "work": work}
+    return fields, [getattr(answer, name) for name in ARRAYS]
