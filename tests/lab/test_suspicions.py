@@ -167,7 +167,7 @@ def test_generalised_coordinates_out_of_order_are_told():
             grouped
         ]  # which does not tell the order
         (found,) = lv.diagnose(problem(j[grouped], target=target))
-        assert "if all normals stand first" in found.reason
+        assert "if all normals come first" in found.reason
     moving = np.arange(len(mass)) % 6 < 3
     inverse = np.linalg.inv(mass)
     for wrong, words in (
@@ -213,7 +213,7 @@ def test_a_state_that_does_not_fit_the_problem_is_refused():
         lv.diagnose(problem, velocity=np.zeros(3))
     with pytest.raises(lv.InputError, match="shape"):
         lv.diagnose(problem, np.zeros(3))
-    with pytest.raises(lv.InputError, match="a matrix does not have"):
+    with pytest.raises(lv.InputError, match="a problem in matrix form does not have"):
         lv.diagnose(lv.Problem.contact(np.eye(3), np.ones(3), mu=0.5), gap=[0.0], dt=0.01)
 
 

@@ -1,4 +1,4 @@
-"""Mistakes that any problem may have: coefficients, keys, order and twins of rows, conflicts, impulses."""
+"""Checks for any problem: friction coefficients, keys, order of rows, duplicate rows, conflicts, impulses."""
 
 from __future__ import annotations
 
@@ -13,46 +13,46 @@ from lavender.lab.diagnostics.diagnostic import Suspicion, suspect
 from lavender.problem import Problem
 from lavender.solvers.certify import conflict_of
 
-MU = 10.0  # -, beyond any pair of materials
-CONFLICT = 1000  # rows up to which a proof is asked for that there is no solution
-CONFLICT_TOL = 1e-6  # relative residual that it rules out
+MAX_PLAUSIBLE_FRICTION = 10.0  # -, no pair of materials has a larger friction coefficient
+MAX_CONFLICT_ROWS = (
+    1000  # Larger problems are not searched for a proof that no solution exists: it takes seconds.
+)
+CONFLICT_TOL = 1e-6  # -, the proof must exclude answers with this relative residual
 
 
 def friction(p: Problem) -> Iterator[Suspicion]:
-    """Coefficients beyond those of materials."""
+    """Yield a suspicion if friction coefficients exceed those of materials."""
     c = p.cones
     mu = c.coefficients.max(axis=1)
-    wild = np.flatnonzero(mu > MU)
-    if len(wild):
-        most = float(mu[wild].max())
-        yield suspect(p, "friction", f"mu up to {most:g}; dry materials have 0.1 to 2", wild, mu=most)
+    blocks = np.flatnonzero(mu > MAX_PLAUSIBLE_FRICTION)
+    if len(blocks):
+        largest = float(mu[blocks].max())
+        yield suspect(p, "friction", f"mu up to {largest:g}; dry materials have 0.1 to 2", blocks, mu=largest)
 
 
 def keys(p: Problem) -> Iterator[Suspicion]:
-    """Keys that stand more than once."""
+    """Yield a suspicion if several blocks have the same key."""
     if p.key is None:
         return
     values, first, count = np.unique(p.key, return_index=True, return_counts=True)
     if len(values) < len(p.key):
         worst = int(np.argmax(count))
         blocks = np.flatnonzero(np.isin(p.key, values[count > 1]))
-        reason = f"{len(p.key) - len(values)} of {len(p.key)} keys stand elsewhere already: block {first[worst]}'s "
-        yield suspect(p, "duplicate keys", reason + f"is that of {count[worst]} blocks", blocks)
+        reason = f"{len(p.key) - len(values)} of {len(p.key)} keys repeat another block's: {count[worst]} blocks have "
+        yield suspect(p, "duplicate keys", reason + f"the key of block {first[worst]}", blocks)
 
 
 def order_of_rows(p: Problem) -> Iterator[Suspicion]:
-    """Rows of contacts that do not stand as normal, tangent, tangent."""
+    """Yield a suspicion if the rows of contacts do not have the order normal, tangent, tangent."""
     c = p.cones
     full = np.flatnonzero(c.n_tangents == 2)
     if p.rows is not None or len(full) < 2:
         return
     if are_grouped(p):
-        reason = (
-            "rows of J are those of rigid bodies if all normals stand first; rows stand by contact: normal, "
-        )
-        yield suspect(p, "all normals first", reason + "tangent, tangent, then those of the next", full)
+        reason = "J has the rows of rigid bodies if all normals come first; the order is contact by contact: normal, "
+        yield suspect(p, "all normals first", reason + "tangent, tangent, then the next contact", full)
         return
-    # By b alone, which in the direction of a normal is an approach: gravity, a bounce, a depth.
+    # Only b is left to check. Along a normal it is an approach velocity: gravity, a bounce, a penetration depth.
     b = p.b[c.ptr[full][:, None] + np.arange(3)]
     whole, toward = np.abs(b).sum(axis=0), b.sum(axis=0)
     size = whole.sum()
@@ -64,19 +64,21 @@ def order_of_rows(p: Problem) -> Iterator[Suspicion]:
             and whole[row] > 0.8 * size
             and toward[0] < 0.1 * whole[0] + 1e-9 * size
         ):
-            reason = f"bodies approach along the {place} row of contacts and not along the first; a contact's rows are "
+            reason = f"bodies approach along the {place} row of contacts, not the first; the rows of a contact are "
             yield suspect(p, "tangents first", reason + "normal, tangent, tangent", full, b=b[0].tolist())
             return
     flat = b.ravel()
     k = len(full)
     late = np.count_nonzero(np.abs(flat[k:]) > 1e-6 * np.abs(flat).max())
     if np.abs(flat[:k]).sum() > 0.9 * size and (flat[:k] > 0.0).mean() > 0.9 and 2 * late <= k:
-        reason = f"the first {k} contact rows approach and the other {2 * k} hardly do; rows stand by contact: normal, "
-        yield suspect(p, "all normals first", reason + "tangent, tangent, then those of the next", full)
+        reason = f"the first {k} contact rows approach, the other {2 * k} hardly; the order is contact by contact: "
+        yield suspect(
+            p, "all normals first", reason + "normal, tangent, tangent, then the next contact", full
+        )
 
 
-def twins(p: Problem) -> Iterator[Suspicion]:
-    """Blocks of the same rows, or of opposed ones that cannot both hold."""
+def duplicate_rows(p: Problem) -> Iterator[Suspicion]:
+    """Yield suspicions about contacts with equal rows, or with opposite rows that cannot both hold."""
     c = p.cones
     contacts = np.flatnonzero(c.is_contact)
     if p.rows is not None or len(contacts) < 2:
@@ -95,45 +97,52 @@ def twins(p: Problem) -> Iterator[Suspicion]:
         seen.setdefault(b"-" + a.indices[row].tobytes() + a.data[row].tobytes(), i)
         if other is not None and len(a.data[row]) and p.b[j] + p.b[c.ptr[other]] > 1e-9 * np.abs(p.b).max():
             opposed += [other, i]
-    if len(again) > max(2, 0.3 * len(contacts)):  # collision detection repeats a point now and then
-        yield suspect(p, "duplicate rows", f"{len(again)} contacts have the rows of an earlier one", again)
+    if len(again) > max(2, 0.3 * len(contacts)):  # collision detection occasionally repeats a point
+        yield suspect(
+            p, "duplicate rows", f"{len(again)} contacts have the same rows as an earlier one", again
+        )
     if opposed:
-        yield suspect(p, "opposed normals", "normals that ask the same row to go both ways at once", opposed)
+        reason = "two normals require the same relative motion in opposite directions"
+        yield suspect(p, "opposed normals", reason, opposed)
 
 
-def wrong_impulses(p: Problem, impulse: FloatArray) -> Iterator[Suspicion]:
-    """What is wrong with impulses (m,) [N s] beyond being no solution."""
+def check_impulses(p: Problem, impulse: FloatArray) -> Iterator[Suspicion]:
+    """Yield a suspicion if impulses (m,) [N s] are implausibly large."""
     r = residual(p, impulse)
     b = float(np.max(np.abs(p.b), initial=0.0))
     if r.nothing_to_do or b == 0.0:
         return
-    if r.relative > 50.0:  # dt = 1/60 s and less; what a step before left is worse than nothing a few times
-        reason = f"they are {r.relative:.2g} times as wrong as doing nothing; are they forces [N], for impulses [N s]?"
+    # Forces in place of impulses are at least 60 times too large (dt <= 1/60 s); a stale warm start only a few times.
+    if r.relative > 50.0:
+        reason = (
+            f"their error is {r.relative:.2g} times that of the zero impulse: are they forces [N], not [N s]?"
+        )
         yield suspect(p, "impulses", reason, [p.block_of(r.worst_row)], relative=r.relative)
         return
-    own = np.abs(impulse) * np.where(p.d > 0.0, p.d, 0.0)  # the velocity that each gives its own row
-    i = int(np.argmax(own))
-    if own[i] > 1e4 * b * max(1.0, p.m / 100):  # a stack of n bodies multiplies its own momentum n times
-        reason = f"an impulse of {impulse[i]:.3g} N s turns its row by {own[i]:.3g} m/s, where b is {b:.3g} m/s at most"
+    row_velocity = np.abs(impulse) * np.where(p.d > 0.0, p.d, 0.0)
+    i = int(np.argmax(row_velocity))
+    # At the foot of a stack of n bodies, impulses are n times those of one body.
+    if row_velocity[i] > 1e4 * b * max(1.0, p.m / 100):
+        reason = f"an impulse of {impulse[i]:.3g} N s changes its row by {row_velocity[i]:.3g} m/s, while b is at most "
         yield suspect(
             p,
             "impulses",
-            reason + ": far beyond the momentum at hand",
+            reason + f"{b:.3g} m/s: far beyond the momentum that is present",
             [p.block_of(i)],
-            velocity=float(own[i]),
+            velocity=float(row_velocity[i]),
         )
 
 
 def conflict(p: Problem) -> Iterator[Suspicion]:
-    """The blocks of a proof that there is no solution, of at most CONFLICT rows."""
-    if not 0 < p.m <= CONFLICT or not np.isfinite(p.b).all():
+    """Yield a suspicion that names the conflicting blocks if the problem provably has no solution."""
+    if not 0 < p.m <= MAX_CONFLICT_ROWS or not np.isfinite(p.b).all():
         return
-    found = conflict_of(p, CONFLICT_TOL)
-    if found is not None:
+    proof = conflict_of(p, CONFLICT_TOL)
+    if proof is not None:
         law = "Of the convex relaxation, " if p.law == "coulomb" else ""
-        reason = law + found.proof.words + (f"; {found.advice}" if found.advice else "")
-        soft = [p.row_name(i) for i in found.soft_rows]
-        yield suspect(p, "conflict", reason, found.blocks, compliance=found.compliance, soft_rows=soft)
+        reason = law + proof.proof.words + (f"; {proof.advice}" if proof.advice else "")
+        soft = [p.row_name(i) for i in proof.soft_rows]
+        yield suspect(p, "conflict", reason, proof.blocks, compliance=proof.compliance, soft_rows=soft)
 
 
-CHECKS = (friction, keys, order_of_rows, twins)
+CHECKS = (friction, keys, order_of_rows, duplicate_rows)

@@ -1,4 +1,4 @@
-"""Mistakes in arms, normals and masses, equations (1) and (2), of bodies or of J and M that are bodies."""
+"""Checks of arms, normals and masses, equations (1) and (2), for bodies and for J and M of free rigid bodies."""
 
 from __future__ import annotations
 
@@ -15,32 +15,34 @@ from lavender.lab.diagnostics.diagnostic import Suspicion, suspect
 from lavender.problem import Problem
 from lavender.problem.rows import Rows
 
-LARGE = 600  # velocities up to which an inverse of M is looked at
-GIVEN_FOR = (  # of bodies, and of M
+MAX_DENSE_VELOCITIES = 600  # M is converted to a dense matrix and inverted up to this many velocities
+MISTAKEN_READINGS = (  # possible mistakes for problems of bodies, and of J and M
     ("mass for inverse mass", "inertia for inverse inertia", "mass and inertia for their inverses"),
     ("inverse mass for mass", "inverse inertia for inertia", "inverses for mass and inertia"),
 )
-FAR = 0.25  # -, of the arms: bodies further off each other than another contact of the pair says
+MAX_CENTRE_DISTANCE = (
+    0.25  # -, share of the arms by which the centres may differ between contacts of one pair
+)
 
 
 def bodies_of(p: Problem) -> Rows | None:
-    """The rows, or contacts of J and M as rows; None where these are of something else than rigid bodies."""
+    """Return the contacts as `Rows`, also for J and M of free rigid bodies; None if they are not rigid bodies."""
     if __name__ not in p.derived.cache:
         p.derived.cache[__name__] = _bodies_of(p)
     return p.derived.cache[__name__]
 
 
 def _bodies_of(p: Problem, rows: npt.NDArray[np.intp] | None = None) -> Rows | None:
-    """rows (c, 3): rows of J of each contact, where they are not those that the cones say."""
+    """Compute `bodies_of`. `rows` (c, 3): rows of J of each contact, if they differ from those of the cones."""
     g, c = p.generalized, p.cones
     contact = c.is_contact
-    if g is None or g.nv > LARGE or not contact.any() or np.any(c.n_tangents[contact] != 2):
+    if g is None or g.nv > MAX_DENSE_VELOCITIES or not contact.any() or np.any(c.n_tangents[contact] != 2):
         return p.rows
     if rows is None:
         rows = c.ptr[:-1][contact][:, None] + np.arange(3)
     mass, part = g.mass.toarray(), g.jac.toarray()[rows]
     six: list[npt.NDArray[np.intp]] = []
-    for j in free_bodies(mass):  # a ball's spin has one mass, too
+    for j in free_bodies(mass):  # the angular velocity of a ball has equal masses, too
         if j + 6 <= g.nv and (not six or j > six[-1][-1]):
             six.append(np.arange(j, j + 6))
     if not six or any(np.delete(mass[x], x, axis=1).any() for x in six):
@@ -70,7 +72,7 @@ def _bodies_of(p: Problem, rows: npt.NDArray[np.intp] | None = None) -> Rows | N
 
 
 def are_grouped(p: Problem) -> bool:
-    """Whether rows of J are those of contacts of rigid bodies if all normals stand first, and not as the cones say."""
+    """Return whether J has the rows of rigid bodies with all normals first, and not in the order of the cones."""
     contact = p.cones.is_contact
     k = int(np.count_nonzero(contact))
     if (
@@ -87,7 +89,7 @@ def are_grouped(p: Problem) -> bool:
 
 
 def geometry(p: Problem) -> Iterator[Suspicion]:
-    """Normals, arms and centres that do not fit each other."""
+    """Yield suspicions about normals, arms and centres that contradict each other."""
     r = bodies_of(p)
     if r is None or not r.n_contacts:
         return
@@ -101,8 +103,8 @@ def geometry(p: Problem) -> Iterator[Suspicion]:
     for row, other in zip(("second", "third"), aside, strict=True):
         for sign in (1.0, -1.0):
             if len(along) > 2 and np.all(sign * other > 1e-3 * size) and not np.all(along > 1e-6 * size):
-                reason = f"bodies lie behind each other along the {row} row of contacts and not along the first; a "
-                reason += "contact's rows are normal, tangent, tangent"
+                reason = f"the second body lies along the {row} row of the contacts, not along the first; the rows of "
+                reason += "a contact are normal, tangent, tangent"
                 yield suspect(p, "tangents first", reason, blocks)
                 return
     against = np.flatnonzero(along < -0.1 * size)  # (1)
@@ -112,38 +114,38 @@ def geometry(p: Problem) -> Iterator[Suspicion]:
         reason += f"{b[i]}, {along[i]:.3g} m; a normal points from a to b, arms from the centres to the point"
         yield suspect(p, "normals", reason, blocks[against], along=float(along[i]))
     if p.rows is None:
-        return  # repeated rows are told by J
-    again, opposed = _same_place(r, size)
+        return  # `blocks.duplicate_rows` compares the rows of J
+    again, opposed = _find_coincident(r, size)
     if len(again):
-        reason = f"{len(again)} contacts stand where another of the pair does"
+        reason = f"{len(again)} contacts are at the position of another contact of the pair"
         yield suspect(p, "duplicate rows", reason, blocks[again])
     if len(opposed):
-        reason = "two contacts of a pair in one place push opposite ways"
+        reason = "two contacts of a pair at one position have opposite normals"
         yield suspect(p, "opposed normals", reason, blocks[opposed])
     moving = np.flatnonzero((a >= 0) & (b >= 0))
-    off = _loops(r.contact_body[moving], (r.arm_a - r.arm_b)[moving], r.n_bodies)
-    wrong = moving[off > FAR * size[moving]]
+    off = _centre_deviations(r.contact_body[moving], (r.arm_a - r.arm_b)[moving], r.n_bodies)
+    wrong = moving[off > MAX_CENTRE_DISTANCE * size[moving]]
     if len(wrong) and len(wrong) <= 0.2 * len(moving):
         i = int(wrong[0])
         reason = (
-            f"by its arms contact {i} has the centres of bodies {a[i]} and {b[i]} elsewhere than the others "
+            f"the arms of contact {i} put the centres of bodies {a[i]} and {b[i]} elsewhere than the other "
         )
         yield suspect(
             p,
             "bodies",
-            reason + "have them: does it name another body?",
+            reason + "contacts do: does it name a wrong body?",
             blocks[wrong],
             off=float(off.max()),
         )
 
 
-def _same_place(r: Rows, size: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Contacts that repeat another of their pair to rounding, and those that oppose one within a hundredth."""
+def _find_coincident(r: Rows, size: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return contacts that repeat another of their pair to rounding, and contacts that oppose one within 1 %."""
     pair = np.sort(r.contact_body, axis=1)
-    turned = np.where(r.contact_body[:, 0] > r.contact_body[:, 1], -1.0, 1.0)[:, None]
-    # of the later, a moving body
+    sign = np.where(r.contact_body[:, 0] > r.contact_body[:, 1], -1.0, 1.0)[:, None]
+    # The arm on the body with the larger number, which moves.
     arm = np.where((r.contact_body[:, 1] == pair[:, 1])[:, None], r.arm_b, r.arm_a)
-    n = turned * r.normal
+    n = sign * r.normal
     order = np.lexsort((arm[:, 2], arm[:, 1], arm[:, 0], pair[:, 1], pair[:, 0]))
     again, opposed = [], []
     for step in (1, 2, 3):
@@ -157,8 +159,11 @@ def _same_place(r: Rows, size: FloatArray) -> tuple[FloatArray, FloatArray]:
     return np.unique(np.concatenate(again)), np.unique(np.concatenate(opposed))
 
 
-def _loops(pair: Any, between: FloatArray, n: int) -> FloatArray:
-    """|c_b - c_a - between| (e,) [m] with centres c of least sum of such distances: few that err stand out."""
+def _centre_deviations(pair: Any, between: FloatArray, n: int) -> FloatArray:
+    """Return |c_b - c_a - between| (e,) [m] for the centres c (n, 3) that minimise the sum of these distances.
+
+    The minimum of a sum of distances isolates a few wrong pairs. Iteratively reweighted least squares, 8 iterations.
+    """
     if not len(pair):
         return np.zeros(0)
     at = np.arange(len(pair))
@@ -168,16 +173,16 @@ def _loops(pair: Any, between: FloatArray, n: int) -> FloatArray:
     )
     to_centres = incidence.T.tocsr()
     a, b = pair.T
-    every = np.arange(n)
-    # What the weights of the pairs stand at in incidence^T weight incidence: entries at one place are added.
-    stand = (np.r_[a, b, a, b, every], np.r_[a, b, b, a, every])
+    diagonal = np.arange(n)
+    # Positions of the weights in incidence^T weight incidence; the constructor adds entries at one position.
+    positions = (np.r_[a, b, a, b, diagonal], np.r_[a, b, b, a, diagonal])
     scale = np.abs(between).max()
     if not 0.0 < scale < np.inf:
         return np.zeros(len(pair))
     weight = np.ones(len(pair))
     for _ in range(8):
         entries = np.r_[weight, weight, -weight, -weight, np.full(n, 1e-9)]
-        normal = sp.csc_array((entries, stand), shape=(n, n))
+        normal = sp.csc_array((entries, positions), shape=(n, n))
         centre = sparse_lu(normal).solve(to_centres @ (weight[:, None] * (between / scale)))
         off = np.linalg.norm(incidence @ centre - between / scale, axis=1)
         weight = 1.0 / (off + 1e-4)
@@ -185,7 +190,7 @@ def _loops(pair: Any, between: FloatArray, n: int) -> FloatArray:
 
 
 def masses(p: Problem) -> Iterator[Suspicion]:
-    """Masses and inertias that no body has."""
+    """Yield suspicions about masses and inertias that no real body has."""
     r = bodies_of(p)
     if r is None or not r.n_bodies:
         return
@@ -200,7 +205,7 @@ def masses(p: Problem) -> Iterator[Suspicion]:
     if not len(known):
         return
     m, e, s2 = r.inv_mass[known], eigen[known], size[known] ** 2
-    given = GIVEN_FOR[p.generalized is not None]
+    given = MISTAKEN_READINGS[p.generalized is not None]
     readings = {  # (2), with each number read as given, or as its inverse
         "": (1.0 / e).sum(axis=1) * m,
         given[0]: (1.0 / e).sum(axis=1) / m,
@@ -228,7 +233,7 @@ def masses(p: Problem) -> Iterator[Suspicion]:
 
 
 def _sizes(r: Any) -> FloatArray:
-    """Longest arm of each body (n,) [m], of contacts and of joint rows that push."""
+    """Return the longest arm of each body (n,) [m] over contacts and joint rows with a linear part."""
     size = np.zeros(r.n_bodies)
     joint = np.repeat(r.joint_body, np.diff(r.joint_ptr), axis=0)
     for side in (0, 1):
@@ -242,9 +247,9 @@ def _sizes(r: Any) -> FloatArray:
 
 
 def inverse(p: Problem) -> Iterator[Suspicion]:
-    """M or J that is the inverse or the transpose of what is meant."""
+    """Yield suspicions that M is the inverse of the mass matrix, or J the transpose of the Jacobian."""
     g = p.generalized
-    if g is None or not 3 <= g.nv <= LARGE:
+    if g is None or not 3 <= g.nv <= MAX_DENSE_VELOCITIES:
         return
     mass = g.mass.toarray()
     given = free_bodies(mass)
@@ -266,20 +271,20 @@ def inverse(p: Problem) -> Iterator[Suspicion]:
 
     wide = spread(mass) if np.count_nonzero(seen) >= 3 else 0.0
     if len(given) and not wide > 2.0:
-        return  # and no inverse is made
+        return
     inverse = np.linalg.inv(mass)
     other = free_bodies(inverse)
     if len(other) and not len(given):
-        reason = "three velocities have one mass, uncoupled, in the inverse of M and not in M: was M^-1 given for M?"
+        reason = "three uncoupled velocities have equal masses in the inverse of M but not in M: was M^-1 given for M?"
         yield suspect(p, "masses", reason, velocities=other)
     narrow = spread(inverse) if wide > 2.0 else wide
     if len(other) <= len(given) and narrow < 0.25 * wide:
-        reason = f"effective masses of the velocities span 10^{wide:.1f}, those of M^-1 10^{narrow:.1f}"
+        reason = f"effective masses of the velocities span 10^{wide:.1f} with M and 10^{narrow:.1f} with M^-1"
         yield suspect(p, "masses", reason + ": was M^-1 given for M?", spread=[wide, narrow])
 
 
 def free_bodies(mass: FloatArray) -> list[int]:
-    """First of each three velocities with equal mass and nothing between them: those of a body that flies."""
+    """Return the first of each three uncoupled velocities of equal mass: the linear velocities of a free body."""
     n = len(mass)
     d = mass.diagonal()
     at = np.arange(n - 2)
@@ -290,7 +295,7 @@ def free_bodies(mass: FloatArray) -> list[int]:
 
 
 def _orthogonal(p: Problem, jac: Any, free: list[int]) -> bool:
-    """Most contacts that move a free body do so by three orthogonal unit vectors."""
+    """Return whether most contacts move some free body along three orthogonal unit vectors."""
     c = p.cones
     first = c.ptr[:-1][c.is_contact & (np.diff(c.ptr) == 3)]
     eye = np.eye(3)

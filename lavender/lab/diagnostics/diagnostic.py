@@ -1,4 +1,4 @@
-"""What a suspicion says."""
+"""The record of one possible mistake."""
 
 from __future__ import annotations
 
@@ -12,21 +12,35 @@ from lavender.problem import Problem
 
 @dataclass(frozen=True)
 class Suspicion:
-    """One thing that looks wrong; `str()` is a line."""
+    """One possible mistake in a problem's data; `str()` is one line.
 
-    kind: str  # in a few words, the same for the same mistake
-    reason: str  # what was found, and what to look at
-    blocks: tuple[int, ...] = ()  # blocks concerned; empty: the whole
-    names: tuple[str, ...] = ()  # of these blocks
-    data: dict[str, Any] = field(default_factory=dict)  # the numbers behind it
+    Parameters
+    ----------
+    kind : str
+        Short name of the kind of mistake.
+    reason : str
+        Observation, and the data to look at.
+    blocks : tuple of int
+        Blocks concerned; empty if the whole problem is.
+    names : tuple of str
+        Names of these blocks, at most 100.
+    data : dict
+        Numbers that led to the suspicion.
+    """
+
+    kind: str
+    reason: str
+    blocks: tuple[int, ...] = ()
+    names: tuple[str, ...] = ()
+    data: dict[str, Any] = field(default_factory=dict)
 
     def __str__(self) -> str:
-        where = ", ".join(self.names[:3]) + (f", {len(self.names) - 3} more" if len(self.names) > 3 else "")
-        return f"{self.kind}: {self.reason}" + (f" ({where})" if where else "")
+        names = ", ".join(self.names[:3]) + (f", {len(self.names) - 3} more" if len(self.names) > 3 else "")
+        return f"{self.kind}: {self.reason}" + (f" ({names})" if names else "")
 
 
 def suspect(problem: Problem, kind: str, reason: str, blocks: Any = (), **data: Any) -> Suspicion:
-    """A suspicion of these blocks (empty: of the whole), with their names."""
+    """Build a suspicion of these blocks (empty: of the whole problem), with their names."""
     at = tuple(int(i) for i in np.unique(np.asarray(blocks, int)))
     names = tuple(problem.row_name(int(problem.cones.ptr[i])).rsplit(", ", 1)[0] for i in at[:100])
     return Suspicion(kind, reason, at, names, data)
