@@ -172,8 +172,9 @@ def test_every_test_that_a_page_names_exists():
             assert (ROOT / file).is_file(), f"{page.name} names {file}"
 
 
-def test_the_readme_lists_every_example():
-    listed = set(re.findall(r"`examples/(\w+\.py)`", (ROOT / "README.md").read_text(encoding="utf-8")))
+def test_the_page_of_examples_lists_every_example():
+    page = (ROOT / "docs" / "examples.md").read_text(encoding="utf-8")
+    listed = set(re.findall(r"`examples/(\w+\.py)`", page))
     assert listed == {path.name for path in (ROOT / "examples").glob("*.py")}
 
 
