@@ -1,6 +1,6 @@
 """The judge once more, in long double and from the data alone: it imports nothing of lavender.
 
-With w = A lambda - b and d as docs/concepts.md defines them, E = sqrt(sum d e^2), V = max sqrt(nu d) |e|, and
+With w = A lambda - b and d as docs/residual.md defines them, E = sqrt(sum d e^2), V = max sqrt(nu d) |e|, and
 
     relative = max(E / E0, V / V0),   floor = 2^-53 (|A| |lambda| + |b|) in the same two norms, at least
                                                 2^-53 (d |lambda| + |b|) where a pair is cut to its bound
