@@ -114,12 +114,22 @@ def test_the_page_on_architecture_lists_floors_and_rooms_in_the_order_of_their_c
             re.findall(r"`([\w.]+)`", line.split("|")[1]) for line in table.splitlines() if line[:3] == "| `"
         ]
 
-    floors = [name for (name,) in listed("## Five floors", "## The flow")]
+    floors = [name for (name,) in listed("## Layers", "## Data flow")]
     assert floors == [*(f"lavender.{floor}" for floor in ("cli", "export", "lab", "sim", "io")), "lavender"]
-    rooms = listed("## The rooms\n", "## The rooms of `lavender_ext`")
+    rooms = listed("## Packages\n", "## Packages of `lavender_ext`")
     assert {room for row in rooms for room in row} == set(height) - {"cli", "export"}
     highest = [max(height[room] for room in row) for row in rooms]
     assert highest == sorted(highest, reverse=True)
+
+
+def test_every_term_of_the_glossary_is_listed_once():
+    page = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+    table = page[page.index("## Glossary") : page.index("## Compatibility")]
+    terms = [
+        term for line in re.findall(r"^\| ([^|]+) \|", table, re.MULTILINE)[1:] for term in line.split(", ")
+    ]
+    assert len(terms) > 40
+    assert sorted(terms) == sorted(set(terms))
 
 
 def test_files_that_the_page_on_architecture_names_are_there():
