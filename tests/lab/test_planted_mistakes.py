@@ -20,7 +20,7 @@ def found():
 
 
 def test_the_page_has_the_shares_of_planted_mistakes_that_are_found(found):
-    page = (ROOT / "docs" / "failures.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "diagnose.md").read_text(encoding="utf-8")
     for mistake in found["bodies"]:
         cells = " | ".join("{} of {}".format(*of[mistake]) for of in found.values())
         assert f"| {mistake} | {cells} |" in page
