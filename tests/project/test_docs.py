@@ -140,6 +140,23 @@ def test_pages_link_to_pages_that_exist():
                 assert (page.parent / target).is_file(), f"{page.name} links to {target}"
 
 
+def anchors(page):
+    """Return the anchors that the headings of a page get from MyST."""
+    text = re.sub(r"^```.*?^```$", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+    return {
+        re.sub(r"[^\w\- ]", "", title.strip().lower()).replace(" ", "-")
+        for title in re.findall(r"^#{1,4} (.+)$", text, re.MULTILINE)
+    }
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_links_lead_to_headings_that_exist(page):
+    for target, anchor in re.findall(r"\]\(([\w/.-]*\.md)?#([^)\s]+)\)", page.read_text(encoding="utf-8")):
+        other = page.parent / target if target else page
+        if "generated" not in other.parts and "=" not in anchor:
+            assert anchor in anchors(other), f"{page.name} links to {target}#{anchor}"
+
+
 def test_the_chapter_names_functions_that_exist():
     text = (ROOT / "docs" / "chapter.md").read_text(encoding="utf-8")
     for function, file in (
