@@ -122,16 +122,6 @@ def test_the_page_on_architecture_lists_floors_and_rooms_in_the_order_of_their_c
     assert highest == sorted(highest, reverse=True)
 
 
-def test_every_term_of_the_glossary_is_listed_once():
-    page = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
-    table = page[page.index("## Glossary") : page.index("## Compatibility")]
-    terms = [
-        term for line in re.findall(r"^\| ([^|]+) \|", table, re.MULTILINE)[1:] for term in line.split(", ")
-    ]
-    assert len(terms) > 40
-    assert sorted(terms) == sorted(set(terms))
-
-
 def test_files_that_the_page_on_architecture_names_are_there():
     page = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
     paths = re.findall(r"`((?:lavender|lavender_ext|tests|\.ci)/[\w./]+)`", page)
