@@ -5,6 +5,7 @@ import importlib
 import pkgutil
 import re
 import shlex
+import textwrap
 from pathlib import Path
 
 import click
@@ -18,7 +19,7 @@ from lavender.cli import cli
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-BLOCK = re.compile(r"^```(python|pycon|sh|console)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+BLOCK = re.compile(r"^( *)```(python|pycon|sh|console)\n(.*?)^\1```$", re.MULTILINE | re.DOTALL)
 FLAGS = doctest.NORMALIZE_WHITESPACE | doctest.ELLIPSIS
 
 
@@ -26,9 +27,9 @@ def blocks(page, *kinds):
     """(line, kind, text) of the fenced blocks of a page."""
     text = page.read_text(encoding="utf-8")
     return [
-        (text.count("\n", 0, found.start(2)) + 1, found[1], found[2])
+        (text.count("\n", 0, found.start(3)) + 1, found[2], textwrap.dedent(found[3]))
         for found in BLOCK.finditer(text)
-        if found[1] in kinds
+        if found[2] in kinds
     ]
 
 
