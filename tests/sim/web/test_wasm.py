@@ -14,7 +14,7 @@ import lavender as lv
 from lavender.base.errors import InputError, LavenderError
 from lavender.sim.scene import SCENES
 from lavender.sim.web import compile as wasm
-from lavender.sim.web import cut, pages
+from lavender.sim.web import extract_c, pages
 from lavender.sim.web.scenes import describe, page_scenes
 
 HERE = Path(__file__).resolve().parent
@@ -156,7 +156,7 @@ def test_hash_covers_what_is_cimported():
     # core/rows.pxd cimports nothing that the judge does not reach; newton.pyx is no part of the module.
     with_rows = wasm.source_hash(ROOT, ["judge.measure"])
     assert with_rows != wasm.source_hash(ROOT, ["sweep.serial"]) != wasm.source_hash(ROOT)
-    assert cut.CIMPORT.findall(
+    assert extract_c.CIMPORT.findall(
         "from lavender_ext.core.rows cimport (a,\n  b)\nfrom libc.math cimport sqrt\n"
     ) == ["core.rows"]
 
