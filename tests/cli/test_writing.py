@@ -277,9 +277,9 @@ def test_every_command_writes_files_under_other_names_first(tmp_path):
         import os, sys
         from lavender import cli
         from lavender.io.stored import PART
-        from lavender.lab.bench.running import finals
+        from lavender.lab.bench.running import alternating
         from lavender.sim.web import pages
-        finals.MOST_ROUNDS = 1
+        alternating.MAX_REPETITIONS = 1
         pages.module = lambda say, name: b"a module"
         here, opened = os.getcwd(), set()
 

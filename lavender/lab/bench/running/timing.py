@@ -22,12 +22,12 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray
 from lavender.base.lazy_import import import_numerics
-from lavender.external.stopwatch import own_time
 from lavender.judge.residuals import reference
 from lavender.judge.solution import Claim, Solution, Status, uninterrupted
 from lavender.lab.bench import machine
-from lavender.lab.bench.line import asked_of
 from lavender.lab.bench.record import ERROR, CaseInfo, Record, measurement_key
+from lavender.lab.bench.stopwatch import measure_backend_time
+from lavender.lab.bench.timed_call import make_call_arguments
 from lavender.problem import Problem
 from lavender.solvers import registry
 from lavender.solving.outcome import finish
@@ -202,7 +202,7 @@ def attempt(problem: Problem, task: Task, impulse: Any = None) -> Outcome | str:
                     parts = uninterrupted(_parts(problem, task, impulse))
                     runs.append((parts, parts.setup_time + parts.solve_time))
                 else:
-                    with own_time(task.solver) as spent:
+                    with measure_backend_time(task.solver) as spent:
                         runs.append(_line(problem, task, impulse, guard))
                     owns += [sum(spent)] if spent else []
                 if task.turns:  # in turns with others: as a simulator that calls the same line at every step
@@ -279,7 +279,7 @@ def just_written(problem: Problem, start: str) -> Problem:
 
 def _line(problem: Problem, task: Task, impulse: Any, guard: Solution | None) -> tuple[Solution, float]:
     """One call of the line, and its time."""
-    more = {**task.options, **asked_of(task, 0 if guard is None else guard.iterations)}
+    more = {**task.options, **make_call_arguments(task, 0 if guard is None else guard.iterations)}
     fresh = just_written(problem, task.start)
     if task.start == "carried":
         more["impulse"] = problem.start() if impulse is None else impulse
