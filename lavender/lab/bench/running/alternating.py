@@ -13,13 +13,13 @@ from statistics import median
 from time import perf_counter
 from typing import Any
 
+from lavender.batch.solve import solve_many
 from lavender.lab.bench.cases import Item, Source, resolve
 from lavender.lab.bench.record import CaseInfo, Record
 from lavender.lab.bench.running.plan import Plan
 from lavender.lab.bench.running.runner import Runner, Watch, is_foreign, open_runner
 from lavender.lab.bench.running.timing import Ask, Task, just_written, outcome_of, pace, record_of
 from lavender.lab.bench.store import Records, Store
-from lavender.batch.solve import solve_many
 
 USUAL_REPETITIONS, MIN_REPETITIONS, MAX_REPETITIONS = 7, 3, 41
 EXTRA_TIME = 3.0  # s, of all cases together; more than the usual repetitions are made only within this time
