@@ -287,7 +287,7 @@ def test_ctrl_c_keeps_what_there_is(tmp_path, plug_in):
 
 @pytest.mark.skipif(sys.platform == "win32", reason="an open file cannot be removed there")
 def test_a_file_that_is_removed_meanwhile_is_told(tmp_path, monkeypatch):
-    monkeypatch.setattr(store, "SYNC", -1.0)
+    monkeypatch.setattr(store, "SYNC_INTERVAL", -1.0)
     monkeypatch.chdir(tmp_path)
     (tmp_path / "sub").mkdir()
     with bench.Store("sub/records.jsonl") as opened:
