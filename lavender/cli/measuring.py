@@ -111,6 +111,8 @@ def measure(context: click.Context, files: Sequence[str], path: Path, sweeps: Se
         workers = asked["workers"] if was_given(context, "workers") else -1
         more = {"workers": workers, "backend": asked["backend"]}
         words = bench.expand_seeds(files, len(asked["seeds"]), asked["seeds"].start)
+        if words == list(files):
+            refuse_unused(context, ["seeds"], "where no case takes one")
         plan = plan_of({**asked, "orders": asked["orders"] or ()}, bench.CampaignPlan)
     else:
         plan = _timed_plan(asked, files, sweeps)
@@ -120,8 +122,6 @@ def measure(context: click.Context, files: Sequence[str], path: Path, sweeps: Se
         if was_given(context, "pass_limit") and not any(item.sequence for item in items):
             raise InputError("--pass-limit has no effect without a sequence: leave it out")
         check_named(items)
-        if campaign and words == list(files):
-            refuse_unused(context, ["seeds"], "where no case takes one")
         before = {name: run.started for name, run in store.records.runs.items()}
         found: list[Records] = []
         with progress() as bar:

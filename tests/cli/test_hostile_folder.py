@@ -111,13 +111,12 @@ HOSTILE = [
 
 @pytest.fixture(scope="module")
 def lines():
-    """The entries of a small report with a sequence, a skip and a campaign's mark."""
+    """The entries of a small report with a sequence and a skip."""
     plan = bench.Plan(levels=(1e-3,), budgets=(2, 4), repeats=1, orders=("reverse",))
     cases = [stack(name="one"), *bench.sequence([stack(), stack()], "walk")]
     records = bench.run(cases, ["pgs", "direct", "gauss_seidel"], plan)
     entries = [*records.runs.values(), *records.cases.values(), *records.skips, *records.records]
-    done = bench.record.Done("r", "one", "pgs")
-    return [to_json(e) for e in [*entries, done]]
+    return [to_json(e) for e in entries]
 
 
 def show_all(records):
@@ -178,7 +177,6 @@ def test_records_of_any_content_are_shown_or_refused(tmp_path, lines):
         "\x00\x00\n",
         "\ufffe\n",
         '{"kind": "case"}\n',
-        '{"kind": "done", "run": 1, "case": [], "solver": {}}\n',
     ],
 )
 def test_a_file_of_anything_is_an_input_error(tmp_path, text):

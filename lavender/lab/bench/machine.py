@@ -84,10 +84,8 @@ def describe(plan: Mapping[str, Any], packages: Iterable[str] = ()) -> Run:
         "threads": 1,
         "versions": versions(packages),
     }
-    # What decides how a single measurement comes out; which cases and solvers are asked for does not. A campaign marks
-    # pairs of case and solver as complete, and another plan runs something else on each pair.
-    parts = plan if plan.get("campaign") else {k: plan[k] for k in ("repeats", "campaign") if k in plan}
-    same: dict[str, Any] = {**facts, "plan": dict(parts)}
+    # What decides how a single measurement comes out; which cases and solvers are asked for does not.
+    same: dict[str, Any] = {**facts, "plan": {k: plan[k] for k in ("repeats", "campaign") if k in plan}}
     build = build_facts()
     same["build"] = build
     digest = hashlib.sha256(json.dumps(same, sort_keys=True, default=str).encode()).hexdigest()[:12]

@@ -28,8 +28,8 @@ from lavender.io.stored import (
     write_text,
 )
 from lavender.lab.bench.record import (
+    REMOVED_KINDS,
     CaseInfo,
-    Done,
     Entry,
     Record,
     Run,
@@ -51,7 +51,6 @@ class Records:
     cases: dict[str, CaseInfo] = field(default_factory=dict)  # the latest description of each
     records: list[Record] = field(default_factory=list)
     source: str = ""
-    done: dict[tuple[str, str, str], Done] = field(default_factory=dict)  # pairs of a campaign, complete
     _skips: dict[tuple[str, str, str], Skip] = field(default_factory=dict, repr=False)
     # the identity of each, as described last
     _sequences: dict[str, str] = field(default_factory=dict, repr=False)
@@ -87,8 +86,6 @@ class Records:
             self._skips.pop((entry.run, entry.case, ""), None)  # it loads now
         elif isinstance(entry, Skip):
             self._skips[entry.run, entry.case, entry.solver] = entry
-        elif isinstance(entry, Done):
-            self.done[entry.run, entry.case, entry.solver] = entry
         else:
             self.records.append(entry)
 
@@ -121,7 +118,7 @@ class Records:
     ) -> Records:
         """Return other records of the same runs, with the descriptions and notes that `keep` accepts."""
         found = Records(source=self.source)
-        entries: list[Entry] = [*self.runs.values(), *self.cases.values(), *self.skips, *self.done.values()]
+        entries: list[Entry] = [*self.runs.values(), *self.cases.values(), *self.skips]
         for entry in (*filter(keep, entries), *records):
             found.add(entry)
         return found
@@ -281,7 +278,10 @@ def read(path: str | Path) -> Records:
         if not line.strip():
             continue
         try:
-            entry = from_json(json.loads(line))
+            content = json.loads(line)
+            if isinstance(content, dict) and content.get("kind") in REMOVED_KINDS:
+                continue
+            entry = from_json(content)
         except (ValueError, RecursionError) as error:
             raise InputError(f"{path}, line {number}: {error}; a records.jsonl is needed") from None
         if isinstance(entry, Record) and not (entry.case in found.cases and entry.run in found.runs):

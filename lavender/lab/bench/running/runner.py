@@ -13,6 +13,7 @@ import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
+from itertools import product
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -23,8 +24,8 @@ from lavender.judge.solution import CONTRADICTED
 from lavender.judge.states import states_of
 from lavender.lab import motion
 from lavender.lab.bench import machine
-from lavender.lab.bench.cases import Item, Source, describe, fingerprint, is_path, resolve, resolve_again
-from lavender.lab.bench.record import CaseInfo, Done, Entry, Record, Run, Skip, asked_of
+from lavender.lab.bench.cases import Item, Source, describe, fingerprint, resolve, resolve_again
+from lavender.lab.bench.record import CaseInfo, Entry, Record, Run, Skip, asked_of
 from lavender.lab.bench.running.plan import CampaignPlan, Plan, list_passes
 from lavender.lab.bench.running.timing import Ask, Task, measure, one_thread
 from lavender.lab.bench.running.worker import Worker
@@ -235,9 +236,10 @@ class Runner:
         self.out = Records(source=str(store.path) if store else "")
         self.done = 0
         self.total = 0
-        self.stored = Records() if store is None or fresh else store.records
-        self.known: dict[Any, Record] = {r.key: r for r in self.stored if r.run == this.run}
-        self.finished: dict[tuple[str, str], list[Entry]] = {}  # complete pairs of a campaign
+        stored = Records() if store is None or fresh else store.records
+        self.known: dict[Any, Record] = {r.key: r for r in stored if r.run == this.run}
+        # Descriptions of a campaign are reused: many cases take longer to describe than to load.
+        self.described = {n: i for n, i in stored.cases.items() if plan.campaign and i.run == this.run}
 
     def keep(self, entry: Entry) -> None:
         """Add an entry to the returned records and to the store."""
@@ -262,8 +264,6 @@ class Runner:
         """Measure every case and sequence; by the workers of a joblib backend if one is named."""
         self.total = len(items) * len(self.names)
         self.keep(replace(self.this, whole=False))
-        if self.plan.campaign:
-            self.finished = _finished_pairs(self.stored, self.this.run, items)
         if backend:
             self.distribute(items, workers, backend, memory)
         else:
@@ -292,16 +292,17 @@ class Runner:
             memory = machine.memory_share(joblib.effective_n_jobs(workers))
         local = tuple(spec for n in self.names if not ((spec := self.specs[n]).own or spec.plugged))
         order = Order(self.plan, self.this, memory, local)
+        known: dict[tuple[str, str], list[Record]] = {}
+        for record in self.known.values():
+            known.setdefault((record.case, record.solver), []).append(record)
         pairs: list[Pair] = []
-        for item in items:
+        for item, name in product(items, self.names):
             # A name or path is read again by the worker: a cluster shares the files, or the suite.
             source = item.source if item.given is None else replace(item.given, copy=False)
-            pairs += [
-                Pair(len(pairs) + j, item.name, source, item.reason, n) for j, n in enumerate(self.names)
-            ]
-        entries = {
-            p.index: self.reuse_pair(p.case, p.solver) for p in pairs if (p.case, p.solver) in self.finished
-        }
+            records = tuple(known.get((item.name, name), ()))
+            info = self.described.get(item.name)
+            pairs.append(Pair(len(pairs), item.name, source, item.reason, name, info, records))
+        entries: dict[int, list[Entry]] = {}
         try:
             for _ in range(MAX_ATTEMPTS):
                 remaining = [p for p in pairs if p.index not in entries]
@@ -309,12 +310,12 @@ class Runner:
                     break
                 calls = ((pair, order) for pair in remaining)
                 for index, new in map_unordered(measure_in_worker, calls, workers, backend):
-                    entries[index] = new
-                    if self.store is not None:
-                        for entry in new:
-                            self.store.add(entry)
+                    self.store_new(new)
+                    entries[index], pair = new, pairs[index]
                     self.done += 1
-                    self.report_progress(pairs[index].case, pairs[index].solver)
+                    for record in (entry for entry in new if isinstance(entry, Record)):
+                        self.report_progress(pair.case, pair.solver, record, record.key in self.known)
+                    self.report_progress(pair.case, pair.solver)
         finally:
             for index in sorted(entries):
                 for entry in entries[index]:
@@ -325,18 +326,19 @@ class Runner:
                 "times; run the same command again, with fewer workers if memory is short"
             )
 
-    def reuse_pair(self, case: str, solver: str) -> list[Entry]:
-        """Return the stored entries of a complete pair."""
-        self.done += 1
-        for entry in self.finished[case, solver]:
-            if isinstance(entry, Record):
-                self.report_progress(case, solver, entry, True)
-        return self.finished[case, solver]
+    def store_new(self, entries: list[Entry]) -> None:
+        """Store the entries that a worker returned, except the records that are stored already."""
+        for entry in entries:
+            is_stored = isinstance(entry, Record) and entry.key in self.known
+            if self.store is not None and not is_stored:
+                self.store.add(entry)
 
     def load_case(self, item: Item) -> CaseInfo | None:
         """Load and describe a case. Return None, with a note in the records, if it does not load."""
         try:
-            info = describe(item, self.this.run)
+            info = self.described.get(item.name)
+            if info is None or info.sha != fingerprint(item.problem):
+                info = describe(item, self.this.run)
             if self.plan.motion:
                 load_reference(item.problem, item.source)
             if self.plan.prove:
@@ -355,21 +357,14 @@ class Runner:
 
     def measure_case(self, item: Item, info: CaseInfo | None = None) -> None:
         """Measure every solver on a case that is no step of a sequence; `info` describes it, if it is known already."""
-        pending = [name for name in self.names if (item.name, name) not in self.finished]
         if info is not None:
             self.keep(info)
-        elif pending:
+        else:
             info = self.load_case(item)
         for name in self.names:
-            if name not in pending:
-                for entry in self.reuse_pair(item.name, name):
-                    self.out.add(entry)
-                continue
             if info is not None:
                 self.report_progress(item.name, name)
                 self.measure_solver(info, item.problem, name)
-            if self.plan.campaign:
-                self.keep(Done(self.this.run, item.name, name, info.sha if info else ""))
             self.done += 1
 
     def measure_sequence(self, items: list[Item]) -> None:
@@ -451,7 +446,7 @@ class Runner:
                 break
         else:
             return spec
-        # A complete pair of a campaign holds only records of its own solver.
+        # A pair of a campaign has only records of its own solver.
         other = None if self.plan.campaign else spec.standing_in(problem)
         if other is not None and other.name in self.names:
             other = None  # is run under its own name
@@ -532,6 +527,8 @@ class Pair:
     source: str | Problem  # a name or path that the worker resolves itself, or the problem
     reason: str
     solver: str
+    info: CaseInfo | None  # stored description of the case
+    known: tuple[Record, ...]  # stored records of the pair
 
 
 @dataclass(frozen=True)
@@ -572,6 +569,8 @@ def measure_in_worker(pair: Pair, order: Order) -> tuple[int, list[Entry]]:
     shared = machine.memory_share(os.cpu_count() or 1) if order.memory is None else order.memory
     with _register(order.local), one_thread(pair.solver):
         runner = Runner(order.run, order.plan, [pair.solver], worker=_isolated_worker(shared))
+        runner.known = {record.key: record for record in pair.known}
+        runner.described = {} if pair.info is None else {pair.case: pair.info}
         key, item, info = None, None, None
         if not isinstance(pair.source, Problem):
             changed = os.stat(pair.source).st_mtime_ns if os.path.exists(pair.source) else 0
@@ -582,41 +581,4 @@ def measure_in_worker(pair: Pair, order: Order) -> tuple[int, list[Entry]]:
         runner.measure_case(item, info)
     out = runner.out
     _last_case = key, item, out.cases.get(pair.case)
-    return pair.index, [*out.cases.values(), *out.skips, *out.records, *out.done.values()]
-
-
-def _finished_pairs(records: Records, run: str, items: Iterable[Item]) -> dict[tuple[str, str], list[Entry]]:
-    """Return the stored entries of each complete pair, by case and solver, unless the case's numbers have changed."""
-    shas: dict[str, dict[str, str]] = {}
-    for (of, case, solver), done in records.done.items():
-        if of == run:
-            shas.setdefault(case, {})[solver] = done.sha
-    found: dict[tuple[str, str], dict[Any, Entry]] = {}
-    for item in items:
-        marks = shas.get(item.name, {})
-        now = _current_sha(item) if marks else None
-        info = records.cases.get(item.name)
-        is_same = not now or (info is not None and info.sha == now)
-        for solver, sha in marks.items():
-            if now is None or (is_same and sha == now):
-                found[item.name, solver] = {} if info is None else {"case": info}
-    for skip in records.skips:
-        for key in found if not skip.solver else ((skip.case, skip.solver),):
-            if skip.run == run and key in found and key[0] == skip.case:
-                found[key]["skip"] = skip
-    for r in records:
-        if r.run == run and (r.case, r.solver) in found and shas[r.case][r.solver] == r.sha:
-            found[r.case, r.solver][r.key] = r  # written again after a kill: the later one
-    return {key: list(entries.values()) for key, entries in found.items()}
-
-
-def _current_sha(item: Item) -> str | None:
-    """Return the fingerprint of a file or a problem in memory, "" if it does not load; None of a case of the suite."""
-    if item.given is None and not is_path(item.source):
-        return None  # the run names the version of the code that makes it
-    try:
-        return fingerprint(item.problem)
-    except Exception:  # a file may make a reader raise anything
-        return ""
-    finally:
-        item.forget()
+    return pair.index, [*out.cases.values(), *out.skips, *out.records]
