@@ -11,12 +11,9 @@ for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(variable, "1")  # before NumPy is imported
 
 NAMES = (
-    "calibration",
     "derivatives",
-    "gallery",
     "kernels",
     "limits",
-    "original",
     "page",
     "peers",
     "stability",

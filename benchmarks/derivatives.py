@@ -13,6 +13,7 @@ as flagged where a block is about to switch, what is compared is not unique, or 
 from __future__ import annotations
 
 import math
+import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -24,7 +25,6 @@ import numpy as np
 
 import lavender as lv
 from benchmarks.output import markdown
-from benchmarks.random_families import wild
 from lavender import suite
 
 STEPS = 10.0 ** -np.arange(3.0, 10.5, 0.5)
@@ -73,6 +73,9 @@ def robots(models: tuple[str, ...], steps: int) -> Iterator[lv.Problem]:
 
 def sources(draws: int, steps: int, models: tuple[str, ...]) -> Iterator[tuple[str, lv.Problem]]:
     """(source, problem) of at most ROWS rows."""
+    sys.path.append(str(Path(__file__).resolve().parent.parent / "tests"))
+    from random_families import wild
+
     for seed in range(draws):
         problem = wild(seed=seed, rows=ROWS).problem
         if 0 < problem.m <= ROWS:

@@ -23,7 +23,7 @@ import numpy as np
 from scipy.optimize import nnls
 
 import lavender as lv
-from benchmarks.made import forms, fresh
+from benchmarks.core_problems import forms, fresh
 from benchmarks.output import markdown
 from lavender import suite
 from lavender.base import lazy_import as _lazy_import

@@ -2,16 +2,13 @@
 
     python -m benchmarks worlds engine [--models FILE ...] [--worlds 1000] [--seed 0]
     python -m benchmarks worlds random [--worlds 100000] [--seed 0]
-    python -m benchmarks worlds uneven [--models FILE ...] [--threads 2] [--seed 0]
 
 `engine`: states of models along random controls, every tenth step, cold. MuJoCo has of each state the largest tolerance
 of seven with which its answer is within 1e-6 by our judge, and nothing but `mj_fwdConstraint` is timed, right after the
 stages of a step before it: M's factor not, its data in the cache. Ours has J and M as arrays, factors M, solves to 1e-6
 and judges. Rounds alternate; least time, of the engine's calls one by one on the wall clock, of all worlds of ours on
 that of the thread.
-`random`: problems drawn, with and without the batch made of their arrays, and the judge alone. `uneven`: 64 problems of
-ten rows and more of these models, as a list of objects of which nothing is worked out, on one thread and on several:
-wall clock, least of a hundred.
+`random`: problems drawn, with and without the batch made of their arrays, and the judge alone.
 """
 
 from __future__ import annotations
@@ -22,14 +19,13 @@ from collections.abc import Callable, Iterator
 from importlib.util import find_spec
 from pathlib import Path
 from statistics import geometric_mean
-from time import perf_counter, process_time, thread_time
+from time import perf_counter, thread_time
 from typing import Any
 
 import click
 import numpy as np
 
 import lavender as lv
-from benchmarks.made import fresh
 from benchmarks.output import markdown
 from lavender.base.errors import LavenderError
 from lavender.lab.simulated_worlds import Runs, simulate_world
@@ -181,31 +177,6 @@ def drawn(worlds: int, seed: int) -> str:
     return markdown(head, lines)
 
 
-def uneven(models: tuple[Path, ...], threads: int, seed: int) -> str:
-    """64 problems of the models as a list: wall clock of one thread and of several."""
-    pool: list[Any] = []
-    for path in models or installed():
-        try:
-            _, model, given = states(path, 30, seed)
-            pool += [p for p in lv.io.from_mujoco_many(model, given)[0] if p.m >= 10]
-        except LavenderError:
-            continue
-    picked = [pool[i] for i in np.random.default_rng(seed).choice(len(pool), 64)]
-    best, had = [float("inf")] * 2, 0.0
-    for _ in range(100):
-        for k, count in enumerate((1, threads)):
-            problems = [fresh(p) for p in picked]
-            begun, spent = perf_counter(), process_time()
-            lv.solve_many(problems, tol=TOL, threads=count)
-            took, spent = perf_counter() - begun, process_time() - spent
-            best[k], had = min(best[k], took), max(had, k * spent / took)
-    one, more = (1e3 * t for t in best)
-    return (
-        f"64 uneven problems: {one:.2f} ms, on {threads} threads {more:.2f} ms, {one / more:.2f} times as fast; "
-        f"they had {had:.2f} cores at most"
-    )
-
-
 @click.group("worlds")
 def command() -> None:
     """What solve_many and residual_many take a world, beside MuJoCo's Newton's method and alone."""
@@ -255,14 +226,3 @@ def engine_command(models: tuple[Path, ...], worlds: int, seed: int) -> None:
 def random_command(worlds: int, seed: int) -> None:
     """Problems drawn."""
     click.echo(drawn(worlds, seed))
-
-
-@command.command("uneven")
-@click.option(
-    "--models", multiple=True, type=click.Path(path_type=Path), help="MJCF; default: those installed."
-)
-@click.option("--threads", default=2, show_default=True)
-@click.option("--seed", default=0, show_default=True)
-def uneven_command(models: tuple[Path, ...], threads: int, seed: int) -> None:
-    """64 uneven problems as a list, on one thread and on several."""
-    click.echo(uneven(models, threads, seed))

@@ -31,11 +31,11 @@ from panels import save
 
 import lavender as lv
 import lavender_ext
-from benchmarks import calibration, stability
+from benchmarks import stability
 from benchmarks.output import markdown as table
 from lavender import bench, registry, suite
 from lavender.base.deadline import seconds
-from lavender.lab.bench import level_name, structure_of
+from lavender.lab.bench import level_name
 from lavender.lab.report import contents, geometric_means, reaches
 from lavender.lab.report.curves import figures as report_figures
 from lavender.lab.report.curves import work_precision
@@ -519,19 +519,6 @@ def suite_page(site):
     site.write("cases.md", "\n\n".join(parts))
 
 
-def calibration_part(site):
-    """Residual against motion error on CASES: a table and a figure for the page on motion."""
-    seen = []
-    for name in CASES:
-        case = suite.case(name)
-        seen += calibration.samples(name, case.problem, " + ".join(structure_of(case.problem)))
-    calibration.figure(seen, site.path("figures/calibration.svg"))
-    site.write(
-        "parts/calibration.md",
-        f"{calibration.table(seen)}\n\n{image('generated/figures/calibration.svg', 'Motion error over residual')}",
-    )
-
-
 def stability_part(site):
     """Eigenvalues of a substep, for the page on towers."""
     stability.figure(site.path("figures/stability.svg"))
@@ -587,7 +574,6 @@ def write(source, cache):
     stability_part(site)
     scene_page(site)
     suite_page(site)
-    calibration_part(site)
     api_page(site)
     site.forget_others()
 

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from benchmarks.clock import least
+from benchmarks.core_problems import lattice_pile
 from benchmarks.kernels import microbenchmarks
 from benchmarks.kernels.problems import bare_contacts, raw_bytes, tridiagonal
-from benchmarks.made import lattice_pile
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import InputError
 from lavender.judge.residuals import residual

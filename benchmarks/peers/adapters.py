@@ -30,8 +30,8 @@ from lavender.external.backend import Backend
 from lavender.external.backends import BACKENDS
 from lavender.external.qp_solver import QPSolver, refusal
 from lavender.external.running import Limits
-from lavender.external.stopwatch import own_time
 from lavender.judge.residuals import reference
+from lavender.lab.bench.stopwatch import measure_backend_time
 from lavender.problem import Problem
 from lavender.problem.cones import CONTACT
 from lavender.solving.solve import prepare
@@ -104,7 +104,7 @@ def _backend(backend: Backend, form: str, own: str = "") -> Contestant:
 
         def once(eps: float) -> tuple[float, FloatArray]:
             begun = process_time()
-            with own_time(backend.name if own else "", process_time, setup=True) as spent:
+            with measure_backend_time(backend.name if own else "", process_time, setup=True) as spent:
                 answer = backend.run(qp, start, _limits(eps, backend.max_iter, limit), {})
             seconds = sum(spent) if own else process_time() - begun
             return seconds, _impulse(qp, answer.x, answer.zeta)

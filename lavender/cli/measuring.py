@@ -1,4 +1,4 @@
-"""Running a plan or a campaign with a progress bar, for the commands that measure."""
+"""Run a plan with a progress bar, for the commands that measure."""
 
 from __future__ import annotations
 
@@ -62,14 +62,14 @@ def check_named(items: Sequence[Item]) -> None:
     InputError
         One of them does not load: nothing is measured, and no page touched.
     """
-    from lavender.lab.bench.running.runner import not_loaded
+    from lavender.lab.bench.running.runner import describe_load_error
 
     for item in items:
         if item.named:
             try:
                 _ = item.problem
             except Exception as error:
-                raise InputError(not_loaded(item.source, error)) from None
+                raise InputError(describe_load_error(item.source, error)) from None
             item.forget()
 
 
@@ -85,8 +85,13 @@ def plan_of(asked: Mapping[str, Any], kind: type[P], **more: Any) -> P:
     return kind(**{name: asked[name] for name in names if asked[name] is not None}, **more)
 
 
+def is_campaign(context: click.Context) -> bool:
+    """Whether workers measure: error and robustness without times."""
+    return was_given(context, "workers") or was_given(context, "backend")
+
+
 def measure(context: click.Context, files: Sequence[str], path: Path, sweeps: Sequence[int]) -> Measured:
-    """Run with a progress bar, then time the lines that a report would print, in turns; `path` has the records.
+    """Run with a progress bar; without workers, then time the lines that a report would print. `path` has the records.
 
     Raises
     ------
@@ -94,24 +99,26 @@ def measure(context: click.Context, files: Sequence[str], path: Path, sweeps: Se
         A file that was named and does not load; a folder that cannot be written or that another process writes.
     """
     from lavender.lab import bench
-    from lavender.lab.proof import require
     from lavender.lab.report.contenders import time_lines
 
     one_thread()
     asked = context.params
     bench.solver_names(asked["solvers"])  # before anything is loaded: names first
-    if asked["sequence"] and not files:
-        raise InputError("--sequence needs a folder of problem files, one for each step")
-    limits = {"pass_limit": asked["pass_limit"]} if asked["pass_limit"] is not None else {}
-    # without files: all of the suite in a minute
-    limits["time_limit"] = (1.0 if files else 0.25) if asked["time_limit"] is None else asked["time_limit"]
-    more: dict[str, Any] = {"repeats": asked["repeats"], "times": asked["time_budgets"], "sweeps": sweeps}
-    plan = plan_of(asked, bench.Plan, **limits, **more)
-    if plan.prove:
-        require()
+    campaign, words = is_campaign(context), list(files)
+    more: dict[str, Any] = {}
+    plan: Plan
+    if campaign:
+        workers = asked["workers"] if was_given(context, "workers") else -1
+        more = {"workers": workers, "backend": asked["backend"]}
+        words = bench.expand_seeds(files, len(asked["seeds"]), asked["seeds"].start)
+        if words == list(files):
+            refuse_unused(context, ["seeds"], "where no case takes one")
+        plan = plan_of({**asked, "orders": asked["orders"] or ()}, bench.CampaignPlan)
+    else:
+        plan = _timed_plan(asked, files, sweeps)
     reused = 0
     with bench.Store(path) as store:
-        items = bench.resolve(files, asked["sequence"])
+        items = bench.resolve(words, asked["sequence"])
         if was_given(context, "pass_limit") and not any(item.sequence for item in items):
             raise InputError("--pass-limit has no effect without a sequence: leave it out")
         check_named(items)
@@ -126,35 +133,32 @@ def measure(context: click.Context, files: Sequence[str], path: Path, sweeps: Se
 
             stopped = False
             try:
-                more = {"watch": watch, "fresh": asked["fresh"], "memory": bytes_of(asked["memory"])}
-                bench.run(items, asked["solvers"], plan, store, into=found, **more)
-                time_lines(items, found[0], plan, store, **more)
+                common = {"watch": watch, "fresh": asked["fresh"], "memory": bytes_of(asked["memory"])}
+                bench.run(items, asked["solvers"], plan, store, into=found, **common, **more)
+                if not campaign:
+                    time_lines(items, found[0], plan, store, **common)
             except KeyboardInterrupt:
+                if not found:
+                    raise
                 stopped = True
     since = before.get(next(iter(found[0].runs)), "") if reused else ""
     return Measured(found[0], stopped, reused, since.replace("T", " ")[:16])
 
 
-def run_campaign(context: click.Context, files: Sequence[str], path: Path) -> Measured:
-    """Run a campaign with a progress bar. Raises as `measure`."""
-    from lavender.lab import bench
+def _timed_plan(asked: Mapping[str, Any], files: Sequence[str], sweeps: Sequence[int]) -> Plan:
+    from lavender.lab.bench import Plan
+    from lavender.lab.proof import require
 
-    one_thread()
-    asked = context.params
-    words = bench.seeds(files, len(asked["seeds"]), asked["seeds"].start)
-    check_named(bench.resolve(words))
-    if words == list(files):
-        refuse_unused(context, ["seeds"], "where no case takes one")
-    if asked["prove"]:
-        raise InputError("--prove is of reports; a campaign has too many problems")
-    plan = plan_of({**asked, "orders": asked["orders"] or ()}, bench.CampaignPlan)
-    more = {"workers": asked["workers"], "backend": asked["backend"], "memory": bytes_of(asked["memory"])}
-    with bench.Store(path) as store, progress() as watch:
-        try:
-            made = bench.campaign(words, asked["solvers"], plan, store, watch=watch, **more)
-        except KeyboardInterrupt:
-            return Measured(bench.read(path).latest(), True)
-        return Measured(made, False)
+    if asked["sequence"] and not files:
+        raise InputError("--sequence needs a folder of problem files, one for each step")
+    limits = {"pass_limit": asked["pass_limit"]} if asked["pass_limit"] is not None else {}
+    # without files: all of the suite in a minute
+    limits["time_limit"] = (1.0 if files else 0.25) if asked["time_limit"] is None else asked["time_limit"]
+    more: dict[str, Any] = {"repeats": asked["repeats"], "times": asked["time_budgets"], "sweeps": sweeps}
+    plan = plan_of(asked, Plan, **limits, **more)
+    if plan.prove:
+        require()
+    return plan
 
 
 def show_sheet(sheet: Sheet, folder: Path) -> None:

@@ -279,7 +279,7 @@ PLAN_OPTIONS: tuple[tuple[str, dict[str, Any]], ...] = (
                       "help": "Limit of a solver over all steps of a sequence, at one budget or level; default: 5 s."}),
     ("--memory", {"type": float, "default": None, "metavar": "GB",
                   "help": "Memory limit of each process of another package's solver; default: half of the "
-                  "machine's memory, shared by the workers of a campaign."}),
+                  "machine's memory, shared by the workers (--workers)."}),
 )  # fmt: skip
 plan_options = adding([((name,), more) for name, more in PLAN_OPTIONS])
 

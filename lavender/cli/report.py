@@ -12,7 +12,7 @@ from typing import Any
 import click
 
 from lavender.base.errors import InputError
-from lavender.cli.measuring import Measured, measure, run_campaign
+from lavender.cli.measuring import Measured, is_campaign, measure
 from lavender.cli.options import (
     EXIT_INTERRUPTED,
     EXIT_UNMET,
@@ -33,6 +33,13 @@ from lavender.cli.options import (
 from lavender.io.stored import lock_output, write_text
 
 
+def _reject_campaign(context: click.Context, option: click.Parameter, given: bool) -> None:
+    """Raise the usual error for the former name of --workers."""
+    if given:
+        message = "No such option '--campaign'. Did you mean '--workers'?"
+        raise click.NoSuchOption("--campaign", message, ctx=context)
+
+
 @click.command(cls=ManyValues)
 @click.argument("files", nargs=-1, metavar="[FILES | FOLDERS | NAMES]...")
 @plan_options
@@ -46,21 +53,25 @@ from lavender.io.stored import lock_output, write_text
     "folders that `lavender run --record` wrote.",
 )
 @click.option(
-    "--campaign", is_flag=True, help="Measure error and robustness with many workers, without times."
+    "--workers",
+    type=int,
+    default=None,
+    help="Measure error and robustness without times, with this number of processes; -1: one for each core.",
+)
+@click.option(
+    "--backend",
+    default="loky",
+    show_default=True,
+    help="The same with the workers of a backend of joblib, such as dask.",
 )
 @click.option(
     "--seeds",
     type=Seeds(),
     default="1",
     metavar="N | A:B",
-    help="With --campaign: seeds 0 to N - 1, or A to B - 1, of cases that take one.",
+    help="With --workers: seeds 0 to N - 1, or A to B - 1, of cases that take one.",
 )
-@click.option(
-    "--workers", type=int, default=-1, help="With --campaign: number of processes; -1: one for each core."
-)
-@click.option(
-    "--backend", default="loky", show_default=True, help="With --campaign: a backend of joblib, such as dask."
-)
+@click.option("--campaign", is_flag=True, hidden=True, expose_value=False, callback=_reject_campaign)
 @click.option("--compare", type=PATH, help="Compare with earlier records (.jsonl, or their folder).")
 @click.option(
     "--time-budgets",
@@ -115,11 +126,9 @@ def report(context: click.Context, /, files: tuple[str, ...], out: Path, **asked
         done = Measured(bench.read(again[0]), False)
         if not (done.records.records or done.records.skips):
             raise InputError(f"{again[0]} holds no records: there is nothing to show")
-    elif asked["campaign"]:
-        done = run_campaign(context, files, path)
     else:
         done = measure(context, files, path, sweeps)
-    engines = [] if asked["campaign"] else contestants(files, done.records.latest())
+    engines = [] if is_campaign(context) else contestants(files, done.records.latest())
     found = Report(done.records, old, asked["time_budgets"], sweeps, engines)
     # before a pipe that nobody reads ends the command
     index = write(found, out, figures=not asked["no_figures"])
@@ -147,25 +156,16 @@ def report(context: click.Context, /, files: tuple[str, ...], out: Path, **asked
 
 def _refuse_unused(context: click.Context, files: tuple[str, ...], solvers: tuple[str, ...] | None) -> None:
     """Every option that would be ignored is an error."""
-    campaign = context.params["campaign"]
     if any(f.endswith(".jsonl") for f in files):
         kept = {"files", "out", "compare", "time_budgets", "budgets", "tables", "paper", "no_figures"}
         rest = [p.name for p in context.command.params if p.name and p.name not in kept]
         refuse_unused(context, rest, "where records are shown again and nothing is solved")
-    elif campaign:
-        of_times = [
-            "repeats",
-            "time_limit",
-            "pass_limit",
-            "time_budgets",
-            "sequence",
-            "fresh",
-        ]
-        refuse_unused(
-            context, of_times, "with --campaign, which ends by iterations and continues where it stopped"
-        )
+    elif is_campaign(context):
+        of_times = ["repeats", "time_limit", "pass_limit", "time_budgets", "sequence"]
+        refuse_unused(context, of_times, "with --workers, which measures no times and ends by iterations")
+        refuse_unused(context, ["prove"], "with --workers, which measures too many problems")
     else:
-        refuse_unused(context, ["seeds", "workers", "backend"], "without --campaign")
+        refuse_unused(context, ["seeds"], "without --workers")
     refuse_unused_recording(context, any(Path(f).suffix.lower() == ".xml" for f in files))
     refuse_idle(context, solvers)
 

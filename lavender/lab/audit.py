@@ -37,8 +37,8 @@ from lavender.io.states import VECTOR
 from lavender.io.stored import folder_for_steps, write_arrays
 from lavender.judge.residuals import AT_FLOOR, CLOSE, ENOUGH, UNCONVERGED, WRONG
 from lavender.judge.residuals import VERDICTS as JUDGED
-from lavender.lab.bench.running.campaign import check_workers, connected, hand_out
 from lavender.lab.bench.running.runner import Event
+from lavender.lab.bench.running.workers import check_workers, connect_backend, map_unordered
 from lavender.lab.report.curves import Curve, Figure
 from lavender.lab.report.sheet import Part as Section
 from lavender.lab.report.sheet import Sheet
@@ -456,9 +456,9 @@ def _by_mujoco(runs: Runs, how: tuple[str, float], workers: int, backend: str) -
     parts = (
         (runs, how, range(first, min(first + many, runs.worlds))) for first in range(0, runs.worlds, many)
     )
-    name, cluster = connected(backend)
+    name, cluster = connect_backend(backend)
     with cluster:
-        for pieces in hand_out(simulated, parts, workers, name):
+        for pieces in map_unordered(simulated, parts, workers, name):
             yield from pieces
 
 

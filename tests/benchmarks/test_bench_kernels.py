@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import lavender as lv
-from benchmarks import made
+from benchmarks import core_problems
 from benchmarks.clock import least
 from benchmarks.kernels import microbenchmarks, problems
 from benchmarks.kernels.cases import job, run
@@ -16,7 +16,7 @@ from benchmarks.kernels.instructions import COUNTED
 
 @pytest.mark.parametrize("shuffle", [False, True])
 def test_the_bare_contact_sweep_is_sequential_impulses(shuffle):
-    problem = made.lattice_pile(200, shuffle=shuffle)
+    problem = core_problems.lattice_pile(200, shuffle=shuffle)
     contacts, bodies = problems.bare_contacts(problem)
     microbenchmarks.contact(contacts.view(np.uint8).reshape(-1), bodies.view(np.uint8).reshape(-1), 20)
     impulse = lv.solve(problem, "sequential_impulses", tol=0.0, max_iter=20).impulse
@@ -39,14 +39,14 @@ def test_the_bare_row_sweep_is_pgs():
 
 def test_the_pile_stands_where_it_says():
     for contacts in (1, 50, 3_000):
-        problem = made.lattice_pile(contacts)
+        problem = core_problems.lattice_pile(contacts)
         assert 0.5 * contacts <= problem.n_blocks <= 1.5 * contacts + 3
         assert (problem.rows.contact_body < 0).any()
-    given, shuffled = made.lattice_pile(300), made.lattice_pile(300, shuffle=True)
+    given, shuffled = core_problems.lattice_pile(300), core_problems.lattice_pile(300, shuffle=True)
     assert given.n_blocks == shuffled.n_blocks
     assert not np.array_equal(given.rows.contact_body, shuffled.rows.contact_body)
     with pytest.raises(lv.InputError, match="at least 1"):
-        made.lattice_pile(0)
+        core_problems.lattice_pile(0)
 
 
 def test_least_is_the_least_of_many(monkeypatch):

@@ -128,18 +128,19 @@ def test_solvers_lists_all_with_reasons(lavender):
         (("solve", "stack(n=4)", "--solver", "pgs", "--output", "no/such/folder.npz"), "cannot write"),
         (("check", "nothing.npz"), "no such file"),
         (("report", "--levels", "many"), "not a list of numbers"),
-        (("report", "--campaign", "--seeds", "9:3"), "whole numbers with A < B"),
+        (("report", "--workers", "1", "--seeds", "9:3"), "whole numbers with A < B"),
         (("report", "--time-budgets", "0"), "time budget 0.0 must be"),
-        (("report", "stack(n=4)", "--seeds", "3"), "--seeds has no effect without --campaign"),
+        (("report", "stack(n=4)", "--seeds", "3"), "--seeds has no effect without --workers"),
         (
-            ("report", "stack(n=4)", "--campaign", "--seeds", "3"),
+            ("report", "stack(n=4)", "--workers", "1", "--seeds", "3"),
             "--seeds has no effect where no case takes one",
         ),
         (("report", "stack(n=4)", "--steps", "3"), "--steps has no effect without a MODEL.xml"),
         (("report", "stack(n=4)", "--pass-limit", "3"), "--pass-limit has no effect without a sequence"),
         (("report", "stack(n=4)", "--solvers", "direct", "--budgets", "3"), "--budgets has no effect"),
         (("report", "stack(n=4)", "--solvers", "direct", "--orders", "reverse"), "--orders has no effect"),
-        (("report", "--campaign", "--time-limit", "3"), "--time-limit has no effect with --campaign"),
+        (("report", "--workers", "1", "--time-limit", "3"), "--time-limit has no effect with --workers"),
+        (("report", "--campaign"), "Did you mean '--workers'?"),
         (("report", "a.jsonl", "--levels", "1e-3"), "--levels has no effect where records are shown again"),
         (("report", "stack(n=4)", "--solvers", "pgs", "--memory", "3"), "--memory has no effect"),
         (("run", "stack", "--replace"), "--replace has no effect without --record"),
@@ -165,12 +166,9 @@ def test_solvers_lists_all_with_reasons(lavender):
         (("nonsense",), "unknown command 'nonsense'"),
         (("slove", "stack(n=4)"), "did you mean 'solve'"),
         (("run", "stack", "--set", "m=3"), "unknown parameter 'm' of scene 'stack'"),
-        (("report", "random_spd", "--campaign", "--seeds", "0:1000000000000"), "1000000000000 seeds"),
+        (("report", "random_spd", "--workers", "1", "--seeds", "0:1000000000000"), "1000000000000 seeds"),
         (("solve", "random_spd(n=5000000)"), "not enough memory"),  # 2e14 bytes, beyond the address space
-        *(
-            (("report", "stack(n=4)", "--campaign", "--workers", n), f"workers is {n}")
-            for n in (0, -2, 1_000_000_000)
-        ),
+        *((("report", "stack(n=4)", "--workers", n), f"workers is {n}") for n in (0, -2, 1_000_000_000)),
     ],
 )
 def test_bad_input_is_one_line_and_status_2(lavender, words, sign):
@@ -377,7 +375,7 @@ def _must_not_begin(*_, **__):
         ("export c {}/sub", "lavender.export.library.source"),
         ("web page {}/sub", "lavender.sim.web.pages.module"),
         ("report toy_stack --out {}/sub", "lavender.lab.bench.resolve"),
-        ("report toy_stack --campaign --out {}/sub", "lavender.lab.bench.resolve"),
+        ("report toy_stack --workers 1 --out {}/sub", "lavender.lab.bench.resolve"),
         ("run stack --record {}/sub", "lavender.sim.engine.Simulation.step"),
     ],
 )
@@ -406,7 +404,7 @@ def test_a_format_that_nobody_writes_is_refused_before_the_work(lavender, monkey
 @pytest.mark.parametrize("words", ["--workers 2", "--workers 1", "--solvers pgs --budgets 2 --no-figures"])
 def test_a_working_directory_that_is_gone_is_said(lavender, path, tmp_path, words):
     os.rmdir(os.getcwd())
-    words = words if "--solvers" in words else f"--campaign --solvers pgs --no-figures {words}"
+    words = words if "--solvers" in words else f"--solvers pgs --no-figures {words}"
     code, _, err = lavender("report", path, *words.split(), "--out", tmp_path / "out")
     assert code == 0 or (code == cli.EXIT_BAD_INPUT and "the working directory is gone" in err)
     for words in (

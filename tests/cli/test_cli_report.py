@@ -218,7 +218,7 @@ def test_a_file_of_a_folder_that_cannot_be_read_is_named_and_costs_itself_alone(
         code, out, err = lavender(command, path.parent, *more.get(command, ()))
         assert (command, code) == (command, cli.EXIT_UNMET)
         assert "[bold]x: " in out + err and "stack8" in out + f"stack8 {command}" * (command == "doctor")
-    campaign = ("report", "--campaign", path.parent / "[bold]x.npz", *more["report"], "--out", "c")
+    campaign = ("report", "--workers", 1, path.parent / "[bold]x.npz", *more["report"], "--out", "c")
     assert lavender(*campaign)[0] == cli.EXIT_BAD_INPUT
     code, out, _ = lavender("check", path.parent / "[bold]x.npz", path, "--solvers", "direct")
     assert code == cli.EXIT_BAD_INPUT and "agrees" in out  # what can be read is checked all the same
@@ -305,9 +305,7 @@ def test_campaigns_over_parts_of_the_seeds_are_one_when_put_together(lavender, t
     more = ("--solvers", "pgs", "--levels", "1e-3", "--budgets", "4", "--workers", 1)
     parts = []
     for name, seeds in (("a", "2"), ("b", "2:4")):
-        code, *_ = lavender(
-            "report", "--campaign", "granular(n=2)", "--seeds", seeds, *more, "--out", tmp_path / name
-        )
+        code, *_ = lavender("report", "granular(n=2)", "--seeds", seeds, *more, "--out", tmp_path / name)
         assert code == 0
         parts.append((tmp_path / name / "records.jsonl").read_text())
     (tmp_path / "all.jsonl").write_text("".join(parts))
@@ -378,7 +376,7 @@ def test_ctrl_c_while_workers_of_a_campaign_start_is_answered_by_the_command_alo
     """The terminal sends the signal to all of its processes, where the first worker begins its imports."""
     (tmp_path / "sitecustomize.py").write_text(WORKER)
     environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
-    command = ("-m", "lavender", "report", "--campaign", "granular(n=2)", "--seeds", 20, "--workers", 2)
+    command = ("-m", "lavender", "report", "granular(n=2)", "--seeds", 20, "--workers", 2)
     more = ("--solvers", "pgs", "--no-figures", "--out", tmp_path / "out")
     done = python(*command, *more, status=130, env=environment, start_new_session=True)
     assert "Traceback" not in done.stderr
@@ -441,9 +439,7 @@ def test_what_is_left_out_stands_beside_what_is_left(lavender, tmp_path, monkeyp
     assert "6 problems (3 left out)" in (tmp_path / "o" / "paper" / "method.tex").read_text()
     assert lavender("report", tmp_path / "o" / "records.jsonl", *more[7:])[0] == 0  # shown again
     (folder,) = (tmp_path / "o" / "recorded").iterdir()
-    code, out, _ = lavender(
-        "report", "--campaign", folder, "--solvers", "pgs", "--workers", 1, "--out", tmp_path / "c"
-    )
+    code, out, _ = lavender("report", folder, "--solvers", "pgs", "--workers", 1, "--out", tmp_path / "c")
     assert code == cli.EXIT_UNMET and "left out, the first of 3: " in out
     assert lavender("check", folder, "--solvers", "pgs")[0] == cli.EXIT_UNMET
     monkeypatch.setattr(recording.adapter, "from_mujoco", true)

@@ -14,8 +14,8 @@ import lavender as lv
 from lavender import bench, cli, io
 from lavender.io.stored import lock_output
 from lavender.lab.bench import machine
-from lavender.lab.bench.line import code_of
 from lavender.lab.bench.record import KINDS, file_name, printable, to_json
+from lavender.lab.bench.timed_call import format_call
 from lavender.lab.report.findings import Report
 from lavender.lab.report.terminal import print_report
 
@@ -92,11 +92,11 @@ def test_a_campaign_takes_files_and_folders(lavender, tmp_path):
         io.save(stack(), tmp_path / "problems" / f"{name}.npz")
     io.save(stack(), tmp_path / "z.npz")
     more = (*QUICK[:6], "--workers", 1, "--seeds", "2")
-    code, _, err = lavender("report", "--campaign", "problems/", "z.npz", "./z.npz", "random_spd(n=4)", *more)
+    code, _, err = lavender("report", "problems/", "z.npz", "./z.npz", "random_spd(n=4)", *more)
     assert (code, err.strip()) == (0, "")
     cases = {r.case for r in bench.read("lavender-report")}
     assert cases == {"x", "y", "z", "z #2", "random_spd(n=4, seed=0)", "random_spd(n=4, seed=1)"}
-    code, _, err = lavender("report", "--campaign", "nothing.npz", *more)
+    code, _, err = lavender("report", "nothing.npz", *more)
     assert code == 2
     assert "no such file" in err
 
@@ -111,13 +111,12 @@ HOSTILE = [
 
 @pytest.fixture(scope="module")
 def lines():
-    """The entries of a small report with a sequence, a skip and a campaign's mark."""
+    """The entries of a small report with a sequence and a skip."""
     plan = bench.Plan(levels=(1e-3,), budgets=(2, 4), repeats=1, orders=("reverse",))
     cases = [stack(name="one"), *bench.sequence([stack(), stack()], "walk")]
     records = bench.run(cases, ["pgs", "direct", "gauss_seidel"], plan)
     entries = [*records.runs.values(), *records.cases.values(), *records.skips, *records.records]
-    done = bench.record.Done("r", "one", "pgs")
-    return [to_json(e) for e in [*entries, done]]
+    return [to_json(e) for e in entries]
 
 
 def show_all(records):
@@ -132,7 +131,7 @@ def show_all(records):
     report = Report(shown, shown)
     print_report(report, Console(file=text_io.StringIO(), width=140))
     for record in shown.records:  # whichever is the fastest, and so shown, differs from run to run
-        assert code_of(record)
+        assert format_call(record)
     page(report, figures(shown)).encode("utf-8")
     summary(report).encode("utf-8")
 
@@ -178,7 +177,6 @@ def test_records_of_any_content_are_shown_or_refused(tmp_path, lines):
         "\x00\x00\n",
         "\ufffe\n",
         '{"kind": "case"}\n',
-        '{"kind": "done", "run": 1, "case": [], "solver": {}}\n',
     ],
 )
 def test_a_file_of_anything_is_an_input_error(tmp_path, text):
@@ -233,7 +231,7 @@ WRITE_A_FOLDER = {
     "record": ("record", "MODEL", "--steps", 1, "--out", "OUT"),
     "report": ("report", "stack(n=2)", *QUICK, "--out", "OUT"),
     "records shown again": ("report", "records.jsonl", "--out", "OUT"),
-    "campaign": ("report", "--campaign", "stack(n=2)", *QUICK[:6], "--out", "OUT"),
+    "campaign": ("report", "--workers", "1", "stack(n=2)", *QUICK[:6], "--out", "OUT"),
     "problems": ("problems", "@walking", "--out", "OUT"),
     "run": ("run", "stack", "--steps", 1, "--record", "OUT"),
     "export": ("export", "c", "OUT"),

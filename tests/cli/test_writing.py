@@ -19,7 +19,7 @@ import lavender as lv
 import lavender.cli
 from lavender import bench, io
 from lavender.io.stored import FOLDER_LOCK, PART, folder_for_steps, write_atomically, write_text
-from lavender.lab.bench.record import Done
+from lavender.lab.bench.record import Skip
 from lavender.lab.bench.store import Records, Store
 from lavender.sim.engine import run
 from lavender.sim.engine.picture import save_picture
@@ -178,7 +178,7 @@ def test_an_fclib_file_beyond_the_room_is_an_error(tmp_path, size):
 def test_records_without_room_say_so_and_let_go_of_their_file(tmp_path):
     path = tmp_path / "records.jsonl"
     with Store(path) as store, room(0), pytest.raises(lv.InputError, match=r"cannot write .* make room"):
-        store.add(Done("run", "case", "pgs"))
+        store.add(Skip("run", "case", "pgs", "reason"))
     Store(path).close()
     assert list(tmp_path.iterdir()) == [path]
 
@@ -277,9 +277,9 @@ def test_every_command_writes_files_under_other_names_first(tmp_path):
         import os, sys
         from lavender import cli
         from lavender.io.stored import PART
-        from lavender.lab.bench.running import finals
+        from lavender.lab.bench.running import alternating
         from lavender.sim.web import pages
-        finals.MOST_ROUNDS = 1
+        alternating.MAX_REPETITIONS = 1
         pages.module = lambda say, name: b"a module"
         here, opened = os.getcwd(), set()
 

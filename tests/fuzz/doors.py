@@ -21,8 +21,8 @@ OPTIONS = ("jacobian", "cone", "timestep", "integrator", "noslip_iterations", "n
 WHOLE = (-1, -2, 0, 1, 2, 3, 5, 7, 100, 2**15, 2**20, 2**30, 2**31 - 1, -(2**31))
 REAL = (0.0, -0.0, 1.0, -1.0, 1e300, -1e300, 1e-300, "nan", "inf", "-inf")
 WORDS = (
-    ("report", "two_particles", "--campaign", "--workers", "{}"),
-    ("report", "granular", "--campaign", "--seeds", "0:{}"),
+    ("report", "two_particles", "--workers", "{}"),
+    ("report", "granular", "--workers", "1", "--seeds", "0:{}"),
     ("solve", "random_spd(n={})"), ("solve", "two_particles", "--tol", "{}"),
     ("solve", "two_particles", "--max-iter", "{}"), ("solve", "two_particles", "--time-limit", "{}"),
     ("check", "two_particles", "--tol", "{}", "--solvers", "pgs"), ("view", "{}"), ("record", "{}", "--out", "{}"),

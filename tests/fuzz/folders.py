@@ -15,7 +15,7 @@ from strategies import chance
 
 import lavender as lv
 import lavender.cli
-from lavender.lab.bench.running import finals
+from lavender.lab.bench.running import alternating
 
 NAMES = (
     "a.npz", "[/x].npz", "[bold].npz", "²1.npz", "a$\\frac$b.npz", "a$b.npz", "<img src=x onerror=alert(1)>.npz",
@@ -127,7 +127,7 @@ def check(spec):
             # Figures cost most: where it is run twice, they are drawn of the records that were read.
             drawn = command[0] == "check" or (spec["figures"] and turn == spec["twice"])
             # What is timed again and again would take seconds, whatever a folder holds.
-            with mock.patch.object(finals, "MOST_ROUNDS", 1):
+            with mock.patch.object(alternating, "MAX_REPETITIONS", 1):
                 code, text = quiet(command if drawn else [*command, "--no-figures"])
             yield from told(code, text, command[0], spec.get("status", STATUS))
         for page in out.glob("*.html"):

@@ -5,12 +5,12 @@ A spec names where its problem comes from (a seed says the rest), so that it sta
 
 import hypothesis.strategies as st
 import numpy as np
+from random_families import wild
 from random_problems import nearly_singular, warmed
 from strategies import plain
 from worked import after
 
 import lavender as lv
-from benchmarks.random_families import wild
 from lavender import suite
 from lavender.lab.suite import hard
 

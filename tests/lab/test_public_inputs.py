@@ -257,7 +257,7 @@ CALLS |= {
                                 "orders": ("given",), "motion": False}),
     "bench.resolve": (bench.resolve, {"words": ["stack(n=2)"], "sequences": False}),
     "bench.sequence": (bench.sequence, {"problems": [LCP], "name": "walk"}),
-    "bench.seeds": (bench.seeds, {"words": ["random_spd(n=3)"], "n": 2, "first": 0}),
+    "bench.expand_seeds": (bench.expand_seeds, {"words": ["random_spd(n=3)"], "n": 2, "first": 0}),
     "bench.carry": (bench.carry, {"before": LCP, "impulse": B, "problem": LCP}),
     "bench.structure_of": (bench.structure_of, {"problem": LCP}),
     "phenomena.chosen": (phenomena.chosen, {"names": ["slide"]}),

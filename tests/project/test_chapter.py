@@ -21,9 +21,6 @@ import pytest
 from click.testing import CliRunner
 from worked import example
 
-import benchmarks.__main__ as benchmarks
-from benchmarks import original
-from lavender.base.errors import InputError
 from lavender.cli import cli
 
 ROOT = Path(__file__).resolve().parent.parent.parent
@@ -61,10 +58,6 @@ def printed(command):
     if folder := os.environ.get("LAVENDER_PRINTED"):
         return Path(folder, command.replace("/", "_")).read_text(encoding="utf-8")
     words = shlex.split(command)
-    if words[:3] == ["python", "-m", "benchmarks"]:
-        result = CliRunner().invoke(benchmarks.cli, words[3:])
-        assert result.exit_code == 0, result.output
-        return result.output
     if words[0] == "python":
         out, figure = io.StringIO(), io.BytesIO()
         with contextlib.redirect_stdout(out):
@@ -173,7 +166,7 @@ def test_every_failure_has_a_command_that_shows_it():
     tables = re.findall(
         r"^\| failure \| how it shows \| command \|\n\|[-|]+\|\n((?:\|.*\n)+)", PAGE, re.MULTILINE
     )
-    assert len(tables) == 6  # one for each experiment, and what is in none of them
+    assert len(tables) == 5  # one for each experiment
     rows = [re.split(r"(?<!\\)\| ", row.strip("|")) for table in tables for row in table.splitlines()]
     assert len(rows) > 14
     for row in rows:
@@ -189,14 +182,3 @@ def test_every_failure_has_a_command_that_shows_it():
 def test_the_comparison_sees_a_wrong_number(number, shown):
     with pytest.raises(AssertionError, match="is printed"):
         check([number], "", "at most {} N s", f"first line\nat  most {shown} N s")
-
-
-def test_the_residual_is_added_to_the_source_of_that_release_alone():
-    release = "\n".join(text for text, _ in original.ADDED)
-    found = original.instrumented(release)
-    assert all(name in found for name in ("error_before = largest", "error_after = largest", "asked_turn &&"))
-    assert all(text in found for text, instead in original.ADDED if "{}" in instead)
-    with pytest.raises(InputError, match=r"not physics.cpp of lavendersim 0.2.0"):
-        original.instrumented(release.replace("gContacts[c],dt", "gContacts[i],dt"))
-    asked = re.search(r"```sh\npip download .*\npython -m benchmarks (original) ", PAGE)
-    assert asked and asked[1] in benchmarks.NAMES

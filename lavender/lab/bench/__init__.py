@@ -1,4 +1,4 @@
-"""Case x solver x budget -> records, timed in one place.
+"""Measure solvers on cases: records of each case, solver and budget, timed in one place.
 
     records = lavender.lab.bench.run(["pile.npz"], ["pgs", "osqp"])
     records.rows()       # plain dictionaries, or records.frame() for pandas
@@ -6,12 +6,11 @@
 Nothing here draws or prints; `lavender.lab.report` reads the records.
 """
 
-from lavender.lab.bench.cases import Item, resolve, sequence, steps_in, structure_of
+from lavender.lab.bench.cases import Item, expand_seeds, resolve, sequence, steps_in, structure_of
 from lavender.lab.bench.machine import cpu_name
 from lavender.lab.bench.record import CaseInfo, Record, Run, Skip, level_name
-from lavender.lab.bench.running.campaign import CampaignPlan, campaign, seeds
-from lavender.lab.bench.running.finals import finals
-from lavender.lab.bench.running.plan import Plan
+from lavender.lab.bench.running.alternating import time_alternately
+from lavender.lab.bench.running.plan import CampaignPlan, Plan
 from lavender.lab.bench.running.runner import Event, carry, run, solver_names
 from lavender.lab.bench.running.timing import Ask, Task, measure, one_thread
 from lavender.lab.bench.store import Records, Store, read, write_csv, write_json
@@ -29,21 +28,20 @@ __all__ = [
     "Skip",
     "Store",
     "Task",
-    "campaign",
     "carry",
     "cpu_name",
-    "finals",
+    "expand_seeds",
     "level_name",
     "measure",
     "one_thread",
     "read",
     "resolve",
     "run",
-    "seeds",
     "sequence",
     "solver_names",
     "steps_in",
     "structure_of",
+    "time_alternately",
     "write_csv",
     "write_json",
 ]

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lavender import io
-from lavender.base.arrays import FloatArray, flag, several
+from lavender.base.arrays import FloatArray, flag, several, whole_number
 from lavender.base.errors import InputError, SolverUnavailable
 from lavender.io.stored import ENGINE, SUFFIXES, whole_file
 from lavender.judge.residuals import ENOUGH, Residual, nothing_to_do, residual
@@ -26,6 +26,7 @@ from lavender.lab import suite
 from lavender.lab.bench.record import CaseInfo, file_name, printable
 from lavender.lab.diagnostics import diagnose
 from lavender.lab.suite import Case
+from lavender.lab.suite.case import FAMILIES, parse
 from lavender.problem import Problem, check_problem
 from lavender.problem.derived import cached_property
 
@@ -34,6 +35,7 @@ SINGULAR = 1e-12  # of the largest singular value: far below any condition numbe
 MANIFOLD = 8  # blocks between one pair of bodies, at most
 LARGE_RATIO = 1e3  # mass ratio from which the velocity form changes everything
 ASYMMETRY = 0.1  # of A, relative: recorded contact problems stay below a hundredth
+MAX_SEEDS = 1_000_000  # of a family in one run: the name and place of each case take a kilobyte
 SOLVED = 1e-6  # relative residual at which `lv.solve` ends by default
 
 
@@ -152,6 +154,45 @@ def resolve(words: Source | Iterable[Source], sequences: bool | None = None) -> 
     return _unique_names(items)
 
 
+def resolve_again(source: str | Problem, name: str, reason: str) -> Item:
+    """Resolve the source of one item in another process. An error is raised when the problem is loaded."""
+    try:
+        (item,) = resolve([source])
+    except Exception as error:  # the file is gone, or reading its folder raises
+        item = Item(name, str(source), _raising(error))
+    return replace(item, name=name, reason=reason, sequence="", step=-1)
+
+
+def expand_seeds(words: Iterable[str], n: int, first: int = 0) -> list[str]:
+    """Return each case with seed=first .. first + n - 1 if its family takes a seed; other names, sets and files once.
+
+    Raises
+    ------
+    UnknownName, InputError
+        A name that the suite does not have; more than `MAX_SEEDS` seeds.
+    """
+    n, first = whole_number("n", n, high=None), whole_number("first", first, high=None)
+    if n > MAX_SEEDS:
+        raise InputError(
+            f"{n} seeds are asked for; at most {MAX_SEEDS} in one run: give A:B, part after part"
+        )
+    out = []
+    for word in several("cases", words, "names"):
+        if not isinstance(word, str):
+            raise InputError(f"case {word!r:.60} is no name of the suite")
+        if is_path(word) or word.startswith("@"):
+            out.append(word)
+            continue
+        name, given = parse(word)
+        if name in FAMILIES and "seed" in FAMILIES[name].signature.parameters and "seed" not in given:
+            for seed in range(first, first + n):
+                inside = ", ".join(f"{k}={v}" for k, v in {**given, "seed": seed}.items())
+                out.append(f"{name}({inside})")
+        else:
+            out.append(word)
+    return out
+
+
 def sequence(problems: Iterable[Problem], name: str) -> list[Item]:
     """Consecutive problems as the steps of one sequence."""
     if not isinstance(name, str):
@@ -159,7 +200,7 @@ def sequence(problems: Iterable[Problem], name: str) -> list[Item]:
     items = []
     for i, problem in enumerate(several("problems", problems, "Problems")):
         check_problem(problem)
-        items.append(Item(f"{name}[{i}]", name, _constant(problem), sequence=name, step=i))
+        items.append(Item(f"{name}[{i}]", name, _constant(problem), sequence=name, step=i, given=problem))
     return items
 
 

@@ -148,7 +148,8 @@ def commit_of(root: Path) -> str:
         return ""
     with contextlib.suppress(OSError, subprocess.SubprocessError):
         said = subprocess.run(
-            ["git", "-C", str(root), "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"],
+            ["git", "--no-optional-locks", "-C", str(root),
+             "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"],
             capture_output=True, encoding="utf-8", errors="replace", timeout=10, check=True,
         )  # fmt: skip
         return said.stdout.strip()

@@ -151,16 +151,6 @@ class Skip(_Texts):
 
 
 @dataclass(frozen=True)
-class Done(_Texts):
-    """Closes one pair of a campaign: every entry of it stands before this one."""
-
-    run: str
-    case: str
-    solver: str
-    sha: str = ""  # of the case's numbers; "": it did not load
-
-
-@dataclass(frozen=True)
 class Record(_Texts):
     """One solver on one case with one budget or tolerance. Times are seconds."""
 
@@ -244,10 +234,11 @@ def measurement_key(what: Any) -> tuple[Any, ...]:
     return (what.case, what.sha, what.solver, options, *asked)
 
 
-Entry = Run | CaseInfo | Skip | Done | Record
+Entry = Run | CaseInfo | Skip | Record
 #: Fields of records by the names that earlier versions wrote.
 RENAMED_FIELDS = {"contradicted": "status_conflict"}
-KINDS: dict[str, type] = {"run": Run, "case": CaseInfo, "skip": Skip, "done": Done, "record": Record}
+REMOVED_KINDS = ("done",)  # Earlier versions marked complete pairs of a campaign; such lines are ignored.
+KINDS: dict[str, type] = {"run": Run, "case": CaseInfo, "skip": Skip, "record": Record}
 
 
 def to_json(entry: Entry) -> dict[str, Any]:

@@ -1,9 +1,7 @@
-"""Records on disk: one JSON object a line, appended and flushed as each is made; CSV and JSON on request.
+"""Store records on disk: one JSON object per line, appended and flushed as each is made; CSV and JSON on request.
 
-A line is whole or it is not there: a run that was killed leaves at most a torn last line, which is cut
-off before the next one is written.
-
-One process writes a file, under the lock of `lavender.io.stored.lock_output`.
+A run that was killed leaves at most one incomplete line, the last one, which is removed before the next is written. One
+process writes a file, under the lock of `lavender.io.stored.lock_output`.
 """
 
 from __future__ import annotations
@@ -30,8 +28,8 @@ from lavender.io.stored import (
     write_text,
 )
 from lavender.lab.bench.record import (
+    REMOVED_KINDS,
     CaseInfo,
-    Done,
     Entry,
     Record,
     Run,
@@ -41,19 +39,18 @@ from lavender.lab.bench.record import (
     to_json,
 )
 
-MOST_LINE = 2**26  # bytes of a record; the longest of ours hold a few thousand
-SYNC = 1.0  # s, at most, of records that a power cut could take; a killed process takes none
+MAX_LINE_BYTES = 2**26  # A longer line is no record; the longest records have a few thousand bytes.
+SYNC_INTERVAL = 1.0  # s; a power cut loses the records of at most this time, a killed process none.
 
 
 @dataclass(repr=False)
 class Records:
-    """Everything that one or more runs wrote."""
+    """Entries of one or more runs."""
 
     runs: dict[str, Run] = field(default_factory=dict)
     cases: dict[str, CaseInfo] = field(default_factory=dict)  # the latest description of each
     records: list[Record] = field(default_factory=list)
     source: str = ""
-    done: dict[tuple[str, str, str], Done] = field(default_factory=dict)  # pairs of a campaign, complete
     _skips: dict[tuple[str, str, str], Skip] = field(default_factory=dict, repr=False)
     # the identity of each, as described last
     _sequences: dict[str, str] = field(default_factory=dict, repr=False)
@@ -65,7 +62,7 @@ class Records:
 
     @property
     def left_out(self) -> dict[str, list[Skip]]:
-        """Cases that did not load, by sequence ("" of none): no number holds them, and each has to say so."""
+        """Cases that did not load, by sequence ("" if none). No number includes them, and each table says so."""
         found: dict[str, list[Skip]] = {}
         for skip in self._skips.values():
             if not skip.solver:
@@ -73,24 +70,22 @@ class Records:
         return found
 
     def add(self, entry: Entry) -> None:
-        """Take one entry; a description, note or run given again replaces the earlier one."""
+        """Add one entry. A description, note or run replaces the earlier one."""
         if isinstance(entry, Run):
-            self.runs.pop(entry.run, None)  # the newest stands last
+            self.runs.pop(entry.run, None)  # the newest is the last
             self.runs[entry.run] = entry
         elif isinstance(entry, CaseInfo):
             if (
                 entry.sequence
                 and self._sequences.setdefault(entry.sequence, entry.identity) != entry.identity
             ):
-                # Another sequence under a name that was used: the steps of the earlier one are none of it.
+                # Another sequence of the same name: remove the steps of the earlier one.
                 self.cases = {n: i for n, i in self.cases.items() if i.sequence != entry.sequence}
                 self._sequences[entry.sequence] = entry.identity
             self.cases[entry.case] = entry
             self._skips.pop((entry.run, entry.case, ""), None)  # it loads now
         elif isinstance(entry, Skip):
             self._skips[entry.run, entry.case, entry.solver] = entry
-        elif isinstance(entry, Done):
-            self.done[entry.run, entry.case, entry.solver] = entry
         else:
             self.records.append(entry)
 
@@ -101,9 +96,9 @@ class Records:
         return len(self.records)
 
     def latest(self) -> Records:
-        """Only the run that wrote last, and what it says of cases as they are now.
+        """Return the records of the run that wrote last, of cases whose numbers have not changed since.
 
-        Ratios of times make sense within one run alone, and a file that changed is another problem.
+        Times are compared only within one run, and a file that has changed is another problem.
         """
         if not self.runs:
             return self
@@ -112,7 +107,7 @@ class Records:
         mine = [
             r for r in self.records if r.run == run and r.sha == now.get(r.case, "" if r.step >= 0 else r.sha)
         ]
-        # lines that took turns with each other
+        # lines that were timed alternately
         newest = next((r.turns for r in reversed(mine) if r.turns), "")
         mine = [r for r in mine if r.turns in ("", newest)]
         cases = {r.case for r in mine}
@@ -121,20 +116,20 @@ class Records:
     def having(
         self, records: Iterable[Record], keep: Callable[[Entry], bool] = lambda entry: True
     ) -> Records:
-        """Other records of the same runs, with the descriptions and notes that `keep` leaves."""
+        """Return other records of the same runs, with the descriptions and notes that `keep` accepts."""
         found = Records(source=self.source)
-        entries: list[Entry] = [*self.runs.values(), *self.cases.values(), *self.skips, *self.done.values()]
+        entries: list[Entry] = [*self.runs.values(), *self.cases.values(), *self.skips]
         for entry in (*filter(keep, entries), *records):
             found.add(entry)
         return found
 
     def success(self, record: Record) -> bool | None:
-        """What the judge said of a run; None where doing nothing is right: neither solved nor failed."""
+        """Return whether a run succeeded, or None if the zero impulse solves the case."""
         info = self.cases.get(record.case)
         return None if info is not None and info.nothing_to_do else record.success
 
     def rows(self) -> list[dict[str, Any]]:
-        """Plain rows, one for each record, with its case and machine: the columns of `records.csv`."""
+        """Return one row for each record, with its case and machine: the columns of `records.csv`."""
         out = []
         for r in self.records:
             run, info = self.runs.get(r.run), self.cases.get(r.case)
@@ -160,13 +155,13 @@ class Records:
         return f"<Records: {len(self.records)} runs of {len(self.cases)} cases, {self.source or 'in memory'}>"
 
     def _repr_html_(self) -> str:
-        """For notebooks: how much there is."""
+        """Return a table of the numbers of runs and cases, for notebooks."""
         solvers = sorted({r.solver for r in self.records})
         facts = {"runs": len(self.records), "cases": len(self.cases), "solvers": ", ".join(solvers)}
         return table_of(facts, self.source or "Records")
 
     def frame(self) -> Any:
-        """`rows()` as a pandas frame.
+        """Return `rows()` as a pandas frame.
 
         Raises
         ------
@@ -182,13 +177,12 @@ class Records:
 
 
 class Store:
-    """Appends entries to a `.jsonl` file, which nobody else writes as long as it is open.
+    """Appends entries to a `.jsonl` file, which no other process can write while it is open.
 
     Raises
     ------
     InputError
-        The file cannot be written, another process writes it, or it holds something else; known before
-        anything is solved.
+        The file cannot be written, another process writes it, or it has other content.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -213,13 +207,13 @@ class Store:
         Raises
         ------
         InputError
-            No room: what was written before is there. Or the file is gone, which nobody else would tell.
+            The disk is full; earlier entries are stored. Or the file was removed.
         """
         line = json.dumps(to_json(entry), allow_nan=False)
         try:
             self.file.write(line + "\n")
             self.file.flush()
-            if time.monotonic() - self._synced > SYNC:
+            if time.monotonic() - self._synced > SYNC_INTERVAL:
                 os.fsync(self.file.fileno())
                 self._synced = time.monotonic()
                 if not self._real.exists():
@@ -235,7 +229,7 @@ class Store:
         self.records.add(entry)
 
     def close(self) -> None:
-        """Close the file and let others write it; what the disk had no room for was reported when it was written."""
+        """Close the file and release its lock. A full disk was reported when an entry was added."""
         with contextlib.suppress(OSError):
             self.file.close()
         self._lock.close()
@@ -249,7 +243,7 @@ class Store:
 
 @contextlib.contextmanager
 def opened(store: Store | str | Path | None) -> Iterator[Store | None]:
-    """A store as it is; of a path, one that is closed at the end."""
+    """Yield a store, or open the store of a path and close it at the end."""
     if store is None or isinstance(store, Store):
         yield store
         return
@@ -267,7 +261,7 @@ def _cut_torn_line(path: Path) -> None:
 
 
 def read(path: str | Path) -> Records:
-    """Read a `records.jsonl` (or the folder that holds one). A torn last line is left out.
+    """Read a `records.jsonl`, or that of a folder, without an incomplete last line.
 
     Raises
     ------
@@ -284,7 +278,10 @@ def read(path: str | Path) -> Records:
         if not line.strip():
             continue
         try:
-            entry = from_json(json.loads(line))
+            content = json.loads(line)
+            if isinstance(content, dict) and content.get("kind") in REMOVED_KINDS:
+                continue
+            entry = from_json(content)
         except (ValueError, RecursionError) as error:
             raise InputError(f"{path}, line {number}: {error}; a records.jsonl is needed") from None
         if isinstance(entry, Record) and not (entry.case in found.cases and entry.run in found.runs):
@@ -294,14 +291,14 @@ def read(path: str | Path) -> Records:
                 "a records.jsonl is needed, whole"
             )
         found.add(entry)
-    # A measurement that was made again stands for the earlier one, in its place.
+    # A repeated measurement replaces the earlier one, in its place.
     newest = {(r.run, r.key): r for r in found.records}
     found.records = list(newest.values())
     return found
 
 
 def _lines(path: Path) -> Iterator[str]:
-    """Lines of a file without the mark that some editors put in front of UTF-8; the last is left out if it is torn."""
+    """Yield the lines of a file without byte order marks, and without an incomplete last line."""
     try:
         size = path.stat().st_size
         if size > MAX_BYTES:
@@ -309,11 +306,11 @@ def _lines(path: Path) -> Iterator[str]:
                 f"{path} holds {size} bytes, more than {MAX_BYTES}; a records.jsonl is needed, of fewer cases"
             )
         with path.open("rb") as f:
-            while line := f.readline(MOST_LINE):
+            while line := f.readline(MAX_LINE_BYTES):
                 if not line.endswith(b"\n"):
-                    if len(line) == MOST_LINE:
+                    if len(line) == MAX_LINE_BYTES:
                         raise InputError(
-                            f"{path} has a line of more than {MOST_LINE} bytes; a records.jsonl is needed"
+                            f"{path} has a line of more than {MAX_LINE_BYTES} bytes; a records.jsonl is needed"
                         )
                     return
                 yield line[:-1].decode("utf-8", errors="replace").removeprefix("\ufeff")
@@ -324,7 +321,7 @@ def _lines(path: Path) -> Iterator[str]:
 
 
 def write_csv(records: Records, path: str | Path) -> None:
-    """One row for each record; `work`, `options`, `versions`, `times` and `reached` are JSON in their cells."""
+    """Write one row for each record; cells of `work`, `options`, `versions`, `times` and `reached` are JSON."""
     rows = records.rows()
     columns = list(rows[0]) if rows else [f.name for f in fields(Record)]
 
@@ -341,18 +338,18 @@ def write_csv(records: Records, path: str | Path) -> None:
 
 
 def write_json(records: Records, path: str | Path) -> None:
-    """{"runs": [...], "cases": [...], "skips": [...], "records": [...]}; inf and nan are words."""
+    """Write {"runs": [...], "cases": [...], "skips": [...], "records": [...]}; inf and nan are strings."""
 
-    def told(entries: Iterable[Any]) -> list[dict[str, Any]]:
+    def as_dicts(entries: Iterable[Any]) -> list[dict[str, Any]]:
         return [{k: v for k, v in to_json(e).items() if k != "kind"} for e in entries]
 
     content = {
-        "runs": told(records.runs.values()),
-        "cases": told(records.cases.values()),
-        "skips": told(records.skips),
+        "runs": as_dicts(records.runs.values()),
+        "cases": as_dicts(records.cases.values()),
+        "skips": as_dicts(records.skips),
         "records": [
             {**entry, "success": records.success(r)}
-            for entry, r in zip(told(records.records), records.records, strict=True)
+            for entry, r in zip(as_dicts(records.records), records.records, strict=True)
         ],
     }
     write_text(path, json.dumps(content, indent=1, allow_nan=False) + "\n")

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from typing import Any
 
 from lavender.lab.bench.cases import Source
-from lavender.lab.bench.line import needs_more
-from lavender.lab.bench.running.finals import finals
+from lavender.lab.bench.running.alternating import time_alternately
 from lavender.lab.bench.running.plan import UNLIMITED, Plan
 from lavender.lab.bench.running.timing import Ask
 from lavender.lab.bench.store import Records
+from lavender.lab.bench.timed_call import exceeds_default_budget
 from lavender.lab.report import choices, tables
 from lavender.lab.report.choices import Advice
 from lavender.lab.report.finals import Final, in_time, lines
@@ -82,7 +82,7 @@ def contenders(records: Records, times: Sequence[float] = ()) -> list[Ask]:
 def _needed(records: Records, solver: str, level: float) -> int:
     """`max_iter` of a line to a level: none, unless some case needs more than the solver's default."""
     runs = (r for r in records if r.solver == solver and r.mode == "tol" and r.tol == level)
-    return UNLIMITED if any(needs_more(solver, r.iterations) for r in runs) else 0
+    return UNLIMITED if any(exceeds_default_budget(solver, r.iterations) for r in runs) else 0
 
 
 def _in_time(
@@ -109,8 +109,8 @@ def _in_time(
 def time_lines(
     cases: Iterable[Source], records: Records, plan: Plan, store: Any = None, **more: Any
 ) -> Records:
-    """Choose the contenders among what `bench.run` measured, and time them; see `bench.finals`."""
+    """Choose the contenders among what `bench.run` measured, and time them; see `bench.time_alternately`."""
     busy = working(records)
     if not len(busy) or plan.speed_levels:
         return records
-    return finals(cases, contenders(busy, plan.times), records, plan, store, **more)
+    return time_alternately(cases, contenders(busy, plan.times), records, plan, store, **more)

@@ -14,9 +14,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lavender.base.arrays import FloatArray
-from lavender.lab.bench.line import code_of
 from lavender.lab.bench.record import Record
 from lavender.lab.bench.store import Records
+from lavender.lab.bench.timed_call import format_call
 from lavender.lab.report import choices
 from lavender.lab.report.choices import FIRST, HALF, QUANTILE, Advice, Choice, counts_sweeps
 from lavender.lab.report.tables import SHIFT, levels_of, limit_of
@@ -47,7 +47,7 @@ class Final:
     @property
     def code(self) -> tuple[str, ...]:
         """To copy."""
-        return code_of(self.line, self.guessed)
+        return format_call(self.line, self.guessed)
 
     @property
     def time(self) -> float:

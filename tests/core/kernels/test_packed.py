@@ -9,7 +9,7 @@ from calls import impulses, in_chunks, packed, swept
 from random_problems import CONTACTS, random_contact_problem
 
 import lavender as lv
-from benchmarks.made import lattice_pile
+from benchmarks.core_problems import lattice_pile
 from lavender.solvers import layout
 
 FIXED = ["given", "reverse", "bottom_up", "top_down", "local", "colored", "array"]

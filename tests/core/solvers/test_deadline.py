@@ -13,7 +13,7 @@ from random_problems import FORMS, random_contact_problem, random_ellipses, rand
 from worked import python
 
 import lavender as lv
-from benchmarks.made import fresh, stacks
+from benchmarks.core_problems import fresh, stacks
 from lavender import registry
 from lavender.base.lazy_import import import_numerics
 from lavender.judge import residuals

@@ -8,7 +8,7 @@ from hypothesis import assume, example, given, settings
 from random_problems import good, seeds, without_solution
 
 import lavender as lv
-from benchmarks.made import fresh
+from benchmarks.core_problems import fresh
 from lavender.base.lu import sparse_lu
 from lavender.judge.certificates import check_certificate
 from lavender.judge.residuals import judging_time

@@ -447,7 +447,7 @@ def test_large_memory_asks_for_no_huge_pages():
 WHERE = """
 import lavender as lv
 from pathlib import Path
-from benchmarks.made import lattice_pile
+from benchmarks.core_problems import lattice_pile
 from lavender_ext.newton.solve import Solve
 
 problem = lattice_pile(3000)

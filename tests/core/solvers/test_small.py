@@ -15,7 +15,7 @@ from random_trees import random_general
 from scipy.sparse import block_diag, coo_array
 
 import lavender as lv
-from benchmarks.made import forms, fresh, stacks
+from benchmarks.core_problems import forms, fresh, stacks
 from lavender import registry
 from lavender.solvers.costs import RATES, newton_cost
 from lavender.solvers.registry import SMALL_ROWS

@@ -7,7 +7,7 @@ import pytest
 from random_problems import as_matrix, random_contact_problem, sweeps
 
 import lavender as lv
-from benchmarks.made import lattice_pile
+from benchmarks.core_problems import lattice_pile
 from lavender.problem.ordering import block_order, body_ranks, colors
 from lavender.solvers import layout, sweeping
 

@@ -2,7 +2,6 @@
 
 import dataclasses
 import io
-import itertools
 import json
 import math
 import sys
@@ -20,9 +19,9 @@ import lavender as lv
 from lavender import bench
 from lavender.lab.bench import cases as bench_cases
 from lavender.lab.bench import machine, store
-from lavender.lab.bench.line import code_of
 from lavender.lab.bench.record import Record, from_json, to_json
 from lavender.lab.bench.running import timing
+from lavender.lab.bench.timed_call import format_call
 from lavender.lab.report.findings import Report
 from lavender.lab.report.paper import write_paper
 from lavender.lab.report.terminal import print_report
@@ -109,11 +108,11 @@ def test_an_answer_is_no_start(tmp_path, early):
     assert {r.start for r in records} == {"cold"}
     assert records.cases["step"].guess == "answer"
     asks = [bench.Ask("pgs", "tol", 1e-6), bench.Ask("pgs", "tol", 1e-6, way="batch")]
-    made = bench.finals([path], asks, records, QUICK).records
+    made = bench.time_alternately([path], asks, records, QUICK).records
     assert all(r.iterations > 5 for r in made if r.mode == "tol" and r.tol <= 1e-6)
     steps = bench.sequence([p.updated(guess=answer), p.updated(guess=answer)], "steps")
     records = bench.run(steps, ["pgs"], QUICK)
-    made = bench.finals(steps, [bench.Ask("pgs", "tol", 1e-6, way="steps")], records, QUICK).records
+    made = bench.time_alternately(steps, [bench.Ask("pgs", "tol", 1e-6, way="steps")], records, QUICK).records
     assert all(r.iterations > 5 for r in made if r.start == "cold" and r.mode == "tol" and r.tol <= 1e-6)
     assert all(r.iterations > 5 for r in made if r.start == "carried" and r.step == 0 and r.tol == 1e-8)
     assert lv.cross_check(lv.load(path), ["pgs"])["pgs"].solution.iterations > 5
@@ -165,18 +164,7 @@ def test_a_plug_in_that_tests_nothing_is_timed_with_its_own_budget(register):
     register(lv.SolverSpec("untested", Untested, laws=laws, summary="of a test", max_iter=200))
     (record,) = bench.run([stack(2)], ["untested"], dataclasses.replace(QUICK, levels=(1e-3,), budgets=()))
     assert (record.status, record.iterations) == ("CONVERGED", 200) and record.times
-    assert code_of(record) == ('lv.solve(problem, "untested", tol=1e-3)',)
-
-
-def test_a_refused_case_and_a_file_that_does_not_load_are_named(tmp_path):
-    (tmp_path / "bad.npz").write_bytes(b"not an archive")
-    records = bench.run([tmp_path, stack(4)], ["sor"], QUICK)
-    assert len(records) == 0
-    lost, refused = records.skips
-    assert (lost.case, lost.solver) == ("bad", "")
-    assert "bad.npz" in lost.reason
-    assert (refused.case, refused.solver) == ("stack", "sor")
-    assert "lcp" in refused.reason
+    assert format_call(record) == ('lv.solve(problem, "untested", tol=1e-3)',)
 
 
 def test_a_method_of_free_rows_is_measured_as_its_method_with_bounds_and_a_note_says_so(capsys):
@@ -214,44 +202,44 @@ def test_each_record_is_on_disk_when_it_is_made(tmp_path):
     assert bench.read(path).records == records.records
 
 
+CAMPAIGN = (
+    bench.expand_seeds(["granular(n=2)", "toy_stack"], 3),
+    ["pgs", "gauss_seidel"],
+    bench.CampaignPlan(levels=(1e-3,), budgets=(4,), orders=()),
+)
 COMMANDS = {
-    "problems": (bench.run, ([stack(6), chain(7)], ["pgs", "direct"], QUICK)),
+    "problems": (([stack(6), chain(7)], ["pgs", "direct"], QUICK), 1, 1),
     "a sequence": (
-        bench.run,
-        (bench.sequence(moving_stack(5), "load"), ["pgs"], bench.Plan((), budgets=(6,), repeats=1)),
+        (bench.sequence(moving_stack(5), "load"), ["pgs"], bench.Plan((), budgets=(6,), repeats=1)), 1, 1
     ),
-    "a campaign": (
-        bench.campaign,
-        (
-            bench.seeds(["granular(n=2)", "toy_stack"], 3),
-            ["pgs", "gauss_seidel"],
-            bench.CampaignPlan(levels=(1e-3,), budgets=(4,), orders=()),
-        ),
-    ),
-}
+    "a campaign": (CAMPAIGN, 1, 1),
+    "a campaign of two workers": (CAMPAIGN, 2, 2),
+    "a campaign that two workers go on with": (CAMPAIGN, 1, 2),
+    "a campaign of two workers that one goes on with": (CAMPAIGN, 2, 1),
+}  # fmt: skip
 
 
-@pytest.mark.parametrize(("run", "given"), COMMANDS.values(), ids=COMMANDS)
-def test_the_same_command_goes_on_where_it_was_killed(run, given, tmp_path):
+@pytest.mark.parametrize(("given", "workers", "later"), COMMANDS.values(), ids=COMMANDS)
+def test_the_same_command_goes_on_where_it_was_killed(given, workers, later, tmp_path):
     """Cut in the middle of a line; impulses that are carried from step to step come back, too."""
     path, events = tmp_path / "records.jsonl", []
 
-    def command():
-        """Records, and how many were made (of a campaign: pairs of case and solver)."""
+    def command(workers):
+        """Records, and the number of those that were measured now."""
         events.clear()
-        records = run(*given, path, watch=events.append)
-        return records, sum(not e.reused and (e.record is not None or run is bench.campaign) for e in events)
+        records = bench.run(*given, path, workers=workers, watch=events.append)
+        return records, sum(e.record is not None and not e.reused for e in events)
 
-    whole, most = command()
+    whole, most = command(workers)
     content = path.read_bytes()
     path.write_bytes(content[: content.rindex(b'"kind": "record"')])
     kept = len(bench.read(path))
-    again, made = command()
+    again, made = command(later)
     assert [(r.key, r.relative) for r in again] == [(r.key, r.relative) for r in whole]
     assert {(s.case, s.solver) for s in again.skips} == {(s.case, s.solver) for s in whole.skips}
     assert 0 < kept < len(whole) == len(bench.read(path)) and 0 < made < most
     # And nothing is left to do the third time.
-    again, made = command()
+    again, made = command(later)
     assert len(again) == len(whole) == len(bench.read(path)) and made == 0
     for line in path.read_bytes().splitlines():
         json.loads(line)
@@ -297,7 +285,7 @@ def test_ctrl_c_keeps_what_there_is(tmp_path, plug_in):
 
 @pytest.mark.skipif(sys.platform == "win32", reason="an open file cannot be removed there")
 def test_a_file_that_is_removed_meanwhile_is_told(tmp_path, monkeypatch):
-    monkeypatch.setattr(store, "SYNC", -1.0)
+    monkeypatch.setattr(store, "SYNC_INTERVAL", -1.0)
     monkeypatch.chdir(tmp_path)
     (tmp_path / "sub").mkdir()
     with bench.Store("sub/records.jsonl") as opened:
@@ -309,33 +297,6 @@ def test_a_file_that_is_removed_meanwhile_is_told(tmp_path, monkeypatch):
         monkeypatch.chdir("/")  # a relative name is of the folder where it was given
         with pytest.raises(lv.InputError, match="was removed"):
             bench.run([stack(5)], ["pgs", "direct"], QUICK, opened, watch=watch)
-
-
-def test_a_full_disk_is_said_and_the_next_run_goes_on(tmp_path):
-    path = tmp_path / "records.jsonl"
-    full = OSError(28, "No space left on device")
-    counter = itertools.count()
-    opened = bench.Store(path)
-    write = opened.file.write
-
-    class Disk:
-        def __getattr__(self, name):
-            return getattr(opened_file, name)
-
-        def write(self, text):
-            if next(counter) == 4:
-                write(text[:20])
-                raise full
-            return write(text)
-
-    opened_file = opened.file
-    opened.file = Disk()
-    with pytest.raises(lv.InputError, match="No space left"):
-        bench.run([stack(6)], ["pgs", "direct"], QUICK, opened)
-    opened.close()
-    assert len(bench.run([stack(6)], ["pgs", "direct"], QUICK, path)) == len(
-        {r.key for r in bench.read(path)}
-    )
 
 
 def test_json_and_csv_hold_every_number(tmp_path):
@@ -539,7 +500,7 @@ def said(record, problem):
 
     names = {"lv": SimpleNamespace(solve=solve, bench=bench), "problem": problem, "problems": [problem]}
     names["dataclasses"] = dataclasses
-    exec("\n".join(code_of(record, problem.guess is not None)), names)
+    exec("\n".join(format_call(record, problem.guess is not None)), names)
     return calls[0]
 
 
@@ -584,7 +545,7 @@ def test_lines_in_turns_are_those_that_are_printed_and_c_asks_for_the_same(timed
     known = bench.run([problem], ["pgs"], plan)
     n = len(known)
     timed.clear()
-    made = bench.finals([problem], asks, known, plan).records[n:]
+    made = bench.time_alternately([problem], asks, known, plan).records[n:]
     for r in made:
         line = said(r, problem)
         assert [asked for solver, asked, guess in timed if (solver, asked, guess is None) == line]
@@ -605,7 +566,7 @@ def test_lines_are_timed_in_turns_and_kept(tmp_path):
     path = tmp_path / "records.jsonl"
     known = bench.run(problems, ["pgs"], plan, path)
     before = len(known)
-    made = bench.finals(problems, asks, known, plan, path).records[before:]
+    made = bench.time_alternately(problems, asks, known, plan, path).records[before:]
     assert len(made) == len(problems) * len(asks)
     for r in made:
         assert len(r.times) == r.repeats >= 3
@@ -613,7 +574,7 @@ def test_lines_are_timed_in_turns_and_kept(tmp_path):
         assert r.success == (r.mode == "tol")
         assert len(r.reached) == (r.repeats if r.mode == "time" else 0)
     assert bench.read(path).records == known.records
-    again = bench.finals(problems, asks, bench.run(problems, ["pgs"], plan, path), plan, path)
+    again = bench.time_alternately(problems, asks, bench.run(problems, ["pgs"], plan, path), plan, path)
     assert again.records == known.records
 
 

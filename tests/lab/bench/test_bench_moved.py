@@ -7,7 +7,7 @@ import pytest
 import lavender as lv
 from lavender import bench, suite
 from lavender.lab.bench.record import from_json, to_json
-from lavender.lab.bench.running.runner import with_motion
+from lavender.lab.bench.running.runner import add_motion_error
 from lavender.lab.collection import difficulty
 from lavender.lab.motion.reference import as_reference
 from lavender.lab.proof import enclosed
@@ -71,13 +71,13 @@ def test_motions_are_measured_from_an_exact_solution_and_a_claim_beyond_its_resi
     enclosed(problem)
     wrong = 0.9 * lv.solve(problem, tol=1e-9).impulse
     record = next(r for r in records if r.case == "granular(n=2)")
-    assert with_motion(record, problem, wrong).claim_check == "confirmed"  # its residual says so
+    assert add_motion_error(record, problem, wrong).claim_check == "confirmed"  # its residual says so
     blind = as_reference(problem, wrong)
     monkeypatch.setattr(
         "lavender.lab.bench.running.runner.as_reference",
         lambda *_: replace(blind, residual=replace(blind.residual, error=0.0 * wrong)),
     )
-    assert "from the exact solution" in with_motion(record, problem, wrong).status_conflict
+    assert "from the exact solution" in add_motion_error(record, problem, wrong).status_conflict
 
 
 def test_a_case_has_its_difficulty_and_who_gave_the_same_answer_without_an_iteration(tmp_path):

@@ -1,4 +1,4 @@
-"""Campaigns: the same records by any number of workers, and none lost with a worker."""
+"""Campaigns: the same records with any number of workers, and none lost with a worker."""
 
 import json
 import math
@@ -13,14 +13,15 @@ import numpy as np
 import pytest
 
 import lavender as lv
-from lavender import bench, report
+from lavender import bench, report, suite
 from lavender.lab.bench.record import to_json
-from lavender.lab.bench.running import campaign as module
+from lavender.lab.bench.running import workers as workers_module
 from lavender.lab.report import tables
 from lavender.lab.report.findings import Report
 
-NAMES = bench.seeds(["random_spd(n=12, condition=100)", "granular(n=2)", "toy_stack"], 4)
+NAMES = bench.expand_seeds(["random_spd(n=12, condition=100)", "granular(n=2)", "toy_stack"], 4)
 PLAN = bench.CampaignPlan(levels=(1e-3, 1e-6), budgets=(4, 8), orders=("random:1",))
+SHORT = bench.CampaignPlan(levels=(1e-6,), budgets=(), orders=())
 
 
 def lines(records):
@@ -28,51 +29,60 @@ def lines(records):
 
 
 def test_seeds_are_spread_over_cases_that_take_one():
-    assert bench.seeds(["granular(n=2)", "random_spd(seed=5)", "toy_stack", "@hard"], 2) == [
+    assert bench.expand_seeds(["granular(n=2)", "random_spd(seed=5)", "toy_stack", "@hard"], 2) == [
         "granular(n=2, seed=0)",
         "granular(n=2, seed=1)",
         "random_spd(seed=5)",
         "toy_stack",
         "@hard",
     ]
-    assert bench.seeds(["granular(n=2)"], 2, first=7) == ["granular(n=2, seed=7)", "granular(n=2, seed=8)"]
+    assert bench.expand_seeds(["granular(n=2)"], 1, first=7) == ["granular(n=2, seed=7)"]
     with pytest.raises(lv.InputError):
-        bench.seeds(["2 +"], 2)
+        bench.expand_seeds(["2 +"], 2)
 
 
-def test_the_same_bits_by_one_worker_and_by_two_and_no_times():
-    one = bench.campaign(NAMES, ["pgs", "direct"], PLAN, workers=1)
-    two = bench.campaign(NAMES, ["pgs", "direct"], PLAN, workers=2)
+def test_one_worker_and_two_give_the_same_bits_and_no_times():
+    one = bench.run(NAMES, ["pgs", "direct"], PLAN)
+    two = bench.run(NAMES, ["pgs", "direct"], PLAN, workers=2)
     assert lines(one) == lines(two)
     assert [s.case for s in one.skips] == [s.case for s in two.skips]
+    assert lines(one.cases.values()) == lines(two.cases.values())
     assert len({r.case for r in one}) == len(NAMES) == 9
     assert all(math.isnan(r.time_min) and math.isnan(r.setup_min) for r in one)
     for r in one:
         if r.case == NAMES[0] and r.solver == "pgs" and r.mode == "budget" and r.order == "given":
-            from lavender import suite
-
             again = lv.solve(suite.case(NAMES[0]).problem, "pgs", tol=0.0, max_iter=r.max_iter)
             assert again.residual.relative == r.relative
 
 
-def test_what_ends_a_campaign_comes_alone_and_its_report_says_so(tmp_path, recwarn):
-    def full(event):
+def test_workers_measure_no_times():
+    assert bench.run(["toy_stack"], ["direct"], workers=2).runs.popitem()[1].plan["campaign"]
+    with pytest.raises(lv.InputError, match="give a CampaignPlan, or workers=1"):
+        bench.run(["toy_stack"], ["direct"], bench.Plan(), workers=2)
+
+
+def test_an_exception_stops_the_workers_without_warnings_and_the_report_says_so(tmp_path, recwarn):
+    def stop(event):
         raise OSError("no room")
 
-    path = tmp_path / "records.jsonl"
+    path, stored = tmp_path / "records.jsonl", []
     with pytest.raises(OSError, match="no room"):
-        bench.campaign(NAMES, ["pgs", "direct"], PLAN, path, workers=2, watch=full)
+        bench.run(NAMES, ["pgs", "direct"], PLAN, path, workers=2, watch=stop, into=stored)
     assert not recwarn.list
-    assert Report(bench.read(path)).stopped
-    bench.campaign(NAMES, ["pgs", "direct"], PLAN, path, workers=1)
+    assert Report(bench.read(path)).stopped and Report(stored[0]).stopped
+    assert lines(stored[0]) == lines(bench.read(path))
+    bench.run(NAMES, ["pgs", "direct"], PLAN, path)
     assert not Report(bench.read(path)).stopped
 
 
-def test_a_file_that_has_changed_is_run_again(tmp_path):
-    plan, file = bench.CampaignPlan(levels=(1e-6,), budgets=(), orders=()), tmp_path / "file.npz"
+def test_a_file_that_has_changed_and_a_plan_that_asks_for_more_are_run_again(tmp_path):
+    file = tmp_path / "file.npz"
+
+    def run(plan):
+        return bench.run([file], ["pgs", "direct"], plan, tmp_path / "records.jsonl")
 
     def shas():
-        out = bench.campaign([file], ["pgs", "direct"], plan, tmp_path / "records.jsonl", workers=1)
+        out = run(SHORT)
         return {(r.solver, r.sha) for r in out}, len(out.skips)
 
     lv.Problem.lcp(np.eye(2), np.ones(2)).save(file)
@@ -83,68 +93,63 @@ def test_a_file_that_has_changed_is_run_again(tmp_path):
     lv.Problem.lcp(2.0 * np.eye(2), np.ones(2)).save(file)
     second = shas()
     assert len(second[0] - first[0]) == 2 == len(second[0]) and not second[1]
+    more = bench.CampaignPlan(levels=(1e-3, 1e-6), budgets=(), orders=())
+    assert {r.tol for r in run(more) if r.solver == "pgs"} == {1e-3, 1e-6}
+    with (tmp_path / "records.jsonl").open("a") as f:  # the mark of a complete pair, of an earlier version
+        f.write('{"kind": "done", "run": "r", "case": "file", "solver": "pgs", "sha": ""}\n')
+    assert {r.tol for r in run(more) if r.solver == "pgs"} == {1e-3, 1e-6}
 
 
-def test_problems_and_files_travel_too(tmp_path):
-    from lavender import io
-
+def test_problems_files_and_solvers_of_this_process_are_sent_to_workers(tmp_path, plug_in):
     p = lv.Problem.lcp(np.array([[2.0, 1.0], [1.0, 2.0]]), np.ones(2), name="mine")
-    io.save(p, tmp_path / "file.npz")
+    lv.io.save(p, tmp_path / "file.npz")
     (tmp_path / "bad.npz").write_bytes(b"broken")
-    plan = bench.CampaignPlan(levels=(1e-6,), budgets=(), orders=())
-    records = bench.campaign([p, tmp_path / "file.npz", tmp_path / "bad.npz"], ["pgs"], plan, workers=2)
-    assert [(r.case, r.success) for r in records] == [("mine", True), ("file", True)]
-    assert ["did not load" in s.reason for s in records.skips] == [True]
-
-
-def test_a_solver_that_is_registered_here_alone_travels_even_under_a_name_of_ours(plug_in):
-    mine = lv.Status.MAX_ITERATIONS
-    for name in ("here alone", "pgs"):
-        plug_in(lambda problem, impulse: lv.Claim(mine, 1, {"mine": 1}), name)
-    plan = bench.CampaignPlan(levels=(1e-6,), budgets=(), orders=())
-    records = bench.campaign(["toy_stack"], ["here alone", "pgs"], plan, workers=2)
-    assert [dict(r.work) for r in records] == 2 * [{"mine": 1}]
+    steps = bench.sequence([p, p], "steps")
+    found = bench.run([p, tmp_path / "file.npz", tmp_path / "bad.npz", *steps], ["direct"], SHORT, workers=2)
+    assert [(r.case, r.success) for r in found] == [
+        (n, True) for n in ("mine", "file", "steps[0]", "steps[1]")
+    ]
+    assert ["did not load" in s.reason for s in found.skips] == [True]
+    for name in ("here alone", "pgs"):  # also under the name of one of ours
+        plug_in(lambda problem, impulse: lv.Claim(lv.Status.MAX_ITERATIONS, 1, {"mine": 1}), name)
+    found = bench.run(["toy_stack"], ["here alone", "pgs"], SHORT, workers=2)
+    assert [dict(r.work) for r in found] == 2 * [{"mine": 1}]
 
 
 @pytest.mark.parametrize(
-    ("backend", "sign"),
+    ("backend", "missing", "sign"),
     [
-        ("nowhere", "'loky' runs processes"),
-        ("loky=here", "'loky' runs processes"),
-        ("dask=tcp://127.0.0.1:1", "no dask scheduler answers"),
-        ("dask", "DASK_SCHEDULER_ADDRESS"),
+        ("nowhere", "", "'loky' runs processes"),
+        ("loky=here", "", "'loky' runs processes"),
+        ("dask=tcp://127.0.0.1:1", "", "no dask scheduler answers"),
+        ("dask", "", "DASK_SCHEDULER_ADDRESS"),
+        ("dask", "distributed", r"pip install 'lavender-contact\[cluster\]'"),
+        ("ray", "ray", r"pip install 'ray\[default\]'"),
     ],
 )
-def test_a_backend_that_is_not_there_is_an_input_error(backend, sign, monkeypatch):
-    if backend.startswith("dask"):
+def test_a_backend_that_cannot_be_used_is_an_input_error(backend, missing, sign, monkeypatch):
+    if missing:
+        monkeypatch.setitem(sys.modules, missing, None)
+    elif backend.startswith("dask"):
         pytest.importorskip("distributed", reason="a cluster needs dask.distributed (extra: cluster)")
-        monkeypatch.setattr(sys.modules["lavender.lab.bench.running.campaign"], "CONNECT", 0.2)
+        monkeypatch.setattr(workers_module, "CONNECT_TIMEOUT", 0.2)
     with pytest.raises(lv.InputError, match=sign):
-        bench.campaign(NAMES[:1], ["pgs"], PLAN, backend=backend)
-
-
-@pytest.mark.parametrize(
-    ("backend", "package"), [("dask", "lavender-contact\\[cluster\\]"), ("ray", "ray\\[default\\]")]
-)
-def test_a_cluster_without_its_package_says_what_to_install(backend, package, monkeypatch):
-    monkeypatch.setitem(sys.modules, "distributed" if backend == "dask" else "ray", None)
-    with pytest.raises(lv.InputError, match=f"pip install '{package}'"):
-        bench.campaign(NAMES[:1], ["pgs"], PLAN, backend=backend)
+        bench.run(NAMES[:1], ["pgs"], PLAN, backend=backend)
 
 
 @pytest.mark.slow
 def test_ray_gives_the_same_bits():
     ray = pytest.importorskip("ray", reason="a ray cluster needs ray")
-    expected = bench.campaign(NAMES[:2], ["pgs"], PLAN, workers=1)
     ray.init(num_cpus=1, include_dashboard=False, log_to_driver=False)
     try:
-        assert lines(bench.campaign(NAMES[:2], ["pgs"], PLAN, workers=1, backend="ray")) == lines(expected)
+        found = bench.run(NAMES[:2], ["pgs"], PLAN, backend="ray")
     finally:
         ray.shutdown()
+    assert lines(found) == lines(bench.run(NAMES[:2], ["pgs"], PLAN))
 
 
 def test_the_report_of_a_campaign_shows_shares_and_no_times(tmp_path):
-    records = bench.campaign(NAMES, ["pgs", "direct"], PLAN, workers=1)
+    records = bench.run(NAMES, ["pgs", "direct"], PLAN)
     rows = {(r.family, r.solver): r for r in tables.robustness(records)}
     dense = rows["dense", "direct"]
     assert (dense.cases, dense.reached[1e-6], dense.wrong, dense.died) == (4, 4, 0, 0)
@@ -163,9 +168,9 @@ def test_a_cluster_that_loses_a_worker_midway_loses_no_record():
     distributed = pytest.importorskip(
         "distributed", reason="a cluster needs dask.distributed (extra: cluster)"
     )
-    names = bench.seeds(["granular(n=2)"], 16)
+    names = bench.expand_seeds(["granular(n=2)"], 16)
     plan = bench.CampaignPlan(levels=(1e-6,), budgets=(8, 64), orders=())
-    expected = bench.campaign(names, ["pgs", "jacobi"], plan, workers=1)
+    expected = bench.run(names, ["pgs", "jacobi"], plan)
     with (
         distributed.LocalCluster(
             n_workers=2, threads_per_worker=1, processes=True, dashboard_address=":0"
@@ -181,7 +186,7 @@ def test_a_cluster_that_loses_a_worker_midway_loses_no_record():
                 half.set()
                 os.kill(pids[0], signal.SIGKILL)
 
-        found = bench.campaign(names, ["pgs", "jacobi"], plan, backend="dask", watch=watch)
+        found = bench.run(names, ["pgs", "jacobi"], plan, backend="dask", watch=watch)
         while pids[0] in client.run(os.getpid, on_error="ignore").values():  # until the cluster has noticed
             time.sleep(0.1)
     assert half.is_set()
@@ -189,9 +194,9 @@ def test_a_cluster_that_loses_a_worker_midway_loses_no_record():
 
 
 @pytest.mark.slow
-def test_a_cluster_that_goes_midway_is_told_and_the_next_one_goes_on(tmp_path, monkeypatch):
+def test_after_a_cluster_that_goes_midway_the_next_run_goes_on(tmp_path, monkeypatch):
     pytest.importorskip("distributed", reason="a cluster needs dask.distributed (extra: cluster)")
-    names, path = bench.seeds(["granular(n=2)"], 40), tmp_path / "records.jsonl"
+    names, path = bench.expand_seeds(["granular(n=2)"], 40), tmp_path / "records.jsonl"
     plan = bench.CampaignPlan(levels=(1e-6,), budgets=(8, 64), orders=())
     code = (
         "import sys, distributed\n"
@@ -200,7 +205,7 @@ def test_a_cluster_that_goes_midway_is_told_and_the_next_one_goes_on(tmp_path, m
         "    print(c.scheduler_address, flush=True)\n"
         "    sys.stdin.read()\n"
     )
-    monkeypatch.setattr(module, "CONNECT", 1.0)
+    monkeypatch.setattr(workers_module, "CONNECT_TIMEOUT", 1.0)
     cluster = subprocess.Popen(
         [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     )
@@ -212,17 +217,15 @@ def test_a_cluster_that_goes_midway_is_told_and_the_next_one_goes_on(tmp_path, m
                 cluster.kill()
 
         with pytest.raises(OSError, match="tcp://"):
-            bench.campaign(names, ["pgs"], plan, path, backend=f"dask={address}", watch=watch)
+            bench.run(names, ["pgs"], plan, path, backend=f"dask={address}", watch=watch)
     finally:
         cluster.kill()
         cluster.communicate()
-    done = len(bench.read(path).done)
-    assert 0 < done < len(names)
-    found = bench.campaign(names, ["pgs"], plan, path, workers=1)
-    assert lines(found) == lines(bench.campaign(names, ["pgs"], plan, workers=1))
+    assert 0 < len(bench.read(path).cases) < len(names)
+    assert lines(bench.run(names, ["pgs"], plan, path)) == lines(bench.run(names, ["pgs"], plan))
 
 
-def test_errors_travel_between_processes():
+def test_errors_are_sent_between_processes():
     import pickle
 
     error = lv.UnknownName("solver", "pgz", ["pgs"])

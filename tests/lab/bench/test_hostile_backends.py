@@ -212,7 +212,7 @@ def hard(i):
     chain = diags_array([2.0, -1.0, -1.0], offsets=[0, 1, -1], shape=(3000, 3000))  # condition 4e6
     return lv.Problem.lcp(chain.tocsr(), (1.0 + i) * np.eye(1, 3000)[0], name=f"hard {i}")
 plan = bench.CampaignPlan(levels=(1e-9,), budgets=(), cap=10_000_000)
-bench.campaign([hard(i) for i in range(4)], ["pgs"], plan, workers=2)
+bench.run([hard(i) for i in range(4)], ["pgs"], plan, workers=2)
 """
 
 

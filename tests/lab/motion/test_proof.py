@@ -8,9 +8,9 @@ from fractions import Fraction
 import numpy as np
 import pytest
 import scipy.sparse as sp
+from random_families import wild
 
 import lavender as lv
-from benchmarks.random_families import wild
 from lavender import suite
 from lavender.lab import proof
 from lavender.lab.proof import dependence, island, operator, search

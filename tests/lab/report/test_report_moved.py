@@ -110,7 +110,7 @@ def test_a_campaign_counts_cases_by_motion_error_too(tmp_path):
     idle = tmp_path / "idle.npz"
     lv.io.save(idle_problem(), idle)
     plan = bench.CampaignPlan(levels=(1e-3,), budgets=(1, 64), orders=(), motion=True)
-    found = bench.campaign(["stack(n=4)", "stack(n=32)", str(idle)], ["pgs"], plan, workers=1)
+    found = bench.run(["stack(n=4)", "stack(n=32)", str(idle)], ["pgs"], plan, workers=1)
     rows = tables.robustness(moved.by_speed(moved.working(found)))
     best = {r.case: math.inf for r in moved.working(found)}
     for r in moved.working(found):

@@ -5,11 +5,11 @@ import functools
 import numpy as np
 import pytest
 from calls import dense, over_velocities
+from random_families import drawn
 from random_problems import as_matrix
 
 import lavender as lv
-from benchmarks.made import fresh
-from benchmarks.random_families import drawn
+from benchmarks.core_problems import fresh
 from lavender import registry, suite
 from lavender.judge import residuals
 from lavender.judge.residuals import judging_time

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from calls import dense_h, system_in
 from hypothesis import given, settings
+from random_families import wild
 from random_problems import as_matrix, good, seeds
 
 import lavender as lv
-from benchmarks.random_families import wild
 from lavender import registry, suite
 from lavender.base.deadline import Deadline
 from lavender.lab.suite import box_stack

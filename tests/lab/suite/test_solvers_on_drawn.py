@@ -1,4 +1,4 @@
-"""Solvers on problems of structures drawn by lot (`benchmarks.random_families`)."""
+"""Solvers on problems of structures drawn by lot (`random_families`)."""
 
 import re
 from dataclasses import replace
@@ -7,10 +7,10 @@ from unittest import mock
 import numpy as np
 import pytest
 from calls import REACHED, check, driven, facts
+from random_families import drawn, wild
 from random_problems import as_matrix, good
 
 import lavender as lv
-from benchmarks.random_families import drawn, wild
 from lavender import registry
 from lavender.problem.rows import Rows
 from lavender.solvers.certify import certify

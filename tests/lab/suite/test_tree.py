@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 from calls import over_velocities
+from random_families import drawn, wild
 from random_problems import as_matrix, general, random_lcp
 from random_trees import random_general
 
 import lavender as lv
-from benchmarks.random_families import drawn, wild
 from lavender import registry, suite
 from lavender.base.deadline import Deadline
 from lavender.judge.residuals import reference

@@ -1,4 +1,4 @@
-"""What to measure: levels, budgets, starts, orders, and the rule that makes measurements of them."""
+"""Define what is measured: levels, budgets, starts and orders, and the sequence of measurements of a solver."""
 
 from __future__ import annotations
 
@@ -16,10 +16,13 @@ from lavender.problem import Problem
 from lavender.problem.ordering import ORDERS
 from lavender.solvers.registry import SolverSpec
 
-# A speed level: the residual that is asked for first, the tightest, and how often a tighter one is tried.
-FIRST_TOL, LAST_TOL, SPEED_TRIES = 1e-2, 1e-13, 6
-PASS_LIMIT = 5.0  # s, of one pass over a sequence
-UNLIMITED = 10_000_000  # iterations of a run to a tolerance: the time limit ends it first
+# A motion error is reached by solves to tighter and tighter residuals: the first, the last, and their maximum number.
+FIRST_TOL, LAST_TOL, MAX_SPEED_TRIES = 1e-2, 1e-13, 6
+PASS_LIMIT = 5.0  # s, of one pass over a sequence.
+UNLIMITED = 10_000_000  # Iterations of a run to a tolerance: the time limit ends it first.
+HANG_LIMIT = (
+    60.0  # s, after which a campaign kills the process of another package's solver and records KILLED
+)
 
 
 @dataclass(frozen=True)
@@ -38,11 +41,11 @@ class Plan:
     warm : also start from the problem's guess, where it has one that is no answer already
     orders : sweep orders beside "given", each at the middle budget, for solvers that take an order;
         "random:3" is random with seed 3
-    motion : tell how wrong the bodies move, by a reference that is solved for once a case
+    motion : measure the motion error, from a reference that is solved once for each case
     prove : compare motions with an exact solution where one is enclosed (`lavender.prove`); implies `motion`. A claim
         that is further from it than the claim's own residual allows is contradicted
     speed_levels : m/s, motion errors to reach; implies `motion`. Each solver is asked for the residual that takes it
-        there: again and tighter while it misses, at most `SPEED_TRIES` times a level
+        there: again and tighter while it misses, at most `MAX_SPEED_TRIES` times a level
     times : s, in which the report is asked to name a solver
     sweeps : of `budgets`, those with which the report is asked to name one
 
@@ -106,14 +109,18 @@ class Plan:
 
     way = "call"  # what of a single problem is timed, as `Record.way`
 
+    def iteration_limit(self) -> int:
+        """Return the maximum number of iterations of a run to a tolerance."""
+        return UNLIMITED
+
     def as_dict(self) -> dict[str, Any]:
-        """For the description of a run."""
+        """Return the fields, for the description of a run."""
         return asdict(self)
 
-    def carry_out(
+    def measure(
         self, info: CaseInfo, problem: Problem, spec: SolverSpec, make: Callable[[Task], Record]
     ) -> None:
-        """Make the measurements of one solver on one case; each record decides what follows.
+        """Measure one solver on one case; each record decides which measurement follows.
 
         To a tolerance: an exact solver once, at the tightest level. Others level by level; one that can
         be resumed, or that ran out of time, is not asked for a tighter level than the one it missed: the
@@ -128,11 +135,11 @@ class Plan:
         starts = ["cold"]
         if self.warm and info.guess == "start" and spec.impulse and not spec.exact:
             starts.append("warm")
-        most = UNLIMITED if spec.resumable else 0
+        most = self.iteration_limit() if spec.resumable else 0
         for start in starts:
             for level in self.levels[-1:] if spec.exact else self.levels:
                 record = one("tol", level, most, start)
-                if not record.relative <= level and (spec.resumable or _hopeless(record)):
+                if not record.relative <= level and (spec.resumable or _rules_out_tighter_levels(record)):
                     break
             if not spec.exact:
                 self._to_speeds(partial(one, "tol", max_iter=most, start=start))
@@ -148,11 +155,11 @@ class Plan:
                 one("budget", 0.0, middle, "cold", order=name, **({"seed": int(seed)} if seed else {}))
 
     def _to_speeds(self, solve_to: Callable[[float], Record]) -> None:
-        """Solves to each speed level: the motion error follows the residual by a factor that the last solve tells."""
+        """Solve to each speed level. The ratio of motion error to residual is taken from the previous solve."""
         tol = FIRST_TOL
         last: Record | None = None
         for level in self.speed_levels:
-            for _ in range(SPEED_TRIES):
+            for _ in range(MAX_SPEED_TRIES):
                 if last is not None:
                     speed = math.inf if last.motion_speed is None else last.motion_speed
                     if speed <= level:
@@ -164,8 +171,31 @@ class Plan:
                 last = solve_to(tol)
 
 
-def passes(plan: Plan, spec: SolverSpec) -> list[Ask]:
-    """What is run over a sequence: each budget and level, cold and carried."""
+@dataclass(frozen=True)
+class CampaignPlan(Plan):
+    """How each solver is run without timing: runs end after a number of iterations, never by the clock.
+
+    Its records do not depend on the machine's load or the number of workers.
+
+    Parameters
+    ----------
+    cap : maximum number of iterations of a run to a level
+    time_limit : s, after which the process of another package's solver is killed; only its own record depends on it
+    """
+
+    repeats: int = 1
+    time_limit: float = HANG_LIMIT
+    cap: int = 20_000
+    campaign: bool = True
+    way = ""  # nothing is timed
+
+    def iteration_limit(self) -> int:
+        """Return `cap`."""
+        return self.cap
+
+
+def list_passes(plan: Plan, spec: SolverSpec) -> list[Ask]:
+    """Return the passes over a sequence: each budget and level, cold and carried."""
     most = UNLIMITED if spec.resumable else 0
     asked = [("tol", level, most) for level in (plan.levels[-1:] if spec.exact else plan.levels)]
     if spec.resumable and not spec.exact:
@@ -174,7 +204,7 @@ def passes(plan: Plan, spec: SolverSpec) -> list[Ask]:
     return [Ask(spec.name, *what, way="steps", start=start) for start in starts for what in asked]
 
 
-def _hopeless(record: Record) -> bool:
+def _rules_out_tighter_levels(record: Record) -> bool:
     return record.status in ("TIME_LIMIT", "KILLED", "ERROR", "INFEASIBLE") or record.status.startswith(
         "CRASHED"
     )

@@ -1,26 +1,35 @@
-"""Every solver on every case: serial, timed, each record kept the moment it is made."""
+"""Measure every solver on every case, in this process or with workers; each record is stored as soon as it is made.
+
+A run with times measures in this process, one solve after the other. A campaign (`CampaignPlan`) measures no times: its
+pairs of case and solver may be distributed over workers, and its records have the same bits with any number of them.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import math
-from collections.abc import Callable, Iterable, Sequence
+import os
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
+from itertools import product
 from pathlib import Path
 from time import perf_counter
 from typing import Any
 
 from lavender.base.arrays import FloatArray, several
-from lavender.base.errors import LavenderError
+from lavender.base.errors import InputError, LavenderError
 from lavender.judge.solution import CONTRADICTED
 from lavender.judge.states import states_of
 from lavender.lab import motion
 from lavender.lab.bench import machine
-from lavender.lab.bench.cases import Item, Source, describe, resolve
-from lavender.lab.bench.record import CaseInfo, Record, Run, Skip, asked_of
-from lavender.lab.bench.running.plan import Plan, passes
+from lavender.lab.bench.cases import Item, Source, describe, fingerprint, resolve, resolve_again
+from lavender.lab.bench.record import CaseInfo, Entry, Record, Run, Skip, asked_of
+from lavender.lab.bench.running.plan import CampaignPlan, Plan, list_passes
 from lavender.lab.bench.running.timing import Ask, Task, measure, one_thread
 from lavender.lab.bench.running.worker import Worker
+from lavender.lab.bench.running.workers import check_workers, connect_backend, map_unordered
 from lavender.lab.bench.store import Records, Store, opened
 from lavender.lab.motion import load_reference
 from lavender.lab.motion.bound import separation
@@ -30,16 +39,19 @@ from lavender.problem import Problem, check_problem
 from lavender.solvers import registry
 from lavender.solvers.registry import SolverSpec
 
-SEARCH = 6  # runs of the search for several motions, once for each Coulomb problem
-QUICK = 0.05  # of the time limit: after a step that took less, the next is solved without a guard
-SHORT_SEQUENCE = 20  # up to which the steps of a sequence are repeated; the sum over more evens out by itself
+MOTION_SEARCH_RUNS = 6  # Runs of the search for several motions, made once for each Coulomb problem.
+# After a step that took less than this fraction of the time limit, the next step is solved without a guard.
+UNGUARDED_TIME_RATIO = 0.05
+# Steps of longer sequences are solved once: the sum of their times varies less.
+MAX_REPEATED_STEPS = 20
+MAX_ATTEMPTS = 5  # If workers are lost, the remaining pairs are handed out at most this many times.
 
 Watch = Callable[["Event"], Any]
 
 
 @dataclass(frozen=True)
 class Event:
-    """What a watcher (a progress bar) is told: pairs of case and solver done, of how many."""
+    """Progress of a run: the number of pairs of case and solver that are done, and of all pairs."""
 
     done: int
     total: int
@@ -50,20 +62,20 @@ class Event:
 
 
 def carry(before: Problem, impulse: FloatArray, problem: Problem) -> FloatArray:
-    """Start of `problem` (m,) [N s] from the impulses of the step before."""
+    """Return the start of `problem` (m,) [N s] from the impulses of the previous step."""
     check_problem(problem)
     return problem.carry((before, impulse))
 
 
-def with_motion(record: Record, problem: Problem, impulse: Any) -> Record:
-    """The record with `motion`, `motion_speed` and `bound` of the impulses (m,) [N s] that came out, None without any.
+def add_motion_error(record: Record, problem: Problem, impulse: Any) -> Record:
+    """Return the record with `motion`, `motion_speed` and `bound` of its impulses (m,) [N s], None if there are none.
 
-    Outside every clock. The reference, and under Coulomb's law the motions that are found, are kept with `problem`.
+    No clock runs. The reference, and under Coulomb's law the motions that are found, are cached in `problem`.
     """
     if impulse is None:
         return record
     problem, impulse = problem.disk, problem.on_disk(impulse)
-    found = motion.motions_of(problem, SEARCH) if problem.law == "coulomb" else None
+    found = motion.motions_of(problem, MOTION_SEARCH_RUNS) if problem.law == "coulomb" else None
     error = (
         motion.motion_error(problem, impulse) if found is None else motion.nearest(problem, impulse, found)
     )
@@ -86,20 +98,29 @@ def with_motion(record: Record, problem: Problem, impulse: Any) -> Record:
     return told
 
 
-def with_answer(record: Record, problem: Problem, impulse: FloatArray) -> Record:
-    """The record with what its impulses (m,) [N s] are: their bits, and how many blocks are at a boundary."""
+def add_solution_hash(record: Record, problem: Problem, impulse: FloatArray) -> Record:
+    """Return the record with the hash of its impulses (m,) [N s] and the fraction of blocks at a boundary."""
     fraction = states_of(problem, impulse).boundary_fraction
     bits = hashlib.sha256(impulse.tobytes()).hexdigest()[:16]
     return replace(record, bits=bits, degenerate=fraction)
 
 
+def without_times(record: Record, time_limit: float) -> Record:
+    """Return the record of a campaign: equal on all machines, with the time limit [s] of the plan."""
+    nan = math.nan
+    return replace(
+        record, setup_min=nan, setup_median=nan, solve_min=nan, solve_median=nan, time_min=nan, time_median=nan,
+        pace=None, load=None, own_min=None, time_limit=time_limit,
+    )  # fmt: skip
+
+
 def is_foreign(spec: SolverSpec) -> bool:
-    """Code that other packages brought, which a process of its own finds: what `register` alone knows is not there."""
+    """Whether a solver is code of another package that a separate process can import by its name."""
     return spec.plugged or (spec.own and (spec.external or bool(spec.requires)))
 
 
 def solver_names(names: str | Sequence[str] | None) -> list[str]:
-    """The solvers to run: those named (or the one), each of them installed; or every one that is installed.
+    """Return the names of the solvers to run: those that are given, each of them installed, or every installed one.
 
     Raises
     ------
@@ -119,6 +140,8 @@ def run(
     plan: Plan | None = None,
     store: Store | str | Path | None = None,
     *,
+    workers: int = 1,
+    backend: str = "loky",
     watch: Watch | None = None,
     isolate: bool = True,
     memory: int | None = None,
@@ -131,15 +154,20 @@ def run(
     ----------
     cases : files, folders, names of the suite, problems; all of `lavender.lab.suite.default()` if none
     solvers : names; every installed one if None. One that refuses a case is skipped with its reason; where another
-        is the same method with bounds (`pgs` for `gauss_seidel`), that one is run.
+        is the same method with bounds (`pgs` for `gauss_seidel`), that one is run, but not in a campaign.
     plan : Plan
+        `Plan()` if None; `CampaignPlan()` with several workers or a cluster, which measure no times.
     store : Store or path of a `.jsonl` file, optional
         Keeps each record when it is made; a measurement that it holds already, from the same machine,
         versions and plan, is not made again.
+    workers : number of processes; 1: this one, -1: one for each core. A cluster has as many as it has.
+    backend : a backend of joblib: "loky" (processes here), "dask" (of the current dask.distributed client,
+        or of DASK_SCHEDULER_ADDRESS), "ray"; "dask=ADDRESS" and "ray=ADDRESS" connect to a cluster
     watch : callable (Event), optional
-    isolate : run solvers that other packages bring in a process of their own
+    isolate : run solvers that other packages bring in a process of their own; workers always do
     memory : bytes, optional
-        Limit of that process; half of the machine's memory if None.
+        Limit of that process. If None: half of the machine's memory, shared by the workers here or by the cores of a
+        machine of a cluster.
     into : list, optional
         Receives the records before the first is made, for those who stop the run and want what there is.
     fresh : measure again what `store` holds already
@@ -147,37 +175,60 @@ def run(
     Returns
     -------
     Records
-        Of this run: those made and those found.
+        Of this run: those made and those found, in the order of cases and solvers. Those of a campaign have no times.
+
+    Raises
+    ------
+    InputError
+        A backend that joblib does not have here, another number of workers than -1 or 1 to 4096, several workers with a
+        plan that measures times, or workers that were lost again and again.
     """
-    plan = plan or Plan()
+    check_workers(workers)
+    spread = workers != 1 or backend != "loky"
+    plan = plan or (CampaignPlan() if spread else Plan())
+    if spread and not plan.campaign:
+        raise InputError("workers disturb each other's times: give a CampaignPlan, or workers=1")
     items = resolve(cases)
+    if plan.campaign:
+        items = [replace(item, sequence="", step=-1) for item in items]
     names = solver_names(solvers)
-    specs = registry.specs()
-    packages = {module for name in names for module in specs[name].requires}
+    packages = {module for name in names for module in registry.specs()[name].requires}
     this = machine.describe(plan.as_dict(), packages)
-    with opened(store) as kept, Worker(memory) as worker:
-        runner = Runner(this, plan, names, kept, watch, worker if isolate else None)
-        if fresh:
-            runner.known = {}
+    backend, cluster = connect_backend(backend) if spread else ("", contextlib.nullcontext())
+    with cluster, open_runner(this, plan, names, store, watch, isolate, memory, fresh) as runner:
         if into is not None:
             into.append(runner.out)
-        with one_thread():  # describing a case computes too
-            return runner.run(items)
+        return runner.run(items, workers, backend, memory)
+
+
+@contextlib.contextmanager
+def open_runner(
+    this: Run,
+    plan: Plan,
+    names: list[str],
+    store: Store | str | Path | None,
+    watch: Watch | None = None,
+    isolate: bool = True,
+    memory: int | None = None,
+    fresh: bool = False,
+) -> Iterator[Runner]:
+    """Open the store and a process for other packages' solvers, and limit BLAS to one thread; see `run`."""
+    with opened(store) as kept, Worker(memory) as worker, one_thread():  # describing a case computes too
+        yield Runner(this, plan, names, kept, watch, worker if isolate else None, fresh)
 
 
 class Runner:
-    """Pairs of case and solver, one after the other: what is known is not made again, what is made is kept."""
-
-    stands_in = True  # a solver of free rows is run as the one that is the same method with bounds
+    """Measures pairs of case and solver. Stored measurements are reused, new ones stored as soon as they are made."""
 
     def __init__(
         self,
         this: Run,
         plan: Plan,
         names: list[str],
-        store: Store | None,
-        watch: Watch | None,
-        worker: Worker | None,
+        store: Store | None = None,
+        watch: Watch | None = None,
+        worker: Worker | None = None,
+        fresh: bool = False,
     ) -> None:
         self.this, self.plan, self.names = this, plan, names
         self.store, self.watch, self.worker = store, watch, worker
@@ -185,18 +236,21 @@ class Runner:
         self.out = Records(source=str(store.path) if store else "")
         self.done = 0
         self.total = 0
-        self.known: dict[Any, Record] = {}
-        if store is not None:
-            self.known = {r.key: r for r in store.records.records if r.run == this.run}
+        stored = Records() if store is None or fresh else store.records
+        self.known: dict[Any, Record] = {r.key: r for r in stored if r.run == this.run}
+        # Descriptions of a campaign are reused: many cases take longer to describe than to load.
+        self.described = {n: i for n, i in stored.cases.items() if plan.campaign and i.run == this.run}
 
-    def keep(self, entry: Run | CaseInfo | Skip | Record) -> None:
-        """Add an entry to what is returned and to what is stored."""
+    def keep(self, entry: Entry) -> None:
+        """Add an entry to the returned records and to the store."""
         self.out.add(entry)
         if self.store is not None:
             self.store.add(entry)
 
-    def tell(self, case: str, solver: str, record: Record | None = None, reused: bool = False) -> None:
-        """Tell whoever watches how far it is."""
+    def report_progress(
+        self, case: str, solver: str, record: Record | None = None, reused: bool = False
+    ) -> None:
+        """Call `watch` with the number of pairs that are done."""
         if self.watch is not None:
             self.watch(
                 Event(
@@ -204,23 +258,87 @@ class Runner:
                 )
             )
 
-    def run(self, items: list[Item]) -> Records:
-        """Measure every case and sequence."""
+    def run(
+        self, items: list[Item], workers: int = 1, backend: str = "", memory: int | None = None
+    ) -> Records:
+        """Measure every case and sequence; by the workers of a joblib backend if one is named."""
         self.total = len(items) * len(self.names)
         self.keep(replace(self.this, whole=False))
-        for name, group in _sequences(items):
-            if name:
-                self.sequence(group)
-            else:
-                self.single(group[0])
+        if backend:
+            self.distribute(items, workers, backend, memory)
+        else:
+            for name, group in _group_sequences(items):
+                if name:
+                    self.measure_sequence(group)
+                else:
+                    self.measure_case(group[0])
+                for item in group:
+                    item.forget()
         self.keep(self.this)
-        self.tell("", "")
+        self.report_progress("", "")
         return self.out
 
-    def look(self, item: Item) -> CaseInfo | None:
-        """Load and describe a case; None, with a note, where it does not load. Steps are kept by `sequence`."""
+    def distribute(self, items: list[Item], workers: int, backend: str, memory: int | None) -> None:
+        """Measure the pairs of a campaign with workers, and store the entries of each pair when a worker returns them.
+
+        Raises
+        ------
+        InputError
+            Workers were lost `MAX_ATTEMPTS` times.
+        """
+        import joblib
+
+        if backend == "loky" and memory is None:
+            memory = machine.memory_share(joblib.effective_n_jobs(workers))
+        local = tuple(spec for n in self.names if not ((spec := self.specs[n]).own or spec.plugged))
+        order = Order(self.plan, self.this, memory, local)
+        known: dict[tuple[str, str], list[Record]] = {}
+        for record in self.known.values():
+            known.setdefault((record.case, record.solver), []).append(record)
+        pairs: list[Pair] = []
+        for item, name in product(items, self.names):
+            # A name or path is read again by the worker: a cluster shares the files, or the suite.
+            source = item.source if item.given is None else replace(item.given, copy=False)
+            records = tuple(known.get((item.name, name), ()))
+            info = self.described.get(item.name)
+            pairs.append(Pair(len(pairs), item.name, source, item.reason, name, info, records))
+        entries: dict[int, list[Entry]] = {}
         try:
-            info = describe(item, self.this.run)
+            for _ in range(MAX_ATTEMPTS):
+                remaining = [p for p in pairs if p.index not in entries]
+                if not remaining:
+                    break
+                calls = ((pair, order) for pair in remaining)
+                for index, new in map_unordered(measure_in_worker, calls, workers, backend):
+                    self.store_new(new)
+                    entries[index], pair = new, pairs[index]
+                    self.done += 1
+                    for record in (entry for entry in new if isinstance(entry, Record)):
+                        self.report_progress(pair.case, pair.solver, record, record.key in self.known)
+                    self.report_progress(pair.case, pair.solver)
+        finally:
+            for index in sorted(entries):
+                for entry in entries[index]:
+                    self.out.add(entry)
+        if len(entries) < len(pairs):
+            raise InputError(
+                f"{len(pairs) - len(entries)} of {len(pairs)} pairs are not done: workers were lost {MAX_ATTEMPTS} "
+                "times; run the same command again, with fewer workers if memory is short"
+            )
+
+    def store_new(self, entries: list[Entry]) -> None:
+        """Store the entries that a worker returned, except the records that are stored already."""
+        for entry in entries:
+            is_stored = isinstance(entry, Record) and entry.key in self.known
+            if self.store is not None and not is_stored:
+                self.store.add(entry)
+
+    def load_case(self, item: Item) -> CaseInfo | None:
+        """Load and describe a case. Return None, with a note in the records, if it does not load."""
+        try:
+            info = self.described.get(item.name)
+            if info is None or info.sha != fingerprint(item.problem):
+                info = describe(item, self.this.run)
             if self.plan.motion:
                 load_reference(item.problem, item.source)
             if self.plan.prove:
@@ -228,28 +346,30 @@ class Runner:
                 told = f"within {found.velocity_radius:.1e} m/s" if found.proven else f"none: {found.reason}"
                 info = replace(info, proof=told)
         except Exception as error:  # a file may make a reader raise anything; it costs its own case
-            self.keep(Skip(self.this.run, item.name, "", not_loaded(item.source, error), item.sequence))
-            self.done += len(self.names)
-            self.tell(item.name, "")
+            self.keep(
+                Skip(self.this.run, item.name, "", describe_load_error(item.source, error), item.sequence)
+            )
+            self.report_progress(item.name, "")
             return None
         if not item.sequence:
             self.keep(info)
         return info
 
-    def single(self, item: Item) -> None:
-        """Every solver on a case that is no step of a sequence."""
-        info = self.look(item)
-        if info is None:
-            return
+    def measure_case(self, item: Item, info: CaseInfo | None = None) -> None:
+        """Measure every solver on a case that is no step of a sequence; `info` describes it, if it is known already."""
+        if info is not None:
+            self.keep(info)
+        else:
+            info = self.load_case(item)
         for name in self.names:
-            self.tell(item.name, name)
-            self.pair(info, item.problem, name)
+            if info is not None:
+                self.report_progress(item.name, name)
+                self.measure_solver(info, item.problem, name)
             self.done += 1
-        item.forget()
 
-    def sequence(self, items: list[Item]) -> None:
-        """Every solver, every pass (a budget or a level, cold or carried), step after step."""
-        infos = [self.look(item) for item in items]
+    def measure_sequence(self, items: list[Item]) -> None:
+        """Measure every solver on the steps of a sequence, in passes: each budget and level, cold and carried."""
+        infos = [self.load_case(item) for item in items]
         identity = hashlib.sha256("".join(i.sha for i in infos if i is not None).encode()).hexdigest()[:16]
         steps = [
             (item, replace(info, identity=identity))
@@ -259,18 +379,16 @@ class Runner:
         for _, info in steps:
             self.keep(info)
         for name in self.names:
-            spec = self.taking(items[0].sequence, name, [item for item, _ in steps])
+            spec = self.select_solver(items[0].sequence, name, [item for item, _ in steps])
             if spec is not None:
-                for ask in passes(self.plan, spec):
-                    self.tell(items[0].sequence, spec.name)
-                    self.run_pass(steps, spec, ask)
-            self.done += len(steps)
-        for item in items:
-            item.forget()
+                for ask in list_passes(self.plan, spec):
+                    self.report_progress(items[0].sequence, spec.name)
+                    self.measure_pass(steps, spec, ask)
+            self.done += len(items)
 
-    def run_pass(self, steps: list[tuple[Item, CaseInfo]], spec: SolverSpec, ask: Ask) -> None:
-        """One pass. It ends where its steps have taken `Plan.pass_limit` together, and a note says so."""
-        repeats = self.plan.repeats if len(steps) <= SHORT_SEQUENCE else 1
+    def measure_pass(self, steps: list[tuple[Item, CaseInfo]], spec: SolverSpec, ask: Ask) -> None:
+        """Measure one pass. It ends, with a note, when its steps have taken `Plan.pass_limit` together."""
+        repeats = self.plan.repeats if len(steps) <= MAX_REPEATED_STEPS else 1
         tasks = [Task.of(info, ask, repeats=repeats, time_limit=self.plan.time_limit) for _, info in steps]
         problems = [item for item, _ in steps]
         limit, spent, made = self.plan.pass_limit, 0.0, 0
@@ -278,23 +396,27 @@ class Runner:
             record = self.known.get(task.key)
             if record is None or spent > limit:
                 break
-            spent, made = spent + _cost(record), made + 1
+            spent, made = spent + _elapsed_time(record), made + 1
             self.out.add(record)
-            self.tell(task.case, spec.name, record, True)
+            self.report_progress(task.case, spec.name, record, True)
         before: tuple[Problem, FloatArray] | None = None
         if ask.start == "carried" and 0 < made < len(tasks) and spent <= limit:
-            # Stopped on the way: the impulses of the last step come from the same steps again, unrecorded.
+            # An earlier run was stopped in this pass: solve its steps again, unrecorded, for the impulses of the last.
             for item, task in zip(problems[:made], tasks, strict=False):
                 again = replace(task, repeats=1)
-                before = self.step(item.problem, again, spec, before)[1]
+                before = self.measure_step(item.problem, again, spec, before)[1]
         while made < len(tasks) and spent <= limit:
             task = tasks[made]
-            if record is not None and record.times and record.time_median < QUICK * self.plan.time_limit:
+            if (
+                record is not None
+                and record.times
+                and record.time_median < UNGUARDED_TIME_RATIO * self.plan.time_limit
+            ):
                 task = replace(task, guarded=False)
-            record, before = self.step(problems[made].problem, task, spec, before)
+            record, before = self.measure_step(problems[made].problem, task, spec, before)
             self.keep(record)
-            self.tell(record.case, spec.name, record)
-            spent, made = spent + _cost(record), made + 1
+            self.report_progress(record.case, spec.name, record)
+            spent, made = spent + _elapsed_time(record), made + 1
         if made < len(tasks):
             asked = asked_of(ask.mode, ask.tol, ask.max_iter)
             reason = (
@@ -303,20 +425,20 @@ class Runner:
             )
             self.keep(Skip(self.this.run, f"{problems[0].sequence}, {asked}, {ask.start}", spec.name, reason))
 
-    def step(
+    def measure_step(
         self, problem: Problem, task: Task, spec: SolverSpec, before: tuple[Problem, FloatArray] | None
     ) -> tuple[Record, tuple[Problem, FloatArray] | None]:
-        """One step, carried on from the problem and impulses before if the task asks for it."""
+        """Measure one step; if its task says "carried", start from the previous problem and impulses."""
         start = None
         if task.start == "carried":
             begun = perf_counter()
             start = problem.start() if before is None else carry(*before, problem)
             task = replace(task, lead=perf_counter() - begun)
-        record, impulse = self.make(problem, task, spec, start)
+        record, impulse = self.make_record(problem, task, spec, start)
         return record, None if impulse is None else (problem, impulse)
 
-    def taking(self, case: str, name: str, given: Sequence[Item | Problem]) -> SolverSpec | None:
-        """The solver to run where `name` is asked for, the same method with bounds if it must be; None, with a note."""
+    def select_solver(self, case: str, name: str, given: Sequence[Item | Problem]) -> SolverSpec | None:
+        """Return the solver to run for `name`, or its method with bounds if it refuses a case, or None, with a note."""
         spec = self.specs[name]
         for problem in (item.problem if isinstance(item, Item) else item for item in given):
             reason = spec.refuses(problem)
@@ -324,15 +446,16 @@ class Runner:
                 break
         else:
             return spec
-        other = spec.standing_in(problem) if self.stands_in else None
+        # A pair of a campaign has only records of its own solver.
+        other = None if self.plan.campaign else spec.standing_in(problem)
         if other is not None and other.name in self.names:
-            other = None  # it runs anyway
+            other = None  # is run under its own name
         self.keep(Skip(self.this.run, case, name, f"{name} → {other.name}: {reason}" if other else reason))
         return other
 
-    def pair(self, info: CaseInfo, problem: Problem, name: str) -> None:
-        """One solver on one case, at every budget and level."""
-        spec = self.taking(info.case, name, [problem])
+    def measure_solver(self, info: CaseInfo, problem: Problem, name: str) -> None:
+        """Measure one solver on one case, at every budget and level."""
+        spec = self.select_solver(info.case, name, [problem])
         if spec is None:
             return
         name = spec.name
@@ -343,32 +466,38 @@ class Runner:
             if record is not None:
                 self.out.add(record)
             else:
-                record = self.make(problem, task, spec, None)[0]
+                record = self.make_record(problem, task, spec, None)[0]
                 self.keep(record)
-            self.tell(info.case, name, record, reused)
+            self.report_progress(info.case, name, record, reused)
             return record
 
-        self.plan.carry_out(info, problem, spec, one)
+        self.plan.measure(info, problem, spec, one)
 
-    def make(self, problem: Problem, task: Task, spec: SolverSpec, impulse: Any) -> tuple[Record, Any]:
-        """The record of a task, made here or in the worker, and the impulses (m,) [N s] that came out, or None."""
+    def make_record(self, problem: Problem, task: Task, spec: SolverSpec, impulse: Any) -> tuple[Record, Any]:
+        """Solve a task, here or in the process for other packages; return its record and impulses (m,) [N s]."""
+        if self.plan.campaign and not is_foreign(spec):
+            task = replace(
+                task, time_limit=math.inf
+            )  # the clock ends only processes of other packages' solvers
         if self.worker is not None and is_foreign(spec):
             record, found = self.worker.measure(replace(problem, copy=False), task, impulse)
         else:
             record, found = measure(problem, task, impulse)
         if found is not None:
-            record = with_answer(record, problem, found)
-        return with_motion(record, problem, found) if self.plan.motion else record, found
+            record = add_solution_hash(record, problem, found)
+        if self.plan.motion:
+            record = add_motion_error(record, problem, found)
+        return without_times(record, self.plan.time_limit) if self.plan.campaign else record, found
 
 
-def _cost(record: Record) -> float:
-    """Time [s] that a record took to make, from what it holds, so that a resumed pass ends where the first did."""
+def _elapsed_time(record: Record) -> float:
+    """Return the time [s] that a record took, from its fields, so that a resumed pass ends at the same step."""
     spent = record.time_median * record.repeats
     return spent if math.isfinite(spent) else record.time_limit
 
 
-def _sequences(items: list[Item]) -> list[tuple[str, list[Item]]]:
-    """Items in runs of one sequence; those of none alone, under no name."""
+def _group_sequences(items: list[Item]) -> list[tuple[str, list[Item]]]:
+    """Group consecutive items of the same sequence. Items without a sequence form groups of one, named ""."""
     out: list[tuple[str, list[Item]]] = []
     for item in items:
         if item.sequence and out and out[-1][0] == item.sequence:
@@ -378,9 +507,78 @@ def _sequences(items: list[Item]) -> list[tuple[str, list[Item]]]:
     return out
 
 
-def not_loaded(source: str, error: Exception) -> str:
-    """Why a case is left out; an error that the reader did not mean to raise with its kind."""
+def describe_load_error(source: str, error: Exception) -> str:
+    """Return why a case is left out, with the type of an error that the reader did not raise on purpose."""
     text = str(error)
     if not isinstance(error, (LavenderError, OSError)):
         text = f"{type(error).__name__}: {text}"
     return f"did not load: {text}" if text.startswith(source) else f"did not load: {source}: {text}"
+
+
+# -- pairs of a campaign, in workers -----------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Pair:
+    """One case and one solver, as they are sent to a worker."""
+
+    index: int
+    case: str
+    source: str | Problem  # a name or path that the worker resolves itself, or the problem
+    reason: str
+    solver: str
+    info: CaseInfo | None  # stored description of the case
+    known: tuple[Record, ...]  # stored records of the pair
+
+
+@dataclass(frozen=True)
+class Order:
+    """What every worker needs besides its pair."""
+
+    plan: Plan
+    run: Run
+    memory: int | None  # bytes of each backend's process; a share of the machine it runs on if None
+    local: tuple[SolverSpec, ...] = ()  # solvers that are registered only in the parent
+
+
+@cache
+def _isolated_worker(memory: int) -> Worker:
+    return Worker(memory)  # one in each worker, kept between pairs
+
+
+@contextlib.contextmanager
+def _register(specs: tuple[SolverSpec, ...]) -> Iterator[None]:
+    """Register solvers of the parent for one pair: the worker may serve another run later."""
+    before = registry.specs() if specs else {}
+    try:
+        for spec in specs:
+            registry.register(spec, replace=True)
+        yield
+    finally:
+        if specs:
+            registry.registered.clear()
+            registry.registered.update(before)
+
+
+_last_case: tuple[Any, Item | None, CaseInfo | None] = None, None, None  # pairs of a case come together
+
+
+def measure_in_worker(pair: Pair, order: Order) -> tuple[int, list[Entry]]:
+    """Return the index of a pair and its entries. Runs in a worker, on one thread: pairs run side by side."""
+    global _last_case
+    shared = machine.memory_share(os.cpu_count() or 1) if order.memory is None else order.memory
+    with _register(order.local), one_thread(pair.solver):
+        runner = Runner(order.run, order.plan, [pair.solver], worker=_isolated_worker(shared))
+        runner.known = {record.key: record for record in pair.known}
+        runner.described = {} if pair.info is None else {pair.case: pair.info}
+        key, item, info = None, None, None
+        if not isinstance(pair.source, Problem):
+            changed = os.stat(pair.source).st_mtime_ns if os.path.exists(pair.source) else 0
+            key = order.run.run, pair.case, pair.source, changed
+            if _last_case[0] == key:
+                _, item, info = _last_case
+        item = item or resolve_again(pair.source, pair.case, pair.reason)
+        runner.measure_case(item, info)
+    out = runner.out
+    _last_case = key, item, out.cases.get(pair.case)
+    return pair.index, [*out.cases.values(), *out.skips, *out.records]

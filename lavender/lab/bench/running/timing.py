@@ -1,10 +1,10 @@
-"""The one place that times a solve.
+"""Time a solve: the only module that does.
 
-What is timed is the line that a report prints: `lv.solve(problem, "name", tol=...)`, judge and all, on a problem whose
-numbers were written just before, as a simulator leaves them, after other work that takes its part of the caches. A
-guarded solve comes first, prepared and under the time limit; what it does not end is timed as far as it went. Where no
-line is asked for (`Task.way` is empty) preparing and solving are timed, on a problem of which nothing is computed yet,
-without the judge. BLAS and OpenMP have one thread and the garbage collector waits.
+The timed call is the line that a report prints, `lv.solve(problem, "name", tol=...)`, with the judge. The arrays of its
+problem were written just before, as a simulator leaves them, and other work has used the caches since. A guarded solve
+under the time limit runs first; if it does not end, its own time is recorded. If `Task.way` is empty, only `prepare`
+and `solve` are timed, without the judge, on a problem of which nothing is computed yet. BLAS and OpenMP use one thread,
+and the garbage collector is off.
 """
 
 from __future__ import annotations
@@ -22,24 +22,24 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray
 from lavender.base.lazy_import import import_numerics
-from lavender.external.stopwatch import own_time
 from lavender.judge.residuals import reference
 from lavender.judge.solution import Claim, Solution, Status, uninterrupted
 from lavender.lab.bench import machine
-from lavender.lab.bench.line import asked_of
 from lavender.lab.bench.record import ERROR, CaseInfo, Record, measurement_key
+from lavender.lab.bench.stopwatch import measure_backend_time
+from lavender.lab.bench.timed_call import make_call_arguments
 from lavender.problem import Problem
 from lavender.solvers import registry
 from lavender.solving.outcome import finish
 from lavender.solving.solve import prepare, solve
 
-SHORT = 5e-3  # s: what took longer is not called once more for warmth
+MAX_WARM_UP_TIME = 5e-3  # s; a line that took longer is not called once more to warm the caches.
 CLAIMS = (Status.CONVERGED, Status.FLOOR, Status.INFEASIBLE)
 
 
 @dataclass(frozen=True)
 class Ask:
-    """A line to time, on whatever case the solver takes."""
+    """A line to time on all cases that the solver accepts."""
 
     solver: str
     mode: str  # "tol" | "budget" | "time"
@@ -52,7 +52,7 @@ class Ask:
 
 @dataclass(frozen=True)
 class Task:
-    """One measurement to make: what an `Ask` says, on a case."""
+    """One measurement: an `Ask` on a case."""
 
     run: str
     case: str
@@ -73,16 +73,16 @@ class Task:
 
     @property
     def key(self) -> tuple[Any, ...]:
-        """As `Record.key` of what comes out."""
+        """The `Record.key` of the measurement."""
         return measurement_key(self)
 
     @classmethod
     def of(cls, info: CaseInfo, ask: Ask, **more: Any) -> Task:
-        """What is asked for, on a case."""
+        """Return the task of an `Ask` on a case."""
         return cls(run=info.run, case=info.case, sha=info.sha, step=info.step, **{**vars(ask), **more})
 
     def record(self, **what: Any) -> Record:
-        """A record of this task."""
+        """Return a record of this task."""
         order, seed = str(self.options.get("order", "given")), int(self.options.get("seed", 0))
         same = {name: getattr(self, name) for name in _SHARED}
         return Record(**{**same, "options": dict(self.options)}, order=order, seed=seed, **what)
@@ -94,11 +94,11 @@ _SHARED = {f.name for f in fields(Task)} & {f.name for f in fields(Record)} - {"
 
 @cache
 def _warm_up(solver: str) -> None:
-    """Import what a solver needs, so that the first measurement does not time it."""
+    """Import the code that a solver needs, so that no measurement includes it."""
     spec = registry.get(solver)
     spec.load()
     if spec.requires:
-        # Backends import their own code when they first solve: one row, outside every clock.
+        # Backends import their own code when they first solve: solve one row before any clock starts.
         with suppress(Exception):
             tiny = (
                 Problem.lcp(np.eye(1), np.ones(1))
@@ -110,7 +110,7 @@ def _warm_up(solver: str) -> None:
 
 @cache
 def _thread_pools(solver: str) -> Any:
-    # Looking for the libraries reads /proc, a few milliseconds: once a solver, when its own are loaded, and SciPy's.
+    # Searching for the libraries takes a few milliseconds: once for each solver, after its own and SciPy's are loaded.
     from threadpoolctl import ThreadpoolController
 
     import_numerics()
@@ -119,14 +119,14 @@ def _thread_pools(solver: str) -> Any:
 
 @contextmanager
 def one_thread(solver: str = "") -> Iterator[None]:
-    """BLAS and OpenMP limited to one thread; those that `solver` brought too, once it was imported."""
+    """Limit BLAS and OpenMP to one thread, also the libraries that `solver` brings once it is imported."""
     with _thread_pools(solver).limit(limits=1):
         yield
 
 
 @contextmanager
 def _undisturbed(solver: str) -> Iterator[None]:
-    # One thread, the garbage collector off.
+    """Limit BLAS and OpenMP to one thread and turn the garbage collector off."""
     collects = gc.isenabled()
     gc.disable()
     try:
@@ -139,7 +139,7 @@ def _undisturbed(solver: str) -> Iterator[None]:
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """What the repeats of one measurement brought, before it is judged."""
+    """Result of the repeats of one measurement, before it is judged."""
 
     impulse: FloatArray  # (m,) N s
     certificate: FloatArray | None  # (m,), with INFEASIBLE
@@ -158,7 +158,7 @@ class Outcome:
 
 
 def measure(problem: Problem, task: Task, impulse: Any = None) -> tuple[Record, FloatArray | None]:
-    """Make one measurement; what the solver raises becomes a record of status ERROR.
+    """Make one measurement. An exception of the solver becomes a record of status ERROR.
 
     Parameters
     ----------
@@ -169,18 +169,18 @@ def measure(problem: Problem, task: Task, impulse: Any = None) -> tuple[Record, 
 
     Returns
     -------
-    Record, and the impulses (m,) [N s] that came out, or None
+    Record, and the final impulses (m,) [N s], or None
 
     Raises
     ------
     KeyboardInterrupt
-        Ctrl-C; nothing is recorded.
+        By Ctrl-C; nothing is recorded.
     """
     return judged(problem, task, attempt(problem, task, impulse))
 
 
 def attempt(problem: Problem, task: Task, impulse: Any = None) -> Outcome | str:
-    """Run the solver as the task asks, in this process; what it raised, as text."""
+    """Run the solver of a task in this process. Return an exception as text."""
     runs: list[tuple[Solution, float]] = []  # with the time of the line
     paces: list[float] = []
     owns: list[float] = []
@@ -192,26 +192,28 @@ def attempt(problem: Problem, task: Task, impulse: Any = None) -> Outcome | str:
             if task.way and task.guarded:
                 # A plug-in may test nothing: then its own budget ends its line, and a larger one never would.
                 tests = registry.get(task.solver).own or task.mode != "tol"
-                guard = uninterrupted(_parts(problem, task if tests else replace(task, max_iter=0), impulse))
-                if not tests and _cut_short(guard, task):
-                    guard = uninterrupted(_parts(problem, task, impulse))
+                guard = uninterrupted(
+                    _prepare_and_solve(problem, task if tests else replace(task, max_iter=0), impulse)
+                )
+                if not tests and _ended_by_budget(guard, task):
+                    guard = uninterrupted(_prepare_and_solve(problem, task, impulse))
             left = max(1, task.repeats - (guard is not None))
             while left and (guard is None or guard.status is not Status.TIME_LIMIT):
                 paces.append(pace())
                 if not task.way:
-                    parts = uninterrupted(_parts(problem, task, impulse))
+                    parts = uninterrupted(_prepare_and_solve(problem, task, impulse))
                     runs.append((parts, parts.setup_time + parts.solve_time))
                 else:
-                    with own_time(task.solver) as spent:
-                        runs.append(_line(problem, task, impulse, guard))
+                    with measure_backend_time(task.solver) as spent:
+                        runs.append(_time_call(problem, task, impulse, guard))
                     owns += [sum(spent)] if spent else []
                 if task.turns:  # in turns with others: as a simulator that calls the same line at every step
-                    left, runs = left if perf_counter() - begun < SHORT else 1, runs[-1:]
+                    left, runs = left if perf_counter() - begun < MAX_WARM_UP_TIME else 1, runs[-1:]
                 left -= 1
                 if runs[-1][0].status is Status.TIME_LIMIT or perf_counter() - begun > task.time_limit:
                     left = 0 if task.mode != "time" else left
             solution = runs[-1][0] if runs else guard
-            if guard is None and task.way and _cut_short(solution, task):
+            if guard is None and task.way and _ended_by_budget(solution, task):
                 # More iterations than the solver's own limit: they are asked for, under the guard.
                 return attempt(problem, replace(task, guarded=True), impulse)
     except Exception as error:
@@ -226,7 +228,7 @@ def attempt(problem: Problem, task: Task, impulse: Any = None) -> Outcome | str:
 def outcome_of(
     solution: Solution, made: list[Solution], times: list[float], paced: float | None, reached: bool = False
 ) -> Outcome:
-    """What the repeats `made` brought, the last of them `solution`."""
+    """Return the outcome of the repeats `made`, the last of which is `solution`."""
     return Outcome(
         impulse=solution.impulse,
         certificate=solution.certificate,
@@ -244,7 +246,7 @@ def outcome_of(
     )
 
 
-def _cut_short(solution: Solution | None, task: Task) -> bool:
+def _ended_by_budget(solution: Solution | None, task: Task) -> bool:
     assert solution is not None
     return (
         task.mode == "tol"
@@ -258,7 +260,7 @@ _NUMBERS = np.arange(2.0**15)  # 256 KiB: more than a first cache holds
 
 
 def pace() -> float:
-    """Time [s] of a loop of fixed work: what the machine is worth now. It takes its part of the caches, too."""
+    """Return the time [s] of a loop of fixed work, which measures the machine's current speed and uses the caches."""
     begun = perf_counter()
     total = 0.0
     for i in range(500):
@@ -269,17 +271,17 @@ def pace() -> float:
 
 
 def just_written(problem: Problem, start: str) -> Problem:
-    """The problem in arrays of its own, written now, nothing derived from them: what a simulator hands over.
+    """Return the problem in newly written arrays, with nothing derived from them, as a simulator leaves it.
 
-    With `start` "cold" without the guess that came with it, as the line that is printed says.
+    With `start` "cold" the guess that came with it is removed, as in the printed line.
     """
     rows = None if problem.rows is None else replace(problem.rows, copy=True)
     return replace(problem, rows=rows, guess=None if start == "cold" else problem.guess, copy=True)
 
 
-def _line(problem: Problem, task: Task, impulse: Any, guard: Solution | None) -> tuple[Solution, float]:
-    """One call of the line, and its time."""
-    more = {**task.options, **asked_of(task, 0 if guard is None else guard.iterations)}
+def _time_call(problem: Problem, task: Task, impulse: Any, guard: Solution | None) -> tuple[Solution, float]:
+    """Run the line once and return its solution and time [s]."""
+    more = {**task.options, **make_call_arguments(task, 0 if guard is None else guard.iterations)}
     fresh = just_written(problem, task.start)
     if task.start == "carried":
         more["impulse"] = problem.start() if impulse is None else impulse
@@ -289,7 +291,7 @@ def _line(problem: Problem, task: Task, impulse: Any, guard: Solution | None) ->
 
 
 def judged(problem: Problem, task: Task, found: Outcome | str) -> tuple[Record, FloatArray | None]:
-    """The record of an outcome, judged here on `problem`, and the impulses (m,) [N s] if they are numbers."""
+    """Judge an outcome on `problem`; return its record, and its impulses (m,) [N s] if they are finite."""
     if isinstance(found, str):
         return task.record(status=ERROR, message=found[:500]), None
     solution = solution_of(problem, task, found)
@@ -298,7 +300,7 @@ def judged(problem: Problem, task: Task, found: Outcome | str) -> tuple[Record, 
 
 
 def solution_of(problem: Problem, task: Task, found: Outcome) -> Solution:
-    """What an outcome says, judged here on `problem`."""
+    """Return the solution of an outcome, judged on `problem`."""
     claim = Claim(
         Status[found.status],
         found.iterations,
@@ -321,9 +323,9 @@ def solution_of(problem: Problem, task: Task, found: Outcome) -> Solution:
     )
 
 
-def _parts(problem: Problem, task: Task, impulse: Any) -> Solution:
+def _prepare_and_solve(problem: Problem, task: Task, impulse: Any) -> Solution:
     """Prepare and solve under the time limit."""
-    fresh = replace(problem, copy=False)  # nothing derived yet: forming A is set-up
+    fresh = replace(problem, copy=False)  # nothing is derived yet: forming A is set-up
     more = {"isolate": False} if "isolate" in registry.get(task.solver).accepts else {}
     # a run has processes of its own for these
     prepared = prepare(fresh, task.solver, **{**more, **task.options})
@@ -341,7 +343,7 @@ def _parts(problem: Problem, task: Task, impulse: Any) -> Solution:
 
 
 def record_of(task: Task, s: Solution, found: Outcome) -> Record:
-    """The record of repeats that ended in the solution `s`."""
+    """Return the record of repeats that ended in the solution `s`."""
     setups, solves = found.setups, found.solves
     both = found.times or [a + b for a, b in zip(setups, solves, strict=True)]
     r = s.residual

@@ -1,7 +1,7 @@
-"""Time that a backend spends in its own solve, within a call through the front door: the rest is conversion and ours.
+"""Measure the time that a backend spends in its own solve during a call of `lv.solve`.
 
-The object or function of its own interface is wrapped while the call runs. Backends that set up within their one
-function (daqp, quadprog, scs) have that in it, too.
+The class or function of the backend's own interface is wrapped while the call runs. The time of backends that set up
+within one function (daqp, quadprog, scs) includes that set-up.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ from contextlib import ExitStack, contextmanager
 from time import perf_counter
 from typing import Any
 
-SETUP = ("setup", "init")  # methods of such classes that take the data
+SETUP = ("setup", "init")  # methods of these classes that receive the data
 
-#: module:class.method or module:function, as the calls in this package and in qpsolvers look them up.
+#: module:class.method or module:function, as the calls in `lavender.external` and in qpsolvers look them up.
 OWN = {
     "clarabel": ("clarabel:DefaultSolver.solve",),
     "clarabel_cone": ("clarabel:DefaultSolver.solve",),
@@ -32,8 +32,8 @@ OWN = {
 }  # fmt: skip
 
 
-class _Watched:
-    """An object of a backend, some of whose methods are timed."""
+class _TimedObject:
+    """A backend's object with some methods timed."""
 
     def __init__(self, inner: Any, methods: Sequence[str], timed: Callable[..., Any]) -> None:
         object.__setattr__(self, "_inner", inner)
@@ -49,12 +49,12 @@ class _Watched:
 
 
 @contextmanager
-def own_time(
+def measure_backend_time(
     solver: str, clock: Callable[[], float] = perf_counter, setup: bool = False
 ) -> Iterator[list[float]]:
-    """A list that receives the time [s] of each call into the backend; it stays empty where that is not known.
+    """Yield a list that receives the time [s] of each call into the backend; it stays empty for unknown backends.
 
-    With `setup` what it works out of the data before it solves is in it, too.
+    With `setup` the time includes the backend's set-up.
     """
     spent: list[float] = []
 
@@ -77,7 +77,7 @@ def own_time(
 
             def watched(*args: Any, true: Any = true, method: str = method, **kwargs: Any) -> Any:
                 make, more = (timed(true), SETUP) if setup else (true, ())
-                return _Watched(make(*args, **kwargs), (method, *more), timed)
+                return _TimedObject(make(*args, **kwargs), (method, *more), timed)
 
             stack.callback(setattr, module, name, true)
             setattr(module, name, watched if method else timed(true))

@@ -1,4 +1,4 @@
-"""Lines of Python: what a user copies, and exactly what was timed."""
+"""The Python call that was timed, as arguments for `lv.solve` and as the lines that a report prints."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 from lavender.lab.bench.record import Record, level_name
 from lavender.solvers import registry
 
-COLD = "dataclasses.replace({}, guess=None)"  # a problem without the start that came with it
+COLD = "dataclasses.replace({}, guess=None)"  # removes the start that came with a problem
 CARRIED = (
     "before, impulse = problems[0], None",
     "for problem in problems:",
@@ -15,20 +15,20 @@ CARRIED = (
 )
 
 
-def needs_more(solver: str, iterations: int) -> bool:
-    """A solve took more iterations than the solver's default budget: its line has to ask for them."""
+def exceeds_default_budget(solver: str, iterations: int) -> bool:
+    """Whether a solve took more iterations than the solver's default budget, so that its line needs `max_iter`."""
     spec = registry.specs().get(solver)
     return spec is not None and iterations > spec.max_iter
 
 
-def asked_of(what: Any, iterations: int) -> dict[str, Any]:
-    """What the line of a Task or Record passes to `lv.solve` beside problem, name and start: timed, and printed.
+def make_call_arguments(what: Any, iterations: int) -> dict[str, Any]:
+    """Return the keyword arguments, without the start, of the timed and printed call of a Task or Record.
 
-    `iterations` are those that a solve took.
+    `iterations` is the number that a solve took.
     """
     asked: dict[str, Any] = {"tol": what.tol}
-    given = what.turns and what.max_iter  # in turns with others: what all of the cases need
-    if what.mode == "budget" or given or needs_more(what.solver, iterations):
+    given = what.turns and what.max_iter  # timed alternately with others: the number that all cases need
+    if what.mode == "budget" or given or exceeds_default_budget(what.solver, iterations):
         asked["max_iter"] = what.max_iter
     if what.mode == "time":
         asked["time_limit"] = what.time_limit
@@ -36,16 +36,16 @@ def asked_of(what: Any, iterations: int) -> dict[str, Any]:
 
 
 def _exact(x: float, short: str) -> str:
-    """A number's short form where that is the number, else all of its digits."""
+    """Return a number's short form if it is exact, else all of its digits."""
     return short if float(short) == x else repr(x)
 
 
-def code_of(record: Record, guessed: bool = False) -> tuple[str, ...]:
-    """The lines that a record is of; the last one was timed.
+def format_call(record: Record, guessed: bool = False) -> tuple[str, ...]:
+    """Return the lines that a record was measured with; the last one was timed.
 
-    `guessed`: there are problems that bring a guess, which a cold start leaves out.
+    `guessed`: some problems bring a guess, which a cold start removes.
     """
-    asked = asked_of(record, record.iterations)
+    asked = make_call_arguments(record, record.iterations)
     text = {
         name: str(x) if name == "max_iter" else _exact(x, level_name(x) if x else "0")
         for name, x in asked.items()

@@ -18,7 +18,15 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.random_families.wild import (
+from lavender.base.errors import check_name
+from lavender.base.lazy_import import sparse as sp
+from lavender.base.lazy_import import spatial
+from lavender.lab.suite.build import Bodies, Contacts, each, sideways
+from lavender.lab.suite.case import Draft
+from lavender.lab.suite.families import BOX, SPHERE, at_least
+from lavender.problem import Problem
+from lavender.problem.cones import Cones
+from random_families.wild import (
     FORMS,
     LARGEST_DENSE,
     LAWS,
@@ -32,14 +40,6 @@ from benchmarks.random_families.wild import (
     problem_of,
     tenfold,
 )
-from lavender.base.errors import check_name
-from lavender.base.lazy_import import sparse as sp
-from lavender.base.lazy_import import spatial
-from lavender.lab.suite.build import Bodies, Contacts, each, sideways
-from lavender.lab.suite.case import Draft
-from lavender.lab.suite.families import BOX, SPHERE, at_least
-from lavender.problem import Problem
-from lavender.problem.cones import Cones
 
 __all__ = ["JUDGED", "TUNED", "drawn"]
 

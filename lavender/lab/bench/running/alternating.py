@@ -1,0 +1,198 @@
+"""Time the lines that a report would print alternately: each repetition runs every line on every case once.
+
+Disturbances of the machine then meet all lines alike, and differences between repetitions are the noise of a rerun.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from statistics import median
+from time import perf_counter
+from typing import Any
+
+from lavender.batch.solve import solve_many
+from lavender.lab.bench.cases import Item, Source, resolve
+from lavender.lab.bench.record import CaseInfo, Record
+from lavender.lab.bench.running.plan import Plan
+from lavender.lab.bench.running.runner import Runner, Watch, is_foreign, open_runner
+from lavender.lab.bench.running.timing import Ask, Task, just_written, outcome_of, pace, record_of
+from lavender.lab.bench.store import Records, Store
+
+USUAL_REPETITIONS, MIN_REPETITIONS, MAX_REPETITIONS = 7, 3, 41
+EXTRA_TIME = 3.0  # s, of all cases together; more than the usual repetitions are made only within this time
+TIME_LIMITS = 20.0  # time limits of the plan that all repetitions may take together, above the minimum
+CASES_IN_MEMORY = 32  # cases that are loaded at the same time
+MAX_SIZE_RATIO = (
+    10  # problems are timed as one batch if the largest has at most this multiple of the smallest's rows
+)
+
+RecordsByKey = dict[tuple[Any, ...], list[Record]]  # records of one measurement, one of each repetition
+Cases = Sequence[tuple[Item, CaseInfo]]
+
+
+def time_alternately(
+    cases: Iterable[Source],
+    asks: Sequence[Ask],
+    known: Records,
+    plan: Plan,
+    store: Store | str | Path | None = None,
+    *,
+    watch: Watch | None = None,
+    isolate: bool = True,
+    memory: int | None = None,
+    fresh: bool = False,
+) -> Records:
+    """Time lines alternately on cases that `lavender.lab.bench.run` has described in `known`.
+
+    Records that `store` holds are reused if the same lines were timed on the same cases.
+
+    Parameters
+    ----------
+    cases, plan, store, watch, isolate, memory, fresh : as `lavender.lab.bench.run`
+    asks : sequence of Ask
+        Of way "call" on single cases, "steps" over sequences, "batch" on either.
+    known : Records
+
+    Returns
+    -------
+    Records
+        `known`, with the new records.
+    """
+    this = list(known.runs.values())[-1]
+    names = list(dict.fromkeys(ask.solver for ask in asks))
+    with open_runner(this, plan, names, store, watch, isolate, memory, fresh) as runner:
+        runner.out = known
+        described = [(i, known.cases[i.name]) for i in resolve(cases) if i.name in known.cases]
+        identity = repr([asks, [info.sha for _, info in described]])
+        alternation = _Alternation(runner, asks, hashlib.sha256(identity.encode()).hexdigest()[:12])
+        single = [(i, info) for i, info in described if not i.sequence]
+        parts = [single[k : k + CASES_IN_MEMORY] for k in range(0, len(single), CASES_IN_MEMORY)]
+        sequences: dict[str, list[tuple[Item, CaseInfo]]] = {}
+        for item, info in described:
+            if item.sequence:
+                sequences.setdefault(item.sequence, []).append((item, info))
+        for part in (*parts, *sequences.values()):
+            share = len(part) / len(described)
+            alternation.measure_part(part, share * TIME_LIMITS * plan.time_limit, share * EXTRA_TIME)
+            for item, _ in part:
+                item.forget()
+    return known
+
+
+class _Alternation:
+    """Repeats all lines on the cases of a part; `turns` identifies the lines and cases that are timed together."""
+
+    def __init__(self, runner: Runner, asks: Sequence[Ask], turns: str) -> None:
+        self.runner, self.asks, self.turns = runner, asks, turns
+        self.known = {r.key for r in runner.known.values() if r.turns == turns}
+        for record in runner.known.values():
+            if record.key in self.known:
+                runner.out.add(record)
+                runner.report_progress(record.case, record.solver, record, True)
+
+    def measure_part(self, part: Cases, limit: float, extra: float) -> None:
+        """Repeat all lines on some cases or one sequence: at most `limit` [s], above the usual number `extra` [s]."""
+        is_sequence = bool(part[0][0].sequence)
+        asks = [a for a in self.asks if a.way == "batch" or (a.way == "steps") == is_sequence]
+        accepted = {ask: [(i, info) for i, info in part if self.accepts(ask, i)] for ask in asks}
+        records: RecordsByKey = {}
+        begun = perf_counter()
+        for repetition in range(MAX_REPETITIONS):
+            spent = perf_counter() - begun
+            allowed = limit if repetition < USUAL_REPETITIONS else min(limit, extra)
+            if repetition >= MIN_REPETITIONS and spent > allowed:
+                break
+            first = repetition % len(asks) if asks else 0
+            order = asks[first:] + asks[:first]
+            if is_sequence:
+                for ask in order:
+                    self.time_steps(ask, accepted[ask], records)
+            else:
+                for item, info in part:
+                    for ask in order:
+                        if ask.way != "batch" and any(info is other for _, other in accepted[ask]):
+                            self.add(records, self.time_case(ask, item, info, None)[0])
+            for ask in order:
+                if ask.way == "batch" and _is_batch(accepted[ask], is_sequence):
+                    self.time_batch(ask, accepted[ask], records)
+        for repeated in records.values():
+            self.runner.keep(_merge(repeated))
+
+    def accepts(self, ask: Ask, item: Item) -> bool:
+        spec = self.runner.specs[ask.solver]
+        if is_foreign(spec) and (ask.way == "batch" or ask.mode == "time"):
+            return False  # a process of its own adds its start, or takes no limit
+        return spec.refuses(item.problem) is None
+
+    def make_task(self, ask: Ask, info: CaseInfo) -> Task:
+        """Return one repetition of a line on one case."""
+        more = {
+            "time_limit": ask.time_limit or self.runner.plan.time_limit,
+            "repeats": 1 if ask.way == "steps" else 2,
+            "turns": self.turns,
+            "guarded": False,
+        }
+        return Task.of(info, ask, **more)
+
+    def add(self, records: RecordsByKey, record: Record | None) -> None:
+        if record is not None and record.key not in self.known:
+            records.setdefault(record.key, []).append(record)
+
+    def time_case(self, ask: Ask, item: Item, info: CaseInfo, before: Any) -> tuple[Record | None, Any]:
+        task = self.make_task(ask, info)
+        if task.key in self.known and ask.start != "carried":
+            return None, None
+        record, after = self.runner.measure_step(item.problem, task, self.runner.specs[ask.solver], before)
+        self.runner.report_progress(info.case, ask.solver, record)
+        return record, after
+
+    def time_steps(self, ask: Ask, steps: Cases, records: RecordsByKey) -> None:
+        if ask.way == "batch" or all(self.make_task(ask, info).key in self.known for _, info in steps):
+            return
+        before = None
+        for item, info in steps:
+            record, before = self.time_case(ask, item, info, before)
+            self.add(records, record)
+
+    def time_batch(self, ask: Ask, cases: Cases, records: RecordsByKey) -> None:
+        """Time one call of `solve_many`: each problem's record has its share of the time."""
+        tasks = [self.make_task(ask, info) for _, info in cases]
+        if all(task.key in self.known for task in tasks):
+            return
+        problems = [just_written(item.problem, ask.start) for item, _ in cases]
+        calibration_time = pace()
+        begun = perf_counter()
+        try:
+            solutions = solve_many(problems, ask.solver, tol=ask.tol, max_iter=ask.max_iter or None)
+        except Exception as error:  # as in `attempt`: it costs its own records
+            for task in tasks:
+                self.add(
+                    records, task.record(status="ERROR", message=f"{type(error).__name__}: {error}"[:500])
+                )
+            return
+        share = (perf_counter() - begun) / len(cases)
+        for task, s in zip(tasks, solutions, strict=True):
+            self.add(records, record_of(task, s, outcome_of(s, [s], [share], calibration_time)))
+
+
+def _is_batch(cases: Cases, is_sequence: bool) -> bool:
+    rows = [info.rows for _, info in cases]
+    return len(rows) > 1 and (is_sequence or max(rows) <= MAX_SIZE_RATIO * min(rows))
+
+
+def _merge(records: Sequence[Record]) -> Record:
+    """Return the last record, with the times of all repetitions."""
+    times = [t for r in records for t in r.times]
+    paces = [r.pace for r in records if r.pace is not None]
+    return replace(
+        records[-1],
+        repeats=len(records),
+        times=tuple(times),
+        reached=tuple(x for r in records for x in r.reached),
+        time_min=min(times, default=records[-1].time_min),
+        time_median=median(times) if times else records[-1].time_median,
+        pace=min(paces, default=None),
+    )

@@ -1,0 +1,174 @@
+"""Call a function on many workers with joblib: processes of this machine, or a dask or ray cluster."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import os
+import signal
+import threading
+import time
+import warnings
+from collections.abc import Callable, Iterable, Iterator
+from functools import cache
+from multiprocessing import resource_tracker
+from typing import Any
+
+from lavender.base.errors import InputError
+
+MAX_WORKERS = 4096  # processes: more than any machine has cores
+CALLS_PER_ROUND = 256  # calls handed out together to a backend that returns only complete lists
+CONNECT_TIMEOUT = 10.0  # s, for a scheduler to answer
+PARENT_CHECK_INTERVAL = 0.5  # s between two checks of a worker whether its parent still runs
+
+
+def check_workers(workers: Any) -> None:
+    """Raise InputError unless the number of workers is -1 or 1 to MAX_WORKERS."""
+    is_int = isinstance(workers, int) and not isinstance(workers, bool)
+    if not is_int or not (workers == -1 or 1 <= workers <= MAX_WORKERS):
+        raise InputError(
+            f"workers is {workers!r}; -1 (one for each core) or a whole number from 1 to {MAX_WORKERS} is needed"
+        )
+
+
+def map_unordered(
+    function: Callable[..., Any], arguments: Iterable[tuple[Any, ...]], workers: int, backend: str
+) -> Iterator[Any]:
+    """Yield the result of `function` for each tuple of arguments as soon as it is known.
+
+    `backend` is a name that `connect_backend` returned. The iteration ends early, without an exception, if workers
+    were lost.
+    """
+    import joblib
+
+    lost: tuple[type[BaseException], ...] = (BrokenPipeError, ConnectionError)
+    with contextlib.suppress(ImportError):
+        from joblib.externals.loky.process_executor import BrokenProcessPool
+
+        lost = (*lost, BrokenProcessPool)
+    with contextlib.suppress(ImportError):
+        from distributed.client import FutureCancelledError
+        from distributed.scheduler import KilledWorker
+
+        lost = (*lost, KilledWorker, FutureCancelledError)
+    parent = os.getpid() if backend == "loky" else 0  # 0: workers belong to a cluster
+    with joblib.parallel_config(backend=backend, n_jobs=workers):
+        calls = (joblib.delayed(_call_in_worker)(parent, function, given) for given in arguments)
+        try:
+            try:
+                parallel = joblib.Parallel(return_as="generator_unordered", batch_size=1)
+            except (
+                ValueError
+            ):  # ray's backend returns only complete lists: results are yielded after each round
+                parallel = joblib.Parallel(batch_size=1)
+                while some := list(itertools.islice(calls, CALLS_PER_ROUND)):
+                    yield from parallel(some)
+                return
+            with _ignore_sigint() if hasattr(signal, "pthread_sigmask") else contextlib.nullcontext():
+                results = parallel(calls)
+            try:
+                for result in results:  # noqa: UP028 - `yield from` would close `results` without the filter below
+                    yield result
+            except GeneratorExit:
+                with warnings.catch_warnings():  # joblib warns about the calls that it cancels
+                    warnings.simplefilter("ignore", UserWarning)
+                    results.close()
+                raise
+        except lost:
+            return
+
+
+def _call_in_worker(parent: int, function: Callable[..., Any], given: tuple[Any, ...]) -> Any:
+    """Call the function in a worker, which ends when its parent does."""
+    if parent and parent != os.getpid():
+        _end_with(parent)
+    return function(*given)
+
+
+@cache
+def _end_with(parent: int) -> None:
+    """Start a thread that ends this process soon after its parent was killed."""
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(PARENT_CHECK_INTERVAL)
+        os._exit(1)
+
+    if hasattr(os, "getppid"):
+        threading.Thread(target=watch, daemon=True).start()
+
+
+@contextlib.contextmanager
+def _ignore_sigint() -> Iterator[None]:
+    """Start processes that ignore Ctrl-C, which a terminal sends to all of them: this process ends them."""
+    from joblib.externals.loky.backend import resource_tracker as loky_tracker
+
+    # Each tracker starts once, and would unblock the signal in this process.
+    resource_tracker.ensure_running()
+    loky_tracker.ensure_running()
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def connect_backend(word: str) -> tuple[str, contextlib.AbstractContextManager[Any]]:
+    """Return joblib's name of a backend, and a context manager that holds the connection to its cluster.
+
+    Raises
+    ------
+    InputError
+        A package is missing, no scheduler answers, or joblib does not have the backend.
+    """
+    from joblib.parallel import BACKENDS
+
+    name, _, address = word.partition("=")
+    if name == "dask":
+        return name, _connect_dask(address)
+    if name == "ray":
+        _connect_ray(address)
+    elif name not in BACKENDS or address:
+        raise InputError(
+            f"joblib has no backend {word!r}: 'loky' runs processes on this machine, 'dask' or 'dask=ADDRESS' and "
+            "'ray' or 'ray=ADDRESS' a cluster"
+        )
+    return name, contextlib.nullcontext()
+
+
+def _connect_dask(address: str) -> contextlib.AbstractContextManager[Any]:
+    """Return a client of the scheduler, or an empty context if there is a client already."""
+    try:
+        import dask
+        import distributed
+    except ImportError:
+        raise InputError(
+            "backend 'dask' needs distributed: pip install 'lavender-contact[cluster]'"
+        ) from None
+    address = address or dask.config.get("scheduler-address", "")
+    try:
+        if address:
+            return distributed.Client(address, timeout=CONNECT_TIMEOUT)  # type: ignore[no-untyped-call]
+        distributed.get_client()
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"no dask scheduler answers at {address!r} ({error}); start one there"
+            if address
+            else "backend 'dask' needs a scheduler: give dask=tcp://HOST:8786, set DASK_SCHEDULER_ADDRESS, or make a "
+            "distributed.Client first"
+        ) from None
+    return contextlib.nullcontext()
+
+
+def _connect_ray(address: str) -> None:
+    try:
+        import ray
+        from ray.util.joblib import register_ray
+    except ImportError:
+        raise InputError("backend 'ray' needs ray: pip install 'ray[default]'") from None
+    if address and not ray.is_initialized():
+        try:
+            ray.init(address=address)
+        except (ConnectionError, ValueError) as error:
+            raise InputError(f"no ray cluster answers at {address!r} ({error}); start one there") from None
+    register_ray()
