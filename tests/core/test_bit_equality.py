@@ -1,0 +1,282 @@
+"""Two ways to compute one result give the same bits. Each pair is compared here once.
+
+`WAYS` compares ways to solve with a fresh solve, `RUNS` a run in parts with the whole run. Other pairs: batches and
+single solves in test_many.py; packed sweeps in test_packed.py; orders of blocks in test_sweeps_large.py; the compiled
+call of small problems in test_small.py; lanes of factors in test_newton.py and test_sparse_factor.py; the C library in
+tests/out/test_same_bits.py; the engine in tests/sim/engine/test_engine_bits.py.
+"""
+
+import copy
+import functools
+import itertools
+import pickle
+import sys
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from calls import driven, facts
+from enumeration import random_bounds
+from random_problems import CONTACTS, FORMS, as_matrix, random_contact_problem, touching
+
+import lavender as lv
+from benchmarks.made import fresh, stacks
+from lavender import registry
+from lavender.judge.residuals import reference
+from lavender.solvers.auto import Tree, make
+from lavender.solvers.newton_systems import general
+from lavender.solvers.pivoting import PivotState
+from lavender.solvers.solve_log import SolveLog
+from lavender_ext.core.method import OUTCOMES
+from lavender_ext.pivot.lemke import Lemke
+
+SOLVERS = lv.available(external=False)
+RESUMABLE = lv.available(external=False, resumable=True)
+
+
+@functools.cache
+def examples():
+    """Problems of every law and kind of block, each in every form."""
+    free = random_contact_problem(21, contacts=0, joints=12, bodies=6)
+    ends = np.full(free.m, np.inf)
+    of_rows = [
+        replace(free, cones=replace(free.cones, lower=-ends, upper=ends)),
+        random_contact_problem(22, tangents=0, spin=False),
+        *(make_contacts(23, law) for law in ("coulomb", "cone") for make_contacts in CONTACTS.values()),
+    ]
+    soft = [replace(p, compliance=p.compliance + 0.3) for p in of_rows]
+    return [convert(p) for p in soft for convert in FORMS.values()]
+
+
+def changed(problem):
+    """The same structure with other numbers: a third of the bounded rows is fixed, a third of the contacts is smooth."""
+    cones = problem.cones
+    fixed = (np.arange(problem.m) % 3 == 0) & (np.repeat(cones.kind, np.diff(cones.ptr)) == lv.ROW)
+    mu = np.where(np.arange(problem.n_blocks) % 3 == 0, 0.0, cones.mu)
+    lower, upper = (np.where(fixed, 0.0, x) for x in (cones.lower, cones.upper))
+    other = replace(problem, b=problem.b * 1.25 + 0.01)
+    less = replace(other, cones=replace(cones, lower=lower, upper=upper, mu=mu))
+    return less if less.law == problem.law and not cones.has_ellipse else other
+
+
+# -- a fresh solve, and the same problem solved in another way --------------------------------------
+
+
+def prepare_and_solve(problem, name, **options):
+    prepared = lv.prepare(problem, name)
+    first = prepared.solve(**options)
+    assert facts(prepared.solve(**options)) == facts(first)
+    return first
+
+
+def prepare_other_numbers(problem, name, **options):
+    prepared = lv.prepare(changed(problem), name)
+    prepared.solve(**options)
+    found = prepared.solve(problem, **options)
+    assert facts(prepared.solve(**options)) == facts(found), "the problem given last is kept"
+    return found
+
+
+def prepare_another_structure(problem, name, **options):
+    accepted = [p for p in examples() if registry.get(name).refuses(p) is None]
+    other = max(accepted, key=lambda p: (p.m != problem.m, p.operator != problem.operator))
+    prepared = lv.prepare(other, name)
+    prepared.solve(**options)
+    return prepared.solve(problem, **options)
+
+
+def prepare_and_copy(problem, name, **options):
+    return copy.deepcopy(lv.prepare(problem, name)).solve(**options)
+
+
+def at_once(function, n=8):
+    """Results of n threads that begin together."""
+    gate = threading.Barrier(n)
+
+    def run():
+        gate.wait(600)
+        return function()
+
+    with ThreadPoolExecutor(n) as pool:
+        return [future.result() for future in [pool.submit(run) for _ in range(n)]]
+
+
+def solve_in_eight_threads(problem, name, **options):
+    """Each property that is derived from the problem is computed by the thread that reads it first."""
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    try:
+        first, *others = at_once(lambda: lv.solve(problem, name, **options))
+    finally:
+        sys.setswitchinterval(interval)
+    assert all(facts(other) == facts(first) for other in others)
+    return first
+
+
+def solve_with_a_callback(problem, name, **options):
+    if not registry.get(name).callback:
+        return lv.solve(problem, name, **options)
+    return lv.solve(problem, name, callback=lambda *_: None, **options)
+
+
+def solve_after_a_residual(problem, name, **options):
+    lv.residual(problem, np.ones(problem.m))
+    return lv.solve(problem, name, **options)
+
+
+#: Ways to solve a problem of which nothing was derived before.
+WAYS = {
+    "prepared": prepare_and_solve,
+    "prepared for other numbers": prepare_other_numbers,
+    "prepared for another structure": prepare_another_structure,
+    "a copy of what was prepared": prepare_and_copy,
+    "a pickled problem": lambda p, name, **more: lv.solve(pickle.loads(pickle.dumps(p)), name, **more),
+    "judged before": solve_after_a_residual,
+    "one of a list": lambda p, name, **more: lv.solve_many([p], name, **more)[0],
+    "a list and two threads": lambda p, name, **more: lv.solve_many([p] * 3, name, threads=2, **more)[2],
+    "eight threads": solve_in_eight_threads,
+    "a time limit that does not bind": lambda p, name, **more: lv.solve(p, name, time_limit=600.0, **more),
+    "a list and a time limit": lambda p, name, **more: lv.solve_many([p], name, time_limit=600.0, **more)[0],
+    "a callback": solve_with_a_callback,
+}
+
+
+@functools.cache
+def solved(name):
+    """(problem, options, facts of its fresh solve) of each example that the solver accepts."""
+    options = {"tol": 1e-7, "max_iter": 60 if registry.get(name).resumable else None}
+    accepted = [p for p in examples() if registry.get(name).refuses(p) is None]
+    return [(p, options, facts(lv.solve(fresh(p), name, **options))) for p in accepted]
+
+
+@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("name", SOLVERS)
+def test_every_way_to_solve_has_the_bits_of_a_fresh_solve(name, way):
+    chosen = solved(name)[:9] if way == "eight threads" else solved(name)
+    for problem, options, expected in chosen:
+        assert facts(WAYS[way](fresh(problem), name, **options)) == expected, problem
+
+
+# -- one run, and the same run in parts ---------------------------------------------------------------
+
+
+def run_solver(problem, sizes, name, tol=1e-9, budget=1000, **options):
+    """`run` of a solver, `turn` of newton, until another claim than MAX_ITERATIONS or the end of the budget."""
+    solver, impulse, done, status = registry.get(name).load()(**options), problem.start(), 0, None
+    state = solver.prepare(problem)
+    call = solver.turn if name == "newton" else solver.run
+    for size in itertools.chain(sizes, itertools.repeat(sizes[-1])):
+        claim = call(state, impulse, min(size, budget - done), tol, None)
+        done, status = done + claim.iterations, claim.status
+        if status is not lv.Status.MAX_ITERATIONS or done >= budget:
+            return done, status, impulse.tobytes()
+
+
+def run_path(problem, sizes):
+    """Lemke's path, nine times begun anew where a ray ends it."""
+    rows = PivotState(problem).rows
+    paths = Lemke(rows)
+    paths.begin(problem.start())
+    codes = [paths.run(n) for n in [*sizes, *9 * [10_000]]]
+    return codes[-1], paths.pivots, paths.paths, rows.work, rows.best.impulse.tobytes()
+
+
+def run_driver(problem, sizes):
+    """Newton's method as hosts without Python lead it, by multiply-adds; None if the driver does not take it."""
+    found = driven(problem, work=sizes[0])
+    return found and (*found[:3], found[3].tobytes())
+
+
+def run_over_velocities(problem, sizes):
+    kernel, impulse = general.prepare(problem), problem.start().copy()
+    kernel.start(impulse, 1e-9, 300)
+    while kernel.step(sizes[0], impulse) == OUTCOMES["more"]:
+        pass
+    return kernel.counts, impulse.tobytes()
+
+
+def run_step_of_auto(problem, sizes, kind):
+    """What a step remembers between its turns is not computed anew from the best impulse."""
+    reference(problem)
+    log = SolveLog(problem, 1e-14, 10**6)
+    log.offer(problem.start())
+    step = make(kind, log, Tree(problem))
+    for n in sizes:
+        step.run(n)
+    return log.iterations, step.impulse.tobytes()
+
+
+def opposed():
+    """Two contacts that nothing can meet: sweeps stall."""
+    rows = touching([[-1, 0], [-1, 0]], normal=np.array([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]]))
+    contacts = lv.Problem.from_rows(rows, 1.0)
+    return [contacts, replace(as_matrix(contacts), cones=lv.Cones.free(2))]
+
+
+def random_bounded():
+    """Bounded rows of an A that is not symmetric, every other one with a symmetric half that is singular."""
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        m = int(rng.integers(1, 31))
+        g, skew = rng.normal(size=(2, m, m))
+        g[:, : m // 2] *= seed % 2
+        low, high = random_bounds(rng, m)
+        yield lv.Problem.lcp(g @ g.T + skew - skew.T, 2.0 * rng.normal(size=m), low, high)
+
+
+def alternating_islands():
+    """J and M of two islands whose rows alternate, under each kind of bound."""
+    rng = np.random.default_rng(0)
+    kinds = (lv.Cones.bounded(np.zeros(20), 1.0), lv.Cones.contacts(0.7, count=4),
+             lv.Cones.contacts([0.7, 0.0, 0.3], tangents=2, patch_radius=0.1))  # fmt: skip
+    for cones, compliance in itertools.product(kinds, (0.0, 0.1)):
+        jac, half = rng.normal(size=(cones.n_rows, 14)), rng.normal(size=(2, 7, 7))
+        first = np.repeat(np.arange(cones.n_blocks) % 2 == 0, np.diff(cones.ptr))
+        jac[first, 7:] = jac[~first, :7] = 0.0
+        mass = np.kron(np.eye(2), np.ones((7, 7))) * np.tile(np.hstack(half @ half.swapaxes(1, 2)), (2, 1))
+        yield lv.Problem.from_jacobian(
+            jac, mass + np.eye(14), rng.normal(size=14), cones=cones, compliance=compliance, friction="cone"
+        )
+
+
+ORDERS = ({}, {"order": "random"}, {"order": "symmetric"}, {"order": "colored"})
+#: Run, how to make its problems, sizes of a whole run and of its parts.
+RUNS = {
+    **{
+        f"{name} {order.get('order', '')} to {tol:g}": (
+            functools.partial(run_solver, name=name, tol=tol, budget=23, **order), examples, [23], [1, 7, 15],
+        )
+        for name in RESUMABLE
+        for order in (ORDERS if registry.get(name).order else ORDERS[:1])
+        for tol in (0.0, 1e-14)
+    },
+    **{
+        f"{name} until it stalls": (functools.partial(run_solver, name=name, tol=1e-6), opposed, [1000], [7])
+        for name in RESUMABLE
+    },
+    "newton": (functools.partial(run_solver, name="newton"), examples, [1000], [2]),
+    "lemke": (run_path, random_bounded, [], [3, 0, 1, 17, 40]),
+    "driver": (run_driver, examples, [10**6], [1]),
+    "newton over velocities": (run_over_velocities, alternating_islands, [300], [1]),
+    **{
+        f"a step of auto: {kind}": (
+            functools.partial(run_step_of_auto, kind=kind), lambda: [stacks(4, 4, 0.5, False)], [40], [3, 10, 27],
+        )
+        for kind in ("anderson", "nncg", "admm", "newton")
+    },
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", RUNS)
+def test_a_run_in_parts_has_the_bits_of_the_whole(case):
+    run, problems, whole, parts = RUNS[case]
+    name = getattr(run, "keywords", {}).get("name", "newton")
+    compared = 0
+    for problem in problems():
+        if registry.get(name).refuses(problem) is None:
+            expected = run(problem, whole)
+            assert run(problem, parts) == expected, problem
+            compared += expected is not None
+    assert compared
