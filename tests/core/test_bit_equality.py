@@ -51,7 +51,7 @@ def examples():
 
 
 def changed(problem):
-    """The same structure with other numbers: a third of the bounded rows is fixed, a third of the contacts is smooth."""
+    """The same structure with other numbers, a third of the bounded rows fixed, a third of the contacts smooth."""
     cones = problem.cones
     fixed = (np.arange(problem.m) % 3 == 0) & (np.repeat(cones.kind, np.diff(cones.ptr)) == lv.ROW)
     mu = np.where(np.arange(problem.n_blocks) % 3 == 0, 0.0, cones.mu)

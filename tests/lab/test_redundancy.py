@@ -153,7 +153,7 @@ def test_a_large_island_is_decomposed_as_sparse():
     assert "sparse Cholesky" in found.method
 
 
-@pytest.mark.parametrize("n", [447, 820, 1221])
+@pytest.mark.parametrize("n", [447, 1221])
 def test_the_rank_of_a_large_island_is_that_of_its_eigenvalues(n):
     """Rows of a sparse J of fewer columns: small pivots that stay in a factor cost up to 32 of the rank."""
     rng, m = np.random.default_rng(1), 1500

@@ -1,5 +1,7 @@
 """J and an ill-conditioned M: claims hold in long double, and the judge's floor counts what the factor of M loses."""
 
+from itertools import product
+
 import judge_twin
 import numpy as np
 import pytest
@@ -15,7 +17,6 @@ from lavender.problem.generalized import Generalized
 
 CONDITIONS = (1e2, 1e8, 1e10, 1e12)
 OURS = lv.available(external=False)
-BACKENDS = [name for name, spec in registry.specs().items() if spec.external]
 # A first pass that is not refined has an error of at most a tenth of the tolerance; the rest is rounding of the sums.
 CLOSE = 1.11
 
@@ -107,18 +108,15 @@ def test_no_claim_is_false_whatever_the_condition_of_m(name, law, condition, see
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("condition", CONDITIONS)
-@pytest.mark.parametrize("name", BACKENDS)
-@settings(max_examples=4)
-@given(seed=seeds, law=st.sampled_from(LAWS))
-def test_no_claim_about_a_backend_is_false_either(name, condition, seed, law):
-    check_claims(name, law, condition, seed, 1e-9)
+@pytest.mark.parametrize("name", sorted(set(lv.available()) - set(OURS)))
+def test_no_claim_about_a_backend_is_false_either(name):
+    for seed, (condition, law) in enumerate(product(CONDITIONS, LAWS)):
+        check_claims(name, law, condition, seed, 1e-9)
 
 
 @pytest.mark.parametrize("tol", [1e-6, 1e-9, 1e-11, 1e-13])
-@pytest.mark.parametrize("n", [10, 40])
-def test_no_claim_is_false_on_a_chain_of_hinges(n, tol):
-    for seed in range(3):
+def test_no_claim_is_false_on_a_chain_of_hinges(tol):
+    for n, seed in ((10, 0), (10, 1), (40, 2)):
         problem = hinges(n, seed)
         for name in ("auto", "newton", "pgs"):
             assert false_claim(problem, lv.solve(problem, name, tol=tol, max_iter=20_000)) is None
@@ -128,7 +126,7 @@ def test_no_claim_is_false_on_a_chain_of_hinges(n, tol):
 def test_sweeps_end_where_float64_loses_the_residual(name):
     """Their own residual meets tol, the refined one does not: no sweep makes it smaller."""
     spec, count = registry.get(name), 0
-    for seed in range(6):
+    for seed in range(3):
         for law in LAWS:
             problem = ill_problem(seed, 1e10, law)
             if spec.refuses(problem) is not None:
@@ -140,7 +138,7 @@ def test_sweeps_end_where_float64_loses_the_residual(name):
                 assert solution.iterations < 3_000_000
                 assert "ill-conditioned" in solution.message
                 count += 1
-    assert count >= 5 or not spec.resumable or spec.refuses(ill_problem(0, 1e10)) is not None
+    assert count >= 2 or not spec.resumable or spec.refuses(ill_problem(0, 1e10)) is not None
 
 
 def test_a_residual_that_no_floor_excuses_is_no_claim():
@@ -223,25 +221,3 @@ def test_the_condition_of_m_is_estimated_from_below(seed, condition, n):
 
 
 # -- batches ---------------------------------------------------------------------------------------
-
-
-def test_batches_are_refined_with_the_bits_of_one_problem():
-    rng = np.random.default_rng(0)
-    conditions = [1e2, 1e6, 1e8, 1e10, 1e12]
-    jac, v = rng.standard_normal((5, 4, 7)), rng.standard_normal((5, 7))
-    mass = [ill_mass(rng, 7, c) for c in conditions]
-    cones = lv.Cones.bounded(np.zeros(4), np.full(4, np.inf))
-    batch = lv.Batch(jac, np.array(mass), v, cones=cones)
-    for tol in (1e-6, 1e-9, 1e-12):
-        many = lv.solve_many(batch, tol=tol)
-        for i, found in enumerate(many):
-            one = lv.solve(batch[i], tol=tol)
-            assert one.status is found.status
-            np.testing.assert_array_equal(one.impulse, found.impulse)
-            assert (one.residual.relative, one.residual.floor) == (many.relative[i], many.floor[i])
-            assert false_claim(batch[i], found) is None
-    impulses = np.array([solution.impulse for solution in many])
-    judgements = lv.residual_many(batch, impulses)
-    for i in range(len(conditions)):
-        one = lv.residual(batch[i], impulses[i])
-        assert (one.relative, one.floor) == (judgements.relative[i], judgements.floor[i])

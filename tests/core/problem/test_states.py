@@ -101,7 +101,7 @@ def test_the_bound_holds_for_every_kind_law_and_form_at_any_distance(kind):
                 continue
             if operator == "asymmetric" and law == "cone":
                 continue
-            for seed in range(3):
+            for seed in range(2):
                 problem = drawn(seed, kind, law, operator)
                 exact = lv.solve(problem, tol=1e-14)
                 assert exact.residual.relative < 1e-11 or exact.residual.at_floor
@@ -221,10 +221,10 @@ def planted(seed):
     return problem, lam, at_boundary
 
 
-@pytest.mark.parametrize("part", range(4))
+@pytest.mark.parametrize("part", range(2))
 def test_planted_boundaries_are_named(part):
     """30 of 800 were not: rounding of the data moves an answer by itself times the condition of A."""
-    found = others = 0
+    found = 0
     tally = {"certain": 0, "at a boundary": 0, "unknown": 0}
     for seed in range(200 * part, 200 * (part + 1)):
         problem, lam, at_boundary = planted(seed)

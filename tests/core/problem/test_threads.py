@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from random_problems import FORMS, random_contact_problem, random_lcp
+from random_problems import random_contact_problem, random_lcp
 from worked import python
 
 import lavender as lv
@@ -74,26 +74,6 @@ def often():
     sys.setswitchinterval(1e-6)
     yield
     sys.setswitchinterval(before)
-
-
-def unseen(seed, form):
-    """A problem without friction of which nothing was worked out yet."""
-    problem = random_contact_problem(seed, tangents=0, spin=False, joints=0, contacts=12)
-    return FORMS[form](problem)
-
-
-@pytest.mark.parametrize(
-    ("form", "name"),
-    [(form, name) for form in FORMS for name in lv.available(unseen(0, form), external=False)],
-)
-def test_threads_share_a_problem_that_nobody_has_looked_at(name, form, often):
-    """Everything derived is worked out at first use, by whichever thread comes first: the bits are those of one."""
-    for seed in range(3):
-        alone, problem = lv.solve(unseen(seed, form), name, max_iter=30), unseen(seed, form)
-        for found in at_once(lambda p=problem: lv.solve(p, name, max_iter=30)):
-            assert found.impulse.tobytes() == alone.impulse.tobytes()
-            assert found.residual.relative == alone.residual.relative
-            assert (found.status, found.work) == (alone.status, alone.work)
 
 
 def test_what_is_derived_is_one_object_for_all_threads(often):

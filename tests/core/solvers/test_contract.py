@@ -171,39 +171,6 @@ def test_declared_options_are_those_of_the_factory(name):
     assert parameters <= spec.accepts, f"{sorted(parameters - spec.accepts)} are taken and not declared"
 
 
-@pytest.mark.parametrize("name", RESUMABLE)
-def test_n1_then_n2_iterations_are_n1_plus_n2_to_the_bit(name):
-    spec = registry.get(name)
-    options = [{}] + ([{"order": o} for o in ("random", "symmetric", "colored")] if spec.order else [])
-    for problem in examples(spec):
-        for option in options:
-            for tol in (0.0, 1e-14):
-                solver = spec.load()(**option)
-                whole, parts = problem.start(), problem.start()
-                state = solver.prepare(problem)
-                done = solver.run(state, whole, 23, tol, None).iterations
-                state = solver.prepare(problem)
-                split = sum(solver.run(state, parts, n, tol, None).iterations for n in (1, 7, 15))
-                assert (done, whole.tobytes()) == (split, parts.tobytes()), (name, option, tol)
-
-
-@pytest.mark.parametrize("name", RESUMABLE)
-def test_where_it_stalls_depends_on_no_cut(name):
-    """Nothing meets both rows: cut into runs of seven, a run ends at the same iteration with the same claim."""
-    problem = lv.Problem.from_rows(
-        touching([[-1, 0], [-1, 0]], normal=np.array([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])), 1.0
-    )
-    if registry.get(name).refuses(problem) is not None:
-        problem = replace(as_matrix(problem), cones=lv.Cones.free(2))
-    solver, whole, parts, done = registry.get(name).load()(), problem.start(), problem.start(), 0
-    one, state = solver.run(solver.prepare(problem), whole, 1000, 1e-6, None), solver.prepare(problem)
-    status = lv.Status.MAX_ITERATIONS
-    while status is lv.Status.MAX_ITERATIONS and done < 1000:
-        claim = solver.run(state, parts, min(7, 1000 - done), 1e-6, None)
-        done, status = done + claim.iterations, claim.status
-    assert (done, status, parts.tobytes()) == (one.iterations, one.status, whole.tobytes())
-
-
 @pytest.mark.parametrize("name", OURS)
 def test_a_budget_is_kept_and_never_leaves_more_than_the_start(name):
     """Of none the start comes back; few iterations are no more than that; without a tolerance all are spent."""
@@ -220,48 +187,6 @@ def test_a_budget_is_kept_and_never_leaves_more_than_the_start(name):
             exact = lv.solve(problem, name, tol=0.0, max_iter=5)
             assert (exact.status, exact.iterations) == (lv.Status.MAX_ITERATIONS, 5)
             assert sum(exact.work.values()) >= 5
-
-
-@pytest.mark.parametrize("name", OURS)
-def test_update_equals_a_fresh_solve_to_the_bit(name):
-    spec = registry.get(name)
-    kwargs = {"tol": 1e-9, "max_iter": 50 if spec.resumable else None}
-    for problem in examples(spec):
-        other = replace(problem, b=problem.b * 1.25 + 0.01)
-        cones = problem.cones  # a third of the joints' rows is held, and a third of the contacts does not rub
-        held = (np.arange(problem.m) % 3 == 0) & (np.repeat(cones.kind, np.diff(cones.ptr)) == lv.ROW)
-        mu = np.where(np.arange(problem.n_blocks) % 3 == 0, 0.0, cones.mu)
-        bounds = (np.where(held, 0.0, x) for x in (cones.lower, cones.upper))
-        less = replace(other, cones=lv.Cones(cones.ptr, cones.kind, *bounds, mu, cones.patch_radius))
-        other = less if less.law == problem.law else other
-        prepared = lv.prepare(problem, name)
-        first = prepared.solve(**kwargs)
-        again = prepared.solve(**kwargs)
-        changed = prepared.solve(other, **kwargs)
-        fresh = lv.solve(other, name, **kwargs)
-        assert first.impulse.tobytes() == again.impulse.tobytes()
-        assert changed.impulse.tobytes() == fresh.impulse.tobytes()
-        assert (changed.status, changed.iterations) == (fresh.status, fresh.iterations)
-        assert prepared.problem is other  # which stays, whichever way solves it
-        for more in ({}, {"max_iter": 500}, {"time_limit": 10.0}):
-            stays = prepared.solve(tol=1e-8, **more)
-            assert stays.residual.relative == lv.residual(other, stays.impulse).relative
-        for unlike in examples(spec):  # of another law, form and structure
-            fresh = lv.solve(unlike, name, **kwargs).impulse
-            assert prepared.solve(unlike, **kwargs).impulse.tobytes() == fresh.tobytes()
-
-
-@pytest.mark.parametrize("name", OURS)
-def test_many_at_once_have_the_bits_of_one_by_one(name):
-    """Every kind of block in every form, in one call and by two threads."""
-    spec = registry.get(name)
-    options = {"tol": 1e-6, "max_iter": 60 if spec.resumable else None}
-    taken = [p for forms, _ in samples().values() for p in forms if spec.refuses(p) is None]
-    for problem, found in zip(taken, lv.solve_many(taken, name, threads=2, **options), strict=True):
-        one = lv.solve(replace(problem, copy=False), name, **options)  # of which nothing was worked out yet
-        assert found.impulse.tobytes() == one.impulse.tobytes()
-        assert (found.status, found.iterations, found.message) == (one.status, one.iterations, one.message)
-        assert dict(found.work) == dict(one.work)
 
 
 @pytest.mark.parametrize("name", lv.available(impulse=True))

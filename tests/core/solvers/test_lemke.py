@@ -1,25 +1,11 @@
 """`lemke`: its path, its pivots, rays, and what a budget or a clock cuts."""
 
-import hypothesis.strategies as st
 import numpy as np
 import pytest
 import scipy.sparse as sp
-from enumeration import random_bounds
-from hypothesis import given
-from random_problems import good, random_lcp, seeds
+from random_problems import good, random_lcp
 
 import lavender as lv
-from lavender import registry
-from lavender.solvers.pivoting import PivotState
-from lavender_ext.pivot.lemke import Lemke
-
-
-def paths_of(problem):
-    """The rows of a problem and the paths on them, begun at its start."""
-    rows = PivotState(problem).rows
-    paths = Lemke(rows)
-    paths.begin(problem.start())
-    return rows, paths
 
 
 def test_free_rows_that_no_pivot_reaches_are_split():
@@ -49,30 +35,6 @@ def test_a_path_that_a_budget_cuts_stands_where_it_stopped_and_too_many_rows_are
     ):
         with pytest.raises(lv.CapabilityError, match=words):
             lv.solve(lv.Problem(np.ones(5001), cones, sp.eye_array(5001, format="csr")), "lemke")
-
-
-@given(
-    seed=seeds, m=st.integers(1, 30), cuts=st.lists(st.integers(0, 40), max_size=8), singular=st.booleans()
-)
-def test_pivots_in_parts_are_those_of_one_call_to_the_bit(seed, m, cuts, singular):
-    rng = np.random.default_rng(seed)
-    g, skew = rng.normal(size=(2, m, m))
-    if singular:
-        g[:, : m // 2] = 0.0
-    low, high = random_bounds(rng, m)
-    problem = lv.Problem.lcp(g @ g.T + skew - skew.T, 2.0 * rng.normal(size=m), low, high)
-    ends = []
-    for parts in ([], cuts):
-        rows, paths = paths_of(problem)
-        codes = [paths.run(n) for n in [*parts, *9 * [10_000]]]  # rays end a call, too
-        ends.append((codes[-1], paths.pivots, paths.paths, rows.work, rows.best.impulse.tobytes()))
-    assert ends[0] == ends[1]
-    state, solver = PivotState(problem), registry.get("lemke").load()()
-    for _ in range(2):  # `run` begins anew
-        impulse = problem.start()
-        claim = solver.run(state, impulse, 10_000, 1e-9)
-        assert claim.iterations <= ends[0][1]  # less where a ray is a proof
-        assert claim.status is lv.Status.INFEASIBLE or impulse.tobytes() == ends[0][4]
 
 
 def test_a_dictionary_that_takes_longer_than_the_time_limit_is_not_formed():

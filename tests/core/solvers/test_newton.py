@@ -415,25 +415,6 @@ def test_cones_with_a_solution_are_never_proven_to_have_none(form, seed):
     assert lv.solve(problem, "newton", max_iter=300).status is not lv.Status.INFEASIBLE
 
 
-@pytest.mark.parametrize("form", FORMS)
-@pytest.mark.parametrize("friction", ["coulomb", "cone"])
-@pytest.mark.parametrize("seed", [1, 4])
-def test_turns_of_one_run_give_its_bits(form, friction, seed):
-    problem = FORMS[form](random_contact_problem(seed, friction, bodies=8, joints=1, contacts=14))
-    newton = Newton()
-    whole, parts = problem.start(), problem.start()
-    claim = newton.run(newton.prepare(problem), whole, 1500, 1e-9)
-    state, work = newton.prepare(problem), 0
-    for _ in range(1500):
-        part = newton.turn(state, parts, 2, 1e-9)
-        work += part.work["factorisations"]
-        if part.status is not lv.Status.MAX_ITERATIONS:
-            break
-    assert claim.status is part.status is lv.Status.CONVERGED
-    assert work == claim.work["factorisations"]
-    np.testing.assert_array_equal(whole, parts)
-
-
 @pytest.mark.skipif(not Path("/proc/self/smaps").exists(), reason="the kernel of Linux alone tells")
 def test_large_memory_asks_for_no_huge_pages():
     """Each of them may wait for the kernel to make room: repeated solves took three times the first.

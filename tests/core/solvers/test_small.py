@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from calls import SHORT, check, facts
+from calls import SHORT, check
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from random_problems import as_matrix, random_contact_problem, random_lcp, seeds, side_by_side
@@ -244,27 +244,6 @@ def test_islands_where_doing_nothing_is_right_from_a_warm_start():
     found = check(problem.updated(b=b), "auto", impulse=start)
     assert found.success and found.residual.relative <= found.tol
     assert not found.impulse[:12].any()
-
-
-@pytest.mark.parametrize("form", ["islands", "cone", "singular"])
-def test_one_problem_in_two_threads_has_the_same_bits(form):
-    """What another thread has in hand is no attempt in vain."""
-    rng = np.random.default_rng(4)
-    if form == "islands":
-        parts = [g @ g.T for g in rng.normal(size=(12, 9, 6))]
-        problem = lv.Problem.contact(
-            block_diag(list(map(coo_array, parts))), rng.normal(size=108), np.full(36, 0.3)
-        )
-    elif form == "cone":
-        g = rng.normal(size=(60, 63))
-        problem = lv.Problem.contact(g @ g.T, rng.normal(size=60), mu=0.5, friction="cone")
-    else:
-        g = rng.normal(size=(60, 30))
-        problem = lv.Problem.lcp(g @ g.T, g @ (g.T @ np.abs(rng.normal(size=60))))
-    expected = facts(lv.solve(problem))
-    for solution in lv.solve_many([problem] * 100, threads=2):
-        assert facts(solution) == expected
-    assert facts(lv.solve(problem)) == expected
 
 
 def test_many_islands_that_each_take_a_few_factors_are_one_call():

@@ -1,8 +1,6 @@
 """The front door: what it refuses before anything runs, budgets, clocks, history, callbacks, Ctrl-C."""
 
-import copy
 import dataclasses
-import pickle
 import signal
 import threading
 import time
@@ -73,15 +71,6 @@ def test_a_senseless_request_is_refused_with_its_reason(name):
     call, error, sign = REFUSED[name]
     with pytest.raises(error, match=sign):
         call()
-
-
-@pytest.mark.parametrize("copied", [copy.copy, copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))])
-def test_a_copy_of_what_is_prepared_is_prepared_for_itself(copied):
-    prepared = lv.prepare(TINY, "jacobi", omega=0.6)
-    right = prepared.solve(tol=1e-9)
-    other = copied(prepared)
-    assert other.state is not prepared.state and other.options == prepared.options
-    np.testing.assert_array_equal(other.solve(tol=1e-9).impulse, right.impulse)
 
 
 @pytest.mark.parametrize("name", ["pgs", "auto"])

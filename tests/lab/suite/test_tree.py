@@ -17,7 +17,7 @@ from lavender import registry, suite
 from lavender.base.deadline import Deadline
 from lavender.judge.residuals import reference
 from lavender.solvers import costs
-from lavender.solvers.auto import LAST, LITTLE, MOST, SURE, Tree, make, solve, tree_goes_on
+from lavender.solvers.auto import LAST, LITTLE, MOST, SURE, Tree, solve, tree_goes_on
 from lavender.solvers.certify import certify
 from lavender.solvers.solve_log import SolveLog
 from lavender.solvers.steps import METHODS, NEAR, Newton, Step, Sweeps
@@ -192,24 +192,6 @@ def test_every_step_goes_on_and_the_best_of_all_is_returned(monkeypatch):
     np.testing.assert_array_equal(log.impulse, found[-1] * solved + problem.start())
     after = [turn.after for turn in log.turns]
     assert (np.diff(after) <= 0.0).all() and len(after) == len(found)
-
-
-@pytest.mark.parametrize("kind", ["anderson", "nncg", "admm", "newton"])
-def test_a_step_goes_on_where_it_stopped(kind):
-    """To the bit: what it remembers is not made anew from the best impulse."""
-    problem = suite.case("pyramidF(k=4, mass_ratio=100)").problem
-    reference(problem)
-    ends, counts = [], []
-    for parts in ([40], [3, 10, 27]):
-        log = SolveLog(problem, 1e-14, 10**6)
-        log.offer(problem.start())
-        step = make(kind, log, Tree(problem))
-        for n in parts:
-            step.run(n)
-        ends.append(step.impulse)
-        counts.append(log.iterations)
-    assert counts[0] == counts[1] and (kind == "newton" or counts[0] == 40)
-    np.testing.assert_array_equal(*ends)
 
 
 @pytest.mark.parametrize("sweeps, from_nothing", [(2, True), (200, False)])
