@@ -81,44 +81,35 @@ def over_velocities(m, nv, seed=0, cones=None, **more):
     return lv.Problem.from_jacobian(rng.normal(size=(m, nv)), mass, rng.normal(size=nv), cones=cones, **more)
 
 
-def impulses(problem, packs=True, name="sequential_impulses", **options):
-    """Sweeps of a problem, prepared, perhaps never in pairs."""
+def prepare_sweeps(problem, name="sequential_impulses", packs=True, **options):
+    """A solver by sweeps that may pack blocks, or never does."""
     prepared = lv.prepare(problem, name, **options)
     if not packs:
         prepared.state.sweeps.alone()
     return prepared
 
 
-def in_chunks(problem, order, counts, start, *, packs=True):
-    """Impulse and velocities after runs of those many sweeps each, and how the contacts were packed."""
-    if order == "array":
-        order = np.random.default_rng(problem.n_blocks).permutation(problem.n_blocks)
-    prepared = impulses(problem, packs, order=order)
-    solver, state = prepared.solver, prepared.state
-    lam = start.copy()
+def sweep_in_parts(problem, counts, name="sequential_impulses", *, start=None, packs=True, **options):
+    """Impulse and velocities of bodies after runs of those many sweeps each, and (packed records, stages)."""
+    prepared = prepare_sweeps(problem, name, packs, **options)
+    lam = (
+        0.05 * np.abs(np.random.default_rng(problem.m).normal(size=problem.m))
+        if start is None
+        else start.copy()
+    )
     for n in counts:
-        solver.run(state, lam, n, 0.0)
-    return lam, state.sweeps.velocity[:-2], state.sweeps.pairs
+        prepared.solver.run(prepared.state, lam, n, 0.0)
+    sweeps = prepared.state.sweeps
+    return lam, sweeps.velocity[: problem.rows.n_bodies], sweeps.pairs
 
 
-def packed(problem, order, counts, start):
-    """(records, stages) of those runs, which have the bits of one contact after the other."""
-    lam, v, pairs = in_chunks(problem, order, counts, start)
-    one, v_one, _ = in_chunks(problem, order, counts, start, packs=False)
-    np.testing.assert_array_equal(lam.view(np.uint8), one.view(np.uint8))
-    np.testing.assert_array_equal(v.view(np.uint8), v_one.view(np.uint8))
+def sweep_packed(problem, counts, name="sequential_impulses", **options):
+    """(records, stages) of runs that have the bits of one block after the other."""
+    lam, v, pairs = sweep_in_parts(problem, counts, name, **options)
+    one, v_one, none = sweep_in_parts(problem, counts, name, packs=False, **options)
+    assert (lam.tobytes(), v.tobytes()) == (one.tobytes(), v_one.tobytes())
+    assert none[0] == 0 and pairs[0] <= problem.n_blocks
     return pairs
-
-
-def swept(problem, name, counts, *, packs=True, tol=0.0, **options):
-    """Impulse and velocities after runs of those many iterations each, and how many pairs there were."""
-    prepared = impulses(problem, packs, name, **options)
-    solver, state = prepared.solver, prepared.state
-    rng = np.random.default_rng(problem.m)
-    lam = 0.05 * np.abs(rng.normal(size=problem.m))
-    for n in counts:
-        solver.run(state, lam, n, tol)
-    return lam, state.sweeps.velocity[: problem.rows.n_bodies], state.sweeps.pairs[0]
 
 
 def robot(seed, m=12, n=10, soft=True, number=np.float64):

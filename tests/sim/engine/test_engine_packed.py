@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from calls import packed, swept
+from calls import sweep_packed
 from worked import after
 
 import lavender as lv
@@ -111,7 +111,7 @@ def test_a_joint_on_top_of_a_tower_leaves_it_packed():
             scene.add_joint("ball", -1, len(scene.bodies) - 1, anchor=(top[0], top[1], top[2] + 0.5))
         sim = after(5, scene)
         problem = sim.constraint_problem()
-        shapes.append(packed(problem, "given", [20], problem.start()))
+        shapes.append(sweep_packed(problem, [20], start=problem.start()))
     assert shapes[1][0] <= shapes[0][0] + 2
     assert shapes[1][1] >= shapes[0][1]
 
@@ -119,7 +119,7 @@ def test_a_joint_on_top_of_a_tower_leaves_it_packed():
 def test_one_chain_is_swept_one_by_one():
     """Where each contact waits for the one before, pairs gain nothing."""
     sim = after(5, "stack", n=40)
-    assert swept(sim.constraint_problem(), "nncg", [40])[2] == 0
+    assert sweep_packed(sim.constraint_problem(), [40], "nncg")[0] == 0
 
 
 @pytest.mark.parametrize("order", ["given", "reverse"])
@@ -127,4 +127,4 @@ def test_a_tall_stack_is_packed_over_sweeps(order):
     """Few contacts are free of each other in one sweep: those of several sweeps stand in pairs."""
     sim = after(5, "stack", n=40)
     problem = sim.constraint_problem()
-    assert packed(problem, order, [8, 1, 2, 3, 5, 30, 4], problem.start())[1] > 1
+    assert sweep_packed(problem, [8, 1, 2, 3, 5, 30, 4], order=order, start=problem.start())[1] > 1
