@@ -7,8 +7,7 @@ from unittest import mock
 
 import numpy as np
 import pytest
-from random_problems import dragged, random_ellipses
-from random_trees import random_tree, tree_mass
+from random_problems import random_tree, tree_mass
 
 import lavender as lv
 from lavender import registry
@@ -144,19 +143,6 @@ def driven(problem, tol=1e-9, budget=1500, work=10**6):
     return how, driver.counts[1], driver.relative, impulse
 
 
-LAWS = ("coulomb", "cone")
-
-
-def free(seed, contacts=3, friction="coulomb", mu=None):
-    return dragged(seed, contacts, mu, friction=friction)
-
-
-def on_rows(seed, friction="coulomb", **sizes):
-    """Bodies with joints and contacts, an ellipse each."""
-    base = random_ellipses(seed, friction, **sizes)
-    return replace(base, compliance=base.compliance + 0.3)
-
-
 def says(status, **more):
     return lv.Claim(status, 1, **more)
 
@@ -164,6 +150,16 @@ def says(status, **more):
 def dense_h(problem):
     s = 1.0 / np.sqrt(problem.d)
     return problem.dense() * s[:, None] * s[None, :]
+
+
+def block_diagonal(system, values):
+    """The small matrices of the elements of Newton's method as one block diagonal matrix."""
+    sc = system.solve
+    out = np.zeros((sc.m, sc.m))
+    for i, q in enumerate(sc.wptr[:-1]):
+        j, end = sc.ptr[i], sc.ptr[i + 1]
+        out[j:end, j:end] = values[q : sc.wptr[i + 1]].reshape(end - j, end - j)
+    return out
 
 
 def system_in(problem, form):

@@ -699,3 +699,23 @@ class Problem:
             if not self._rim_rounds(y, zk[0] + rim, share, part, parts):
                 pull += max(ZERO, zk[0] + rim) * LARGEST
         return None if gain > pull else "impulses within the bounds can meet b.y"
+
+
+def sweep(problem, twin, lam, blocks):
+    """One sweep over blocks under Coulomb's law, in place; A, d and bounds are those of the judge's twin."""
+    c, s, (a, b, d) = problem.cones, twin.stretch, (x.astype(float) for x in (twin.A, twin.b, twin.d))
+    given, lam = lam, lam / s
+    for i in blocks:
+        j, end = c.ptr[i], c.ptr[i + 1]
+        if c.kind[i] == ROW:
+            for q in range(j, end):
+                lam[q] = np.clip(lam[q] - (a[q] @ lam - b[q]) / d[q], c.lower[q], c.upper[q])
+            continue
+        lam[j] = max(0.0, lam[j] - (a[j] @ lam - b[j]) / d[j])
+        for rows, bound in twin.parts(i):
+            t = j + np.array(rows)
+            block = a[np.ix_(t, t)]
+            y = lam[t] - (a[t] @ lam - b[t]) / np.linalg.eigvalsh(0.5 * (block + block.T)).max()
+            size = np.linalg.norm(y)
+            lam[t] = y if size <= bound * lam[j] else y * (bound * lam[j] / size)
+    given[:] = s * lam

@@ -1,19 +1,10 @@
-"""The bound of the motion error beside the truth: small random problems solved in long double or in rational numbers.
+"""The bound of the motion error beside the truth: small random problems solved in long double or rational numbers."""
 
-    python tests/motion_truth.py 100000 50
-
-tries that many random problems in long double, every 50th in rational numbers as well, and those that long double
-does not settle in rational numbers alone; it says how many bounds are broken, and how loose they are.
-"""
-
-import sys
-import time
-from collections import Counter
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from kkt_truth import EXACT_BITS, Exact, Wide, curved, matrix_in, shift_in, solution_in
+from kkt_truth import Wide, matrix_in, shift_in, solution_in
 from random_problems import as_matrix, random_contact_problem, random_lcp
 
 import lavender as lv
@@ -112,38 +103,3 @@ def truth(found, numbers=Wide):
     # What compliance stores is part of the energy: its kinetic part is no more.
     broken |= any(abs(e) > numbers.number(found.moved) for e in shift)
     return Truth(float(max(square, 0)) ** 0.5, bool(broken))
-
-
-def main(count, share):
-    rng = np.random.default_rng(20261120)
-    start, ratios, tally = time.perf_counter(), {True: [], False: []}, Counter()
-    for i in range(count):
-        found = draw(rng)
-        if found is None:
-            tally["without a reference"] += 1
-            continue
-        wide = truth(found)
-        tally["settled in long double"] += wide is not None
-        exact = None
-        if wide is None or i % share == 0:
-            exact = truth(found, Exact)
-            kind = "curved" if curved(found.problem) else "polyhedral"
-            tally[f"rational, {kind}"] += exact is not None
-            tally["not settled"] += exact is None and wide is None
-            tally["rational, broken"] += exact is not None and exact.broken
-        tally["long double, broken"] += wide is not None and wide.broken
-        best = exact or wide
-        if best is not None and best.energy > 0.0:
-            ratios[found.good].append(found.bound / best.energy)
-        if (i + 1) % 5000 == 0:
-            print(f"{i + 1} problems, {time.perf_counter() - start:.0f} s, {dict(tally)}", flush=True)
-    print(f"{count} problems (rational: to 2^-{EXACT_BITS} where a disk slides, else exact): {dict(tally)}")
-    for good, name in ((True, "witness at the floor"), (False, "witness at random")):
-        r = np.array(ratios[good])
-        print(
-            f"bound / truth, {name}: {len(r)} times, median {np.median(r):.4g}, 95% {np.quantile(r, 0.95):.4g}"
-        )
-
-
-if __name__ == "__main__":
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else 2000, int(sys.argv[2]) if len(sys.argv) > 2 else 50)

@@ -43,11 +43,10 @@ def problems():
 def ill_conditioned(seed, friction):
     """J and an M of condition 1e10, whose factor loses what is asked for."""
     rng = np.random.default_rng(seed)
-    basis = np.linalg.qr(rng.normal(size=(4, 4)))[0]
-    mass = basis @ np.diag(np.geomspace(1.0, 1e10, 4)) @ basis.T
+    mass = rp.conditioned(rng, 4, 1e10)
     cones = lv.Cones.contacts(0.5, count=2)
     jac, v = rng.normal(size=(6, 4)), rng.normal(size=4)
-    return lv.Problem.from_jacobian(jac, 0.5 * (mass + mass.T), v, cones=cones, friction=friction)
+    return lv.Problem.from_jacobian(jac, mass, v, cones=cones, friction=friction)
 
 
 def kinds_of(friction, mu=0.4):

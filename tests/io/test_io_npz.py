@@ -13,8 +13,7 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 from hypothesis import given, settings
-from random_problems import CONTACTS, FORMS, random_contact_problem, random_lcp, seeds
-from random_trees import random_general
+from random_problems import CONTACTS, FORMS, random_contact_problem, random_general, random_lcp, seeds
 
 import lavender as lv
 import lavender.io

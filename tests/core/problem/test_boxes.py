@@ -1,14 +1,13 @@
 """Two coefficients of a contact: boxes, which bound each tangent by itself, findex, pivoting; ellipses, which share."""
 
 from dataclasses import replace
+from functools import partial
 
 import hypothesis.strategies as st
 import numpy as np
 import pytest
-from calls import free as ellipses
-from calls import on_rows
 from hypothesis import given, settings
-from random_problems import as_matrix, dragged, random_boxes, seeds
+from random_problems import as_matrix, dragged, random_boxes, random_ellipses, seeds
 
 import lavender as lv
 from lavender import registry
@@ -110,7 +109,7 @@ def test_what_findex_cannot_hold_is_told():
     with pytest.raises(lv.InputError, match=r"relaxed\('coulomb'\)"):
         free(1, friction="cone").to_findex()
     with pytest.raises(lv.InputError, match="bounds its tangents together"):
-        ellipses(0).to_findex()
+        dragged(0, 3).to_findex()
 
 
 # -- solutions ---------------------------------------------------------------------------------------------------------
@@ -203,7 +202,16 @@ def test_disks_share_the_factor_of_the_mass_matrix(mass):
     )
 
 
-ELLIPSES = {"generalized": ellipses, "matrix": lambda *a, **k: as_matrix(ellipses(*a, **k)), "rows": on_rows}
+def ellipses_of_rows(seed, friction="coulomb"):
+    base = random_ellipses(seed, friction)
+    return replace(base, compliance=base.compliance + 0.3)
+
+
+ELLIPSES = {
+    "generalized": partial(dragged, contacts=3),
+    "matrix": lambda *a, **k: as_matrix(dragged(*a, contacts=3, **k)),
+    "rows": ellipses_of_rows,
+}
 
 
 @pytest.mark.parametrize("form", ELLIPSES)

@@ -5,8 +5,7 @@ import pytest
 import scipy.sparse as sp
 from calls import robot
 from hypothesis import given, settings
-from random_problems import random_contact_problem, random_lcp, seeds
-from random_trees import random_tree, tree_mass
+from random_problems import random_contact_problem, random_lcp, random_tree, seeds, tree_mass
 
 import lavender as lv
 from lavender.judge.residuals import UNIT32, rounded

@@ -9,8 +9,7 @@ import scipy.linalg
 import scipy.sparse as sp
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from random_problems import as_matrix, seeds
-from random_trees import chain, random_general, random_tree, tree_mass
+from random_problems import ancestors, as_matrix, random_general, random_tree, seeds, tree_mass
 
 import lavender as lv
 from lavender.problem import generalized as coordinates
@@ -203,7 +202,7 @@ def test_rows_fewer_than_velocities_have_the_answer_of_their_matrix(rows, compli
     parent = random_tree(rng, 20)
     jac = np.zeros((rows, 20))
     for row in jac:
-        on = chain(parent, int(rng.integers(0, 20)))
+        on = ancestors(parent, int(rng.integers(0, 20)))
         row[on] = rng.normal(size=len(on))
     cones = lv.Cones.bounded(np.where(rng.random(rows) < 0.5, 0.0, -0.2), np.full(rows, 0.3))
     problem = lv.Problem.from_jacobian(

@@ -7,8 +7,16 @@ import pytest
 import scipy.sparse as sp
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from random_problems import CONTACTS, FORMS, as_matrix, random_contact_problem, seeds, side_by_side, touching
-from random_trees import random_general
+from random_problems import (
+    CONTACTS,
+    FORMS,
+    as_matrix,
+    random_contact_problem,
+    random_general,
+    seeds,
+    side_by_side,
+    touching,
+)
 
 import lavender as lv
 from lavender.solvers.islands import islands

@@ -9,8 +9,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from judge_twin import spec_of
 from kkt_truth import parts
-from random_problems import CONTACTS, FORMS, as_matrix, random_contact_problem, random_lcp, seeds
-from random_trees import random_general
+from random_problems import (
+    CONTACTS,
+    FORMS,
+    as_matrix,
+    random_contact_problem,
+    random_general,
+    random_lcp,
+    seeds,
+)
 
 import lavender as lv
 from lavender.judge import residuals

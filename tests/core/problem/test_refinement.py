@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from judge_twin import spec_of
-from random_problems import seeds
+from random_problems import conditioned, seeds
 
 import lavender as lv
 from lavender import registry
@@ -21,13 +21,6 @@ OURS = lv.available(external=False)
 CLOSE = 1.11
 
 
-def ill_mass(rng, n, condition):
-    """A dense M (n, n) with eigenvalues from 1 to `condition` along random directions."""
-    basis, _ = np.linalg.qr(rng.standard_normal((n, n)))
-    mass = basis @ np.diag(np.geomspace(1.0, condition, n)) @ basis.T
-    return 0.5 * (mass + mass.T)
-
-
 def ill_problem(seed, condition, law="lcp", n=8):
     """Rows on all velocities: of equations, of an LCP, or contacts under a law of friction."""
     rng = np.random.default_rng(seed)
@@ -38,7 +31,7 @@ def ill_problem(seed, condition, law="lcp", n=8):
     else:
         cones = lv.Cones.contacts(rng.uniform(0.1, 0.8, 2), 2)
     return lv.Problem.from_jacobian(
-        rng.standard_normal((cones.n_rows, n)), ill_mass(rng, n, condition), rng.standard_normal(n), cones=cones,
+        rng.standard_normal((cones.n_rows, n)), conditioned(rng, n, condition), rng.standard_normal(n), cones=cones,
         friction="cone" if law == "cone" else "coulomb",
     )  # fmt: skip
 
@@ -161,7 +154,7 @@ def test_no_claim_is_false_with_ellipses(seed):
     rng = np.random.default_rng(seed)
     cones = lv.Cones.contacts([[0.5, 0.2], [0.3, 0.9]], 2)
     problem = lv.Problem.from_jacobian(
-        rng.standard_normal((6, 8)), ill_mass(rng, 8, 1e10), rng.standard_normal(8), cones=cones
+        rng.standard_normal((6, 8)), conditioned(rng, 8, 1e10), rng.standard_normal(8), cones=cones
     )
     for name in ("auto", "pgs", "newton"):
         assert false_claim(problem, lv.solve(problem, name, tol=1e-9, max_iter=3000)) is None
@@ -209,7 +202,7 @@ def test_a_well_conditioned_m_is_not_refined():
 @given(seed=seeds, condition=st.sampled_from([1.0, 1e3, 1e6, 1e10]), n=st.integers(1, 30))
 def test_the_condition_of_m_is_estimated_from_below(seed, condition, n):
     rng = np.random.default_rng(seed)
-    mass = ill_mass(rng, n, condition)
+    mass = conditioned(rng, n, condition)
     scale = rng.uniform(-6, 6, n)
     mass *= 10.0 ** (scale[:, None] + scale[None, :])  # units of the velocities do not count
     mass = 0.5 * (mass + mass.T)

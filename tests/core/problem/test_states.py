@@ -9,23 +9,21 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 from gradient_problems import KINDS, OPERATORS, drawn
-from random_problems import side_by_side
+from random_problems import conditioned, side_by_side
 
 import lavender as lv
 from lavender.judge import error_bound
 from lavender.judge.states import states_of
 
 
+def scaled(rng, n, condition):
+    """A symmetric matrix (n, n) with eigenvalues from 1 / condition to 1."""
+    return conditioned(rng, n, condition) / condition
+
+
 def norms(problem, x):
     """(k,) norm of each block's rows."""
     return np.sqrt(np.add.reduceat(x**2, problem.cones.ptr[:-1]))
-
-
-def conditioned(rng, n, condition):
-    """A symmetric positive definite matrix (n, n) of that condition."""
-    q, _ = np.linalg.qr(rng.standard_normal((n, n)))
-    a = q @ np.diag(np.geomspace(1.0 / condition, 1.0, n)) @ q.T
-    return (a + a.T) / 2
 
 
 def compare(problem, exact, impulse, states):
@@ -48,7 +46,7 @@ def test_no_block_of_a_loose_solve_is_in_another_state_and_not_at_a_boundary(tol
     blocks = known = 0
     for seed in range(60):
         rng = np.random.default_rng(seed)
-        a = conditioned(rng, 9, 1e6)
+        a = scaled(rng, 9, 1e6)
         problem = lv.Problem.contact(a, a @ rng.standard_normal(9), mu=[0.5] * 3).relaxed("cone")
         exact, answer = (lv.solve(problem, "newton", tol=t) for t in (1e-13, tol))
         assert exact.residual.relative <= 1e-12 and not exact.states.boundary
@@ -68,7 +66,7 @@ def test_states_of_loose_solves_by_every_solver(law):
     }
     for seed in range(8):
         rng = np.random.default_rng(seed)
-        a = conditioned(rng, 9, 1e3 if law != "coulomb" else 1.5)
+        a = scaled(rng, 9, 1e3 if law != "coulomb" else 1.5)
         b = rng.standard_normal(9) + 0.5
         if law == "linear":
             problem = lv.Problem.linear(a, b)
@@ -141,7 +139,7 @@ def test_an_ill_conditioned_mass_matrix_widens_the_bound(condition):
     finite = blocks = 0
     for seed in range(12):
         rng, nv, m = np.random.default_rng(seed), 6, 4
-        mass = np.tril(conditioned(rng, nv, condition))
+        mass = np.tril(scaled(rng, nv, condition))
         mass = mass + np.tril(mass, -1).T
         jac, free = rng.standard_normal((m, nv)), rng.standard_normal(nv)
         holds = rng.random(m) < 0.6
@@ -211,7 +209,7 @@ def planted(seed):
             at_boundary.add(i)
     friction = "cone" if law == "cone" else "coulomb"
     if rng.random() < 0.5:
-        a = conditioned(rng, m, 10.0 ** rng.uniform(0.0, 6.0))
+        a = scaled(rng, m, 10.0 ** rng.uniform(0.0, 6.0))
         return lv.Problem(a @ lam - w, cones, a, friction=friction), lam, at_boundary
     nv = m + int(rng.integers(0, 4))
     jac, half, free = rng.standard_normal((m, nv)), rng.standard_normal((nv, nv)), rng.standard_normal(nv)
@@ -265,7 +263,7 @@ def test_an_island_has_the_bound_that_it_has_alone():
     rng = np.random.default_rng(0)
     parts = [
         lv.Problem.contact(
-            conditioned(rng, 6, c), 10.0**k * rng.standard_normal(6), mu=[0.5, 0.3], friction="cone"
+            scaled(rng, 6, c), 10.0**k * rng.standard_normal(6), mu=[0.5, 0.3], friction="cone"
         )
         for c, k in ((1e2, 0), (1e5, 3), (1.0, -3))
     ]

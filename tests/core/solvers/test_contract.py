@@ -10,8 +10,15 @@ import pytest
 from enumeration import enumerate_lcp, random_bounds
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from random_problems import CONTACTS, FORMS, as_matrix, random_contact_problem, seeds, touching
-from random_trees import random_general
+from random_problems import (
+    CONTACTS,
+    FORMS,
+    as_matrix,
+    random_contact_problem,
+    random_general,
+    seeds,
+    touching,
+)
 
 import lavender as lv
 from lavender import registry

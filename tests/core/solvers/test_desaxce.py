@@ -4,10 +4,9 @@ import dataclasses
 
 import numpy as np
 import pytest
-from calls import dense_h, system_in
+from calls import block_diagonal, dense_h, system_in
 from hypothesis import given, settings
 from random_problems import random_contact_problem, seeds
-from twins import block_diagonal
 
 from lavender.solvers.newton_systems.systems import make_system
 

@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 from ball_pile import Pile
-from calls import dense_h, system_in
+from calls import block_diagonal, dense_h, system_in
 from hypothesis import given, settings
 from random_problems import FORMS, as_matrix, good, random_contact_problem, seeds
 from stacks import bricks
-from twins import block_diagonal
 from worked import python
 
 import lavender as lv

@@ -10,8 +10,7 @@ import pytest
 from calls import SHORT, check
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from random_problems import as_matrix, random_contact_problem, random_lcp, seeds, side_by_side
-from random_trees import random_general
+from random_problems import as_matrix, random_contact_problem, random_general, random_lcp, seeds, side_by_side
 from scipy.sparse import block_diag, coo_array
 
 import lavender as lv

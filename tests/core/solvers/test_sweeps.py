@@ -3,7 +3,6 @@
 import judge_twin
 import numpy as np
 import pytest
-import twins
 from hypothesis import given, settings
 from random_problems import CONTACTS, FORMS, random_contact_problem, random_lcp, seeds, sweeps
 
@@ -19,7 +18,7 @@ def test_a_sweep_is_the_update_written_densely_in_every_form(kind, seed):
     problem = CONTACTS[kind](seed)
     lam, twin = problem.start(), judge_twin.Problem(judge_twin.spec_of(problem))
     for _ in range(5):
-        twins.sweep(problem, twin, lam, range(problem.n_blocks))
+        judge_twin.sweep(problem, twin, lam, range(problem.n_blocks))
     # 1e-12 of the largest impulse: a few hundred roundings, none amplified; of J and M those of their inverses.
     size = np.abs(lam).max()
     if lv.get("sequential_impulses").refuses(problem) is None:

@@ -10,8 +10,7 @@ import scipy.sparse as sp
 from hypothesis import given, settings
 from kkt_truth import HAS_WIDE, Exact, Wide, matrix_in, solution_in
 from motion_truth import draw, truth
-from random_problems import as_matrix, dragged, random_contact_problem, random_lcp, seeds
-from random_trees import random_general
+from random_problems import as_matrix, dragged, random_contact_problem, random_general, random_lcp, seeds
 
 import lavender as lv
 from lavender import suite

@@ -9,8 +9,7 @@ import pytest
 import scipy.sparse as sp
 from calls import over_velocities
 from random_families import drawn, wild
-from random_problems import as_matrix, general, random_lcp
-from random_trees import random_general
+from random_problems import as_matrix, general, random_general, random_lcp
 
 import lavender as lv
 from lavender import registry, suite
