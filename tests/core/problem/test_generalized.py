@@ -16,7 +16,6 @@ from lavender.problem import generalized as coordinates
 from lavender.solvers.newton import Newton
 from lavender.solvers.newton_systems import general
 from lavender.solvers.sweeping import reads_whitened
-from lavender_ext.core.method import OUTCOMES
 
 # -- the operator ----------------------------------------------------------------------------------
 
@@ -290,10 +289,10 @@ def test_branches_are_factored_in_their_own_pattern(friction, seed):
     ],
     ids=["bounded", "contacts", "spinning"],
 )
-@given(seed=seeds, steps=st.integers(1, 4), compliance=st.sampled_from([0.0, 0.1]))
+@given(seed=seeds, compliance=st.sampled_from([0.0, 0.1]))
 @settings(max_examples=15)
-def test_newton_on_rows_of_islands_that_alternate(cones, size, other, seed, steps, compliance):
-    """From any start: the judge's end, the velocities of another solver, and cut anywhere the bits of one run."""
+def test_newton_on_rows_of_islands_that_alternate(cones, size, other, seed, compliance):
+    """From any start: the judge's end, and the velocities of another solver."""
     rng = np.random.default_rng(seed)
     m = int(cones.ptr[-1])
     jac, half = rng.normal(size=(m, 14)), rng.normal(size=(2, 7, 7))
@@ -303,18 +302,10 @@ def test_newton_on_rows_of_islands_that_alternate(cones, size, other, seed, step
     v_free = rng.normal(size=14)
     problem = lv.Problem.from_jacobian(jac, mass, v_free, cones=cones, compliance=compliance, friction="cone")
     start = rng.uniform(0.0, 1.0, m)
-    whole, cut = start.copy(), start.copy()
-    once, kernel = general.prepare(problem), general.prepare(problem)
-    once.start(whole, 1e-9, 300)
-    kernel.start(cut, 1e-9, 300)
-    assert once.step(300, whole) == OUTCOMES["reached"]
-    while kernel.step(steps, cut) == OUTCOMES["more"]:
-        pass
-    assert kernel.counts == once.counts
-    np.testing.assert_array_equal(cut, whole)
-    assert lv.residual(problem, whole).relative <= 1e-9
+    whole = lv.solve(problem, "newton", form="velocity", impulse=start, tol=1e-9)
+    assert whole.success
     apart = lv.solve(problem, other, tol=1e-9)
-    np.testing.assert_allclose(problem.velocity(whole), problem.velocity(apart.impulse), atol=1e-6)
+    np.testing.assert_allclose(problem.velocity(whole.impulse), problem.velocity(apart.impulse), atol=1e-6)
 
 
 def cloth(side, seed, friction="cone"):

@@ -16,12 +16,9 @@ from scipy.sparse import block_diag, coo_array
 import lavender as lv
 from benchmarks.core_problems import forms, fresh, stacks
 from lavender import registry
-from lavender.solvers.costs import RATES, newton_cost
-from lavender.solvers.registry import SMALL_ROWS
+from lavender.solvers.costs import newton_cost
 from lavender.solvers.small import (
     AUTO,
-    ISLAND,
-    TREE,
     SmallCall,
     call_ends_within,
     limits,
@@ -33,7 +30,7 @@ from lavender_ext.small.many import solve_first
 def draw(kind, seed):
     rng = np.random.default_rng(seed)
     if kind == "lcp":
-        return random_lcp(seed, m=int(rng.integers(1, SMALL_ROWS)), rank=None if rng.random() < 0.7 else 3)
+        return random_lcp(seed, m=int(rng.integers(1, 64)), rank=None if rng.random() < 0.7 else 3)
     if kind == "linear":
         g = rng.normal(size=(9, 9))
         a = g @ g.T if rng.random() < 0.6 else g
@@ -152,8 +149,6 @@ def test_the_compiled_gate_is_the_count_of_newton(seed):
     problem = random_general(seed, friction, n=n, compliance=seed > 8, contacts=contacts)
     state = registry.get("newton").load()().prepare(problem)
     cost = newton_cost(state.count, problem.law)
-    each = RATES["sweep cone" if problem.law == "cone" else "entry"]
-    sweeps = (cost - TREE) / (RATES["sweep row"] * problem.m + each * problem.metric.work)
     assert limits(0.0).cost(problem.metric, state.count.work, 1)[0] == pytest.approx(cost, rel=1e-12)
 
     def lets_in(of):
@@ -165,8 +160,6 @@ def test_the_compiled_gate_is_the_count_of_newton(seed):
         assert not lets_in(limits(np.inf, np.inf))
         return
     assert lets_in(limits(np.inf, 1.01 * cost)) and not lets_in(limits(np.inf, 0.99 * cost))
-    assert lets_in(limits(max(1.01 * sweeps, 0.0)))
-    assert sweeps < 0.0 or state.general.soft or not lets_in(limits(0.99 * sweeps))
 
 
 def test_velocities_that_all_meet_are_one_call_as_well():
@@ -226,7 +219,7 @@ def test_islands_are_no_one_call_where_that_may_take_too_long():
     problem = forms(stacks(40, 2, 0.4, False))["matrix"]
     assert registry.get("auto").small.attempt(fresh(problem), None, 1e-6)[0] is not None
     assert not call_ends_within(problem, 1e-6) and call_ends_within(problem, 10.0)
-    pile = stacks(3, 1 + ISLAND // 12, 0.4, False)  # 12 rows for each cube
+    pile = stacks(3, 30, 0.4, False)  # few islands, but large ones
     assert registry.get("auto").small.attempt(pile, None, 1e-6)[0] is None
     assert registry.get("newton").small.attempt(fresh(problem), None, 1e-6)[0] is None
 

@@ -12,14 +12,15 @@ from random_families import drawn, wild
 from random_problems import as_matrix, general, random_general, random_lcp
 
 import lavender as lv
+from benchmarks.core_problems import fresh
 from lavender import registry, suite
 from lavender.base.deadline import Deadline
 from lavender.judge.residuals import reference
 from lavender.solvers import costs
-from lavender.solvers.auto import LAST, LITTLE, MOST, SURE, Tree, solve, tree_goes_on
+from lavender.solvers.auto import Tree, solve, tree_goes_on
 from lavender.solvers.certify import certify
 from lavender.solvers.solve_log import SolveLog
-from lavender.solvers.steps import METHODS, NEAR, Newton, Step, Sweeps
+from lavender.solvers.steps import METHODS, Newton, Step, Sweeps
 
 
 @pytest.fixture(autouse=True)
@@ -94,9 +95,6 @@ def test_the_tail_doubles(name):
     reference(tree.problem)
     stages = list(tree)
     in_turn = stages[next(i for i, stage in enumerate(stages) if stage.why.startswith("in turn")) :]
-    assert tree.begun + MOST * tree.newton + sum(stage.cost for stage in in_turn) <= LAST * max(
-        tree.newton, LITTLE
-    )
     last = {}
     for stage in in_turn[:-1]:  # the last has what is left
         if stage.solver in last:
@@ -199,7 +197,6 @@ def test_newton_under_friction_begins_from_nothing_where_much_is_left(sweeps, fr
     reference(problem)
     log = SolveLog(problem, 1e-13, 10**6)
     log.offer(lv.solve(problem, "anderson", max_iter=sweeps, tol=1e-13).impulse)
-    assert (log.best > NEAR) == from_nothing
     step = Newton("newton", log)
     step.state = Tree(problem).states["newton"]
     step.run(1)
@@ -284,11 +281,12 @@ def test_sweeps_alone_solve_contacts_whose_rows_have_unlike_units(contacts, fric
 def test_what_is_counted_to_take_long_has_no_more_than_that(monkeypatch):
     problem = random_lcp(0, m=80)
     before = lv.explain(problem)
-    monkeypatch.setattr("lavender.solvers.auto.LONG", 0.5 * before.newton)
-    tree = Tree(problem)
-    costs_of = [stage.cost for stage in tree if stage.solver == "newton"]
-    assert costs_of == [pytest.approx(SURE * tree.newton)]
-    assert max(stage.cost for stage in before.stages) == pytest.approx(MOST * before.newton)
+    slow = {name: 1e6 * rate for name, rate in costs.RATES.items() if not isinstance(rate, dict)}
+    slow["work"] = {name: 1e6 * rate for name, rate in costs.RATES["work"].items()}
+    monkeypatch.setattr(costs, "RATES", costs.RATES | slow)
+    after = lv.explain(fresh(problem))
+    most, fewer = (max(stage.cost for stage in plan.stages) / plan.newton for plan in (before, after))
+    assert 1.0 < fewer < 0.5 * most
 
 
 def test_a_certificate_that_costs_more_than_ten_times_newton_comes_after_these():
@@ -302,8 +300,7 @@ def test_a_certificate_that_costs_more_than_ten_times_newton_comes_after_these()
     at = [stage.solver for stage in plan.stages].index("certificate")
     certificate, before = plan.stages[at], plan.stages[at - 1]
     assert before.solver == "newton over rows"  # A is sparse where N over velocities is full
-    assert certificate.cost > MOST * plan.newton
-    assert before.cost == pytest.approx(MOST * plan.newton)
+    assert certificate.cost > before.cost >= 10.0 * plan.newton
 
 
 def test_what_a_turn_of_many_rows_on_few_velocities_cannot_pay_is_left_out_or_comes_last():
@@ -321,7 +318,6 @@ def test_what_a_turn_of_many_rows_on_few_velocities_cannot_pay_is_left_out_or_co
         tree.best = 1.0  # nobody gains
         ran.append(stage.solver)
     assert "admm" not in ran and ran[-2:] == ["newton", "newton over rows"]
-    assert max(MOST * tree.newton, LITTLE) < tree.formed < LAST * tree.newton
 
 
 def test_squeezed_bodies_are_proved_to_have_no_solution_before_all_go_in_turn():
