@@ -1,73 +1,247 @@
-"""The page in a real browser without a window: what it shows is what the native kernels compute."""
+"""The page in a real browser without a window: its numbers are the native kernels', its words those of a file.
+
+`told.json` holds all that the page says at each stop of each tour. Whoever changes that on purpose writes it anew, by
+LAVENDER_TOLD=write, and reads what changed.
+"""
+
+import json
+import os
+from itertools import zip_longest
+from pathlib import Path
 
 import numpy as np
 import pytest
 from newton_steps import NewtonSteps
 
 import lavender as lv
-from lavender.sim.engine import SOLVER_FIELDS
 from lavender.sim.scene import SCENES as SCENES_OF_GALLERY
-from lavender.sim.scene.parts import rotation
-from lavender.sim.web.scenes import EXPERIMENTS, PRESETS
+from lavender.sim.web.scenes import EXPERIMENTS, PRESETS, Side
 
 pytestmark = pytest.mark.slow  # the module is the same whatever checks the native kernels are built with
 
-WHOLE = ("iterations", "warm_start", "contacts", "cache_matches")
+GOLDEN = Path(__file__).with_name("told.json")
+WARM, COLD = Side(16, True, ""), Side(16, False, "")  # in the scene's own order
+TELL = """() => {
+  const all = (selector, within = document) => [...within.querySelectorAll(selector)];
+  const shown = (element) => element.checkVisibility(), text = (element) => element.textContent.trim();
+  const words = (selector) => all(selector).filter(shown).map(text).join(" | ");
+  return {
+    address: location.hash, clock: words("#clock"), note: words("#note"), caption: words("#caption"),
+    failure: words("#failure"), pressed: words("button[aria-pressed=true]"), numbers: words("#numbers tbody tr"),
+    panels: all("[id^=chart-]").filter(shown).map((panel) => panel.id.slice(6)).join(" "),
+    sides: all(".side").map((side) => ({
+      set: all("select, input", side).map((of) => of.type === "checkbox" ? of.checked : of.value).join(" "),
+      sweeps: text(side.querySelector(".sweeps output")), told: text(side.querySelector(".told")),
+      values: all("td[data-field]", side).filter(shown).map((td) => `${td.dataset.field} ${text(td)}`).join(", "),
+    })),
+  };
+}"""
 
 
-def native(scene, steps, **parameters):
+def native(scene, steps, side=WARM, **settings):
     """The eight values of the last of `steps` steps."""
-    simulation = lv.Simulation(lv.Scene(scene, **parameters))
-    for _ in range(steps):
-        observation = simulation.step()[0]
-    return observation["solver"].tolist()
+    settings["warm_start"] = side.warm_start
+    if side.order:
+        settings["order"] = side.order
+    if side.solver == "newton":
+        made = NewtonSteps(scene, **settings)
+        return [made.step().tolist() for _ in range(steps)][-1]
+    simulation = lv.Simulation(lv.Scene(scene, solver_iterations=side.iterations, **settings))
+    return [simulation.step()[0]["solver"].tolist() for _ in range(steps)][-1]
 
 
-def as_shown(values):
-    """How the page writes them: whole numbers and zeros as they are, else six digits."""
-    return [
-        str(int(v)) if field in WHOLE or v == 0 else f"{v:.5e}"
-        for field, v in zip(SOLVER_FIELDS, values, strict=True)
-    ]
+def both(scene, steps, sides=(WARM, COLD)):
+    return [native(scene, steps, side) for side in sides]
 
 
-def readable(text):
-    # JavaScript writes 1.5e-4 where Python writes 1.5e-04.
-    head, e, power = text.partition("e")
-    return f"{head}e{int(power):+03d}" if e else head
+# Tours: generators that lead a visit from stop to stop, and give the native values of both sides there, or None.
 
 
-def test_120_steps_show_the_native_numbers(visit):
-    v = visit("#pyramid")
-    assert v.page.locator("#scene").input_value() == "pyramid"
-    v.page.click("#second")
-    assert v.page.locator("#clock").text_content() == "1.000 s, step 120"
-    for i, warm in enumerate((True, False)):
-        exact, shown = v.values(i)
-        expected = native("pyramid", 120, warm_start=warm)
-        assert exact == expected
-        assert [readable(text) for text in shown] == as_shown(expected)
-
-
-def test_settings_of_each_side_are_the_native_ones(visit):
-    v = visit("#pyramid")
-    v.side(0).locator(".sweeps input").fill("40")
-    v.side(0).locator(".order").select_option(label="top down")
-    v.side(1).locator(".sweeps input").fill("4")
-    v.side(0).locator(".warm input").uncheck()
-    v.side(1).locator(".warm input").check()
-    v.side(1).locator(".order").select_option(label="random")
+def settings(v):
+    yield v.page.click("#second") or both("pyramid", 120)
+    for i, sweeps, order, warm in ((0, "40", "top down", "uncheck"), (1, "4", "random", "check")):
+        v.side(i).locator(".sweeps input").fill(sweeps)
+        v.side(i).locator(".order").select_option(label=order)
+        getattr(v.side(i).locator(".warm input"), warm)()
     v.side(1).locator(".box input").check()
-    assert v.js("location.hash").split("&b=")[1].startswith("4,warm,random,box")
-    assert v.side(0).locator(".sweeps output").text_content() == "40"
     for _ in range(3):
         v.page.click("#step")
+    yield None
     v.page.click("#reset")  # settings stay
     for _ in range(5):
         v.page.click("#step")
-    cold = {"warm_start": False, "order": "top_down", "solver_iterations": 40}
-    assert v.values(0)[0] == native("pyramid", 5, **cold)
-    assert v.values(1)[0] == native("pyramid", 5, order="random", solver_iterations=4, friction_shape="box")
+    a = native("pyramid", 5, Side(40, False, "top_down"))
+    yield a, native("pyramid", 5, Side(4, True, "random"), friction_shape="box")
+
+
+def restore(v):
+    v.page.keyboard.press("p")  # a push, so that there is something to differ
+    v.page.click("#second")
+    v.page.click("#snapshot")
+    v.page.click("#second")
+    first = v.js(TELL)
+    v.side(0).locator(".sweeps input").fill("64")
+    v.side(1).locator(".warm input").check()
+    yield v.page.click("#second")
+    yield v.page.click("#restore")
+    v.page.click("#second")
+    assert v.js(TELL) == first
+
+
+def gallery(v):
+    names = v.js("lavender.contents.scenes.map((scene) => scene.name)")
+    made = {name for name, of in SCENES_OF_GALLERY.items() if of.__module__ == "lavender.sim.scene.gallery"}
+    assert len(names) == len(made) and set(names) == made
+    for name in names:
+        v.page.locator("#scene").select_option(name)
+        v.js("lavender.advance(2)")
+        yield both(name, 2)
+
+
+def joints(v):
+    """Values of joints, which other scenes have not, and panels that give way where they have nothing to show."""
+    yield v.page.click("#second") or both("chain", 120)
+    v.page.select_option("#scene", "stack")
+    yield v.page.click("#second") or both("stack", 120)
+    width = v.js("lavender.charts.contacts.plot.width")
+    assert width == v.js("document.querySelector('#chart-contacts').clientWidth")
+    assert v.page.locator("figure .legend").first.text_content() == "AB"
+
+
+def opening(v):
+    """It opens moving, with two settings that make the point."""
+    assert v.page.locator("#play").get_attribute("aria-pressed") == "true"
+    v.page.wait_for_function("lavender.steps > 3")
+    v.page.keyboard.press(" ")
+    v.page.click("#reset")  # a slow machine is at any step by now
+    v.js("lavender.advance(300)")
+    yield both(PRESETS[0].scene, 300, PRESETS[0].sides)
+    a, b = v.js("lavender.sides.map((side) => side.gap())")
+    assert b > 5.0 * a  # the sentence says that links part
+
+
+def presets(v):
+    for preset in (*PRESETS, *EXPERIMENTS):
+        v.page.get_by_role("button", name=preset.title, exact=True).click()
+        v.page.keyboard.press("Escape")
+        v.js("lavender.play(false)")
+        v.js("lavender.choose(lavender.scene.name)")
+        v.page.wait_for_function("!lavender.waiting")
+        v.js("lavender.advance(30)")
+        yield both(preset.scene, 30, preset.sides)
+
+
+def address(v):
+    """It holds every setting, and is followed."""
+    v.js("lavender.advance(3)")
+    yield both("pyramid", 3, (Side(8, False, "top_down"), Side(40, True, "random")))
+    v.side(0).locator(".sweeps input").fill("12")
+    v.side(1).locator(".warm input").uncheck()
+    yield v.page.locator("#speed").select_option("0.05") and None
+    for to, done in (
+        ("#scene=table&a=5,warm,given&b=6,warm,given&play=0", "lavender.scene.name === 'table'"),
+        ("#no such scene", "lavender.scene.name === 'stack'"),
+        (
+            "#half%",
+            "document.querySelector('#failure').textContent.includes('half%')",
+        ),  # that encodes nothing
+        ("#scene=pyramid&play=0", "lavender.scene.name === 'pyramid'"),
+        ("#scene=stack&a=1000,x,y&b=&play=0", "lavender.scene.name === 'stack'"),  # leaves what was set
+    ):
+        v.js(f"location.hash = {to!r}")
+        v.page.wait_for_function(done)
+        v.js("lavender.play(false)")
+        yield v.page.click("#reset")
+
+
+def fetched(v):
+    """The module of Newton's method is fetched when it is asked for, once."""
+
+    def times():
+        v.page.wait_for_function("!lavender.waiting")
+        return sum(url.endswith("newton.wasm") for url in v.requests)
+
+    assert times() == 0
+    v.side(0).locator(".solver").select_option("newton")
+    assert times() == 1 and v.side(0).locator(".sweeps input").is_disabled()
+    v.side(1).locator(".solver").select_option("newton")
+    v.page.click("#reset")
+    assert times() == 1
+    v.js("lavender.advance(20)")
+    twin = NewtonSteps("bridge")
+    values = [twin.step().tolist() for _ in range(20)][-1]
+    yield values, values
+    short = sum(how == 0 for how in twin.ended)
+    told = v.side(0).locator(".told").text_content()
+    assert told.endswith(f"{short} of {len(twin.ended)} solves short of 1e-6")
+    assert v.js("lavender.charts.energy.data.slice(0, 2)") == twin.trace[:, :2].T.tolist()
+    v.side(1).locator(".solver").select_option("sweeps")
+    v.page.click("#reset")
+    v.js("lavender.advance(2)")
+    yield both("bridge", 2, (Side(16, True, "given", "newton"), Side(16, True)))
+
+
+def disturbed(v):
+    """Numbers of an experiment are of an undisturbed run."""
+    v.js("lavender.play(false)")
+    v.page.click("#reset")
+    v.js("lavender.advance(30)")
+    v.page.click("#push")
+    yield v.js("lavender.advance(300)")
+    first, *later = v.js("lavender.seen")
+    assert first is not None and later == [None, None]
+    v.page.click("#reset")
+    yield v.js("lavender.advance(240)")
+    assert None not in v.js("lavender.seen")
+    yield v.page.select_option("#scene", "pyramid") and None
+
+
+TOURS = {
+    "#pyramid": settings, "#stack": restore, "#stack&gallery": gallery, "#chain": joints, "": opening, "#": presets,
+    "#scene=pyramid&a=8,cold,top_down&b=40,warm,random&speed=0.25&play=0": address,
+    "#scene=bridge&a=16,warm,given&b=16,warm,given&play=0": fetched, "#experiment=4": disturbed,
+}  # fmt: skip
+
+
+def compare_told(name, told):
+    golden = json.loads(GOLDEN.read_text()) if GOLDEN.exists() else {}
+    if os.environ.get("LAVENDER_TOLD") == "write":
+        golden[name] = told
+        stops = {k: ",\n".join(json.dumps(x, ensure_ascii=False) for x in golden[k]) for k in sorted(golden)}
+        GOLDEN.write_text("{" + ",\n".join(f'"{k}": [\n{x}]' for k, x in stops.items()) + "}\n")
+    for stop, (now, before) in enumerate(zip_longest(told, golden[name])):
+        assert now == before, (name, stop)
+
+
+@pytest.mark.parametrize("start", TOURS)
+def test_a_tour_shows_the_native_numbers_and_says_what_it_said(visit, start):
+    tour, told = TOURS[start], []
+    v = visit("#stack" if start == "#stack&gallery" else "#stack" if start == "#" else start)
+    for expected in tour(v):
+        if expected is not None:
+            assert [v.values(i)[0] for i in (0, 1)] == list(expected)
+        told.append(v.js(TELL))
+    compare_told(tour.__name__, told)
+
+
+@pytest.mark.parametrize(
+    ("preset", "phone"),
+    [
+        *((preset, {}) for preset in EXPERIMENTS),
+        (EXPERIMENTS[0], {"viewport": {"width": 390, "height": 844}}),
+    ],
+)
+def test_an_experiment_opens_by_its_link_and_tells_its_numbers(visit, preset, phone):
+    v = visit("#" + preset.name, **phone)
+    v.js("lavender.play(false)")
+    v.page.click("#reset")
+    v.page.wait_for_function("!lavender.waiting")
+    v.js("lavender.advance(240)")
+    assert [v.values(i)[0] for i in (0, 1)] == both(preset.scene, 240, preset.sides)
+    compare_told(preset.name, [v.js(TELL)])
+    assert v.js("document.documentElement.scrollWidth <= innerWidth")
+    pressed = v.page.locator("#experiments button[aria-pressed=true]").bounding_box()
+    assert 0 <= pressed["x"] < pressed["x"] + pressed["width"] <= v.js("innerWidth")
 
 
 def test_plots_hold_the_native_errors(visit):
@@ -108,32 +282,13 @@ def test_a_run_of_its_own_shows_one_step_when_it_pauses(visit):
     steps = v.js("lavender.steps")
     assert 0 < v.js("window.watched") < steps
     assert v.page.locator("#clock").text_content() == f"{steps / 120:.3f} s, step {steps}"
-    for i, warm in enumerate((True, False)):
-        assert v.values(i)[0] == native("stack", steps, warm_start=warm)
+    for i, side in enumerate((WARM, COLD)):
+        assert v.values(i)[0] == native("stack", steps, side)
     shown = v.js("lavender.charts.energy.data")
     again = visit()
     again.js(f"lavender.advance({steps})")
     assert again.js("lavender.charts.energy.data") == shown
     assert v.js("lavender.charts.residual.data[0].length") == steps
-
-
-def test_restore_leads_back(visit):
-    v = visit()
-    v.page.keyboard.press("p")  # a push, so that there is something to differ
-    v.page.click("#second")
-    v.page.click("#snapshot")
-    v.page.click("#second")
-    first = [v.values(i)[0] for i in (0, 1)]
-    v.side(0).locator(".sweeps input").fill("64")
-    v.side(1).locator(".warm input").check()
-    v.page.click("#second")
-    assert [v.values(i)[0] for i in (0, 1)] != first
-    v.page.click("#restore")
-    assert v.page.locator("#clock").text_content() == "1.000 s, step 120"
-    assert v.side(0).locator(".sweeps input").input_value() == "16"
-    assert not v.side(1).locator(".warm input").is_checked()
-    v.page.click("#second")
-    assert [v.values(i)[0] for i in (0, 1)] == first
 
 
 def test_keyboard_does_everything(visit):
@@ -213,197 +368,9 @@ def test_a_lost_state_is_named(visit):
     assert v.page.locator("#failure").is_hidden()
 
 
-def test_it_opens_moving_with_two_settings_that_make_the_point(visit):
-    v = visit("")
-    _, title, scene, (one, two), note, _ = PRESETS[0]
-    assert v.page.locator("#scene").input_value() == scene
-    assert v.page.locator("#note").text_content() == note
-    assert v.page.locator("#play").get_attribute("aria-pressed") == "true"
-    assert v.page.locator("#presets button[aria-pressed=true]").text_content() == title
-    assert v.side(0).locator(".warm input").is_checked() == one.warm_start
-    assert v.side(1).locator(".warm input").is_checked() == two.warm_start
-    v.page.wait_for_function("lavender.steps > 3")
-    v.page.keyboard.press(" ")
-    v.page.click("#reset")  # a slow machine is at any step by now
-    v.js("lavender.advance(300)")
-    gaps = v.js("lavender.sides.map((side) => side.gap())")
-    assert gaps == [
-        pytest.approx(native_gap(scene, 300, s.iterations, s.warm_start), rel=1e-9) for s in (one, two)
-    ]
-    assert gaps[1] > 5.0 * gaps[0]  # the sentence says that links part
-    caption = v.page.locator("#caption").text_content()
-    assert caption == "A's joints are open by {}, B's by {}".format(*(said(v, x) for x in gaps))
-
-
-def test_joints_have_values_too(visit):
-    v = visit("#chain")
-    v.page.click("#second")
-    for i, warm in enumerate((True, False)):
-        simulation = lv.Simulation(lv.Scene("chain", warm_start=warm))
-        for _ in range(120):
-            observation = simulation.step()[0]
-        impulse, opened = (
-            float(v.side(i).locator(f"td[data-field='{name}']").get_attribute("data-value"))
-            for name in ("joint impulse", "joints open")
-        )
-        assert impulse == np.abs(observation["joint_impulses"]).max() > 0.0
-        assert opened == pytest.approx(native_gap("chain", 120, simulation.solver_iterations, warm), rel=1e-9)
-    v.page.select_option("#scene", "stack")
-    assert v.side(0).locator("td[data-field='joints open']").is_hidden()
-
-
-def said(v, x):
-    return v.js(f"import('./app.js').then((module) => module.length({x!r}))")
-
-
-def native_gap(scene, steps, iterations, warm_start):
-    """Largest distance between the ends of a ball joint after some steps."""
-    simulation = lv.Simulation(lv.Scene(scene, solver_iterations=iterations, warm_start=warm_start))
-    for _ in range(steps):
-        observation = simulation.step()[0]
-    most = 0.0
-    for joint in simulation.scene.joints:
-        ends = []
-        for body, local in ((joint.a, joint.anchor_a), (joint.b, joint.anchor_b)):
-            turn = np.eye(3) if body < 0 else rotation(observation["quaternions"][body])
-            ends.append(turn @ local + (0.0 if body < 0 else observation["positions"][body]))
-        most = max(most, float(np.linalg.norm(ends[1] - ends[0])))
-    return most
-
-
 def test_reduced_motion_opens_at_rest(visit):
     v = visit("", reduced_motion="reduce")
     assert v.page.locator("#play").get_attribute("aria-pressed") == "false"
-
-
-@pytest.mark.parametrize("preset", PRESETS, ids=lambda preset: preset[0])
-def test_presets_set_everything_and_are_part_of_the_address(visit, preset):
-    _, title, scene, sides, note, _ = preset
-    v = visit()
-    v.page.get_by_role("button", name=title, exact=True).click()
-    v.page.keyboard.press("Escape")
-    v.js("lavender.play(false)")
-    v.js("lavender.choose(lavender.scene.name)")
-    assert v.page.locator("#scene").input_value() == scene
-    assert v.page.locator("#note").text_content() == note
-    v.page.wait_for_function("!lavender.waiting")
-    v.js("lavender.advance(30)")
-    displaced = v.js("lavender.sides.map((side) => side.displacement())")
-    for i, side in enumerate(sides):
-        values, moved = run(scene, 30, **side._asdict())
-        assert v.values(i)[0] == values
-        assert displaced[i] == pytest.approx(moved, abs=1e-12)
-
-
-def medians(number, side):
-    """Of the native engine, the median that a line of an experiment shows."""
-    settings = {"warm_start": side.warm_start, "order": side.order}
-    if side.solver == "newton":
-        steps_of = NewtonSteps("stack", **settings)
-        values = [steps_of.step() for _ in range(number.last)]
-    else:
-        settings["solver_iterations"] = side.iterations
-        if number.last == 0:
-            one_solve = lv.Simulation(lv.Scene("stack", dt=1 / 240, substeps=1, **settings))
-            return one_solve.step()[0]["solver"][SOLVER_FIELDS.index(number.field)]
-        simulation = lv.Simulation(lv.Scene("stack", **settings))
-        values = [simulation.step()[0]["solver"] for _ in range(number.last)]
-    return np.median(np.array(values)[number.first :, SOLVER_FIELDS.index(number.field)])
-
-
-@pytest.mark.parametrize(
-    ("preset", "phone"),
-    [
-        *((preset, {}) for preset in EXPERIMENTS),
-        (EXPERIMENTS[0], {"viewport": {"width": 390, "height": 844}}),
-    ],
-)
-def test_an_experiment_opens_by_its_link_and_tells_its_numbers(visit, preset, phone):
-    v = visit("#" + preset.name, **phone)
-    assert v.page.locator("#experiments button[aria-pressed=true]").text_content() == preset.title
-    assert v.page.locator("#note").text_content() == preset.note
-    v.js("lavender.play(false)")
-    v.page.click("#reset")
-    v.page.wait_for_function("!lavender.waiting")
-    assert v.page.locator("#numbers").is_visible()
-    v.js("lavender.advance(240)")
-    lines = v.page.locator("#numbers tbody tr").all()
-    assert len(lines) == len(preset.numbers) > 0
-    for line, number, seen in zip(lines, preset.numbers, v.js("lavender.seen"), strict=True):
-        a, b = (medians(number, side) for side in preset.sides)
-        assert [seen["a"], seen["b"]] == [a, b]
-        assert number.text in line.text_content()
-        if number.over:
-            ratio = a / b if number.over == "AB" else b / a
-            shown = float(line.text_content().rsplit("= ")[1])
-            assert shown == pytest.approx(ratio, rel=6e-3 if ratio < 1000 else 0.5)  # three digits, or one
-    assert v.js("document.documentElement.scrollWidth <= innerWidth")
-    pressed = v.page.locator("#experiments button[aria-pressed=true]").bounding_box()
-    assert 0 <= pressed["x"] < pressed["x"] + pressed["width"] <= v.js("innerWidth")
-
-
-def test_numbers_of_an_experiment_are_of_an_undisturbed_run(visit):
-    v = visit("#experiment=4")
-    v.js("lavender.play(false)")
-    v.page.click("#reset")
-    v.js("lavender.advance(30)")
-    v.page.click("#push")
-    v.js("lavender.advance(300)")
-    first, *later = v.js("lavender.seen")
-    assert first is not None and later == [None, None]
-    v.page.click("#reset")
-    v.js("lavender.advance(240)")
-    assert None not in v.js("lavender.seen")
-    v.page.select_option("#scene", "pyramid")
-    assert v.page.locator("#numbers").is_hidden()
-
-
-def run(scene, steps, iterations, solver="sweeps", **settings):
-    """The eight values of the last step, and how far a body is from its start at most: sideways, and below it."""
-    if solver == "newton":
-        steps_of = NewtonSteps(scene, **settings)
-        simulation = steps_of.simulation
-        for _ in range(steps):
-            values = steps_of.step().tolist()
-        positions = steps_of.state.a["x"].reshape(-1, 3)
-    else:
-        settings.setdefault("order", "given")
-        simulation = lv.Simulation(lv.Scene(scene, solver_iterations=iterations, **settings))
-        for _ in range(steps):
-            observation = simulation.step()[0]
-        values, positions = observation["solver"].tolist(), observation["positions"]
-    moved = positions - np.array([body.position for body in simulation.scene.bodies])
-    return values, [float(np.hypot(*moved[:, :2].T).max()), float(max(-moved[:, 2].min(), 0.0))]
-
-
-def test_the_module_of_newton_is_fetched_when_it_is_asked_for(visit):
-    v = visit("#scene=bridge&a=16,warm,given&b=16,warm,given&play=0")
-    assert not any(url.endswith("newton.wasm") for url in v.requests)
-    v.side(0).locator(".solver").select_option("newton")
-    v.page.wait_for_function("!lavender.waiting")
-    assert sum(url.endswith("newton.wasm") for url in v.requests) == 1
-    assert v.side(0).locator(".sweeps input").is_disabled()
-    v.side(1).locator(".solver").select_option("newton")
-    v.page.click("#reset")
-    v.page.wait_for_function("!lavender.waiting")
-    assert sum(url.endswith("newton.wasm") for url in v.requests) == 1
-    assert (
-        v.js("location.hash") == "#scene=bridge&a=16,warm,given,newton&b=16,warm,given,newton&speed=1&play=0"
-    )
-    v.js("lavender.advance(20)")
-    twin = NewtonSteps("bridge")
-    for _ in range(20):
-        values = twin.step().tolist()
-    assert v.values(0)[0] == v.values(1)[0] == values
-    short = sum(how == 0 for how in twin.ended)
-    told = v.side(0).locator(".told").text_content()
-    assert told.endswith(f"{short} of {len(twin.ended)} solves short of 1e-6")
-    assert v.js("lavender.charts.energy.data[0]") == twin.trace[:, 0].tolist()
-    assert v.js("lavender.charts.energy.data[1]") == twin.trace[:, 1].tolist()
-    v.side(1).locator(".solver").select_option("sweeps")
-    v.page.click("#reset")
-    v.js("lavender.advance(2)")
-    assert v.values(1)[0] == native("bridge", 2)
 
 
 def test_without_the_module_of_newton_both_sides_sweep(new_page, address):
@@ -414,47 +381,6 @@ def test_without_the_module_of_newton_both_sides_sweep(new_page, address):
     assert "could not be loaded" in page.locator("#failure").text_content()
     assert page.locator(".solver").first.input_value() == "sweeps"
     page.wait_for_function("lavender.steps > 3")
-
-
-def test_the_address_holds_every_setting_and_is_followed(visit):
-    v = visit("#scene=pyramid&a=8,cold,top_down&b=40,warm,random&speed=0.25&play=0")
-    assert v.page.locator("#scene").input_value() == "pyramid"
-    assert v.page.locator("#speed").input_value() == "0.25"
-    v.js("lavender.advance(3)")
-    assert v.values(0)[0] == native("pyramid", 3, solver_iterations=8, warm_start=False, order="top_down")
-    assert v.values(1)[0] == native("pyramid", 3, solver_iterations=40, order="random")
-    v.side(0).locator(".sweeps input").fill("12")
-    v.side(1).locator(".warm input").uncheck()
-    v.page.locator("#speed").select_option("0.05")
-    assert v.js("location.hash") == "#scene=pyramid&a=12,cold,top_down&b=40,cold,random&speed=0.05&play=0"
-    v.js("location.hash = '#scene=table&a=5,warm,given&b=6,warm,given&play=1'")
-    v.page.wait_for_function("lavender.scene.name === 'table' && lavender.playing")
-    assert v.side(0).locator(".sweeps output").text_content() == "5"
-    v.js("location.hash = '#no such scene'")
-    v.page.wait_for_function("lavender.scene.name === 'stack'")
-    assert v.page.text_content("#failure") == 'There is no scene "no such scene": this is stack.'
-    v.js("location.hash = '#half%'")  # that encodes nothing
-    v.page.wait_for_function("document.querySelector('#failure').textContent.includes('half%')")
-    v.js("location.hash = '#pyramid'")
-    v.page.wait_for_function("lavender.scene.name === 'pyramid'")
-    assert v.page.locator("#failure").is_hidden()
-    v.js("location.hash = '#scene=stack&a=1000,x,y&b='")  # senseless values leave what was set
-    v.page.wait_for_function("!lavender.playing")
-    assert v.side(0).locator(".sweeps output").text_content() == "5"
-
-
-def test_every_scene_of_the_gallery_runs_and_is_captioned(visit):
-    v = visit()
-    names = v.js("lavender.contents.scenes.map((scene) => scene.name)")
-    gallery = (
-        name for name, build in SCENES_OF_GALLERY.items() if build.__module__ == "lavender.sim.scene.gallery"
-    )
-    assert sorted(names) == sorted(gallery)
-    for name in names:
-        v.page.locator("#scene").select_option(name)
-        v.js("lavender.advance(2)")
-        assert v.values(0)[0] == native(name, 2)
-        assert v.page.locator("#caption").text_content() != ""
 
 
 def test_a_body_can_be_pulled_at_and_both_sides_are_pulled_alike(visit):
@@ -480,19 +406,6 @@ def test_a_body_can_be_pulled_at_and_both_sides_are_pulled_alike(visit):
     v.page.mouse.move(box["x"] + 40, box["y"] + 8)
     v.page.mouse.up()
     assert v.js("lavender.sides[1].view.turn") != turn
-
-
-def test_panels_with_nothing_to_show_give_way(visit):
-    v = visit("#chain")
-    v.page.click("#second")
-    hidden = {name: v.page.locator(f"#chart-{name}").is_hidden() for name in ("energy", "normal", "contacts")}
-    assert hidden == {"energy": False, "normal": True, "contacts": True}
-    v.page.locator("#scene").select_option("stack")
-    v.page.click("#second")
-    assert v.page.locator("#chart-contacts").is_visible()
-    width = v.js("lavender.charts.contacts.plot.width")
-    assert width == v.js("document.querySelector('#chart-contacts').clientWidth")
-    assert v.page.locator("figure .legend").first.text_content() == "AB"
 
 
 def test_a_run_is_shown_live_and_again(visit):

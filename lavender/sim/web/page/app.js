@@ -335,6 +335,7 @@ class App {
     }
     [this.steps, this.seed] = this.keptSteps;
     this.sides.forEach((side) => side.restore());
+    this.write();
     find("failure").hidden = true;
     this.show(true);
   }
