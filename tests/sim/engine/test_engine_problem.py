@@ -3,10 +3,10 @@
 import hashlib
 import re
 from dataclasses import replace
-from itertools import product
 
 import numpy as np
 import pytest
+from test_engine_bits import SCENES
 from worked import after
 
 import lavender as lv
@@ -16,18 +16,6 @@ from lavender.sim.engine.layout import HEAD
 from lavender.sim.engine.snapshot import MAGIC
 from lavender.sim.scene.scene import SCENE_ORDERS
 from lavender.sim.scene.steppers import STEPPERS
-
-SCENES = {
-    "stack": {},
-    "pyramid": {"base": 4, "friction_shape": "box"},
-    "chain": {"n": 8},
-    "spinner": {},
-    "ramp": {"rolling_radius": 0.01},
-    "four_bar": {"motor": 1.0},
-    "bridge": {"n": 6},
-    "pile": {"n": 20, "kind": "mixed", "rolling_radius": 0.03, "patch_radius": 0.05},
-    "card_house": {},
-}
 
 
 def reported(observation, problem):
@@ -97,61 +85,7 @@ def test_budget_and_mode_take_effect_at_the_next_step():
     assert sim.step()[0]["solver"][[0, 1, 3]].tolist() == [33, 1, 24]
 
 
-# -- the same bits -------------------------------------------------------------------------------
-
-
-def trajectory(sim, steps):
-    out = []
-    for _ in range(steps):
-        o = sim.step()[0]
-        out += [
-            o["positions"],
-            o["quaternions"],
-            o["velocities"],
-            o["joint_impulses"],
-            o["solver"],
-            *o["contacts"].values(),
-        ]
-    return out
-
-
-def assert_same(a, b):
-    assert len(a) == len(b)
-    for x, y in zip(a, b, strict=True):
-        np.testing.assert_array_equal(x, y)
-
-
-@pytest.mark.parametrize(
-    ("name", "stepper"),
-    [*product(SCENES, ["impulses"]), *product(["card_house", "bridge"], list(STEPPERS)[1:])],
-)
-def test_repeat_runs_and_restored_runs_have_the_same_bits(name, stepper, tmp_path):
-    order = {"order": "random"} if stepper == "impulses" else {}
-    scene = lv.Scene(name, stepper=stepper, seed=3, **order, **SCENES[name])
-    sim = after(15, scene)
-    sim.set_solver_iterations(7)
-    sim.set_warm_start(name != "stack")
-    state = sim.snapshot()
-    sim.save(tmp_path / "state")
-    expected = trajectory(sim, 20)
-    sim.restore(state)
-    assert_same(trajectory(sim, 20), expected)
-    other = lv.Simulation(scene)
-    other.load(tmp_path / "state")
-    assert (other.solver_iterations, other.warm_start, other.steps) == (7, name != "stack", 15)
-    assert_same(trajectory(other, 20), expected)
-    assert_same(trajectory(lv.Simulation(scene), 5), trajectory(lv.Simulation(scene), 5))
-
-
-def test_reset_starts_again_and_a_seed_builds_the_scene_anew():
-    sim = lv.Simulation(lv.Scene("pile", n=10, seed=1))
-    first = sim.reset()[0]["positions"]
-    trajectory(sim, 5)
-    observation, info = sim.reset()
-    np.testing.assert_array_equal(observation["positions"], first)
-    assert info["step"] == 0
-    assert not np.array_equal(sim.reset(seed=2)[0]["positions"], first)
-    np.testing.assert_array_equal(sim.reset(seed=1)[0]["positions"], first)
+# -- snapshots -----------------------------------------------------------------------------------
 
 
 def test_foreign_and_damaged_snapshots_are_refused(tmp_path):
@@ -200,46 +134,6 @@ def test_foreign_and_damaged_snapshots_are_refused(tmp_path):
     one = after(2, alone)
     one.save(path)
     one.load(path)
-
-
-def test_substeps_are_steps_of_a_fraction():
-    one = lv.Simulation(lv.Scene("stack", n=3, dt=0.01, substeps=2))
-    two = lv.Simulation(lv.Scene("stack", n=3, dt=0.005, substeps=1))
-    for _ in range(30):
-        two.step()
-        assert_same(trajectory(one, 1), trajectory(two, 1))
-    assert one.time == pytest.approx(two.time, rel=1e-15)
-
-
-def with_room(state, pairs, contacts):
-    """The same state in arrays of so much room."""
-    size = state.size.copy()
-    size[8:10] = pairs, contacts
-    tight = type(state)(size)
-    for name, array in state.a.items():
-        goal = tight.a[name]
-        goal[...] = array[tuple(slice(n) for n in goal.shape)]
-    return tight
-
-
-def test_arrays_grow_without_changing_the_trajectory():
-    scene = lv.Scene("pile", n=60, kind="boxes")
-    sim, tight = lv.Simulation(scene), lv.Simulation(scene)
-    tight.state = with_room(tight.state, 3, 3)
-    for _ in range(80):
-        a, b = sim.step()[0], tight.step()[0]
-        np.testing.assert_array_equal(a["positions"], b["positions"])
-    assert tight.state.size[9] >= a["solver"][2] > 3
-
-
-def test_what_lacks_room_says_so_before_any_state_has_changed():
-    sim = lv.Simulation("stack")
-    state = with_room(sim.state, sim.state.size[8], 5)
-    before = {k: state.a[k].copy() for k in ("x", "q", "v", "cache_key", "cache_impulse", "joint_impulse")}
-    assert state.kernel.substeps(3) == (1, 0)
-    assert state.head[HEAD["need_contacts"]] == 24
-    for key, value in before.items():
-        np.testing.assert_array_equal(state.a[key], value)
 
 
 # -- other solvers ---------------------------------------------------------------------------------

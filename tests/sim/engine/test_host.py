@@ -8,11 +8,6 @@ import lavender as lv
 from lavender.sim.engine.layout import SETTING
 from lavender.sim.engine.state import State
 from lavender_ext.engine.arrays import SHAPES, offsets
-from lavender_ext.host import memory
-
-
-def buffers(state):
-    return state.size, state.real, state.index, state.keys
 
 
 @pytest.mark.parametrize("name", ["stack", "chain", "spinner", "pile", "four_bar"])
@@ -33,21 +28,6 @@ def test_arrays_lie_where_the_engine_has_them(name):
                     assert view.ctypes.data == total[buffer][start:].ctypes.data, n
     named = {n for names in SHAPES.values() for n in names}
     assert set(state.a) <= named
-
-
-@pytest.mark.parametrize("more", [{}, {"rolling_radius": 0.01}], ids=["slides", "rolls"])
-def test_moving_while_running_keeps_the_motion(more):
-    simulation, twin = (after(60, "pile", n=40, kind="mixed", **more) for _ in range(2))
-    state = simulation.state
-    size = state.size.copy()
-    size[8:] += 100
-    moved = State(size)
-    memory.move(*buffers(state), *buffers(moved))
-    simulation.state = moved
-    for _ in range(30):
-        a, b = simulation.step()[0], twin.step()[0]
-        assert a["positions"].tobytes() == b["positions"].tobytes()
-        assert a["solver"].tobytes() == b["solver"].tobytes()
 
 
 @pytest.mark.parametrize("name", ["stack", "chain", "bridge", "pile"])

@@ -1,8 +1,6 @@
 """Scenes: what they are made of, what they refuse, and the gallery."""
 
-import copy
 import math
-import pickle
 
 import numpy as np
 import pytest
@@ -282,21 +280,6 @@ def test_what_is_added_to_a_scene_is_in_its_copies_and_not_in_the_simulations_be
     assert len(lv.Simulation(scene, stepper="soft_step").step()[0]["positions"]) == 4
     with pytest.raises(lv.InputError, match="by number"):
         changed.with_parameters(n=5)
-
-
-@pytest.mark.parametrize("copied", [copy.copy, copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))])
-def test_a_copy_of_a_simulation_goes_on_alone(copied):
-    sim, twin = lv.Simulation("stack"), lv.Simulation("stack")
-    for _ in range(5):
-        sim.step(), twin.step()
-    other = copied(sim)
-    for _ in range(3):
-        last = other.step()[0]
-    for _ in range(3):
-        mine, right = sim.step()[0], twin.step()[0]
-    assert (other.steps, sim.steps) == (8, 8)
-    np.testing.assert_array_equal(mine["positions"], right["positions"])
-    np.testing.assert_array_equal(last["positions"], right["positions"])
 
 
 def test_a_builder_registers_itself_and_is_a_scene_like_those_of_the_gallery(monkeypatch):
