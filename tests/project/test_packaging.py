@@ -205,14 +205,6 @@ def test_the_chapter_s_commands_are_found_in_its_own_text():
     assert len(commands) > 35 and len(set(commands)) == len(commands)
 
 
-def test_readme_python_runs(capsys):
-    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL)
-    assert blocks
-    for block in blocks:
-        exec(compile(block, "README.md", "exec"), {})
-    assert capsys.readouterr().out
-
-
 def test_debug_build_differs_in_checks_alone():
     from lavender_ext.build_options import COMPILE_FLAGS, directives
 
