@@ -76,10 +76,7 @@ def test_no_python_header_and_nothing_but_sqrt_and_moves_of_memory(folder, share
 )
 def test_what_computes_otherwise_does_not_compile_and_says_why(folder, compiler, flag, sign):
     done = subprocess.run(
-        [compiler, flag, "-fsyntax-only", folder / "lavender.c"],
-        capture_output=True,
-        text=True,
-        check=False,
+        [compiler, flag, "-fsyntax-only", folder / "lavender.c"], capture_output=True, text=True, check=False
     )
     assert done.returncode and sign in done.stderr
 

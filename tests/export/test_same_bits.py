@@ -396,10 +396,7 @@ def test_a_motion_beside_which_compliance_stores_much_more_is_measured(library):
     given = lv.Problem.from_rows(rows, compliance=[1.0])
     solver = library.open(library.problem(given), library.options("sequential_impulses"))
     impulse, reference = np.array([2.0]), np.array([1.0])
-    found, wanted = (
-        motion(library, solver, impulse, reference),
-        lv.motion_error(given, impulse, reference),
-    )
+    found, wanted = (motion(library, solver, impulse, reference), lv.motion_error(given, impulse, reference))
     assert found.kinetic == pytest.approx(wanted.kinetic, rel=1e-12) and wanted.kinetic > 0.0
     assert found.relative == pytest.approx(1.0, rel=1e-12)
     found = motion(library, solver, np.array([1e200]), np.array([1.0]))  # whose energy float64 does not hold

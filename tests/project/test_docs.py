@@ -68,7 +68,9 @@ def files(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
 
 
-@pytest.mark.parametrize("page", [page for page in PAGES if page.stem != "chapter"], ids=lambda page: page.name)
+@pytest.mark.parametrize(
+    "page", [page for page in PAGES if page.stem != "chapter"], ids=lambda page: page.name
+)
 def test_python_of_a_page_runs(page, files, capsys):
     whole = "".join(text for *_, text in blocks(page, "python", "pycon"))
     if ".hdf5" in whole:

@@ -3,12 +3,7 @@
 import numpy as np
 import pytest
 from hypothesis import given, settings
-from random_problems import (
-    FORMS,
-    as_matrix,
-    random_contact_problem,
-    seeds,
-)
+from random_problems import FORMS, as_matrix, random_contact_problem, seeds
 
 import lavender as lv
 from lavender.solvers.islands import islands, restrict, rows_of

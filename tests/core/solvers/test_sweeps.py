@@ -111,21 +111,6 @@ def test_the_damping_is_the_same_in_every_unit(seed):
     assert serial.damping(other.csr_data) == pytest.approx(serial.damping(problem.csr_data), rel=1e-12)
 
 
-@pytest.mark.parametrize("name", ["gauss_seidel", "sor", "jacobi", "pgs"])
-@pytest.mark.parametrize(
-    ("a", "words"),
-    [
-        ([[0.0, 1.0], [1.0, 2.0]], "row 0 has a zero diagonal"),
-        ([[2.0, 3.0], [3.0, -1.0]], "row 1 has a negative diagonal, -1"),
-        ([[1.0, 3.0], [3.0, 1.0]], "the residual grew instead of falling"),  # without such an entry
-    ],
-)
-def test_divergence_names_the_diagonal_entry_that_no_sweep_can_divide_by(name, a, words):
-    solution = lv.solve(lv.Problem.linear(a, [1.0, -1.0]), name)
-    assert solution.status is lv.Status.DIVERGED
-    assert solution.message.startswith(words)
-
-
 @pytest.mark.parametrize("name", lv.available(order=True))
 def test_the_order_of_a_sweep_is_in_the_solution_and_its_text(name):
     problem = random_contact_problem(1, tangents=2, spin=False)

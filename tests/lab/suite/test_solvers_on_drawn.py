@@ -2,11 +2,10 @@
 
 import re
 from dataclasses import replace
-from unittest import mock
 
 import numpy as np
 import pytest
-from calls import REACHED, check, driven, facts
+from calls import REACHED, check, driven
 from random_families import drawn, wild
 from random_problems import as_matrix, good
 
@@ -14,21 +13,11 @@ import lavender as lv
 from lavender import registry
 from lavender.problem.rows import Rows
 from lavender.solvers.certify import certify
-from lavender.solvers.newton_systems import general, systems
+from lavender.solvers.newton_systems import general
 from lavender.solvers.newton_systems.systems import make_system
 from lavender.solvers.small import AUTO, FAILED_CALL_KEY
 from lavender.solvers.solve_log import SolveLog
 from lavender_ext.small.many import solve_first
-
-
-@pytest.mark.parametrize("limit", [None, 60.0])
-def test_many_islands_are_not_cut_between_two_looks_at_the_clock(limit, monkeypatch):
-    problem = wild(seed=5192).problem  # 152 islands
-    cut = lv.solve(problem, "newton", time_limit=limit, tol=1e-9)
-    assert cut.success and cut.iterations > general.CLOCK
-    monkeypatch.setattr(general, "CLOCK", 10**6)
-    whole = lv.solve(problem, "newton", time_limit=60.0, tol=1e-9)
-    assert whole.work == cut.work and np.array_equal(whole.impulse, cut.impulse)
 
 
 def test_under_a_limit_nothing_long_is_begun_in_setting_up():
@@ -129,23 +118,14 @@ def test_many_bodies_on_one_leave_half_of_the_rows():
     # 26 % of A is nonzero; of 228 rows, half of them of bodies that touch nothing else, elimination leaves a quarter of
     # the entries of a full factor and an eighth of its work. Bounded rows as full as that stay full.
     bounded = wild(seed=7566).problem
-    assert bounded.law == "lcp" and bounded.csr.nnz / bounded.m**2 < systems.DENSE_FILL
-    assert make_system(bounded, "impulse").dense
+    assert bounded.law == "lcp" and make_system(bounded, "impulse").dense
     problem = wild(seed=7012).problem
     assert problem.matrix is not None
-    assert systems.EARLY_FILL < problem.csr.nnz / problem.m**2 < systems.DENSE_FILL
     system = make_system(problem, "impulse")
     assert not system.dense
     assert system.work < 0.2 * problem.m**3 / 3.0
     sparse_one = lv.solve(problem, "newton", tol=1e-9)
-    with mock.patch.multiple(systems, DENSE_FILL=0.25):
-        assert make_system(problem, "impulse").dense
-        full = lv.solve(problem, "newton", tol=1e-9)
-    assert sparse_one.success
-    assert full.success
-    np.testing.assert_allclose(
-        problem.csr @ sparse_one.impulse, problem.csr @ full.impulse, atol=1e-6 * np.abs(problem.b).max()
-    )
+    assert good(sparse_one, 1e-9)
 
 
 @pytest.mark.parametrize(
@@ -225,10 +205,6 @@ def test_what_newton_leaves_of_few_velocities_goes_on_the_same_way_everywhere(se
     assert short.success and "newton" in short.message
     told = sum(int(count) for count in re.findall(r"(\d+) sweeps", short.message))
     assert told == short.work.get("sweeps", 0), "sweeps that go on are counted once"
-    (together,) = lv.solve_many([replace(problem, copy=False)])
-    assert facts(together) == facts(short)
-    limited = lv.solve(replace(problem, copy=False), time_limit=10.0)
-    assert facts(limited) == facts(short), "a limit chooses nothing"
 
 
 @pytest.mark.parametrize("seed", [1224])  # of 48 rows, where newton is stuck
