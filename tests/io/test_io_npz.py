@@ -72,7 +72,7 @@ def test_a_saved_problem_is_the_same_problem(tmp_path, problem):
 
 
 @given(seeds)
-@settings(max_examples=5)
+@settings(max_examples=2)
 def test_every_kind_of_block_comes_back_in_every_form(tmp_path_factory, seed):
     path = tmp_path_factory.mktemp("npz") / "p.npz"
     bodies = [given_by(make(seed)) for make in CONTACTS.values() for given_by in FORMS.values()]

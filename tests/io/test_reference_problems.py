@@ -108,5 +108,5 @@ def test_piles_that_creep_are_solved_along_a_path_through_its_folds(step, proble
     solution = lv.solve(problem, "newton", tol=1e-6)
     assert good(solution, 1e-6) and "path steps" in solution.message, solution
     with newton_without("path"):
-        other = lv.solve(problem, "newton", tol=1e-6)
-    assert not good(other, 1e-6) or other.work["factorisations"] > 1000, other
+        other = lv.solve(problem, "newton", tol=1e-6, max_iter=1000)
+    assert not good(other, 1e-6), other

@@ -167,9 +167,7 @@ def test_the_rank_of_a_large_island_is_that_of_its_eigenvalues(n):
     assert not ((values > 1e-13) & (values < 1e-7)).any()  # zeros are roundings, all others far above
     assert found.rank == np.count_nonzero(values > 1e-7)
     kept = np.delete(np.arange(a.shape[0]), found.rows)
-    assert (
-        np.linalg.eigvalsh((unit @ a @ unit).toarray()[np.ix_(kept, kept)])[0] > 1e-12
-    )  # and they are independent
+    np.linalg.cholesky((unit @ a @ unit).toarray()[np.ix_(kept, kept)])  # and they are independent
 
 
 def test_a_share_that_is_none_is_refused():

@@ -283,8 +283,8 @@ def test_what_is_looked_for_once_is_told_anew():
 def test_contacts_that_fight_in_a_pile_are_named_with_a_compliance_that_gives_an_answer():
     """Walls leave these balls no room: several conflicts at once, of which a proof names one."""
     fights = 0
-    for step, problem in Pile(17).problems(30):
-        found = conflict_of(problem, 1e-6) if step in (0, 30) else None
+    for step, problem in Pile(17).problems(4):
+        found = conflict_of(problem, 1e-6) if step == 4 else None
         if found is not None:
             fights += 1
             assert found.blocks and "contacts" in found.advice

@@ -124,11 +124,11 @@ def test_sweeps_end_where_float64_loses_the_residual(name):
             problem = ill_problem(seed, 1e10, law)
             if spec.refuses(problem) is not None:
                 continue
-            solution = lv.solve(problem, name, tol=1e-9, max_iter=3_000_000)
+            solution = lv.solve(problem, name, tol=1e-9, max_iter=300_000)
             if judged(problem, solution.impulse).relative <= 1e-9 < solution.residual.relative:
                 assert solution.status is lv.Status.FLOOR, (seed, law, str(solution))
                 assert solution.residual.relative <= 2.0 * solution.residual.floor <= 1e-4
-                assert solution.iterations < 3_000_000
+                assert solution.iterations < 300_000
                 assert "ill-conditioned" in solution.message
                 count += 1
     assert count >= 2 or not spec.resumable or spec.refuses(ill_problem(0, 1e10)) is not None
