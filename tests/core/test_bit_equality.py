@@ -3,7 +3,7 @@
 `WAYS` compares ways to solve with a fresh solve, `RUNS` a run in parts with the whole run. Other pairs: batches and
 single solves in test_many.py; packed sweeps in test_packed.py; orders of blocks in test_sweeps_large.py; the compiled
 call of small problems in test_small.py; lanes of factors in test_newton.py and test_sparse_factor.py; the C library in
-tests/out/test_same_bits.py; the engine in tests/sim/engine/test_engine_bits.py.
+tests/export/test_same_bits.py; the engine in tests/sim/engine/test_engine_bits.py.
 """
 
 import copy
