@@ -33,7 +33,6 @@ LANGUAGES = {"C99": ["-std=c99"], "C++11": ["-std=c++11", "-x", "c++"], "C++17":
     [
         ("gcc", "C99", []),
         ("gcc", "C++17", []),
-        ("clang", "C99", []),
         ("clang", "C++11", []),
         ("gcc", "C99", ["-DLAV_SWEEPS_ONLY"]),
         ("clang", "C++11", ["-DLAV_SWEEPS_ONLY"]),

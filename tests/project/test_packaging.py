@@ -162,16 +162,8 @@ def test_every_import_is_declared():
     known |= (
         declared("cluster") | declared("peers") | declared("mujoco") | declared("torch") | declared("jax")
     )
-    known |= {
-        "lavendersim",
-        "mujoco_warp",
-        "newton",
-        "pinocchio",
-        "pydrake",
-        "qoco",
-        "siconos",
-        "warp",
-    }  # if installed
+    # If installed:
+    known |= {"lavendersim", "mujoco_warp", "newton", "pinocchio", "pydrake", "qoco", "siconos", "warp"}
     known |= {"flint"}  # python-flint, of the extra `proof`
     known |= {"ray"}  # a cluster that campaigns can use where it is installed
     known |= set(sys.stdlib_module_names) | {"lavender", "lavender_ext"}
