@@ -51,12 +51,31 @@ def test_an_absent_backend_says_what_to_install():
             registry.get(backend.name)
 
 
+class Finder:
+    """Looks for no module, and says for which it was asked."""
+
+    def __init__(self):
+        self.asked = []
+
+    def find_spec(self, name, path=None, target=None):
+        self.asked.append(name)
+
+
 @pytest.mark.parametrize("name", BACKENDS)
-def test_nothing_is_printed(name, capfd):
-    """HiGHS greets where it is made, whatever it is told; on standard output that is no JSON."""
+def test_nothing_is_printed_or_looked_for_and_threads_run_one_each(name, capfd, monkeypatch):
+    """HiGHS greets where it is made; a fork while a module is looked for waits for ever for it."""
     for problem in (lv.Problem.linear(*spd(6)), lv.Problem.lcp(*spd(4))):
-        if registry.get(name).refuses(problem) is None:
+        if registry.get(name).refuses(problem) is not None:
+            continue
+        alone, finder, before = lv.solve(problem, name), Finder(), (sys.stdout, warnings.filters.copy())
+        with monkeypatch.context() as patch:
+            patch.setattr(sys, "meta_path", [finder, *sys.meta_path])
             lv.solve(problem, name)
+        assert finder.asked == []
+        with ThreadPoolExecutor(4) as pool:
+            for found in pool.map(lambda _, p=problem: lv.solve(p, name), range(8)):
+                assert (found.impulse.tobytes(), found.status) == (alone.impulse.tobytes(), alone.status)
+        assert (sys.stdout, warnings.filters) == before
     assert capfd.readouterr() == ("", "")
 
 
@@ -130,37 +149,6 @@ def test_a_process_forked_while_a_thread_runs_a_backend_is_not_silent():
         print("the parent")"""
     said = python("-W", "ignore::DeprecationWarning", "-c", script)
     assert said.stdout.split("\n") == ["the child", "the parent", ""]
-
-
-@pytest.mark.parametrize("name", BACKENDS)
-def test_a_second_solve_looks_for_no_module(name, monkeypatch):
-    """A process that is forked while a module is looked for waits for ever where it looks for the same one."""
-
-    class Finder:
-        @staticmethod
-        def find_spec(name, path=None, target=None):
-            looked_for.append(name)
-
-    looked_for = []
-    problem = lv.Problem.lcp(*spd(4))
-    if registry.get(name).refuses(problem) is None:
-        lv.solve(problem, name)
-        monkeypatch.setattr(sys, "meta_path", [Finder, *sys.meta_path])
-        lv.solve(problem, name)
-        assert looked_for == []
-
-
-@pytest.mark.parametrize("name", BACKENDS)
-def test_threads_run_a_backend_each(name):
-    problem = lv.Problem.lcp(*spd(4))
-    if registry.get(name).refuses(problem) is None:
-        alone = lv.solve(problem, name)
-        before = sys.stdout, warnings.filters.copy()
-        with ThreadPoolExecutor(4) as pool:
-            for found in pool.map(lambda _: lv.solve(problem, name), range(16)):
-                assert found.impulse.tobytes() == alone.impulse.tobytes()
-                assert found.status is alone.status
-        assert (sys.stdout, warnings.filters) == before
 
 
 # -- what a problem may be ----------------------------------------------------------------------------
@@ -399,126 +387,110 @@ def test_errors_of_a_process_of_its_own_are_told():
 # -- options ------------------------------------------------------------------------------------------
 
 
-def test_settings_reach_the_backend():
+def test_settings_reach_the_backend_or_are_an_input_error():
     problem = lv.Problem.lcp(*spd(20))
     one = lv.solve(problem, "osqp", settings={"max_iter": 25, "polishing": False, "rho": 1e-6})
-    assert one.work["iterations"] == 25
-    assert one.status is lv.Status.MAX_ITERATIONS
+    assert (one.work["iterations"], one.status) == (25, lv.Status.MAX_ITERATIONS)
     assert "polish" not in one.message
-
-
-@pytest.mark.parametrize("name", installed("osqp", "clarabel", "qpalm", "highs"))
-def test_an_unknown_setting_is_an_input_error(name):
-    with pytest.raises(lv.InputError, match="bogus"):
-        lv.solve(lv.Problem.lcp(*spd(3)), name, settings={"bogus": 1})
+    for name in installed("osqp", "clarabel", "qpalm", "highs", "clarabel_cone"):
+        for wrong, word in (({"bogus": 1}, "bogus"), ([1], "mapping")):
+            with pytest.raises(lv.InputError, match=word):
+                lv.solve(problem, name, settings=wrong)
 
 
 # -- failures of a backend ----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["osqp", "clarabel_cone"])
-def test_settings_must_be_a_mapping(name):
-    with pytest.raises(lv.InputError, match="mapping"):
-        lv.solve(lv.Problem.lcp(*spd(3)), name, settings=[1])
+def answers(register, *given):
+    """osqp gives these, one after the other, the last again and again: an error is raised."""
+    asked, left = [], list(given)
+
+    def call(qp, impulse, limit, extra):
+        asked.append(limit)
+        answer = left.pop(0) if len(left) > 1 else left[0]
+        if isinstance(answer, BaseException):
+            raise answer
+        return answer(qp, limit) if callable(answer) else answer
+
+    replaced(register, "osqp", call)
+    return asked
 
 
 @pytest.mark.parametrize(
-    ("error", "status"),
+    ("given", "status", "words"),
     [
-        (ValueError("it broke"), lv.Status.NUMERICAL_ERROR),
-        (MemoryError("it broke"), lv.Status.NUMERICAL_ERROR),
-        (type("Panic", (BaseException,), {})("it broke"), lv.Status.NUMERICAL_ERROR),
-        (KeyboardInterrupt(), lv.Status.INTERRUPTED),
+        (ValueError("it broke"), lv.Status.NUMERICAL_ERROR, "ValueError: it broke"),
+        (MemoryError("it broke"), lv.Status.NUMERICAL_ERROR, "MemoryError: it broke"),
+        (type("Panic", (BaseException,), {})("it broke"), lv.Status.NUMERICAL_ERROR, "Panic: it broke"),
+        (KeyboardInterrupt(), lv.Status.INTERRUPTED, ""),
+        *(
+            (Answer(lv.Status.CONVERGED, "gave up", x), lv.Status.NUMERICAL_ERROR, "gave up; no iterate")
+            for x in (None, np.array([np.nan, 1.0, 1.0]), np.zeros(2))
+        ),
     ],
 )
-def test_an_exception_becomes_a_result(register, error, status):
-    def call(*_):
-        raise error
-
-    replaced(register, "osqp", call)
+def test_an_exception_and_no_iterate_become_a_result_at_the_start_point(register, given, status, words):
+    answers(register, given)
     start = np.array([0.1, 0.2, 0.3])
     solution = lv.solve(lv.Problem.lcp(*spd(3)), "osqp", impulse=start)
-    assert solution.status is status
-    assert not error.args or f"{type(error).__name__}: it broke" in solution.message
-    assert np.array_equal(solution.impulse, start)
-    assert solution.dual is None
-
-
-@pytest.mark.parametrize("x", [None, np.array([np.nan, 1.0, 1.0]), np.zeros(2)])
-def test_no_iterate_returns_the_start_point(register, x):
-    replaced(register, "osqp", lambda *_: Answer(lv.Status.CONVERGED, "gave up", x))
-    start = np.array([0.1, 0.2, 0.3])
-    solution = lv.solve(lv.Problem.lcp(*spd(3)), "osqp", impulse=start)
-    assert solution.status is lv.Status.NUMERICAL_ERROR
-    assert solution.message.startswith("gave up; no iterate")
-    assert np.array_equal(solution.impulse, start)
+    assert solution.status is status and words in solution.message
+    assert np.array_equal(solution.impulse, start) and solution.dual is None
 
 
 def test_a_claim_that_the_judge_does_not_find_is_asked_again_then_marked(register):
-    asked = []
+    def short(qp, limit):
+        x = np.full(qp.n, 0.5 + limit.eps)
+        return Answer(lv.Status.CONVERGED, "solved", x, np.zeros(0), np.zeros(qp.n))
 
-    def call(qp, impulse, limit, extra):
-        asked.append((limit.eps, limit.gap))
-        return Answer(
-            lv.Status.CONVERGED, "solved", np.full(qp.n, 0.5 + limit.eps), np.zeros(0), np.zeros(qp.n)
-        )
-
-    replaced(register, "osqp", call)
+    asked = answers(register, short)
     solution = lv.solve(lv.Problem.lcp(*spd(3)), "osqp")
     assert len(asked) == solution.work["backend_calls"] > 1
-    assert all(after < before for before, after in itertools.pairwise(asked))
+    assert all((b.eps, b.gap) < (a.eps, a.gap) for a, b in itertools.pairwise(asked))
     assert solution.status is lv.Status.CONVERGED
     assert "above tol" in solution.status_conflict
 
 
 @pytest.mark.parametrize(
-    ("feasible", "check", "words"),
-    [(False, "confirmed", "auto found the certificate"), (True, "contradicted", "auto found a solution")],
+    ("feasible", "search", "check", "words"),
+    [
+        (False, True, "confirmed", "auto found the certificate"),
+        (True, True, "contradicted", "auto found a solution"),
+        (
+            True,
+            False,
+            "not proven",
+            "not proven: no certificate was given",
+        ),  # too many rows for our own search
+    ],
 )
 def test_a_claim_of_infeasibility_without_a_certificate_is_checked_by_our_own(
-    feasible, check, words, register
+    feasible, search, check, words, register, monkeypatch
 ):
-    def call(qp, impulse, limit, extra):
-        return Answer(lv.Status.INFEASIBLE, "infeasible")
-
-    replaced(register, "osqp", call)
+    answers(register, Answer(lv.Status.INFEASIBLE, "infeasible"))
+    if not search:
+        monkeypatch.setattr("lavender.solvers.certify.CERTIFICATE_ROWS", 1)
     a = np.array([[1.0, -1.0], [-1.0, 2.0 if feasible else 1.0]])
     solution = lv.solve(lv.Problem.lcp(a, [1.0, 1.0]), "osqp")
     assert solution.status is lv.Status.INFEASIBLE and solution.claim_check == check
     assert words in solution.message + solution.status_conflict
-    assert (solution.status_conflict != "") is feasible
-    assert "CONTRADICTED" in str(solution) if feasible else "CONTRADICTED" not in str(solution)
+    contradicted = check == "contradicted"
+    assert (solution.status_conflict != "") is ("CONTRADICTED" in str(solution)) is contradicted
+    assert (solution.certificate is None) is feasible
 
 
-def test_a_claim_of_infeasibility_that_nobody_decides_is_not_proven(register, monkeypatch):
-    from lavender.solvers import certify
+def off_by(share, **more):  # A is the unit matrix: the solution is -q
+    def answer(qp, limit):
+        x = -(1.0 + share) * qp.q
+        return Answer(lv.Status.CONVERGED, "solved", x, np.zeros(0), np.zeros(qp.n), **more)
 
-    def call(qp, impulse, limit, extra):
-        return Answer(lv.Status.INFEASIBLE, "infeasible")
-
-    replaced(register, "osqp", call)
-    monkeypatch.setattr(certify, "CERTIFICATE_ROWS", 1)  # too many rows for our own search
-    solution = lv.solve(lv.Problem.lcp(*spd(3)), "osqp")
-    assert solution.status is lv.Status.INFEASIBLE and solution.claim_check == "not proven"
-    assert solution.certificate is None
-    assert solution.status_conflict == "" and "not proven: no certificate was given" in solution.message
-    assert "CONTRADICTED" not in str(solution)
+    return answer
 
 
 @pytest.mark.parametrize("later", [lv.Status.INFEASIBLE, lv.Status.NUMERICAL_ERROR, lv.Status.TIME_LIMIT])
 def test_a_stricter_call_that_fails_does_not_replace_a_good_answer(later, register):
-    calls = []
-
-    def call(qp, impulse, limit, extra):  # A is the unit matrix: the solution is -q
-        calls.append(limit)
-        x = -(1.0 + 1e-9) * qp.q
-        if len(calls) > 1:
-            return Answer(later, "failed")
-        return Answer(lv.Status.CONVERGED, "solved", x, np.zeros(0), np.zeros(qp.n))
-
-    replaced(register, "osqp", call)
+    asked = answers(register, off_by(1e-9), Answer(later, "failed"))
     solution = lv.solve(lv.Problem.lcp(np.eye(3), np.ones(3)), "osqp", tol=1e-12)
-    assert len(calls) == 2 and solution.residual.relative < 2e-9
+    assert len(asked) == 2 and solution.residual.relative < 2e-9
     expected = later if later is lv.Status.TIME_LIMIT else lv.Status.STALLED
     assert solution.status is expected and solution.claim_check == "confirmed"
     assert "asked more closely: failed" in solution.message
@@ -533,11 +505,7 @@ def test_a_stricter_call_that_fails_does_not_replace_a_good_answer(later, regist
     ],
 )
 def test_tests_of_other_norms_are_no_false_claim(off, max_iter, status, words, register):
-    def call(qp, impulse, limit, extra):  # A is the unit matrix: the solution is -q
-        x = -(1.0 + off) * qp.q
-        return Answer(lv.Status.CONVERGED, "solved", x, np.zeros(0), np.zeros(qp.n), work={"iterations": 7})
-
-    replaced(register, "osqp", call)
+    answers(register, off_by(off, work={"iterations": 7}))
     solution = lv.solve(lv.Problem.lcp(np.eye(3), np.ones(3)), "osqp", tol=1e-12, max_iter=max_iter)
     assert solution.status is status and words in solution.message
     assert solution.claim_check == "confirmed" and solution.success == (off == 0.0)
