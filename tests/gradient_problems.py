@@ -1,6 +1,7 @@
 """Small problems of every kind of block, law and operator, and the same with their data moved."""
 
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 
@@ -23,6 +24,26 @@ KINDS = {
     "round": lambda rng: lv.Cones.contacts(rng.uniform(0.2, 1.0), 5),
 }
 OPERATORS = ("dense", "csr", "asymmetric", "generalized", "bodies")
+
+
+def combinations():
+    """(kind, law, operator) that there are."""
+    for kind, law, operator in product(KINDS, ("coulomb", "cone"), OPERATORS):
+        if kind == "round" and (law != "cone" or operator != "generalized"):
+            continue
+        if operator == "bodies" and kind in ("free", "bounded", "equal", "round"):
+            continue
+        if operator != "asymmetric" or law == "coulomb":
+            yield kind, law, operator
+
+
+def table():
+    """A box on four corners, resting: three rows are enough to hold it."""
+    corner = np.array([(x, y) for x in (-1.0, 1.0) for y in (-1.0, 1.0)])
+    jac = np.column_stack([np.ones(4), corner[:, 1], -corner[:, 0]])
+    return lv.Problem.from_jacobian(
+        jac, np.eye(3), [-1.0, 0.1, 0.0], cones=lv.Cones.bounded(np.zeros(4), np.full(4, np.inf))
+    )
 
 
 def drawn(seed, kind, law="coulomb", operator="dense", count=3):

@@ -5,7 +5,7 @@ import sys
 
 import numpy as np
 import pytest
-from gradient_problems import KINDS, OPERATORS, directions, drawn, moved, named
+from gradient_problems import KINDS, combinations, directions, drawn, moved, named, table
 
 import lavender as lv
 
@@ -20,20 +20,7 @@ def solved(problem):
     return solution
 
 
-def _problems():
-    for kind in KINDS:
-        for law in LAWS:
-            for operator in OPERATORS:
-                if kind == "round" and (law != "cone" or operator != "generalized"):
-                    continue
-                if operator == "bodies" and kind in ("free", "bounded", "equal", "round"):
-                    continue
-                if operator == "asymmetric" and law == "cone":
-                    continue
-                yield pytest.param(kind, law, operator, id=f"{kind}-{law}-{operator}")
-
-
-PROBLEMS = list(_problems())
+PROBLEMS = [pytest.param(*given, id="-".join(given)) for given in combinations()]
 
 
 @pytest.mark.parametrize("kind, law, operator", PROBLEMS)
@@ -129,15 +116,6 @@ def test_states_fit_impulse_and_slack(kind):
 
 
 # -- where it does not exist ------------------------------------------------------------------------------------
-
-
-def table():
-    """A box on four corners, resting: three rows are enough to hold it."""
-    corner = np.array([(x, y) for x in (-1.0, 1.0) for y in (-1.0, 1.0)])
-    jac = np.column_stack([np.ones(4), corner[:, 1], -corner[:, 0]])
-    return lv.Problem.from_jacobian(
-        jac, np.eye(3), [-1.0, 0.1, 0.0], cones=lv.Cones.bounded(np.zeros(4), np.full(4, np.inf))
-    )
 
 
 def test_of_rows_that_repeat_others_velocities_are_told_and_impulses_refused():
