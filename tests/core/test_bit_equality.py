@@ -22,7 +22,7 @@ from enumeration import random_bounds
 from random_problems import CONTACTS, FORMS, as_matrix, random_contact_problem, touching
 
 import lavender as lv
-from benchmarks.made import fresh, stacks
+from benchmarks.core_problems import fresh, stacks
 from lavender import registry
 from lavender.judge.residuals import reference
 from lavender.solvers.auto import Tree, make
