@@ -301,7 +301,17 @@ class Runner:
             source = item.source if item.given is None else replace(item.given, copy=False)
             records = tuple(known.get((item.name, name), ()))
             info = self.described.get(item.name)
-            pairs.append(Pair(len(pairs), item.name, source, item.reason, name, info, records))
+            pairs.append(
+                Pair(
+                    index=len(pairs),
+                    case=item.name,
+                    source=source,
+                    reason=item.reason,
+                    solver=name,
+                    info=info,
+                    known=records,
+                )
+            )
         entries: dict[int, list[Entry]] = {}
         try:
             for _ in range(MAX_ATTEMPTS):
