@@ -23,6 +23,7 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray
 from lavender.base.deadline import Deadline
+from lavender.base.errors import InputError
 from lavender.base.lazy_import import sparse as sp
 from lavender.judge.certificates import check_certificate
 from lavender.judge.residuals import quick
@@ -52,7 +53,7 @@ class AsRows:
             if not sides:
                 out += list(x[j : j + 1] if contact[i] else x[j : c.ptr[i + 1]])
             elif self.problem.law == "cone":
-                share = [np.divide(x[j + t], s * x[j]) if x[j] > 0.0 else 0.0 for t, s in sides]
+                share = [np.divide(x[j + t], s * x[j]) if s * x[j] > 0.0 else 0.0 for t, s in sides]
                 for signs in product((1.0, -1.0), repeat=len(sides)):
                     out.append(
                         x[j] * np.prod([0.5 * (1.0 + a * b) for a, b in zip(signs, share, strict=True)])
@@ -108,9 +109,10 @@ def as_rows(problem: Problem) -> AsRows:
     with np.errstate(all="ignore"):
         a = sp.csr_array(e.T @ (problem.csr @ e)) + _sparse(more, (n, n))
         b = e.T @ problem.b
-    if not (np.isfinite(a.data).all() and np.isfinite(b).all()):
-        raise OverflowError("A or b, times coefficients of friction, is beyond float64")
-    rows = Problem.lcp(sp.csr_array(a), b, np.array(low), np.array(high), copy=False)
+    try:
+        rows = Problem.lcp(sp.csr_array(a), b, np.array(low), np.array(high), copy=False)
+    except InputError as error:  # The given problem is valid: only these sums of its entries are out of range.
+        raise OverflowError("A or b, times coefficients of friction, is out of range") from error
     return AsRows(problem, rows, e)
 
 

@@ -391,7 +391,10 @@ class Prepared:
             return claim
         b, start = self.problem.b.copy(), loop.impulse.copy()
         b[rows] = start[rows] = 0.0
-        others = Prepared(self.problem.updated(b=b), self.spec, self.options)
+        try:
+            others = Prepared(self.problem.updated(b=b), self.spec, self.options)
+        except InputError:  # All other numbers of b are below the smallest that a problem may have.
+            return claim
         found = others.solve(
             impulse=start, tol=loop.tol, max_iter=max_iter, time_limit=loop.deadline.left(LEAST)
         )

@@ -126,8 +126,10 @@ def solver_names(names: str | Sequence[str] | None) -> list[str]:
     ------
     UnknownName, SolverUnavailable
     """
+    if names is not None and not isinstance(names, str):
+        names = several("solvers", names, "names")
     if names:
-        names = [names] if isinstance(names, str) else several("solvers", names, "names")
+        names = [names] if isinstance(names, str) else names
         for name in names:
             registry.get(name)
         return list(dict.fromkeys(names))
