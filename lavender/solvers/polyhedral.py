@@ -111,7 +111,9 @@ def as_rows(problem: Problem) -> AsRows:
         b = e.T @ problem.b
     try:
         rows = Problem.lcp(sp.csr_array(a), b, np.array(low), np.array(high), copy=False)
-    except InputError as error:  # The given problem is valid: only these sums of its entries are out of range.
+    except (
+        InputError
+    ) as error:  # The given problem is valid: only these sums of its entries are out of range.
         raise OverflowError("A or b, times coefficients of friction, is out of range") from error
     return AsRows(problem, rows, e)
 

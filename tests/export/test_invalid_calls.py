@@ -1,4 +1,4 @@
-"""What is wrong comes back as a number with a text, and nothing is written where it must not be."""
+"""Invalid calls of the C library: an error number with a text, and nothing is written outside of its memory."""
 
 import ctypes as ct
 import re
@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from clib import COUNTS, STRUCTS, SWEEPS, Options, Problem, Result, Verdict, functions
-from hypothesis import given as drawn
-from hypothesis import settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
+from invalid_values import draw_examples
 from random_problems import as_matrix, random_contact_problem, random_lcp, seeds
 from tower import self_test_problem
 
@@ -25,7 +25,7 @@ CANARY = 0xA5
 
 
 class Guarded:
-    """A solver in memory of just so many bytes, with marks before and behind."""
+    """A solver in memory of exactly so many bytes, with marked bytes before and behind."""
 
     def __init__(self, library, problem, options, bytes_):
         self.c, self.bytes = library.c, bytes_
@@ -36,18 +36,19 @@ class Guarded:
             ct.c_void_p(begin), ct.c_uint64(bytes_), ct.byref(problem), ct.byref(options), ct.byref(self.at)
         )
 
-    def whole(self):
+    def is_intact(self):
+        """Whether nothing was written before and behind the memory."""
         return set(self.memory[:128]) == set(self.memory[128 + self.bytes :]) == {CANARY}
 
 
-def opened(library, method="sequential_impulses"):
+def open_solver(library, method="sequential_impulses"):
     problem, options = library.problem(self_test_problem()), library.options(method)
     solver = Guarded(library, problem, options, library.room(problem, options).value)
     assert solver.code == 0
     return solver, problem
 
 
-def changed(key, at, value):
+def change(key, at, value):
     def apply(problem):
         array = problem.keep[key].copy()
         array.reshape(-1)[at] = value
@@ -58,11 +59,11 @@ def changed(key, at, value):
     return apply
 
 
-def put(key, value):
+def set_field(key, value):
     return lambda problem: setattr(problem, key, value)
 
 
-def put_array(key, values):
+def set_array(key, values):
     def apply(problem):
         problem.keep[key] = np.array(values)
         setattr(problem, key, problem.keep[key].ctypes.data)
@@ -71,42 +72,42 @@ def put_array(key, values):
 
 
 MISTAKES = {
-    "struct of another version": (put("size", 8), "VERSION"),
-    "form": (put("form", 9), "OPTION"),
-    "law": (put("law", 5), "OPTION"),
-    "rows below 0": (put("n_rows", -3), "COUNT"),
-    "fewer rows than blocks": (put("n_rows", 3), "COUNT"),
-    "entries below 0": (put("n_entries", -1), "COUNT"),
-    "more joints than blocks": (put("n_joints", 99), "COUNT"),
-    "joints that are contacts": (put("n_joints", 2), "BLOCKS"),
-    "blocks that do not end": (changed("block_ptr", -1, 35), "BLOCKS"),
-    "blocks that go back": (changed("block_ptr", 3, 1), "BLOCKS"),
-    "a block far away": (changed("block_ptr", 4, 2**30), "BLOCKS"),
-    "no such kind": (changed("kind", 2, 7), "BLOCKS"),
-    "friction below 0": (changed("mu", 1, -0.1), "FRICTION"),
-    "friction not a number": (changed("mu", 1, np.nan), "FRICTION"),
-    "a body that is not there": (changed("contact_body", 5, 3), "INDEX"),
-    "a body below the world": (changed("contact_body", 5, -2), "INDEX"),
-    "NaN in b": (changed("b", 0, np.nan), "NUMBER"),
-    "an infinite normal": (changed("normal", 4, np.inf), "NUMBER"),
-    "NaN in an inertia": (changed("inv_inertia", 9, np.nan), "NUMBER"),
-    "a mass below 0": (changed("inv_mass", 1, -1.0), "MASS"),
-    "a compliance below 0": (changed("compliance", 3, -1.0), "MASS"),
-    "an inertia below 0": (changed("inv_inertia", 13, -1.0), "MASS"),
-    "an inertia that is not symmetric": (changed("inv_inertia", 11, 0.5), "MASS"),
-    "a normal of length 0": (changed("normal", 14, 0.0), "FRAME"),
-    "a normal of length 2": (changed("normal", 14, 2.0), "FRAME"),
-    "a tangent along the normal": (changed("tangent", 14, 0.6), "FRAME"),
-    "a body that touches itself": (changed("contact_body", 10, 1), "PAIR"),
-    "two static bodies": (changed("contact_body", 1, -1), "PAIR"),
-    "no masses": (put("inv_mass", None), "NULL"),
-    "no normals": (put("normal", None), "NULL"),
-    "no bodies of contacts": (put("contact_body", None), "NULL"),
-    "rolling below 0": (put_array("rolling", [-0.1] * 12), "FRICTION"),
-    "rolling not a number": (put_array("rolling", [np.nan] * 12), "FRICTION"),
-    "rows that do not roll": (changed("kind", 2, 5), "BLOCKS"),
-    "a box of one tangent": (lambda q: (changed("kind", 2, 4)(q), changed("block_ptr", 3, 8)(q)), "BLOCKS"),
-    "an order with a block twice": (changed("order", 1, 0), "INDEX"),
+    "struct of another version": (set_field("size", 8), "VERSION"),
+    "form": (set_field("form", 9), "OPTION"),
+    "law": (set_field("law", 5), "OPTION"),
+    "rows below 0": (set_field("n_rows", -3), "COUNT"),
+    "fewer rows than blocks": (set_field("n_rows", 3), "COUNT"),
+    "entries below 0": (set_field("n_entries", -1), "COUNT"),
+    "more joints than blocks": (set_field("n_joints", 99), "COUNT"),
+    "joints that are contacts": (set_field("n_joints", 2), "BLOCKS"),
+    "blocks that do not end": (change("block_ptr", -1, 35), "BLOCKS"),
+    "blocks that go back": (change("block_ptr", 3, 1), "BLOCKS"),
+    "a block far away": (change("block_ptr", 4, 2**30), "BLOCKS"),
+    "no such kind": (change("kind", 2, 7), "BLOCKS"),
+    "friction below 0": (change("mu", 1, -0.1), "FRICTION"),
+    "friction not a number": (change("mu", 1, np.nan), "FRICTION"),
+    "a body that is not there": (change("contact_body", 5, 3), "INDEX"),
+    "a body below the world": (change("contact_body", 5, -2), "INDEX"),
+    "NaN in b": (change("b", 0, np.nan), "NUMBER"),
+    "an infinite normal": (change("normal", 4, np.inf), "NUMBER"),
+    "NaN in an inertia": (change("inv_inertia", 9, np.nan), "NUMBER"),
+    "a mass below 0": (change("inv_mass", 1, -1.0), "MASS"),
+    "a compliance below 0": (change("compliance", 3, -1.0), "MASS"),
+    "an inertia below 0": (change("inv_inertia", 13, -1.0), "MASS"),
+    "an inertia that is not symmetric": (change("inv_inertia", 11, 0.5), "MASS"),
+    "a normal of length 0": (change("normal", 14, 0.0), "FRAME"),
+    "a normal of length 2": (change("normal", 14, 2.0), "FRAME"),
+    "a tangent along the normal": (change("tangent", 14, 0.6), "FRAME"),
+    "a body that touches itself": (change("contact_body", 10, 1), "PAIR"),
+    "two static bodies": (change("contact_body", 1, -1), "PAIR"),
+    "no masses": (set_field("inv_mass", None), "NULL"),
+    "no normals": (set_field("normal", None), "NULL"),
+    "no bodies of contacts": (set_field("contact_body", None), "NULL"),
+    "rolling below 0": (set_array("rolling", [-0.1] * 12), "FRICTION"),
+    "rolling not a number": (set_array("rolling", [np.nan] * 12), "FRICTION"),
+    "rows that do not roll": (change("kind", 2, 5), "BLOCKS"),
+    "a box of one tangent": (lambda q: (change("kind", 2, 4)(q), change("block_ptr", 3, 8)(q)), "BLOCKS"),
+    "an order with a block twice": (change("order", 1, 0), "INDEX"),
 }
 
 
@@ -114,8 +115,8 @@ ROWS = ("inv_mass", "inv_inertia", "contact_body", "normal", "tangent", "arm_a",
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)
-def test_a_problem_with_a_mistake_is_refused_and_said(library, mistake):
-    solver, problem = opened(library)
+def test_an_invalid_problem_is_rejected_with_the_place_of_its_mistake(library, mistake):
+    solver, problem = open_solver(library)
     assert library.c.lav_set(solver.at, ct.byref(problem)) == 0
     problem.keep["order"] = np.arange(12, dtype=np.int32)
     apply, error = MISTAKES[mistake]
@@ -129,10 +130,10 @@ def test_a_problem_with_a_mistake_is_refused_and_said(library, mistake):
         size = whole.get(apply.array, 1)
         assert at.value // size == apply.index % problem.keep[apply.array].size // size
         if apply.array in ROWS:  # as the package refuses it
-            given = {name: problem.keep[name] for name in ROWS} | {"v_free": problem.keep["velocity"]}
+            arrays = {name: problem.keep[name] for name in ROWS} | {"v_free": problem.keep["velocity"]}
             with pytest.raises(lv.InputError, match=apply.array):
-                lv.Rows(**given)
-    assert solver.whole()
+                lv.Rows(**arrays)
+    assert solver.is_intact()
     result = Result()
     result.size = ct.sizeof(Result)
     budget = library.budget(5, 0.0)
@@ -140,19 +141,19 @@ def test_a_problem_with_a_mistake_is_refused_and_said(library, mistake):
     assert library.c.lav_set(solver.at, ct.byref(library.problem(self_test_problem()))) == 0  # and goes on
 
 
-def test_every_error_has_its_own_text(library):
+def test_every_error_has_a_text_of_its_own(library):
     texts = {library.c.lav_text(code) for code in [0, *ERRORS]}
     assert len(texts) == 1 + len(ERRORS) and all(len(text) > 7 for text in texts)
 
 
-def test_null_and_no_solver_are_told_apart(library):
+def test_null_and_memory_without_a_solver_have_different_errors(library):
     c, q, o, r = library.c, Problem(), Options(), Result()
     assert c.lav_set(None, ct.byref(q)) == c.lav_run(None, None, None) == c.lav_impulse(None, None, 0) == -1
     assert c.lav_room(None, None, None) == c.lav_open(None, ct.c_uint64(8), None, None, None) == -1
     nobody = (ct.c_double * 400)()
     assert c.lav_set(nobody, ct.byref(q)) == -15
     assert c.lav_default_options(99, ct.byref(o)) == c.lav_default_problem(0, ct.byref(q)) == -12
-    solver, problem = opened(library)
+    solver, problem = open_solver(library)
     budget = library.budget(5, 0.0)
     assert c.lav_run(solver.at, ct.byref(budget), ct.byref(r)) == -14  # no problem yet
     assert c.lav_set(solver.at, ct.byref(problem)) == 0
@@ -164,13 +165,13 @@ def test_null_and_no_solver_are_told_apart(library):
     assert c.lav_run(solver.at, ct.byref(budget), ct.byref(r)) == -1  # a limit without a clock
     out = np.full(35, 7.0)
     assert c.lav_impulse(solver.at, ct.c_void_p(out.ctypes.data), 35) == -3 and set(out) == {7.0}
-    assert solver.whole()
+    assert solver.is_intact()
 
 
 @pytest.mark.parametrize(
     "method", ["sequential_impulses", "block_gauss_seidel", "anderson", "nncg", "newton", "admm"]
 )
-def test_too_little_room_is_said_and_nothing_is_written_behind_it(library, method):
+def test_too_little_memory_is_an_error_and_nothing_is_written_behind_it(library, method):
     problem, options = library.problem(self_test_problem()), library.options(method)
     seen, room = set(), library.room(problem, options).value
     for bytes_ in [*range(0, room, room // 40), room]:
@@ -182,13 +183,13 @@ def test_too_little_room_is_said_and_nothing_is_written_behind_it(library, metho
                 assert library.c.lav_needed(solver.at) > bytes_
         else:
             assert solver.code == -10
-        assert solver.whole()
+        assert solver.is_intact()
     assert seen == {0, -10}
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_memory_alone_binds_and_needed_suffices_wherever_nothing_is_guessed(library, method):
-    """A solver that was opened for little takes the largest problem in enough memory, with the impulses it had."""
+def test_a_solver_moved_to_the_memory_it_needs_takes_a_larger_problem(library, method):
+    """It keeps the impulses that it had; sweeps are moved at most once, factors at most three times."""
     small, c = random_lcp(1, m=3), library.c
     bodies = random_contact_problem(3, bodies=4, contacts=6)
     rng = np.random.default_rng(5)
@@ -223,7 +224,7 @@ def test_memory_alone_binds_and_needed_suffices_wherever_nothing_is_guessed(libr
     assert grown
 
 
-def test_newton_of_more_bodies_than_its_factor_has_room_for_is_refused(library):
+def test_newton_rejects_more_bodies_than_its_factor_can_hold(library):
     problem, options, room = library.problem(stack_of(1501)), library.options("newton"), ct.c_uint64()
     assert ERRORS[library.c.lav_takes(ct.byref(problem), ct.byref(options))] == "LAV_ERROR_BODIES"
     assert (
@@ -231,9 +232,9 @@ def test_newton_of_more_bodies_than_its_factor_has_room_for_is_refused(library):
     )
 
 
-def test_a_second_caller_in_one_solver_is_turned_away(library):
+def test_a_solver_that_is_running_rejects_other_calls(library):
     # From within the clock, which stands for another thread: the solver is busy until the run returns.
-    solver, problem = opened(library)
+    solver, problem = open_solver(library)
     assert library.c.lav_set(solver.at, ct.byref(problem)) == 0
     said = []
     out, inner = Result(), Result()
@@ -256,7 +257,7 @@ def test_a_second_caller_in_one_solver_is_turned_away(library):
 
 
 @pytest.mark.parametrize("form, method", [(1, "direct"), (2, "anderson"), (3, "newton")])
-def test_to_count_memory_no_array_is_read_but_where_joints_end(library, form, method):
+def test_counting_memory_reads_only_where_the_joints_end(library, form, method):
     # Addresses that nothing may be read from: whoever does ends this process.
     problem, options = Problem(), library.options(method)
     ptr = np.arange(0, 39, 3, dtype=np.int32)
@@ -286,9 +287,10 @@ REAL = st.lists(st.floats(allow_nan=True, allow_infinity=True), min_size=0, max_
 
 
 @pytest.mark.slow
-@settings(max_examples=150)
-@drawn(st.data())
-def test_no_problem_whatever_makes_the_library_write_beside_its_memory(library, data):
+@pytest.mark.fuzz
+@draw_examples(150)
+@given(st.data())
+def test_no_drawn_problem_makes_the_library_write_outside_its_memory(library, data):
     problem, keep = Problem(), []
     form, method = data.draw(st.integers(1, 3)), data.draw(st.integers(1, 12))
     library.c.lav_default_problem(form, ct.byref(problem))
@@ -324,20 +326,20 @@ def test_no_problem_whatever_makes_the_library_write_beside_its_memory(library, 
         impulse = (ct.c_double * (problem.n_rows + 2))(*([7.0] * (problem.n_rows + 2)))
         assert library.c.lav_impulse(solver.at, impulse, problem.n_rows) == 0
         assert impulse[problem.n_rows] == 7.0
-    assert solver.whole()
+    assert solver.is_intact()
 
 
 @settings(max_examples=40)
-@drawn(
+@given(
     seed=seeds,
     method=st.sampled_from(sorted(METHODS)),
     iterations=st.integers(0, 300),
     tol=st.sampled_from((0.0, 1e-6)),
 )
-def test_what_comes_back_is_what_the_package_judges_it_to_be(library, seed, method, iterations, tol):
+def test_the_verdict_of_the_library_equals_that_of_the_package(library, seed, method, iterations, tol):
     bodies = random_contact_problem(seed, "cone" if seed % 2 else "coulomb", bodies=4, contacts=6, joints=1)
-    for given in (bodies, as_matrix(bodies), random_lcp(seed, m=9)):
-        problem, options = library.problem(given), library.options(method)
+    for source in (bodies, as_matrix(bodies), random_lcp(seed, m=9)):
+        problem, options = library.problem(source), library.options(method)
         if library.c.lav_takes(ct.byref(problem), ct.byref(options)):
             continue
         room, code = library.room(problem, options), -10
@@ -350,28 +352,29 @@ def test_what_comes_back_is_what_the_package_judges_it_to_be(library, seed, meth
                 ERRORS[code] == "LAV_ERROR_UNSUPPORTED"
             )  # `admm` finds an asymmetric A when it has its numbers
             continue
-        out, impulse = Result(), np.zeros(given.m)
+        out, impulse = Result(), np.zeros(source.m)
         out.size = ct.sizeof(Result)
         budget = library.budget(iterations, tol)
         assert library.c.lav_run(solver.at, ct.byref(budget), ct.byref(out)) == 0
-        assert library.c.lav_impulse(solver.at, ct.c_void_p(impulse.ctypes.data), given.m) == 0
-        truth = lv.residual(given, impulse)
+        assert library.c.lav_impulse(solver.at, ct.c_void_p(impulse.ctypes.data), source.m) == 0
+        truth = lv.residual(source, impulse)
         assert out.verdict.relative == truth.relative and out.verdict.worst == truth.worst_row
         assert tol == 0.0 or (out.outcome == 1) == (truth.relative <= tol)
-        assert out.iterations <= iterations + 2 and solver.whole()
+        assert out.iterations <= iterations + 2 and solver.is_intact()
 
 
 @pytest.mark.parametrize("method, tol", [("sequential_impulses", 0.1), ("anderson", 0.01), ("nncg", 0.01)])
-def test_a_budget_that_ends_within_tol_between_two_checks_has_converged(library, method, tol):
-    given = self_test_problem()
+def test_a_budget_that_ends_within_tol_has_converged(library, method, tol):
+    problem = self_test_problem()
     for n in range(1, 40):
-        solver = library.open(library.problem(given), library.options(method))
-        found = lv.solve(given, method, tol=tol, max_iter=n)
-        assert (solver.run(n, tol).outcome == 1) == found.success == (found.status is lv.Status.CONVERGED)
-    assert found.success
+        solver = library.open(library.problem(problem), library.options(method))
+        solution = lv.solve(problem, method, tol=tol, max_iter=n)
+        converged = solution.status is lv.Status.CONVERGED
+        assert (solver.run(n, tol).outcome == 1) == solution.success == converged
+    assert solution.success
 
 
-def test_structs_lie_as_python_reads_them_and_grow_only_at_the_end(library, folder):
+def test_structs_have_the_released_layout_and_grow_only_at_the_end(library, folder):
     header = HEADER.read_text()
     made = [f"{kind} {name}({', '.join(arguments)})" for kind, name, arguments in functions(header)]
     made += [f"{name} = {value}" for name, value in constants(header).items()]

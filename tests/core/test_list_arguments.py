@@ -1,4 +1,4 @@
-"""Lists and whole numbers are taken as arrays are, at run time and by mypy, which reads this file as a user's."""
+"""Lists and integers are accepted like arrays, at run time and by mypy, which checks this file as a user's."""
 
 from typing import Any
 
@@ -8,10 +8,10 @@ import pytest
 
 import lavender as lv
 
-NONE: list[float] = []
+EMPTY: list[float] = []
 
 
-def test_rows_of_lists_are_rows_of_arrays() -> None:
+def test_rows_from_lists_equal_rows_from_arrays() -> None:
     up, side, none = (0.0, 0.0, 1.0), [1, 0, 0], (0, 0, 0)
     lists = lv.Rows(
         inv_mass=[0.5],
@@ -40,7 +40,7 @@ def test_rows_of_lists_are_rows_of_arrays() -> None:
     assert lv.residual(problem, impulse.tolist()).relative == solution.residual.relative
 
 
-def test_cones_and_problems_of_lists_are_those_of_arrays() -> None:
+def test_cones_and_problems_from_lists_equal_those_from_arrays() -> None:
     cones = lv.Cones(ptr=[0, 1], kind=[0], lower=[0.0], upper=[1], mu=[0.0], patch_radius=[0.0])
     assert cones == lv.Cones.bounded([0], [1.0]) == lv.Cones.bounded(np.zeros(1), 1.0)
     problem = lv.Problem([1], cones, [[2.0]], guess=[0.5], key=[3], names=["a"])
@@ -70,34 +70,34 @@ class Halves:
         return lv.Claim(lv.Status.MAX_ITERATIONS, n)
 
 
-def test_a_solver_that_derives_from_nothing_is_one(register: Any) -> None:
+def test_a_solver_needs_no_base_class(register: Any) -> None:
     register(lv.SolverSpec(name="halves", factory=Halves, laws=frozenset({"lcp"}), summary=""))
     solution = lv.solve(lv.Problem.lcp([[1.0]], [1.0]), "halves", impulse=[8.0], tol=0.0, max_iter=3)
     assert solution.impulse.tolist() == [1.0]
 
 
 @pytest.mark.parametrize("bodies", [0, 2])
-def test_empty_lists_are_no_contacts_joints_or_bodies(bodies: int) -> None:
-    """What a loop over the contacts of a step leaves where there are none."""
+def test_empty_lists_mean_no_contacts_joints_or_bodies(bodies: int) -> None:
+    """A loop over the contacts of a step gives empty lists if there are none."""
     mass, inertia, free = [1.0] * bodies, [np.eye(3)] * bodies, [np.ones(6)] * bodies
     rows = lv.Rows(
         mass,
         inertia,
         free,
-        jac=NONE,
-        joint_body=NONE,
-        contact_body=NONE,
-        normal=NONE,
-        tangent=NONE,
-        arm_a=NONE,
-        arm_b=NONE,
+        jac=EMPTY,
+        joint_body=EMPTY,
+        contact_body=EMPTY,
+        normal=EMPTY,
+        tangent=EMPTY,
+        arm_a=EMPTY,
+        arm_b=EMPTY,
     )
     assert rows == lv.Rows(np.ones(bodies), np.tile(np.eye(3), (bodies, 1, 1)), np.ones((bodies, 6)))
-    problem = lv.Problem.from_rows(rows, target=NONE, mu=NONE)
+    problem = lv.Problem.from_rows(rows, target=EMPTY, mu=EMPTY)
     assert problem.m == 0 and lv.solve(problem).success
     with pytest.raises(lv.InputError, match=r"contact_body has shape \(1, 2\); \(0, 2\) is needed"):
         lv.Rows(
-            mass, inertia, free, contact_body=[(-1, 0)], normal=NONE, tangent=NONE, arm_a=NONE, arm_b=NONE
+            mass, inertia, free, contact_body=[(-1, 0)], normal=EMPTY, tangent=EMPTY, arm_a=EMPTY, arm_b=EMPTY
         )
 
 

@@ -1,0 +1,812 @@
+"""Invalid paths, files, folders and numbers at the commands: refused in words, and what stood there stays."""
+
+import contextlib
+import dataclasses
+import errno
+import io as streams
+import json
+import os
+import re
+import signal
+import stat
+import subprocess
+import sys
+from ast import literal_eval
+from importlib.util import find_spec
+from pathlib import Path
+
+import hypothesis.strategies as st
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from invalid_values import MORE
+from mujoco_scene import scene
+from stacks import stack
+from worked import python
+
+import lavender as lv
+from lavender import bench, cli, io
+from lavender.io.stored import FOLDER_LOCK, PART, folder_for_steps, lock_output, write_atomically, write_text
+from lavender.lab import collection
+from lavender.lab.bench import machine
+from lavender.lab.bench.record import KINDS, Skip, file_name, printable, to_json
+from lavender.lab.bench.store import Records, Store
+from lavender.lab.bench.timed_call import format_call
+from lavender.lab.report.findings import Report
+from lavender.lab.report.terminal import print_report
+from lavender.sim.engine import run
+from lavender.sim.engine.picture import save_picture
+
+resource = pytest.importorskip("resource", reason="limits, pipes and devices with names are of POSIX")
+pytestmark = pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="pipes and devices with names are of POSIX")
+
+# -- every reader and every writer ----------------------------------------------------------------------------------
+
+READERS = {
+    "load npz": (".npz", lambda results, path: lv.load(path)),
+    "load hdf5": (".hdf5", lambda results, path: lv.load(path)),
+    "load solution": (".npz", lambda results, path: io.load_solution(path)),
+    "load film": (".film", lambda results, path: lv.engine.Film.load(path)),
+    "load snapshot": (".snap", lambda results, path: lv.Snapshot.load(path)),
+    "load state": (".snap", lambda results, path: lv.Simulation("stack").load(path)),
+    "read records": (".jsonl", lambda results, path: bench.read(path)),
+    "load manifest": (".json", lambda results, path: collection.load(path)),
+}
+
+
+@pytest.fixture(scope="module")
+def results():
+    """What is written: a problem, a film, a trace and a snapshot."""
+    simulation = lv.Simulation("stack")
+    return {
+        "problem": lv.Problem.contact(np.eye(3), [1.0, 0.0, 0.0], 0.5),
+        "film": lv.Simulation(lv.Scene("stack", n=1)).film(1),
+        "trace": run(simulation, 3),
+        "state": simulation.snapshot(),
+    }
+
+
+WRITERS = {
+    "npz": (".npz", lambda results, path: io.save(results["problem"], path)),
+    "hdf5": (".hdf5", lambda results, path: io.save(results["problem"], path)),
+    "film": (".film", lambda results, path: results["film"].save(path)),
+    "strip": (".png", lambda results, path: save_picture(results["film"], path, frames=1)),
+    "animation": (".gif", lambda results, path: save_picture(results["film"], path)),
+    "trace": (".csv", lambda results, path: results["trace"].save(path)),
+    "figure": (".svg", lambda results, path: results["trace"].plot(path)),
+    "snapshot": (".snap", lambda results, path: results["state"].save(path)),
+    "records": (".jsonl", lambda results, path: Store(path).close()),
+    "records as CSV": (".csv", lambda results, path: bench.write_csv(Records(), path)),
+    "records as JSON": (".json", lambda results, path: bench.write_json(Records(), path)),
+    "text": (".txt", lambda results, path: write_text(path, "abc")),
+}
+needs_hdf5 = pytest.mark.skipif(find_spec("h5py") is None, reason="FCLIB's files need h5py (extra: fclib)")
+
+
+def each_of(table):
+    """Parametrize a test by the suffix of a file and the call that reads or writes it."""
+    cases = [
+        pytest.param(*case, marks=[needs_hdf5] if "hdf5" in name else []) for name, case in table.items()
+    ]
+    return pytest.mark.parametrize(("suffix", "call"), cases, ids=table)
+
+
+each_reader, each_writer, each_call = each_of(READERS), each_of(WRITERS), each_of(READERS | WRITERS)
+BEFORE = b"the content before"
+SPECIAL = ("pipe", "folder", "device", "link to a pipe", "link to itself")
+
+
+def make_special(kind, path):
+    """Make something that is no regular file at `path`; return its mode, inode and device."""
+    if kind == "pipe":
+        os.mkfifo(path)
+    elif kind == "folder":
+        path.mkdir()
+    elif kind == "link to a pipe":
+        os.mkfifo(path.with_name("pipe"))
+        path.symlink_to("pipe")
+    elif kind == "link to itself":
+        path.symlink_to(path.name)
+    else:
+        try:
+            os.mknod(path, 0o666 | stat.S_IFCHR, os.makedev(1, 7))  # as /dev/full
+        except PermissionError:
+            pytest.skip("a device needs its privileges")
+    return facts(path)
+
+
+def facts(path):
+    s = os.lstat(path)
+    return s.st_mode, s.st_ino, s.st_rdev
+
+
+@contextlib.contextmanager
+def file_size_limit(size):
+    """Limit the files of this process to so many bytes."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+
+
+@pytest.mark.parametrize("kind", SPECIAL)
+@each_call
+def test_only_regular_files_are_read_or_replaced(kind, suffix, call, results, tmp_path):
+    path = tmp_path / f"there{suffix}"
+    before = make_special(kind, path)
+    with pytest.raises(lv.InputError, match=str(path)):
+        call(results, path)
+    assert facts(path) == before
+    assert {p.name for p in tmp_path.iterdir()} <= {path.name, "pipe"}
+
+
+@each_call
+def test_what_names_no_file_is_rejected_and_nothing_is_written(suffix, call, results, tmp_path):
+    """A number is not the descriptor of an open file, which is neither read nor closed."""
+    path = tmp_path / "p.npz"
+    lv.Problem.lcp([[2.0]], [1.0]).save(path)
+    wrong = [0, 1, True, None, 1.5, b"p.npz", open, path.open, ["p.npz"], f"a\0{suffix}", path / f"p{suffix}"]
+    if suffix != ".jsonl":  # The folder of records is made.
+        wrong.append(tmp_path / "missing" / f"p{suffix}")
+    with open(path, "rb") as stream:
+        for value in [*wrong, stream.fileno()]:
+            with pytest.raises(lv.InputError, match=r"path is|NUL|cannot (read|write)"):
+                call(results, value)
+        assert stream.read(2) == b"PK"
+    assert os.listdir(tmp_path) == ["p.npz"]
+
+
+@each_reader
+def test_files_of_ten_gigabytes_are_rejected_before_they_are_read(suffix, call, results, tmp_path):
+    path = tmp_path / f"long{suffix}"
+    with path.open("wb") as stream:
+        stream.truncate(10**10)  # which takes no space
+    message = "starts with" if suffix in (".npz", ".hdf5") else "10000000000 bytes"
+    with pytest.raises(lv.InputError, match=message):
+        call(results, path)
+
+
+@each_writer
+def test_a_link_stays_and_the_file_behind_it_is_replaced(suffix, call, results, tmp_path):
+    (tmp_path / "far").mkdir()
+    names = (f"far/target{suffix}", f"link{suffix}", f"second{suffix}")
+    target, link, second = (tmp_path / name for name in names)
+    link.symlink_to(target)
+    second.symlink_to(f"link{suffix}")
+    for _ in range(2):  # The links lead to nothing at first.
+        call(results, second)
+        assert link.is_symlink() and second.is_symlink()
+        assert target.is_file() and not target.is_symlink()
+        if suffix != ".jsonl":  # Records are added to the file.
+            assert target.stat().st_size
+            target.write_bytes(BEFORE)
+    assert [p.name for p in (tmp_path / "far").iterdir()] == [target.name]
+
+
+@each_writer
+@pytest.mark.parametrize("is_renamed", [False, True], ids=["writing", "renaming"])
+def test_a_full_disk_leaves_the_file_of_before(is_renamed, suffix, call, results, tmp_path, monkeypatch):
+    if suffix == ".jsonl":
+        pytest.skip("records are added to the file")
+    path = tmp_path / f"there{suffix}"
+    path.write_bytes(BEFORE)
+
+    def raise_full(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    if is_renamed:
+        monkeypatch.setattr(os, "replace", raise_full)
+    limit = contextlib.nullcontext() if is_renamed else file_size_limit(1)
+    with limit, pytest.raises(lv.InputError, match=r"No space left|cannot write"):
+        call(results, path)
+    assert path.read_bytes() == BEFORE
+    assert [p.name for p in tmp_path.iterdir()] == [path.name]
+
+
+@needs_hdf5
+@pytest.mark.parametrize("size", [1, 4096, 16384, 24576])
+def test_a_full_disk_while_fclib_writes_is_an_error(tmp_path, size):
+    """HDF5 itself ends the process by a signal if a write fails that is not its first."""
+    path = tmp_path / "p.hdf5"
+    lv.Problem.contact(np.eye(3), [1.0, 0.0, 0.0], 0.5).save(path)
+    before = path.read_bytes()
+    a = np.random.default_rng(0).normal(size=(60, 60))
+    with file_size_limit(size), pytest.raises(lv.InputError, match="cannot write"):
+        lv.Problem.contact(a @ a.T, np.ones(60), np.full(20, 0.5)).save(path)
+    assert path.read_bytes() == before
+    assert os.listdir(tmp_path) == ["p.hdf5"]
+
+
+def test_a_full_disk_while_records_are_added_is_an_error_and_releases_the_file(tmp_path):
+    path = tmp_path / "records.jsonl"
+    with (
+        Store(path) as store,
+        file_size_limit(0),
+        pytest.raises(lv.InputError, match=r"cannot write .* make room"),
+    ):
+        store.add(Skip("run", "case", "pgs", "reason"))
+    Store(path).close()
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_the_longest_file_names_are_written_and_permissions_stay(results, tmp_path):
+    for name in ("n" * 251 + ".npz", "\N{GREEK SMALL LETTER LAMDA}" * 125 + ".npz"):
+        io.save(results["problem"], tmp_path / name)
+        (tmp_path / name).chmod(0o640)
+        io.save(results["problem"], tmp_path / name)
+        assert io.load(tmp_path / name) == results["problem"]
+        assert stat.S_IMODE((tmp_path / name).stat().st_mode) == 0o640
+
+
+def test_the_path_of_an_open_descriptor_is_not_written(tmp_path):
+    with open(tmp_path / "gone", "wb") as stream:
+        path = f"/proc/self/fd/{stream.fileno()}"
+        if not os.path.exists(path):
+            pytest.skip("descriptors have no paths here")
+        os.unlink(tmp_path / "gone")
+        with pytest.raises(lv.InputError, match="cannot write"):
+            write_text(path, "a")
+    assert list(tmp_path.iterdir()) == []
+
+
+# -- writers that are killed, and writers of one path ----------------------------------------------------------------
+
+
+def test_threads_that_write_one_path_have_their_own_temporary_files(tmp_path):
+    from threading import Barrier, Thread
+
+    both, parts = Barrier(2), []
+
+    def write(part):
+        parts.append(part)
+        both.wait(timeout=600.0)
+        part.write_text(str(part))
+        both.wait(timeout=600.0)
+
+    threads = [Thread(target=write_atomically, args=(tmp_path / "a", write)) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(set(parts)) == 2
+    assert (tmp_path / "a").read_text() in map(str, parts)
+
+
+WRITE_AND_DIE = """if True:
+    import os, signal, sys
+    from pathlib import Path
+    from lavender.io.stored import write_atomically
+    from lavender.sim.web import compile
+
+    def write(part):
+        Path(part).write_bytes(b"half")
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    if sys.argv[1] == "module":
+        Path.replace = lambda part, target: os.kill(os.getpid(), signal.SIGKILL)
+        compile.put(Path("a.txt"), b"half")
+    write_atomically("a.txt", write)"""
+
+
+@pytest.mark.parametrize("kind", ["file", "module"])
+def test_the_temporary_file_of_a_killed_writer_is_removed_later(kind, tmp_path):
+    (tmp_path / "a.txt").write_bytes(BEFORE)
+    python("-c", WRITE_AND_DIE, kind, cwd=tmp_path, status=-signal.SIGKILL)
+    assert (tmp_path / "a.txt").read_bytes() == BEFORE
+    (part,) = (p for p in tmp_path.iterdir() if p.name != "a.txt")
+    assert PART.fullmatch(part.name)
+    write_text(tmp_path / "a.txt", "of another")
+    assert part.exists()  # Its writer may be alive, on another machine.
+    os.utime(part, (0.0, 0.0))
+    again = "from lavender.io.stored import write_text; write_text('a.txt', 'of another')"
+    python("-c", again, cwd=tmp_path)  # A process searches a folder once.
+    assert [p.name for p in tmp_path.iterdir()] == ["a.txt"]
+
+
+@pytest.mark.skipif(os.name != "posix", reason="Windows keeps files that are open")
+def test_a_clock_that_jumps_does_not_remove_the_file_of_a_running_writer(tmp_path):
+    ended = subprocess.Popen([sys.executable, "-c", ""])
+    ended.wait()
+    own, dead = (tmp_path / f".x.npz.{pid}.1.part" for pid in (os.getpid(), ended.pid))
+    for part in (own, dead):
+        part.write_bytes(b"half")
+        os.utime(part, (0, 0))  # as after a clock that was decades late
+    write_text(tmp_path / "y", "")
+    assert own.exists() and not dead.exists()
+
+
+def test_one_process_writes_records_and_a_dead_one_holds_no_lock(tmp_path):
+    path = tmp_path / "records.jsonl"
+    with bench.Store(path) as store:
+        for _ in range(2):  # The first refusal releases nothing.
+            with pytest.raises(lv.InputError, match="is being written by another command"):
+                bench.Store(path)
+        other = python("-c", f"from lavender import bench; bench.Store({str(path)!r})", status=1)
+        assert "is being written by another command" in other.stderr
+        store.close()
+        bench.Store(path).close()
+    killed = f"import os; from lavender import bench; s = bench.Store({str(path)!r}); os.kill(os.getpid(), 9)"
+    python("-c", killed, status=-9)
+    bench.Store(path).close()
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_one_recording_at_a_time_is_written_into_a_folder(tmp_path):
+    with folder_for_steps(tmp_path):
+        for replace in (False, True):
+            with pytest.raises(lv.InputError, match="is being written by another command"):
+                run(lv.Simulation("stack"), 3, record=tmp_path, replace=replace)
+        with pytest.raises(lv.InputError, match="is being written by another command"):
+            lv.Simulation("stack").record(tmp_path, 3)
+    holder = "import os, signal, lavender.io.stored as s; s.folder_for_steps('.').__enter__(); os.kill(os.getpid(), 9)"
+    python("-c", holder, cwd=tmp_path, status=-signal.SIGKILL)
+    simulation = lv.Simulation("stack")
+    assert len(simulation.record(tmp_path, 2)) == 2
+    assert len(simulation.record(tmp_path, 2)) == 2  # the next two steps
+    with pytest.raises(lv.InputError, match="holds 4 problem files"):
+        lv.Simulation("stack").record(tmp_path, 2)
+
+
+def test_a_new_recording_removes_the_description_of_the_old_one(tmp_path):
+    for name in ("engine.jsonl", "step_1.npz"):
+        (tmp_path / name).write_text("of before")
+    with folder_for_steps(tmp_path, replace=True) as folder:
+        assert folder == tmp_path
+        assert [p.name for p in tmp_path.iterdir()] == [FOLDER_LOCK]
+    assert not list(tmp_path.iterdir())
+
+
+# -- commands that write -----------------------------------------------------------------------------------------
+
+QUICK = ("--solvers", "pgs", "--levels", "1e-3", "--budgets", "4", "--repeats", "1", "--orders", "reverse")
+
+
+@pytest.fixture
+def lavender(lavender, tmp_path, monkeypatch):
+    """The command, in the folder of what it reads."""
+    monkeypatch.chdir(tmp_path)
+    return lavender
+
+
+#: Each command that writes a folder, and its words.
+WRITE_A_FOLDER = {
+    "audit": ("audit", "MODEL", "--worlds", 1, "--steps", 1, "--out", "OUT"),
+    "tune": ("tune", "MODEL", "--worlds", 1, "--steps", 1, "--out", "OUT"),
+    "record": ("record", "MODEL", "--steps", 1, "--out", "OUT"),
+    "report": ("report", "stack(n=2)", *QUICK, "--out", "OUT"),
+    "records shown again": ("report", "records.jsonl", "--out", "OUT"),
+    "report with workers": ("report", "--workers", "1", "stack(n=2)", *QUICK[:6], "--out", "OUT"),
+    "problems": ("problems", "@walking", "--out", "OUT"),
+    "run": ("run", "stack", "--steps", 1, "--record", "OUT"),
+    "export": ("export", "c", "OUT"),
+    "web": ("web", "page", "OUT"),
+}
+
+
+def words_of(name, folder):
+    """Write what a command of WRITE_A_FOLDER reads; return its words, and the folder that it writes."""
+    (folder / "model.xml").write_text(scene())
+    (folder / "records.jsonl").touch()
+    out = folder / "out"
+    return [{"MODEL": folder / "model.xml", "OUT": out}.get(word, word) for word in WRITE_A_FOLDER[name]], out
+
+
+@pytest.mark.parametrize("name", WRITE_A_FOLDER)
+def test_a_folder_that_another_command_writes_is_refused_before_the_work(lavender, tmp_path, name):
+    words, out = words_of(name, tmp_path)
+    with lock_output(out, folder=True):
+        before = list(out.iterdir())
+        code, _, err = lavender(*words)
+        assert code == 2 and "is being written by another command" in err
+        assert list(out.iterdir()) == before
+    assert not out.exists()  # It was made for the lock alone.
+
+
+@pytest.mark.parametrize("name", ["report", "run", "export", "web", "problems"])
+def test_a_folder_that_cannot_be_made_is_named(name, lavender, tmp_path, monkeypatch):
+    """Some file systems refuse only when they are asked: /proc is writable to root, and makes nothing."""
+    if name == "export":
+        pytest.importorskip("Cython", reason="the export translates the kernels (extra: test)")
+    words, out = words_of(name, tmp_path)
+    make = Path.mkdir
+
+    def mkdir(path, *more, **others):
+        if path == out:
+            raise OSError(errno.ENOENT, os.strerror(errno.ENOENT), str(path))
+        make(path, *more, **others)
+
+    monkeypatch.setattr(Path, "mkdir", mkdir)
+    code, _, err = lavender(*words)
+    why = f"cannot make the folder {out}: {os.strerror(errno.ENOENT)}; give another path"
+    assert (code, err.splitlines()[-1]) == (2, f"lavender: {why}")
+
+
+COMMANDS = [
+    ("report", "stack(n=2)", "--solvers", "sequential_impulses", "--levels", "1e-3", "--budgets", "4", "--repeats", "1",
+     "--out", "report", "--paper"),
+    ("run", "stack", "--steps", "3", "--record", "steps", "--trace", "t.csv", "--plot", "t.svg", "--film", "t.gif"),
+    ("solve", "stack(n=2)", "--output", "solution.npz"),
+    ("phenomena", "slide", "--steppers", "impulses", "--engines", "none", "--out", "phenomena.json"),
+    ("export", "c", "c", "--for", "report"),
+    ("web", "page", "page"),
+    ("problems", "@hard", "--page", "set.md"),
+]  # fmt: skip
+
+
+def test_every_command_writes_files_under_temporary_names_first(tmp_path):
+    """A reader, a full disk or a signal finds the old file or the new one; records are added to their file."""
+    pytest.importorskip("Cython", reason="the export translates the kernels (extra: test)")
+    script = """if True:
+        import os, sys
+        from lavender import cli
+        from lavender.io.stored import PART
+        from lavender.lab.bench.running import alternating
+        from lavender.sim.web import pages
+        alternating.MAX_REPETITIONS = 1
+        pages.module = lambda say, name: b"a module"
+        here, opened = os.getcwd(), set()
+
+        def watch(event, given):
+            if event == "open" and isinstance(given[0], (str, os.PathLike)) and given[2] & (os.O_WRONLY | os.O_RDWR):
+                path = os.path.abspath(given[0])
+                if path.startswith(here) and not (os.path.isdir(path) or PART.fullmatch(os.path.basename(path))):
+                    opened.add(os.path.relpath(path, here))
+
+        sys.addaudithook(watch)
+        for words in COMMANDS:
+            try:
+                cli.main(list(words))
+            except SystemExit as end:
+                assert not end.code, (words, end.code)
+        print("OPENED", sorted(opened))"""
+    done = python("-c", script.replace("COMMANDS", repr(COMMANDS)), cwd=tmp_path)
+    files = {p.relative_to(tmp_path).parts[0] for p in tmp_path.rglob("*") if p.is_file()}
+    assert files >= {"report", "steps", "t.csv", "t.gif", "c", "page", "phenomena.json", "set.md"}
+    locks = [f"{name}/{FOLDER_LOCK}" for name in ("c", "page", "report", "steps")]
+    assert literal_eval(done.stdout.splitlines()[-1].removeprefix("OPENED ")) == sorted(
+        [*locks, "report/records.jsonl", "report/records.jsonl.lock"]
+    )
+
+
+# -- names and numbers that commands are given ------------------------------------------------------------------------
+
+WORDS = (
+    ("report", "two_particles", "--workers", "{}"),
+    ("report", "granular", "--workers", "1", "--seeds", "0:{}"),
+    ("solve", "random_spd(n={})"), ("solve", "two_particles", "--tol", "{}"),
+    ("solve", "two_particles", "--max-iter", "{}"), ("solve", "two_particles", "--time-limit", "{}"),
+    ("check", "two_particles", "--tol", "{}", "--solvers", "pgs"), ("view", "{}"), ("record", "{}", "--out", "{}"),
+)  # fmt: skip
+VALUES = ("0", "-1", "-2", "1000000000", "1000000000000", "1e400", "nan", "", "a", "10000000", "1:", "0x10")
+
+
+def check_command(code, text, statuses=(0, 1, 2, 3)):
+    """Require a documented status, with a message if it is 2, no traceback and no code of the terminal."""
+    assert code in statuses, text
+    assert "Traceback (most recent call last)" not in text
+    assert "\x1b" not in text
+    assert code != 2 or text.strip()
+
+
+@pytest.mark.fuzz
+@settings(max_examples=12 * MORE, suppress_health_check=list(HealthCheck))
+@given(words=st.sampled_from(WORDS), value=st.sampled_from(VALUES))
+def test_any_number_on_the_command_line_gives_a_documented_status(lavender, words, value):
+    code, out, err = lavender(*(word.format(value) for word in words))
+    check_command(code, out + err)
+
+
+def test_characters_that_cannot_be_shown_are_written_as_their_codes():
+    assert printable("a\udce9\ud800\n\x1b\u202eé²") == "a\\xe9\\ud800\\n\\x1b\\u202eé²"
+    assert printable("a\nb\r", lines=True) == "a\nb\\r"
+
+
+@pytest.mark.skipif(os.name != "posix", reason="file names of POSIX")
+def test_commands_print_paths_as_text(lavender, tmp_path):
+    pytest.importorskip("mujoco")
+    path = tmp_path / "evil\x1b]0;title\x07.xml"
+    path.write_text(scene())
+    to = "to\x1b[31m"
+    for line in (
+        ["bench", "mujoco", path, "--steps", "1"],
+        ["record", path, "--steps", "15", "--every", "15", "--out", to],
+        ["problems", "@walking", "--out", f"{to}1"],
+        ["run", "stack", "--set", "n=1", "--steps", "2", "--trace", f"{to}.csv", "--record", f"{to}2"],
+        ["solve", "stack(n=2)", "--output", f"{to}.npz"],
+    ):
+        code, out, err = lavender(*line)
+        assert code == 0, err
+        assert "\\x1b" in out + err and "\x1b" not in out + err
+
+
+def test_the_name_of_a_plug_in_is_printed_as_text(lavender, register):
+    register(dataclasses.replace(lv.registry.get("pgs"), name="p\x1b[31m[red]q", summary="of [bold]a\x1b[0m"))
+    code, out, _ = lavender("solvers")
+    assert code == 0 and "\x1b" not in out
+    assert r"p\x1b[31m[red]q" in out and r"of [bold]a\x1b[0m" in out
+
+
+def test_long_names_that_differ_at_the_end_have_different_file_names():
+    names = ["n" * 300 + str(i) for i in range(3)]
+    assert len({file_name(name) for name in names}) == 3
+    items = bench.resolve([stack(name=n) for n in [*names, names[0], "x", "x", "x #2"]])
+    assert len({file_name(item.name).lower() for item in items}) == len(items)
+
+
+# -- folders that a report or a check reads ----------------------------------------------------------------------
+
+NAMES = (
+    "a.npz", "[/x].npz", "[bold].npz", "²1.npz", "a$\\frac$b.npz", "a$b.npz", "<img src=x onerror=alert(1)>.npz",
+    "a\nb.npz", "a\tb.npz", "'; DROP.npz", '".npz', "&amp;.npz", "-x.npz", "--out.npz", "..npz", " .npz", "%s.npz",
+    "{0}.npz", "a\u0308.npz", "\u202ex.npz", "a|b.npz", "`a`.npz", "*_#.npz", "a\x1b[31m.npz", "x.hdf5", "x.jsonl",
+    "case(n=1).npz", "1.npz", "01.npz", "step-1.npz", "step-\N{ARABIC-INDIC DIGIT THREE}.npz",
+    "\N{GRINNING FACE}.npz", b"\xff\xfe.npz", b"a\x80.npz",
+)  # fmt: skip
+HTML, A = "<img src=x onerror=alert(1)>", np.array([[2.0, 0.5], [0.5, 1.0]])
+PROBLEMS = {
+    "names": lambda: lv.Problem.lcp(
+        A, [1.0, 1.0], names=["[/x]", "<script>alert(1)</script>"], name=f"[bold]{HTML}"
+    ),
+    "a name": lambda: lv.Problem.lcp(A, [1.0, -1.0], name="a\nb$\\frac$|`"),
+    "a lone surrogate": lambda: lv.Problem.lcp(A, [1.0, 1.0], names=["\ud800", "b"], name="\udcff"),
+    "huge numbers": lambda: lv.Problem.lcp(1e59 * A, [1e59, -1e59]),
+    "infeasible": lambda: lv.Problem.lcp(-np.eye(2), [1.0, 1.0]),
+    "empty": lambda: lv.Problem.linear(np.zeros((0, 0)), []),
+    "zero": lambda: lv.Problem.lcp(np.zeros((2, 2)), [0.0, 0.0]),
+    "contacts": lambda: lv.Problem.contact(np.eye(3), [1.0, 0.2, 0.1], [0.5]),
+}
+CONTENTS = (*PROBLEMS, "garbage", "arrays", "a pipe", "a link to its folder")
+
+
+def write_entry(folder, name, content):
+    """Write one file of a folder; a name that this file system refuses is left out."""
+    path = folder / (os.fsdecode(name) if isinstance(name, bytes) else name)
+    with contextlib.suppress(OSError):
+        if content == "a link to its folder":
+            path.symlink_to(folder)
+        elif content == "a pipe":
+            os.mkfifo(path)
+        elif content == "garbage":
+            path.write_bytes(b"PK\x03\x04" + os.fsencode(path.name))
+        elif content == "arrays":
+            with path.open("wb") as file:  # An error may name its arrays.
+                np.savez(file, **{"[/x]": np.ones(2), "a\nb": np.ones(2), "\x1b[31m": np.ones(2)})
+        else:
+            complete = folder.parent / "complete.npz"
+            io.save(PROBLEMS[content](), complete)
+            os.replace(complete, path)
+
+
+def check_folder(lavender, folder, entries, command, with_figures=False, again=False, statuses=(0, 1, 2, 3)):
+    """Run a command on a folder; require a documented status, and text that is escaped in all that it writes."""
+    out, problems = folder / "out", folder / "problems"
+    problems.mkdir(parents=True)
+    for name, content in entries:
+        write_entry(problems, name, content)
+    plan = ("--solvers", "pgs,nncg", "--levels", "1e-3", "--budgets", "4", "--repeats", "1", "--out", out)
+    words = {
+        "report": ("report", problems, *plan),
+        "files": ("report", *sorted(problems.iterdir()), *plan),
+        "check": ("check", problems, "--solvers", "pgs,nncg"),
+    }[command]
+    for run_again in (False, True) if again else (False,):
+        # Figures cost most: a second run draws them from the records.
+        has_figures = command == "check" or (with_figures and run_again == again)
+        code, printed, err = lavender(*words, *([] if has_figures else ["--no-figures"]))
+        check_command(code, printed + err, statuses)
+    for page in out.glob("*.html"):
+        html = page.read_text(encoding="utf-8")
+        assert "<img src=x" not in html and "<script>alert" not in html
+    for page in out.glob("*.md"):
+        summary = page.read_text(encoding="utf-8")
+        assert "<img src=x" not in summary
+        for table in re.split(r"\n\n+", summary):
+            rows = [row for row in table.splitlines() if row.startswith("|")]
+            assert len({len(re.findall(r"(?<!\\)\|", row)) for row in rows}) <= 1, "rows with unequal cells"
+
+
+FOLDERS = {
+    "any names": {
+        "entries": [
+            ("[x][bold]{y}[ a|b`c`[d](e)*f*.npz", "names"), ("²1.npz", "a name"),
+            ("a$\\frac$b.npz", "a lone surrogate"), ("_a$b.npz", "contacts"),
+            (f"{HTML} \u202egnp.npz", "a name"), ("two\nlines\r\x1b[31m" + 200 * "n" + ".npz", "names"),
+            (b"caf\xe9\xff.npz", "contacts"), ("odd.npz", "arrays"),
+        ],
+        "command": "report", "with_figures": True, "again": True, "statuses": (1,),
+    },
+    "odd files": {
+        "entries": [("--out.npz", "huge numbers"), ("a.npz", "infeasible"), ("b.npz", "empty"), ("c.npz", "zero"),
+                    ("pipe.npz", "a pipe"), ("loop", "a link to its folder")],
+        "command": "report",
+    },
+    "odd arrays": {"entries": [("a.npz", "arrays")], "command": "check"},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", FOLDERS)
+def test_a_folder_of_anything_gives_a_documented_status_and_escaped_text(lavender, tmp_path, name):
+    check_folder(lavender, tmp_path / "folder", **FOLDERS[name])
+
+
+@pytest.mark.fuzz
+@pytest.mark.skipif(MORE == 1, reason="a second each; the folders above have one of each kind")
+@settings(max_examples=60, suppress_health_check=list(HealthCheck))
+@given(
+    entries=st.lists(st.tuples(st.sampled_from(NAMES), st.sampled_from(CONTENTS)), min_size=1, max_size=5),
+    command=st.sampled_from(("report", "check", "files")),
+    again=st.booleans(),
+)
+def test_drawn_folders_give_a_documented_status_and_escaped_text(
+    lavender, tmp_path_factory, entries, command, again
+):
+    check_folder(lavender, tmp_path_factory.mktemp("drawn"), entries, command, again=again)
+
+
+def test_a_reader_that_raises_costs_its_own_case(tmp_path, monkeypatch):
+    load = io.load
+    for name in ("good", "bad"):
+        io.save(stack(), tmp_path / f"{name}.npz")
+
+    def load_or_raise(path, **more):
+        if "bad" in str(path):
+            raise RecursionError("[/x]")
+        return load(path, **more)
+
+    monkeypatch.setattr(io, "load", load_or_raise)
+    records = bench.run([tmp_path], ["pgs"], bench.Plan(levels=(1e-3,), budgets=(), repeats=1))
+    assert {r.case for r in records} == {"good"}
+    assert ["RecursionError: [/x]" in s.reason for s in records.skips] == [True]
+
+
+def test_a_report_with_workers_takes_files_and_folders(lavender, tmp_path):
+    (tmp_path / "problems").mkdir()
+    for name in ("x", "y"):
+        io.save(stack(), tmp_path / "problems" / f"{name}.npz")
+    io.save(stack(), tmp_path / "z.npz")
+    more = (*QUICK[:6], "--workers", 1, "--seeds", "2")
+    code, _, err = lavender("report", "problems/", "z.npz", "./z.npz", "random_spd(n=4)", *more)
+    assert (code, err.strip()) == (0, "")
+    cases = {r.case for r in bench.read("lavender-report")}
+    assert cases == {"x", "y", "z", "z #2", "random_spd(n=4, seed=0)", "random_spd(n=4, seed=1)"}
+    code, _, err = lavender("report", "nothing.npz", *more[:-2])
+    assert code == 2 and "no such file" in err
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "[" * 100_000,
+        '{"file": "../../x.npz", "left_out": "\\u202e<i>why"}',
+        '{"file": "a\\u0000b", "left_out": ["why"]}',
+        '{"file": ["x"], "left_out": null}',
+        '{"file": "", "left_out": "why"}',
+        pytest.param(None, id="a pipe"),
+    ],
+)
+def test_a_description_of_a_recording_by_anybody_is_harmless(lavender, tmp_path, text):
+    """At most it names steps that are not there."""
+    folder = tmp_path / "steps"
+    folder.mkdir()
+    io.save(stack(4), folder / "step_1.npz")
+    if text is None:
+        os.mkfifo(folder / "engine.jsonl")
+    else:
+        (folder / "engine.jsonl").write_text(text)
+    items = bench.resolve(folder)
+    assert items[0].problem.m == 4 and len(items) <= 2
+    assert all(item.name.isprintable() for item in items)
+    code = lavender("report", folder, *QUICK, "--no-figures")[0]
+    assert code == (cli.EXIT_UNMET if len(items) == 2 else 0)
+    assert "<i>" not in (tmp_path / "lavender-report" / "index.html").read_text()
+
+
+# -- records ------------------------------------------------------------------------------------------------------
+
+HOSTILE = [
+    None, True, -1, 2**70, 1e400, float("nan"), "", "[/x]", "\ud800", "a$\\frac$b", "<b>", [], [[]], ["a", 2],
+    ["\x1b"], {}, {"levels": ["x"]}, {"a": {"b": 1}}, {"x": 1.5},
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def entries():
+    """The entries of a small report with a sequence and a skip."""
+    plan = bench.Plan(levels=(1e-3,), budgets=(2, 4), repeats=1, orders=("reverse",))
+    cases = [stack(name="one"), *bench.sequence([stack(), stack()], "walk")]
+    records = bench.run(cases, ["pgs", "direct", "gauss_seidel"], plan)
+    kinds = [*records.runs.values(), *records.cases.values(), *records.skips, *records.records]
+    return [to_json(e) for e in kinds]
+
+
+def write_entries(path, entries):
+    path.write_text("".join(json.dumps(e) + "\n" for e in entries))
+
+
+def show_all(records):
+    """Make everything that is shown of records, but the files of figures, in memory."""
+    from rich.console import Console
+
+    from lavender.lab.report.curves import figures
+    from lavender.lab.report.page import page
+    from lavender.lab.report.write import summary
+
+    shown = records.latest()
+    report = Report(shown, shown)
+    print_report(report, Console(file=streams.StringIO(), width=140))
+    for record in shown.records:  # The fastest, which is shown, differs from run to run.
+        assert format_call(record)
+    page(report, figures(shown)).encode("utf-8")
+    summary(report).encode("utf-8")
+
+
+def test_records_of_any_content_are_shown_or_rejected(tmp_path, entries):
+    """The values that fields accept are shown together: a page takes longer than reading a file."""
+    path = tmp_path / "records.jsonl"
+    first = {kind: next(i for i, e in enumerate(entries) if e["kind"] == kind) for kind in KINDS}
+
+    def read(changes):
+        changed = [
+            e | changes.get(e["kind"], {}) if i in first.values() else e for i, e in enumerate(entries)
+        ]
+        write_entries(path, changed)
+        try:
+            return bench.read(path)
+        except lv.InputError:
+            return None
+
+    accepted = {}
+    for kind, cls in KINDS.items():
+        names = [f.name for f in dataclasses.fields(cls)]
+        accepted[kind] = {n: [v for v in HOSTILE if read({kind: {n: v}}) is not None] for n in names}
+        assert any(len(values) < len(HOSTILE) for values in accepted[kind].values())
+    shown = 0
+    for i in range(max(len(values) for fields in accepted.values() for values in fields.values())):
+        some = {kind: {n: x[i % len(x)] for n, x in fields.items() if x} for kind, fields in accepted.items()}
+        records = read(some)
+        if records is not None:
+            show_all(records)
+            shown += 1
+    assert shown > 0
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "[" * 100_000,
+        '{"kind": ' * 5000,
+        "1" * 5000,
+        '{"kind": ["run"]}',
+        '{"kind": {}}',
+        "null",
+        '"run"',
+        "\x00\x00",
+        "\ufffe",
+        '{"kind": "case"}',
+    ],
+)
+def test_lines_that_are_no_records_are_rejected_by_number(tmp_path, text):
+    (tmp_path / "records.jsonl").write_text(f"{text}\n")
+    with pytest.raises(lv.InputError, match="line 1"):
+        bench.read(tmp_path)
+
+
+def test_a_record_of_an_undescribed_case_is_rejected(tmp_path, entries):
+    write_entries(tmp_path / "records.jsonl", [e for e in entries if e["kind"] != "case"])
+    with pytest.raises(lv.InputError, match="record of a case that no line before it describes"):
+        bench.read(tmp_path)
+
+
+def test_the_newest_run_shows_its_own_cases_and_only_as_they_are_now(tmp_path, monkeypatch):
+    plan = bench.Plan(levels=(1e-3,), budgets=(), repeats=1)
+    path = tmp_path / "records.jsonl"
+    bench.run([stack(name="a"), stack(name="b")], ["pgs"], plan, path)
+    monkeypatch.setattr(machine, "cpu_name", lambda: "another")
+    bench.run([stack(name="a")], ["pgs"], plan, path)
+    monkeypatch.undo()
+    bench.run([stack(8, name="b")], ["pgs"], plan, path)  # the first run again; b has changed
+    newest = bench.read(path).latest()
+    assert sorted((r.case, newest.cases[r.case].rows) for r in newest) == [("a", 6), ("b", 8)]
+    show_all(newest)

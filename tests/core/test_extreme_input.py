@@ -1,0 +1,399 @@
+"""Extreme but valid input of the core: other units, dust, and problems whose numbers are near the limits.
+
+The claims are compared with the judge in long double (`judge_twin`).
+"""
+
+import hashlib
+import json
+import math
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import hypothesis.strategies as st
+import numpy as np
+import pytest
+from extreme_problems import LARGEST, SMALLEST, SPECIAL, build_problem, plain_data, problem_data
+from hypothesis import given, reject, settings
+from invalid_values import draw_examples
+from judge_twin import Problem
+from random_problems import CONTACTS, FORMS, random_contact_problem, random_lcp, seeds
+
+import lavender as lv
+
+# -- units -------------------------------------------------------------------------------------------------------
+
+# Units are scaled by powers of four, so that every number, its square root and the results of a solver keep their bits.
+near = st.tuples(*[st.integers(-40, 40)] * 3)
+far = st.tuples(*[st.integers(-110, 110)] * 3)
+
+
+def joint_rows(seed, friction, free=False, **sizes):
+    """Build rows of joints alone, bounded or free."""
+    problem = random_contact_problem(seed, friction, bodies=4, joints=4, contacts=0)
+    ends = np.full(problem.m, np.inf)
+    cones = replace(problem.cones, lower=-ends, upper=ends) if free else problem.cones
+    return replace(problem, cones=cones, compliance=problem.compliance + 0.1)
+
+
+KINDS = CONTACTS | {"bounded rows": joint_rows, "free rows": partial(joint_rows, free=True)}
+
+
+def make_problem(kind, form, seed):
+    """Return a problem given in this form, and the mask of its rows whose velocities are angular."""
+    rows = KINDS[kind](seed, ("coulomb", "cone")[seed % 2], bodies=3, joints=1, contacts=3)
+    angular = np.zeros(rows.m, bool)
+    for at in (rows.cones.spin_rows, rows.cones.rolling_rows, rows.cones.rolling_rows + 1):
+        angular[at[at > 0]] = True
+    return FORMS[form](rows), angular
+
+
+def in_units(problem, angular, exponent):
+    """Return plain data with 1/kg, m/s and m 4^exponent times as large, and the scales (m,) of impulse, b and A_ii."""
+    mobile, speed, length = (4.0**k for k in exponent)
+    if problem.matrix is not None:
+        length = 1.0  # d compares the entries of a row, which must have one unit
+    data, c = plain_data(problem), problem.cones
+    row = np.where(angular, 1.0 / length, 1.0)
+    impulse, column = speed / mobile / row, np.tile([1.0, length], 20).repeat(3)
+    radius = np.where(np.isin(c.kind, (lv.CONTACT_BOX, lv.CONTACT_ELLIPSE)), 1.0, length)
+
+    def scale(home, **factors):
+        for name, factor in factors.items():
+            home[name] = (np.array(home[name]) * factor).tolist()
+
+    scale(data["cones"], lower=impulse, upper=impulse, patch_radius=radius, rolling=length)
+    if problem.matrix is not None:
+        scale(data, A=mobile * row[:, None] * row)
+    else:
+        scale(data, compliance=mobile * row**2)
+    if problem.rows is not None:
+        scale(data["rows"], inv_mass=mobile, inv_inertia=mobile / length**2, jac=column[:12], arm_a=length,
+              arm_b=length, v_free=speed / column[:6])  # fmt: skip
+    if problem.generalized is not None:
+        column = column[: problem.generalized.nv]
+        scale(data, J=row[:, None] * column, M=column[:, None] * column / mobile, v_free=speed / column)
+        scale(data, target=speed * row)
+    else:
+        scale(data, b=speed * row)
+    return data, impulse, speed * row, mobile * row**2
+
+
+def arrays_of(data):
+    """Yield (name, array) of plain data."""
+    for name, x in data.items():
+        if isinstance(x, dict):
+            yield from arrays_of(x)
+        elif name not in ("operator", "friction", "guess"):
+            yield name, np.array(x, float)
+
+
+def is_in_range(data, b, d):
+    """Whether a problem may have these numbers: at most 1e60, masses and coefficients 0 or at least 1e-60."""
+    x = dict(arrays_of(data))
+    sizes = [x["mu"], x["patch_radius"], x["mu"] * x["patch_radius"], x["rolling"], [np.abs(b).max()]]
+    sizes += [x[name] for name in ("compliance", "inv_mass") if name in x]
+    if "inv_inertia" in x:
+        sizes.append(np.abs(x["inv_inertia"]).max(axis=(1, 2)))
+    if "M" in x:
+        sizes.append(np.linalg.cholesky(x["M"][::-1, ::-1]).diagonal()[::-1] ** 2)
+    inside = all(np.all(np.isinf(y) | (np.abs(y) <= LARGEST)) for y in [*x.values(), b, d])
+    return inside and all(np.all((np.asarray(y) == 0.0) | (np.asarray(y) >= SMALLEST)) for y in sizes)
+
+
+def in_two_units(kind, form, seed, exponent):
+    """Return a problem, the maker of the same in other units, the impulses' scale, and whether it is valid."""
+    problem, angular = make_problem(kind, form, seed)
+    data, impulse, b, d = in_units(problem, angular, exponent)
+    largest = (
+        np.abs(problem.dense()).max(axis=1) if problem.matrix is not None else problem.delassus().diagonal()
+    )
+    is_valid = is_in_range(data, problem.b * b, problem.d * d)
+    is_empty = bool(np.any(largest * d < SMALLEST))  # rows that count as empty have another metric
+    return build_problem(plain_data(problem)), partial(build_problem, data), impulse, is_valid, is_empty
+
+
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("kind", KINDS)
+@given(seed=seeds, exponent=far | near)
+@settings(max_examples=10)
+def test_a_problem_in_other_units_is_rejected_or_has_the_same_residual(kind, form, seed, exponent):
+    problem, build, scale, is_valid, is_empty = in_two_units(kind, form, seed, exponent)
+    impulse = np.random.default_rng(seed).normal(size=problem.m)
+    if not is_valid:
+        with pytest.raises(lv.InputError, match=r"1e[+-]60.* unit|1e-18 to 1e18"):
+            lv.residual(build(), impulse)
+    elif not is_empty:
+        expected, residual = lv.residual(problem, impulse), lv.residual(build(), impulse * scale)
+        for name in ("relative", "floor", "worst_row"):
+            assert getattr(residual, name) == getattr(expected, name)
+
+
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("kind", KINDS)
+@given(seed=seeds, exponent=near)
+@settings(max_examples=3)
+def test_every_solver_gives_the_same_answer_in_other_units(kind, form, seed, exponent):
+    if kind not in ("disks", "boxes", "ellipses", "bounded rows", "free rows"):
+        exponent = (*exponent[:2], 0)  # a solver may sum over rows of different units
+    problem, build, scale, is_valid, is_empty = in_two_units(kind, form, seed, exponent)
+    if not is_valid or is_empty:
+        return
+    for name in lv.available(problem, external=False):
+        expected, solution = (lv.solve(p, name, tol=1e-8, max_iter=200) for p in (problem, build()))
+        assert (solution.status, solution.iterations) == (expected.status, expected.iterations), name
+        np.testing.assert_array_equal(solution.impulse, expected.impulse * scale, err_msg=name)
+
+
+# -- rows without an entry ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("form", ["A", "J and M"])
+def test_a_row_below_the_smallest_entry_is_an_empty_row(form):
+    """Its d is that of the other rows, and nothing is divided by its entry."""
+    dust = 1e-61
+    if form == "A":
+        problem = lv.Problem([1.0, 0.0], lv.Cones.free(2), np.diag([1.0, dust]))
+    else:
+        problem = lv.Problem.from_jacobian(
+            np.diag([1.0, dust]), np.eye(2), [0.0, 0.0], target=[1.0, 0.0], cones=lv.Cones.free(2)
+        )
+    assert problem.metric.empty.tolist() == [1] and problem.d.tolist() == [1.0, 1.0]
+    assert lv.solve(problem, "auto").success
+    solution = lv.solve(problem.updated(b=[1.0, 1.0]), "auto")
+    assert not solution.success or solution.residual.relative <= 1e-6
+    assert solution.status is not lv.Status.INFEASIBLE or solution.claim_check == "confirmed"
+
+
+# -- claims of solvers, against the judge in long double --------------------------------------------------------------
+
+# Numbers whose exponents are below this are far from the ends of float64, so that both judges give the same.
+MODERATE = 90.0
+# 10 n times the condition number of M, above which float64 cannot give all digits of the judge in long double.
+ILL_CONDITIONED = 1e14
+ORDERS = ("given", "reverse", "symmetric", "random", "bottom_up", "top_down", "colored", "local")
+STARTS = ("finite", "special", "none", "none")
+
+
+@st.composite
+def solve_cases(draw):
+    """A problem, a solver (one in ten of another package) and options."""
+    data = draw(problem_data())
+    try:
+        problem = build_problem(data)
+    except lv.InputError:
+        reject()
+    own, external = (lv.available(problem, external=other) for other in (False, True))
+    name = draw(st.sampled_from(external if external and draw(st.integers(0, 9)) == 9 else own))
+    if len(data["cones"]["kind"]) > 10 and draw(st.booleans()):
+        name = "auto"  # it solves each island by itself
+    spec, rng = lv.get(name), np.random.default_rng(draw(seeds))
+    options = {"tol": draw(st.sampled_from((1e-6, 1e-6, 1e-9, 1e-12, 1e-3, 0.0, 1e-300, 2.0)))}
+    options["max_iter"] = draw(st.sampled_from((1, 2, 20, 50, 200, spec.max_iter)))
+    start = draw(st.sampled_from(STARTS))
+    if start != "none":
+        numbers = rng.normal(size=problem.m) if start == "finite" else rng.choice(SPECIAL, problem.m)
+        options["impulse"] = numbers.tolist()
+    if spec.order and draw(st.booleans()):
+        options["order"] = draw(st.sampled_from(ORDERS))
+    if spec.history and draw(st.integers(0, 19)) == 19:
+        options["history"] = True
+    if draw(st.integers(0, 49)) == 49:
+        options["time_limit"] = draw(st.sampled_from((0.0, 1e-6, 1e-3, 1.0)))
+    case = {"problem": data, "solver": name, "options": options}
+    if not spec.external and "time_limit" not in options:  # Repeating others' solvers is their own affair.
+        how = draw(st.sampled_from(("once", "once", "again", "prepared", "many")))
+        case |= {"again": how == "again", "prepared": how == "prepared"}
+        if how == "many":
+            count = draw(st.integers(0, 3))
+            case["others"] = rng.choice(SPECIAL, (count, problem.m)).tolist()
+            case["threads"] = draw(st.integers(1, 2))
+    return case
+
+
+def bits(solution):
+    """Return everything that must be the same in a second run."""
+    r = solution.residual
+    numbers = np.array([r.relative, r.energy, r.velocity, r.floor])
+    return (
+        solution.impulse.tobytes(), solution.slack.tobytes(), numbers.tobytes(), solution.status.name,
+        solution.iterations, tuple(sorted(solution.work.items())),
+    )  # fmt: skip
+
+
+def hash_of(problem):
+    """Return a hash of everything that a solver could have changed."""
+    digest, c = hashlib.sha256(), problem.cones
+    arrays = [
+        problem.b,
+        problem.d,
+        problem.guess,
+        c.ptr,
+        c.kind,
+        c.lower,
+        c.upper,
+        c.mu,
+        c.patch_radius,
+        c.rolling,
+    ]
+    matrices = [problem.csr] if problem.generalized is None else [problem.jacobian, problem.generalized.mass]
+    for matrix in matrices:
+        arrays += [matrix.indptr, matrix.indices, matrix.data] if hasattr(matrix, "indptr") else [matrix]
+    for x in arrays:
+        digest.update(b"" if x is None else np.ascontiguousarray(x).tobytes())
+    return digest.digest()
+
+
+def check_case(case):
+    """Solve a case, compare its claims with the judge in long double, and repeat it in every other way it names."""
+    problem, name, options = build_problem(case["problem"]), case["solver"], case["options"]
+    before = hash_of(problem) if case.get("again") else None
+    try:
+        if case.get("prepared"):
+            mine = {k: v for k, v in options.items() if k == "order"}
+            rest = {k: v for k, v in options.items() if k != "order"}
+            prepared = lv.prepare(problem, name, **mine)
+            first, solution = prepared.solve(**rest), prepared.solve(problem, **rest)
+            assert bits(first) == bits(solution)
+        else:
+            solution = lv.solve(problem, name, **options)
+    except lv.InputError:
+        assert options.get("time_limit") == 0.0, "a valid problem was rejected later"
+        return
+    check_claims(case["problem"], problem, solution, options)
+    if "others" in case:
+        check_many(case, problem, solution)
+    if case.get("again"):
+        check_states(problem, solution)
+        assert hash_of(problem) == before, "the solver changed its problem"
+        assert bits(lv.solve(build_problem(case["problem"]), name, **options)) == bits(solution)
+
+
+def check_many(case, problem, solution):
+    """Solve the same structure with other b in one call, and one by one."""
+    options, others = dict(case["options"]), []
+    start = options.pop("impulse", None)
+    for b in case["others"]:
+        try:
+            others.append((b, problem.updated(b=np.array(b, float))))
+        except lv.InputError:
+            continue  # Its numbers are out of range.
+    problems = [problem, *(other for _, other in others)]
+    starts = None if start is None else [start] * len(problems)
+    solutions = lv.solve_many(problems, case["solver"], impulses=starts, threads=case["threads"], **options)
+    assert bits(solutions[0]) == bits(solution)
+    for (b, other), one in zip(others, solutions[1:], strict=True):
+        assert bits(lv.solve(other, case["solver"], **case["options"])) == bits(one)
+        check_claims(case["problem"] | {"b": b}, other, one, case["options"])
+
+
+def check_claims(data, problem, solution, options):
+    """Compare status, success and numbers of a solution with the judge in long double."""
+    spec, status, r = lv.get(solution.solver.name), solution.status.name, solution.residual
+    budget = options.get("max_iter", spec.max_iter)
+    if not spec.external:  # Those count in their own way.
+        assert solution.iterations <= budget
+        assert solution.claim_check == "confirmed", solution.status_conflict
+    if status == "MAX_ITERATIONS" and solution.tol == 0.0 and spec.resumable:
+        assert solution.iterations == budget
+    is_finite = bool(np.isfinite(solution.impulse).all())
+    assert is_finite or status in ("DIVERGED", "NUMERICAL_ERROR")
+    assert not any(math.isnan(getattr(r, name)) for name in ("relative", "energy", "velocity", "floor"))
+    try:
+        solution.raise_for_status()
+        accepted = True
+    except lv.SolveFailed:
+        accepted = False
+    twin = Problem(data)
+    if status == "INFEASIBLE" and solution.claim_check == "confirmed":
+        assert not solution.success and solution.certificate is not None
+        assert twin.refutes(solution.certificate) is None
+    j = twin.judge(solution.impulse)
+    if j.nothing or twin.d_edge or twin.of_factor > ILL_CONDITIONED:
+        return
+    slop = 1.0 + 1e-6
+    unrefined = min(
+        j.unrefined, 0.1 * max(solution.tol, j.relative)
+    )  # A pass of this accuracy is not refined.
+    within = solution.tol * slop + j.allowed + unrefined
+    floor = 2.0 * max(j.floor, min(r.floor, j.floor_most)) * slop + j.allowed + unrefined
+    confirmed = solution.claim_check == "confirmed"
+    numbers = f"relative {r.relative:.3e}, floor {r.floor:.3e}, in long double {j.relative:.3e}"
+    if solution.success or (status == "CONVERGED" and confirmed):
+        assert j.relative <= within, numbers
+    if (status == "FLOOR" and confirmed) or accepted:
+        assert j.relative <= max(within, floor), numbers
+    if status == "FLOOR" or (accepted and not solution.success):
+        assert r.relative <= 1e-5 and math.isfinite(r.floor), numbers
+    # A judge that reports a floor above 1e-5 accepts nothing: it says that float64 cannot measure this impulse.
+    if is_finite and j.range < MODERATE and not r.relative <= r.floor > 1e-5:
+        both_infinite = r.relative == j.relative == math.inf  # Zero impulses solve the problem, these do not.
+        assert both_infinite or abs(r.relative - j.relative) <= 1e-6 * j.relative + j.allowed + unrefined, (
+            numbers
+        )
+        d = np.array(twin.d, float)
+        rounding = 1e-6 + float(twin.of_factor) * 2.0**-53  # The second term is that of the factor of M.
+        assert abs(problem.disk.d - d).max(initial=0.0) <= rounding * d.max(initial=0.0)
+
+
+def check_states(problem, solution):
+    """Compare the blocks' states and error bounds with those of a tighter solution, if there is only one."""
+    own = solution.states
+    assert (own.tolerance >= 0.0).all() and own.unknown == tuple(np.flatnonzero(np.isinf(own.tolerance)))
+    if problem.m == 0 or problem.law == "coulomb" or not problem.is_semidefinite:
+        return
+    other = lv.solve(problem, tol=1e-13)
+    tight = other.states
+    with np.errstate(all="ignore"):  # of impulses that are not finite
+        difference = problem.on_disk(solution.impulse - other.impulse)
+        error = np.sqrt(np.add.reduceat(difference**2, problem.cones.ptr[:-1]))
+        assert not np.any(error > (own.tolerance + tight.tolerance) * (1.0 + 1e-9))
+    for i in set(range(len(own))) - set(own.boundary) - set(tight.boundary):
+        assert own.names[i] == tight.names[i]
+
+
+@pytest.mark.fuzz
+@pytest.mark.filterwarnings("error")
+@draw_examples(150)
+@given(case=solve_cases())
+def test_claims_about_extreme_problems_hold_in_long_double(case):
+    try:
+        check_case(case)
+    except (lv.CapabilityError, lv.SolverUnavailable):
+        reject()  # an order or an option that this solver does not have for this problem
+
+
+FOUND = [
+    json.loads(line) for line in Path(__file__).with_name("found_problems.jsonl").read_text().splitlines()
+]
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("case", FOUND, ids=[case["name"] for case in FOUND])
+def test_problems_that_once_had_false_claims_stay_fixed(case):
+    check_case(case["spec"])
+
+
+def test_the_comparison_in_long_double_detects_false_claims():
+    problem = random_lcp(3)
+    solution = lv.solve(problem, "direct", tol=1e-9)
+    data, options = plain_data(problem), {"tol": 1e-9}
+    check_claims(data, problem, solution, options)
+
+    for changed in (
+        {"impulse": solution.impulse * (1.0 + 1e-6)},
+        {"impulse": np.full(problem.m, np.nan)},
+        {"status": lv.Status.INFEASIBLE, "certificate": np.ones(problem.m)},
+        {"iterations": 10**9},
+    ):
+        false = object.__new__(lv.Solution)
+        object.__setattr__(false, "__dict__", solution.__dict__ | changed)
+        with pytest.raises(AssertionError):
+            check_claims(data, problem, false, options)
+
+
+def test_the_comparison_in_long_double_accepts_certificates_that_prove():
+    twin = Problem(plain_data(lv.Problem.lcp(-np.eye(2), [1.0, 1.0])))
+    assert twin.refutes(np.array([1.0, 0.0])) is None
+    assert twin.refutes(np.array([-1.0, 0.0])) is not None
+    assert Problem(plain_data(lv.Problem.lcp(np.eye(2), [1.0, 1.0]))).refutes(np.ones(2)) is not None

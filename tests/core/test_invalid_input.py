@@ -1,0 +1,357 @@
+"""Invalid input of the core: every public call rejects it by an error that names the argument."""
+
+from dataclasses import fields, replace
+from functools import partial
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from invalid_values import (
+    Call,
+    check_every_public_call,
+    check_float32,
+    check_malformed_arguments,
+    check_memory_layouts,
+    public_calls,
+)
+from random_problems import random_contact_problem, random_rows
+
+import lavender as lv
+
+A, B = np.array([[2.0, 1.0], [1.0, 2.0]]), np.array([1.0, -1.0])
+ONES = np.ones(2)
+LCP = lv.Problem.lcp(A, B, key=np.array([3, 4]))
+LINEAR = replace(LCP, cones=lv.Cones.free(2))
+CONTACT = random_contact_problem(3)
+ROWS = random_rows(np.random.default_rng(0))
+ROW_ARRAYS = {f.name: getattr(ROWS, f.name) for f in fields(ROWS) if f.name != "copy"}
+N_JOINT_ROWS, N_CONTACTS = len(ROWS.jac), len(ROWS.normal)
+SLIDING = lv.Cones.contacts(0.5, tangents=1)
+GENERAL = lv.Problem.from_jacobian(np.eye(2), A, B, cones=lv.Cones.bounded([0.0, 0.0], [1.0, 1.0]))
+JAC, MASS, FREE = np.array([np.eye(2)] * 2), np.array([A] * 2), np.ones((2, 2))
+BATCH = lv.Batch(JAC, MASS, FREE, cones=SLIDING)
+BATCH_SOLUTION = lv.solve_many(BATCH)
+PROGRAM = lv.Problem.from_qp(A, B, lb=np.zeros(2))
+EXACT = lv.solve(GENERAL, tol=1e-12)
+DERIVATIVE = lv.derivative(GENERAL, EXACT)
+BODIES = ROW_ARRAYS | {"v_free": np.array([ROWS.v_free] * 2)}
+INDEX = {"i": "index of worlds"}
+LIMITS = {"tol": 1e-6, "max_iter": 100, "time_limit": 1.0}
+
+
+def solve_batch(**arguments):
+    return lv.solve_many(lv.Batch(**arguments))
+
+
+CALLS = {
+    "Batch": Call(
+        lv.Batch,
+        {"J": JAC, "M": MASS, "v_free": FREE, "target": FREE, "cones": SLIDING, "compliance": FREE,
+         "mu": np.full((2, 1), 0.5), "friction": "coulomb"},
+        accepts_nan=True,
+    ),
+    "Batch, solved": Call(
+        solve_batch,
+        {"J": JAC, "M": MASS, "v_free": FREE, "target": FREE, "cones": SLIDING, "compliance": FREE,
+         "mu": np.full((2, 1), 0.5)},
+    ),
+    "Batch, padded": Call(
+        lv.Batch, {"J": JAC, "M": MASS, "v_free": FREE, "cones": lv.Cones.free(3), "count": np.array([1, 2])},
+        accepts_nan=True,
+    ),
+    "Batch, ragged": Call(
+        lv.Batch,
+        {"J": np.ones(6), "M": np.array([2.0, 0.0, 0.0, 2.0, 1.0]), "v_free": np.ones(3), "cones": lv.Cones.free(4),
+         "row_ptr": np.array([0, 2, 4]), "velocity_ptr": np.array([0, 2, 3])},
+        accepts_nan=True, any_length={"J", "M", "v_free"},
+    ),
+    "Batch, triangle of M": Call(
+        lv.Batch,
+        {"J": JAC, "M": (np.ones((2, 2)), np.array([0, 1]), np.array([0, 1, 2])), "v_free": FREE, "cones": SLIDING},
+        accepts_nan=True,
+    ),
+    "Batch.of_matrices": Call(
+        lv.Batch.of_matrices,
+        {"A": MASS, "b": FREE, "cones": SLIDING, "mu": np.full((2, 1), 0.5), "friction": "cone"}, accepts_nan=True,
+    ),
+    "Batch.of_matrices, solved": Call(
+        lambda **arguments: lv.solve_many(lv.Batch.of_matrices(**arguments)), {"A": MASS, "b": FREE, "cones": SLIDING},
+    ),
+    "Batch.of_bodies": Call(lambda **arrays: lv.Batch.of_bodies(arrays), BODIES, any_length={"v_free"}),
+    "Batch.of_bodies, the dictionary": Call(lv.Batch.of_bodies, {"fields": BODIES}),
+    "Batch.of_bodies, bounds": Call(
+        lambda **more: lv.Batch.of_bodies(BODIES, **more),
+        {"target": np.zeros((2, N_JOINT_ROWS + 2 * N_CONTACTS)), "mu": np.zeros((2, N_CONTACTS)), "tangents": 1,
+         "friction": "coulomb", "lower": np.zeros(N_JOINT_ROWS), "compliance": np.ones(N_JOINT_ROWS + 2 * N_CONTACTS)},
+        accepts={"tangents": ("True",)},
+    ),
+    "Batch.impulses": Call(
+        lambda given: BATCH.impulses("impulse", given), {"given": FREE}, {"given": "impulse"}, accepts_nan=True
+    ),
+    "Batch.__getitem__": Call(BATCH.__getitem__, {"i": np.array([0, 1])}, INDEX, any_length={"i"}),
+    "Solutions.__getitem__": Call(BATCH_SOLUTION.__getitem__, {"i": np.array([0, 1])}, INDEX, any_length={"i"}),
+    "Solutions.__getitem__, of a list": Call(lv.solve_many([LCP] * 2).__getitem__, {"i": [0, -1]}, INDEX),
+    "Residuals.__getitem__": Call(lv.residual_many(BATCH, FREE).__getitem__, {"i": np.array([True, False])}, INDEX),
+    "Cones": Call(
+        lv.Cones,
+        {"ptr": np.array([0, 1, 4]), "kind": np.array([lv.ROW, lv.CONTACT]), "lower": np.array([0.0] + 3 * [-np.inf]),
+         "upper": np.full(4, np.inf), "mu": np.array([0.0, 0.5]), "patch_radius": np.zeros(2), "rolling": np.zeros(2)},
+    ),
+    "Cones.bounded": Call(lv.Cones.bounded, {"lower": -ONES, "upper": ONES}),
+    "Cones.contacts": Call(
+        lv.Cones.contacts,
+        {"mu": np.array([0.5, 0.2]), "tangents": 2, "patch_radius": ONES, "rolling": ONES, "shape": "disk"},
+    ),
+    "Cones.contacts, one": Call(lv.Cones.contacts, {"mu": 0.5, "count": 3}, accepts={"mu": ("True",)}),
+    "Cones.free": Call(lv.Cones.free, {"m": 3}),
+    "Cones.shaped": Call(lv.Cones.contacts(0.5, count=2).shaped, {"shape": "box"}),
+    "Cones.take": Call(CONTACT.cones.take, {"blocks": np.array([1, 0])}, any_length={"blocks"}),
+    "Derivative.jvp": Call(
+        DERIVATIVE.jvp, {"J": np.eye(2), "M": A, "v_free": B, "target": B, "lower": B, "upper": B}
+    ),
+    "Derivative.jvp, b": Call(DERIVATIVE.jvp, {"b": B}),
+    "Derivative.vjp": Call(DERIVATIVE.vjp, {"velocity": B, "impulse": B, "slack": B}),
+    "Derivatives.vjp": Call(
+        lv.derivatives([GENERAL, GENERAL], lv.solve_many([GENERAL, GENERAL], tol=1e-12)).vjp,
+        {"velocity": FREE, "impulse": FREE, "slack": FREE},
+    ),
+    "Generalized": Call(
+        lv.Generalized, {"jac": np.eye(2), "mass": A, "v_free": B, "names": ["x", "y"]}, {"jac": "J", "mass": "M"},
+        any_length={"jac"},
+    ),
+    "Generalized, sparse": Call(
+        lv.Generalized, {"jac": sp.csr_array(np.eye(2)), "mass": sp.csr_array(A), "v_free": B},
+        {"jac": "J", "mass": "M"},
+    ),
+    **{f"Generalized.{name}": Call(getattr(GENERAL.generalized, name), {argument: B}, accepts_nan=name != "solve")
+       for name, argument in {"bias": "target", "change": "impulse", "force": "impulse", "momentum_of": "v",
+                              "solve": "x", "velocity_of": "v"}.items()},
+    "Generalized.velocity_name": Call(GENERAL.generalized.velocity_name, {"i": 1}),
+    "Generalized.with_jacobian": Call(
+        GENERAL.generalized.with_jacobian, {"jac": A, "v_free": B}, {"jac": "J"}, any_length={"jac"}
+    ),
+    "Problem": Call(
+        lv.Problem,
+        {"b": B, "cones": lv.Cones.free(2), "matrix": A, "friction": "coulomb", "guess": B, "key": np.array([1, 2]),
+         "names": ["x", "y"], "name": "two", "precision": "float64"},
+        {"matrix": "A"}, accepts={"name": ("an object", "an ellipsis", "bytes")},
+    ),
+    "Problem, not copied": Call(
+        partial(lv.Problem, copy=False), {"b": B, "cones": lv.Cones.free(2), "matrix": A}, {"matrix": "A"}
+    ),
+    "Problem, sparse": Call(
+        lv.Problem, {"b": B, "cones": lv.Cones.free(2), "matrix": sp.csr_array(A)}, {"matrix": "A"}
+    ),
+    "Problem.linear": Call(lv.Problem.linear, {"A": A, "b": B}),
+    "Problem.lcp": Call(lv.Problem.lcp, {"A": A, "b": B, "lower": -ONES, "upper": ONES, "guess": B}),
+    "Problem.contact": Call(
+        lv.Problem.contact,
+        {"A": np.eye(8), "b": np.ones(8), "mu": np.array([0.5, 0.2]), "patch_radius": ONES},
+    ),
+    "Problem.contact, rolling": Call(
+        lv.Problem.contact,
+        {"A": np.eye(10), "b": np.ones(10), "mu": np.array([0.5, 0.2]), "rolling": ONES},
+    ),
+    "Problem.from_findex": Call(
+        lv.Problem.from_findex,
+        {"A": np.eye(3), "b": np.ones(3), "lower": np.array([0.0, -0.5, -0.5]),
+         "upper": np.array([np.inf, 0.5, 0.5]), "findex": np.array([-1, 0, 0])},
+    ),
+    "Problem.findex_order": Call(
+        lv.Problem.findex_order, {"findex": np.array([-1, 0, 0])}, any_length={"findex"}
+    ),
+    "Problem.from_rows": Call(
+        lv.Problem.from_rows,
+        {"rows": ROWS, "target": np.zeros(N_JOINT_ROWS + 5 * N_CONTACTS), "lower": -np.ones(N_JOINT_ROWS),
+         "upper": np.ones(N_JOINT_ROWS), "mu": np.full(N_CONTACTS, 0.5), "tangents": np.full(N_CONTACTS, 2),
+         "rolling": np.ones(N_CONTACTS), "shape": "disk", "compliance": np.ones(N_JOINT_ROWS + 5 * N_CONTACTS)},
+    ),
+    "Problem.from_jacobian": Call(
+        lv.Problem.from_jacobian,
+        {"J": np.eye(2), "M": A, "v_free": B, "target": B, "cones": lv.Cones.free(2), "compliance": ONES,
+         "friction": "cone", "names": ["x", "y"], "dof_names": ["u", "v"]},
+        {"dof_names": "names of velocities"},
+    ),
+    "Problem.from_jacobian, blocks": Call(
+        lv.Problem.from_jacobian,
+        {"J": sp.csr_array(np.eye(2)), "M": [np.eye(1), np.eye(1)], "v_free": B, "cones": lv.Cones.free(2)},
+    ),
+    "Problem.from_qp": Call(
+        lv.Problem.from_qp,
+        {"P": A, "q": B, "G": np.ones((1, 2)), "h": np.ones(1), "A": np.ones((1, 2)), "b": np.ones(1),
+         "lb": np.zeros(2), "ub": ONES},
+    ),
+    "Problem.block_of": Call(LCP.block_of, {"row": 1}),
+    "Problem.row_name": Call(LCP.row_name, {"row": 1}),
+    "Problem.block_name": Call(LCP.block_name, {"block": 1}),
+    "Problem.boxed": Call(CONTACT.boxed, {"normal_impulse": np.ones(N_CONTACTS)}),
+    "Problem.carry": Call(LCP.carry, {"previous": (LCP, B), "keys": np.array([4, 5])}, {"keys": "key"}),
+    "Problem.carry, impulse": Call(lambda impulse: LCP.carry((LCP, impulse)), {"impulse": B}),
+    "Problem.impulse_array": Call(LCP.impulse_array, {"impulse": B}),
+    "Problem.relaxed": Call(CONTACT.relaxed, {"friction": "cone"}),
+    "Problem.slack": Call(LCP.slack, {"impulse": B}),
+    "Problem.velocity": Call(GENERAL.velocity, {"impulse": B}),
+    "Problem.updated": Call(GENERAL.updated, {"J": A, "M": A, "v_free": B, "target": B, "guess": B}),
+    "Problem.updated, b": Call(LCP.updated, {"b": B, "guess": B}),
+    "Rows": Call(lv.Rows, ROW_ARRAYS),
+    "Rows.jacobian": Call(CONTACT.rows.jacobian, {"cones": CONTACT.cones}),
+    "Solution.state": Call(lv.solve(LCP).state, {"i": 0}, {"i": "block"}),
+    "SolverSpec.refuses": Call(lv.get("pgs").refuses, {"problem": LCP}),
+    "SolverSpec.standing_in": Call(lv.get("gauss_seidel").standing_in, {"problem": LCP}),
+    "available": Call(lv.available, {"problem": LCP, "law": "lcp", "order": True}),
+    "derivative": Call(
+        lv.derivative, {"problem": GENERAL, "solution": EXACT.impulse}, {"solution": "impulse"}
+    ),
+    "derivatives": Call(lv.derivatives, {"problems": [GENERAL], "solutions": [EXACT.impulse]}),
+    "explain": Call(lv.explain, {"problem": LCP, "tol": 1e-6}),
+    "get": Call(lv.get, {"name": "pgs"}, {"name": "solver"}),
+    "known": Call(lv.known, {"problem": LCP}),
+    "prepare": Call(lv.prepare, {"problem": LCP, "solver": "pgs"}),
+    "Prepared.solve": Call(
+        lv.prepare(LCP, "pgs").solve, {"problem": LCP, "impulse": B, "history": True} | LIMITS
+    ),
+    "register": Call(lv.register, {"spec": lv.get("pgs"), "replace": True}, {"spec": "SolverSpec"}),
+    "residual": Call(
+        lv.residual, {"problem": LCP, "impulse": B, "precision": "float32", "threshold": 1e-6}, accepts_nan=True
+    ),
+    "residual_many": Call(
+        lv.residual_many,
+        {"problems": BATCH, "impulses": FREE, "precision": "float32", "threshold": 1e-6, "threads": 2,
+         "errors": "raise"},
+        accepts_nan=True, accepts={"threads": ("very large",)},
+    ),
+    "residual_many, a list": Call(lv.residual_many, {"problems": [LCP, LCP], "impulses": [B, B]}),
+    "solve": Call(lv.solve, {"problem": LCP, "solver": "pgs", "impulse": B, "history": True} | LIMITS),
+    "solve by auto": Call(lv.solve, {"problem": LCP, "impulse": B} | LIMITS),
+    "solve, in random order": Call(
+        lambda seed: lv.solve(LCP, "pgs", order="random", seed=seed), {"seed": 7}, accepts={"seed": ("very large",)}
+    ),
+    "solve, by jacobi": Call(lambda omega: lv.solve(LCP, "jacobi", omega=omega), {"omega": 0.5}),
+    "solve, by sor": Call(lambda omega: lv.solve(LINEAR, "sor", omega=omega), {"omega": 1.5}),
+    "solve, by anderson": Call(lambda memory: lv.solve(LCP, "anderson", memory=memory), {"memory": 3}),
+    "solve_many": Call(
+        lv.solve_many,
+        {"problems": BATCH, "solver": "auto", "impulse": FREE, "threads": 2, "errors": "raise"} | LIMITS,
+        accepts={"threads": ("very large",)},
+    ),
+    "solve_many, a list": Call(lv.solve_many, {"problems": [LCP, LCP], "impulses": [B, None]} | LIMITS),
+    "solve_many, one start": Call(
+        lambda impulse: lv.solve_many([LCP, LCP], "pgs", impulses=[impulse, None]), {"impulse": B},
+        {"impulse": "impulses?"},
+    ),
+    "solve_many, an empty list": Call(lambda **more: lv.solve_many([], **more), LIMITS),
+    "solve_qp": Call(lv.solve_qp, {"problem": PROGRAM, "solver": "auto", "tol": 1e-9, "time_limit": 1.0}),
+}  # fmt: skip
+
+#: Public calls that are not in the table, and why.
+NOT_CALLED = {
+    **dict.fromkeys(
+        ("Claim", "Derivative", "Plan", "QPSolution", "Residual", "Residuals", "Solution", "Solutions", "Turn"),
+        "a result: the package makes it",
+    ),
+    **dict.fromkeys(
+        ("Batch.worlds", "Generalized.compressed", "Generalized.laid_out", "Generalized.restrict",
+         "Generalized.shifted", "Generalized.with_scaled_rows", "Batch.start", "Solutions.mark_late",
+         "Problem.on_disk", "Residuals.keep", "Solution.late", "Solution.of", "Solution.unstretched",
+         "Solutions.keep", "Solutions.late", "Solutions.start", "Batch.rows_of"),
+        "for the package's own use, with arrays that it has checked",
+    ),
+    **dict.fromkeys(("Batch.count", "Batch.index", "Solutions.count", "Solutions.index"), "a sequence of Python"),
+    "Problem.save": "a file: test_invalid_files.py of tests/cli",
+    "Solution.motion_error": "tests/lab",
+    "SolverSpec": "tests/core/solvers/test_registry.py",
+    "Status": "an enumeration",
+}  # fmt: skip
+
+
+def test_every_public_call_of_the_core_is_in_the_table():
+    check_every_public_call(public_calls("core"), CALLS, NOT_CALLED)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("name", CALLS)
+def test_malformed_arguments_are_rejected_by_name(name):
+    check_malformed_arguments(name, CALLS[name])
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("name", CALLS)
+def test_arrays_in_any_memory_layout_give_the_same_result(name):
+    check_memory_layouts(CALLS[name])
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "Batch",
+        "Batch, triangle of M",
+        "Batch.of_matrices",
+        "Batch.of_bodies",
+        "Problem.from_jacobian",
+        "Rows",
+    ],
+)
+def test_float32_of_either_byte_order_is_single_precision(name):
+    check_float32(CALLS[name])
+
+
+def test_the_residual_of_a_nan_is_infinite_and_products_keep_it():
+    nan = [np.nan, 0.0]
+    assert lv.residual(LCP, nan).relative == lv.residual(LCP, nan, precision="float32").relative == np.inf
+    assert np.isnan(GENERAL.generalized.force(nan)).any()
+
+
+@pytest.mark.parametrize(
+    ("solver", "option"),
+    [(name, option) for name in lv.available(external=False) for option in lv.get(name).options],
+)
+def test_every_option_of_every_solver_is_validated(solver, option):
+    spec = lv.get(solver)
+    problem = next(p for p in (LCP, LINEAR, CONTACT) if spec.refuses(p) is None)
+    for value in ("no such word", np.nan, 1j, {1: 2}):
+        with pytest.raises(lv.LavenderError, match=option):
+            lv.solve(problem, solver, **{option: value})
+
+
+# -- numbers out of range -----------------------------------------------------------------------------------------
+
+
+def two_rows(jac=(1.0, 1.0), mass=(1.0, 1.0), v_free=(1.0, 1.0), **more):
+    """Build two rows on two velocities that nothing couples."""
+    return lv.Problem.from_jacobian(np.diag(jac), np.diag(mass), v_free, cones=lv.Cones.free(2), **more)
+
+
+def one_row_batch(jac):
+    one = np.ones((3, 1))
+    return lv.Batch(
+        np.full((3, 1, 1), jac), np.ones((3, 1, 1)), 0.0 * one, target=one, cones=lv.Cones.free(1)
+    )
+
+
+#: Call, and the name in its message.
+OUT_OF_RANGE = {
+    "b": (lambda: lv.Problem.lcp(np.eye(2), [1.0, 1e61]), "b"),
+    "b, too small": (lambda: lv.Problem.lcp(np.eye(2), [1e-61, -1e-70]), "b"),
+    "A": (lambda: lv.Problem.lcp(np.diag([1.0, 1e61]), [1.0, 1.0]), "A"),
+    "upper": (lambda: lv.Problem.lcp(np.eye(2), [1.0, 1.0], 0.0, [1.0, 1e300]), "upper"),
+    "mu": (lambda: lv.Cones.contacts([0.5, 1e-61]), "mu"),
+    "patch_radius": (lambda: lv.Cones.contacts(0.5, patch_radius=[1e61]), "patch_radius"),
+    "mu patch_radius": (lambda: lv.Cones.contacts([1e-40], patch_radius=[1e-40]), "mu patch_radius"),
+    "rolling": (lambda: lv.Cones.contacts(0.5, rolling=[1e-200]), "rolling"),
+    "compliance": (lambda: two_rows(compliance=[1.0, 1e-70]), "compliance"),
+    "M": (lambda: two_rows(mass=(1.0, 1e-61)), "M"),
+    "J": (lambda: two_rows(jac=(1.0, 1e61)), "J"),
+    "v_free": (lambda: two_rows(v_free=(0.0, -1e61)), "v_free"),
+    "A_ii of J and M": (lambda: lv.solve(two_rows(jac=(1.0, 1e40), target=[1.0, 1.0])), "A_ii"),
+    "a problem of a batch": (lambda: one_row_batch(1e40)[1].d, "A_ii"),
+    "an update": (lambda: lv.Problem.lcp(np.eye(2), [1.0, 1.0]).updated(b=[1.0, 1e61]), "b"),
+}
+
+
+@pytest.mark.parametrize("case", OUT_OF_RANGE)
+def test_numbers_out_of_range_are_rejected_by_name_and_limit(case):
+    call, name = OUT_OF_RANGE[case]
+    with pytest.raises(lv.InputError) as error:
+        call()
+    assert name in str(error.value)
+    assert "e+60" in str(error.value) or "e-60" in str(error.value)

@@ -1,0 +1,582 @@
+"""Invalid files and invalid data of other simulators: rejected by name, within a limit of memory."""
+
+import contextlib
+import functools
+import io as streams
+import json
+import warnings
+import zipfile
+from pathlib import Path
+
+import hypothesis.strategies as st
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from hypothesis import given
+from invalid_values import (
+    Call,
+    check_every_public_call,
+    check_float32,
+    check_malformed_arguments,
+    check_memory_layouts,
+    draw_examples,
+    public_calls,
+)
+from random_problems import random_contact_problem
+from scipy.sparse.csgraph import connected_components
+
+import lavender as lv
+from lavender import io
+from lavender.io import fclib
+from lavender.io.condensed import most_entries
+
+h5py = pytest.importorskip("h5py")
+resource = pytest.importorskip("resource")
+
+HUGE = 2**31 - 1
+ALLOWED_MEMORY = 100_000_000  # Rejecting a file may need so many bytes.
+
+# -- public calls -----------------------------------------------------------------------------------------------
+
+RNG = np.random.default_rng(0)
+EFC = {
+    "efc_J": RNG.standard_normal((2, 7, 4)), "efc_D": np.ones((2, 7)), "efc_aref": np.ones((2, 7)),
+    "efc_type": np.array([[0, 1, 7, 7, 7, 3, 0]] * 2), "M": np.array([np.eye(4)] * 2), "qvel": np.ones((2, 4)),
+    "qacc_smooth": np.zeros((2, 4)), "timestep": 0.01, "efc_frictionloss": np.ones((2, 7)), "nefc": np.array([6, 7]),
+    "contacts": ([0, 1], [2, 2], [3, 3], np.full((2, 5), 0.5)), "efc_force": np.ones((2, 7)),
+    "qfrc_smooth": np.zeros((2, 4)),
+}  # fmt: skip
+
+
+def with_contact_part(k, part):
+    parts = list(EFC["contacts"])
+    parts[k] = part
+    return io.from_efc(**EFC | {"contacts": tuple(parts)})
+
+
+CALLS = {
+    "io.from_efc": Call(io.from_efc, EFC, accepts_nan=True),
+    **{f"io.from_efc, {name}": Call(
+        functools.partial(with_contact_part, k), {"part": np.array(EFC["contacts"][k])},
+        {"part": f"{name} of contacts?"}, any_length={"part"} if k == 0 else frozenset(),
+    ) for k, name in enumerate(("world", "efc_address", "dim", "friction"))},
+}  # fmt: skip
+
+#: Public calls that are not in the table, and why.
+NOT_CALLED = {
+    **dict.fromkeys(("io.Recording", "io.Stored"), "a result: the package makes it"),
+    **dict.fromkeys(
+        ("io.load", "io.load_solution", "io.read", "io.record", "io.save", "load"),
+        "a file: below, and test_invalid_paths.py of tests/cli",
+    ),
+    **dict.fromkeys(
+        ("io.from_drake", "io.from_mujoco", "io.from_mujoco_many", "io.from_pinocchio"),
+        "another simulator's objects: the other files of this folder",
+    ),
+}
+
+
+def test_every_public_call_of_io_is_in_the_table():
+    check_every_public_call(public_calls("io", io, "io.") | public_calls("io"), CALLS, NOT_CALLED)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("name", CALLS)
+def test_malformed_arguments_are_rejected_by_name(name):
+    check_malformed_arguments(name, CALLS[name])
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("name", CALLS)
+def test_arrays_in_any_memory_layout_give_the_same_result(name):
+    check_memory_layouts(CALLS[name])
+
+
+def test_float32_of_either_byte_order_is_single_precision():
+    check_float32(CALLS["io.from_efc"])
+
+
+# -- small files that would make large arrays ---------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def limited_memory():
+    """Let the address space of this process grow by ALLOWED_MEMORY bytes."""
+    used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    limits = resource.getrlimit(resource.RLIMIT_AS)
+    resource.setrlimit(resource.RLIMIT_AS, (used + ALLOWED_MEMORY, limits[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, limits)
+
+
+def npy_header(kind, shape):
+    text = repr({"descr": kind, "fortran_order": False, "shape": shape}).encode()
+    text += b" " * (63 - (10 + len(text)) % 64) + b"\n"
+    return b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text
+
+
+def write_npz(path, method=zipfile.ZIP_DEFLATED, **entries):
+    """Write arrays; a tuple (kind, shape, bytes) is an array of these bytes, repeated."""
+    with zipfile.ZipFile(path, "w", method) as out:
+        for name, entry in entries.items():
+            with out.open(f"{name}.npy", "w", force_zip64=True) as stream:
+                if isinstance(entry, tuple):
+                    kind, shape, text = entry
+                    stream.write(npy_header(kind, shape))
+                    left = int(np.prod(shape)) * np.dtype(kind).itemsize
+                    block = text * (2**20 // len(text))
+                    while left > 0:
+                        stream.write(block[:left])
+                        left -= len(block)
+                else:
+                    np.lib.format.write_array(stream, np.asarray(entry), allow_pickle=False)
+    return path
+
+
+META = {"operator": "dense", "friction": "coulomb", "name": "", "names": None}
+OWN = {
+    "lavender_format": np.int64(1),
+    "meta": np.frombuffer(json.dumps(META).encode(), np.uint8),
+    "b": np.zeros(2),
+    "cones_ptr": [0, 1, 2],
+    "cones_kind": [0, 0],
+    "cones_lower": np.zeros(2),
+    "cones_upper": np.ones(2),
+    "cones_mu": np.zeros(2),
+    "cones_patch_radius": np.zeros(2),
+    "A": np.eye(2),
+}
+
+
+def hdf5(path, parts):
+    """Write datasets by path; a tuple (shape, kind) is a dataset whose chunks were never written."""
+    with h5py.File(path, "w") as out:
+        for name, value in parts.items():
+            if isinstance(value, tuple):
+                out.create_dataset(name, value[0], value[1], chunks=(2**16,))
+            else:
+                out[name] = np.asarray(value)
+    return path
+
+
+def matrix(name, m, n, nz, p, i, x):
+    parts = {"m": [m], "n": [n], "nz": [nz], "nzmax": [max(nz, 0)], "p": p, "i": i, "x": x}
+    return {
+        f"{name}/{key}": np.array(v, np.int32) if key in ("m", "n", "nz", "nzmax") else v
+        for key, v in parts.items()
+    }
+
+
+NO_NUMBERS = np.zeros(0)
+NO_INDICES = np.zeros(0, np.int32)
+LOCAL = {"fclib_local/spacedim": np.array([3], np.int32)}
+GLOBAL = {"fclib_global/spacedim": np.array([3], np.int32)}
+
+
+def one_wide_body(path):
+    m = 36_000
+    h = sp.csr_array(np.ones((2, m)))  # M is no mass matrix, so A is formed
+    return hdf5(
+        path,
+        GLOBAL
+        | matrix("fclib_global/H", 2, m, -2, h.indptr, h.indices, h.data)
+        | matrix("fclib_global/M", 2, 2, -2, np.array([0, 2, 3]), np.array([0, 1, 1]), np.ones(3))
+        | {"fclib_global/vectors/f": np.zeros(2), "fclib_global/vectors/w": np.zeros(m)}
+        | {"fclib_global/vectors/mu": np.full(m // 3, 0.5)},
+    )
+
+
+def large_chunk(path):
+    with h5py.File(path, "w") as out:
+        out.create_dataset(
+            "fclib_local/spacedim",
+            (1,),
+            "i4",
+            maxshape=(None,),
+            chunks=(2**27,),
+            compression="gzip",
+            fillvalue=3,
+        )
+    return path
+
+
+BOMBS = {
+    "pointers that announce rows, bounds that one number fills": (
+        lambda path: write_npz(
+            path, **OWN | {"cones_ptr": [0, HUGE], "cones_kind": [0], "cones_lower": 0.0, "cones_upper": 1.0}
+        ),
+        "must end with the number of its rows",
+    ),
+    "one number for every b": (lambda path: write_npz(path, **OWN | {"b": 0.0}), "one dimension"),
+    "a dense matrix of bytes": (
+        lambda path: write_npz(path, **OWN | {"A": ("|b1", (17_000, 17_000), b"\0")}),
+        "max_bytes=",
+    ),
+    "an entry before the one that is too much": (
+        lambda path: write_npz(
+            path, **OWN | {"A": ("|i1", (11_500, 11_500), b"\0"), "guess": ("|i1", (200_000_000,), b"\0")}
+        ),
+        "max_bytes=",
+    ),
+    "text that makes many objects": (
+        lambda path: write_npz(path, **OWN | {"meta": ("|u1", (60_000_000,), b"[{},{}],")}),
+        "max_bytes=",
+    ),
+    "a packing that chooses its memory": (
+        lambda path: write_npz(path, zipfile.ZIP_LZMA, **OWN),
+        "packed by method",
+    ),
+    "one body under many contacts": (one_wide_body, "max_bytes="),
+    "triplets of a huge matrix": (
+        lambda path: hdf5(
+            path,
+            LOCAL
+            | matrix("fclib_local/W", HUGE, HUGE, 0, NO_INDICES, NO_INDICES, NO_NUMBERS)
+            | {"fclib_local/vectors/q": NO_NUMBERS, "fclib_local/vectors/mu": NO_NUMBERS},
+        ),
+        "are needed|not a multiple",
+    ),
+    "triplets of a huge matrix, with vectors that nobody wrote": (
+        lambda path: hdf5(
+            path,
+            LOCAL
+            | matrix("fclib_local/W", HUGE // 3 * 3, HUGE // 3 * 3, 0, NO_INDICES, NO_INDICES, NO_NUMBERS)
+            | {"fclib_local/vectors/q": ((HUGE // 3 * 3,), "f8"), "fclib_local/vectors/mu": ((HUGE // 3,), "f8")},
+        ),
+        "max_bytes=",
+    ),
+    "numbers that nobody wrote, one byte each": (
+        lambda path: hdf5(
+            path,
+            LOCAL
+            | matrix("fclib_local/W", 3, 3, -2, [0, 0, 0, 0], ((2**28,), "i1"), ((2**28,), "i1"))
+            | {"fclib_local/vectors/q": np.zeros(3), "fclib_local/vectors/mu": [0.5]},
+        ),
+        "max_bytes=",
+    ),
+    "compressed columns of a huge number of rows": (
+        lambda path: hdf5(
+            path,
+            GLOBAL
+            | matrix("fclib_global/H", HUGE, 3, -1, [0, 0, 0, 0], NO_INDICES, NO_NUMBERS)
+            | matrix("fclib_global/M", HUGE, HUGE, 0, NO_INDICES, NO_INDICES, NO_NUMBERS)
+            | {"fclib_global/vectors/f": ((HUGE,), "i1"), "fclib_global/vectors/w": np.zeros(3)}
+            | {"fclib_global/vectors/mu": [0.5]},
+        ),
+        "max_bytes=",
+    ),
+    "one number in a large chunk": (large_chunk, "in a chunk of"),
+}  # fmt: skip
+
+
+@pytest.mark.slow  # the sanitizers reserve the whole address space
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="/proc is Linux's")
+@pytest.mark.parametrize("kind", BOMBS)
+def test_a_small_file_of_large_arrays_is_rejected_before_they_are_allocated(kind, tmp_path):
+    make, sign = BOMBS[kind]
+    good = tmp_path / "good.hdf5"
+    io.save(lv.Problem.contact(np.eye(3), np.ones(3), [0.5]), good)
+    io.load(good)  # what a first load imports
+    path = make(tmp_path / "bomb")
+    assert path.stat().st_size < 2_000_000
+    with limited_memory(), pytest.raises(lv.InputError, match=sign) as error:
+        io.load(path)
+    assert str(path) in str(error.value)
+
+
+def test_max_bytes_limits_the_size_of_the_arrays(tmp_path):
+    # A as bytes, 300 x 300: 90 kB to be read, 720 kB to be made.
+    m = 300
+    path = write_npz(
+        tmp_path / "p.npz", b=np.zeros(m), lo=np.zeros(m), hi=np.ones(m), A=np.eye(m, dtype=np.int8)
+    )  # fmt: skip
+    needed = 8 * (m * m + 3 * m)
+    assert io.load(path, max_bytes=needed).m == m
+    with pytest.raises(lv.InputError, match=f"would take {needed} bytes .* more than {needed - 1}"):
+        io.load(path, max_bytes=needed - 1)
+    for wrong in (-1, 1e9, "2G", None, True):
+        with pytest.raises(lv.InputError, match="max_bytes is"):
+            io.load(path, max_bytes=wrong)
+
+
+def contents(mass, h):
+    m = h.shape[1]
+    return fclib.Contents(
+        3, np.full(m // 3, 0.5), M=sp.csr_array(mass), H=sp.csr_array(h), f=np.ones(len(h)), w=np.zeros(m)
+    )
+
+
+def test_a_condensed_matrix_is_at_most_as_large_as_predicted():
+    rng = np.random.default_rng(1)
+    for _ in range(20):
+        n, m = int(rng.integers(1, 30)), 3 * int(rng.integers(1, 12))
+        h = np.where(rng.random((n, m)) < 0.15, rng.standard_normal((n, m)), 0.0)
+        mass = np.diag(rng.uniform(1.0, 2.0, n))
+        for _ in range(int(rng.integers(0, n))):
+            i, j = rng.integers(0, n, 2)
+            mass[i, j] = mass[j, i] = mass[i, j] + (1.0 if i == j else 0.1)
+        file = contents(mass, h)
+        label = connected_components(file.M, directed=False)[1]
+        assert file.problem().csr.nnz <= most_entries(label, file.H)
+
+
+def test_dense_factors_are_rejected_and_banded_ones_are_not():
+    n = 1200
+    rng = np.random.default_rng(2)
+    h = np.zeros((n, 3))
+    h[:3] = np.eye(3)
+    chain = sp.diags_array([np.full(n - 1, -1.0), np.full(n, 2.5), np.full(n - 1, -1.0)], offsets=[-1, 0, 1])
+    shuffled = rng.permutation(n)
+    chain = sp.csr_array(chain)[shuffled][:, shuffled]
+    got = contents(chain, h).problem(max_bytes=400_000).csr.toarray()  # 1200^2 entries: 23 MB
+    expected = np.linalg.inv(chain.toarray())[:3, :3]
+    np.testing.assert_allclose(got, expected, rtol=1e-12)
+    wild = sp.csr_array(np.eye(n) * 10.0 + np.where(rng.random((n, n)) < 5e-3, rng.random((n, n)), 0.0))
+    with pytest.raises(lv.InputError, match="factors of M"):
+        contents(wild, h).problem(max_bytes=10**6)
+
+
+# -- damaged files -----------------------------------------------------------------------------------------------
+
+
+def problems(n):
+    """Yield one problem of each form, of about n contacts."""
+    a, contacts = np.eye(3 * n) + 0.1, lv.Cones.contacts(0.5, count=n)
+    yield lv.Problem.lcp(a, np.ones(3 * n), guess=np.ones(3 * n))
+    yield lv.Problem(np.ones(3 * n), contacts, sp.csr_array(a), friction="cone")
+    yield lv.Problem.from_jacobian(
+        a, np.eye(3 * n), np.ones(3 * n), cones=contacts, compliance=np.ones(3 * n)
+    )
+    yield random_contact_problem(n, tangents=2, spin=False, bodies=3, joints=0, contacts=n)
+
+
+@functools.cache
+def valid_files(folder):
+    """Return (suffix, bytes) of files in every layout."""
+    files = []
+    for problem in [*problems(2), *problems(3)]:
+        for suffix in (".npz", ".hdf5"):
+            path = folder / f"p{suffix}"
+            try:
+                io.save(problem, path, impulse=np.zeros(problem.m))
+            except lv.LavenderError:  # This layout has no place for the problem.
+                continue
+            files.append((suffix, path.read_bytes()))
+    three = {"b": np.ones(3), "lo": np.zeros(3), "hi": np.ones(3)}
+    sparse = {
+        "A_data": np.ones(3),
+        "A_indices": np.arange(3),
+        "A_indptr": np.arange(4),
+        "A_shape": np.array([3, 3]),
+    }
+    for arrays in (
+        three | {"A": np.eye(3), "l_ref": np.ones(3), "w_ref": np.zeros(3), "compare": "l,w"},
+        three | sparse | {"cone_start": np.array([0]), "cone_dim": np.array([3]), "cone_mu": np.array([0.5])},
+    ):
+        stream = streams.BytesIO()
+        np.savez(stream, **arrays)
+        files.append((".npz", stream.getvalue()))
+    mass, h = sp.csr_array(np.eye(6)), sp.csr_array(np.ones((6, 3)))
+    vectors = {"vectors/f": np.ones(6), "vectors/w": np.zeros(3), "vectors/mu": np.array([0.5])}
+    path = hdf5(
+        folder / "global.hdf5",
+        GLOBAL
+        | matrix("fclib_global/M", 6, 6, -2, mass.indptr, mass.indices, mass.data)
+        | matrix("fclib_global/H", 6, 3, -2, h.indptr, h.indices, h.data)
+        | {f"fclib_global/{name}": x for name, x in vectors.items()},
+    )
+    return [*files, (".hdf5", path.read_bytes())]
+
+
+KINDS = ("<f8", "<f4", "<f2", "<i4", "<i8", "<u8", "|i1", "|b1", "<c16", "|S3", "<U2", ">f8", ">i4")
+
+
+@st.composite
+def replaced_array(draw, x):
+    """Another array in the place of x: other numbers, another shape or another type."""
+    x = np.array(x)
+    how = draw(st.sampled_from(("number", "number", "number", "shape", "kind", "scalar", "empty", "longer")))
+    if how == "number" and x.size and x.dtype.kind in "iuf":
+        whole = (-(2**31), -2, -1, 0, 1, 2, 3, 100, 2**31 - 1)
+        reals = (np.nan, np.inf, -np.inf, -0.0, 1e-310, 1e308, -1.0, 0.5)
+        value = draw(st.sampled_from(reals if x.dtype.kind == "f" else whole))
+        x = x.copy()
+        with np.errstate(all="ignore"):
+            x.reshape(-1)[draw(st.integers(0, x.size - 1))] = np.array(value).astype(x.dtype)
+        return x
+    if how == "shape":
+        return x.reshape(draw(st.sampled_from(((-1,), (1, -1), (-1, 1), (-1, 1, 1)))))
+    if how == "kind" and x.dtype.kind in "iufb":
+        with warnings.catch_warnings(), np.errstate(all="ignore"):
+            warnings.simplefilter("ignore")
+            return x.astype(draw(st.sampled_from(KINDS)))
+    if how == "scalar":
+        return np.array(draw(st.sampled_from((0, 1, -1, 0.5, np.nan, 2**31 - 1))))
+    if how == "empty":
+        return x.reshape(-1)[:0]
+    return np.concatenate([x.reshape(-1), x.reshape(-1)[:1]])
+
+
+def arrays_in(suffix, data):
+    """Return the arrays of a file by name."""
+    if suffix == ".npz":
+        with np.load(streams.BytesIO(data)) as archive:
+            return {name: archive[name] for name in archive.files}
+    with h5py.File(streams.BytesIO(data)) as file:
+        names = []
+        file.visititems(lambda name, node: names.append(name) if isinstance(node, h5py.Dataset) else None)
+        return {name: file[name][()] for name in names}
+
+
+def file_of(suffix, arrays, is_chunked):
+    """Return the bytes of a file of arrays; HDF5 has no place for texts of NumPy, and may store only chunks."""
+    stream = streams.BytesIO()
+    if suffix == ".npz":
+        write_npz(stream, zipfile.ZIP_DEFLATED if is_chunked else zipfile.ZIP_STORED, **arrays)
+        return stream.getvalue()
+    with h5py.File(stream, "w") as file:
+        for name, x in arrays.items():
+            x = np.asarray(x)
+            if is_chunked and x.ndim:
+                file.create_dataset(name, x.shape, x.dtype, chunks=True, maxshape=(None,) * x.ndim)
+            elif x.dtype.kind != "U":
+                file[name] = x
+    return stream.getvalue()
+
+
+@st.composite
+def damaged_files(draw, folder):
+    """A file some of whose bytes or arrays are others, as (suffix, bytes)."""
+    suffix, data = draw(st.sampled_from(valid_files(folder)))
+    how = draw(st.sampled_from(("bytes", "bytes", "arrays", "arrays", "arrays", "cut", "splice", "same")))
+    if how == "bytes":
+        changed = bytearray(data)
+        for _ in range(draw(st.sampled_from((1, 1, 2, 8)))):
+            changed[draw(st.integers(0, len(data) - 1))] = draw(st.integers(0, 255))
+        return suffix, bytes(changed)
+    if how in ("cut", "splice"):
+        end = draw(st.sampled_from(valid_files(folder)))[1] if how == "splice" else b""
+        return suffix, data[: draw(st.integers(0, len(data)))] + end[draw(st.integers(0, len(end))) :]
+    arrays = arrays_in(suffix, data)
+    for _ in range(draw(st.sampled_from((1, 1, 2))) if how == "arrays" else 0):
+        name = draw(st.sampled_from(sorted(arrays)))
+        if name == "meta" and draw(st.booleans()):
+            with contextlib.suppress(ValueError, TypeError):  # It was replaced before.
+                meta = json.loads(arrays[name].tobytes())
+                values = (None, "", "rows", "csr", "dense", "cone", [], [1], ["a"], {}, 1, True)
+                meta[draw(st.sampled_from(sorted(meta)))] = draw(st.sampled_from(values))
+                arrays[name] = np.frombuffer(json.dumps(meta).encode(), np.uint8)
+            continue
+        if draw(st.integers(0, 9)) == 9:
+            x = arrays.pop(name)
+            arrays |= draw(st.sampled_from(({}, {"extra": x}, {"b": x}, {"A": x}, {"guess": x})))
+        else:
+            arrays[name] = draw(replaced_array(arrays[name]))
+    return suffix, file_of(suffix, arrays, draw(st.integers(0, 9)) == 9)
+
+
+@pytest.mark.fuzz
+@pytest.mark.filterwarnings("error")
+@draw_examples(150)
+@given(data=st.data())
+def test_a_damaged_file_is_rejected_by_its_path_or_holds_a_valid_problem(data, tmp_path_factory):
+    folder = tmp_path_factory.getbasetemp()
+    suffix, content = data.draw(damaged_files(folder))
+    path = folder / f"damaged{suffix}"
+    path.write_bytes(content)
+    try:
+        stored = io.read(path, max_bytes=10**7)
+    except lv.LavenderError:
+        with pytest.raises(lv.LavenderError, match=str(path)):
+            io.read(path, max_bytes=10**7)
+        return
+    problem = stored.problem
+    assert all(np.isfinite(x).all() for x in (problem.b, problem.cones.mu, *stored.guesses))
+    assert stored.impulse is None or len(stored.impulse) == problem.m
+    for solver in ("auto", "pgs") if problem.m <= 200 else ():
+        if lv.get(solver).refuses(problem) is None:
+            lv.solve(problem, solver, max_iter=20)
+
+
+# -- memory of MuJoCo that was overwritten ----------------------------------------------------------------------------
+
+INDICES = ("efc_id", "efc_type", "efc_J_colind", "efc_J_rowadr", "efc_J_rownnz", "dim", "geom", "M_colind", "M_rowadr",
+           "M_rownnz")  # fmt: skip
+NUMBERS = ("efc_J", "efc_R", "efc_D", "efc_aref", "efc_force", "efc_frictionloss", "efc_vel", "efc_b", "qacc",
+           "qacc_smooth", "qfrc_smooth", "qfrc_constraint", "qvel", "M")  # fmt: skip
+COUNTS = ("nefc", "ncon", "nJ")
+OPTIONS = ("jacobian", "cone", "timestep", "integrator", "noslip_iterations", *COUNTS)
+WHOLE = (-1, -2, 0, 1, 2, 3, 5, 7, 100, 2**15, 2**20, 2**30, 2**31 - 1, -(2**31))
+REAL = (0.0, -0.0, 1.0, -1.0, 1e300, -1e300, 1e-300, np.nan, np.inf, -np.inf)
+
+
+def overwrite(model, data, name, places, value):
+    """Write a value at some places (shares of the length); what MuJoCo does not let be written stays."""
+    with contextlib.suppress(TypeError, ValueError, OverflowError, AttributeError):
+        if name in OPTIONS:
+            home = data if name in COUNTS else model.opt
+            setattr(home, name, type(getattr(home, name))(value))
+            return
+        home = model if name.startswith("M_") else data.contact if name in ("dim", "geom") else data
+        array = np.asarray(getattr(home, name)).reshape(-1)
+        for place in places if array.size else ():
+            array[place * array.size // 1000] = value
+
+
+def may_change_the_problem(edit):
+    """Whether an edit may make another valid problem: an option, a bound, or a number of something that exists.
+
+    An entry of M or J that nothing moves or pushes has no effect to which it could be compared.
+    """
+    name, _, value = edit
+    exists = name in ("efc_id", "efc_type", "dim") and 0 <= value < 100
+    return name in OPTIONS or name in ("efc_frictionloss", "efc_J", "M") or exists
+
+
+def assert_same_problem(problem, other):
+    """Require the same problem but for rounding."""
+    assert problem.cones == other.cones
+    for numbers in (
+        lambda p: p.b, lambda p: p.compliance, lambda p: p.generalized.v_free, lambda p: p.jacobian.toarray(),
+        lambda p: p.generalized.mass.toarray(),
+    ):  # fmt: skip
+        np.testing.assert_allclose(numbers(problem), numbers(other), rtol=1e-5, atol=1e-6)
+
+
+def edits_of(names, values):
+    """Edits of arrays with these names."""
+    places = st.lists(st.integers(0, 999), min_size=1, max_size=20)
+    return st.tuples(st.sampled_from(names), places, st.sampled_from(values))
+
+
+@pytest.mark.fuzz
+@pytest.mark.filterwarnings("error")
+@draw_examples(30)
+@given(
+    cone=st.sampled_from(("elliptic", "pyramidal")),
+    condim=st.sampled_from((1, 3, 4, 6)),
+    jacobian=st.sampled_from(("dense", "sparse")),
+    edits=st.lists(
+        edits_of(INDICES, WHOLE) | edits_of(NUMBERS, REAL) | edits_of(OPTIONS, WHOLE + REAL), min_size=1, max_size=3
+    ),
+)  # fmt: skip
+def test_overwritten_memory_of_mujoco_is_rejected_or_a_finite_problem(cone, condim, jacobian, edits):
+    pytest.importorskip("mujoco")
+    from mujoco_scene import state
+
+    model, data = state(cone, condim=condim, jacobian=jacobian)
+    expected = io.from_mujoco(model, data)
+    for edit in sorted(edits, key=lambda edit: edit[0] in COUNTS):  # Nothing is written behind those.
+        overwrite(model, data, *edit)
+    readers = (io.from_mujoco, io.mujoco.jacobian, io.mujoco.scaling, io.mujoco.impulse)
+    for read in (*readers, lambda model, data: list(io.from_mujoco(model, data).names)):
+        try:
+            result = read(model, data)
+        except lv.LavenderError:
+            continue
+        if isinstance(result, lv.Problem):
+            assert np.isfinite(result.b).all()
+            if not any(map(may_change_the_problem, edits)):
+                assert_same_problem(result, expected)

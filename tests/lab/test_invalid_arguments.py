@@ -1,0 +1,180 @@
+"""Invalid and extreme input of what measures and examines problems: rejected by name, or measured by numbers."""
+
+import hypothesis.strategies as st
+import numpy as np
+import pytest
+from extreme_problems import build_problem, problem_data
+from hypothesis import assume, given, reject
+from invalid_values import (
+    Call,
+    check_every_public_call,
+    check_malformed_arguments,
+    check_memory_layouts,
+    draw_examples,
+    public_calls,
+)
+from random_families import wild
+from random_problems import nearly_singular, random_contact_problem, seeds, warmed
+from worked import after
+
+import lavender as lv
+from lavender import bench, motion, phenomena, suite
+from lavender.lab.suite import hard
+
+A, B = np.array([[2.0, 1.0], [1.0, 2.0]]), np.array([1.0, -1.0])
+LCP = lv.Problem.lcp(A, B)
+CONTACT = random_contact_problem(3)
+MOTIONS = lv.motions(LCP, n=1)
+ANY_SEED = {"seed": ("very large",)}
+
+CALLS = {
+    "Motions.__getitem__": Call(MOTIONS.__getitem__, {"i": 0}, {"i": "motions?"}),
+    "Motions.nearest": Call(MOTIONS.nearest, {"impulse": B}, {"impulse": "x"}),
+    "Motions.picks": Call(MOTIONS.picks, {"solvers": ["pgs"], "tol": 1e-6, "max_iter": 100}),
+    "Motions.select": Call(MOTIONS.select, {"choice": "nearest", "impulse": B}),
+    "Solution.motion_error": Call(lv.solve(LCP, tol=1e-12).motion_error, {"reference": B}),
+    "cross_check": Call(
+        lv.cross_check,
+        {"problem": LCP, "solvers": ["pgs"], "reference": "direct", "tol": 1e-6, "max_iter": 100, "time_limit": 1.0},
+        {"reference": "solver"},
+    ),
+    "diagnose": Call(
+        lv.diagnose,
+        {"problem": CONTACT, "impulse": np.zeros(CONTACT.m), "velocity": CONTACT.rows.v_free,
+         "gap": np.zeros(len(CONTACT.rows.normal)), "dt": 0.01},
+    ),
+    "motion_error": Call(lv.motion_error, {"problem": LCP, "impulse": B, "reference": B}),
+    "motions": Call(
+        lv.motions, {"problem": LCP, "n": 1, "seed": 1, "always": True}, accepts=ANY_SEED
+    ),
+    "redundancy": Call(lv.redundancy, {"problem": LCP, "tol": 1e-12}),
+    "bench.Plan": Call(
+        bench.Plan,
+        {"levels": (1e-3,), "budgets": (4,), "repeats": 1, "time_limit": 1.0, "pass_limit": 1.0, "orders": ("given",),
+         "times": (), "motion": False, "warm": True, "campaign": True},
+    ),
+    "bench.Plan, a level": Call(lambda level: bench.Plan(levels=[level]), {"level": 1e-3}),
+    "bench.Plan, a budget": Call(lambda budget: bench.Plan(budgets=[budget]), {"budget": 3}),
+    "bench.resolve": Call(
+        bench.resolve, {"words": ["stack(n=2)"], "sequences": False}, {"words": "cases"},
+        accepts={"sequences": ("None",)},
+    ),
+    "bench.resolve, a problem": Call(lambda case: bench.resolve([case]), {"case": LCP}),
+    "bench.sequence": Call(bench.sequence, {"problems": [LCP], "name": "walk"}),
+    "bench.expand_seeds": Call(
+        bench.expand_seeds, {"words": ["random_spd(n=3)"], "n": 2, "first": 0}, {"words": "cases", "n": "n|seeds"},
+        accepts={"first": ("very large",)},
+    ),
+    "bench.solver_names": Call(lambda solvers: bench.solver_names(solvers), {"solvers": ["pgs"]}),
+    "bench.carry": Call(bench.carry, {"before": LCP, "impulse": B, "problem": LCP}, {"before": "previous"}),
+    "bench.structure_of": Call(bench.structure_of, {"problem": LCP}),
+    "phenomena.chosen": Call(phenomena.chosen, {"names": ["slide"]}),
+    "suite.case": Call(lambda case: suite.case(case), {"case": "stack"}),
+    "suite.stack": Call(suite.stack, {"n": 3, "mass_ratio": 2.0, "friction": "none", "sliding": 0.5}),
+    "suite.engine_step": Call(suite.engine_step, {"scene": "pyramid", "at": 3}),
+    "suite.names": Call(suite.names, {"text": "@hard"}, {"text": "set"}),
+    "motion.adopt": Call(
+        motion.adopt, {"problem": LCP, "impulse": B, "solver": "mine"}, {"impulse": "reference"},
+        accepts={"solver": ("an object", "an ellipsis", "bytes")},
+    ),
+    "motion.branch": Call(motion.branch, {"problem": LCP, "impulse": B}),
+    "motion.distance": Call(motion.distance, {"problem": LCP, "x": B, "y": B}),
+    "motion.reference": Call(motion.reference, {"problem": LCP}),
+    "motion.uniqueness": Call(motion.uniqueness, {"problem": LCP}),
+}  # fmt: skip
+
+#: Public calls that are not in the table, and why.
+NOT_CALLED = {
+    **dict.fromkeys(
+        ("CrossCheck", "Enclosure", "MotionError", "Motions", "Redundancy", "Suspicion"),
+        "a result: the package makes it",
+    ),
+    "CrossCheck.__getitem__": "a mapping by the names of solvers",
+    "prove": "needs python-flint: tests/lab/motion/test_proof.py",
+}
+
+
+def test_every_public_call_of_the_lab_is_in_the_table():
+    check_every_public_call(public_calls("lab"), CALLS, NOT_CALLED)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("name", CALLS)
+def test_malformed_arguments_are_rejected_by_name(name):
+    check_malformed_arguments(name, CALLS[name])
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("name", CALLS)
+def test_arrays_in_any_memory_layout_give_the_same_result(name):
+    check_memory_layouts(CALLS[name])
+
+
+# -- extreme numbers ------------------------------------------------------------------------------------------------
+
+MEASURES = ("kinetic", "energy", "speed", "spin", "rows", "bound", "bound_speed", "bound_spin", "moved", "spread",
+            "spread_speed")  # fmt: skip
+
+
+@pytest.mark.fuzz
+@pytest.mark.filterwarnings("error")
+@draw_examples(40)
+@given(data=problem_data(), exponent=st.integers(-1070, 1020))
+def test_motion_errors_and_ranks_of_extreme_problems_are_numbers(data, exponent):
+    """A motion error is finite, or its `note` says why there is none."""
+    try:
+        problem = build_problem(data)
+    except lv.InputError:
+        reject()
+    for impulse in (np.full(problem.m, 2.0**exponent), lv.solve(problem).impulse):
+        if not np.isfinite(impulse).all():
+            continue
+        error = lv.motion_error(problem, impulse)
+        values = {name: getattr(error, name) for name in MEASURES}
+        assert [name for name, value in values.items() if value is not None and not np.isfinite(value)] == []
+        assert error.relative is None or np.isfinite(error.relative) or error.note
+        assert str(error)
+    if problem.m and problem.is_symmetric:
+        result = lv.redundancy(problem)
+        assert 0 <= result.rank == problem.m - len(result.rows)
+
+
+#: Scenes and their parameters, of which one value each is drawn.
+SCENES = {
+    "stack": {"n": (3, 6, 10)}, "pyramid": {"base": (3, 4)}, "card_house": {"levels": (2, 3)}, "chain": {"n": (5, 20)},
+    "bridge": {"n": (6, 12)}, "heavy_on_light": {"ratio": (1.0, 10.0, 1e3)}, "table": {"legs": (3, 4, 9)},
+    "four_bar": {}, "ramp": {"angle": (0.1, 0.35, 0.6)}, "pile": {"n": (8, 16)},
+}  # fmt: skip
+
+
+@st.composite
+def slow_problems(draw):
+    """A problem on which sweeps creep, stop or diverge, and its name."""
+    source, seed = draw(st.sampled_from(("scene", "scene", "hard", "singular", "wild", "warm"))), draw(seeds)
+    if source == "scene":
+        name = draw(st.sampled_from(sorted(SCENES)))
+        parameters = {key: draw(st.sampled_from(values)) for key, values in SCENES[name].items()}
+        parameters["solver_iterations"] = draw(st.sampled_from((4, 8, 16, 32)))
+        return after(draw(st.integers(1, 120)), name, **parameters).constraint_problem()
+    if source == "hard":
+        return suite.case(draw(st.sampled_from(hard.SET))).problem
+    if source == "singular":
+        return nearly_singular(seed)
+    problem = wild(seed=seed % 10**6, rows=200).problem
+    return problem if source == "wild" else warmed(problem, seed) or problem
+
+
+@pytest.mark.fuzz
+@pytest.mark.filterwarnings("error")
+@draw_examples(40)
+@given(
+    problem=slow_problems(),
+    solver=st.sampled_from(lv.available(external=False, resumable=True)),
+    tol=st.sampled_from((1e-6, 1e-6, 1e-9, 1e-12)),
+    max_iter=st.sampled_from((None, None, None, 200, 3000)),
+)
+def test_claims_of_iterative_solvers_that_make_little_progress_are_confirmed(problem, solver, tol, max_iter):
+    assume(0 < problem.m <= 700 and not lv.get(solver).refuses(problem))
+    solution = lv.solve(problem, solver, tol=tol, **({} if max_iter is None else {"max_iter": max_iter}))
+    assert solution.claim_check == "confirmed", solution.status_conflict
+    assert np.isnan(solution.sweeps_per_decade) or 0.0 < solution.sweeps_per_decade < np.inf

@@ -1,0 +1,720 @@
+"""Invalid input of the engine: scenes, snapshots, threads and Ctrl-C; the engine refuses, or makes whole steps."""
+
+import _thread
+import hashlib
+import json
+import struct
+import threading
+from types import SimpleNamespace
+
+import hypothesis.strategies as st
+import numpy as np
+import pytest
+from extreme_problems import SPECIAL
+from hypothesis import given, reject
+from invalid_values import (
+    Call,
+    check_every_public_call,
+    check_malformed_arguments,
+    check_memory_layouts,
+    draw_examples,
+    public_calls,
+)
+from worked import after, python
+
+import lavender as lv
+from lavender.sim.engine import check
+from lavender.sim.engine.layout import HEAD
+from lavender.sim.engine.state import KEPT
+from lavender_ext.engine.arrays import lengths
+
+CARRIED = ("setting", "x", "q", "v", "cache_key", "cache_impulse", "cache_local", "joint_impulse")
+
+
+def trajectory(sim, steps):
+    """Return the bytes of the positions after each step."""
+    return [sim.step()[0]["positions"].tobytes() for _ in range(steps)]
+
+
+# -- public calls ------------------------------------------------------------------------------------------------
+
+
+def on_scene(method):
+    """Call a method of a new scene with one sphere, which a rejected call leaves as it was."""
+
+    def call(**arguments):
+        scene = lv.Scene()
+        scene.add_sphere()
+        try:
+            return getattr(scene, method)(**arguments)
+        except lv.LavenderError:
+            assert (scene.n_bodies, scene.n_joints) == (1, 0)
+            raise
+
+    return call
+
+
+def on_simulation(method):
+    """Call a method of a new simulation."""
+    return lambda **arguments: getattr(lv.Simulation("stack"), method)(**arguments)
+
+
+UP = np.array([0.0, 0.0, 1.0])
+JOINT = {"a": 0, "b": -1}
+JOINT_NAMES = {"kind": "joint", "a": "body", "b": "body"}
+BODY = {"mass": 1.0, "friction": 0.5, "restitution": 0.5, "patch_radius": 0.1, "position": np.ones(3),
+        "quaternion": np.array([1.0, 0.0, 0.0, 0.0]), "velocity": np.ones(3),
+        "angular_velocity": np.ones(3)}  # fmt: skip
+
+CALLS = {
+    "Scene": Call(
+        lv.Scene,
+        {"name": "stack", "n": 3, "gravity": np.array([0.0, 0.0, -9.81]), "warm_start": False}
+        | dict.fromkeys(("dt", "friction", "restitution", "patch_radius", "rolling_radius", "slop", "margin",
+                         "restitution_threshold", "max_substep", "mass", "size"), 0.25)
+        | dict.fromkeys(("substeps", "solver_iterations", "position_iterations", "seed"), 4),
+        {"name": "scene"},
+    ),
+    "Scene.add_body": Call(on_scene("add_body"), BODY | {"inertia": np.ones(3)}),
+    "Scene.add_box": Call(on_scene("add_box"), BODY | {"size": np.ones(3)}),
+    "Scene.add_box, static": Call(on_scene("add_box"), {"static": True}),
+    "Scene.add_plane": Call(on_scene("add_plane"), {"normal": UP, "offset": 0.5}),
+    "Scene.add_sphere": Call(on_scene("add_sphere"), BODY | {"radius": 0.5}),
+    "Scene.add_joint": Call(
+        on_scene("add_joint"),
+        JOINT | {"kind": "hinge", "anchor": np.zeros(3), "axis": UP, "hertz": 0.5, "damping": 1.0, "collide": True},
+        JOINT_NAMES,
+    ),
+    "Scene.add_joint, distance": Call(
+        on_scene("add_joint"),
+        JOINT | {"kind": "distance", "anchor_a": np.zeros(3), "anchor_b": UP, "length": 0.5}, JOINT_NAMES,
+    ),
+    "Scene.with_parameters": Call(lv.Scene("stack").with_parameters, {"dt": 0.01, "solver_iterations": 8}),
+    "Simulation": Call(
+        lv.Simulation,
+        {"scene": "stack", "stepper": "impulses", "report_residual": True, "report_motion": True},
+    ),
+    "Simulation.film": Call(on_simulation("film"), {"steps": 1}),
+    "Simulation.reset": Call(on_simulation("reset"), {"seed": 1}),
+    "Simulation.restore": Call(on_simulation("restore"), {"snapshot": lv.Simulation("stack").snapshot()}),
+    "Simulation.set_solver_iterations": Call(
+        on_simulation("set_solver_iterations"), {"n": 8}, {"n": "solver_iterations"}
+    ),
+    "Simulation.set_velocity": Call(
+        on_simulation("set_velocity"), {"body": 1, "velocity": np.ones(3), "angular_velocity": np.ones(3)}
+    ),
+    "Simulation.set_warm_start": Call(on_simulation("set_warm_start"), {"flag": True}, {"flag": "warm_start"}),
+    "Simulation.step": Call(on_simulation("step"), {"action": None}),
+}  # fmt: skip
+
+#: Public calls that are not in the table, and why.
+NOT_CALLED = {
+    "Snapshot": "a result: the package makes it",
+    **dict.fromkeys(
+        ("Simulation.end_film", "Simulation.write_problem"), "for the package's own use"
+    ),
+    **dict.fromkeys(
+        ("Simulation.frames", "Simulation.load", "Simulation.record", "Simulation.save", "Snapshot.load",
+         "Snapshot.save"),
+        "a file: test_invalid_files.py of tests/cli",
+    ),
+    "Simulation.view": "a server",
+}  # fmt: skip
+
+
+def test_every_public_call_of_the_engine_is_in_the_table():
+    check_every_public_call(public_calls("sim"), CALLS, NOT_CALLED)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("name", CALLS)
+def test_malformed_arguments_are_rejected_by_name(name):
+    check_malformed_arguments(name, CALLS[name])
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("name", CALLS)
+def test_arrays_in_any_memory_layout_are_accepted(name):
+    check_memory_layouts(CALLS[name])
+
+
+@pytest.mark.parametrize(
+    ("call", "name"),
+    [
+        (lambda: lv.Scene(friction=1e-61), "friction"),
+        (lambda: lv.Scene(gravity=1e61), "gravity"),
+        (lambda: lv.Scene().add_box(mass=1e-61), "mass"),
+    ],
+    ids=["friction", "gravity", "mass"],
+)
+def test_numbers_out_of_range_are_rejected_by_name_and_limit(call, name):
+    with pytest.raises(lv.InputError, match=rf"{name}.*e[+-]60"):
+        call()
+
+
+# -- scenes that are stepped --------------------------------------------------------------------------------------
+
+real = st.floats(-4.0, 4.0, allow_subnormal=False) | st.sampled_from(
+    [s * x for x in SPECIAL for s in (1.0, -1.0)]
+)
+positive = real.map(lambda x: abs(x) or 1.0)
+size = st.sampled_from((0.0, 1e-60, 1e-12, 1e-3, 0.1, 0.5, 1.0, 10.0, 1e8, 1e30, 1e60))
+vector = st.lists(real, min_size=3, max_size=3) | st.lists(st.floats(-4.0, 4.0), min_size=3, max_size=3)
+GALLERY = {"stack": {"n": 3}, "pyramid": {"base": 3}, "card_house": {}, "pile": {"n": 12}, "chain": {"n": 6},
+           "bridge": {"n": 4}, "heavy_on_light": {}, "table": {"legs": 4}, "ramp": {}, "spinner": {},
+           "newtons_cradle": {}, "four_bar": {}}  # fmt: skip
+SOLVERS = ("newton", "auto", "pgs", "block_gauss_seidel", "nncg", "admm", "anderson", "jacobi")
+ORDERS = ("given", "reverse", "symmetric", "random", "colored", "bottom_up", "top_down")
+PARAMETERS = st.fixed_dictionaries({}, optional={
+    "seed": st.integers(0, 3), "dt": st.sampled_from((1e-60, 1e-9, 1e-3, 0.1, 1.0, 1e6, 1e60)),
+    "substeps": st.sampled_from((1, 2, 4)), "restitution": st.sampled_from((0.0, 0.5, 1.0)), "gravity": vector,
+    "position_iterations": st.sampled_from((0, 1, 20)), "warm_start": st.booleans(), "friction": size,
+    "patch_radius": size, "slop": size, "margin": size, "restitution_threshold": size,
+})  # fmt: skip
+HOW_SOLVED = st.one_of(
+    st.just({}),
+    st.fixed_dictionaries({"order": st.sampled_from(ORDERS)}),
+    st.fixed_dictionaries({
+        "solver": st.sampled_from(SOLVERS), "solver_iterations": st.sampled_from((1, 10, 60)),
+        "on_failure": st.sampled_from(("use", "keep", "damp", "raise")),
+    }),
+)  # fmt: skip
+MOTION = {"quaternion": st.lists(real, min_size=4, max_size=4), "inertia": st.lists(positive, min_size=3, max_size=3),
+          "friction": size, "patch_radius": size, "velocity": vector, "angular_velocity": vector}  # fmt: skip
+JOINT_OPTIONS = {"collide": st.booleans(), "hertz": st.sampled_from((0.0, 1e-9, 1.0, 1e9, 1e60)),
+                 "damping": st.sampled_from((0.0, 1.0, 1e60))}  # fmt: skip
+MOTOR = {"motor_speed": real, "motor_torque": st.sampled_from((0.0, 1.0, 1e9, 1e60))}
+SHAPES = {
+    "body": {},
+    "sphere": {"radius": positive},
+    "box": {"size": st.lists(positive, min_size=3, max_size=3)},
+}
+UNCHANGING = ("save", "problem", "residual")  # Actions that change nothing.
+ACTIONS = st.sampled_from((*UNCHANGING, "few sweeps", "many sweeps", "cold", "warm", "snapshot", "restore", "reset",
+                           "seed"))  # fmt: skip
+
+
+@st.composite
+def bodies(draw):
+    """Up to eight bodies, often at one place, perhaps on a plane."""
+    place = draw(vector)
+    planes = draw(st.sampled_from(([], [{"add": "plane"}], [{"add": "plane", "normal": place}])))
+
+    def body(shape):
+        fields = {"add": st.just(shape), "mass": positive, "position": st.just(place) | vector}
+        options = MOTION if shape == "body" else {k: x for k, x in MOTION.items() if k != "inertia"}
+        return st.fixed_dictionaries(fields | SHAPES[shape], optional=options)
+
+    return planes + draw(st.lists(st.sampled_from(sorted(SHAPES)).flatmap(body), min_size=1, max_size=8))
+
+
+def joints(n):
+    """Joints between two of n bodies or the world."""
+    ends = {"a": st.integers(-1, n - 1), "b": st.integers(-1, n - 1)}
+    kinds = (("ball", {"anchor": vector}, {}), ("hinge", {"anchor": vector, "axis": vector}, MOTOR),
+             ("distance", {"anchor_a": vector}, {"length": size}))  # fmt: skip
+    strategies = (
+        st.fixed_dictionaries({"kind": st.just(kind)} | ends | fields, optional=JOINT_OPTIONS | options)
+        for kind, fields, options in kinds
+    )
+    return st.lists(st.one_of(*strategies), max_size=3)
+
+
+@st.composite
+def scenes(draw):
+    """A scene as plain data, and what is done with it."""
+    parameters = draw(PARAMETERS) | draw(HOW_SOLVED)
+    data = {"parameters": parameters, "again": draw(st.integers(0, 3)) == 3}
+    if draw(st.integers(0, 3)) == 3:
+        data["name"] = draw(st.sampled_from(sorted(GALLERY)))
+        parameters |= GALLERY[data["name"]]
+    else:
+        data["bodies"] = draw(bodies())
+        data["joints"] = draw(joints(len(data["bodies"])))
+    steps = st.integers(1, 10 if "solver" in parameters else 20)
+    return data | {"actions": draw(st.lists(st.one_of(steps, steps, ACTIONS), min_size=1, max_size=8))}
+
+
+def build_scene(data):
+    """Build the scene of plain data; an error of the package if it is not valid."""
+    scene = lv.Scene(data.get("name"), **data["parameters"])
+    for body in data.get("bodies", ()):
+        getattr(scene, f"add_{body['add']}")(**{k: x for k, x in body.items() if k != "add"})
+    for joint in data.get("joints", ()):
+        scene.add_joint(**joint)
+    return scene
+
+
+def act(simulation, action, snapshot, path):
+    """Do one of ACTIONS; return the snapshot to restore."""
+    if action in ("few sweeps", "many sweeps"):
+        simulation.set_solver_iterations(4 if action == "few sweeps" else 64)
+    elif action in ("cold", "warm"):
+        simulation.set_warm_start(action == "warm")
+    elif action == "snapshot":
+        return simulation.snapshot()
+    elif action == "restore" and snapshot is not None:
+        simulation.restore(snapshot)
+    elif action == "save":
+        simulation.save(path)
+        simulation.load(path)
+    elif action == "problem":
+        problem = simulation.constraint_problem()
+        if problem.m:
+            lv.solve(problem, "sequential_impulses", max_iter=4)
+    elif action == "residual":
+        simulation.residual()
+    elif action in ("reset", "seed"):
+        simulation.reset(*([5] if action == "seed" else []))
+        return None  # It is another scene if the seed shakes it.
+    return snapshot
+
+
+def check_observation(observation, terminated, info):
+    """Require finite numbers, or `terminated` and a body's name in the step in which one is not finite."""
+    if terminated:
+        assert "lost_body" in info
+        return
+    for key in ("positions", "quaternions", "velocities", "solver", "joint_impulses"):
+        assert np.isfinite(observation[key]).all(), key
+    q = observation["quaternions"]
+    assert np.all(np.abs(np.einsum("ij,ij->i", q, q) - 1.0) < 1e-9)
+
+
+def play(data, path, inspect=True):
+    """Step a scene, with or without the actions that change nothing; return a hash of all observations."""
+    simulation, seen, snapshot = lv.Simulation(build_scene(data)), hashlib.sha256(), None
+    for action in data["actions"]:
+        if isinstance(action, str):
+            if inspect or action not in UNCHANGING:
+                try:
+                    snapshot = act(simulation, action, snapshot, path)
+                except lv.LavenderError:
+                    if action not in UNCHANGING:
+                        raise
+            continue
+        for _ in range(action):
+            try:
+                observation, _, terminated, _, info = simulation.step()
+            except lv.LavenderError as error:
+                seen.update(type(error).__name__.encode())
+                return seen.digest()
+            check_observation(observation, terminated, info)
+            for key in ("positions", "quaternions", "velocities", "joint_impulses", "solver"):
+                seen.update(observation[key].tobytes())
+            seen.update(observation["contacts"]["impulses"].tobytes())
+            if terminated:
+                assert not data.get("lasts"), f"{info['lost_body']} is lost"
+                return seen.digest()
+    return seen.digest()
+
+
+@pytest.mark.fuzz
+@pytest.mark.filterwarnings("error")
+@draw_examples(60)
+@given(data=scenes())
+def test_extreme_scenes_stay_finite_or_terminate_and_inspection_changes_nothing(data, tmp_path_factory):
+    path = tmp_path_factory.getbasetemp() / "drawn.state"
+    try:
+        seen = play(data, path)
+    except lv.LavenderError:
+        reject()
+    if data["again"]:
+        assert play(data, path, inspect=False) == seen
+
+
+def box(size, x=0.0, y=0.0, z=0.0, **more):
+    return {
+        "add": "box",
+        "size": [size] * 3 if np.isscalar(size) else size,
+        "mass": 1.0,
+        "position": [x, y, z],
+    } | more
+
+
+def sphere(radius, x=0.0, z=0.0):
+    return {"add": "sphere", "radius": radius, "mass": 1.0, "position": [x, 0.0, z]}
+
+
+def tilted(angle):
+    return [np.cos(0.5 * angle), 0.0, np.sin(0.5 * angle), 0.0]
+
+
+PLANE = {"add": "plane"}
+ON_BOX = [PLANE, box(1.0, z=0.5)]
+#: Scenes from which nothing may be lost in 240 steps.
+LASTING = {
+    "on one place": [*[box(1.0)] * 5, *[sphere(0.5, 3.0)] * 3, sphere(0.5), {"add": "plane", "offset": 0.3}],
+    "flat boxes": [PLANE, *(b for i in range(4) for b in (
+        box([1e-6, 1.0, 1.0], 0.1 * i, z=0.6, quaternion=tilted(0.1 * i)),
+        box([1e-3, 1e-3, 10.0], 0.2 * i, 2.0, 5.0)))],
+    **{f"sizes of {x:g}": [*ON_BOX, sphere(0.5 * x, z=1.0 + 0.5 * x), box(x, 0.2, z=1.0 + x)] for x in (1e-6, 1e6)},
+    **{f"masses of {x:g}": [*ON_BOX, box(1.0, z=1.5, mass=x)] for x in (1e-6, 1e6)},
+}  # fmt: skip
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("name", LASTING)
+def test_scenes_of_unlike_sizes_and_masses_lose_no_body(name, tmp_path):
+    play({"parameters": {}, "bodies": LASTING[name], "actions": [240], "lasts": True}, tmp_path / "state")
+
+
+# -- snapshots that were changed ------------------------------------------------------------------------------------
+
+MAGIC = b"LAVENDER-SNAPSHOT\n"
+ARRAYS = {"size": "<i4", "real": "<f8", "index": "<i4", "keys": "<u8"}
+NUMBERS = {
+    "real": st.sampled_from((*SPECIAL, float("nan"), float("inf"), -1.0, 1e9)),
+    "keys": st.integers(0, 2**64 - 1),
+    **dict.fromkeys(
+        ("size", "index"), st.sampled_from((-(2**31), -1000, -1, 0, 1, 2, 7, 65536, 10**8, 2**31 - 1))
+    ),
+}
+HEADER = st.tuples(
+    st.sampled_from(("version", "fingerprint", "steps", "failed", "lost", "lengths", "extra", None)),
+    st.sampled_from(
+        (None, -1, 0, 1, 10**30, 1.5, "x", [], [[]], [1, 2, 3, 4], {}, True, float("inf"), "\ud800")
+    ),
+)
+DAMAGE = st.one_of(
+    st.sampled_from(("deep", "long", "text", "checksum")),
+    st.tuples(st.sampled_from(("cut", "flip")), st.integers(0, 4000)),
+)  # fmt: skip
+
+
+def changed_snapshot(data, edits, header_edits, damage):
+    """Return the bytes of a snapshot with other numbers and a right checksum, unless the damage is to it."""
+    start = len(MAGIC) + 8
+    end = start + int.from_bytes(data[len(MAGIC) : start], "little")
+    header, arrays, at = json.loads(data[start:end]), {}, end
+    for (name, code), n in zip(ARRAYS.items(), header["lengths"], strict=True):
+        arrays[name] = np.frombuffer(data, code, n, at).copy()
+        at += arrays[name].nbytes
+    for name, place, value in edits:
+        if len(arrays[name]):
+            arrays[name][place % len(arrays[name])] = value
+    for key, value in header_edits:
+        header = value if key is None else header | {key: value}
+    text = {"deep": b"[" * 100_000, "text": b"{"}.get(damage, json.dumps(header).encode())
+    length = 2**62 if damage == "long" else len(text)
+    body = MAGIC + struct.pack("<Q", length) + text + b"".join(x.tobytes() for x in arrays.values())
+    if isinstance(damage, tuple) and damage[0] == "cut":
+        body = body[: max(len(MAGIC), len(body) - damage[1])]
+    elif isinstance(damage, tuple):
+        at = damage[1] % len(body)
+        body = body[:at] + bytes([body[at] ^ 255]) + body[at + 1 :]
+    return body + (bytes(32) if damage == "checksum" else hashlib.sha256(body).digest())
+
+
+@pytest.mark.fuzz
+@pytest.mark.filterwarnings("error")
+@draw_examples(60)
+@given(
+    name=st.sampled_from(sorted(GALLERY)),
+    how=HOW_SOLVED,
+    steps=st.integers(0, 6),
+    edits=st.lists(st.sampled_from(("size", *["index"] * 3, "real", "keys")).flatmap(
+        lambda name: st.tuples(st.just(name), st.integers(0, 10**6), NUMBERS[name])), max_size=5),
+    header=st.lists(HEADER, max_size=1),
+    damage=st.none() | st.none() | DAMAGE,
+)  # fmt: skip
+def test_a_changed_snapshot_is_rejected_or_stepped(name, how, steps, edits, header, damage, tmp_path_factory):
+    """What a forged state computes is not promised; that it reads and writes within its arrays is."""
+    path = tmp_path_factory.getbasetemp() / "drawn.snapshot"
+    simulation = after(steps, name, **GALLERY[name], **how | {"on_failure": "use"})
+    simulation.save(path)
+    path.write_bytes(changed_snapshot(path.read_bytes(), edits, header, damage))
+    try:
+        simulation.load(path)
+        for _ in range(4):
+            if simulation.step()[2]:
+                return
+        simulation.constraint_problem()
+    except lv.LavenderError:
+        return
+
+
+# -- arrays of snapshots ---------------------------------------------------------------------------------
+
+
+def test_every_array_of_a_snapshot_that_the_scene_gives_is_compared():
+    # One bit of one entry changes, which no other check detects.
+    sim = after(5, "bridge", n=4, patch_radius=0.1)
+    assert set(check.GIVEN) | set(check.CARRIED) | {"head", "setting", "ptr"} == set(KEPT)
+    for name in check.GIVEN:
+        if not sim.state.a[name].size:
+            continue
+        state = sim.state.copy()
+        state.a[name].reshape(-1).view(np.uint8)[0] ^= 1
+        shot = sim.snapshot()
+        bad = lv.Snapshot(shot.fingerprint, 5, 0, "", state.size, state.real, state.index, state.keys)
+        before = sim.snapshot()
+        with pytest.raises(lv.InputError, match=f"damaged: {name} "):
+            sim.restore(bad)
+        assert sim.snapshot().real.tobytes() == before.real.tobytes()
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("size", np.zeros(10)),
+        ("size", np.zeros((2, 5), np.int32)),
+        ("real", np.zeros(5, np.float32)),
+        ("index", "no array"),
+        ("keys", np.zeros(3, np.int64)),
+        ("steps", 1.5),
+        ("failed", -1),
+        ("lost", None),
+        ("fingerprint", b"x"),
+    ],
+)
+def test_fields_of_a_snapshot_have_their_types(field, value, tmp_path):
+    sim = lv.Simulation("stack")
+    shot = sim.snapshot()
+    object.__setattr__(shot, field, value)
+    with pytest.raises(lv.InputError):
+        sim.restore(shot)
+    with pytest.raises(lv.InputError, match=field):
+        shot.save(tmp_path / "state")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("name", "solver"), [("pile", {}), ("bridge", {}), ("pyramid", {"solver": "newton"})]
+)
+def test_a_restored_snapshot_is_the_same_and_its_pairs_are_searched_again(name, solver):
+    sim = after(30, name, **solver)
+    shot = sim.snapshot()
+    sim.restore(shot)
+    again = sim.snapshot()
+    for field in ("size", "real", "index", "keys"):
+        assert getattr(shot, field).tobytes() == getattr(again, field).tobytes()
+    expected, problem = trajectory(sim, 5), sim.constraint_problem()
+    # A snapshot without pairs changes nothing.
+    state = sim.state.copy()
+    state.real[:], state.index[:], state.keys[:] = shot.real, shot.index, shot.keys
+    state.head[HEAD["pairs"]] = 0
+    sim.restore(
+        lv.Snapshot(shot.fingerprint, shot.steps, 0, "", state.size, state.real, state.index, state.keys)
+    )
+    assert sim.constraint_problem().n_blocks > 0
+    assert trajectory(sim, 5) == expected
+    assert sim.constraint_problem().b.tobytes() == problem.b.tobytes()
+
+
+# -- threads -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("inspects", [False, True])
+def test_threads_that_share_a_simulation_wait_for_each_other(inspects):
+    # Without the lock, eight of eight runs crashed. restore(snapshot()) of one thread may undo a step of another
+    # between the two calls, so the bits are compared if each thread only steps.
+    scene = lv.Scene("pile", n=60, kind="mixed", substeps=2)
+    sim, twin = lv.Simulation(scene), lv.Simulation(scene)
+
+    def work():
+        for i in range(60):
+            sim.step()
+            if inspects and i % 10 == 0:
+                sim.constraint_problem(), sim.residual(), sim.restore(sim.snapshot())
+
+    threads = [threading.Thread(target=work) for _ in range(3)]
+    for t in threads:
+        t.start()
+    for t in threads:
+        t.join()
+    if not inspects:
+        trajectory(twin, 180)
+        assert sim.steps == 180 and sim.snapshot().real.tobytes() == twin.snapshot().real.tobytes()
+
+
+class ReplacedCalls:
+    """The kernel of a simulation with other functions in the place of some."""
+
+    def __init__(self, kernel, **calls):
+        self.kernel, self.calls = kernel, calls
+
+    def __getattr__(self, name):
+        return self.calls.get(name) or getattr(self.kernel, name)
+
+
+def test_ctrl_c_stops_a_step_of_very_many_substeps():
+    sim = lv.Simulation(lv.Scene("stack", n=2, substeps=10**6))  # whose arrays need not grow
+    start, kernel, limits = sim.snapshot(), sim.state.kernel, []
+
+    def substeps(most):
+        limits.append(most)
+        if len(limits) == 4:
+            _thread.interrupt_main()  # the flag of the signal: Python looks at it before its next line
+        return kernel.substeps(most)
+
+    sim.state.kernel = ReplacedCalls(kernel, substeps=substeps)
+    with pytest.raises(KeyboardInterrupt):
+        sim.step()
+    assert len(limits) == 4
+    for call in (sim.step, sim.snapshot):
+        with pytest.raises(lv.LavenderError, match="between its substeps"):
+            call()
+    sim.restore(start)
+    sim.constraint_problem()
+
+
+@pytest.fixture
+def caller(plug_in):
+    """Register a solver that calls `now` in run number `at`; return both and the number of runs."""
+
+    def make(now, at, **more):
+        plan = SimpleNamespace(now=now, at=at, runs=0)
+
+        def run(problem, impulse):
+            plan.runs += 1
+            if plan.runs == plan.at:
+                plan.now()
+            return lv.Claim(lv.Status.MAX_ITERATIONS, 1)
+
+        plug_in(run, "caller", parts=True, **more)
+        return plan
+
+    return make
+
+
+def test_calls_from_inside_a_step_are_rejected(caller):
+    rejected = []
+
+    def inside():
+        for call in calls:
+            with pytest.raises(lv.LavenderError, match="inside a step"):
+                call()
+            rejected.append(call)
+
+    caller(inside, 1)
+    sim = lv.Simulation(lv.Scene("stack", solver="caller"))
+    calls = (sim.step, sim.snapshot, sim.constraint_problem, sim.reset, lambda: sim.set_warm_start(False))
+    sim.step()
+    assert len(rejected) == len(calls)
+    sim.step()
+
+
+# -- Ctrl-C --------------------------------------------------------------------------------------------
+
+
+def stop():
+    raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize("resumable", [False, True])
+@pytest.mark.parametrize("at", [1, 2, 3])
+def test_ctrl_c_in_any_substep_restores_the_state_before_the_step(caller, at, resumable):
+    plan = caller(stop, 0, resumable=resumable)
+    scene = lv.Scene("bridge", n=4, solver="caller", substeps=3, solver_iterations=1)
+    sim, twin = lv.Simulation(scene), lv.Simulation(scene)
+    trajectory(sim, 3), trajectory(twin, 3)
+    for one in (sim, twin):
+        one.state.head[HEAD["step"]] = 2**31 - 1  # substeps are counted in 32 bits, which begin again
+    before = sim.state.copy()
+    plan.at = plan.runs + at
+    with pytest.raises(KeyboardInterrupt):
+        sim.step()
+    assert sim.steps == 3
+    assert sim.last_solution is None
+    before.head[HEAD["solved"]] = 0
+    for name in before.a if at > 1 else CARRIED:  # the first substep forms its problem anew
+        assert sim.state.a[name].tobytes() == before.a[name].tobytes(), name
+    with pytest.raises(lv.InputError, match="stopped"):
+        sim.residual()
+    assert trajectory(sim, 4) == trajectory(twin, 4)
+    for name in CARRIED:
+        np.testing.assert_array_equal(sim.state.a[name], twin.state.a[name], err_msg=name)
+
+
+@pytest.mark.parametrize(("solver", "calls"), [("newton", "run"), ("auto", "turn")])
+def test_ctrl_c_inside_a_solver_that_returns_its_best_impulse_stops_the_step(solver, calls, monkeypatch):
+    # `newton` and `auto` return their best impulses after Ctrl-C: the step does not use them.
+    from lavender.solvers.newton import Newton
+
+    scene = lv.Scene("bridge", n=30, solver=solver, substeps=2)  # too many rows for the one compiled call
+    sim, twin = lv.Simulation(scene), lv.Simulation(scene)
+    trajectory(sim, 3), trajectory(twin, 3)
+    original = getattr(Newton, calls)
+
+    def interrupted(self, *a, **k):
+        claim = original(self, *a, **k)
+        return lv.Claim(lv.Status.INTERRUPTED, claim.iterations, claim.work, "Ctrl-C")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Newton, calls, interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            trajectory(sim, 200)
+    trajectory(twin, sim.steps - 3)
+    assert trajectory(sim, 3) == trajectory(twin, 3)
+
+
+# -- counts that overflow ------------------------------------------------------------------------------
+
+COINCIDENT = """
+import resource, sys
+import lavender as lv
+resource.setrlimit(resource.RLIMIT_AS, (3 * 2**30, 3 * 2**30))
+for n in (60, 65_537):
+    scene = lv.Scene(substeps=1)
+    scene.add_sphere(0.5, position=(0, 0, 1))
+    scene.bodies = scene.bodies * n
+    sim = lv.Simulation(scene)
+    try:
+        contacts = len(sim.step()[0]["contacts"]["depth"])
+    except lv.InputError as error:
+        assert "move" in str(error) and str(n) in str(error), error
+        assert sim.steps == 0 and n > 60
+    else:
+        assert contacts == n * (n - 1) // 2 and n == 60, contacts
+"""
+
+
+@pytest.mark.slow
+def test_coincident_spheres_touch_or_are_rejected():
+    # 65,537 spheres are 2^31 + 32,768 pairs, a negative number in 32 bits.
+    pytest.importorskip("resource")
+    python("-X", "faulthandler", "-c", COINCIDENT)
+
+
+def test_counts_of_32_bits_wrap_around():
+    sim = after(1, "stack", substeps=2)
+    head = sim.state.head
+    head[[HEAD["step"], HEAD["rebuilds"]]], head[HEAD["pairs_valid"]] = 2**31 - 1, 0
+    sim.step()
+    assert (head[HEAD["step"]], head[HEAD["rebuilds"]]) == (1, 0)
+
+
+def test_more_contacts_than_memory_holds_are_rejected():
+    sim = lv.Simulation(lv.Scene("stack", n=2))
+    sim.state.head[HEAD["need_contacts"]] = 2**28
+    with pytest.raises(lv.InputError, match="GiB"):
+        sim.state.grown()
+
+
+# -- numbers at the edge of float64 --------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("scale", [1e-12 * 1.01, 1e-5, 1.0, 1e59])
+def test_directions_of_any_length_are_normalised(scale):
+    scene = lv.Scene()
+    body = scene.add_box(quaternion=np.array([1.0, -1.0, 0.5, 0.25]) * scale)
+    np.testing.assert_allclose(
+        scene.bodies[body].quaternion, np.array([1.0, -1.0, 0.5, 0.25]) / 1.5206906325745548, rtol=1e-15
+    )
+    plane = scene.add_plane((scale, 0.0, 0.0))
+    assert scene.bodies[plane].shape.normal == (1.0, 0.0, 0.0)
+
+
+def test_reset_reports_no_residual_and_does_not_fail():
+    sim = lv.Simulation("stack", report_residual=True)
+    assert "residual" in sim.step()[4]
+    assert "residual" not in sim.reset()[1]
+
+
+def test_sizes_whose_entries_exceed_32_bits_are_detected():
+    size = lv.Simulation("stack").snapshot().size
+    for k in range(len(size)):
+        large = size.copy()
+        large[k] = 2**31 - 1
+        assert -1 in lengths(large), k
