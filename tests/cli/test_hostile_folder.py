@@ -123,17 +123,17 @@ def show_all(records):
     """Everything that is made of records but the files of figures, in memory."""
     from rich.console import Console
 
-    from lavender.lab.report.curves import figures
-    from lavender.lab.report.page import page
-    from lavender.lab.report.write import summary
+    from lavender.lab.report.figures import build_figures
+    from lavender.lab.report.markdown import summarise_report
+    from lavender.lab.report.page import render_page
 
     shown = records.latest()
     report = Report(shown, shown)
     print_report(report, Console(file=text_io.StringIO(), width=140))
     for record in shown.records:  # whichever is the fastest, and so shown, differs from run to run
         assert format_call(record)
-    page(report, figures(shown)).encode("utf-8")
-    summary(report).encode("utf-8")
+    render_page(report, build_figures(shown)).encode("utf-8")
+    summarise_report(report).encode("utf-8")
 
 
 def test_records_of_any_content_are_shown_or_refused(tmp_path, lines):

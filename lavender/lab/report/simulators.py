@@ -1,4 +1,4 @@
-"""Our Newton beside that of a simulator, as a table."""
+"""Tabulate times of lavender's Newton method and of a simulator's."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ from typing import TypeVar
 import numpy as np
 
 from lavender.lab.bench.simulators import STRICT, TARGET, Step, WarmStep
-from lavender.lab.report.table import Table, markdown
-from lavender.lab.report.tables import geometric_mean
+from lavender.lab.bench.statistics import geometric_mean
+from lavender.lab.report.markdown import format_markdown
+from lavender.lab.report.table import Table
 
 S = TypeVar("S", bound=WarmStep)
 OVER = "lavender's time over MuJoCo's, geometric means, above 1 MuJoCo is faster"
@@ -29,14 +30,14 @@ def _sizes(x: Sequence[float]) -> tuple[str, str]:
 
 
 def _row(name: str, part: Sequence[WarmStep]) -> list[str]:
-    """Models, problems, the engine's time and ours over it."""
+    """Return the first cells of a row: models, problems, the engine's time and the ratio of times."""
     ratio = geometric_mean([s.ours / s.engine for s in part])
     models, engine = len({s.model for s in part}), geometric_mean([s.engine for s in part])
     return [name, str(models), str(len(part)), f"{1e6 * engine:.1f}", f"{ratio:.2f}"]
 
 
 def table(steps: Sequence[Step]) -> str:
-    """Geometric means of ours / MuJoCo's by the number of rows, and what was solved, as Markdown."""
+    """Return geometric means of time ratios by the number of rows, and how many problems were solved, as Markdown."""
     heads = ["rows", "models", "problems", "MuJoCo [µs]", "one call", "`solve_many`"]
     rows = [
         [*_row(name, part), f"{geometric_mean([s.many / s.engine for s in part]):.2f}"]
@@ -52,11 +53,11 @@ def table(steps: Sequence[Step]) -> str:
         f"to {TARGET:.0e} at no tolerance count with its default."
     )
     start = f"Cold, both sides from nothing, to a judged residual of {TARGET:.0e}. `one call`, `solve_many`: {OVER}."
-    return "\n".join([start, "", *markdown(Table(heads, rows)), "", told])
+    return "\n".join([start, "", *format_markdown(Table(heads, rows)), "", told])
 
 
 def warm_table(steps: Sequence[WarmStep]) -> str:
-    """The same over consecutive steps, both sides from what they knew of the last one."""
+    """Return the same over consecutive steps, both solvers started from their last step."""
     rows = [
         [
             *_row(name, part),
@@ -71,4 +72,4 @@ def warm_table(steps: Sequence[WarmStep]) -> str:
         f"{TARGET:.0e}. `one call`: {OVER}."
     )
     heads = ["rows", "models", "steps", "MuJoCo [µs]", "one call", *residuals]
-    return "\n".join([start, "", *markdown(Table(heads, rows))])
+    return "\n".join([start, "", *format_markdown(Table(heads, rows))])

@@ -1,4 +1,4 @@
-"""Records -> plain tables (lists of small frozen rows), of each case and over many. Nothing is solved or drawn here.
+"""Compute statistics of records, of each case and over many cases, as lists of small frozen rows.
 
 Time to a level: the smallest time of any run whose judged residual is at or below it, whatever was asked
 for: runs are matched by the accuracy they reached, never by the one they were asked for.
@@ -28,7 +28,7 @@ SHIFT = 1e-5
 
 
 def levels_of(records: Records) -> tuple[float, ...]:
-    """Levels of the newest run's plan, loosest first; else the tolerances that were asked for."""
+    """Return the levels of the newest run's plan, loosest first; without a plan the tolerances of the runs."""
     for run in reversed(list(records.runs.values())):
         if run.plan.get("levels"):
             return tuple(sorted(map(float, run.plan["levels"]), reverse=True))
@@ -36,7 +36,7 @@ def levels_of(records: Records) -> tuple[float, ...]:
 
 
 def pairs(records: Iterable[Record]) -> dict[tuple[str, str, str], list[Record]]:
-    """Runs in the given order of blocks, by (case, solver, start)."""
+    """Group runs in the given order of blocks by (case, solver, start)."""
     groups: dict[tuple[str, str, str], list[Record]] = defaultdict(list)
     for r in records:
         if r.order == "given" and r.step < 0 and not r.turns:
@@ -45,7 +45,7 @@ def pairs(records: Iterable[Record]) -> dict[tuple[str, str, str], list[Record]]
 
 
 def families(records: Records) -> dict[str, list[str]]:
-    """Structure -> cases, biggest first. A case is in every family whose word describes it.
+    """Group cases by structure. A case is in every family whose word describes it.
 
     A structure whose cases have several laws is a family for each law: "pile, coulomb". Words that describe the same
     cases are one family: "stack / friction".
@@ -66,8 +66,17 @@ def families(records: Records) -> dict[str, list[str]]:
 
 
 def is_campaign(records: Records) -> bool:
-    """Times were left out on purpose."""
+    """Return whether the runs are of a campaign, which has no times."""
     return any(run.plan.get("campaign") for run in records.runs.values())
+
+
+def drop_idle_cases(records: Records) -> Records:
+    """Return the records without cases whose solution is the zero impulse: no ranking counts them."""
+    idle = {name for name, info in records.cases.items() if info.nothing_to_do}
+    if not idle:
+        return records
+    remaining = (r for r in records if r.case not in idle)
+    return records.having(remaining, lambda entry: getattr(entry, "case", None) not in idle)
 
 
 # -- single cases ------------------------------------------------------------------------------------------
@@ -75,7 +84,7 @@ def is_campaign(records: Records) -> bool:
 
 @dataclass(frozen=True)
 class Reach:
-    """How far and how fast one solver came on one case."""
+    """Times and smallest residual of one solver on one case."""
 
     case: str
     solver: str
@@ -98,7 +107,7 @@ class Reach:
 
 @dataclass(frozen=True)
 class Difficulty:
-    """What makes a case hard, and who did not solve it by a way of its own."""
+    """Measures of the difficulty of a case, and the solvers that took the same shortcut."""
 
     case: str
     rows: int
@@ -113,7 +122,7 @@ class Difficulty:
 
 @dataclass(frozen=True)
 class Claims:
-    """What a solver said of itself, against the judge."""
+    """Claims of a solver, compared with the judge."""
 
     solver: str
     runs: int
@@ -142,7 +151,7 @@ class Spread:
 
 
 def reaches(records: Records, levels: Sequence[float] | None = None) -> list[Reach]:
-    """One row for each case, solver and start, in the order of the records."""
+    """Return one row for each case, solver and start, in the order of the records."""
     levels = levels_of(records) if levels is None else tuple(levels)
     out = []
     for (case, solver, start), group in pairs(records).items():
@@ -173,12 +182,12 @@ def reaches(records: Records, levels: Sequence[float] | None = None) -> list[Rea
 
 
 def _is_again(r: Record) -> bool:
-    """A run that was made before, again in turns with others; only those to a limit of time are run in turns alone."""
+    """Return whether a run repeats an earlier one in turns; runs with a time limit exist only in turns."""
     return bool(r.turns) and r.mode != "time"
 
 
 def failures(records: Records) -> list[Record]:
-    """Runs to a level that the judge does not confirm (nor the floor excuses), crashes, and false claims."""
+    """Return runs that missed their level above the round-off floor, crashes, and false claims."""
     out = []
     for r in records:
         if _is_again(r):
@@ -192,7 +201,7 @@ def failures(records: Records) -> list[Record]:
 
 
 def difficulties(records: Records) -> list[Difficulty]:
-    """Each case of the records, from doing nothing: what a guess or the step before spares is not the case's."""
+    """Return the difficulty of each case, from runs with a cold start."""
     out = []
     for name, info in records.cases.items():
         mine = [r for r in records if r.case == name and r.start == "cold"]
@@ -218,7 +227,7 @@ def difficulties(records: Records) -> list[Difficulty]:
 
 
 def claims(records: Records) -> list[Claims]:
-    """By solver: how often its claim holds."""
+    """Count the correct and wrong claims of each solver."""
     out = []
     for solver in sorted({r.solver for r in records}):
         mine = [r for r in records if r.solver == solver and not _is_again(r)]
@@ -238,7 +247,7 @@ def claims(records: Records) -> list[Claims]:
 
 
 def spreads(records: Records) -> list[Spread]:
-    """Where one budget was run in several sweep orders, the residual of each."""
+    """Return the residual of each sweep order for budgets that were run in several orders."""
     groups: dict[tuple[str, str, int], dict[str, Record]] = defaultdict(dict)
     for r in records:
         if r.mode == "budget" and r.start == "cold" and r.step < 0 and not r.turns:
@@ -252,7 +261,7 @@ def spreads(records: Records) -> list[Spread]:
 
 
 def budgets(records: Records) -> dict[tuple[str, str, str], list[tuple[int, float]]]:
-    """(case, solver, start) -> (iterations, residual) of the exact budgets, given order."""
+    """Return (iterations, residual) of the exact budgets in the given order, by (case, solver, start)."""
     groups: dict[tuple[str, str, str], list[tuple[int, float]]] = defaultdict(list)
     for r in records:
         if r.mode != "budget" or r.turns:
@@ -314,7 +323,7 @@ def changes(old: Records, new: Records) -> list[Change]:
 
 
 def drift(old: Records, new: Records, case: str = "") -> float:
-    """Time of the loop of fixed work now over then, medians beside the runs of a case, or of all; 1 where not known."""
+    """Return the ratio of new to old time of the calibration loop, medians over runs of a case or of all; else 1."""
     found = []
     for records in (old, new):
         some = [r.pace for r in records if r.pace and (not case or r.case == case)]
@@ -333,20 +342,20 @@ class Profile:
 
 
 def geometric_mean(values: Sequence[float], shift: float = 0.0) -> float:
-    """exp(mean(log(x + shift))) - shift; nan for nothing."""
+    """Return exp(mean(log(x + shift))) - shift; nan without values."""
     if not values:
         return math.nan
     return math.exp(sum(math.log(v + shift) for v in values) / len(values)) - shift
 
 
 def quantile(values: Sequence[float], q: float) -> float:
-    """The smallest value that at least a share q of them does not exceed."""
+    """Return the smallest value that at least a share q of the values does not exceed."""
     ordered = sorted(values)
     return ordered[min(len(ordered) - 1, math.ceil(q * len(ordered)) - 1)]
 
 
 def times_to(records: Records, level: float) -> dict[str, dict[str, float]]:
-    """Case -> solver -> time [s] to a level from a cold start, inf if missed; solvers that refused it are absent."""
+    """Return time [s] to a level from a cold start by case and solver: inf if missed, absent if the solver refused."""
     out: dict[str, dict[str, float]] = defaultdict(dict)
     for reach in reaches(records, [level]):
         if reach.start == "cold":
@@ -355,14 +364,14 @@ def times_to(records: Records, level: float) -> dict[str, dict[str, float]]:
 
 
 def limit_of(records: Records) -> float:
-    """What a missed level is charged [s]: the time limit."""
+    """Return the time [s] that a missed level counts with: the time limit."""
     return max((r.time_limit for r in records), default=1.0)
 
 
 def geometric_means(records: Records) -> dict[str, dict[float, dict[str, tuple[float, int, int]]]]:
-    """law -> level -> solver -> (shifted geometric mean [s], solved, cases); a miss costs the time limit.
+    """Return (shifted geometric mean [s], solved, cases) by law, level and solver; a miss counts with the time limit.
 
-    A solver stands in a law's table when it takes every case of it.
+    A law's table has the solvers that accept every case of it.
     """
     limit = limit_of(records)
     out: dict[str, dict[float, dict[str, tuple[float, int, int]]]] = {}
@@ -395,7 +404,7 @@ class Backend:
 
 
 def backends(records: Records) -> list[Backend]:
-    """Those of which both times are known; by their own interface first the fastest."""
+    """Return solvers with both times, sorted by the time of their own interface."""
     levels = levels_of(records)
     level = levels[len(levels) // 2]
     best: dict[tuple[str, str], Record] = {}
@@ -433,10 +442,10 @@ def _whole(times: Mapping[str, Mapping[str, float]], cases: Sequence[str]) -> li
 
 
 def profiles(records: Records) -> list[Profile]:
-    """Share of cases that a solver brings to a level within `ratio` times the fastest; misses at infinity.
+    """Compute the share of cases that a solver brings to a level within `ratio` times the fastest; a miss is infinite.
 
-    Over the cases of one law, and within one run (`Records.latest`); a case that nobody brought to the
-    level counts against everyone.
+    Over the cases of one law, and within one run (`Records.latest`); a case that no solver brought to
+    the level counts as a miss of all.
     """
     out = []
     for law, cases in _laws(records).items():
@@ -463,7 +472,7 @@ def profiles(records: Records) -> list[Profile]:
 
 @dataclass(frozen=True)
 class Robustness:
-    """One solver over the many cases of a campaign, by family of structure."""
+    """Results of one solver over the cases of a campaign with one structure."""
 
     family: str
     solver: str
@@ -476,7 +485,7 @@ class Robustness:
 
 
 def robustness(records: Records) -> list[Robustness]:
-    """By structure and solver: on how many cases each level is reached, false claims, residual by budget."""
+    """Count cases that reach each level, false claims and deaths by structure and solver, with residuals by budget."""
     levels = levels_of(records)
     groups = {k[:2]: g for k, g in pairs(records).items() if k[2] == "cold"}
     solvers = sorted({solver for _, solver in groups})
@@ -513,7 +522,7 @@ def robustness(records: Records) -> list[Robustness]:
 
 @dataclass(frozen=True)
 class Pass:
-    """One solver over one sequence at one budget or level: cold, and with its impulses carried along."""
+    """Results of one solver over one sequence at one budget or level, cold and with carried impulses."""
 
     sequence: str
     solver: str
@@ -533,7 +542,7 @@ class Pass:
 
     @property
     def time(self) -> dict[str, float]:
-        """start -> s, all steps."""
+        """Time of all steps [s] by start."""
         return {start: sum(times) for start, times in self.times.items()}
 
     def middle(self, start: str) -> float:
@@ -552,7 +561,7 @@ class Pass:
 
 
 def passes(records: Records) -> list[Pass]:
-    """Sequences: total time and iterations, residual of each step, carried against cold."""
+    """Group the runs over sequences: times, iterations and residuals of each step, carried and cold."""
     groups: dict[tuple[str, str, str, float, int], dict[str, list[Record]]] = defaultdict(
         lambda: defaultdict(list)
     )
@@ -579,12 +588,12 @@ def passes(records: Records) -> list[Pass]:
 
 
 def _step_time(r: Record) -> float:
-    # A step that brought nothing back took its limit.
+    """Return the time of a step: its limit if it has no result."""
     return r.time_min if math.isfinite(r.time_min) else r.time_limit
 
 
-def by_sequence(records: Records) -> dict[str, list[Pass]]:
-    """Passes over each sequence."""
+def group_passes(records: Records) -> dict[str, list[Pass]]:
+    """Group passes by sequence."""
     out: dict[str, list[Pass]] = defaultdict(list)
     for one in passes(records):
         out[one.sequence].append(one)
