@@ -36,7 +36,7 @@ from benchmarks.output import markdown as table
 from lavender import bench, registry, suite
 from lavender.base.deadline import seconds
 from lavender.lab.bench import level_name
-from lavender.lab.bench.statistics import NOISE, RESIDUAL_NOISE
+from lavender.lab.bench.statistics import RESIDUAL_NOISE_FACTOR, TIME_NOISE_FACTOR
 from lavender.lab.report import geometric_means, reaches, table_specs
 from lavender.lab.report.figures import build_figures, build_work_precision
 from lavender.lab.report.findings import Report
@@ -73,7 +73,8 @@ ADVICE = (
     "as many, is the fastest. The number is the shifted geometric mean of its times; brackets show on how many cases,\n"
     "if not on all. The second table has the solver that serves the most cases within each time (a case is served if\n"
     "at most half of the start's residual is left); the number is the residual at the 90th percentile. Solvers\n"
-    f"after ≈ are as good within noise (a factor of {NOISE:g} in time, {RESIDUAL_NOISE:g} in residual).\n"
+    f"after ≈ are as good within noise (a factor of {TIME_NOISE_FACTOR:g} in time, {RESIDUAL_NOISE_FACTOR:g} in "
+    "residual).\n"
     "[A report's page](REPORT) shows the same records."
 )
 LAW_NAMES = {

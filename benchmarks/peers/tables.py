@@ -37,7 +37,9 @@ def engines_table(steps: Sequence[Step]) -> str:
         over = over_ours(s, steps)
         known = format_residual(s.relative) if math.isfinite(s.relative) else "not known"
         timed = f"{_ratio(over)} ({seconds(s.time)})"
-        rows.append((s.scene, s.engine, timed, s.contacts, f"{1e3 * s.depth:.3g}", format_residual(s.speed), known))
+        rows.append(
+            (s.scene, s.engine, timed, s.contacts, f"{1e3 * s.depth:.3g}", format_residual(s.speed), known)
+        )
         if over < 1.0:
             lost.append((over, f"- {s.scene}: {s.engine}, {over:.2f} of the time of ours"))
     told = [f"\nLost: {len(lost)}.", *(text for _, text in sorted(lost))] if lost else []

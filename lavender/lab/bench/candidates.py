@@ -86,7 +86,7 @@ def _list_time_limited(
 def time_candidates(
     cases: Iterable[Source], records: Records, plan: Plan, store: Any = None, **more: Any
 ) -> Records:
-    """Choose the candidates among what `bench.run` measured, and time them; see `bench.time_alternately` for the arguments."""
+    """Choose the candidates among what `bench.run` measured, and time them by `bench.time_alternately`."""
     remaining = drop_idle_cases(records)
     if not len(remaining) or plan.speed_levels:
         return records

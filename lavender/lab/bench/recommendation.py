@@ -18,9 +18,9 @@ from typing import Any
 
 from lavender.lab.bench.record import Record
 from lavender.lab.bench.statistics import (
-    NOISE,
-    RESIDUAL_NOISE,
-    SHIFT,
+    MEAN_TIME_SHIFT,
+    RESIDUAL_NOISE_FACTOR,
+    TIME_NOISE_FACTOR,
     families,
     geometric_mean,
     group_passes,
@@ -233,10 +233,10 @@ def rank_to_level(
         runs = {c: _select_fastest(group.runs.get(c, ()), level) for c in cases}
         solved = [r for r in runs.values() if r is not None]
         times = {c: math.inf if r is None else r.time_min for c, r in runs.items()}
-        score = geometric_mean([t if math.isfinite(t) else limit for t in times.values()], SHIFT)
+        score = geometric_mean([t if math.isfinite(t) else limit for t in times.values()], MEAN_TIME_SHIFT)
         choice = Choice.of(group.solver, times, len(solved), score, **group.describe_budget(solved))
         choices.append(((group.solver in liars, -len(solved)), choice))
-    return rank_choices(family, level, _keep_best_of_each(choices), NOISE)
+    return rank_choices(family, level, _keep_best_of_each(choices), TIME_NOISE_FACTOR)
 
 
 def rank_in_time(
@@ -259,17 +259,19 @@ def rank_in_time(
         return (group.solver in liars, -served), Choice.of(group.solver, residuals, served, score, **budget)
 
     choices = _keep_best_of_each(rank_group(group, limit) for group in selected)
-    advice = rank_choices(family, limit, choices, RESIDUAL_NOISE)
+    advice = rank_choices(family, limit, choices, RESIDUAL_NOISE_FACTOR)
     # Solvers that serve fewer cases have a residual of 1 at the 90th percentile, so that noise would rank them.
     advice = replace(advice, least=SERVED_QUANTILE)
     if advice.best is None or math.isinf(limit):
         return advice
-    late_choices = _keep_best_of_each(rank_group(group, NOISE * limit) for group in selected)
+    late_choices = _keep_best_of_each(rank_group(group, TIME_NOISE_FACTOR * limit) for group in selected)
     late = {c.solver: (key, c.score) for key, c in late_choices}
     first = min(key for key, _ in choices)
     best = min(c.score for c in advice.ranking[: advice.equal])
     rest = advice.ranking[advice.equal :]
-    near = [c for c in rest if late[c.solver][0] <= first and late[c.solver][1] <= RESIDUAL_NOISE * best]
+    near = [
+        c for c in rest if late[c.solver][0] <= first and late[c.solver][1] <= RESIDUAL_NOISE_FACTOR * best
+    ]
     others = [c for c in rest if all(c is not n for n in near)]
     ranking = (*advice.ranking[: advice.equal], *near, *others)
     return replace(advice, ranking=ranking, equal=advice.equal + len(near))

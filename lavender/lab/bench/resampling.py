@@ -26,7 +26,7 @@ from lavender.lab.bench.recommendation import (
     recommend_from_single_runs,
 )
 from lavender.lab.bench.record import Record
-from lavender.lab.bench.statistics import SHIFT, levels_of, limit_of
+from lavender.lab.bench.statistics import MEAN_TIME_SHIFT, levels_of, limit_of
 from lavender.lab.bench.store import Records
 from lavender.lab.bench.timed_call import format_call
 
@@ -64,9 +64,9 @@ class TimedCall:
 
     @property
     def time(self) -> float:
-        """Geometric mean over the cases of the lower quartile of the repetitions [s], shifted by `SHIFT`."""
+        """Geometric mean over the cases of the lower quartile of the repetitions [s], shifted by `MEAN_TIME_SHIFT`."""
         each = [float(np.quantile(r.times or (r.time_min,), TIME_QUANTILE)) for r in self.runs.values()]
-        return float(np.exp(np.mean(np.log(np.array(each) + SHIFT))) - SHIFT)
+        return float(np.exp(np.mean(np.log(np.array(each) + MEAN_TIME_SHIFT))) - MEAN_TIME_SHIFT)
 
 
 @dataclass(frozen=True)
@@ -142,7 +142,10 @@ def rank_calls_to_level(
     charged = np.where(missed[:, :, None] | ~np.isfinite(times), limit, times)
 
     def score(values: FloatArray) -> FloatArray:
-        means = np.exp(np.log(np.quantile(values, TIME_QUANTILE, axis=-1) + SHIFT).mean(axis=-1)) - SHIFT
+        means = (
+            np.exp(np.log(np.quantile(values, TIME_QUANTILE, axis=-1) + MEAN_TIME_SHIFT).mean(axis=-1))
+            - MEAN_TIME_SHIFT
+        )
         return np.asarray(np.maximum(means, MIN_TIME))
 
     def choose(i: int, value: float) -> Choice:

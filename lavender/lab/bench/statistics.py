@@ -17,14 +17,16 @@ from lavender.judge.solution import CLAIM_CHECKS, CONFIRMED
 from lavender.lab.bench.record import Record, asked_of
 from lavender.lab.bench.store import Records
 
-SHAPES = ("separate", "chain", "mesh", "stack", "pile", "dense")
-DIED = ("ERROR", "KILLED", "CRASHED")
-EASY = 1e-3  # relative residual to which sweeps are counted
-#: Factors within which two scores are the same: what a busy machine does to the minimum of a few repeats, and what
-#: one run more or less within a time does to a mean residual.
-NOISE, RESIDUAL_NOISE = 1.25, 2.0
-#: s, of the geometric means, whoever takes part: what is quicker than that differs by Python's share of a call.
-SHIFT = 1e-5
+STRUCTURE_ORDER = ("separate", "chain", "mesh", "stack", "pile", "dense")  # as tables list structures
+DEATH_STATUSES = ("ERROR", "KILLED", "CRASHED")
+EASY_RESIDUAL = 1e-3  # Relative residual to which sweeps are counted as a measure of difficulty.
+TIME_NOISE_FACTOR = (
+    1.25  # Times within this factor are equal: a busy machine changes the minimum of repeats by it.
+)
+RESIDUAL_NOISE_FACTOR = (
+    2.0  # Residuals within this factor are equal: one run more or less in a time changes as much.
+)
+MEAN_TIME_SHIFT = 1e-5  # s, added to times in geometric means: below it, Python's share of a call decides.
 
 
 def levels_of(records: Records) -> tuple[float, ...]:
@@ -50,16 +52,16 @@ def families(records: Records) -> dict[str, list[str]]:
     A structure whose cases have several laws is a family for each law: "pile, coulomb". Words that describe the same
     cases are one family: "stack / friction".
     """
-    found: dict[str, dict[str, list[str]]] = defaultdict(lambda: defaultdict(list))
+    cases_by_word: dict[str, dict[str, list[str]]] = defaultdict(lambda: defaultdict(list))
     ran = {r.case for r in records if r.step < 0}
     for name, info in records.cases.items():
         if name in ran:
             for word in info.structure:
-                found[word][info.law].append(name)
-    order = (*SHAPES, "redundant", "friction", "large mass ratio", "asymmetric")
+                cases_by_word[word][info.law].append(name)
+    order = (*STRUCTURE_ORDER, "redundant", "friction", "large mass ratio", "asymmetric")
     names: dict[tuple[str, ...], list[str]] = {}
-    for word in sorted(found, key=lambda w: (order.index(w) if w in order else len(order), w)):
-        laws = found[word]
+    for word in sorted(cases_by_word, key=lambda w: (order.index(w) if w in order else len(order), w)):
+        laws = cases_by_word[word]
         for law in sorted(laws, key=lambda x: (-len(laws[x]), x)):
             names.setdefault(tuple(laws[law]), []).append(word if len(laws) == 1 else f"{word}, {law}")
     return {" / ".join(words): list(cases) for cases, words in names.items()}
@@ -111,7 +113,7 @@ class Difficulty:
 
     case: str
     rows: int
-    sweeps: int | None  # of `pgs` to EASY; None where it did not get there, or was not asked
+    sweeps: int | None  # of `pgs` to EASY_RESIDUAL; None where it did not get there, or was not asked
     condition: float | None  # of A, as `CaseInfo.condition`
     degenerate: (
         float | None
@@ -194,7 +196,7 @@ def failures(records: Records) -> list[Record]:
             continue
         missed = r.mode == "tol" and not r.success and not at_floor(r.relative, r.floor)
         proven = r.status == "INFEASIBLE" and r.claim_check == CONFIRMED
-        lost = not math.isfinite(r.relative) or r.status.startswith(DIED)
+        lost = not math.isfinite(r.relative) or r.status.startswith(DEATH_STATUSES)
         if (missed and not proven) or lost or r.status_conflict:
             out.append(r)
     return out
@@ -204,10 +206,14 @@ def difficulties(records: Records) -> list[Difficulty]:
     """Return the difficulty of each case, from runs with a cold start."""
     out = []
     for name, info in records.cases.items():
-        mine = [r for r in records if r.case == name and r.start == "cold"]
-        swept = [r.iterations for r in mine if r.solver == "pgs" and r.mode == "tol" and r.relative <= EASY]
-        known = [r for r in mine if r.degenerate is not None]
-        idle = [r for r in mine if r.bits and r.iterations == 0 and r.claims]
+        runs = [r for r in records if r.case == name and r.start == "cold"]
+        swept = [
+            r.iterations
+            for r in runs
+            if r.solver == "pgs" and r.mode == "tol" and r.relative <= EASY_RESIDUAL
+        ]
+        judged = [r for r in runs if r.degenerate is not None]
+        idle = [r for r in runs if r.bits and r.iterations == 0 and r.claims]
         groups = defaultdict(set)
         for r in idle:
             groups[r.bits].add(r.solver)
@@ -218,7 +224,7 @@ def difficulties(records: Records) -> list[Difficulty]:
                 rows=info.rows,
                 sweeps=min(swept, default=None),
                 condition=info.condition,
-                degenerate=min(known, key=lambda r: r.relative).degenerate if known else None,
+                degenerate=min(judged, key=lambda r: r.relative).degenerate if judged else None,
                 proof=info.proof,
                 same=tuple(sorted(same)) if len(same) > 1 and not info.nothing_to_do else (),
             )
@@ -230,17 +236,17 @@ def claims(records: Records) -> list[Claims]:
     """Count the correct and wrong claims of each solver."""
     out = []
     for solver in sorted({r.solver for r in records}):
-        mine = [r for r in records if r.solver == solver and not _is_again(r)]
-        asked = [r for r in mine if r.mode == "tol"]
+        runs = [r for r in records if r.solver == solver and not _is_again(r)]
+        to_level = [r for r in runs if r.mode == "tol"]
         out.append(
             Claims(
                 solver=solver,
-                runs=len(mine),
-                claims=sum(r.claims for r in mine),
-                wrong=sum(r.claims and bool(r.status_conflict) for r in mine),
-                reached=sum(r.success for r in asked),
-                asked=len(asked),
-                crashed=sum(r.status.startswith(DIED) for r in mine),
+                runs=len(runs),
+                claims=sum(r.claims for r in runs),
+                wrong=sum(r.claims and bool(r.status_conflict) for r in runs),
+                reached=sum(r.success for r in to_level),
+                asked=len(to_level),
+                crashed=sum(r.status.startswith(DEATH_STATUSES) for r in runs),
             )
         )
     return out
@@ -297,10 +303,10 @@ class Change:
 
 
 def changes(old: Records, new: Records) -> list[Change]:
-    """Time to each level in two runs, on the cases whose numbers are the same in both.
+    """Compare times to each level of two runs, on the cases whose numbers are the same in both.
 
-    Noise is at least `NOISE`, and at least twice the ratio between minimum and median of either run. Earlier times are
-    in what the machine is worth now: multiplied by the drift of the case, where both runs know it.
+    Noise is at least `TIME_NOISE_FACTOR`, and at least twice the ratio between minimum and median of either run.
+    Earlier times are multiplied by the drift of the case, if both runs have measured it.
     """
     levels = levels_of(new)
     same = {name for name, info in new.cases.items() if name in old.cases and old.cases[name].sha == info.sha}
@@ -317,18 +323,18 @@ def changes(old: Records, new: Records) -> list[Change]:
         if row.case not in same or key not in before:
             continue
         worth = drift(old, new, row.case)
-        noise = max(NOISE, 1.0 + 2.0 * (jitter[key] - 1.0))
+        noise = max(TIME_NOISE_FACTOR, 1.0 + 2.0 * (jitter[key] - 1.0))
         out += [Change(*key, x, worth * before[key].times[x], row.times[x], noise) for x in levels]
     return out
 
 
 def drift(old: Records, new: Records, case: str = "") -> float:
     """Return the ratio of new to old time of the calibration loop, medians over runs of a case or of all; else 1."""
-    found = []
+    medians = []
     for records in (old, new):
         some = [r.pace for r in records if r.pace and (not case or r.case == case)]
-        found.append(median(some) if some else math.nan)
-    return found[1] / found[0] if all(map(math.isfinite, found)) else 1.0
+        medians.append(median(some) if some else math.nan)
+    return medians[1] / medians[0] if all(map(math.isfinite, medians)) else 1.0
 
 
 @dataclass(frozen=True)
@@ -384,7 +390,7 @@ def geometric_means(records: Records) -> dict[str, dict[float, dict[str, tuple[f
                 t = [times[c][solver] for c in cases]
                 solved = sum(map(math.isfinite, t))
                 by[solver] = (
-                    geometric_mean([x if math.isfinite(x) else limit for x in t], SHIFT),
+                    geometric_mean([x if math.isfinite(x) else limit for x in t], MEAN_TIME_SHIFT),
                     solved,
                     len(cases),
                 )
@@ -421,9 +427,11 @@ def backends(records: Records) -> list[Backend]:
     for solver in sorted({r.solver for r in best.values() if r.own_min is not None}):
         mine = {c: r for (s, c), r in best.items() if s == solver and r.own_min is not None}
         owns = {c: r.own_min or 0.0 for c, r in mine.items()}
-        whole = geometric_mean([r.time_min for r in mine.values()], SHIFT)
+        whole = geometric_mean([r.time_min for r in mine.values()], MEAN_TIME_SHIFT)
         wins = sum(t < ours.get(c, math.inf) for c, t in owns.items())
-        out.append(Backend(solver, len(mine), whole, geometric_mean(list(owns.values()), SHIFT), wins))
+        out.append(
+            Backend(solver, len(mine), whole, geometric_mean(list(owns.values()), MEAN_TIME_SHIFT), wins)
+        )
     return sorted(out, key=lambda b: b.own)
 
 
@@ -492,24 +500,24 @@ def robustness(records: Records) -> list[Robustness]:
     out = []
     for family, cases in families(records).items():
         for solver in solvers:
-            mine = {c: groups[c, solver] for c in cases if (c, solver) in groups}
-            if not mine:
+            groups_of_case = {c: groups[c, solver] for c in cases if (c, solver) in groups}
+            if not groups_of_case:
                 continue
-            best = {c: min(r.relative for r in g) for c, g in mine.items()}
+            best = {c: min(r.relative for r in g) for c, g in groups_of_case.items()}
             by_budget: dict[int, list[float]] = defaultdict(list)
-            for group in mine.values():
+            for group in groups_of_case.values():
                 for r in group:
                     if r.mode == "budget":
                         by_budget[r.max_iter].append(r.relative)
-            runs = [r for g in mine.values() for r in g]
+            runs = [r for g in groups_of_case.values() for r in g]
             out.append(
                 Robustness(
                     family=family,
                     solver=solver,
-                    cases=len(mine),
+                    cases=len(groups_of_case),
                     reached={x: sum(v <= x for v in best.values()) for x in levels},
                     wrong=sum(bool(r.status_conflict) for r in runs),
-                    died=sum(r.status.startswith(DIED) for r in runs),
+                    died=sum(r.status.startswith(DEATH_STATUSES) for r in runs),
                     budgets={n: (median(v), quantile(v, 0.95)) for n, v in sorted(by_budget.items())},
                     hardest=max(best, key=lambda c: best[c]),
                 )

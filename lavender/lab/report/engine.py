@@ -19,7 +19,7 @@ from lavender.io.stored import ENGINE, SUFFIXES, whole_file
 from lavender.judge.residuals import AT_FLOOR, UNCONVERGED, VERDICTS_OF_OLD, WRONG
 from lavender.lab.bench.recommendation import Choice
 from lavender.lab.bench.record import printable
-from lavender.lab.bench.statistics import SHIFT, geometric_mean, limit_of
+from lavender.lab.bench.statistics import MEAN_TIME_SHIFT, geometric_mean, limit_of
 from lavender.lab.bench.store import Records
 
 _NUMBERS = ("rows", "seconds", "relative")
@@ -54,38 +54,38 @@ def read_engine_answers(words: Sequence[str], records: Records) -> list[EngineAn
     Lines that cannot be read are left out.
     """
     parents = (Path(x.source).parent for x in records.cases.values() if x.source.endswith(SUFFIXES))
-    found = (_read_folder(folder) for folder in dict.fromkeys([*map(Path, words), *parents]))
-    return [engine for engine in found if engine is not None]
+    engines = (_read_folder(folder) for folder in dict.fromkeys([*map(Path, words), *parents]))
+    return [engine for engine in engines if engine is not None]
 
 
 def _read_folder(folder: Path) -> EngineAnswers | None:
     path = folder / ENGINE
     if not path.is_file():
         return None
-    found, lost, answers = [], 0, {}
+    entries, left_out, answers = [], 0, {}
     for line in whole_file(path, "the engine's answers").decode(errors="replace").splitlines():
         try:
             entry = json.loads(line)
-            lost += "left_out" in entry
+            left_out += "left_out" in entry
             rows, time, relative = (float(entry[name]) for name in _NUMBERS)
             row = float(entry.get("velocity", math.nan)), str(entry.get("worst", ""))
             verdict = str(entry["verdict"])
             verdict = VERDICTS_OF_OLD.get(verdict, verdict)
-            found.append((rows, relative, row, verdict, printable(str(entry["solver"]))))
+            entries.append((rows, relative, row, verdict, printable(str(entry["solver"]))))
             if math.isfinite(time) and time >= 0.0:
                 answers[printable(str(entry.get("file", "")))] = time, relative
         except (ValueError, KeyError, TypeError, RecursionError):
             continue
-    if not found:
+    if not entries:
         return None
-    sizes, relatives, worst_rows, verdicts, solvers = zip(*found, strict=True)
+    sizes, relatives, worst_rows, verdicts, solvers = zip(*entries, strict=True)
     velocity, where = max(worst_rows, key=lambda row: (row[0] == row[0], row[0]))
     return EngineAnswers(
         folder=folder.name,
         source=printable(str(folder)),
         solver=max(set(solvers), key=solvers.count).replace("NEWTON", "Newton"),
-        steps=len(found),
-        left_out=lost,
+        steps=len(entries),
+        left_out=left_out,
         rows=float(np.median(sizes)),
         relative=float(np.median(relatives)),
         worst=float(np.max(relatives)),
@@ -122,7 +122,7 @@ def rank_engine(
         return None
     times = {name: time if relative <= level else math.inf for name, (time, relative) in answers.items()}
     limit = limit_of(records)
-    score = geometric_mean([t if math.isfinite(t) else limit for t in times.values()], SHIFT)
+    score = geometric_mean([t if math.isfinite(t) else limit for t in times.values()], MEAN_TIME_SHIFT)
     solved = sum(map(math.isfinite, times.values()))
     return Choice.of(" and ".join(solvers), times, solved, score)
 

@@ -196,11 +196,11 @@ def build_profile_figure(profile: statistics.Profile) -> Figure:
     curves = [
         Curve.of(name, name, [(r, 100.0 * s) for r, s in profile.curves[name]], steps=True) for name in shown
     ]
-    left = tuple(sorted(set(profile.curves) - set(shown)))
+    left_out = tuple(sorted(set(profile.curves) - set(shown)))
     return Figure(
         f"profile {profile.law} {level_name(profile.level)}",
         f"{profile.law}, to {level_name(profile.level)} ({format_count(profile.cases, 'case')})",
-        "time / fastest time", "cases solved [%]", tuple(curves), y_log=False, left_out=left,
+        "time / fastest time", "cases solved [%]", tuple(curves), y_log=False, left_out=left_out,
     )  # fmt: skip
 
 
@@ -233,15 +233,15 @@ def build_figures(records: Records) -> Figures:
     """Build the figures of records by residual and, if it is known, by motion error; none for a campaign."""
     if statistics.is_campaign(records):
         return Figures()
-    found = _build_figures(records)
+    by_residual = _build_figures(records)
     return (
-        replace(found, moved=_relabel_for_motion(_build_figures(convert_to_motion_errors(records))))
+        replace(by_residual, moved=_relabel_for_motion(_build_figures(convert_to_motion_errors(records))))
         if get_speed_levels(records)
-        else found
+        else by_residual
     )
 
 
-def _relabel_for_motion(found: Figures) -> Figures:
+def _relabel_for_motion(figures: Figures) -> Figures:
     """Return figures of `convert_to_motion_errors`, with names and titles that say so."""
 
     def relabel(figure: Figure) -> Figure:
@@ -254,7 +254,7 @@ def _relabel_for_motion(found: Figures) -> Figures:
 
     groups: dict[str, Any] = {
         place: {name: tuple(map(relabel, own)) for name, own in group.items()}
-        for place, group in found.places.items()
+        for place, group in figures.places.items()
     }
     return Figures(**groups)
 

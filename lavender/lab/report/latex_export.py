@@ -24,7 +24,7 @@ from lavender.base.errors import InputError
 from lavender.io.stored import SUFFIXES, make_folder, write_figure, write_text
 from lavender.lab.bench import statistics
 from lavender.lab.bench.record import file_name, level_name
-from lavender.lab.bench.statistics import NOISE
+from lavender.lab.bench.statistics import TIME_NOISE_FACTOR
 from lavender.lab.bench.store import Records
 from lavender.lab.report import table_specs
 from lavender.lab.report.figures import MAX_CURVES, Figure, Group, build_figures, build_overall_figure
@@ -56,10 +56,10 @@ def write_paper(report: Report, folder: str | Path) -> Path:
     InputError
         No runs with times (a campaign), or the folder cannot be written.
     """
-    found = report.records
-    if not len(found) or report.is_campaign:
+    records = report.records
+    if not len(records) or report.is_campaign:
         raise InputError("a paper's figures need runs with times; these records have none")
-    own = found.having(r if r.own_min is None else replace(r, time_min=r.own_min) for r in found)
+    own = records.having(r if r.own_min is None else replace(r, time_min=r.own_min) for r in records)
     drawn = build_figures(own)
     groups = (drawn.over, _build_folder_figures(own), drawn.profiles, drawn.sequences)
     some = [
@@ -83,15 +83,15 @@ def _build_folder_figures(records: Records) -> Group:
     """Build figures of error against time over the cases of each folder, if the cases come from several folders."""
     sources = {r.case: Path(records.cases[r.case].source) for r in records if r.step < 0}
     folders = sorted({p.parent for p in sources.values() if p.suffix.lower() in SUFFIXES})
-    found = {}
+    groups = {}
     for folder in folders if len(folders) > 1 else ():
         figure = build_overall_figure(
             records.having(r for r in records if sources.get(r.case, Path()).parent == folder)
         )
         name = folder.name if sum(f.name == folder.name for f in folders) == 1 else str(folder)
         if figure.curves:
-            found[name] = (replace(figure, name=f"class {name}", title=f"{name}: {figure.title}"),)
-    return found
+            groups[name] = (replace(figure, name=f"class {name}", title=f"{name}: {figure.title}"),)
+    return groups
 
 
 def _select_leaders(figure: Figure, leaders: Sequence[str]) -> Figure:
@@ -101,9 +101,9 @@ def _select_leaders(figure: Figure, leaders: Sequence[str]) -> Figure:
     ends = sorted(figure.curves, key=lambda c: c.y[-1] if math.isfinite(c.y[-1]) else math.inf)
     solvers = list(dict.fromkeys(c.solver for c in ends))
     solvers.sort(key=lambda name: leaders.index(name) if name in leaders else len(leaders))
-    kept = [c for name in solvers[:MAX_CURVES] for c in figure.curves if c.solver == name]
-    kept[2:] = [replace(c, low=(), high=()) for c in kept[2:]]
-    return replace(figure, curves=tuple(kept), left_out=tuple(sorted(solvers[MAX_CURVES:])))
+    selected = [c for name in solvers[:MAX_CURVES] for c in figure.curves if c.solver == name]
+    selected[2:] = [replace(c, low=(), high=()) for c in selected[2:]]
+    return replace(figure, curves=tuple(selected), left_out=tuple(sorted(solvers[MAX_CURVES:])))
 
 
 # -- LaTeX ------------------------------------------------------------------------------------------------
@@ -117,8 +117,9 @@ _SPECIAL = {
 
 def escape_tex(text: str) -> str:
     """Return text with the special characters of LaTeX escaped."""
-    made = re.sub(r"[\\~^&%$#_{}µ≈✗–]", lambda found: _SPECIAL[found[0]], " ".join(text.split()))
-    return f"{{}}{made}" if made.startswith(("[", "*")) else made  # no argument of the line's end before it
+    escaped = re.sub(r"[\\~^&%$#_{}µ≈✗–]", lambda match: _SPECIAL[match[0]], " ".join(text.split()))
+    # After the end of a line, LaTeX would read [ and * as arguments of it.
+    return f"{{}}{escaped}" if escaped.startswith(("[", "*")) else escaped
 
 
 def format_latex(table: Table, caption: str, label: str) -> str:
@@ -165,10 +166,10 @@ def _include_figure(figure: Figure, records: Records) -> str:
 
 
 def _write_tables(report: Report, own: Records) -> str:
-    records, shift = report.records, seconds(statistics.SHIFT)
+    records, shift = report.records, seconds(statistics.MEAN_TIME_SHIFT)
     caption = (
         "Recommended solver, its mean time (of other packages with conversion), and the cases that it brings to the "
-        f"level where that is not all. Within {NOISE:g} times of each other solvers count as equal."
+        f"level where that is not all. Within {TIME_NOISE_FACTOR:g} times of each other solvers count as equal."
     )
     caption += _state_lost_cases(records)
     advice, last = table_specs.tabulate_advice(report), 1 + len(report.levels)
@@ -180,21 +181,21 @@ def _write_tables(report: Report, own: Records) -> str:
         ]
         for row, line in zip(advice.rows, report.lines, strict=True)
     ]
-    made = [format_latex(Table(["structure", "cases", *advice.heads[1:last]], rows), caption, "recommended")]
+    parts = [format_latex(Table(["structure", "cases", *advice.heads[1:last]], rows), caption, "recommended")]
     for law, by_level in statistics.geometric_means(own).items():
-        told = set(next(iter(by_level.values())))
-        rest = sorted({r.solver for r in own if r.step < 0 and own.cases[r.case].law == law} - told)
+        solvers = set(next(iter(by_level.values())))
+        rest = sorted({r.solver for r in own if r.step < 0 and own.cases[r.case].law == law} - solvers)
         others = f" (not {', '.join(rest)})" if rest else ""
         caption = (
             f"Law {law}: geometric mean of times with {shift} added, and cases brought to the level; a miss costs "
             f"{seconds(statistics.limit_of(records))}. Solvers that take every case{others}."
         )
-        caption += _state_own_times(own, told) + _state_lost_cases(records)
-        made.append(format_latex(table_specs.tabulate_means(by_level), caption, f"means-{law}"))
+        caption += _state_own_times(own, solvers) + _state_lost_cases(records)
+        parts.append(format_latex(table_specs.tabulate_means(by_level), caption, f"means-{law}"))
     caption = "Claims of solvers against the judge, who recomputes every residual from the problem's data."
     caption += _state_lost_cases(records)
-    made.append(format_latex(table_specs.tabulate_claims(records), caption, "claims"))
-    return "% \\usepackage{booktabs}\n" + "\n".join(made)
+    parts.append(format_latex(table_specs.tabulate_claims(records), caption, "claims"))
+    return "% \\usepackage{booktabs}\n" + "\n".join(parts)
 
 
 def _describe_method(report: Report) -> str:
@@ -219,6 +220,7 @@ def _describe_method(report: Report) -> str:
     solvers = format_count(len({r.solver for r in own}), "solver")
     lost = format_left_out(sum(map(len, records.left_out.values())))
     problems, runs = format_count(len(infos), "problem"), format_count(len(own), "run")
+    shift = seconds(statistics.MEAN_TIME_SHIFT)
     own_times = _state_own_times(records, {r.solver for r in own})
     parts = (
         f"We ran {solvers} on {problems}{lost} ({', '.join(laws)}; {rows[0]} to {rows[-1]} rows),",
@@ -227,8 +229,8 @@ def _describe_method(report: Report) -> str:
         "in velocity, each over that of doing nothing, so that 1 is doing nothing and 0 a solution. Times are those",
         f"of set-up and solve, {least}, within a limit of {limit}; BLAS and OpenMP had {threads}.",
         f"{own_times} {report.stopped} {report.busy} Means of times are",
-        f"geometric, with {seconds(statistics.SHIFT)} added to each and a miss charged the limit. Profiles follow",
-        f"Dolan and Moré (2002). Machine: {run.cpu}, {run.cores} cores, {run.platform}; lavender {run.lavender},",
+        f"geometric, with {shift} added to each and a miss charged the limit. Profiles follow Dolan and Moré",
+        f"(2002). Machine: {run.cpu}, {run.cores} cores, {run.platform}; lavender {run.lavender},",
         f"Python {run.python}, {versions}; run {run.run}, {run.started}.",
     )
     return escape_tex(" ".join(parts)) + "\n"

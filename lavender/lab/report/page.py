@@ -10,7 +10,7 @@ from typing import Any
 from lavender.base.deadline import seconds
 from lavender.lab.bench import recommendation, statistics
 from lavender.lab.bench.record import file_name, level_name
-from lavender.lab.bench.statistics import NOISE, RESIDUAL_NOISE
+from lavender.lab.bench.statistics import RESIDUAL_NOISE_FACTOR, TIME_NOISE_FACTOR
 from lavender.lab.bench.store import Records
 from lavender.lab.report import table_specs
 from lavender.lab.report.figures import Figures
@@ -50,7 +50,10 @@ def create_environment() -> Any:
         isfinite=math.isfinite,
     )
     environment.globals.update(
-        noise=NOISE, residual_noise=RESIDUAL_NOISE, max_failures=MAX_FAILURES, max_spreads=MAX_SPREADS
+        noise=TIME_NOISE_FACTOR,
+        residual_noise=RESIDUAL_NOISE_FACTOR,
+        max_failures=MAX_FAILURES,
+        max_spreads=MAX_SPREADS,
     )
     return environment
 

@@ -18,11 +18,11 @@ CLASSES = ((0, 10), (10, 50), (50, 300), (300, 10**9))  # rows
 
 
 def _by_class(steps: Sequence[S]) -> list[tuple[str, list[S]]]:
-    found = []
+    classes = []
     for low, high in CLASSES:
         name = f"under {high}" if low == 0 else f"{low} and more" if high > 10**6 else f"{low}-{high}"
-        found.append((name, [s for s in steps if low <= s.rows < high]))
-    return [(name, part) for name, part in found if part]
+        classes.append((name, [s for s in steps if low <= s.rows < high]))
+    return [(name, part) for name, part in classes if part]
 
 
 def _sizes(x: Sequence[float]) -> tuple[str, str]:
@@ -47,13 +47,13 @@ def table(steps: Sequence[Step]) -> str:
     coulomb = [s for s in steps if s.coulomb is not None]
     solved = sum(s.coulomb <= STRICT for s in coulomb if s.coulomb is not None)
     never = sum(s.tolerance == 0.0 for s in steps)
-    told = (
+    summary = (
         f"{len(convex)} of {len(steps)} solved to {STRICT:.0e} or the floor of float64 under MuJoCo's own law, "
         f"{solved} of {len(coulomb)} under Coulomb's (contacts of up to two tangents); {never} that MuJoCo brings "
         f"to {TARGET:.0e} at no tolerance count with its default."
     )
     start = f"Cold, both sides from nothing, to a judged residual of {TARGET:.0e}. `one call`, `solve_many`: {OVER}."
-    return "\n".join([start, "", *format_markdown(Table(heads, rows)), "", told])
+    return "\n".join([start, "", *format_markdown(Table(heads, rows)), "", summary])
 
 
 def warm_table(steps: Sequence[WarmStep]) -> str:

@@ -65,7 +65,7 @@ def list_sections(report: Report) -> list[Section]:
         shares = tabulate_robustness(statistics.robustness(records), levels)
         by_speed = tabulate_robustness(statistics.robustness(report.by_speed), report.speeds, " m/s")
         note = "no times; share of cases brought to a level, residual at each budget"
-        found = [
+        sections = [
             Section("Campaign", note, shares, grouped=True),
             Section("By motion error", moved, by_speed, grouped=True),
         ]
@@ -88,7 +88,7 @@ def list_sections(report: Report) -> list[Section]:
         every = "floor: rounding to float64 allows no better"
         carried = "median residual, time of all steps; carried from step to step, or cold"
         cases = tabulate_reaches(statistics.reaches(records, levels), levels).without("form")
-        found = [
+        sections = [
             Section("By structure", by_structure, tabulate_advice(report)),
             Section("By sweeps", by_sweeps, tabulate_sweeps(report.lines)),
             Section("Inside the engine", inside, tabulate_engines(report)),
@@ -102,8 +102,8 @@ def list_sections(report: Report) -> list[Section]:
         changed = tabulate_changes(report.earlier_run, records)
         title = f"Against {printable(report.earlier_run.source)}"
         empty = "nothing beyond noise" if statistics.changes(report.earlier_run, records) else NOT_COMPARED
-        found.append(Section(title, "times to a level", changed, empty=empty))
-    return [s for s in found if s.table.rows or s.empty]
+        sections.append(Section(title, "times to a level", changed, empty=empty))
+    return [s for s in sections if s.table.rows or s.empty]
 
 
 def build_short_table(report: Report) -> Table:
@@ -114,19 +114,19 @@ def build_short_table(report: Report) -> Table:
     """
     middle = len(report.levels) // 2
     if report.is_campaign:
-        found = tabulate_robustness(statistics.robustness(report.records), report.levels[middle : middle + 1])
-        return found.without(*(head for head in found.heads if "iterations" in head), "hardest")
+        table = tabulate_robustness(statistics.robustness(report.records), report.levels[middle : middle + 1])
+        return table.without(*(head for head in table.heads if "iterations" in head), "hardest")
     by_motion = any(run.plan.get("speed_levels") for run in report.newest.runs.values())
     if len(report.lines) == 1 and not by_motion:
         return _tabulate_solvers(report, report.levels[middle])
-    found = tabulate_speeds(report) if by_motion else tabulate_advice(report)
+    table = tabulate_speeds(report) if by_motion else tabulate_advice(report)
     column = 1 + (len(report.speeds) // 2 if by_motion else middle)
-    rows: Rows = [[str(row[0]), replace(row[column], after="")] for row in found.rows]  # type: ignore[type-var]
-    head = f"{found.heads[column]}, timed {IN_TURNS if has_turns(report) and not by_motion else ALONE}"
+    rows: Rows = [[str(row[0]), replace(row[column], after="")] for row in table.rows]  # type: ignore[type-var]
+    head = f"{table.heads[column]}, timed {IN_TURNS if has_turns(report) and not by_motion else ALONE}"
     heads = ["structure", head]
-    if ENGINES_OWN in found.heads:
+    if ENGINES_OWN in table.heads:
         heads.append(ENGINES_OWN)
-        rows = [[*row, whole[-1]] for row, whole in zip(rows, found.rows, strict=True)]
+        rows = [[*row, whole[-1]] for row, whole in zip(rows, table.rows, strict=True)]
     return Table(heads, rows, words=WORDS | set(heads))
 
 
@@ -167,20 +167,20 @@ def format_advice(advice: Advice, in_time: bool) -> Cell:
     if best is None:
         most = advice.ranking[0] if advice.ranking else None
         return Cell("nobody", after=f" ({most.solved}/{most.cases} at most)" if most and most.solved else "")
-    say = format_residual if in_time else seconds
+    write = format_residual if in_time else seconds
     after = f", {best.how}" if best.how else ""
     if ties:
-        left = f" and {len(ties) - SHOWN_TIES} more" if len(ties) > SHOWN_TIES else ""
-        after += f" ≈ {', '.join(ties[:SHOWN_TIES])}{left}"
+        others = f" and {len(ties) - SHOWN_TIES} more" if len(ties) > SHOWN_TIES else ""
+        after += f" ≈ {', '.join(ties[:SHOWN_TIES])}{others}"
     more, title = "", ", ".join(ties)
     if best.cases > 1 and not math.isnan(best.worst):
-        p95 = f"p95 {say(best.p95)}, " if best.cases >= 20 and not in_time else ""
+        p95 = f"p95 {write(best.p95)}, " if best.cases >= 20 and not in_time else ""
         more, title = (
-            f"{p95}worst {say(best.worst)}",
+            f"{p95}worst {write(best.worst)}",
             f"worst: {best.hardest}" + (f"; ≈ {title}" if ties else ""),
         )
     mark = "warn" if best.solved < best.cases else ""
-    text = ("to " if in_time else "") + say(best.score) + format_share(best.solved, best.cases)
+    text = ("to " if in_time else "") + write(best.score) + format_share(best.solved, best.cases)
     return Cell(text, best.solver, after, more, title, mark=mark)
 
 
@@ -206,8 +206,8 @@ def tabulate_advice(report: Report, links: Mapping[str, str] | None = None) -> T
         ]
         for line, engine in zip(report.lines, engines, strict=True)
     ]
-    found = Table(["structure", *heads, ENGINES_OWN], rows, folds=True)
-    return found if any(engines) else found.without(ENGINES_OWN)
+    table = Table(["structure", *heads, ENGINES_OWN], rows, folds=True)
+    return table if any(engines) else table.without(ENGINES_OWN)
 
 
 def _format_engine(engine: Choice | None, level: float) -> Cell:
@@ -265,8 +265,8 @@ def tabulate_cases(
         )  # fmt: skip
     head = f"fastest to {level_name(level)}"
     heads = ["case", "law", "rows", "contacts", "structure", head, "time", "stored answer"]
-    found = Table(heads, rows, words=WORDS | {head})
-    return found if stored else found.without("stored answer")
+    table = Table(heads, rows, words=WORDS | {head})
+    return table if stored else table.without("stored answer")
 
 
 def tabulate_reaches(reaches: Sequence[statistics.Reach], levels: Sequence[float]) -> Table:
@@ -288,7 +288,7 @@ def tabulate_reaches(reaches: Sequence[statistics.Reach], levels: Sequence[float
     return Table(heads, rows, marks)
 
 
-def tabulate_difficulties(found: Sequence[statistics.Difficulty]) -> Table:
+def tabulate_difficulties(difficulties: Sequence[statistics.Difficulty]) -> Table:
     """Tabulate the measures of difficulty of each case, and the proved distance of an exact solution if known."""
     rows: Rows = [
         [
@@ -300,7 +300,7 @@ def tabulate_difficulties(found: Sequence[statistics.Difficulty]) -> Table:
             ", ".join(d.same),
             d.proof,
         ]
-        for d in found
+        for d in difficulties
     ]
     heads = ["case", "rows", "sweeps", "condition", "at a boundary", "same answer", "exact solution"]
     return Table(heads, rows).without(*(heads[i] for i in (5, 6) if not any(row[i] for row in rows)))
@@ -358,13 +358,13 @@ def tabulate_skips(skips: Sequence[Skip]) -> Table:
 
 def tabulate_changes(old: Records, new: Records) -> Table:
     """Tabulate times to a level that differ from an earlier run beyond noise."""
-    found = [c for c in statistics.changes(old, new) if c.kind != "same"]
+    changes = [c for c in statistics.changes(old, new) if c.kind != "same"]
     rows: Rows = []
-    for c in found:
+    for c in changes:
         factor = f" {c.new / c.old:.3g} times" if c.kind in ("faster", "slower") else ""
         times_of = (level_name(c.level), seconds(c.old), seconds(c.new))
         rows.append([c.case, name_run(c.solver, c.start), *times_of, c.kind + factor])
-    marks = ["bad" if c.kind in ("lost", "slower") else "good" for c in found]
+    marks = ["bad" if c.kind in ("lost", "slower") else "good" for c in changes]
     return Table(["case", "solver", "level", "before", "now", "change"], rows, marks)
 
 
@@ -376,7 +376,7 @@ def tabulate_robustness(
 ) -> Table:
     """Tabulate shares of cases brought to each level, false claims, and residual (or motion error) by budget."""
     budgets = sorted({n for row in rows for n in row.budgets})
-    told = [
+    cells = [
         {
             "structure": r.family,
             "solver": r.solver,
@@ -394,20 +394,20 @@ def tabulate_robustness(
         }
         for r in rows
     ]
-    return Table.of(told, ["bad" if r.wrong or r.died else "" for r in rows])
+    return Table.of(cells, ["bad" if r.wrong or r.died else "" for r in rows])
 
 
 def tabulate_claims(records: Records) -> Table:
     """Tabulate how many claims of each solver are correct."""
-    found = statistics.claims(records)
+    claims = statistics.claims(records)
     rows: Rows = [
         [
             c.solver, str(c.runs), format_percent(c.claims - c.wrong, c.claims) if c.claims else NONE, str(c.claims),
             f"✗ {c.wrong}" if c.wrong else "0", f"{c.reached} of {c.asked}", str(c.crashed),
         ]
-        for c in found
+        for c in claims
     ]  # fmt: skip
-    marks = ["bad" if c.wrong or c.crashed else "" for c in found]
+    marks = ["bad" if c.wrong or c.crashed else "" for c in claims]
     return Table(["solver", "runs", "correct rate", "claims", "wrong", "levels reached", "died"], rows, marks)
 
 

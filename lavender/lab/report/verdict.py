@@ -27,7 +27,7 @@ from lavender.lab.bench.resampling import (
     rank_calls_to_level,
     select_calls,
 )
-from lavender.lab.bench.statistics import SHAPES
+from lavender.lab.bench.statistics import STRUCTURE_ORDER
 from lavender.lab.bench.store import Records
 from lavender.lab.report.engine import INSIDE, EngineAnswers, rank_engine, ranks_before
 from lavender.lab.report.motion_tables import convert_to_motion_errors, format_speed, get_speed_levels
@@ -213,7 +213,7 @@ def _describe_subject(records: Records, subject: Subject, n: int) -> str:
 def _describe_cases(records: Records, cases: Sequence[str]) -> str:
     """Return words for single cases: built-in problems, or the structure that all of them have."""
     words = [set(records.cases[c].structure) for c in cases]
-    shape = next((s for s in SHAPES if all(s in w for w in words)), "")
+    shape = next((s for s in STRUCTURE_ORDER if all(s in w for w in words)), "")
     if all(c.partition("(")[0] in FAMILIES and not records.cases[c].source.endswith(SUFFIXES) for c in cases):
         return f"the {format_count(len(cases), 'built-in problem')}" if len(cases) > 1 else cases[0]
     if shape in ("", "separate", "dense"):

@@ -270,8 +270,8 @@ def test_lines_that_were_refused_different_cases_are_compared_on_all_of_them():
     charged = {"slow": (2e-3, 2e-2, 2.0), "quick": (2.0, 1e-2, 1e-1)}  # a miss costs the limit of 2 s
     for _, choice in found.ranking:
         assert (choice.solved, choice.cases) == (2, 3)
-        each = [t + statistics.SHIFT for t in charged[choice.solver]]
-        assert choice.score == pytest.approx(math.prod(each) ** (1.0 / 3.0) - statistics.SHIFT)
+        each = [t + statistics.MEAN_TIME_SHIFT for t in charged[choice.solver]]
+        assert choice.score == pytest.approx(math.prod(each) ** (1.0 / 3.0) - statistics.MEAN_TIME_SHIFT)
     assert max(found.shares) < 1.0
     quick = rank_calls_in_time(records, select_calls(records, "call"), 1.0)
     served = {(c.solver, c.solved, c.cases, c.worst) for _, c in quick.ranking}

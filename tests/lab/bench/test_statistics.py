@@ -64,7 +64,7 @@ def test_shifted_geometric_means_charge_misses_the_limit():
         record("a", "z", 1.0, 1e-7),  # does not take b: not compared
     )  # fmt: skip
     means = report.geometric_means(found)["lcp"][1e-6]
-    shift = statistics.SHIFT
+    shift = statistics.MEAN_TIME_SHIFT
     assert set(means) == {"x", "y"}
     assert means["x"] == (pytest.approx(math.sqrt((1 + shift) * (4 + shift)) - shift), 2, 2)
     assert means["y"] == (pytest.approx(math.sqrt((1 + shift) * (2 + shift)) - shift), 1, 2)  # limit 2 s

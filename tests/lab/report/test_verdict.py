@@ -122,8 +122,8 @@ def test_the_first_sentence_the_structures_and_the_engine_have_one_set_of_number
     assert text.startswith("First is the engine's own Newton") == first
     solved = sum(x <= 1e-6 for _, x in answers)
     charged = [t if x <= 1e-6 else 2.0 for t, x in answers]  # the limit is 2 s
-    score = statistics.geometric_mean(charged, statistics.SHIFT)
-    ours = seconds(statistics.geometric_mean([40e-6, 80e-6], statistics.SHIFT))
+    score = statistics.geometric_mean(charged, statistics.MEAN_TIME_SHIFT)
+    ours = seconds(statistics.geometric_mean([40e-6, 80e-6], statistics.MEAN_TIME_SHIFT))
     if solved:
         assert f"in {seconds(score)} on average" in text or f"takes {seconds(score)} on average" in text
     else:
