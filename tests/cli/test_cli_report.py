@@ -347,7 +347,7 @@ def test_a_second_report_takes_its_runs_from_the_first_unless_told_otherwise(lav
     assert code == 0 and len(out.splitlines()) <= 25
     said, _, rest = out.strip().partition("\n    lv.solve(problem, ")
     assert said.startswith("Use ") and "\n" not in said  # in a pipe a sentence is a line
-    assert "duplicate rows: 2 contacts stand where another of the pair does" in rest
+    assert "suspicious: duplicated(k=3): duplicate rows: " in rest
     assert "By structure" not in out
     code, out, _ = lavender(*words, "--tables")
     assert "By structure" in out

@@ -297,6 +297,8 @@ def plot_for_page(
     axes = canvas.add_axes(
         (LEFT / WIDTH, BOTTOM / HEIGHT, (right - LEFT) / WIDTH, (bottom - TOP) / HEIGHT), frame_on=False
     )
+    axes.grid(True)
+    axes.tick_params(length=0, pad=10, labelsize=FONT_SIZE)
     artists = _draw(axes, figure)
     _tag_axes(axes, figure)
     to_units = axes.transData.transform
@@ -327,8 +329,6 @@ def plot_for_page(
 
 def _tag_axes(axes: Any, figure: Figure) -> None:
     """Mark grid, ticks, titles of axes and floor for `_rewrite_svg`; the title of the vertical axis is above it."""
-    axes.grid(True)
-    axes.tick_params(length=0, pad=10, labelsize=FONT_SIZE)
     for tick in (*axes.xaxis.get_major_ticks(), *axes.yaxis.get_major_ticks()):
         tick.gridline.set_gid("@ g")
         tick.label1.set_gid("@ a")
