@@ -15,6 +15,7 @@ from lavender.lab.bench.statistics import (
     passes,
     profiles,
     reaches,
+    robustness,
     spreads,
 )
 from lavender.lab.report.findings import Report
@@ -30,6 +31,7 @@ __all__ = [
     "profiles",
     "reaches",
     "recommend_solvers",
+    "robustness",
     "spreads",
     "write",
 ]
