@@ -36,14 +36,13 @@ from benchmarks.output import markdown as table
 from lavender import bench, registry, suite
 from lavender.base.deadline import seconds
 from lavender.lab.bench import level_name
-from lavender.lab.report import contents, geometric_means, reaches
-from lavender.lab.report.curves import figures as report_figures
-from lavender.lab.report.curves import work_precision
-from lavender.lab.report.draw import looks, matplotlib_panels
+from lavender.lab.bench.statistics import RESIDUAL_NOISE_FACTOR, TIME_NOISE_FACTOR
+from lavender.lab.report import geometric_means, reaches, table_specs
+from lavender.lab.report.figures import build_figures, build_work_precision
 from lavender.lab.report.findings import Report
-from lavender.lab.report.page import page as report_page
-from lavender.lab.report.tables import NOISE, RESIDUAL_NOISE
-from lavender.lab.report.text import residual
+from lavender.lab.report.page import render_page
+from lavender.lab.report.plotting import assign_styles, plot_panels
+from lavender.lab.report.text import format_residual
 from lavender.problem import LAWS
 from lavender.sim.scene.gallery import SCENES
 
@@ -74,7 +73,8 @@ ADVICE = (
     "as many, is the fastest. The number is the shifted geometric mean of its times; brackets show on how many cases,\n"
     "if not on all. The second table has the solver that serves the most cases within each time (a case is served if\n"
     "at most half of the start's residual is left); the number is the residual at the 90th percentile. Solvers\n"
-    f"after ≈ are as good within noise (a factor of {NOISE:g} in time, {RESIDUAL_NOISE:g} in residual).\n"
+    f"after ≈ are as good within noise (a factor of {TIME_NOISE_FACTOR:g} in time, {RESIDUAL_NOISE_FACTOR:g} in "
+    "residual).\n"
     "[A report's page](REPORT) shows the same records."
 )
 LAW_NAMES = {
@@ -146,15 +146,15 @@ def fingerprint():
 
 def law_figures(records):
     """Law -> SVG text: error against time, a panel for each case, lines with the solver's name as id."""
-    look = looks(r.solver for r in records)
+    styles = assign_styles(r.solver for r in records)
     out = {}
     for law in LAWS:
-        drawn = (work_precision(records, c) for c, info in records.cases.items() if info.law == law)
+        drawn = (build_work_precision(records, c) for c, info in records.cases.items() if info.law == law)
         some = [replace(figure, curves=tuple(curve.front for curve in figure.curves)) for figure in drawn]
         if some:
             text = io.StringIO()
             with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "lavender"}):
-                canvas = matplotlib_panels(some, look)
+                canvas = plot_panels(some, styles)
                 for line in (line for axes in canvas.axes for line in axes.get_lines()):
                     line.set_markeredgewidth(0.0)  # one colour, which `highlighted` can change
                 canvas.savefig(text, format="svg", metadata={"Date": None})
@@ -253,7 +253,7 @@ def standing(records, solver):
                 best[level].append(case)
             ratio = "" if fastest == float("inf") else f" ({_times(t / fastest)} ×)"
             cells.append(f"{seconds(t)}{ratio}")
-        cells.append(residual(mine.best) + (" (floor)" if mine.at_floor else ""))
+        cells.append(format_residual(mine.best) + (" (floor)" if mine.at_floor else ""))
         rows.append(cells)
     if not rows:
         return "Not measured here: it is not installed, or accepts none of the cases."
@@ -364,7 +364,7 @@ def by_structure(records):
         return "<br>".join(filter(None, words))
 
     report = Report(records)
-    found = contents.advice_table(report)
+    found = table_specs.tabulate_advice(report)
     rows = [(f"{cell(name)}<br>{name.more}", *map(cell, cells)) for name, *cells in found.rows]
     first = 1 + len(report.levels)
     to_level = table(found.heads[:first], [row[:first] for row in rows])
@@ -378,7 +378,7 @@ def measured_page(site, records, figures):
     structures = by_structure(records)
     site.write(
         "report.html",
-        report_page(Report(records), report_figures(records), saved=False),
+        render_page(Report(records), build_figures(records), saved=False),
     )
     shown = ", ".join(f"{n} {v}" for n, v in run.versions.items())
     site.write("parts/advice.md", structures.replace("REPORT", "generated/report.html"))

@@ -10,8 +10,8 @@ from benchmarks.output import markdown
 from benchmarks.peers.adapters import SCIPY, SCRATCH, TARGETS, Result
 from benchmarks.peers.engines import Step
 from lavender.base.deadline import seconds
-from lavender.lab.report.tables import geometric_mean
-from lavender.lab.report.text import residual
+from lavender.lab.bench.statistics import geometric_mean
+from lavender.lab.report.text import format_residual
 
 LARGE = 1000  # rows from which a problem counts as large
 
@@ -35,9 +35,11 @@ def engines_table(steps: Sequence[Step]) -> str:
             rows.append((s.scene, s.engine, s.note, "", "", "", ""))
             continue
         over = over_ours(s, steps)
-        known = residual(s.relative) if math.isfinite(s.relative) else "not known"
+        known = format_residual(s.relative) if math.isfinite(s.relative) else "not known"
         timed = f"{_ratio(over)} ({seconds(s.time)})"
-        rows.append((s.scene, s.engine, timed, s.contacts, f"{1e3 * s.depth:.3g}", residual(s.speed), known))
+        rows.append(
+            (s.scene, s.engine, timed, s.contacts, f"{1e3 * s.depth:.3g}", format_residual(s.speed), known)
+        )
         if over < 1.0:
             lost.append((over, f"- {s.scene}: {s.engine}, {over:.2f} of the time of ours"))
     told = [f"\nLost: {len(lost)}.", *(text for _, text in sorted(lost))] if lost else []

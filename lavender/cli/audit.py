@@ -8,7 +8,7 @@ from typing import Any
 import click
 
 from lavender.base.errors import InputError
-from lavender.cli.measuring import progress, show_sheet
+from lavender.cli.measuring import progress, show_page
 from lavender.cli.options import (
     EXIT_UNMET,
     FILE,
@@ -64,6 +64,6 @@ def audit(context: click.Context, /, model: Path, out: Path, accept: float | Non
     with progress() as watch:
         result = run(model, watch=watch, **asked)
     result.write(out)
-    show_sheet(result.sheet, out)
+    show_page(result.summary_page, out)
     if result.diverged or result.unjudged or (accept is not None and result.largest > accept):
         raise click.exceptions.Exit(EXIT_UNMET)

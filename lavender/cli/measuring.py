@@ -25,7 +25,7 @@ from lavender.cli.options import (
 
 if TYPE_CHECKING:
     from lavender.lab.bench import Event, Item, Plan, Records
-    from lavender.lab.report.sheet import Sheet
+    from lavender.lab.report.summary_page import SummaryPage
 
     P = TypeVar("P", bound=Plan)
 
@@ -99,7 +99,7 @@ def measure(context: click.Context, files: Sequence[str], path: Path, sweeps: Se
         A file that was named and does not load; a folder that cannot be written or that another process writes.
     """
     from lavender.lab import bench
-    from lavender.lab.report.contenders import time_lines
+    from lavender.lab.bench.candidates import time_candidates
 
     one_thread()
     asked = context.params
@@ -136,7 +136,7 @@ def measure(context: click.Context, files: Sequence[str], path: Path, sweeps: Se
                 common = {"watch": watch, "fresh": asked["fresh"], "memory": bytes_of(asked["memory"])}
                 bench.run(items, asked["solvers"], plan, store, into=found, **common, **more)
                 if not campaign:
-                    time_lines(items, found[0], plan, store, **common)
+                    time_candidates(items, found[0], plan, store, **common)
             except KeyboardInterrupt:
                 if not found:
                     raise
@@ -161,13 +161,13 @@ def _timed_plan(asked: Mapping[str, Any], files: Sequence[str], sweeps: Sequence
     return plan
 
 
-def show_sheet(sheet: Sheet, folder: Path) -> None:
-    """Write a page and print its short form; an exit where Ctrl-C came before the end."""
-    page = sheet.write(folder)
+def show_page(page: SummaryPage, folder: Path) -> None:
+    """Write a page and print its short form; exit if Ctrl-C ended the measurement."""
+    path = page.write(folder)
     with going_on():
-        sheet.show(console())
-        say(f"\npage: {page}")
-    if sheet.stopped:
+        page.print_short(console())
+        say(f"\npage: {path}")
+    if page.stopped:
         end_stopped()
 
 

@@ -102,10 +102,10 @@ def report(context: click.Context, /, files: tuple[str, ...], out: Path, **asked
     a named file cannot be read, or another report is writing to the folder.
     """
     from lavender.lab import bench
-    from lavender.lab.report.engine import contestants
+    from lavender.lab.report.engine import read_engine_answers
     from lavender.lab.report.findings import Report
     from lavender.lab.report.terminal import print_report
-    from lavender.lab.report.text import count, reasons
+    from lavender.lab.report.text import format_count, list_reasons
     from lavender.lab.report.write import write
 
     for limit in asked["time_budgets"]:
@@ -128,29 +128,29 @@ def report(context: click.Context, /, files: tuple[str, ...], out: Path, **asked
             raise InputError(f"{again[0]} holds no records: there is nothing to show")
     else:
         done = measure(context, files, path, sweeps)
-    engines = [] if is_campaign(context) else contestants(files, done.records.latest())
-    found = Report(done.records, old, asked["time_budgets"], sweeps, engines)
+    engines = [] if is_campaign(context) else read_engine_answers(files, done.records.latest())
+    shown = Report(done.records, old, asked["time_budgets"], sweeps, engines)
     # before a pipe that nobody reads ends the command
-    index = write(found, out, figures=not asked["no_figures"])
+    index = write(shown, out, figures=not asked["no_figures"])
     paper = None
     if asked["paper"]:
-        from lavender.lab.report.paper import write_paper
+        from lavender.lab.report.latex_export import write_paper
 
-        paper = write_paper(found, out / "paper")
-    print_report(found, console(), whole=asked["tables"])
+        paper = write_paper(shown, out / "paper")
+    print_report(shown, console(), complete=asked["tables"])
     if paper is not None:
         say(f"figures, tables and method of a paper: {paper}")
-    say(f"\n{count(len(done.records), 'run')}; page: {index}")
+    say(f"\n{format_count(len(done.records), 'run')}; page: {index}")
     if done.note:
         say(done.note)
     if done.stopped:
         say("Stopped; the same command continues from here.", style="yellow")
         raise click.exceptions.Exit(EXIT_INTERRUPTED)
     if not (again or done.records.records):
-        say(f"nothing was measured: {'; '.join(reasons(done.records.skips))}", style="yellow")
+        say(f"nothing was measured: {'; '.join(list_reasons(done.records.skips))}", style="yellow")
         raise click.exceptions.Exit(EXIT_UNMET)
     if done.lost and not again:
-        say(f"{count(done.lost, 'case')} of a folder left out of every number", style="yellow")
+        say(f"{format_count(done.lost, 'case')} of a folder left out of every number", style="yellow")
         raise click.exceptions.Exit(EXIT_UNMET)
 
 

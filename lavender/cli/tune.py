@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from lavender.cli.measuring import progress, show_sheet
+from lavender.cli.measuring import progress, show_page
 from lavender.cli.options import FILE, FOLDER, one_thread, threshold_option, worlds_options
 from lavender.io.stored import lock_output
 
@@ -36,4 +36,4 @@ def tune(context: click.Context, /, model: Path, out: Path, **asked: Any) -> Non
     one_thread()
     with progress() as watch:
         found = run(model, watch=watch, **asked)
-    show_sheet(found.sheet, out)
+    show_page(found.summary_page, out)

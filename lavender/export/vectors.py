@@ -21,12 +21,11 @@ from lavender.base.errors import InputError
 from lavender.export.library import HERE
 from lavender.export.view import METHODS, OTHER_BITS, NotTaken, choices, takes, view
 from lavender.lab import bench
+from lavender.lab.bench import statistics
 from lavender.lab.bench.cases import fingerprint
 from lavender.lab.bench.record import Record
 from lavender.lab.bench.store import Records, read
-from lavender.lab.report import tables
-from lavender.lab.report.moved import working
-from lavender.lab.report.verdict import verdict
+from lavender.lab.report.verdict import build_verdict
 from lavender.solvers import registry
 from lavender.solvers.steps import METHODS as CANDIDATES
 from lavender_ext.core.method import OUTCOMES
@@ -119,7 +118,7 @@ def made(path: Path, solver: str | None, most: int) -> dict[str, str | bytes]:
     InputError
         No such solver, or one that the library does not have, or no problem that can be had again.
     """
-    records = working(read(path).latest())  # what the report itself recommends by
+    records = statistics.drop_idle_cases(read(path).latest())  # what the report itself recommends by
     measured = _chosen(records, solver)
     packed: list[bytes] = []
     left: list[str] = []
@@ -154,7 +153,7 @@ def _chosen(records: Records, solver: str | None) -> list[Record]:
     solved = [r for r in records if r.success and r.mode == "tol" and r.way in ("call", "steps")]
     names = sorted({r.solver for r in solved if r.solver in METHODS or r.solver == "auto"})
     if solver is None:
-        leaders = verdict(records).leaders
+        leaders = build_verdict(records).leaders
         solver = next((name for name in leaders if name in names), None)
     if solver not in names:
         have = ", ".join(names) or "none"
@@ -162,7 +161,7 @@ def _chosen(records: Records, solver: str | None) -> list[Record]:
             f"{solver or 'what is recommended'} is not in the C library or reached no level in these records; of both "
             f"are: {have} (--solver)"
         )
-    mine, levels = [r for r in solved if r.solver == solver], tables.levels_of(records)
+    mine, levels = [r for r in solved if r.solver == solver], statistics.levels_of(records)
     level = levels[len(levels) // 2]
     tol = level if any(r.tol == level for r in mine) else min(r.tol for r in mine)
     return [r for r in mine if r.tol == tol and r.options == mine[0].options]

@@ -2,7 +2,7 @@
 
     result = audit("ant.xml", worlds=64, steps=200)
     result.table_of_errors; result.worst[0].problem
-    result.write("lavender-audit"); result.sheet.write("lavender-audit")
+    result.write("lavender-audit"); result.summary_page.write("lavender-audit")
 
 An answer that rounding explains, in the precision of the engine, is at its floor and did not stop before convergence
 (`Residual.verdict`). MuJoCo's problems are those of `lavender.io.from_mujoco_many`, computed again from the state
@@ -39,11 +39,10 @@ from lavender.judge.residuals import AT_FLOOR, CLOSE, ENOUGH, UNCONVERGED, WRONG
 from lavender.judge.residuals import VERDICTS as JUDGED
 from lavender.lab.bench.running.runner import Event
 from lavender.lab.bench.running.workers import check_workers, connect_backend, map_unordered
-from lavender.lab.report.curves import Curve, Figure
-from lavender.lab.report.sheet import Part as Section
-from lavender.lab.report.sheet import Sheet
+from lavender.lab.report.figures import Curve, Figure
+from lavender.lab.report.summary_page import PageSection, SummaryPage
 from lavender.lab.report.table import Cell, Table
-from lavender.lab.report.text import NONE, count, percent, size
+from lavender.lab.report.text import NONE, format_count, format_percent, format_size
 from lavender.lab.simulated_worlds import (
     ENGINES,
     Divergence,
@@ -202,16 +201,16 @@ class Audit:
     def head(self) -> str:
         """All in a few sentences."""
         unconverged, judged = self.unconverged, self.judged
-        worlds = count(int(np.count_nonzero(self.is_judged.any(axis=1))), "world")
+        worlds = format_count(int(np.count_nonzero(self.is_judged.any(axis=1))), "world")
         n = int(unconverged.sum())
         said = (
-            f"{Path(self.runs.model).name}, {self.engine}: {n or 'none'} of {count(judged, 'step')} judged in {worlds} "
-            "stopped before convergence"
+            f"{Path(self.runs.model).name}, {self.engine}: {n or 'none'} of {format_count(judged, 'step')} judged in "
+            f"{worlds} stopped before convergence"
         )
         if n:
             said += (
-                f" ({percent(n, judged, 1)}), in {count(int(unconverged.any(axis=1).sum()), 'world')}; "
-                f"the worst is {size(self.largest)} m/s off"
+                f" ({format_percent(n, judged, 1)}), in {format_count(int(unconverged.any(axis=1).sum()), 'world')}; "
+                f"the worst is {format_size(self.largest)} m/s off"
             )
         few = "" if self.sizes.is_enough else (
             f"Only {self.sizes.sentence}: this says little about the solver. Start from other states with --states."
@@ -222,12 +221,12 @@ class Audit:
     @property
     def _of_divergence(self) -> str:
         lost = self.verdict == NOT_JUDGED
-        unjudged = count(int(lost.sum()), "step")
+        unjudged = format_count(int(lost.sum()), "step")
         were = "was" if lost.sum() == 1 else "were"
         if not self.divergences:
             return f"{unjudged} {were} not judged: the answer is not finite." if lost.any() else ""
         first = min(d.step for d in self.divergences)
-        said = f"{count(self.diverged, 'world')} diverged, in step {first} at the earliest"
+        said = f"{format_count(self.diverged, 'world')} diverged, in step {first} at the earliest"
         said += f"; {unjudged} {were} not judged." if lost.any() else "."
         exact = sum(map(self.has_exact_solves, self.divergences))
         if exact == self.diverged:
@@ -246,7 +245,7 @@ class Audit:
                 known = x[chosen & np.isfinite(x)]
                 if len(known):
                     quantiles = np.quantile(known, QUANTILES, method="higher")
-                    rows.append([f"{name} [{unit}], {of}", *map(size, quantiles.tolist())])
+                    rows.append([f"{name} [{unit}], {of}", *map(format_size, quantiles.tolist())])
         return Table(heads, rows, words=frozenset({"error"}))
 
     @property
@@ -257,14 +256,14 @@ class Audit:
             here = self.verdict == i
             if here.any():
                 worlds = str(np.count_nonzero(here.any(axis=1)))
-                rows.append([word, str(here.sum()), percent(int(here.sum()), self.done, 2), worlds])
+                rows.append([word, str(here.sum()), format_percent(int(here.sum()), self.done, 2), worlds])
         return Table(["verdict", "steps", "share", "worlds"], rows, words=frozenset({"verdict"}))
 
     @property
     def table_of_rows(self) -> Table:
         """The worst rows of steps that stopped before convergence, most often first."""
         ranked = sorted(self.where.items(), key=lambda entry: -entry[1][0])
-        rows = [[name, str(n), size(largest)] for name, (n, largest) in ranked]
+        rows = [[name, str(n), format_size(largest)] for name, (n, largest) in ranked]
         return Table(["worst row", UNCONVERGED, "at most [m/s]"], rows)
 
     @property
@@ -273,7 +272,7 @@ class Audit:
         rows = []
         for d in self.divergences:
             error = self.numbers[0, d.world, d.step]
-            known = size(error) if np.isfinite(error) else NONE
+            known = format_size(error) if np.isfinite(error) else NONE
             exact = "exact" if self.has_exact_solves(d) else "not exact"
             rows.append([d.cause, str(d.world), str(d.step), known, exact])
         heads = ["too large", "world", "step", "error [m/s]", "solves until then"]
@@ -283,7 +282,7 @@ class Audit:
     def table_of_worst(self) -> Table:
         """The worlds that are kept as files."""
         rows = [
-            [f"worst_{i}.npz", str(w.world), str(w.step), size(w.velocity), w.where]
+            [f"worst_{i}.npz", str(w.world), str(w.step), format_size(w.velocity), w.where]
             for i, w in enumerate(self.worst, 1)
         ]
         return Table(
@@ -303,7 +302,9 @@ class Audit:
         return Figure("over-time", "over time", "step", "velocity error [m/s]", curves, x_log=False)
 
     def write(self, folder: str | os.PathLike[str]) -> None:
-        """Write `records.npz`, the worst steps as `worst/worst_1.npz`, and `states.npz`; `sheet.write` writes the page.
+        """Write `records.npz`, the worst steps as `worst/worst_1.npz`, and `states.npz`.
+
+        `summary_page.write` writes the page.
 
         `records.npz` holds `velocity` [m/s], `impulse` [N s], `relative`, `floor`, `verdict`, `rows`, `contacts` (each
         (worlds, steps)), `verdicts` and `diverged`, rows of (world, step). `states.npz` holds qpos, qvel, act, ctrl,
@@ -336,17 +337,19 @@ class Audit:
         }  # fmt: skip
 
     @property
-    def sheet(self) -> Sheet:
+    def summary_page(self) -> SummaryPage:
         """The page."""
-        return Sheet(
+        return SummaryPage(
             "lavender audit", self.head,
             [
-                Section("How wrong", [self.table_of_errors, self.table_of_verdicts], [self.figure], OF_ERRORS, short=4),
-                Section("Rows and contacts", [self.sizes.table], short=2, note=OF_SIZES),
-                Section("Worlds that diverged", [self.table_of_diverged], short=2, note=OF_DIVERGED),
-                Section("Where", [self.table_of_rows], short=3,
+                PageSection(
+                    "How wrong", [self.table_of_errors, self.table_of_verdicts], [self.figure], OF_ERRORS, short=4
+                ),
+                PageSection("Rows and contacts", [self.sizes.table], short=2, note=OF_SIZES),
+                PageSection("Worlds that diverged", [self.table_of_diverged], short=2, note=OF_DIVERGED),
+                PageSection("Where", [self.table_of_rows], short=3,
                         note="Rows that were the worst of a step that stopped before convergence."),
-                Section("The worst worlds", [self.table_of_worst], short=WORST, note=OF_FILES),
+                PageSection("The worst worlds", [self.table_of_worst], short=WORST, note=OF_FILES),
             ],
             self.totals,
             self.stopped,
@@ -387,7 +390,7 @@ def audit(
     backend : str
         Of joblib, as of a campaign.
     watch : callable, optional
-        Told of what is done.
+        Statement of what is done.
 
     Returns
     -------

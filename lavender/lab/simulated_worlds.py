@@ -27,7 +27,7 @@ from lavender.io.efc import from_efc
 from lavender.io.recording import Control, control_of, drive_of, model_of
 from lavender.io.states import StartStates, read_states
 from lavender.lab.report.table import Table
-from lavender.lab.report.text import percent
+from lavender.lab.report.text import format_percent
 
 ENGINES = ("mujoco", "mjx", "mujoco_warp")
 BEGIN = ("qpos", "qvel", "act", "qacc_warmstart", "mocap_pos", "mocap_quat")  # what MJX and Warp start from
@@ -134,7 +134,7 @@ class StepSizes:
     def sentence(self) -> str:
         """How many steps have contact, and how many are needed."""
         n, what = len(self.rows), "contact" if self.can_touch else "a constraint"
-        share = f" ({percent(self._with_any, n, min(1, self._with_any))})" if n else ""
+        share = f" ({format_percent(self._with_any, n, min(1, self._with_any))})" if n else ""
         needed = f"{100.0 * MIN_CONTACT_SHARE:g} %"
         return f"{self._with_any} of {n} steps judged have {what}{share}, fewer than {needed}"
 
@@ -144,7 +144,7 @@ class StepSizes:
         rows = []
         for name, counts in (("rows", self.rows), ("contacts", self.contacts)):
             if len(counts):
-                some = percent(int(np.count_nonzero(counts)), len(counts), 1)
+                some = format_percent(int(np.count_nonzero(counts)), len(counts), 1)
                 rows.append([name, f"{np.median(counts):g}", str(counts.max()), some])
         heads = ["in a step", "median", "maximum", "steps with any"]
         return Table(heads, rows, words=frozenset(heads[:1]))

@@ -1,7 +1,7 @@
 """MuJoCo's settings on worlds of one model: time of a step beside error, and the `<option>` line to copy.
 
     found = tune("ant.xml", worlds=16, steps=200)
-    found.faster, found.closer; found.sheet.write("lavender-tune")
+    found.faster, found.closer; found.summary_page.write("lavender-tune")
 
 Even worlds are chosen on, odd ones held back. Each world is cut into stretches of `ahead` steps of a run with the
 settings that the model has. From the start of each, a setting makes its own steps, warm from its own answers:
@@ -38,10 +38,10 @@ from lavender.io.recording import Control
 from lavender.judge.residuals import ENOUGH
 from lavender.lab.audit import AT_ONCE
 from lavender.lab.bench.running.runner import Event
-from lavender.lab.report.curves import Curve, Figure
-from lavender.lab.report.sheet import Part, Sheet
+from lavender.lab.report.figures import Curve, Figure
+from lavender.lab.report.summary_page import PageSection, SummaryPage
 from lavender.lab.report.table import Table
-from lavender.lab.report.text import size, times
+from lavender.lab.report.text import format_ratio, format_size
 from lavender.lab.simulated_worlds import Runs, StepSizes, can_touch, has_diverged, simulate_world
 from lavender.problem.derived import cached_property
 
@@ -317,7 +317,7 @@ class Tuning:
         if self.why_no_line:
             return []
         none = f"none of {len(self._own)} settings"
-        enough = f"not needed, {size(self.now.worst)} m/s is within {self.threshold:g}"
+        enough = f"not needed, {format_size(self.now.worst)} m/s is within {self.threshold:g}"
         closer = enough if self.now.worst <= self.threshold else none
         said = []
         for word, m, why, gains, most in (
@@ -339,8 +339,8 @@ class Tuning:
     def _table(self, some: Iterable[Measured]) -> Table:
         rows = [
             [
-                m.setting.line or "as it is", seconds(m.time), f"{m.time / self.now.time:.2f}", size(m.worst),
-                size(float(m.error.max())), size(m.worst_motion),
+                m.setting.line or "as it is", seconds(m.time), f"{m.time / self.now.time:.2f}", format_size(m.worst),
+                format_size(float(m.error.max())), format_size(m.worst_motion),
             ]
             for m in some
         ]  # fmt: skip
@@ -362,15 +362,15 @@ class Tuning:
                       "error that 1 % of the steps exceed [m/s]", tuple(parts), x_log=True)  # fmt: skip
 
     @property
-    def sheet(self) -> Sheet:
+    def summary_page(self) -> SummaryPage:
         """The page."""
         now = self.now
         head = (
             f"{Path(self.runs.model).name}: a step takes {seconds(now.time)}, and 1 % of the steps are more than "
-            f"{size(now.worst)} m/s off."
+            f"{format_size(now.worst)} m/s off."
         )
         if self.closer is not None:
-            gain = times(now.worst / self.closer.worst) if self.closer.worst else "exact:"
+            gain = format_ratio(now.worst / self.closer.worst) if self.closer.worst else "exact:"
             head += f" In the same time it can be {gain} less."
         if self.why_no_line:
             head += f" {self.why_no_line}"
@@ -379,17 +379,17 @@ class Tuning:
         every = sorted(self.measured, key=lambda m: m.time)
         sizes = [] if self.sizes is None else [self.sizes.table]
         figures = [] if self.why_no_line else [self.figure]
-        return Sheet(
+        return SummaryPage(
             "lavender tune", head,
             [
-                Part("Lines to copy", code=self.lines,
+                PageSection("Lines to copy", code=self.lines,
                      note="None, for the reason above." if self.why_no_line
                      else "Chosen on the even worlds, tried on the odd ones."),
-                Part("Rows and contacts", sizes, short=2, note="Of the steps with the model's own setting."),
-                Part("The front of time and error", [self._table(shown)], figures, short=5),
-                Part("Other problems", [self._table(other)], short=2,
+                PageSection("Rows and contacts", sizes, short=2, note="Of the steps with the model's own setting."),
+                PageSection("The front of time and error", [self._table(shown)], figures, short=5),
+                PageSection("Other problems", [self._table(other)], short=2,
                      note="A cone, impratio or noslip other than the model's: the error is that of its own problem."),
-                Part("Every setting", [self._table(every)], note="Without those with which a world diverges."),
+                PageSection("Every setting", [self._table(every)], note="Without those with which a world diverges."),
             ],
             {"model": self.runs.model, "lines": self.lines, "why_no_line": self.why_no_line,
              **({} if self.sizes is None else self.sizes.numbers), "stopped": self.stopped,
@@ -399,7 +399,7 @@ class Tuning:
 
 
 def _beside(m: Measured, now: Measured) -> str:
-    return f"{m.time / now.time:.2f} of the time, error {size(m.worst)} m/s beside {size(now.worst)}"
+    return f"{m.time / now.time:.2f} of the time, error {format_size(m.worst)} m/s beside {format_size(now.worst)}"
 
 
 def _told(m: Measured) -> dict[str, Any]:
@@ -460,7 +460,7 @@ def tune(
     threshold : float, m/s, m
         Error, and distance, below which nobody asks for less.
     watch : callable, optional
-        Told of what is done.
+        Statement of what is done.
 
     Returns
     -------

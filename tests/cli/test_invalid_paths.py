@@ -729,17 +729,17 @@ def show_all(records):
     """Make everything that is shown of records, but the files of figures, in memory."""
     from rich.console import Console
 
-    from lavender.lab.report.curves import figures
-    from lavender.lab.report.page import page
-    from lavender.lab.report.write import summary
+    from lavender.lab.report.figures import build_figures
+    from lavender.lab.report.markdown import summarise_report
+    from lavender.lab.report.page import render_page
 
     shown = records.latest()
     report = Report(shown, shown)
     print_report(report, Console(file=streams.StringIO(), width=140))
     for record in shown.records:  # The fastest, which is shown, differs from run to run.
         assert format_call(record)
-    page(report, figures(shown)).encode("utf-8")
-    summary(report).encode("utf-8")
+    render_page(report, build_figures(shown)).encode("utf-8")
+    summarise_report(report).encode("utf-8")
 
 
 def test_records_of_any_content_are_shown_or_rejected(tmp_path, entries):

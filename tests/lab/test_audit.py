@@ -147,7 +147,7 @@ def test_ctrl_c_keeps_what_there_is(boxes, tmp_path, monkeypatch):
     assert found.stopped and found.done == 20
     assert np.isnan(found.numbers[:, 1:]).all()
     found.write(tmp_path / "out")
-    assert "Stopped before the end" in found.sheet.write(tmp_path / "out").read_text()
+    assert "Stopped before the end" in found.summary_page.write(tmp_path / "out").read_text()
 
 
 def test_what_is_close_enough_may_still_not_be_accepted(boxes):

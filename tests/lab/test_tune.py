@@ -98,7 +98,7 @@ def test_no_line_is_recommended_if_few_steps_have_contact(with_contact, is_enoug
     contacts = (np.arange(100) < with_contact).astype(int)
     found = replace(chosen(now, quick), sizes=StepSizes(contacts + 1, contacts, True))
     assert bool(found.lines) == is_enough == (not found.why_no_line)
-    assert ("No setting is recommended: 19 of 100" in found.sheet.head) != is_enough
+    assert ("No setting is recommended: 19 of 100" in found.summary_page.head) != is_enough
     assert "(19.0 %)" in found.why_no_line or is_enough
     # A model without geoms that can collide is judged by its rows.
     assert replace(found, sizes=StepSizes(contacts + 1, 0 * contacts, False)).lines
@@ -165,7 +165,7 @@ def test_ctrl_c_keeps_what_there_is(boxes, monkeypatch):
     seen = []
     found = tune(boxes(EARLY), worlds=2, steps=10, rounds=1, watch=watch)
     assert found.stopped and len(found.measured) == 5 and not found.held
-    assert "Stopped before the end" in found.sheet.html()
+    assert "Stopped before the end" in found.summary_page.render_html()
     assert "not measured" in "".join(found.lines) or found.faster is found.closer is None
 
 

@@ -1,4 +1,4 @@
-"""Records -> terminal tables, plots, a page. Never solves.
+"""Write records as terminal tables, plots and a page. Nothing here solves a problem.
 
 records = lavender.lab.bench.read("report/records.jsonl")
 lavender.lab.report.reaches(records)          # plain rows
@@ -6,9 +6,8 @@ lavender.lab.report.write(records, "report")  # records.csv, records.json, figur
 lavender.lab.report.write(lavender.lab.report.Report(records, earlier), "report")  # compared with an earlier run
 """
 
-from lavender.lab.report.finals import advice
-from lavender.lab.report.findings import Report
-from lavender.lab.report.tables import (
+from lavender.lab.bench.resampling import recommend_solvers
+from lavender.lab.bench.statistics import (
     claims,
     failures,
     families,
@@ -16,13 +15,14 @@ from lavender.lab.report.tables import (
     passes,
     profiles,
     reaches,
+    robustness,
     spreads,
 )
+from lavender.lab.report.findings import Report
 from lavender.lab.report.write import write
 
 __all__ = [
     "Report",
-    "advice",
     "claims",
     "failures",
     "families",
@@ -30,6 +30,8 @@ __all__ = [
     "passes",
     "profiles",
     "reaches",
+    "recommend_solvers",
+    "robustness",
     "spreads",
     "write",
 ]

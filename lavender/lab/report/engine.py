@@ -1,6 +1,7 @@
-"""The answers of the engine that recorded a folder of steps: judged like the others, timed inside it.
+"""Read and rank the answers of the engine that recorded a folder of steps.
 
-Its time holds neither a copy of the problem nor the judge, and it starts from what the engine kept of the step before.
+The judge scores them like all answers. Their time is measured inside the engine: it includes neither a copy of the
+problem nor the judge, and the engine starts from the step before.
 `engine_choice` ranks it by the rule of the solvers: cases brought to a level, then the shifted geometric mean of times.
 """
 
@@ -16,18 +17,18 @@ import numpy as np
 
 from lavender.io.stored import ENGINE, SUFFIXES, whole_file
 from lavender.judge.residuals import AT_FLOOR, UNCONVERGED, VERDICTS_OF_OLD, WRONG
+from lavender.lab.bench.recommendation import Choice
 from lavender.lab.bench.record import printable
+from lavender.lab.bench.statistics import MEAN_TIME_SHIFT, geometric_mean, limit_of
 from lavender.lab.bench.store import Records
-from lavender.lab.report.choices import Choice
-from lavender.lab.report.tables import SHIFT, geometric_mean, limit_of
 
 _NUMBERS = ("rows", "seconds", "relative")
 INSIDE = "inside the engine, warm from the step before, without copy and judge"
 
 
 @dataclass(frozen=True)
-class Contestant:
-    """One folder of recorded steps; residuals relative."""
+class EngineAnswers:
+    """Answers of an engine to one folder of recorded steps; residuals are relative."""
 
     folder: str
     source: str  # the folder's path as the records have it
@@ -47,44 +48,44 @@ class Contestant:
     ]  # by the file's name: time inside the engine [s], relative residual
 
 
-def contestants(words: Sequence[str], records: Records) -> list[Contestant]:
+def read_engine_answers(words: Sequence[str], records: Records) -> list[EngineAnswers]:
     """Read the engine's answers in the folders among `words` and in those of the records' files.
 
     Lines that cannot be read are left out.
     """
     parents = (Path(x.source).parent for x in records.cases.values() if x.source.endswith(SUFFIXES))
-    found = (_read_folder(folder) for folder in dict.fromkeys([*map(Path, words), *parents]))
-    return [contestant for contestant in found if contestant is not None]
+    engines = (_read_folder(folder) for folder in dict.fromkeys([*map(Path, words), *parents]))
+    return [engine for engine in engines if engine is not None]
 
 
-def _read_folder(folder: Path) -> Contestant | None:
+def _read_folder(folder: Path) -> EngineAnswers | None:
     path = folder / ENGINE
     if not path.is_file():
         return None
-    found, lost, answers = [], 0, {}
+    entries, left_out, answers = [], 0, {}
     for line in whole_file(path, "the engine's answers").decode(errors="replace").splitlines():
         try:
             entry = json.loads(line)
-            lost += "left_out" in entry
+            left_out += "left_out" in entry
             rows, time, relative = (float(entry[name]) for name in _NUMBERS)
             row = float(entry.get("velocity", math.nan)), str(entry.get("worst", ""))
             verdict = str(entry["verdict"])
             verdict = VERDICTS_OF_OLD.get(verdict, verdict)
-            found.append((rows, relative, row, verdict, printable(str(entry["solver"]))))
+            entries.append((rows, relative, row, verdict, printable(str(entry["solver"]))))
             if math.isfinite(time) and time >= 0.0:
                 answers[printable(str(entry.get("file", "")))] = time, relative
         except (ValueError, KeyError, TypeError, RecursionError):
             continue
-    if not found:
+    if not entries:
         return None
-    sizes, relatives, worst_rows, verdicts, solvers = zip(*found, strict=True)
+    sizes, relatives, worst_rows, verdicts, solvers = zip(*entries, strict=True)
     velocity, where = max(worst_rows, key=lambda row: (row[0] == row[0], row[0]))
-    return Contestant(
+    return EngineAnswers(
         folder=folder.name,
         source=printable(str(folder)),
         solver=max(set(solvers), key=solvers.count).replace("NEWTON", "Newton"),
-        steps=len(found),
-        left_out=lost,
+        steps=len(entries),
+        left_out=left_out,
         rows=float(np.median(sizes)),
         relative=float(np.median(relatives)),
         worst=float(np.max(relatives)),
@@ -96,14 +97,14 @@ def _read_folder(folder: Path) -> Contestant | None:
     )
 
 
-def cases_of(engine: Contestant, records: Records) -> tuple[str, ...]:
+def list_cases_of(engine: EngineAnswers, records: Records) -> tuple[str, ...]:
     """The cases of the records that are files of its folder."""
     sources = {name: Path(info.source) for name, info in records.cases.items()}
     return tuple(name for name, path in sources.items() if str(path.parent) == engine.source)
 
 
-def engine_choice(
-    engines: Sequence[Contestant], records: Records, cases: Sequence[str], level: float
+def rank_engine(
+    engines: Sequence[EngineAnswers], records: Records, cases: Sequence[str], level: float
 ) -> Choice | None:
     """Rank the engines' own answers to these cases to a level as lines of solvers are ranked.
 
@@ -121,11 +122,11 @@ def engine_choice(
         return None
     times = {name: time if relative <= level else math.inf for name, (time, relative) in answers.items()}
     limit = limit_of(records)
-    score = geometric_mean([t if math.isfinite(t) else limit for t in times.values()], SHIFT)
+    score = geometric_mean([t if math.isfinite(t) else limit for t in times.values()], MEAN_TIME_SHIFT)
     solved = sum(map(math.isfinite, times.values()))
     return Choice.of(" and ".join(solvers), times, solved, score)
 
 
-def is_ahead(one: Choice, other: Choice) -> bool:
+def ranks_before(one: Choice, other: Choice) -> bool:
     """Whether one solver ranks before another: more cases, or as many in less time."""
     return (-one.solved, one.score) < (-other.solved, other.score)

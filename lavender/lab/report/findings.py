@@ -1,4 +1,4 @@
-"""What a report says of records, worked out once: its page, the terminal, the summary and a paper show it."""
+"""Compute the contents of a report once: its page, the terminal, the summary and a paper show them."""
 
 from __future__ import annotations
 
@@ -6,108 +6,109 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import fmean
 
+from lavender.lab.bench import statistics
+from lavender.lab.bench.recommendation import FamilyAdvice, choose_time_budgets
+from lavender.lab.bench.resampling import recommend_solvers
 from lavender.lab.bench.store import Records
-from lavender.lab.report import choices, tables
-from lavender.lab.report.engine import Contestant
-from lavender.lab.report.finals import advice
-from lavender.lab.report.moved import by_speed, speed_levels, working
-from lavender.lab.report.text import count
-from lavender.lab.report.verdict import Verdict, verdict
+from lavender.lab.report.engine import EngineAnswers
+from lavender.lab.report.motion_tables import convert_to_motion_errors, get_speed_levels
+from lavender.lab.report.text import format_count
+from lavender.lab.report.verdict import Verdict, build_verdict
 from lavender.problem.derived import cached_property
 
 
 @dataclass(frozen=True, eq=False)
 class Report:
-    """Records, and what is asked of them.
+    """Records, what they are compared with, and the budgets of interest.
 
     Parameters
     ----------
-    given : Records
+    all_records : Records
         Times are compared within the newest run alone.
-    old : Records, optional
+    earlier : Records, optional
         An earlier run to compare with.
-    asked : s, optional
-        Time budgets of the recommendation; those of the plan, or `choices.time_budgets`, if none are given.
-    sweeps : int, optional
-        Budgets of sweeps with which a solver is to be named; those of the plan if none are given.
-    engines : sequence of Contestant
-        Answers of the engines that recorded the steps: `lavender.lab.report.engine.contestants`.
+    time_budgets : s, optional
+        Times with a recommended solver; those of the plan, or `recommendation.choose_time_budgets`, if there are none.
+    sweep_budgets : int, optional
+        Numbers of sweeps with a recommended solver; those of the plan if there are none.
+    engines : sequence of EngineAnswers
+        Answers of the engines that recorded the steps: `lavender.lab.report.engine.read_engine_answers`.
     """
 
-    given: Records
-    old: Records | None = None
-    asked: Sequence[float] = ()
-    sweeps: Sequence[int] = ()
-    engines: Sequence[Contestant] = ()
+    all_records: Records
+    earlier: Records | None = None
+    time_budgets: Sequence[float] = ()
+    sweep_budgets: Sequence[int] = ()
+    engines: Sequence[EngineAnswers] = ()
 
     @cached_property
-    def every(self) -> Records:
+    def newest(self) -> Records:
         """The newest run."""
-        return self.given.latest()
+        return self.all_records.latest()
 
     @cached_property
     def records(self) -> Records:
-        """The newest run without cases where doing nothing is right."""
-        return working(self.every)
+        """The newest run without cases whose solution is the zero impulse."""
+        return statistics.drop_idle_cases(self.newest)
 
     @cached_property
-    def before(self) -> Records | None:
+    def earlier_run(self) -> Records | None:
         """The newest run of the earlier records."""
-        return None if self.old is None else self.old.latest()
+        return None if self.earlier is None else self.earlier.latest()
 
     @cached_property
     def is_campaign(self) -> bool:
-        """Times were left out on purpose."""
-        return tables.is_campaign(self.records)
+        """Whether the runs have no times."""
+        return statistics.is_campaign(self.records)
 
     @cached_property
     def stopped(self) -> str:
-        """What is to be said of a run that ended before all was measured; empty where nothing is."""
-        if all(run.whole for run in self.every.runs.values()):
+        """A warning if the run ended before everything was measured; else empty."""
+        if all(run.whole for run in self.newest.runs.values()):
             return ""
         return "Stopped before the end: what was not measured is in no number here."
 
     @cached_property
     def busy(self) -> str:
-        """What is to be said of times that were taken while others used the processors too; empty where nothing is."""
-        if self.is_campaign or not len(self.every):
+        """A warning if other processes used the processors while times were taken; else empty."""
+        if self.is_campaign or not len(self.newest):
             return ""
-        (run,) = self.every.runs.values()
-        loads = [load for r in self.every if (load := run.load if r.load is None else r.load) is not None]
-        # A half more: on one core this process makes a load of 1, and the system's own a little.
+        (run,) = self.newest.runs.values()
+        loads = [load for r in self.newest if (load := run.load if r.load is None else r.load) is not None]
+        # Half a core more than there are: on one core this process makes a load of 1, and the system adds a little.
         if not loads or fmean(loads) <= run.cores + 0.5:
             return ""
         return (
-            f"The machine was busy: load {fmean(loads):.1f} on {count(run.cores, 'core')} while this was timed. These "
-            "times are void; measure again with --fresh."
+            f"The machine was busy: load {fmean(loads):.1f} on {format_count(run.cores, 'core')} while this was timed. "
+            "These times are void; measure again with --fresh."
         )
 
     @cached_property
     def levels(self) -> tuple[float, ...]:
-        """Residuals to reach, loosest first."""
-        return tables.levels_of(self.records)
+        """Levels of the residual, loosest first."""
+        return statistics.levels_of(self.records)
 
     @cached_property
     def speeds(self) -> tuple[float, ...]:
-        """Motion errors to reach [m/s]; empty without motion errors."""
-        return speed_levels(self.records)
+        """Levels of the motion error [m/s]; empty without motion errors."""
+        return get_speed_levels(self.records)
 
     @cached_property
     def by_speed(self) -> Records:
-        """The same records by motion error in place of the residual; none without motion errors."""
-        return by_speed(self.records)
+        """The records with motion errors in place of residuals; empty without motion errors."""
+        return convert_to_motion_errors(self.records)
 
     @cached_property
     def times(self) -> tuple[float, ...]:
-        """Times [s] in which a solver is recommended."""
-        return tuple(self.asked) or choices.time_budgets(self.records)
+        """Times [s] with a recommended solver."""
+        return tuple(self.time_budgets) or choose_time_budgets(self.records)
 
     @cached_property
     def verdict(self) -> Verdict:
-        """What the whole comes to."""
-        return verdict(self.records, tuple(self.asked), tuple(self.sweeps), self.engines)
+        """The sentences of the recommendation."""
+        return build_verdict(self.records, tuple(self.time_budgets), tuple(self.sweep_budgets), self.engines)
 
     @cached_property
-    def lines(self) -> list[choices.Line]:
-        """Recommendations by structure and sequence; none of a campaign."""
-        return [] if self.is_campaign else advice(self.records, self.times)
+    def lines(self) -> list[FamilyAdvice]:
+        """Rankings by structure and sequence; empty for a campaign."""
+        return [] if self.is_campaign else recommend_solvers(self.records, self.times)

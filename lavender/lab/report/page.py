@@ -1,4 +1,4 @@
-"""The report as one self-contained HTML file: no network, dark and light, phone and print."""
+"""Render the report as one HTML file without external parts, for dark and light themes, phones and print."""
 
 from __future__ import annotations
 
@@ -8,23 +8,30 @@ from collections.abc import Sequence
 from typing import Any
 
 from lavender.base.deadline import seconds
+from lavender.lab.bench import recommendation, statistics
 from lavender.lab.bench.record import file_name, level_name
+from lavender.lab.bench.statistics import RESIDUAL_NOISE_FACTOR, TIME_NOISE_FACTOR
 from lavender.lab.bench.store import Records
-from lavender.lab.report import choices, contents, tables
-from lavender.lab.report.curves import Figures
+from lavender.lab.report import table_specs
+from lavender.lab.report.figures import Figures
 from lavender.lab.report.findings import Report
-from lavender.lab.report.svg import svg
-from lavender.lab.report.tables import NOISE, RESIDUAL_NOISE
-from lavender.lab.report.text import count, left_out, residual, suspicions, without
+from lavender.lab.report.plotting import plot_for_page
+from lavender.lab.report.text import (
+    format_count,
+    format_left_out,
+    format_residual,
+    list_left_out,
+    list_suspicions,
+)
 from lavender.lab.report.verdict import Verdict
 
-MOST = 500  # failures on a page, for its weight: 200 problems are to fit into 3 MB
-MOST_SPREADS = 100  # widest spreads of sweep orders on a page
+MAX_FAILURES = 500  # Failures on a page, so that a page of 200 problems has less than 3 MB.
+MAX_SPREADS = 100  # Spreads of sweep orders on a page: the widest ones.
 
 
 @functools.cache
-def environment() -> Any:
-    """The templates, compiled once."""
+def create_environment() -> Any:
+    """Compile the templates, once."""
     import jinja2
 
     environment = jinja2.Environment(
@@ -34,86 +41,95 @@ def environment() -> Any:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters.update(seconds=seconds, residual=residual, level=level_name, anchor=file_name)
+    environment.filters.update(seconds=seconds, residual=format_residual, level=level_name, anchor=file_name)
     environment.globals.update(
-        contents=contents, tables=tables, count=count, without=without, isfinite=math.isfinite
+        table_specs=table_specs,
+        statistics=statistics,
+        format_count=format_count,
+        format_left_out=format_left_out,
+        isfinite=math.isfinite,
     )
     environment.globals.update(
-        noise=NOISE, residual_noise=RESIDUAL_NOISE, most=MOST, most_spreads=MOST_SPREADS
+        noise=TIME_NOISE_FACTOR,
+        residual_noise=RESIDUAL_NOISE_FACTOR,
+        max_failures=MAX_FAILURES,
+        max_spreads=MAX_SPREADS,
     )
     return environment
 
 
-def page(report: Report, figures: Figures, saved: bool = True) -> str:
-    """The whole page. Every text that came from a file, a problem or a backend is escaped.
+def render_page(report: Report, figures: Figures, saved: bool = True) -> str:
+    """Return the page. Every text from a file, a problem or a backend is escaped.
 
-    `figures` are those of the report's records; `saved`: they are beside the page as SVG and PNG.
+    `figures` show the records of the report; `saved` says that the folder of the page has them as SVG and PNG, too.
     """
     records = report.records
-    return environment().get_template("index.html.j2").render(
+    return create_environment().get_template("index.html.j2").render(
         report=report, records=records, verdict=report.verdict, levels=report.levels, saved=saved,
-        level=report.levels[len(report.levels) // 2], links=_links(report.lines), left_out=left_out(records),
-        suspicions=suspicions(records), **_drawings(records, figures, report.verdict), **_cases(report),
+        level=report.levels[len(report.levels) // 2], links=_list_links(report.lines), left_out=list_left_out(records),
+        suspicions=list_suspicions(records), **_render_drawings(records, figures, report.verdict),
+        **_describe_cases(report),
     )  # fmt: skip
 
 
-def _drawings(records: Records, figures: Figures, found: Verdict) -> dict[str, Any]:
-    """The figures, and by section the names of its own; of motion errors beside those of residuals."""
+def _render_drawings(records: Records, figures: Figures, verdict: Verdict) -> dict[str, Any]:
+    """Return the drawings by name, and for each section of the page the names of its drawings."""
     names = sorted({r.solver for r in records} | {c.solver for f in figures for c in f.curves})
     number = {name: i for i, name in enumerate(names)}
-    # Under the heading of a case its name says nothing new.
+    # The drawings of a case have no title: the heading above them is the name of the case.
     own = [f.name for some in figures.cases.values() for f in some]
     titles = {name: "" for plain in own for name in (plain, f"motion {plain}")}
     return {
-        "drawings": {  # each escapes what it holds
-            file_name(figure.name): svg(figure, number, found.leaders, titles.get(figure.name))
+        "drawings": {  # their texts are escaped
+            file_name(figure.name): plot_for_page(figure, number, verdict.leaders, titles.get(figure.name))
             for figure in figures
         },
         "solvers": names,
         "number": number,
         "by_motion": figures.moved is not None,
-        "drawn": _keys(figures),
-        "moved_drawn": _keys(figures.moved or Figures()),
+        "drawn": _list_keys(figures),
+        "moved_drawn": _list_keys(figures.moved or Figures()),
     }
 
 
-def _keys(figures: Figures) -> dict[str, dict[str, list[str]]]:
+def _list_keys(figures: Figures) -> dict[str, dict[str, list[str]]]:
+    """Return the names of the drawings by place and subject."""
     return {
         place: {name: [file_name(figure.name) for figure in some] for name, some in group.items()}
         for place, group in figures.places.items()
     }
 
 
-def _cases(report: Report) -> dict[str, Any]:
-    """Each case with its solvers; none of a campaign: of thousands the tables over all of them say it."""
+def _describe_cases(report: Report) -> dict[str, Any]:
+    """Return the tables of each case; none for a campaign, which has thousands of cases."""
     records, levels = report.records, report.levels
-    by_case: dict[str, list[tables.Reach]] = {}
+    by_case: dict[str, list[statistics.Reach]] = {}
     if not report.is_campaign:
-        for reach in tables.reaches(records, levels):
+        for reach in statistics.reaches(records, levels):
             by_case.setdefault(reach.case, []).append(reach)
     level = levels[len(levels) // 2]
-    fastest = {name: _fastest(rows, level) for name, rows in by_case.items()}
+    fastest = {name: _select_fastest(rows, level) for name, rows in by_case.items()}
     stored = any(math.isfinite(x.stored) for x in records.cases.values())
     cases = [
-        {"info": records.cases[name], "reaches": contents.reach_table(rows, levels).without("case")}
+        {"info": records.cases[name], "reaches": table_specs.tabulate_reaches(rows, levels).without("case")}
         for name, rows in by_case.items()
     ]
     return {
         "cases": cases,
-        "case_list": contents.case_table(records, fastest, level, stored),
-        "difficulty": contents.difficulty_table(tables.difficulties(records) if cases else []),
+        "case_list": table_specs.tabulate_cases(records, fastest, level, stored),
+        "difficulty": table_specs.tabulate_difficulties(statistics.difficulties(records) if cases else []),
     }
 
 
-def _links(lines: Sequence[choices.Line]) -> dict[str, str]:
-    """Where on the page more is said of a structure or sequence."""
+def _list_links(lines: Sequence[recommendation.FamilyAdvice]) -> dict[str, str]:
+    """Return for each structure and sequence the part of the page that describes it."""
     parts = {line.name: "sequence" if line.sequence else "family" for line in lines}
     return {name: f"{part}-{file_name(name)}" for name, part in parts.items()}
 
 
-def _fastest(rows: Sequence[tables.Reach], level: float) -> tables.Reach | None:
-    """Who brings a case to the level first, from a cold start, with claims that hold."""
-    honest = [
+def _select_fastest(rows: Sequence[statistics.Reach], level: float) -> statistics.Reach | None:
+    """Return the fastest solver to the level from a cold start, without a false claim."""
+    candidates = [
         r for r in rows if r.start == "cold" and not r.status_conflict and math.isfinite(r.times[level])
     ]
-    return min(honest, key=lambda r: r.times[level], default=None)
+    return min(candidates, key=lambda r: r.times[level], default=None)

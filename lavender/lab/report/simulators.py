@@ -1,4 +1,4 @@
-"""Our Newton beside that of a simulator, as a table."""
+"""Tabulate times of lavender's Newton method and of a simulator's."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ from typing import TypeVar
 import numpy as np
 
 from lavender.lab.bench.simulators import STRICT, TARGET, Step, WarmStep
-from lavender.lab.report.table import Table, markdown
-from lavender.lab.report.tables import geometric_mean
+from lavender.lab.bench.statistics import geometric_mean
+from lavender.lab.report.markdown import format_markdown
+from lavender.lab.report.table import Table
 
 S = TypeVar("S", bound=WarmStep)
 OVER = "lavender's time over MuJoCo's, geometric means, above 1 MuJoCo is faster"
@@ -17,11 +18,11 @@ CLASSES = ((0, 10), (10, 50), (50, 300), (300, 10**9))  # rows
 
 
 def _by_class(steps: Sequence[S]) -> list[tuple[str, list[S]]]:
-    found = []
+    classes = []
     for low, high in CLASSES:
         name = f"under {high}" if low == 0 else f"{low} and more" if high > 10**6 else f"{low}-{high}"
-        found.append((name, [s for s in steps if low <= s.rows < high]))
-    return [(name, part) for name, part in found if part]
+        classes.append((name, [s for s in steps if low <= s.rows < high]))
+    return [(name, part) for name, part in classes if part]
 
 
 def _sizes(x: Sequence[float]) -> tuple[str, str]:
@@ -29,14 +30,14 @@ def _sizes(x: Sequence[float]) -> tuple[str, str]:
 
 
 def _row(name: str, part: Sequence[WarmStep]) -> list[str]:
-    """Models, problems, the engine's time and ours over it."""
+    """Return the first cells of a row: models, problems, the engine's time and the ratio of times."""
     ratio = geometric_mean([s.ours / s.engine for s in part])
     models, engine = len({s.model for s in part}), geometric_mean([s.engine for s in part])
     return [name, str(models), str(len(part)), f"{1e6 * engine:.1f}", f"{ratio:.2f}"]
 
 
 def table(steps: Sequence[Step]) -> str:
-    """Geometric means of ours / MuJoCo's by the number of rows, and what was solved, as Markdown."""
+    """Return geometric means of time ratios by the number of rows, and how many problems were solved, as Markdown."""
     heads = ["rows", "models", "problems", "MuJoCo [µs]", "one call", "`solve_many`"]
     rows = [
         [*_row(name, part), f"{geometric_mean([s.many / s.engine for s in part]):.2f}"]
@@ -46,17 +47,17 @@ def table(steps: Sequence[Step]) -> str:
     coulomb = [s for s in steps if s.coulomb is not None]
     solved = sum(s.coulomb <= STRICT for s in coulomb if s.coulomb is not None)
     never = sum(s.tolerance == 0.0 for s in steps)
-    told = (
+    summary = (
         f"{len(convex)} of {len(steps)} solved to {STRICT:.0e} or the floor of float64 under MuJoCo's own law, "
         f"{solved} of {len(coulomb)} under Coulomb's (contacts of up to two tangents); {never} that MuJoCo brings "
         f"to {TARGET:.0e} at no tolerance count with its default."
     )
     start = f"Cold, both sides from nothing, to a judged residual of {TARGET:.0e}. `one call`, `solve_many`: {OVER}."
-    return "\n".join([start, "", *markdown(Table(heads, rows)), "", told])
+    return "\n".join([start, "", *format_markdown(Table(heads, rows)), "", summary])
 
 
 def warm_table(steps: Sequence[WarmStep]) -> str:
-    """The same over consecutive steps, both sides from what they knew of the last one."""
+    """Return the same over consecutive steps, both solvers started from their last step."""
     rows = [
         [
             *_row(name, part),
@@ -71,4 +72,4 @@ def warm_table(steps: Sequence[WarmStep]) -> str:
         f"{TARGET:.0e}. `one call`: {OVER}."
     )
     heads = ["rows", "models", "steps", "MuJoCo [µs]", "one call", *residuals]
-    return "\n".join([start, "", *markdown(Table(heads, rows))])
+    return "\n".join([start, "", *format_markdown(Table(heads, rows))])

@@ -1,4 +1,4 @@
-"""What a terminal shows of a report."""
+"""Print tables and reports on a terminal."""
 
 from __future__ import annotations
 
@@ -7,105 +7,155 @@ from collections.abc import Iterator
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+from lavender.lab.bench import statistics
 from lavender.lab.bench.record import printable
-from lavender.lab.report import tables
-from lavender.lab.report.contents import NOT_COMPARED, sections, short_table
 from lavender.lab.report.findings import Report
-from lavender.lab.report.moved import idle
-from lavender.lab.report.table import Table, print_table
-from lavender.lab.report.text import count, left_out, residual, suspicions
+from lavender.lab.report.motion_tables import list_idle_cases
+from lavender.lab.report.table import COLOURS, Cell, Table
+from lavender.lab.report.table_specs import NOT_COMPARED, build_short_table, list_sections
+from lavender.lab.report.text import format_count, format_residual, list_left_out, list_suspicions
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-LINES = 25  # of a report in short, with those that a command adds
-ADDED = 5  # of them: a blank one, where the page is, what was reused, what a paper has, what did not load
-MOST = 20  # notes of a kind, where all is printed
+MAX_LINES = 25  # Lines of a short report, with those that the command adds.
+COMMAND_LINES = (
+    5  # Lines that the command adds: a blank line, page, reused runs, paper, cases that did not load.
+)
+MAX_NOTES = 20  # Notes of a kind in a complete report.
 
 
-def print_report(report: Report, console: Console, whole: bool = False) -> None:
-    """What the terminal shows after a run: the recommendation, a table to the middle level, and what to know besides.
+def print_table(console: Console, table: Table, grouped: bool = False, cut: bool = False) -> None:
+    """Print a table within the width of the terminal. Its texts are not read as markup.
 
-    In short no more than `LINES` lines, none wider than the terminal; `whole` prints every sentence, table and warning.
+    Cells of a table that is too wide fold. A table that `folds` then becomes one line for each cell below the first
+    cell of its row. With `cut`, a row is one line and its first cell is shortened instead. `grouped` shows the first
+    cell only if it differs from the row above, and separates such groups.
+    """
+    from rich.table import Table as RichTable
+    from rich.text import Text
+
+    grid = RichTable(box=None, pad_edge=False, header_style="bold")
+    for head in table.heads:
+        grid.add_column(
+            Text(head), justify="right" if table.is_number(head) else "left", no_wrap=not table.folds
+        )
+    grid.columns[0].no_wrap = not (table.folds or cut)
+    above = ""
+    for i, row in enumerate(table.rows):
+        cells = [Text(str(c), style=COLOURS.get(c.mark, "") if isinstance(c, Cell) else "") for c in row]
+        if cut:
+            cells[0].no_wrap, cells[0].overflow = True, "ellipsis"
+        first = str(row[0])
+        if grouped and first == above:
+            cells[0] = Text("")
+        elif grouped and above:
+            grid.add_section()
+        grid.add_row(*cells, style=COLOURS.get(table.marks[i], "") if table.marks else "")
+        above = first
+    is_wide = console.measure(grid, options=console.options.update(width=100_000)).maximum > console.width
+    if is_wide and table.folds and not cut:
+        width = max(map(len, table.heads[1:]))
+        for name, *texts in table.texts:
+            console.print(name, highlight=False, markup=False)
+            for head, text in zip(table.heads[1:], texts, strict=True):
+                console.print(f"  {head:<{width}}  {text}", highlight=False, markup=False)
+        return
+    if is_wide and not cut:
+        for column in grid.columns:
+            column.no_wrap, column.overflow = False, "fold"
+    console.print(grid, highlight=False)
+
+
+def print_report(report: Report, console: Console, complete: bool = False) -> None:
+    """Print the recommendation, a table to the middle level, and notes.
+
+    A short report has at most `MAX_LINES` lines, none wider than the terminal. `complete` prints every sentence, table
+    and warning.
     """
     from rich.text import Text
 
-    said: list[Text] = []
-    for i, told in enumerate(report.verdict.told):
-        if whole or i == 0 or told.asked:
-            said.append(Text(told.text, style="" if i else "bold"))
-            around = "  # the lines around it: --tables" if len(told.code) > 1 else ""
-            in_c = (f"# in C: {told.in_c}",) * bool(told.in_c)
-            code = (*told.code, *in_c) if whole else (told.line + around,) * bool(told.line)
-            said += [Text(f"    {line}") for line in code]
-    said += [Text(warning, style="yellow") for warning in (report.stopped, report.busy) if warning]
-    notes = [Text.assemble((text, style)) for text, style in _notes(report, MOST if whole else 1)]
-    for text in said:
+    lines: list[Text] = []
+    for i, statement in enumerate(report.verdict.statements):
+        if complete or i == 0 or statement.asked:
+            lines.append(Text(statement.text, style="" if i else "bold"))
+            hint = "  # the lines around it: --tables" if len(statement.code) > 1 else ""
+            in_c = (f"# in C: {statement.in_c}",) * bool(statement.in_c)
+            code = (*statement.code, *in_c) if complete else (statement.line + hint,) * bool(statement.line)
+            lines += [Text(f"    {line}") for line in code]
+    lines += [Text(warning, style="yellow") for warning in (report.stopped, report.busy) if warning]
+    notes = [
+        Text.assemble((text, style)) for text, style in _list_notes(report, MAX_NOTES if complete else 1)
+    ]
+    for text in lines:
         console.print(text, highlight=False)
-    if whole:
-        for section in sections(report):
+    if complete:
+        for section in list_sections(report):
             note = f" ({section.note})" if section.table.rows else f": {section.empty}"
             console.print(Text.assemble("\n", (section.title, "bold"), note))
             if section.table.rows:
                 print_table(console, section.table, grouped=section.grouped)
     else:
-        used = sum(len(text.wrap(console, console.width)) for text in said)
-        _print_short(short_table(report), console, LINES - ADDED - used - len(notes))
+        used = sum(len(text.wrap(console, console.width)) for text in lines)
+        print_first_rows(console, build_short_table(report), MAX_LINES - COMMAND_LINES - used - len(notes))
     for text in notes:
-        console.print(text, highlight=False, no_wrap=not whole, overflow="fold" if whole else "ellipsis")
+        console.print(
+            text, highlight=False, no_wrap=not complete, overflow="fold" if complete else "ellipsis"
+        )
 
 
-def _print_short(table: Table, console: Console, room: int) -> None:
-    """As many rows as there is room for, and how many more there are."""
+def print_first_rows(console: Console, table: Table, height: int) -> None:
+    """Print a blank line and as many rows as `height` lines hold, then the number of the others."""
     if not table.rows:
         return
-    rows = table.rows if len(table.rows) <= room - 2 else table.rows[: max(1, room - 3)]
+    rows = table.rows if len(table.rows) <= height - 2 else table.rows[: max(1, height - 3)]
     console.print()
     print_table(console, replace(table, rows=rows), cut=True)
     if len(rows) < len(table.rows):
         console.print(f"{len(table.rows) - len(rows)} more: --tables", highlight=False, style="dim")
 
 
-def _notes(report: Report, most: int) -> Iterator[tuple[str, str]]:
-    """What to know besides, each with a style; of each kind so many, and how many there are."""
+def _list_notes(report: Report, most: int) -> Iterator[tuple[str, str]]:
+    """Yield notes, each with a style: at most `most` of each kind, with the number of all of them."""
     records = report.records
-    wrong = [
-        f"{r.case}, {r.solver}: {r.status_conflict}" for r in tables.failures(records) if r.status_conflict
+    false_claims = [
+        f"{r.case}, {r.solver}: {r.status_conflict}"
+        for r in statistics.failures(records)
+        if r.status_conflict
     ]
     kinds = {
-        "false claim": ("red", wrong),
-        "suspicious": ("yellow", [f"{case}: {told}" for case, told in suspicions(records)]),
+        "false claim": ("red", false_claims),
+        "suspicious": ("yellow", [f"{case}: {reason}" for case, reason in list_suspicions(records)]),
         "same answer without an iteration": (
             "yellow",
-            [f"{d.case}: {', '.join(d.same)}" for d in tables.difficulties(records) if d.same],
+            [f"{d.case}: {', '.join(d.same)}" for d in statistics.difficulties(records) if d.same],
         ),
-        "left out": ("yellow", [f"{what}: {reason}" for what, reason in left_out(records)]),
+        "left out": ("yellow", [f"{what}: {reason}" for what, reason in list_left_out(records)]),
     }
     for kind, (style, texts) in kinds.items():
         for i, text in enumerate(texts[:most], 1):
             place = f" ({i} of {len(texts)})" if most > 1 else f", the first of {len(texts)}"
             yield f"{kind}{place if len(texts) > 1 else ''}: {text}", style
-    pairs = [s.reason.partition(":")[0] for s in records.skips if s.solver]
-    stand_ins = Counter(pair for pair in pairs if " → " in pair)
-    for pair, n in stand_ins.items():
-        yield (
-            f"{pair} on {count(n, 'case')} with bounds: the same method; the first takes free rows alone",
-            "",
-        )
-    refused = len(pairs) - stand_ins.total()
+    skipped = [s.reason.partition(":")[0] for s in records.skips if s.solver]
+    replacements = Counter(pair for pair in skipped if " → " in pair)
+    for pair, n in replacements.items():
+        cases = format_count(n, "case")
+        yield f"{pair} on {cases} with bounds: the same method; the first takes free rows alone", ""
+    refused = len(skipped) - replacements.total()
     if refused:
-        yield (
-            f"{count(refused, 'pair')} of case and solver not run, or not to the end: the page says why",
-            "dim",
+        pairs = format_count(refused, "pair")
+        yield f"{pairs} of case and solver not run, or not to the end: the page says why", "dim"
+    if report.earlier_run is not None:
+        changes = statistics.changes(report.earlier_run, records)
+        by_kind = Counter(c.kind for c in changes if c.kind != "same")
+        text = ", ".join(f"{n} {kind}" for kind, n in sorted(by_kind.items()))
+        text = text or ("nothing beyond noise" if changes else NOT_COMPARED)
+        yield f"Against {printable(report.earlier_run.source)}: {text}", ""
+    idle = list_idle_cases(report.newest)
+    if idle:
+        worst = max(idle, key=lambda case: case.velocity)
+        cases, speed = format_count(len(idle), "case"), format_residual(worst.velocity)
+        text = (
+            f"{cases} with nothing to do; at worst {speed} m/s, by {worst.solver or 'nobody'} on {worst.case}"
         )
-    if report.before is not None:
-        found = tables.changes(report.before, records)
-        kinds_of = Counter(c.kind for c in found if c.kind != "same")
-        told = ", ".join(f"{n} {kind}" for kind, n in sorted(kinds_of.items()))
-        told = told or ("nothing beyond noise" if found else NOT_COMPARED)
-        yield f"Against {printable(report.before.source)}: {told}", ""
-    still = idle(report.every)
-    if still:
-        worst = max(still, key=lambda case: case.velocity)
-        said = f"{count(len(still), 'case')} with nothing to do; at worst {residual(worst.velocity)} m/s, by "
-        yield said + f"{worst.solver or 'nobody'} on {worst.case}", "dim"
+        yield text, "dim"

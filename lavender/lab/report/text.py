@@ -1,4 +1,4 @@
-"""Numbers as people read them."""
+"""Format numbers and short texts of a report."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from collections.abc import Iterable
 from lavender.lab.bench.record import Skip
 from lavender.lab.bench.store import Records
 
-NONE = "–"  # where there is no number
+NONE = "–"  # shown in place of a missing number
 
 
-def residual(x: float) -> str:
-    """Two digits: 3.4e-7; inf and nan as words."""
+def format_residual(x: float) -> str:
+    """Return two digits: 3.4e-7; inf and nan as words."""
     if not math.isfinite(x):
         return str(x)
     if x == 0.0:
@@ -21,42 +21,45 @@ def residual(x: float) -> str:
     return f"{mantissa}e{int(exponent)}"
 
 
-def size(x: float) -> str:
-    """Two digits of what may be large: 24, 0.31, 3.4e-7."""
-    return f"{x:.2g}" if 0.05 <= x < 99.5 else residual(x)
+def format_size(x: float) -> str:
+    """Return two digits, without an exponent for usual sizes: 24, 0.31, 3.4e-7."""
+    return f"{x:.2g}" if 0.05 <= x < 99.5 else format_residual(x)
 
 
-def times(x: float) -> str:
-    """A ratio as a word: 1.3 times, 850 times; beyond a million its power of ten, where digits say nothing."""
+def format_ratio(x: float) -> str:
+    """Return a ratio in words: 1.3 times, 850 times; its power of ten from a million."""
     if not math.isfinite(x):
         return NONE
     return f"{x:.2g} times" if x < 99.5 else f"{x:.0f} times" if x < 1e6 else f"10^{math.log10(x):.0f} times"
 
 
-def count(n: int, what: str, plural: str = "") -> str:
-    """1 contact, 2 contacts."""
+def format_count(n: int, what: str, plural: str = "") -> str:
+    """Return a number with its noun: 1 contact, 2 contacts."""
     return f"{n} {what if n == 1 else plural or what + 's'}"
 
 
-def suspicions(records: Records) -> list[tuple[str, str]]:
-    """(case, what looks like a mistake in its data); of a sequence the first step, and how many more."""
+def list_suspicions(records: Records) -> list[tuple[str, str]]:
+    """Return (case, possible mistake in its data); a sequence has its first step and the number of further steps."""
     seen: dict[tuple[str, str], list[tuple[str, str]]] = {}
     for name, info in records.cases.items():
-        for told in info.suspicions:
-            kind = told.partition(":")[0]
-            seen.setdefault((info.sequence or name, kind), []).append((name, told))
+        for suspicion in info.suspicions:
+            kind = suspicion.partition(":")[0]
+            seen.setdefault((info.sequence or name, kind), []).append((name, suspicion))
     return [
-        (f"{some[0][0]} and {count(len(some) - 1, 'more step')}" if len(some) > 1 else some[0][0], some[0][1])
+        (
+            f"{some[0][0]} and {format_count(len(some) - 1, 'more step')}" if len(some) > 1 else some[0][0],
+            some[0][1],
+        )
         for some in seen.values()
     ]
 
 
 def _cause_of(skip: Skip) -> str:
-    """The reason of a skip without the name of its case, which others may share."""
+    """Return the reason of a skip without the name of its case, so that equal reasons can be grouped."""
     return skip.reason.removeprefix("did not load: ").removeprefix(f"{skip.case}: ")
 
 
-def reasons(skips: Iterable[Skip]) -> list[str]:
+def list_reasons(skips: Iterable[Skip]) -> list[str]:
     """Return each reason of some skips once, with the number of cases that it holds for if these are several."""
     same: dict[str, list[Skip]] = {}
     for skip in skips:
@@ -68,27 +71,31 @@ def reasons(skips: Iterable[Skip]) -> list[str]:
     ]
 
 
-def left_out(records: Records) -> list[tuple[str, str]]:
-    """(what did not load, why): cases, those of one reason together, and how many steps of each sequence."""
+def list_left_out(records: Records) -> list[tuple[str, str]]:
+    """Return (what did not load, why): cases grouped by reason, and the number of steps of each sequence."""
     same: dict[str, list[Skip]] = {}
     for skip in records.left_out.get("", ()):
         same.setdefault(_cause_of(skip), []).append(skip)
     single = [
         (some[0].case, some[0].reason)
         if len(some) == 1
-        else (f"{some[0].case} and {count(len(some) - 1, 'more case')}", cause)
+        else (f"{some[0].case} and {format_count(len(some) - 1, 'more case')}", cause)
         for cause, some in same.items()
     ]
-    steps = {f"{count(len(some), 'step')} of {name}": some for name, some in records.left_out.items() if name}
-    return [*single, *((told, some[0].reason) for told, some in steps.items())]
+    steps = {
+        f"{format_count(len(some), 'step')} of {name}": some
+        for name, some in records.left_out.items()
+        if name
+    }
+    return [*single, *((n_steps, some[0].reason) for n_steps, some in steps.items())]
 
 
-def without(lost: int) -> str:
-    """What stands beside a number that rests on what is left."""
+def format_left_out(lost: int) -> str:
+    """Return the number of cases that a number leaves out, in parentheses; empty for none."""
     return f" ({lost} left out)" if lost else ""
 
 
-def percent(part: int, whole: int, digits: int = 0) -> str:
+def format_percent(part: int, whole: int, digits: int = 0) -> str:
     """Return part of a whole, rounded down, with at least so many digits: 100 % is all of it, and 0 % is nothing."""
     while 0 < 100 * 10**digits * part < whole:
         digits += 1
@@ -96,11 +103,11 @@ def percent(part: int, whole: int, digits: int = 0) -> str:
     return f"{tenths / 10**digits:.{digits}f} %"
 
 
-def share(solved: int, cases: int) -> str:
-    """(7/8); nothing where all are solved."""
+def format_share(solved: int, cases: int) -> str:
+    """Return (7/8); empty if all are solved."""
     return "" if solved == cases else f" ({solved}/{cases})"
 
 
-def who(solver: str, start: str) -> str:
-    """A solver, and from where it started if not cold: newton (warm)."""
+def name_run(solver: str, start: str) -> str:
+    """Return a solver with its start unless it is cold: newton (warm)."""
     return solver if start == "cold" else f"{solver} ({start})"

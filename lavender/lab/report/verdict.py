@@ -1,4 +1,4 @@
-"""What a whole report comes to: one sentence and a line of Python to copy, then what is asked next."""
+"""Build the sentences of a report: a recommendation and a line of Python to copy, then answers to further questions."""
 
 from __future__ import annotations
 
@@ -9,224 +9,296 @@ from shlex import quote
 
 from lavender.base.deadline import seconds
 from lavender.io.stored import SUFFIXES
+from lavender.lab.bench import statistics
+from lavender.lab.bench.recommendation import (
+    SERVED_QUANTILE,
+    SHORT_TIME_RATIO,
+    Choice,
+    Subject,
+    list_subjects,
+)
 from lavender.lab.bench.record import Record, level_name
+from lavender.lab.bench.resampling import (
+    STARTS,
+    ResampledRanking,
+    TimedCall,
+    compute_serving_time,
+    rank_calls_in_time,
+    rank_calls_to_level,
+    select_calls,
+)
+from lavender.lab.bench.statistics import STRUCTURE_ORDER
 from lavender.lab.bench.store import Records
-from lavender.lab.report import tables
-from lavender.lab.report.choices import QUANTILE, Choice
-from lavender.lab.report.contenders import QUICKER, Subject, subjects
-from lavender.lab.report.engine import INSIDE, Contestant, engine_choice, is_ahead
-from lavender.lab.report.finals import STARTS, Final, Race, in_time, lines, serves_in
-from lavender.lab.report.finals import to_level as race_to_level
-from lavender.lab.report.moved import by_speed, speed_levels, speed_name
-from lavender.lab.report.tables import SHAPES
-from lavender.lab.report.text import count, residual, without
-from lavender.lab.report.text import times as times_of
+from lavender.lab.report.engine import INSIDE, EngineAnswers, rank_engine, ranks_before
+from lavender.lab.report.motion_tables import convert_to_motion_errors, format_speed, get_speed_levels
+from lavender.lab.report.text import format_count, format_left_out, format_ratio, format_residual
 from lavender.lab.suite import FAMILIES
 from lavender.solvers.registry import specs
 
 
 @dataclass(frozen=True)
-class Told:
-    """A sentence, and the lines that do what it says."""
+class Statement:
+    """A sentence, and the lines of code that it describes."""
 
     text: str
     code: tuple[str, ...] = ()  # Python, as it was timed
-    in_c: str = ""  # the command that exports it to C, or why there is none
-    asked: bool = False  # for a time or a number of sweeps that somebody asked for
+    in_c: str = ""  # the command that exports the call to C, or the reason that there is none
+    asked: bool = False  # the sentence is about a time or a number of sweeps that the user named
 
     @property
     def line(self) -> str:
-        """The call alone, without the loop around it; empty where there is none."""
+        """The call alone, without the loop around it; empty if there is none."""
         return next((line.strip() for line in self.code if "lv.solve" in line), "")
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What the whole comes to: the first thing to read, then what may be asked of it."""
+    """All sentences of a report, the recommendation first."""
 
-    told: tuple[Told, ...]
-    leaders: tuple[str, ...]  # solvers that the page draws in colour, the recommended one first
-    # Of the only subject, the lines that the first sentence was chosen from, with the times that it tells.
-    raced: tuple[tuple[Final, Choice], ...] = ()
+    statements: tuple[Statement, ...]
+    leaders: tuple[str, ...]  # solvers that the page shows in colour, the recommended one first
+    # Of a report with one subject: the calls among which the first sentence chooses, with the times that it states.
+    ranking: tuple[tuple[TimedCall, Choice], ...] = ()
 
     @property
     def text(self) -> str:
         """All sentences in one line."""
-        return " ".join(t.text for t in self.told)
+        return " ".join(statement.text for statement in self.statements)
 
 
-def _until(speed: float) -> str:
-    return f"until no body is wrong by more than {speed_name(speed)}"
-
-
-def verdict(
+def build_verdict(
     records: Records,
     times: Sequence[float] = (),
     sweeps: Sequence[int] = (),
-    engines: Sequence[Contestant] = (),
+    engines: Sequence[EngineAnswers] = (),
 ) -> Verdict:
-    """The recommendation for everything that was measured together: single cases, then sequences.
+    """Build the recommendation for all that was measured together: single cases, then sequences.
 
-    By motion error where the plan names speed levels; where motion errors were measured beside residuals, a sentence
-    says who is first by them. `times` [s] and `sweeps` that are asked for each get a sentence; those of the newest plan
-    if none are given. The first sentence also ranks the solver of the engine that recorded the cases, by its answers in
-    `engines`.
+    The recommendation is by motion error if the plan has speed levels. If motion errors were measured besides
+    residuals, a sentence names the first solver by them. Each of `times` [s] and `sweeps` gets a sentence; those of the
+    newest plan if none are given. The first sentence also ranks the solver of the engine that recorded the cases, by
+    its answers in `engines`.
     """
-    if tables.is_campaign(records) or not len(records):
+    if statistics.is_campaign(records) or not len(records):
         return Verdict((), ())
     plan = next((run.plan for run in reversed(list(records.runs.values()))), {})
-    speeds = speed_levels(records)
+    speeds = get_speed_levels(records)
     if speeds and plan.get("speed_levels"):
-        return _by_advice(by_speed(records))
+        return _recommend_by_speed(convert_to_motion_errors(records))
     times = tuple(times) or tuple(plan.get("times", ()))
     sweeps = tuple(sweeps) or tuple(plan.get("sweeps", ()))
-    parts = [_of(records, subject, times, sweeps, engines) for subject in subjects(records, times)]
-    told = [t for part in parts for t in part.told]
+    subjects = list_subjects(records, times)
+    parts = [_recommend(records, subject, times, sweeps, engines) for subject in subjects]
+    statements = [statement for part in parts for statement in part.statements]
     if speeds and parts:
-        best = subjects(by_speed(records))[0].best.best
+        best = list_subjects(convert_to_motion_errors(records))[0].best.best
         if best is not None:
-            reached = _until(speeds[len(speeds) // 2])
-            told.append(Told(f"By motion error {best.solver}: {seconds(best.score)} {reached}."))
+            reached = _describe_speed(speeds[len(speeds) // 2])
+            statements.append(Statement(f"By motion error {best.solver}: {seconds(best.score)} {reached}."))
     leaders = dict.fromkeys(name for part in parts for name in part.leaders)
-    return Verdict(tuple(told), tuple(leaders)[:3], parts[0].raced if len(parts) == 1 else ())
+    return Verdict(tuple(statements), tuple(leaders)[:3], parts[0].ranking if len(parts) == 1 else ())
 
 
-def _of(
+def _recommend(
     records: Records,
     subject: Subject,
     times: Sequence[float],
     sweeps: Sequence[int],
-    engines: Sequence[Contestant],
+    engines: Sequence[EngineAnswers],
 ) -> Verdict:
-    """The recommendation for one subject, by the lines that were timed in turns or, without any, by those measured."""
+    """Recommend a solver for one subject by the calls timed in turns, or by single runs if there are none."""
     level, n = subject.best.target, subject.best.ranking[0].cases if subject.best.ranking else 0
-    in_turns = lines(records, subject.way)
-    race = race_to_level(records, in_turns or lines(records, subject.way, rounds=False), level, n)
-    what, reached = _what(records, subject, n), f"down to {level_name(level)} of the error of doing nothing"
-    engine = engine_choice(engines, records, subject.cases, level)
-    if race is None or not race.ranking[0][1].solved:
+    in_turns, single = select_calls(records, subject.way), select_calls(records, subject.way, in_turns=False)
+    resampled = rank_calls_to_level(records, in_turns or single, level, n)
+    cases = _describe_subject(records, subject, n)
+    reached = f"down to {level_name(level)} of the error of doing nothing"
+    engine = rank_engine(engines, records, subject.cases, level)
+    if resampled is None or not resampled.ranking[0][1].solved:
         near = tuple(c.solver for c in subject.best.ranking[:3] if c.solved)
-        said = f"No solver brings {what} {reached}."
-        return Verdict((Told(_add_engine(records, said, None, engine, what)),), near)
-    final, first = race.ranking[0]
-    of = "them" if engine is not None and is_ahead(engine, first) else what
-    head = _head(records, first, f"{STARTS[final.line.start]}, {reached}", of)
-    told = [
-        _told(records, final, _add_engine(records, head, first, engine, what)),
-        *_sure(race),
+        text = f"No solver brings {cases} {reached}."
+        return Verdict((Statement(_add_engine(records, text, None, engine, cases)),), near)
+    call, first = resampled.ranking[0]
+    named_cases = "them" if engine is not None and ranks_before(engine, first) else cases
+    head = _state_choice(records, first, f"{STARTS[call.line.start]}, {reached}", named_cases)
+    statements = [
+        _add_code(records, call, _add_engine(records, head, first, engine, cases)),
+        *_state_certainty(resampled),
     ]
-    leaders = [c.solver for _, c in race.ranking[:3] if c.solved]
-    some = [
-        f for f in lines(records, "batch") if f.line.solver == first.solver and set(f.runs) <= set(final.runs)
+    leaders = [c.solver for _, c in resampled.ranking[:3] if c.solved]
+    batches = [
+        f
+        for f in select_calls(records, "batch")
+        if f.line.solver == first.solver and set(f.runs) <= set(call.runs)
     ]
-    for batch in some[:1] if len(final.runs) > 1 else ():
-        told.append(_told(records, batch, f"As a batch: {seconds(batch.time)} for each problem."))
-    plain = lines(records, subject.way, rounds=False)
-    for t in times or [a.target for a in subject.quick if a.target <= QUICKER * first.score][-1:]:
+    for batch in batches[:1] if len(call.runs) > 1 else ():
+        statements.append(_add_code(records, batch, f"As a batch: {seconds(batch.time)} for each problem."))
+    for t in times or [a.target for a in subject.quick if a.target <= SHORT_TIME_RATIO * first.score][-1:]:
         if first.worst <= t and first.solved == first.cases:
-            continue  # there is time for the whole
-        races = (in_time(records, some, t, n) for some in (in_turns, plain))
-        quick = next((r for r in races if r is not None and r.ranking[0][1].is_for(QUANTILE)), None)
+            continue  # the recommended call ends in this time
+        rankings = (rank_calls_in_time(records, calls, t, n) for calls in (in_turns, single))
+        quick = next((r for r in rankings if r is not None and r.ranking[0][1].is_for(SERVED_QUANTILE)), None)
         if quick is None:
-            told.append(Told(_nothing(plain, t), asked=bool(times)))
+            statements.append(Statement(_state_serving_time(single, t), asked=bool(times)))
             continue
         best, choice = quick.ranking[0]
-        told.append(_told(records, best, _serves(f"If you have only {seconds(t)}", choice, t), bool(times)))
+        text = _state_service(f"If you have only {seconds(t)}", choice, t)
+        statements.append(_add_code(records, best, text, bool(times)))
         leaders.insert(1, choice.solver)
     for budget in sweeps:
-        same = [f for f in plain if f.line.mode == "budget" and f.line.max_iter == budget]
-        swept = in_time(records, same, math.inf, n)
-        if swept is not None and swept.ranking[0][1].is_for(QUANTILE):
+        calls = [f for f in single if f.line.mode == "budget" and f.line.max_iter == budget]
+        swept = rank_calls_in_time(records, calls, math.inf, n)
+        asked = f"With {format_count(budget, 'sweep')}"
+        if swept is not None and swept.ranking[0][1].is_for(SERVED_QUANTILE):
             best, choice = swept.ranking[0]
-            said = _serves(f"With {count(budget, 'sweep')}", choice, math.inf)
-            told.append(_told(records, best, said, True))
+            statements.append(_add_code(records, best, _state_service(asked, choice, math.inf), True))
         elif swept is not None:
-            told.append(Told(f"With {count(budget, 'sweep')} nothing serves nine cases of ten.", asked=True))
-    foreign = [f"{b.solver} on {b.wins} of {b.solved} cases" for b in tables.backends(records) if b.wins]
-    if foreign and subject.way == "call":
-        said = f"By their own interface, on data given before, some are faster than all of ours: {', '.join(foreign)}."
-        told.append(Told(said))
-    return Verdict(tuple(told), tuple(dict.fromkeys(leaders))[:3], race.ranking)
+            statements.append(Statement(f"{asked} nothing serves nine cases of ten.", asked=True))
+    faster = [f"{b.solver} on {b.wins} of {b.solved} cases" for b in statistics.backends(records) if b.wins]
+    if faster and subject.way == "call":
+        head = "By their own interface, on data given before, some are faster than all of ours"
+        statements.append(Statement(f"{head}: {', '.join(faster)}."))
+    return Verdict(tuple(statements), tuple(dict.fromkeys(leaders))[:3], resampled.ranking)
 
 
-def _what(records: Records, subject: Subject, n: int) -> str:
+def _recommend_by_speed(records: Records) -> Verdict:
+    """Recommend a solver by motion error. Calls are not timed in turns for it."""
+    subject = list_subjects(records)[0]
+    best, n = subject.best, subject.best.ranking[0].cases if subject.best.ranking else 0
+    cases, reached = _describe_subject(records, subject, n), _describe_speed(subject.best.target)
+    leaders = tuple(c.solver for c in best.ranking[:3] if c.solved)
+    first = best.best
+    if first is None:
+        return Verdict((Statement(f"No solver brings {cases} so far {reached}."),), leaders)
+    ties = (Statement(f"As good within noise: {', '.join(best.ties)}."),) if best.ties else ()
+    tol = _find_tolerance(records, first.solver, best.target)
+    arguments = f"tol={level_name(tol)}" if math.isfinite(tol) else f"tol=0, max_iter={first.iterations}"
+    code = f'lv.solve(problem, "{first.solver}", {arguments})'
+    start = STARTS["carried" if "carried" in first.how else "cold"]
+    text = _state_choice(records, first, f"{start}, {reached}", cases)
+    return Verdict((Statement(text, (code,)), *ties), leaders)
+
+
+def _find_tolerance(records: Records, solver: str, level: float) -> float:
+    """Return the smallest tolerance of the fastest runs to this speed, over the cases; nan if they had none."""
+    fastest: dict[str, Record] = {}
+    for r in records:
+        if r.solver != solver or r.mode != "tol" or r.relative > level:
+            continue
+        if r.case not in fastest or r.time_min < fastest[r.case].time_min:
+            fastest[r.case] = r
+    tightest = min((r.tol for r in fastest.values()), default=math.nan)
+    if not tightest > 0.0:
+        return math.nan
+    power = math.floor(math.log10(tightest))
+    return float(f"{math.floor(tightest / 10.0**power + 1e-9)}e{power}")  # rounded down, so that it is enough
+
+
+# -- sentences -----------------------------------------------------------------------------------------------
+
+
+def _describe_speed(speed: float) -> str:
+    return f"until no body is wrong by more than {format_speed(speed)}"
+
+
+def _describe_subject(records: Records, subject: Subject, n: int) -> str:
+    """Return words for the cases of a subject, with the number of those that did not load."""
     names, lost = subject.names, records.left_out
     if subject.way == "call":
-        return _name(records, names) + without(len(lost.get("", ())))
-    of = names[0] if len(names) == 1 else f"your {count(len(names), 'sequence')}"
-    return f"the {count(n, 'step')} of {of}" + without(sum(len(lost.get(name, ())) for name in names))
+        return _describe_cases(records, names) + format_left_out(len(lost.get("", ())))
+    of = names[0] if len(names) == 1 else f"your {format_count(len(names), 'sequence')}"
+    n_lost = sum(len(lost.get(name, ())) for name in names)
+    return f"the {format_count(n, 'step')} of {of}" + format_left_out(n_lost)
 
 
-def _head(records: Records, first: Choice, reached: str, what: str) -> str:
-    missed = first.solved < first.cases
+def _describe_cases(records: Records, cases: Sequence[str]) -> str:
+    """Return words for single cases: built-in problems, or the structure that all of them have."""
+    words = [set(records.cases[c].structure) for c in cases]
+    shape = next((s for s in STRUCTURE_ORDER if all(s in w for w in words)), "")
+    if all(c.partition("(")[0] in FAMILIES and not records.cases[c].source.endswith(SUFFIXES) for c in cases):
+        return f"the {format_count(len(cases), 'built-in problem')}" if len(cases) > 1 else cases[0]
+    if shape in ("", "separate", "dense"):
+        return f"your {format_count(len(cases), 'problem')}" if len(cases) > 1 else "your problem"
+    plural = {"mesh": "meshes"}.get(shape, shape + "s")
+    return f"your {format_count(len(cases), shape, plural)}" if len(cases) > 1 else f"your {shape}"
+
+
+def _state_choice(records: Records, first: Choice, reached: str, cases: str) -> str:
+    """Return the first sentence: the solver, its mean time, what a miss counts, and the slowest case."""
+    has_misses = first.solved < first.cases
     idle = first.cases - len({r.case for r in records if r.solver == first.solver})  # records of several runs
-    said = f"Use {first.solver}: it solves {f'{first.solved} of ' if missed else ''}{what} in {seconds(first.score)}"
+    solved = f"{first.solved} of " if has_misses else ""
+    text = f"Use {first.solver}: it solves {solved}{cases} in {seconds(first.score)}"
     if first.cases > 1:
-        said += " on average"
-    if missed:
-        never = f"; on {idle} it has no run" if idle > 0 else ""
-        said += f" (a miss counted as {seconds(tables.limit_of(records))}{never})"
+        text += " on average"
+    if has_misses:
+        no_run = f"; on {idle} it has no run" if idle > 0 else ""
+        text += f" (a miss counted as {seconds(statistics.limit_of(records))}{no_run})"
     elif math.isfinite(first.worst) and first.worst > 3.0 * first.score:
-        said += f" ({seconds(first.worst)} at worst, {first.hardest})"
-    return f"{said}, {reached}."
+        text += f" ({seconds(first.worst)} at worst, {first.hardest})"
+    return f"{text}, {reached}."
 
 
-def _add_engine(records: Records, head: str, first: Choice | None, engine: Choice | None, what: str) -> str:
+def _add_engine(records: Records, head: str, first: Choice | None, engine: Choice | None, cases: str) -> str:
     """Add the engine's own solver to the first sentence: before it if it ranks first, else after it."""
     if engine is None:
         return head
-    missed = engine.solved < engine.cases
+    has_misses = engine.solved < engine.cases
     time = seconds(engine.score) + (" on average" if engine.cases > 1 else "")
-    if missed:
-        time += f" (a miss counted as {seconds(tables.limit_of(records))})"
-    if engine.solved and (first is None or is_ahead(engine, first)):
-        of = f"{engine.solved} of " if missed else ""
+    if has_misses:
+        time += f" (a miss counted as {seconds(statistics.limit_of(records))})"
+    if engine.solved and (first is None or ranks_before(engine, first)):
+        of = f"{engine.solved} of " if has_misses else ""
         here = head if first is None else f"Of the solvers here, u{head[1:]}"
-        return f"First is the engine's own {engine.solver}: it solves {of}{what} in {time}, {INSIDE}. {here}"
+        return f"First is the engine's own {engine.solver}: it solves {of}{cases} in {time}, {INSIDE}. {here}"
     if not engine.solved:
         return f"{head} The engine's own {engine.solver} solves none of them to that level."
-    of = f"solves {engine.solved} of them in" if missed else "takes"
+    of = f"solves {engine.solved} of them in" if has_misses else "takes"
     return f"{head} The engine's own {engine.solver} {of} {time}, {INSIDE}."
 
 
-def _sure(race: Race) -> list[Told]:
-    """How often the choice is among the fastest, and who else is, with the time of each."""
-    if len(race.ranking) < 2:
+def _state_certainty(resampled: ResampledRanking) -> list[Statement]:
+    """State how often each named solver is among the fastest, with its time; nothing if there is one call alone."""
+    if len(resampled.ranking) < 2:
         return []
     shares = [
         f"{c.solver} ({seconds(c.score)}) in {int(100.0 * share + 1e-9)} %"  # rounded down: 100 is all
-        for (_, c), share in zip(race.ranking, race.shares, strict=True)
-        if c.solver in race.named
+        for (_, c), share in zip(resampled.ranking, resampled.shares, strict=True)
+        if c.solver in resampled.named
     ]
-    said = f"Among the fastest, within noise, in resamplings of cases and repetitions: {', '.join(shares)}."
-    if race.loss > 1.0:
-        said += f" Where {race.named[0]} is not, it takes {times_of(race.loss)} the fastest's time."
-    return [Told(said)]
+    text = f"Among the fastest, within noise, in resamplings of cases and repetitions: {', '.join(shares)}."
+    if resampled.loss > 1.0:
+        loss = format_ratio(resampled.loss)
+        text += f" Where {resampled.named[0]} is not, it takes {loss} the fastest's time."
+    return [Statement(text)]
 
 
-def _nothing(some: Sequence[Final], limit: float) -> str:
-    """That nobody serves enough of the cases in a time, and in what time somebody does."""
-    least = min(map(serves_in, some), default=math.inf)
-    said = f"Nothing serves in {seconds(limit)}"
+def _state_serving_time(calls: Sequence[TimedCall], limit: float) -> str:
+    """State that no call serves enough cases in a time, and the time in which one does."""
+    least = min(map(compute_serving_time, calls), default=math.inf)
+    text = f"Nothing serves in {seconds(limit)}"
     if math.isfinite(least):
-        said += f": to leave at most half of the start's residual on nine cases of ten takes {seconds(least)}"
-    return f"{said}."
+        text += f": to leave at most half of the start's residual on nine cases of ten takes {seconds(least)}"
+    return f"{text}."
 
 
-def _serves(asked: str, choice: Choice, limit: float) -> str:
+def _state_service(asked: str, choice: Choice, limit: float) -> str:
+    """State the solver to take within a budget, and what it leaves of the residual."""
     how = f", {choice.how}" if choice.how and math.isfinite(limit) else ""
-    said = (
+    text = (
         f"{asked}, take {choice.solver}{how}: it serves {choice.solved} of {choice.cases} (at most half of the start's "
-        f"residual), at the 90th percentile {residual(choice.score)}"
+        f"residual), at the 90th percentile {format_residual(choice.score)}"
     )
     if math.isfinite(limit) and choice.overrun > 1.0:
-        said += f", and takes up to {times_of(choice.overrun)} that time on the others"
-    return f"{said}."
+        text += f", and takes up to {format_ratio(choice.overrun)} that time on the others"
+    return f"{text}."
 
 
-def _not_in_c(records: Records, final: Final) -> str:
-    """Why the C library does not take what a line was measured on; empty where it does."""
-    for case, record in final.runs.items():
+# -- code ----------------------------------------------------------------------------------------------------
+
+
+def _explain_missing_c(records: Records, call: TimedCall) -> str:
+    """Return why the C library cannot run a call on its cases; empty if it can."""
+    for case, record in call.runs.items():
         info = records.cases[case]
         if "ellipses" in info.structure:
             return "the library has no ellipses: give it problem.disk"
@@ -237,56 +309,14 @@ def _not_in_c(records: Records, final: Final) -> str:
     return ""
 
 
-def _told(records: Records, final: Final, said: str, asked: bool = False) -> Told:
-    """A sentence with its lines, of Python and, as the command that exports them, of C."""
-    if not final.line.times:
-        said += " Records of an earlier version: the line itself was not timed."
-    line, reason, in_c = final.line, _not_in_c(records, final), ""
+def _add_code(records: Records, call: TimedCall, text: str, asked: bool = False) -> Statement:
+    """Return a sentence with the lines of its call in Python, and with the command that exports it to C."""
+    if not call.line.times:
+        text += " Records of an earlier version: the line itself was not timed."
+    line, reason, in_c = call.line, _explain_missing_c(records, call), ""
     spec = specs().get(line.solver)
     if spec is not None and spec.own and not spec.external and line.mode == "tol" and line.way != "batch":
-        made = f"lavender export c liblavender --solver {line.solver} --for {quote(records.source or 'records.jsonl')}"
-        in_c = f"not in C: {reason}" if reason else made
-    return Told(said, final.code, in_c, asked)
-
-
-def _by_advice(records: Records) -> Verdict:
-    """By motion error: lines are not timed for it."""
-    subject = subjects(records)[0]
-    best, n = subject.best, subject.best.ranking[0].cases if subject.best.ranking else 0
-    what, reached = _what(records, subject, n), _until(subject.best.target)
-    leaders = tuple(c.solver for c in best.ranking[:3] if c.solved)
-    first = best.best
-    if first is None:
-        return Verdict((Told(f"No solver brings {what} so far {reached}."),), leaders)
-    ties = (Told(f"As good within noise: {', '.join(best.ties)}."),) if best.ties else ()
-    tol = _tolerance(records, first.solver, best.target)
-    asked = f"tol={level_name(tol)}" if math.isfinite(tol) else f"tol=0, max_iter={first.iterations}"
-    code = f'lv.solve(problem, "{first.solver}", {asked})'
-    start = STARTS["carried" if "carried" in first.how else "cold"]
-    return Verdict((Told(_head(records, first, f"{start}, {reached}", what), (code,)), *ties), leaders)
-
-
-def _tolerance(records: Records, solver: str, level: float) -> float:
-    """The residual to ask for: the tightest that the quickest runs to this speed were asked for, over the cases."""
-    quickest: dict[str, Record] = {}
-    for r in records:
-        if r.solver != solver or r.mode != "tol" or r.relative > level:
-            continue
-        if r.case not in quickest or r.time_min < quickest[r.case].time_min:
-            quickest[r.case] = r
-    tightest = min((r.tol for r in quickest.values()), default=math.nan)
-    if not tightest > 0.0:
-        return math.nan
-    power = math.floor(math.log10(tightest))
-    return float(f"{math.floor(tightest / 10.0**power + 1e-9)}e{power}")  # rounded down: it still gets there
-
-
-def _name(records: Records, cases: Sequence[str]) -> str:
-    words = [set(records.cases[c].structure) for c in cases]
-    shape = next((s for s in SHAPES if all(s in w for w in words)), "")
-    if all(c.partition("(")[0] in FAMILIES and not records.cases[c].source.endswith(SUFFIXES) for c in cases):
-        return f"the {count(len(cases), 'built-in problem')}" if len(cases) > 1 else cases[0]
-    if shape in ("", "separate", "dense"):
-        return f"your {count(len(cases), 'problem')}" if len(cases) > 1 else "your problem"
-    plural = {"mesh": "meshes"}.get(shape, shape + "s")
-    return f"your {count(len(cases), shape, plural)}" if len(cases) > 1 else f"your {shape}"
+        source = quote(records.source or "records.jsonl")
+        command = f"lavender export c liblavender --solver {line.solver} --for {source}"
+        in_c = f"not in C: {reason}" if reason else command
+    return Statement(text, call.code, in_c, asked)

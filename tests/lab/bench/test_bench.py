@@ -23,7 +23,7 @@ from lavender.lab.bench.record import Record, from_json, to_json
 from lavender.lab.bench.running import timing
 from lavender.lab.bench.timed_call import format_call
 from lavender.lab.report.findings import Report
-from lavender.lab.report.paper import write_paper
+from lavender.lab.report.latex_export import write_paper
 from lavender.lab.report.terminal import print_report
 from lavender.lab.report.write import write
 
@@ -81,7 +81,7 @@ def test_one_case_and_one_solver_need_no_list():
     assert [item.name for item in bench.resolve(case)] == ["stack(n=3)"]
     with pytest.raises(lv.InputError, match=r"give its \.problem"):
         lv.solve(case)
-    with pytest.raises(lv.InputError, match="found is a list; Records"):
+    with pytest.raises(lv.InputError, match="source is a list; Records"):
         lv.report.write(list(one), "nowhere")
 
 

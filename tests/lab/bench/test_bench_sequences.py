@@ -6,8 +6,9 @@ from stacks import moving_stack, stack
 
 import lavender as lv
 from lavender import bench
+from lavender.lab.bench import statistics
 from lavender.lab.bench.running import runner
-from lavender.lab.report import contents, tables
+from lavender.lab.report import table_specs
 
 
 def test_a_sequence_carries_each_solvers_own_impulses():
@@ -36,11 +37,13 @@ def test_a_pass_that_takes_too_long_ends_and_says_so(tmp_path, monkeypatch):
     assert [(r.step, r.start) for r in records] == [(0, "cold"), (0, "carried")]
     assert [s.case for s in records.skips] == ["load, 6 iterations, cold", "load, 6 iterations, carried"]
     assert all("after 1 of 5 steps" in s.reason for s in records.skips)
-    (row,) = contents.pass_table(tables.passes(records)).texts  # beside solvers that took all five
+    (row,) = table_specs.tabulate_passes(
+        statistics.passes(records)
+    ).texts  # beside solvers that took all five
     assert [cell.endswith(" (1/5)") for cell in row].count(True) == 2
     monkeypatch.setattr(runner, "measure", None)  # nothing is solved again
     assert bench.run(items, ["pgs"], plan, path).records == records.records
-    (line,) = lv.report.advice(records, [1.0])
+    (line,) = lv.report.recommend_solvers(records, [1.0])
     assert line.by_time[1.0].best is None  # one of five
     assert line.by_time[1.0].ranking[0].solved == 1
     assert line.by_time[1.0].ranking[0].score > max(
@@ -108,7 +111,7 @@ def test_steps_of_two_sequences_are_never_one(tmp_path):
     path, plan = tmp_path / "records.jsonl", bench.Plan(levels=(), budgets=(6,), repeats=1)
     bench.run(bench.sequence(moving_stack(5), "load"), ["pgs"], plan, path)
     bench.run(bench.sequence(moving_stack(2, n=11), "load"), ["pgs"], plan, path)
-    (one,) = lv.report.tables.passes(bench.read(path).latest())
+    (one,) = bench.statistics.passes(bench.read(path).latest())
     assert (one.steps, len(one.times["cold"])) == (2, 2)
 
 
@@ -124,7 +127,7 @@ def test_a_level_of_a_sequence_is_solved_to_that_level():
     plan = bench.Plan(levels=(1e-3, 1e-6, 1e-9), budgets=(), repeats=1)
     records = bench.run(bench.sequence(moving_stack(3), "load"), ["pgs", "direct"], plan)
     assert {r.tol for r in records if r.solver == "pgs"} == set(plan.levels)
-    (line,) = lv.report.advice(records)
+    (line,) = lv.report.recommend_solvers(records)
     for advice in line.by_level.values():
         assert all(
             float(c.how.removeprefix("to ").partition(",")[0]) <= advice.target for c in advice.ranking

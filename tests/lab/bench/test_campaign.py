@@ -14,9 +14,9 @@ import pytest
 
 import lavender as lv
 from lavender import bench, report, suite
+from lavender.lab.bench import statistics
 from lavender.lab.bench.record import to_json
 from lavender.lab.bench.running import workers as workers_module
-from lavender.lab.report import tables
 from lavender.lab.report.findings import Report
 
 NAMES = bench.expand_seeds(["random_spd(n=12, condition=100)", "granular(n=2)", "toy_stack"], 4)
@@ -150,7 +150,7 @@ def test_ray_gives_the_same_bits():
 
 def test_the_report_of_a_campaign_shows_shares_and_no_times(tmp_path):
     records = bench.run(NAMES, ["pgs", "direct"], PLAN)
-    rows = {(r.family, r.solver): r for r in tables.robustness(records)}
+    rows = {(r.family, r.solver): r for r in statistics.robustness(records)}
     dense = rows["dense", "direct"]
     assert (dense.cases, dense.reached[1e-6], dense.wrong, dense.died) == (4, 4, 0, 0)
     budget = [

@@ -11,9 +11,9 @@ from lavender.lab.bench import resolve
 from lavender.lab.bench.cases import describe
 from lavender.lab.bench.record import from_json, to_json
 from lavender.lab.bench.store import Records
-from lavender.lab.report.contents import engine_table
-from lavender.lab.report.engine import contestants
+from lavender.lab.report.engine import read_engine_answers
 from lavender.lab.report.findings import Report
+from lavender.lab.report.table_specs import tabulate_engines
 
 
 def test_a_report_shows_the_verdict_of_a_stored_answer_in_float32(tmp_path):
@@ -44,9 +44,9 @@ def test_a_recording_of_a_float32_engine_counts_its_early_answers(tmp_path):
     early = sum(line["verdict"] != "at its floor" for line in lines)
     assert all(line["precision"] == "float32" and line["floor"] > 1e-9 for line in lines)
     assert early > 0  # at its tolerance, far above the floor
-    (engine,) = contestants([str(tmp_path)], Records())
+    (engine,) = read_engine_answers([str(tmp_path)], Records())
     assert engine.unconverged == early
-    (row,) = engine_table(Report(Records(), engines=[engine])).texts
+    (row,) = tabulate_engines(Report(Records(), engines=[engine])).texts
     assert str(early) in row
     with pytest.raises(lv.InputError, match="precision is 'half'"):
         lv.io.record(model, mujoco.MjData(model), tmp_path / "other", 1, precision="half")
@@ -57,5 +57,5 @@ def test_verdicts_of_earlier_recordings_are_read(tmp_path):
     verdicts = ("stopped early", "stopped before convergence", "wrong", "close enough", "at its floor")
     lines = [json.dumps(line | {"verdict": verdict}) for verdict in verdicts]
     (tmp_path / "engine.jsonl").write_text("\n".join(lines))
-    (engine,) = contestants([str(tmp_path)], Records())
+    (engine,) = read_engine_answers([str(tmp_path)], Records())
     assert (engine.unconverged, engine.above_floor) == (3, 4)

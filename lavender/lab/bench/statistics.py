@@ -1,4 +1,4 @@
-"""Records -> plain tables (lists of small frozen rows), of each case and over many. Nothing is solved or drawn here.
+"""Compute statistics of records, of each case and over many cases, as lists of small frozen rows.
 
 Time to a level: the smallest time of any run whose judged residual is at or below it, whatever was asked
 for: runs are matched by the accuracy they reached, never by the one they were asked for.
@@ -17,18 +17,20 @@ from lavender.judge.solution import CLAIM_CHECKS, CONFIRMED
 from lavender.lab.bench.record import Record, asked_of
 from lavender.lab.bench.store import Records
 
-SHAPES = ("separate", "chain", "mesh", "stack", "pile", "dense")
-DIED = ("ERROR", "KILLED", "CRASHED")
-EASY = 1e-3  # relative residual to which sweeps are counted
-#: Factors within which two scores are the same: what a busy machine does to the minimum of a few repeats, and what
-#: one run more or less within a time does to a mean residual.
-NOISE, RESIDUAL_NOISE = 1.25, 2.0
-#: s, of the geometric means, whoever takes part: what is quicker than that differs by Python's share of a call.
-SHIFT = 1e-5
+STRUCTURE_ORDER = ("separate", "chain", "mesh", "stack", "pile", "dense")  # as tables list structures
+DEATH_STATUSES = ("ERROR", "KILLED", "CRASHED")
+EASY_RESIDUAL = 1e-3  # Relative residual to which sweeps are counted as a measure of difficulty.
+TIME_NOISE_FACTOR = (
+    1.25  # Times within this factor are equal: a busy machine changes the minimum of repeats by it.
+)
+RESIDUAL_NOISE_FACTOR = (
+    2.0  # Residuals within this factor are equal: one run more or less in a time changes as much.
+)
+MEAN_TIME_SHIFT = 1e-5  # s, added to times in geometric means: below it, Python's share of a call decides.
 
 
 def levels_of(records: Records) -> tuple[float, ...]:
-    """Levels of the newest run's plan, loosest first; else the tolerances that were asked for."""
+    """Return the levels of the newest run's plan, loosest first; without a plan the tolerances of the runs."""
     for run in reversed(list(records.runs.values())):
         if run.plan.get("levels"):
             return tuple(sorted(map(float, run.plan["levels"]), reverse=True))
@@ -36,7 +38,7 @@ def levels_of(records: Records) -> tuple[float, ...]:
 
 
 def pairs(records: Iterable[Record]) -> dict[tuple[str, str, str], list[Record]]:
-    """Runs in the given order of blocks, by (case, solver, start)."""
+    """Group runs in the given order of blocks by (case, solver, start)."""
     groups: dict[tuple[str, str, str], list[Record]] = defaultdict(list)
     for r in records:
         if r.order == "given" and r.step < 0 and not r.turns:
@@ -45,29 +47,38 @@ def pairs(records: Iterable[Record]) -> dict[tuple[str, str, str], list[Record]]
 
 
 def families(records: Records) -> dict[str, list[str]]:
-    """Structure -> cases, biggest first. A case is in every family whose word describes it.
+    """Group cases by structure. A case is in every family whose word describes it.
 
     A structure whose cases have several laws is a family for each law: "pile, coulomb". Words that describe the same
     cases are one family: "stack / friction".
     """
-    found: dict[str, dict[str, list[str]]] = defaultdict(lambda: defaultdict(list))
+    cases_by_word: dict[str, dict[str, list[str]]] = defaultdict(lambda: defaultdict(list))
     ran = {r.case for r in records if r.step < 0}
     for name, info in records.cases.items():
         if name in ran:
             for word in info.structure:
-                found[word][info.law].append(name)
-    order = (*SHAPES, "redundant", "friction", "large mass ratio", "asymmetric")
+                cases_by_word[word][info.law].append(name)
+    order = (*STRUCTURE_ORDER, "redundant", "friction", "large mass ratio", "asymmetric")
     names: dict[tuple[str, ...], list[str]] = {}
-    for word in sorted(found, key=lambda w: (order.index(w) if w in order else len(order), w)):
-        laws = found[word]
+    for word in sorted(cases_by_word, key=lambda w: (order.index(w) if w in order else len(order), w)):
+        laws = cases_by_word[word]
         for law in sorted(laws, key=lambda x: (-len(laws[x]), x)):
             names.setdefault(tuple(laws[law]), []).append(word if len(laws) == 1 else f"{word}, {law}")
     return {" / ".join(words): list(cases) for cases, words in names.items()}
 
 
 def is_campaign(records: Records) -> bool:
-    """Times were left out on purpose."""
+    """Return whether the runs are of a campaign, which has no times."""
     return any(run.plan.get("campaign") for run in records.runs.values())
+
+
+def drop_idle_cases(records: Records) -> Records:
+    """Return the records without cases whose solution is the zero impulse: no ranking counts them."""
+    idle = {name for name, info in records.cases.items() if info.nothing_to_do}
+    if not idle:
+        return records
+    remaining = (r for r in records if r.case not in idle)
+    return records.having(remaining, lambda entry: getattr(entry, "case", None) not in idle)
 
 
 # -- single cases ------------------------------------------------------------------------------------------
@@ -75,7 +86,7 @@ def is_campaign(records: Records) -> bool:
 
 @dataclass(frozen=True)
 class Reach:
-    """How far and how fast one solver came on one case."""
+    """Times and smallest residual of one solver on one case."""
 
     case: str
     solver: str
@@ -98,11 +109,11 @@ class Reach:
 
 @dataclass(frozen=True)
 class Difficulty:
-    """What makes a case hard, and who did not solve it by a way of its own."""
+    """Measures of the difficulty of a case, and the solvers that took the same shortcut."""
 
     case: str
     rows: int
-    sweeps: int | None  # of `pgs` to EASY; None where it did not get there, or was not asked
+    sweeps: int | None  # of `pgs` to EASY_RESIDUAL; None where it did not get there, or was not asked
     condition: float | None  # of A, as `CaseInfo.condition`
     degenerate: (
         float | None
@@ -113,7 +124,7 @@ class Difficulty:
 
 @dataclass(frozen=True)
 class Claims:
-    """What a solver said of itself, against the judge."""
+    """Claims of a solver, compared with the judge."""
 
     solver: str
     runs: int
@@ -142,7 +153,7 @@ class Spread:
 
 
 def reaches(records: Records, levels: Sequence[float] | None = None) -> list[Reach]:
-    """One row for each case, solver and start, in the order of the records."""
+    """Return one row for each case, solver and start, in the order of the records."""
     levels = levels_of(records) if levels is None else tuple(levels)
     out = []
     for (case, solver, start), group in pairs(records).items():
@@ -173,32 +184,36 @@ def reaches(records: Records, levels: Sequence[float] | None = None) -> list[Rea
 
 
 def _is_again(r: Record) -> bool:
-    """A run that was made before, again in turns with others; only those to a limit of time are run in turns alone."""
+    """Return whether a run repeats an earlier one in turns; runs with a time limit exist only in turns."""
     return bool(r.turns) and r.mode != "time"
 
 
 def failures(records: Records) -> list[Record]:
-    """Runs to a level that the judge does not confirm (nor the floor excuses), crashes, and false claims."""
+    """Return runs that missed their level above the round-off floor, crashes, and false claims."""
     out = []
     for r in records:
         if _is_again(r):
             continue
         missed = r.mode == "tol" and not r.success and not at_floor(r.relative, r.floor)
         proven = r.status == "INFEASIBLE" and r.claim_check == CONFIRMED
-        lost = not math.isfinite(r.relative) or r.status.startswith(DIED)
+        lost = not math.isfinite(r.relative) or r.status.startswith(DEATH_STATUSES)
         if (missed and not proven) or lost or r.status_conflict:
             out.append(r)
     return out
 
 
 def difficulties(records: Records) -> list[Difficulty]:
-    """Each case of the records, from doing nothing: what a guess or the step before spares is not the case's."""
+    """Return the difficulty of each case, from runs with a cold start."""
     out = []
     for name, info in records.cases.items():
-        mine = [r for r in records if r.case == name and r.start == "cold"]
-        swept = [r.iterations for r in mine if r.solver == "pgs" and r.mode == "tol" and r.relative <= EASY]
-        known = [r for r in mine if r.degenerate is not None]
-        idle = [r for r in mine if r.bits and r.iterations == 0 and r.claims]
+        runs = [r for r in records if r.case == name and r.start == "cold"]
+        swept = [
+            r.iterations
+            for r in runs
+            if r.solver == "pgs" and r.mode == "tol" and r.relative <= EASY_RESIDUAL
+        ]
+        judged = [r for r in runs if r.degenerate is not None]
+        idle = [r for r in runs if r.bits and r.iterations == 0 and r.claims]
         groups = defaultdict(set)
         for r in idle:
             groups[r.bits].add(r.solver)
@@ -209,7 +224,7 @@ def difficulties(records: Records) -> list[Difficulty]:
                 rows=info.rows,
                 sweeps=min(swept, default=None),
                 condition=info.condition,
-                degenerate=min(known, key=lambda r: r.relative).degenerate if known else None,
+                degenerate=min(judged, key=lambda r: r.relative).degenerate if judged else None,
                 proof=info.proof,
                 same=tuple(sorted(same)) if len(same) > 1 and not info.nothing_to_do else (),
             )
@@ -218,27 +233,27 @@ def difficulties(records: Records) -> list[Difficulty]:
 
 
 def claims(records: Records) -> list[Claims]:
-    """By solver: how often its claim holds."""
+    """Count the correct and wrong claims of each solver."""
     out = []
     for solver in sorted({r.solver for r in records}):
-        mine = [r for r in records if r.solver == solver and not _is_again(r)]
-        asked = [r for r in mine if r.mode == "tol"]
+        runs = [r for r in records if r.solver == solver and not _is_again(r)]
+        to_level = [r for r in runs if r.mode == "tol"]
         out.append(
             Claims(
                 solver=solver,
-                runs=len(mine),
-                claims=sum(r.claims for r in mine),
-                wrong=sum(r.claims and bool(r.status_conflict) for r in mine),
-                reached=sum(r.success for r in asked),
-                asked=len(asked),
-                crashed=sum(r.status.startswith(DIED) for r in mine),
+                runs=len(runs),
+                claims=sum(r.claims for r in runs),
+                wrong=sum(r.claims and bool(r.status_conflict) for r in runs),
+                reached=sum(r.success for r in to_level),
+                asked=len(to_level),
+                crashed=sum(r.status.startswith(DEATH_STATUSES) for r in runs),
             )
         )
     return out
 
 
 def spreads(records: Records) -> list[Spread]:
-    """Where one budget was run in several sweep orders, the residual of each."""
+    """Return the residual of each sweep order for budgets that were run in several orders."""
     groups: dict[tuple[str, str, int], dict[str, Record]] = defaultdict(dict)
     for r in records:
         if r.mode == "budget" and r.start == "cold" and r.step < 0 and not r.turns:
@@ -252,7 +267,7 @@ def spreads(records: Records) -> list[Spread]:
 
 
 def budgets(records: Records) -> dict[tuple[str, str, str], list[tuple[int, float]]]:
-    """(case, solver, start) -> (iterations, residual) of the exact budgets, given order."""
+    """Return (iterations, residual) of the exact budgets in the given order, by (case, solver, start)."""
     groups: dict[tuple[str, str, str], list[tuple[int, float]]] = defaultdict(list)
     for r in records:
         if r.mode != "budget" or r.turns:
@@ -288,10 +303,10 @@ class Change:
 
 
 def changes(old: Records, new: Records) -> list[Change]:
-    """Time to each level in two runs, on the cases whose numbers are the same in both.
+    """Compare times to each level of two runs, on the cases whose numbers are the same in both.
 
-    Noise is at least `NOISE`, and at least twice the ratio between minimum and median of either run. Earlier times are
-    in what the machine is worth now: multiplied by the drift of the case, where both runs know it.
+    Noise is at least `TIME_NOISE_FACTOR`, and at least twice the ratio between minimum and median of either run.
+    Earlier times are multiplied by the drift of the case, if both runs have measured it.
     """
     levels = levels_of(new)
     same = {name for name, info in new.cases.items() if name in old.cases and old.cases[name].sha == info.sha}
@@ -308,18 +323,18 @@ def changes(old: Records, new: Records) -> list[Change]:
         if row.case not in same or key not in before:
             continue
         worth = drift(old, new, row.case)
-        noise = max(NOISE, 1.0 + 2.0 * (jitter[key] - 1.0))
+        noise = max(TIME_NOISE_FACTOR, 1.0 + 2.0 * (jitter[key] - 1.0))
         out += [Change(*key, x, worth * before[key].times[x], row.times[x], noise) for x in levels]
     return out
 
 
 def drift(old: Records, new: Records, case: str = "") -> float:
-    """Time of the loop of fixed work now over then, medians beside the runs of a case, or of all; 1 where not known."""
-    found = []
+    """Return the ratio of new to old time of the calibration loop, medians over runs of a case or of all; else 1."""
+    medians = []
     for records in (old, new):
         some = [r.pace for r in records if r.pace and (not case or r.case == case)]
-        found.append(median(some) if some else math.nan)
-    return found[1] / found[0] if all(map(math.isfinite, found)) else 1.0
+        medians.append(median(some) if some else math.nan)
+    return medians[1] / medians[0] if all(map(math.isfinite, medians)) else 1.0
 
 
 @dataclass(frozen=True)
@@ -333,20 +348,20 @@ class Profile:
 
 
 def geometric_mean(values: Sequence[float], shift: float = 0.0) -> float:
-    """exp(mean(log(x + shift))) - shift; nan for nothing."""
+    """Return exp(mean(log(x + shift))) - shift; nan without values."""
     if not values:
         return math.nan
     return math.exp(sum(math.log(v + shift) for v in values) / len(values)) - shift
 
 
 def quantile(values: Sequence[float], q: float) -> float:
-    """The smallest value that at least a share q of them does not exceed."""
+    """Return the smallest value that at least a share q of the values does not exceed."""
     ordered = sorted(values)
     return ordered[min(len(ordered) - 1, math.ceil(q * len(ordered)) - 1)]
 
 
 def times_to(records: Records, level: float) -> dict[str, dict[str, float]]:
-    """Case -> solver -> time [s] to a level from a cold start, inf if missed; solvers that refused it are absent."""
+    """Return time [s] to a level from a cold start by case and solver: inf if missed, absent if the solver refused."""
     out: dict[str, dict[str, float]] = defaultdict(dict)
     for reach in reaches(records, [level]):
         if reach.start == "cold":
@@ -355,14 +370,14 @@ def times_to(records: Records, level: float) -> dict[str, dict[str, float]]:
 
 
 def limit_of(records: Records) -> float:
-    """What a missed level is charged [s]: the time limit."""
+    """Return the time [s] that a missed level counts with: the time limit."""
     return max((r.time_limit for r in records), default=1.0)
 
 
 def geometric_means(records: Records) -> dict[str, dict[float, dict[str, tuple[float, int, int]]]]:
-    """law -> level -> solver -> (shifted geometric mean [s], solved, cases); a miss costs the time limit.
+    """Return (shifted geometric mean [s], solved, cases) by law, level and solver; a miss counts with the time limit.
 
-    A solver stands in a law's table when it takes every case of it.
+    A law's table has the solvers that accept every case of it.
     """
     limit = limit_of(records)
     out: dict[str, dict[float, dict[str, tuple[float, int, int]]]] = {}
@@ -375,7 +390,7 @@ def geometric_means(records: Records) -> dict[str, dict[float, dict[str, tuple[f
                 t = [times[c][solver] for c in cases]
                 solved = sum(map(math.isfinite, t))
                 by[solver] = (
-                    geometric_mean([x if math.isfinite(x) else limit for x in t], SHIFT),
+                    geometric_mean([x if math.isfinite(x) else limit for x in t], MEAN_TIME_SHIFT),
                     solved,
                     len(cases),
                 )
@@ -395,7 +410,7 @@ class Backend:
 
 
 def backends(records: Records) -> list[Backend]:
-    """Those of which both times are known; by their own interface first the fastest."""
+    """Return solvers with both times, sorted by the time of their own interface."""
     levels = levels_of(records)
     level = levels[len(levels) // 2]
     best: dict[tuple[str, str], Record] = {}
@@ -412,9 +427,11 @@ def backends(records: Records) -> list[Backend]:
     for solver in sorted({r.solver for r in best.values() if r.own_min is not None}):
         mine = {c: r for (s, c), r in best.items() if s == solver and r.own_min is not None}
         owns = {c: r.own_min or 0.0 for c, r in mine.items()}
-        whole = geometric_mean([r.time_min for r in mine.values()], SHIFT)
+        whole = geometric_mean([r.time_min for r in mine.values()], MEAN_TIME_SHIFT)
         wins = sum(t < ours.get(c, math.inf) for c, t in owns.items())
-        out.append(Backend(solver, len(mine), whole, geometric_mean(list(owns.values()), SHIFT), wins))
+        out.append(
+            Backend(solver, len(mine), whole, geometric_mean(list(owns.values()), MEAN_TIME_SHIFT), wins)
+        )
     return sorted(out, key=lambda b: b.own)
 
 
@@ -433,10 +450,10 @@ def _whole(times: Mapping[str, Mapping[str, float]], cases: Sequence[str]) -> li
 
 
 def profiles(records: Records) -> list[Profile]:
-    """Share of cases that a solver brings to a level within `ratio` times the fastest; misses at infinity.
+    """Compute the share of cases that a solver brings to a level within `ratio` times the fastest; a miss is infinite.
 
-    Over the cases of one law, and within one run (`Records.latest`); a case that nobody brought to the
-    level counts against everyone.
+    Over the cases of one law, and within one run (`Records.latest`); a case that no solver brought to
+    the level counts as a miss of all.
     """
     out = []
     for law, cases in _laws(records).items():
@@ -463,7 +480,7 @@ def profiles(records: Records) -> list[Profile]:
 
 @dataclass(frozen=True)
 class Robustness:
-    """One solver over the many cases of a campaign, by family of structure."""
+    """Results of one solver over the cases of a campaign with one structure."""
 
     family: str
     solver: str
@@ -476,31 +493,31 @@ class Robustness:
 
 
 def robustness(records: Records) -> list[Robustness]:
-    """By structure and solver: on how many cases each level is reached, false claims, residual by budget."""
+    """Count cases that reach each level, false claims and deaths by structure and solver, with residuals by budget."""
     levels = levels_of(records)
     groups = {k[:2]: g for k, g in pairs(records).items() if k[2] == "cold"}
     solvers = sorted({solver for _, solver in groups})
     out = []
     for family, cases in families(records).items():
         for solver in solvers:
-            mine = {c: groups[c, solver] for c in cases if (c, solver) in groups}
-            if not mine:
+            groups_of_case = {c: groups[c, solver] for c in cases if (c, solver) in groups}
+            if not groups_of_case:
                 continue
-            best = {c: min(r.relative for r in g) for c, g in mine.items()}
+            best = {c: min(r.relative for r in g) for c, g in groups_of_case.items()}
             by_budget: dict[int, list[float]] = defaultdict(list)
-            for group in mine.values():
+            for group in groups_of_case.values():
                 for r in group:
                     if r.mode == "budget":
                         by_budget[r.max_iter].append(r.relative)
-            runs = [r for g in mine.values() for r in g]
+            runs = [r for g in groups_of_case.values() for r in g]
             out.append(
                 Robustness(
                     family=family,
                     solver=solver,
-                    cases=len(mine),
+                    cases=len(groups_of_case),
                     reached={x: sum(v <= x for v in best.values()) for x in levels},
                     wrong=sum(bool(r.status_conflict) for r in runs),
-                    died=sum(r.status.startswith(DIED) for r in runs),
+                    died=sum(r.status.startswith(DEATH_STATUSES) for r in runs),
                     budgets={n: (median(v), quantile(v, 0.95)) for n, v in sorted(by_budget.items())},
                     hardest=max(best, key=lambda c: best[c]),
                 )
@@ -513,7 +530,7 @@ def robustness(records: Records) -> list[Robustness]:
 
 @dataclass(frozen=True)
 class Pass:
-    """One solver over one sequence at one budget or level: cold, and with its impulses carried along."""
+    """Results of one solver over one sequence at one budget or level, cold and with carried impulses."""
 
     sequence: str
     solver: str
@@ -533,7 +550,7 @@ class Pass:
 
     @property
     def time(self) -> dict[str, float]:
-        """start -> s, all steps."""
+        """Time of all steps [s] by start."""
         return {start: sum(times) for start, times in self.times.items()}
 
     def middle(self, start: str) -> float:
@@ -552,7 +569,7 @@ class Pass:
 
 
 def passes(records: Records) -> list[Pass]:
-    """Sequences: total time and iterations, residual of each step, carried against cold."""
+    """Group the runs over sequences: times, iterations and residuals of each step, carried and cold."""
     groups: dict[tuple[str, str, str, float, int], dict[str, list[Record]]] = defaultdict(
         lambda: defaultdict(list)
     )
@@ -579,12 +596,12 @@ def passes(records: Records) -> list[Pass]:
 
 
 def _step_time(r: Record) -> float:
-    # A step that brought nothing back took its limit.
+    """Return the time of a step: its limit if it has no result."""
     return r.time_min if math.isfinite(r.time_min) else r.time_limit
 
 
-def by_sequence(records: Records) -> dict[str, list[Pass]]:
-    """Passes over each sequence."""
+def group_passes(records: Records) -> dict[str, list[Pass]]:
+    """Group passes by sequence."""
     out: dict[str, list[Pass]] = defaultdict(list)
     for one in passes(records):
         out[one.sequence].append(one)

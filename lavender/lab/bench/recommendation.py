@@ -1,0 +1,356 @@
+"""Rank solvers: for each structure and sequence, to each accuracy level and within each time.
+
+To a level, solvers rank by the number of cases that they bring there, then by the shifted geometric mean of their
+times. Within a time, and with a budget of sweeps, they rank by the number of cases served (at most half of the start's
+residual is left), then by the 90th percentile of the residual; a solver is recommended only if it serves nine cases of
+ten. A case without a result in the time counts with residual 1, that of the zero impulse. A solver with a false claim
+on one of the cases ranks behind all solvers without one.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from statistics import median
+from typing import Any
+
+from lavender.lab.bench.record import Record
+from lavender.lab.bench.statistics import (
+    MEAN_TIME_SHIFT,
+    RESIDUAL_NOISE_FACTOR,
+    TIME_NOISE_FACTOR,
+    families,
+    geometric_mean,
+    group_passes,
+    levels_of,
+    limit_of,
+    quantile,
+    times_to,
+)
+from lavender.lab.bench.store import Records
+
+SERVED_RESIDUAL = 0.5  # A case is served if at most this part of the start's residual is left.
+SERVED_QUANTILE = (
+    0.9  # Quantile of residuals over the cases that ranks within a time; a mean would hide misses.
+)
+PREFERRED_SOLVER = "auto"  # It comes first among equals: the only name that needs no choice.
+SHORT_TIME_RATIO = (
+    0.5  # A time is worth a sentence of its own if it is below this part of the time to the level.
+)
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Results of one solver in a family of cases, or over the steps of a sequence."""
+
+    solver: str
+    solved: int
+    cases: int
+    # Ranks solvers and is shown: shifted geometric mean of times [s], or the 90th percentile of residuals [-].
+    score: float
+    p95: float = (
+        math.nan
+    )  # 95th percentile over the cases of the values that `score` summarises; inf: not reached
+    worst: float = math.nan
+    hardest: str = ""  # the case of `worst`
+    how: str = ""  # the budget that was used, and for a sequence whether impulses are carried
+    iterations: int = 0  # of that budget, 0 without one
+    overrun: float = math.nan  # 95th percentile of the call's time over the time that it was given
+
+    def is_for(self, share: float) -> bool:
+        """Return whether it solves at least this share of the cases, and at least one case."""
+        return self.solved >= max(1, share * self.cases)
+
+    @classmethod
+    def of(cls, solver: str, values: Mapping[str, float], solved: int, score: float, **more: Any) -> Choice:
+        """Create it from the value of each case: a time [s] or the remaining residual [-]."""
+        each = list(values.values())
+        return cls(
+            solver=solver,
+            solved=solved,
+            score=score,
+            p95=quantile(each, 0.95),
+            worst=max(each),
+            hardest=max(values, key=lambda c: values[c]),
+            **{"cases": len(each), **more},
+        )
+
+
+@dataclass(frozen=True)
+class Advice:
+    """Ranking of solvers in a family for one accuracy level or time budget."""
+
+    family: str
+    target: float  # level [-] or time [s]
+    ranking: tuple[Choice, ...]
+    equal: int = 1  # number of solvers at the head that are the best within noise; their order is fixed
+    least: float = 0.0  # share of the cases below which no solver is recommended
+
+    @property
+    def best(self) -> Choice | None:
+        """The recommended solver; None if no solver reached the level, or none serves enough cases in the time."""
+        return self.ranking[0] if self.ranking and self.ranking[0].is_for(self.least) else None
+
+    @property
+    def ties(self) -> tuple[str, ...]:
+        """Names of the solvers that are as good as the best, within noise."""
+        return tuple(c.solver for c in self.ranking[1 : self.equal]) if self.best else ()
+
+
+RankedChoice = tuple[tuple[float, ...], Choice]  # A smaller key ranks first, whatever the score.
+
+
+def rank_choices(family: str, target: float, choices: Iterable[RankedChoice], noise: float) -> Advice:
+    """Rank by key, then by score; solvers within a factor `noise` of the best by name, so that a rerun agrees."""
+    order = sorted(choices, key=lambda entry: (entry[0], entry[1].score, entry[1].solver))
+    if not order:
+        return Advice(family, target, ())
+    key, best = order[0]
+    equal = [c for k, c in order if k == key and c.score <= noise * best.score]
+    equal.sort(key=lambda c: (c.solver != PREFERRED_SOLVER, c.solver))
+    rest = [c for _, c in order if all(c is not e for e in equal)]
+    return Advice(family, target, (*equal, *rest), len(equal))
+
+
+@dataclass(frozen=True)
+class FamilyAdvice:
+    """All rankings of a structure over its cases, or of a sequence over its steps."""
+
+    name: str
+    cases: tuple[str, ...]
+    sequence: bool
+    left_out: int  # steps that did not load
+    by_level: Mapping[float, Advice]
+    by_time: Mapping[float, Advice]
+    by_sweeps: Mapping[float, Advice]
+
+    @property
+    def size(self) -> int:
+        """Number of cases."""
+        return len(self.cases)
+
+
+def recommend_from_single_runs(records: Records, times: Sequence[float] = ()) -> list[FamilyAdvice]:
+    """Rank solvers by runs that were timed one after the other: structures first, then sequences.
+
+    `times` [s] are the time budgets; `choose_time_budgets` gives them if there are none.
+    """
+    times = tuple(times) or choose_time_budgets(records)
+    groups, by_sweeps, lost = _group_runs(records), _group_sweep_budgets(records), records.left_out
+    return [
+        FamilyAdvice(
+            name=name,
+            cases=tuple(cases),
+            sequence=is_sequence,
+            left_out=len(lost.get(name, ())) if is_sequence else 0,
+            by_level={x: rank_to_level(records, name, cases, x, groups) for x in levels_of(records)},
+            by_time={t: rank_in_time(records, name, cases, t, groups) for t in times},
+            by_sweeps={
+                float(n): replace(rank_in_time(records, name, cases, math.inf, some), target=float(n))
+                for n, some in by_sweeps.items()
+            },
+        )
+        for is_sequence, families_of in ((False, families(records)), (True, group_steps(records)))
+        for name, cases in families_of.items()
+    ]
+
+
+@dataclass(frozen=True)
+class _RunGroup:
+    """A solver with all of its runs on single cases, or with those of one call over the steps of sequences."""
+
+    solver: str
+    how: str = ""  # the call; empty for single cases
+    iterations: int = 0
+    tol: float = 0.0  # that a call has
+    runs: dict[str, list[Record]] = field(default_factory=dict)  # by case
+
+    def describe_budget(self, runs: Sequence[Record]) -> dict[str, Any]:
+        """Return `how` and `iterations` of a choice from these of its runs: the median number of sweeps, if known."""
+        if self.how or self.iterations:
+            return {"how": self.how, "iterations": self.iterations}
+        sweeps = [r.work["sweeps"] for r in runs if "sweeps" in r.work]
+        middle = round(median(sweeps)) if runs and len(sweeps) == len(runs) else 0
+        return {"how": f"{middle} sweeps" if middle else "", "iterations": middle}
+
+
+RunGroups = Mapping[tuple[str, str, str], _RunGroup]  # by solver, call and start
+
+
+def _group_runs(records: Records) -> RunGroups:
+    """Group cold runs on single cases by solver, and runs over sequences by budget or level and start, too."""
+    groups: dict[tuple[str, str, str], _RunGroup] = {}
+    for r in records:
+        if r.order != "given" or r.turns or (r.step < 0 and r.start != "cold"):
+            continue
+        if r.step < 0:
+            group = groups.setdefault((r.solver, "", ""), _RunGroup(r.solver))
+        else:
+            tol, budget = (r.tol, 0) if r.mode == "tol" else (0.0, r.max_iter)
+            new = _RunGroup(r.solver, f"{r.asked}, {r.start}", budget, tol)
+            group = groups.setdefault((r.solver, r.asked, r.start), new)
+        group.runs.setdefault(r.case, []).extend([r] if r.usable else [])
+    return groups
+
+
+def _group_sweep_budgets(records: Records) -> dict[int, RunGroups]:
+    """Group the runs of each budget whose iterations are sweeps."""
+    groups: dict[int, dict[tuple[str, str, str], _RunGroup]] = defaultdict(dict)
+    for r in records:
+        compared = r.order == "given" and not r.turns and r.start in ("cold", "carried") and r.usable
+        if compared and r.mode == "budget" and counts_sweeps(r):
+            start = "" if r.step < 0 else r.start
+            new = _RunGroup(r.solver, start, r.max_iter)
+            groups[r.max_iter].setdefault((r.solver, "", start), new).runs[r.case] = [r]
+    return {n: groups[n] for n in sorted(groups)}
+
+
+def group_steps(records: Records) -> dict[str, list[str]]:
+    """Return the names of all steps of each sequence that ran, also of steps without a run."""
+    ran = {r.case for r in records if r.step >= 0}
+    steps_of: dict[str, list[str]] = {}
+    for name, info in records.cases.items():
+        if info.sequence:
+            steps_of.setdefault(info.sequence, []).append(name)
+    return {name: steps for name, steps in steps_of.items() if not ran.isdisjoint(steps)}
+
+
+def rank_to_level(
+    records: Records, family: str, cases: Sequence[str], level: float, groups: RunGroups | None = None
+) -> Advice:
+    """Rank the solvers that bring these cases, or steps, to a level.
+
+    Steps of several sequences count together, by calls with at most this tolerance or with a budget. `groups` spares a
+    pass over the records.
+    """
+    limit, liars = limit_of(records), _list_false_claims(records, cases)
+    choices: list[RankedChoice] = []
+    for group in _select_groups(cases, _group_runs(records) if groups is None else groups):
+        if group.tol > level:
+            continue
+        runs = {c: _select_fastest(group.runs.get(c, ()), level) for c in cases}
+        solved = [r for r in runs.values() if r is not None]
+        times = {c: math.inf if r is None else r.time_min for c, r in runs.items()}
+        score = geometric_mean([t if math.isfinite(t) else limit for t in times.values()], MEAN_TIME_SHIFT)
+        choice = Choice.of(group.solver, times, len(solved), score, **group.describe_budget(solved))
+        choices.append(((group.solver in liars, -len(solved)), choice))
+    return rank_choices(family, level, _keep_best_of_each(choices), TIME_NOISE_FACTOR)
+
+
+def rank_in_time(
+    records: Records, family: str, cases: Sequence[str], limit: float, groups: RunGroups | None = None
+) -> Advice:
+    """Rank solvers by the residual that they leave on these cases, or steps, within a time [s].
+
+    A run whose time equals the limit within noise is in it in one report and not in the next: a solver that would be
+    the best with such runs is as good as the best.
+    """
+    selected = _select_groups(cases, _group_runs(records) if groups is None else groups)
+    liars = _list_false_claims(records, cases)
+
+    def rank_group(group: _RunGroup, time: float) -> RankedChoice:
+        runs = {c: _select_most_accurate(group.runs.get(c, ()), time) for c in cases}
+        residuals = {c: 1.0 if r is None else min(max(r.relative, 1e-17), 1.0) for c, r in runs.items()}
+        served = sum(x <= SERVED_RESIDUAL for x in residuals.values())
+        budget = group.describe_budget([r for r in runs.values() if r is not None])
+        score = quantile(list(residuals.values()), SERVED_QUANTILE)
+        return (group.solver in liars, -served), Choice.of(group.solver, residuals, served, score, **budget)
+
+    choices = _keep_best_of_each(rank_group(group, limit) for group in selected)
+    advice = rank_choices(family, limit, choices, RESIDUAL_NOISE_FACTOR)
+    # Solvers that serve fewer cases have a residual of 1 at the 90th percentile, so that noise would rank them.
+    advice = replace(advice, least=SERVED_QUANTILE)
+    if advice.best is None or math.isinf(limit):
+        return advice
+    late_choices = _keep_best_of_each(rank_group(group, TIME_NOISE_FACTOR * limit) for group in selected)
+    late = {c.solver: (key, c.score) for key, c in late_choices}
+    first = min(key for key, _ in choices)
+    best = min(c.score for c in advice.ranking[: advice.equal])
+    rest = advice.ranking[advice.equal :]
+    near = [
+        c for c in rest if late[c.solver][0] <= first and late[c.solver][1] <= RESIDUAL_NOISE_FACTOR * best
+    ]
+    others = [c for c in rest if all(c is not n for n in near)]
+    ranking = (*advice.ranking[: advice.equal], *near, *others)
+    return replace(advice, ranking=ranking, equal=advice.equal + len(near))
+
+
+def _list_false_claims(records: Records, cases: Sequence[str]) -> set[str]:
+    """Return the solvers with a false claim on any of these cases."""
+    names = set(cases)
+    return {r.solver for r in records if r.status_conflict and r.case in names}
+
+
+def _select_groups(cases: Sequence[str], groups: RunGroups) -> list[_RunGroup]:
+    """Select the groups that ran on any of these cases."""
+    names = set(cases)
+    return [group for _, group in sorted(groups.items()) if not names.isdisjoint(group.runs)]
+
+
+def _select_fastest(runs: Iterable[Record], level: float) -> Record | None:
+    return min((r for r in runs if r.relative <= level), key=lambda r: r.time_min, default=None)
+
+
+def _select_most_accurate(runs: Iterable[Record], limit: float) -> Record | None:
+    return min((r for r in runs if r.time_min <= limit), key=lambda r: r.relative, default=None)
+
+
+def choose_time_budgets(records: Records) -> tuple[float, ...]:
+    """Return three decades of time [s] about the median of the fastest times to the middle level."""
+    levels = levels_of(records)
+    level = levels[len(levels) // 2]
+    fastest = [min(by.values()) for by in times_to(records, level).values() if by]
+    for passes in group_passes(records).values():
+        reached = [
+            median(w.times[start])
+            for w in passes
+            for start, residuals in w.residuals.items()
+            if len(residuals) == w.steps and max(residuals) <= level
+        ]
+        fastest.append(min(reached, default=math.inf))
+    fastest = [t for t in fastest if 0.0 < t < math.inf]
+    middle = math.ceil(math.log10(median(fastest))) if fastest else -3
+    return tuple(10.0**k for k in (middle - 1, middle, middle + 1))
+
+
+def counts_sweeps(r: Record) -> bool:
+    """Return whether the iterations of a budget are sweeps, so that the budget bounds the time of a solve."""
+    return 0 < r.work.get("sweeps", 0) <= r.max_iter
+
+
+def _keep_best_of_each(choices: Iterable[RankedChoice]) -> list[RankedChoice]:
+    """Keep the best entry of each solver."""
+    first: dict[str, RankedChoice] = {}
+    for entry in sorted(choices, key=lambda pair: (pair[0], pair[1].score)):
+        first.setdefault(entry[1].solver, entry)
+    return list(first.values())
+
+
+@dataclass(frozen=True)
+class Subject:
+    """All single cases together, or all sequences: the subject of a report's first sentence."""
+
+    names: tuple[str, ...]  # cases, or sequences
+    cases: tuple[str, ...]  # cases, or steps of the sequences
+    way: str  # "call" or "steps"
+    best: Advice  # to the middle level
+    quick: tuple[Advice, ...]  # in each time
+
+
+def list_subjects(records: Records, times: Sequence[float] = ()) -> list[Subject]:
+    """Return the subject of single cases, then that of sequences, each only if there are any."""
+    levels = levels_of(records)
+    level = levels[len(levels) // 2]
+    times = tuple(times) or choose_time_budgets(records)
+    cases = tuple(dict.fromkeys(r.case for r in records if r.step < 0))
+    sequences = group_steps(records)
+    steps = tuple(step for some in sequences.values() for step in some)
+    subjects = []
+    for names, members, way in ((cases, cases, "call"), (tuple(sequences), steps, "steps")):
+        if members:
+            quick = tuple(rank_in_time(records, "all", members, t) for t in times)
+            best = rank_to_level(records, "all", members, level)
+            subjects.append(Subject(names, members, way, best, quick))
+    return subjects

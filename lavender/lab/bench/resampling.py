@@ -1,0 +1,346 @@
+"""Rank calls that were timed in turns, and measure by resampling how sure the ranking is.
+
+A resampling draws the cases and the repetitions with replacement (the steps of a sequence in blocks of consecutive
+ones, since neighbours are alike). In each resampling the calls are ranked by the rule of `recommendation`; every call
+within noise of the best wins it. Noise is the difference of a score between repetitions of the whole, not between
+repeats in one loop.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lavender.base.arrays import FloatArray
+from lavender.lab.bench.recommendation import (
+    PREFERRED_SOLVER,
+    SERVED_QUANTILE,
+    SERVED_RESIDUAL,
+    Advice,
+    Choice,
+    FamilyAdvice,
+    counts_sweeps,
+    recommend_from_single_runs,
+)
+from lavender.lab.bench.record import Record
+from lavender.lab.bench.statistics import MEAN_TIME_SHIFT, levels_of, limit_of
+from lavender.lab.bench.store import Records
+from lavender.lab.bench.timed_call import format_call
+
+SAMPLES = 500  # Resamplings of a ranking.
+MAX_ARRAY_ENTRIES = 1_000_000  # Numbers of the resamplings that are computed at a time.
+SURE_SHARE = 0.8  # A second solver is named if the first wins a smaller share of the resamplings.
+EQUAL_SHARE = (
+    0.2  # A solver that wins at least this share of the resamplings is as good a choice as the first.
+)
+MIN_TIME_NOISE = 1.05  # Factor between two times that counts as noise, at least: a user does not notice it.
+SEQUENCE_BLOCKS = 10  # The steps of a sequence are cut into this many blocks, which are drawn as a whole.
+TIME_QUANTILE = (
+    0.25  # Quantile of the repetitions that is the time of a call: other processes only ever add time.
+)
+MIN_TIME = 1e-12  # s; smaller than the resolution of any clock, so that a logarithm exists.
+IN_TIME_SHARE = 0.95  # Share of the repetitions that must end in time.
+
+
+@dataclass(frozen=True)
+class TimedCall:
+    """One call of `lv.solve` or `lv.solve_many` on all of its cases."""
+
+    runs: Mapping[str, Record]  # by case
+    guessed: bool  # some cases have a guess
+
+    @property
+    def line(self) -> Record:
+        """A record that has the arguments of the call."""
+        return next(iter(self.runs.values()))
+
+    @property
+    def code(self) -> tuple[str, ...]:
+        """The call as lines of Python."""
+        return format_call(self.line, self.guessed)
+
+    @property
+    def time(self) -> float:
+        """Geometric mean over the cases of the lower quartile of the repetitions [s], shifted by `MEAN_TIME_SHIFT`."""
+        each = [float(np.quantile(r.times or (r.time_min,), TIME_QUANTILE)) for r in self.runs.values()]
+        return float(np.exp(np.mean(np.log(np.array(each) + MEAN_TIME_SHIFT))) - MEAN_TIME_SHIFT)
+
+
+@dataclass(frozen=True)
+class ResampledRanking:
+    """A ranking of calls, and how often each wins a resampling."""
+
+    ranking: tuple[tuple[TimedCall, Choice], ...]  # the recommended call first
+    shares: tuple[float, ...]  # share of the resamplings that each call wins, in this order
+    loss: float  # median of the recommended call's score over the best's in resamplings that it does not win; else 1
+
+    @property
+    def named(self) -> tuple[str, ...]:
+        """The recommended solver and those that are as good a choice; the second if the first is not sure."""
+        solvers = [choice.solver for _, choice in self.ranking]
+        others = [s for s, share in zip(solvers[1:], self.shares[1:], strict=True) if share >= EQUAL_SHARE]
+        if not others and self.shares[0] < SURE_SHARE and len(solvers) > 1:
+            others = [solvers[1 + int(np.argmax(self.shares[1:]))]]
+        return tuple(dict.fromkeys([solvers[0], *others]))
+
+
+def select_calls(records: Records, way: str, in_turns: bool = True) -> list[TimedCall]:
+    """Select the calls of a way ("call", "steps", "batch") that ran on the largest number of cases.
+
+    With `in_turns` these are calls that were timed in turns with others. Without it they are runs that were measured
+    one after the other; records of earlier versions have no others.
+    """
+    groups: dict[tuple[object, ...], dict[str, Record]] = {}
+    for r in records:
+        same_way = r.way == way or (not r.way and not in_turns and (r.step >= 0) is (way == "steps"))
+        compared = r.order == "given" and r.start != "warm" and (r.mode != "budget" or counts_sweeps(r))
+        if same_way and compared and bool(r.turns) is in_turns and r.case in records.cases:
+            key = (r.solver, r.mode, r.tol, r.max_iter, r.time_limit, r.start)
+            groups.setdefault(key, {})[r.case] = r
+    most = max((len(runs) for runs in groups.values()), default=0)
+    calls = [
+        TimedCall(runs, any(records.cases[c].guess for c in runs))
+        for runs in groups.values()
+        if len(runs) == most
+    ]
+    if way != "batch":
+        return calls
+    # A batch of some of the cases cannot be compared with a call on all of them.
+    complete = {
+        (f.line.solver, *sorted(f.runs)) for one in ("call", "steps") for f in select_calls(records, one)
+    }
+    return [f for f in calls if (f.line.solver, *sorted(f.runs)) in complete]
+
+
+STARTS = {"cold": "cold", "carried": "warm from the step before"}
+
+
+def _keep_best_of_each(calls: Sequence[TimedCall], level: float) -> list[TimedCall]:
+    """Keep one call of each solver: the start that brings more cases to the level, then the faster one."""
+    best: dict[str, TimedCall] = {}
+    for call in sorted(calls, key=lambda f: (sum(not r.relative <= level for r in f.runs.values()), f.time)):
+        best.setdefault(call.line.solver, call)
+    return list(best.values())
+
+
+def rank_calls_to_level(
+    records: Records, calls: Sequence[TimedCall], level: float, cases: int = 0
+) -> ResampledRanking | None:
+    """Rank calls with a tolerance by the cases that they bring to the level, then by the geometric mean of times.
+
+    `cases` is the number of all cases, if calls were timed on fewer. Returns None without such a call.
+    """
+    calls = _keep_best_of_each([f for f in calls if f.line.mode == "tol" and f.line.tol <= level], level)
+    if not calls:
+        return None
+    limit, names = limit_of(records), _list_cases(calls)
+    missed = np.array([[c not in f.runs or not f.runs[c].relative <= level for c in names] for f in calls])
+    times = _stack_repetitions(calls, names, lambda r: r.times or (r.time_min,))
+    charged = np.where(missed[:, :, None] | ~np.isfinite(times), limit, times)
+
+    def score(values: FloatArray) -> FloatArray:
+        means = (
+            np.exp(np.log(np.quantile(values, TIME_QUANTILE, axis=-1) + MEAN_TIME_SHIFT).mean(axis=-1))
+            - MEAN_TIME_SHIFT
+        )
+        return np.asarray(np.maximum(means, MIN_TIME))
+
+    def choose(i: int, value: float) -> Choice:
+        each = np.where(missed[i], math.inf, np.quantile(times[i], TIME_QUANTILE, axis=1))
+        by_case = dict(zip(names, each.tolist(), strict=True))
+        solved = int((~missed[i]).sum())
+        return Choice.of(calls[i].line.solver, by_case, solved, value, cases=max(cases, len(by_case)))
+
+    return _resample(records, calls, names, charged, missed, score, choose)
+
+
+def recommend_solvers(records: Records, times: Sequence[float] = ()) -> list[FamilyAdvice]:
+    """Rank solvers for each structure and sequence; to the middle level by the calls timed in turns, if there are any.
+
+    Parameters
+    ----------
+    records : Records
+    times : s, optional
+        Time budgets; three decades about the fastest times if none are given.
+    """
+    levels = levels_of(records)
+    level = levels[len(levels) // 2]
+    in_turns = {way: select_calls(records, way) for way in ("call", "steps")}
+    advice = []
+    for family in recommend_from_single_runs(records, times):
+        calls = in_turns["steps" if family.sequence else "call"]
+        first = recommend_for_cases(records, family.by_level[level], calls, family.cases)
+        advice.append(replace(family, by_level={**family.by_level, level: first}))
+    return advice
+
+
+def recommend_for_cases(
+    records: Records, alone: Advice, calls: Sequence[TimedCall], cases: Sequence[str]
+) -> Advice:
+    """Rank solvers to a level on some cases by the rule and the times of the report's first sentence.
+
+    Solvers of `calls`, which were timed in turns, come first, then the others of `alone`. Returns `alone` if no call
+    was timed on these cases, or if the calls solve fewer of them.
+    """
+    parts = [replace(f, runs={c: f.runs[c] for c in cases if c in f.runs}) for f in calls]
+    resampled = rank_calls_to_level(records, [f for f in parts if f.runs], alone.target, len(cases))
+    best = alone.ranking[0].solved if alone.ranking else 0
+    if resampled is None or resampled.ranking[0][1].solved < max(1, best):
+        return alone
+    hows = {c.solver: c.how for c in alone.ranking}
+    in_turns = [
+        replace(c, how=f"{f.line.asked}, {f.line.start}" if f.line.step >= 0 else hows.get(c.solver, ""))
+        for f, c in resampled.ranking
+    ]
+    named = resampled.named
+    in_turns.sort(key=lambda c: named.index(c.solver) if c.solver in named else len(in_turns))
+    known = {c.solver for c in in_turns}
+    rest = [c for c in alone.ranking if c.solver not in known]
+    return replace(alone, ranking=(*in_turns, *rest), equal=len(named))
+
+
+def rank_calls_in_time(
+    records: Records, calls: Sequence[TimedCall], limit: float, cases: int = 0
+) -> ResampledRanking | None:
+    """Rank calls within a time [s] by the number of cases served, then by the residual at the 90th percentile.
+
+    A case is served if in 95 of 100 repetitions the call took no more than the time and left at most half of the
+    start's residual. Returns None if no call has a budget or a shorter time limit.
+    """
+    calls = [
+        f for f in calls if f.line.mode == "budget" or (f.line.mode == "time" and f.line.time_limit < limit)
+    ]
+    if not calls:
+        return None
+    names = _list_cases(calls)
+    times = _stack_repetitions(calls, names, lambda r: r.times or (r.time_min,))
+    residuals = np.minimum(_stack_repetitions(calls, names, lambda r: r.reached or (r.relative,)), 1.0)
+    in_time = np.where(times <= limit, np.nan_to_num(residuals, nan=1.0), 1.0)
+    served = np.quantile(in_time, IN_TIME_SHARE, axis=2, method="lower") <= SERVED_RESIDUAL
+
+    def score(values: FloatArray) -> FloatArray:
+        each = np.quantile(values, IN_TIME_SHARE, axis=-1, method="lower")
+        upper = np.quantile(each, SERVED_QUANTILE, axis=-1, method="inverted_cdf")
+        return np.asarray(np.maximum(upper, 1e-17))
+
+    def choose(i: int, value: float) -> Choice:
+        line, each = calls[i].line, np.quantile(in_time[i], IN_TIME_SHARE, axis=1, method="lower")
+        return Choice.of(
+            line.solver,
+            dict(zip(names, each.tolist(), strict=True)),
+            int(served[i].sum()),
+            value,
+            cases=max(cases, len(each)),
+            how=f"{line.max_iter} sweeps" if line.mode == "budget" else "",
+            iterations=line.max_iter,
+            overrun=float(np.nanquantile(times[i], IN_TIME_SHARE, method="lower")) / limit,
+        )
+
+    return _resample(records, calls, names, in_time, ~served, score, choose)
+
+
+def compute_serving_time(call: TimedCall) -> float:
+    """Return the time [s] in which a call with a budget serves nine cases of ten (`rank_calls_in_time`); else inf."""
+    if call.line.mode != "budget":
+        return math.inf
+    times = _stack_repetitions([call], list(call.runs), lambda r: r.times or (r.time_min,))[0]
+    residuals = np.array([r.relative for r in call.runs.values()])
+    slow = np.quantile(times, IN_TIME_SHARE, axis=-1, method="lower")
+    served = np.where(residuals <= SERVED_RESIDUAL, slow, math.inf)
+    return float(np.quantile(served, SERVED_QUANTILE, method="inverted_cdf"))
+
+
+def _list_cases(calls: Sequence[TimedCall]) -> list[str]:
+    """Return the cases of all calls; a call misses a case on which it did not run."""
+    return list(dict.fromkeys(name for f in calls for name in f.runs))
+
+
+def _stack_repetitions(
+    calls: Sequence[TimedCall], names: Sequence[str], values_of: Callable[[Record], Sequence[float]]
+) -> FloatArray:
+    """Return values by (calls, cases, repetitions): nan if a case did not run, repeated if repetitions are fewer."""
+    most = max(len(values_of(r)) for f in calls for r in f.runs.values())
+    return np.array(
+        [[np.resize(values_of(f.runs[c]) if c in f.runs else np.nan, most) for c in names] for f in calls],
+        float,
+    )
+
+
+def _group_blocks(records: Records, names: Sequence[str]) -> list[list[int]]:
+    """Group the numbers of cases that are drawn together: a single case, or consecutive steps of a sequence."""
+    blocks: dict[tuple[str, int], list[int]] = {}
+    steps: dict[str, int] = {}
+    for name in names:
+        steps[records.cases[name].sequence] = steps.get(records.cases[name].sequence, 0) + 1
+    for i, name in enumerate(names):
+        info = records.cases[name]
+        size = max(1, steps[info.sequence] // SEQUENCE_BLOCKS)
+        blocks.setdefault((info.sequence, info.step // size) if info.sequence else (name, -1), []).append(i)
+    return list(blocks.values())
+
+
+def _draw_samples(
+    blocks: Sequence[Sequence[int]], repeats: int, most: int
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yield up to `most` samples of equally many cases: indices of (samples, cases) and (samples, repetitions)."""
+    draw = np.random.default_rng(0)
+    by_count: dict[int, list[tuple[list[int], np.ndarray]]] = {}
+    for _ in range(SAMPLES):
+        cases = [i for b in draw.integers(0, len(blocks), len(blocks)) for i in blocks[b]]
+        by_count.setdefault(len(cases), []).append((cases, draw.integers(0, repeats, repeats)))
+    for samples in by_count.values():
+        for start in range(0, len(samples), most):
+            case_indices, repetitions = zip(*samples[start : start + most], strict=True)
+            yield np.array(case_indices), np.array(repetitions)
+
+
+def _resample(
+    records: Records,
+    calls: Sequence[TimedCall],
+    names: Sequence[str],
+    values: FloatArray,
+    missed: np.ndarray,
+    score: Callable[[FloatArray], FloatArray],
+    choose: Callable[[int, float], Choice],
+) -> ResampledRanking:
+    """Rank calls by the share of resamplings that they win; `values` are by call, case and repetition."""
+    n, _, repeats = values.shape
+    blocks = _group_blocks(records, names)
+    single = np.array([score(values[:, :, k : k + 1]) for k in range(repeats)])  # (repetitions, calls)
+    # Two standard errors of the difference of two scores; the error of a quartile is 1.36 times that of a mean.
+    deviation = float(np.median(np.log(single).std(axis=0)))
+    noise = max(MIN_TIME_NOISE, math.exp(2.0 * math.sqrt(2.0) * 1.36 * deviation / math.sqrt(repeats)))
+    scores = score(values)
+    wins, losses = np.zeros(n), [[] for _ in range(n)]  # type: ignore[var-annotated]
+    false_claims = np.array([any(r.status_conflict for r in f.runs.values()) for f in calls])
+    for cases, repetitions in _draw_samples(blocks, repeats, max(1, MAX_ARRAY_ENTRIES // values.size)):
+        sampled = score(values[:, cases[:, :, None], repetitions[:, None, :]])  # (calls, samples)
+        # A false claim comes last, then the call that misses more cases.
+        behind = missed[:, cases].sum(axis=2) + 1e6 * false_claims[:, None]
+        first = behind == behind.min(axis=0)
+        best = np.where(first, sampled, math.inf).min(axis=0)
+        won = first & (sampled <= noise * best)
+        wins += won.sum(axis=1)
+        for lost, ratios, own in zip(losses, sampled / best, won, strict=True):
+            lost.extend(ratios[~own])
+    shares = wins / SAMPLES
+    # Among calls that win about as often as the best, the preferred solver, then by name: a rerun agrees.
+    order = sorted(
+        range(n),
+        key=lambda i: (
+            shares[i] < SURE_SHARE * shares.max(),
+            -shares[i] if shares[i] < SURE_SHARE * shares.max() else 0.0,
+            calls[i].line.solver != PREFERRED_SOLVER,
+            calls[i].line.solver,
+            scores[i],
+        ),
+    )
+    head = order[0]
+    return ResampledRanking(
+        ranking=tuple((calls[i], choose(i, float(scores[i]))) for i in order),
+        shares=tuple(float(shares[i]) for i in order),
+        loss=float(np.median(losses[head])) if losses[head] else 1.0,
+    )

@@ -1,0 +1,295 @@
+"""Compute the points of every figure of a report, independent of the drawing library (`plotting`)."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from lavender.lab.bench import statistics
+from lavender.lab.bench.record import Record, level_name
+from lavender.lab.bench.store import Records
+from lavender.lab.report.motion_tables import convert_to_motion_errors, get_speed_levels
+from lavender.lab.report.text import format_count, name_run
+
+MIN_RESIDUAL = 1e-17  # A residual of exactly zero is drawn here.
+
+
+@dataclass(frozen=True)
+class Curve:
+    """A line of a figure: points, each with the budget or tolerance of its run."""
+
+    solver: str
+    label: str
+    x: tuple[float, ...]
+    y: tuple[float, ...]
+    notes: tuple[str, ...] = ()  # budget or tolerance of each point: "to 1e-6", "16 iterations"
+    thin: bool = False  # warm starts
+    steps: bool = False
+    points: bool = False  # without a line between them
+    low: tuple[float, ...] = ()  # lower edge of a band about the line, as `y`; empty without one
+    high: tuple[float, ...] = ()
+
+    @classmethod
+    def of(cls, solver: str, label: str, points: Iterable[tuple[float, float]], **more: Any) -> Curve:
+        """Create a line through points. A residual of zero is drawn at `MIN_RESIDUAL`; nan and inf are gaps."""
+        x, y = zip(*points, strict=True)
+        drawn = tuple(max(v, MIN_RESIDUAL) if math.isfinite(v) else math.nan for v in y)
+        return cls(solver, label, tuple(map(float, x)), drawn, **more)
+
+    @property
+    def front(self) -> Curve:
+        """The points in the order of x that are lower than all points before."""
+        front: list[tuple[float, float]] = []
+        for x, y in sorted(zip(self.x, self.y, strict=True)):
+            if not front or y < front[-1][1]:
+                front.append((x, y))
+        xs, ys = zip(*front, strict=True) if front else ((), ())
+        return replace(self, x=xs, y=ys, notes=())
+
+
+@dataclass(frozen=True)
+class Figure:
+    """Titles, scales and curves of a diagram."""
+
+    name: str  # file name, without suffix
+    title: str
+    x_title: str
+    y_title: str
+    curves: tuple[Curve, ...]
+    x_log: bool = True
+    y_log: bool = True
+    levels: tuple[float, ...] = ()
+    floor: float = math.nan
+    left_out: tuple[str, ...] = ()  # solvers without a curve, so that the others can be distinguished
+
+    @property
+    def heading(self) -> str:
+        """The title, with the number of solvers that are left out."""
+        left = format_count(len(self.left_out), "more solver")
+        return f"{self.title}; {left} not drawn" if self.title and self.left_out else self.title
+
+
+def _sort_by_work(runs: list[Record]) -> list[Record]:
+    """Sort runs by iterations or tolerance: times of microseconds vary from run to run."""
+    if any(r.mode == "budget" for r in runs):
+        return sorted(runs, key=lambda r: (r.iterations, r.time_min))
+    return sorted(runs, key=lambda r: (-r.tol, r.time_min))
+
+
+def build_work_precision(records: Records, case: str) -> Figure:
+    """Plot error against time for every run of a case: a curve for each solver and start, in the order of work."""
+    curves = []
+    for (name, solver, start), group in sorted(statistics.pairs(records).items()):
+        runs = _sort_by_work([r for r in group if r.usable]) if name == case else []
+        if runs:
+            points, asked = [(r.time_min, r.relative) for r in runs], tuple(r.asked for r in runs)
+            curves.append(
+                Curve.of(solver, name_run(solver, start), points, notes=asked, thin=start != "cold")
+            )
+    return _build_case_figure("work-precision", "time: set-up and solve [s]", records, case, curves)
+
+
+def _build_case_figure(name: str, x_title: str, records: Records, case: str, curves: list[Curve]) -> Figure:
+    """Create a figure of a case, with the round-off floor of its best run."""
+    runs = (r for (of, _, _), some in statistics.pairs(records).items() if of == case for r in some)
+    best = min(((r.relative, r.floor) for r in runs if r.usable and r.floor > 0.0), default=(0.0, math.nan))
+    return Figure(
+        f"{name} {case}", case, x_title, "relative residual [-]", tuple(curves),
+        levels=statistics.levels_of(records), floor=best[1],
+    )  # fmt: skip
+
+
+GRID_SIZE = 49  # Times at which the residuals of all cases are compared.
+
+
+def build_overall_figure(records: Records) -> Figure:
+    """Plot the residual that a solver has reached by a time, over all cases: the median, and a band of the middle half.
+
+    A case without a result by that time counts with residual 1, that of the zero impulse; so does a case that a solver
+    does not accept, which the title states. Cases are single problems from a cold start. If there are only sequences,
+    each step is a case, with carried impulses if there are any.
+    """
+    single = any(r.step < 0 for r in records)
+    start = "cold" if single or all(r.start == "cold" for r in records) else "carried"
+    runs = [
+        r for r in records
+        if (r.step < 0) == single and r.start == start and r.order == "given" and not r.turns
+    ]  # fmt: skip
+    cases = sorted({r.case for r in runs})
+    by: dict[str, dict[str, list[tuple[float, float]]]] = {}
+    for r in runs:
+        if r.usable and r.time_min > 0.0:
+            by.setdefault(r.solver, {}).setdefault(r.case, []).append(
+                (r.time_min, max(r.relative, MIN_RESIDUAL))
+            )
+    times = [t for own in by.values() for some in own.values() for t, _ in some]
+    if not times:
+        return Figure("over all", "", "", "", ())
+    grid = np.geomspace(min(times), max(times), GRID_SIZE)
+    curves = []
+    for solver, own in sorted(by.items()):
+        reached = np.ones((len(cases), GRID_SIZE))
+        for row, case in zip(reached, cases, strict=True):
+            for t, x in own.get(case, ()):
+                np.minimum(row, x, out=row, where=grid * (1.0 + 1e-9) >= t)
+        bands = np.quantile(reached, (0.25, 0.5, 0.75), axis=0, method="inverted_cdf")
+        # from the last time at which half of the cases have nothing
+        first = max(np.flatnonzero(bands[0] == 1.0), default=0)
+        across, lower, middle, upper = (tuple(x[first:].tolist()) for x in (grid, *bands))
+        curves.append(Curve(solver, solver, across, middle, low=lower, high=upper))
+    over = f" over all {len(cases)} {'cases' if single else 'steps'}: median, middle half"
+    if any(len(own) < len(cases) for own in by.values()):
+        over += "; no result: 1"
+    return Figure(
+        "over all", f"Error against time{over if len(cases) > 1 else ''}",
+        "time: set-up and solve [s]", "relative residual [-]", tuple(curves), levels=statistics.levels_of(records),
+    )  # fmt: skip
+
+
+def build_budget_figure(records: Records, case: str) -> Figure:
+    """Plot the residual against exact iteration budgets, cold and warm."""
+    curves = []
+    for (name, solver, start), points in sorted(statistics.budgets(records).items()):
+        if name == case:
+            curves.append(Curve.of(solver, name_run(solver, start), points, thin=start != "cold"))
+    return _build_case_figure("budget", "iterations (sweeps)", records, case, curves)
+
+
+def build_pass_figure(sequence: str, passes: list[statistics.Pass]) -> Figure:
+    """Plot each step of a sequence, carried and cold (thin): the residual at one budget, or the time to one level."""
+    timed = passes[0].mode == "tol"
+    curves = []
+    for w in passes:
+        for start, residuals in sorted(w.residuals.items()):
+            values = w.times[start] if timed else residuals
+            cold = start == "cold" and len(w.residuals) > 1
+            label = f"{w.solver} (cold)" if cold else w.solver
+            curves.append(Curve.of(w.solver, label, enumerate(values), thin=cold))
+    asked = passes[0].asked
+    return Figure(
+        f"sequence {sequence} {asked}", f"{sequence}: {asked}", "step",
+        "time: set-up and solve [s]" if timed else "relative residual [-]", tuple(curves), x_log=False,
+    )  # fmt: skip
+
+
+MAX_CURVES = 5  # Curves of a profile: more cannot be distinguished, and mislead about the second place.
+
+
+def build_profile_figure(profile: statistics.Profile) -> Figure:
+    """Plot a Dolan-More profile of the five solvers that solve most cases and are nearest to the fastest."""
+
+    def standing(name: str) -> tuple[float, float, str]:
+        steps = profile.curves[name]
+        last = steps[-1][1] if steps else 0.0
+        return (
+            -last,
+            sum(r * (s - t) for (r, s), t in zip(steps, (0.0, *(s for _, s in steps)), strict=False)),
+            name,
+        )
+
+    shown = [name for name in sorted(profile.curves, key=standing) if standing(name)[0] < 0.0][:MAX_CURVES]
+    curves = [
+        Curve.of(name, name, [(r, 100.0 * s) for r, s in profile.curves[name]], steps=True) for name in shown
+    ]
+    left_out = tuple(sorted(set(profile.curves) - set(shown)))
+    return Figure(
+        f"profile {profile.law} {level_name(profile.level)}",
+        f"{profile.law}, to {level_name(profile.level)} ({format_count(profile.cases, 'case')})",
+        "time / fastest time", "cases solved [%]", tuple(curves), y_log=False, left_out=left_out,
+    )  # fmt: skip
+
+
+Group = Mapping[str, tuple[Figure, ...]]  # by case, law or sequence
+
+
+@dataclass(frozen=True)
+class Figures:
+    """Every figure of a report that has a curve, by its place on the page."""
+
+    over: Group = field(default_factory=dict)  # "all": the one over all cases
+    profiles: Group = field(default_factory=dict)  # by law, one for each level
+    sequences: Group = field(default_factory=dict)
+    cases: Group = field(default_factory=dict)  # error against time, residual against iterations
+    moved: Figures | None = None  # the same with motion errors [m/s] in place of residuals, where known
+
+    @property
+    def places(self) -> dict[str, Group]:
+        """The groups by name."""
+        return {name: group for name, group in vars(self).items() if name != "moved"}
+
+    def __iter__(self) -> Iterator[Figure]:
+        for group in self.places.values():
+            for some in group.values():
+                yield from some
+        yield from self.moved or ()
+
+
+def build_figures(records: Records) -> Figures:
+    """Build the figures of records by residual and, if it is known, by motion error; none for a campaign."""
+    if statistics.is_campaign(records):
+        return Figures()
+    by_residual = _build_figures(records)
+    return (
+        replace(by_residual, moved=_relabel_for_motion(_build_figures(convert_to_motion_errors(records))))
+        if get_speed_levels(records)
+        else by_residual
+    )
+
+
+def _relabel_for_motion(figures: Figures) -> Figures:
+    """Return figures of `convert_to_motion_errors`, with names and titles that say so."""
+
+    def relabel(figure: Figure) -> Figure:
+        return replace(
+            figure,
+            name=f"motion {figure.name}",
+            title=re.sub(r"(, to \S+) \(", r"\1 m/s (", figure.title),
+            y_title=figure.y_title.replace("relative residual [-]", "motion error [m/s]"),
+        )
+
+    groups: dict[str, Any] = {
+        place: {name: tuple(map(relabel, own)) for name, own in group.items()}
+        for place, group in figures.places.items()
+    }
+    return Figures(**groups)
+
+
+def _build_figures(records: Records) -> Figures:
+    parts: dict[str, Records] = {}  # records of each case
+    for r in records:
+        if r.step < 0:
+            parts.setdefault(r.case, Records(records.runs)).add(r)
+    profiles: dict[str, list[Figure]] = {}
+    for profile in statistics.profiles(records):
+        if profile.cases > 1:
+            profiles.setdefault(profile.law, []).append(build_profile_figure(profile))
+    over = _keep_drawn(build_overall_figure(records))
+    return Figures(
+        over={"all": over} if over else {},
+        profiles={law: _keep_drawn(*some) for law, some in profiles.items()},
+        sequences={
+            name: _build_pass_figures(name, passes)
+            for name, passes in statistics.group_passes(records).items()
+        },
+        cases={
+            c: _keep_drawn(build_work_precision(part, c), build_budget_figure(part, c))
+            for c, part in parts.items()
+        },
+    )
+
+
+def _keep_drawn(*some: Figure) -> tuple[Figure, ...]:
+    return tuple(figure for figure in some if figure.curves)
+
+
+def _build_pass_figures(name: str, passes: list[statistics.Pass]) -> tuple[Figure, ...]:
+    # The middle budget, and the solvers that have none.
+    budgets = sorted({w.max_iter for w in passes if w.mode == "budget"})
+    middle = [w for w in passes if w.mode == "budget" and w.max_iter == budgets[len(budgets) // 2]]
+    levels = [w for w in passes if w.mode == "tol"]
+    return tuple(build_pass_figure(name, some) for some in (middle, levels) if some)

@@ -1,0 +1,62 @@
+"""Convert records so that all tables and figures show motion errors [m/s] in place of residuals; list idle cases."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+from lavender.lab.bench.record import level_name
+from lavender.lab.bench.store import Records
+
+DEFAULT_SPEED_LEVELS = (1e-2, 1e-3)  # m/s, if the plan has none
+
+
+@dataclass(frozen=True)
+class IdleCase:
+    """A case whose solution is the zero impulse, and the worst answer of any solver to it."""
+
+    case: str
+    rows: int
+    solver: str  # with the largest velocity error
+    velocity: float  # m/s
+    energy: float  # sqrt J
+
+
+def format_speed(level: float) -> str:
+    """Return a speed in words: 1e-3 m/s."""
+    return f"{level_name(level)} m/s"
+
+
+def get_speed_levels(records: Records) -> tuple[float, ...]:
+    """Return the speed levels [m/s] of the newest run's plan, or the default ones; empty without motion errors."""
+    if all(r.motion_speed is None for r in records):
+        return ()
+    for run in reversed(list(records.runs.values())):
+        if run.plan.get("speed_levels"):
+            return tuple(sorted(map(float, run.plan["speed_levels"]), reverse=True))
+    return DEFAULT_SPEED_LEVELS
+
+
+def convert_to_motion_errors(records: Records) -> Records:
+    """Return the records with the motion error [m/s] as residual, inf for runs without one; empty if all have none."""
+    levels = get_speed_levels(records)
+    if not levels:
+        return Records()
+    converted = records.having(
+        replace(r, relative=math.inf if r.motion_speed is None else r.motion_speed, floor=0.0)
+        for r in records
+        if not r.turns
+    )
+    for run in records.runs.values():
+        converted.add(replace(run, plan={**run.plan, "levels": levels}))
+    return converted
+
+
+def list_idle_cases(records: Records) -> list[IdleCase]:
+    """List cases whose solution is the zero impulse, with the worst residual of any run in units."""
+    worst: dict[str, tuple[str, float, float]] = {}
+    for r in sorted(records, key=lambda r: -r.velocity):
+        worst.setdefault(r.case, (r.solver, r.velocity, r.energy))
+    no_run = ("", 0.0, 0.0)
+    idle = ((name, info.rows) for name, info in records.cases.items() if info.nothing_to_do)
+    return [IdleCase(name, rows, *worst.get(name, no_run)) for name, rows in idle]

@@ -1,0 +1,81 @@
+"""Write a page of tables and figures under one sentence, its short form on a terminal, and its numbers as JSON."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from lavender.io.stored import make_folder, write_text
+from lavender.lab.report.figures import Figure
+from lavender.lab.report.page import create_environment
+from lavender.lab.report.plotting import plot_for_page, save_figures
+from lavender.lab.report.table import Table
+from lavender.lab.report.terminal import print_table
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+
+@dataclass(frozen=True)
+class PageSection:
+    """A heading with its tables, figures and lines to copy."""
+
+    title: str
+    tables: Sequence[Table] = ()
+    figures: Sequence[Figure] = ()
+    note: str = ""
+    code: Sequence[str] = ()  # lines to copy
+    short: int = 0  # rows of the first table that a terminal shows
+
+    @property
+    def is_shown(self) -> bool:
+        """Whether it has contents: tables without rows and figures without curves do not count."""
+        has_contents = any(t.rows for t in self.tables) or any(f.curves for f in self.figures)
+        return has_contents or bool(self.code) or not (self.tables or self.figures)
+
+
+@dataclass(frozen=True)
+class SummaryPage:
+    """A title, the sentence that sums up the page, sections, and numbers for programs."""
+
+    title: str
+    head: str
+    sections: Sequence[PageSection]
+    numbers: dict[str, Any]
+    stopped: bool = False  # the measurement ended early; all numbers are of the part before
+
+    def render_html(self) -> str:
+        """Return one file without external parts; every text is escaped."""
+        names = list(
+            dict.fromkeys(c.solver for part in self.sections for f in part.figures for c in f.curves)
+        )
+        number = {name: i for i, name in enumerate(names)}
+        shown = [part for part in self.sections if part.is_shown]
+        sections = [
+            (part, [plot_for_page(f, number, names) for f in part.figures if f.curves]) for part in shown
+        ]
+        template = create_environment().get_template("summary_page.html.j2")
+        return str(template.render(page=self, sections=sections, number=number))
+
+    def write(self, folder: str | os.PathLike[str]) -> Path:
+        """Write `index.html`, `numbers.json` and `figures/*.svg, *.png`; return the path of the page."""
+        folder = make_folder(folder)
+        write_text(folder / "index.html", self.render_html())
+        write_text(folder / "numbers.json", json.dumps(self.numbers, indent=1) + "\n")
+        save_figures((f for part in self.sections for f in part.figures if f.curves), folder / "figures")
+        return folder / "index.html"
+
+    def print_short(self, console: Console) -> None:
+        """Print the sentence, lines to copy, and the first rows of each section's first table."""
+        console.print(self.head, style="bold", highlight=False, markup=False)
+        for part in self.sections:
+            for line in part.code:
+                console.print(f"    {line}", highlight=False, markup=False, soft_wrap=True)
+            for table in part.tables[:1] if part.short else ():
+                if table.rows:
+                    console.print()
+                    print_table(console, replace(table, rows=table.rows[: part.short]), cut=True)

@@ -1,0 +1,507 @@
+"""Describe every table of a report once: its page, the terminal, the summary and a paper show the same rows.
+
+`sections` is their order for those who read from top to bottom: the terminal and the summary walk it. The page has the
+same tables between its figures.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+from lavender.base.deadline import seconds
+from lavender.judge.residuals import UNCONVERGED
+from lavender.judge.solution import CONFIRMED, CONTRADICTED, NOT_PROVEN
+from lavender.lab.bench import recommendation, resampling, statistics
+from lavender.lab.bench.recommendation import Advice, Choice, FamilyAdvice
+from lavender.lab.bench.record import Record, Skip, file_name, level_name, printable
+from lavender.lab.bench.store import Records
+from lavender.lab.report.engine import INSIDE, list_cases_of, rank_engine, ranks_before
+from lavender.lab.report.findings import Report
+from lavender.lab.report.motion_tables import format_speed, list_idle_cases
+from lavender.lab.report.table import WORDS, Cell, Table
+from lavender.lab.report.text import (
+    NONE,
+    format_count,
+    format_left_out,
+    format_percent,
+    format_ratio,
+    format_residual,
+    format_share,
+    name_run,
+)
+
+Rows = list[Sequence[str | Cell]]
+GOOD = ("CONVERGED", "FLOOR")
+CLAIM_MARKS = {CONFIRMED: "", NOT_PROVEN: NOT_PROVEN, CONTRADICTED: "✗ contradicted"}
+SHOWN_TIES = 2
+DIFFICULTY = (
+    "sweeps of pgs to a thousandth of doing nothing; condition of A scaled to a diagonal of 1; share of blocks at the "
+    "boundary of two states, among those whose error has a bound; "
+    "solvers with the same bits and no iteration, whose times are of one shortcut"
+)
+IN_TURNS, ALONE = "in turns", "alone"  # lines of a recommendation, timed again; runs one after the other
+ENGINES_OWN = "engine's own"  # column of the solver of the engine that recorded the cases
+NOT_COMPARED = "no case has the same numbers in both (steps of sequences are not compared)"
+
+
+@dataclass(frozen=True)
+class Section:
+    """A table under its heading."""
+
+    title: str
+    note: str  # what its numbers are
+    table: Table
+    grouped: bool = False  # rows of one case or structure stand together
+    empty: str = ""  # what is said in place of no rows; a section without rows and this is left out
+
+
+def list_sections(report: Report) -> list[Section]:
+    """List the tables of a report with their headings, from the recommendations to changes since an earlier report."""
+    records, levels = report.records, report.levels
+    moved = "how wrong the body moves that is furthest off"
+    if report.is_campaign:
+        shares = tabulate_robustness(statistics.robustness(records), levels)
+        by_speed = tabulate_robustness(statistics.robustness(report.by_speed), report.speeds, " m/s")
+        note = "no times; share of cases brought to a level, residual at each budget"
+        sections = [
+            Section("Campaign", note, shares, grouped=True),
+            Section("By motion error", moved, by_speed, grouped=True),
+        ]
+    else:
+        timed = (
+            f"{IN_TURNS} to {level_name(levels[len(levels) // 2])}, else {ALONE}"
+            if has_turns(report)
+            else ALONE
+        )
+        by_structure = (
+            f"to a level: mean time, {timed} (cold, if not carried), share of cases that get there, budget; in a time "
+            "or with sweeps: share of cases served, nine of ten at least, residual at the 90th percentile; ≈ as good "
+            "within noise"
+        )
+        by_sweeps = "share of cases served, residual at the 90th percentile"
+        inside = (
+            "its own answers, judged like ours; its time holds no copy of the problem and no judge; ranked as in the "
+            "first sentence"
+        )
+        every = "floor: rounding to float64 allows no better"
+        carried = "median residual, time of all steps; carried from step to step, or cold"
+        cases = tabulate_reaches(statistics.reaches(records, levels), levels).without("form")
+        sections = [
+            Section("By structure", by_structure, tabulate_advice(report)),
+            Section("By sweeps", by_sweeps, tabulate_sweeps(report.lines)),
+            Section("Inside the engine", inside, tabulate_engines(report)),
+            Section("By motion error", moved, tabulate_speeds(report)),
+            Section("Motion error of each case", moved, tabulate_motion_errors(report), grouped=True),
+            Section("Cases", every, cases, grouped=True),
+            Section("Difficulty", DIFFICULTY, tabulate_difficulties(statistics.difficulties(records))),
+            Section("Sequences", carried, tabulate_passes(statistics.passes(records)), grouped=True),
+        ]
+    if report.earlier_run is not None:
+        changed = tabulate_changes(report.earlier_run, records)
+        title = f"Against {printable(report.earlier_run.source)}"
+        empty = "nothing beyond noise" if statistics.changes(report.earlier_run, records) else NOT_COMPARED
+        sections.append(Section(title, "times to a level", changed, empty=empty))
+    return [s for s in sections if s.table.rows or s.empty]
+
+
+def build_short_table(report: Report) -> Table:
+    """Build the table of a short report, to the middle level alone.
+
+    Its rows are structures with the first solver of each, or the solvers of the only structure; for a campaign shares
+    of cases.
+    """
+    middle = len(report.levels) // 2
+    if report.is_campaign:
+        table = tabulate_robustness(statistics.robustness(report.records), report.levels[middle : middle + 1])
+        return table.without(*(head for head in table.heads if "iterations" in head), "hardest")
+    by_motion = any(run.plan.get("speed_levels") for run in report.newest.runs.values())
+    if len(report.lines) == 1 and not by_motion:
+        return _tabulate_solvers(report, report.levels[middle])
+    table = tabulate_speeds(report) if by_motion else tabulate_advice(report)
+    column = 1 + (len(report.speeds) // 2 if by_motion else middle)
+    rows: Rows = [[str(row[0]), replace(row[column], after="")] for row in table.rows]  # type: ignore[type-var]
+    head = f"{table.heads[column]}, timed {IN_TURNS if has_turns(report) and not by_motion else ALONE}"
+    heads = ["structure", head]
+    if ENGINES_OWN in table.heads:
+        heads.append(ENGINES_OWN)
+        rows = [[*row, whole[-1]] for row, whole in zip(rows, table.rows, strict=True)]
+    return Table(heads, rows, words=WORDS | set(heads))
+
+
+def has_turns(report: Report) -> bool:
+    """Return whether calls of the recommendation were timed in turns."""
+    return any(r.turns for r in report.records)
+
+
+def _tabulate_solvers(report: Report, level: float) -> Table:
+    """Tabulate the solvers of the only structure to a level: first those of the first sentence, with its times."""
+    raced = {choice.solver: (final.line, choice) for final, choice in report.verdict.ranking if choice.solved}
+    alone = [c for c in report.lines[0].by_level[level].ranking if c.solved and c.solver not in raced]
+    rows: Rows = [
+        [
+            c.solver,
+            seconds(c.score) + format_share(c.solved, c.cases),
+            f"{line.asked}, {line.start}",
+            IN_TURNS if line.turns else ALONE,
+        ]
+        for line, c in raced.values()
+    ]
+    rows += [[c.solver, seconds(c.score) + format_share(c.solved, c.cases), c.how, ALONE] for c in alone]
+    engine = rank_engine(report.engines, report.records, report.lines[0].cases, level)
+    if engine is not None and engine.solved:
+        ranked = [*(choice for _, choice in raced.values()), *alone]
+        before = sum(not ranks_before(engine, choice) for choice in ranked)
+        time = seconds(engine.score) + format_share(engine.solved, engine.cases)
+        rows.insert(before, [f"engine's {engine.solver}", time, "own, warm", "inside the engine"])
+    return Table(["solver", f"to {level_name(level)}", "asked", "timed"], rows)
+
+
+# -- recommendations ---------------------------------------------------------------------------------------
+
+
+def format_advice(advice: Advice, in_time: bool) -> Cell:
+    """Return the first solver with its time or residual, the number of cases that it solves, and its budget."""
+    best, ties = advice.best, advice.ties
+    if best is None:
+        most = advice.ranking[0] if advice.ranking else None
+        return Cell("nobody", after=f" ({most.solved}/{most.cases} at most)" if most and most.solved else "")
+    write = format_residual if in_time else seconds
+    after = f", {best.how}" if best.how else ""
+    if ties:
+        others = f" and {len(ties) - SHOWN_TIES} more" if len(ties) > SHOWN_TIES else ""
+        after += f" ≈ {', '.join(ties[:SHOWN_TIES])}{others}"
+    more, title = "", ", ".join(ties)
+    if best.cases > 1 and not math.isnan(best.worst):
+        p95 = f"p95 {write(best.p95)}, " if best.cases >= 20 and not in_time else ""
+        more, title = (
+            f"{p95}worst {write(best.worst)}",
+            f"worst: {best.hardest}" + (f"; ≈ {title}" if ties else ""),
+        )
+    mark = "warn" if best.solved < best.cases else ""
+    text = ("to " if in_time else "") + write(best.score) + format_share(best.solved, best.cases)
+    return Cell(text, best.solver, after, more, title, mark=mark)
+
+
+def tabulate_advice(report: Report, links: Mapping[str, str] | None = None) -> Table:
+    """Tabulate the first solver to each level and within each time [s], for each structure and sequence.
+
+    `links` are the parts of the page that a name leads to.
+    """
+    heads = [*(f"to {level_name(x)}" for x in report.levels), *(f"in {seconds(t)}" for t in report.times)]
+    level = report.levels[len(report.levels) // 2]
+    engines = [rank_engine(report.engines, report.records, line.cases, level) for line in report.lines]
+    rows: Rows = [
+        [
+            Cell(
+                line.name,
+                after=format_left_out(line.left_out),
+                more=format_count(line.size, "step" if line.sequence else "case"),
+                link=(links or {}).get(line.name, ""),
+            ),
+            *(format_advice(a, False) for a in line.by_level.values()),
+            *(format_advice(a, True) for a in line.by_time.values()),
+            _format_engine(engine, level),
+        ]
+        for line, engine in zip(report.lines, engines, strict=True)
+    ]
+    table = Table(["structure", *heads, ENGINES_OWN], rows, folds=True)
+    return table if any(engines) else table.without(ENGINES_OWN)
+
+
+def _format_engine(engine: Choice | None, level: float) -> Cell:
+    """Return the engine's own solver to the level of the first sentence."""
+    if engine is None or not engine.solved:
+        return Cell(NONE if engine is None else f"nothing to {level_name(level)}")
+    text = seconds(engine.score) + format_share(engine.solved, engine.cases)
+    return Cell(text, engine.solver, f", to {level_name(level)}", title=INSIDE)
+
+
+def tabulate_sweeps(lines: Sequence[FamilyAdvice]) -> Table:
+    """Tabulate the first solver with each budget of sweeps; no rows if no budget was run."""
+    budgets = sorted({n for line in lines for n in line.by_sweeps})
+    heads = [format_count(int(n), "sweep") for n in budgets]
+    rows: Rows = [
+        [
+            Cell(line.name, after=format_left_out(line.left_out)),
+            *(format_advice(x, True) for x in line.by_sweeps.values()),
+        ]
+        for line in lines
+        if line.by_sweeps
+    ]
+    return Table(["structure", *heads], rows, folds=True)
+
+
+def tabulate_speeds(report: Report) -> Table:
+    """Tabulate the first solver to each motion error [m/s], for each structure."""
+    heads = [f"to {format_speed(x)}" for x in report.speeds]
+    rows: Rows = [
+        [line.name, *(format_advice(a, False) for a in line.by_level.values())]
+        for line in recommendation.recommend_from_single_runs(report.by_speed)
+        if not line.sequence
+    ]
+    return Table(["structure", *heads], rows, folds=True)
+
+
+# -- cases -------------------------------------------------------------------------------------------------
+
+
+def tabulate_cases(
+    records: Records, fastest: Mapping[str, statistics.Reach | None], level: float, stored: bool
+) -> Table:
+    """Tabulate each case with its size, the first solver to the level, and the residual of its stored answer."""
+    rows: Rows = []
+    for name, best in fastest.items():
+        info = records.cases[name]
+        time = math.inf if best is None else best.times[level]
+        answer = format_residual(info.stored) if math.isfinite(info.stored) else NONE
+        rows.append(
+            [
+                Cell(name, link=f"case-{file_name(name)}"), info.law, str(info.rows), str(info.contacts),
+                ", ".join(info.structure), "nobody" if best is None else best.solver, Cell(seconds(time), value=time),
+                Cell(answer, value=info.stored),
+            ]
+        )  # fmt: skip
+    head = f"fastest to {level_name(level)}"
+    heads = ["case", "law", "rows", "contacts", "structure", head, "time", "stored answer"]
+    table = Table(heads, rows, words=WORDS | {head})
+    return table if stored else table.without("stored answer")
+
+
+def tabulate_reaches(reaches: Sequence[statistics.Reach], levels: Sequence[float]) -> Table:
+    """Tabulate time to each level, smallest residual, status and claim of each case and solver."""
+    rows: Rows = [
+        [
+            r.case,
+            name_run(r.solver, r.start),
+            *(seconds(r.times[x]) for x in levels),
+            Cell(format_residual(r.best), after=" floor" if r.at_floor else ""),
+            Cell(r.status, mark="good" if r.status in GOOD else "warn"),
+            Cell(CLAIM_MARKS[r.claim_check], more=r.status_conflict),
+            r.form,
+        ]
+        for r in reaches
+    ]
+    marks = ["bad" if r.status_conflict else "" for r in reaches]
+    heads = ["case", "solver", *(f"to {level_name(x)}" for x in levels), "best", "status", "claim", "form"]
+    return Table(heads, rows, marks)
+
+
+def tabulate_difficulties(difficulties: Sequence[statistics.Difficulty]) -> Table:
+    """Tabulate the measures of difficulty of each case, and the proved distance of an exact solution if known."""
+    rows: Rows = [
+        [
+            d.case,
+            str(d.rows),
+            NONE if d.sweeps is None else str(d.sweeps),
+            NONE if d.condition is None else f"{d.condition:.1e}",
+            NONE if d.degenerate is None else format_percent(round(1e6 * d.degenerate), 10**6),
+            ", ".join(d.same),
+            d.proof,
+        ]
+        for d in difficulties
+    ]
+    heads = ["case", "rows", "sweeps", "condition", "at a boundary", "same answer", "exact solution"]
+    return Table(heads, rows).without(*(heads[i] for i in (5, 6) if not any(row[i] for row in rows)))
+
+
+def tabulate_motion_errors(report: Report) -> Table:
+    """Tabulate time to each motion error, the smallest, relative, and its bound, of each case and solver."""
+    levels = report.speeds
+    rows: Rows = []
+    for m in statistics.reaches(report.by_speed, levels):
+        known = [
+            f"{format_residual(x)}{unit}" if math.isfinite(x) else NONE
+            for x, unit in ((m.best, " m/s"), (m.motion, ""), (m.bound, " √J"))
+        ]
+        rows.append([m.case, name_run(m.solver, m.start), *(seconds(m.times[x]) for x in levels), *known])
+    heads = [f"to {format_speed(x)}" for x in levels]
+    return Table(["case", "solver", *heads, "best", "relative", "bound"], rows)
+
+
+def tabulate_idle_cases(records: Records) -> Table:
+    """Tabulate cases whose solution is the zero impulse, with the worst answer to each, in units."""
+    rows: Rows = [
+        [
+            c.case,
+            str(c.rows),
+            c.solver or "nobody",
+            f"{format_residual(c.velocity)} m/s",
+            f"{format_residual(c.energy)} √J",
+        ]
+        for c in list_idle_cases(records)
+    ]
+    return Table(["case", "rows", "solver", "velocity", "energy"], rows)
+
+
+def tabulate_failures(failures: Sequence[Record], campaign: bool) -> Table:
+    """Tabulate runs that missed their level or made a false claim. Cases of a campaign have no section to link to."""
+    rows: Rows = [
+        [
+            Cell(f.case, link="" if campaign else f"case-{file_name(f.case)}"), name_run(f.solver, f.start), f.asked,
+            f.status, format_residual(f.relative), format_residual(f.floor), f.worst_name,
+            (f"✗ {f.status_conflict}. " if f.status_conflict else "") + f.message,
+        ]
+        for f in failures
+    ]  # fmt: skip
+    marks = ["bad" if f.status_conflict else "" for f in failures]
+    return Table(
+        ["case", "solver", "asked", "status", "residual", "floor", "worst row", "message"], rows, marks
+    )
+
+
+def tabulate_skips(skips: Sequence[Skip]) -> Table:
+    """Tabulate pairs of case and solver that were not run, or not to the end."""
+    return Table(["case", "solver", "reason"], [[s.case, s.solver, s.reason] for s in skips])
+
+
+def tabulate_changes(old: Records, new: Records) -> Table:
+    """Tabulate times to a level that differ from an earlier run beyond noise."""
+    changes = [c for c in statistics.changes(old, new) if c.kind != "same"]
+    rows: Rows = []
+    for c in changes:
+        factor = f" {c.new / c.old:.3g} times" if c.kind in ("faster", "slower") else ""
+        times_of = (level_name(c.level), seconds(c.old), seconds(c.new))
+        rows.append([c.case, name_run(c.solver, c.start), *times_of, c.kind + factor])
+    marks = ["bad" if c.kind in ("lost", "slower") else "good" for c in changes]
+    return Table(["case", "solver", "level", "before", "now", "change"], rows, marks)
+
+
+# -- over many cases ---------------------------------------------------------------------------------------
+
+
+def tabulate_robustness(
+    rows: Sequence[statistics.Robustness], levels: Sequence[float], unit: str = ""
+) -> Table:
+    """Tabulate shares of cases brought to each level, false claims, and residual (or motion error) by budget."""
+    budgets = sorted({n for row in rows for n in row.budgets})
+    cells = [
+        {
+            "structure": r.family,
+            "solver": r.solver,
+            "cases": str(r.cases),
+            **{f"to {level_name(x)}{unit}": format_percent(r.reached[x], r.cases, 1) for x in levels},
+            "false claims": str(r.wrong),
+            "died": str(r.died),
+            **{
+                f"{n} iterations: median, 95 %": ", ".join(map(format_residual, r.budgets[n]))
+                if n in r.budgets
+                else NONE
+                for n in budgets
+            },
+            "hardest": r.hardest,
+        }
+        for r in rows
+    ]
+    return Table.of(cells, ["bad" if r.wrong or r.died else "" for r in rows])
+
+
+def tabulate_claims(records: Records) -> Table:
+    """Tabulate how many claims of each solver are correct."""
+    claims = statistics.claims(records)
+    rows: Rows = [
+        [
+            c.solver, str(c.runs), format_percent(c.claims - c.wrong, c.claims) if c.claims else NONE, str(c.claims),
+            f"✗ {c.wrong}" if c.wrong else "0", f"{c.reached} of {c.asked}", str(c.crashed),
+        ]
+        for c in claims
+    ]  # fmt: skip
+    marks = ["bad" if c.wrong or c.crashed else "" for c in claims]
+    return Table(["solver", "runs", "correct rate", "claims", "wrong", "levels reached", "died"], rows, marks)
+
+
+def tabulate_means(by_level: Mapping[float, Mapping[str, tuple[float, int, int]]]) -> Table:
+    """Tabulate `statistics.geometric_means` of one law: mean time to each level, and number of cases that reach it."""
+    levels = list(by_level)
+    rows: Rows = [
+        [
+            solver,
+            *(Cell(seconds(t), after=f" {n}/{of}") for t, n, of in (by_level[x][solver] for x in levels)),
+        ]
+        for solver in by_level[levels[0]]
+    ]
+    return Table(["solver", *(f"to {level_name(x)}" for x in levels)], rows)
+
+
+def tabulate_backends(records: Records) -> Table:
+    """Tabulate total time, its two parts, and wins against the built-in solvers, of solvers of other packages."""
+    rows: Rows = [
+        [b.solver, str(b.solved), *map(seconds, (b.whole, b.whole - b.own, b.own)), str(b.wins)]
+        for b in statistics.backends(records)
+    ]
+    return Table(["solver", "cases", "whole way", "conversion", "own interface", "less than ours"], rows)
+
+
+def tabulate_spreads(spreads: Sequence[statistics.Spread]) -> Table:
+    """Tabulate residuals after one budget in several orders of the blocks."""
+    rows: Rows = [
+        [
+            s.case, s.solver, str(s.budget), format_ratio(s.factor),
+            ", ".join(f"{order} {format_residual(x)}" for order, x in s.by_order.items()),
+        ]
+        for s in spreads
+    ]  # fmt: skip
+    return Table(["case", "solver", "budget", "spread", "residual by order"], rows)
+
+
+def tabulate_passes(passes: Sequence[statistics.Pass]) -> Table:
+    """Tabulate residual and time of each solver over sequences, with carried impulses and cold."""
+    starts = ("carried", "cold")
+    rows: Rows = []
+    for w in passes:
+        rows.append(
+            [
+                Cell(w.sequence, after=format_left_out(w.left_out)), w.solver, w.asked, str(w.steps),
+                f"{w.gain:.3g}" if math.isfinite(w.gain) and w.mode == "budget" else NONE,
+                *(format_residual(w.middle(s)) if s in w.residuals else NONE for s in starts),
+                *(seconds(w.time[s]) + format_share(len(w.times[s]), w.steps) if s in w.time else NONE for s in starts),
+                *(str(w.iterations.get(s, NONE)) for s in starts),
+            ]
+        )  # fmt: skip
+    heads = [f"{what}, {start}" for what in ("median", "time", "iterations") for start in starts]
+    return Table(["sequence", "solver", "asked", "steps", "gain", *heads], rows)
+
+
+def tabulate_engines(report: Report) -> Table:
+    """Tabulate engines' own answers, and the first solver here on the same cases, to the middle level."""
+    records, level = report.records, report.levels[len(report.levels) // 2]
+    rows = []
+    for c in report.engines:
+        cases = list_cases_of(c, records)
+        engine = rank_engine([c], records, cases, level)
+        first = _recommend_here(records, cases, level)
+        far = c.unconverged and c.where
+        rows.append(
+            {
+                "recorded": c.folder,
+                "steps": f"{c.steps}{format_left_out(c.left_out)}",
+                "rows": f"{c.rows:g}",
+                "engine's own": f"{c.solver} (inside the engine)",
+                f"to {level_name(level)}": _format_time(engine),
+                "residual, median": format_residual(c.relative),
+                "worst": format_residual(c.worst),
+                "above floor": str(c.above_floor),
+                UNCONVERGED: str(c.unconverged),
+                "furthest off": f"{c.velocity:.2g} m/s, {c.where}" if far else NONE,
+                "first here": NONE if first is None else first.solver,
+                f"to {level_name(level)}, here": _format_time(first),
+            }
+        )
+    return Table.of(rows)
+
+
+def _recommend_here(records: Records, cases: Sequence[str], level: float) -> Choice | None:
+    """Return the solver that is recommended for the cases of a folder, by the rule of the first sentence."""
+    if not cases:
+        return None
+    way = "steps" if records.cases[cases[0]].sequence else "call"
+    alone = recommendation.rank_to_level(records, "", cases, level)
+    best = resampling.recommend_for_cases(records, alone, resampling.select_calls(records, way), cases).best
+    return best if best is not None and best.solved else None
+
+
+def _format_time(choice: Choice | None) -> str:
+    if choice is None or not choice.solved:
+        return NONE
+    return seconds(choice.score) + format_share(choice.solved, choice.cases)

@@ -1,0 +1,151 @@
+"""Statistics of records are what their definitions say."""
+
+import dataclasses
+import math
+import sys
+
+import pytest
+
+from lavender import bench, report
+from lavender.lab.bench import statistics
+from lavender.lab.report import table_specs
+from tests.lab.report.synthetic import BUDGET, FALSE_CLAIM, LEVELS, info, record, records_of
+
+
+def test_time_to_a_level_is_that_of_the_cheapest_run_that_reached_it():
+    found = records_of(
+        record("a", "x", 5.0, 1e-4, tol=1e-3),
+        record("a", "x", 9.0, 1e-8),
+        record("a", "x", 1.0, 9e-4, **BUDGET),
+        record("a", "x", 0.1, 1e-9, order="reverse", mode="budget"),  # another order does not count
+        record("a", "y", 2.0, 2e-3, tol=1e-3, status="STALLED", claims=False),
+        record("a", "y", 3.0, 0.5, tol=1e-3, **FALSE_CLAIM),
+    )
+    x, y = report.reaches(found)
+    assert dict(x.times) == {1e-3: 1.0, 1e-6: 9.0}
+    assert (x.best, x.status) == (1e-8, "CONVERGED")
+    assert dict(y.times) == {1e-3: math.inf, 1e-6: math.inf}
+    assert (y.best, y.status_conflict) == (2e-3, "says CONVERGED")
+
+
+@pytest.mark.parametrize(
+    ("check", "conflict", "mark", "wrong"),
+    [
+        ("confirmed", "", "", 0),
+        ("not proven", "", "not proven", 0),
+        ("contradicted", "says INFEASIBLE, auto found a solution", "✗ contradicted", 1),
+    ],
+)
+def test_a_claim_that_is_not_proven_is_neither_a_proof_nor_a_false_claim(check, conflict, mark, wrong):
+    claim = {"status": "INFEASIBLE", "claim_check": check, "status_conflict": conflict}
+    found = records_of(record("a", "x", 1.0, 0.5, **claim))
+    assert len(report.failures(found)) == (0 if check == "confirmed" else 1)
+    assert [c.wrong for c in report.claims(found)] == [wrong]
+    table = table_specs.tabulate_reaches(report.reaches(found), LEVELS)
+    assert str(table.rows[0][table.heads.index("claim")]) == mark
+    assert table.marks == ["bad" if wrong else ""]
+
+
+def test_profiles_count_misses_and_refusals_at_infinity():
+    found = records_of(
+        record("a", "fast", 1.0, 1e-7), record("a", "slow", 3.0, 1e-7),
+        record("b", "fast", 2.0, 1e-1, success=False), record("b", "slow", 4.0, 1e-7),
+        record("c", "slow", 1.0, 1e-7), record("d", "slow", 1.0, 1.0), record("d", "fast", 1.0, 1.0),
+    )  # fmt: skip
+    profile = next(p for p in report.profiles(found) if p.level == 1e-6)
+    assert profile.cases == 4
+    assert dict(profile.curves) == {"fast": ((1.0, 0.25),), "slow": ((1.0, 0.5), (3.0, 0.75))}
+
+
+def test_shifted_geometric_means_charge_misses_the_limit():
+    found = records_of(
+        record("a", "x", 1.0, 1e-7), record("b", "x", 4.0, 1e-7),
+        record("a", "y", 1.0, 1e-7), record("b", "y", 0.5, 1.0, success=False),
+        record("a", "z", 1.0, 1e-7),  # does not take b: not compared
+    )  # fmt: skip
+    means = report.geometric_means(found)["lcp"][1e-6]
+    shift = statistics.MEAN_TIME_SHIFT
+    assert set(means) == {"x", "y"}
+    assert means["x"] == (pytest.approx(math.sqrt((1 + shift) * (4 + shift)) - shift), 2, 2)
+    assert means["y"] == (pytest.approx(math.sqrt((1 + shift) * (2 + shift)) - shift), 1, 2)  # limit 2 s
+
+
+def test_families_are_structures_and_laws():
+    words = {"a": ("stack",), "b": ("stack", "redundant")}
+    made = [record(case, "x", 1.0, 1e-7) for case in "ab"]
+    assert list(report.families(records_of(*made, structure=words))) == ["stack", "redundant"]
+    alone = records_of(made[0], structure={"a": ("stack", "redundant", "friction")})
+    assert report.families(alone) == {"stack / redundant / friction": ["a"]}
+    two_laws = records_of(*made, law={"b": "coulomb"})
+    assert report.families(two_laws) == {"stack, coulomb": ["b"], "stack, lcp": ["a"]}
+
+
+def test_claims_failures_and_spreads():
+    found = records_of(
+        record("a", "x", 1.0, 1e-7), record("a", "x", 1.0, 1e-2, **FALSE_CLAIM),
+        record("a", "y", math.nan, math.inf, status="CRASHED (SIGSEGV)", claims=False, success=False, message="died"),
+        record("a", "z", 1.0, 1e-5, status="FLOOR", floor=1e-5),  # excused
+        record("a", "w", 1.0, math.inf, status="INFEASIBLE", floor=math.nan, success=False, worst_name="row 3"),
+        *(record("a", "x", 1.0, r, order=o, **BUDGET) for o, r in (("given", 1e-2), ("reverse", 4e-2))),
+    )  # fmt: skip
+    by = {c.solver: c for c in report.claims(found)}
+    assert (by["x"].claims, by["x"].wrong) == (2, 1)
+    assert (by["y"].crashed, by["y"].asked, by["y"].reached) == (1, 1, 0)
+    # Of what was run again in turns the first run counts; a run to a limit of time is in turns alone.
+    for mode, wrong in (("tol", 1), ("time", 2)):
+        more = records_of(*found, record("a", "x", 1.0, 1e-2, mode=mode, turns="one", **FALSE_CLAIM))
+        assert next(c.wrong for c in report.claims(more) if c.solver == "x") == wrong
+        assert sum(bool(f.status_conflict) for f in report.failures(more)) == wrong
+    failed = [(f.solver, f.status) for f in report.failures(found)]
+    assert failed == [("x", "CONVERGED"), ("y", "CRASHED (SIGSEGV)"), ("w", "INFEASIBLE")]
+    (spread,) = report.spreads(found)
+    assert (spread.budget, spread.factor) == (8, 4.0)
+    assert statistics.Spread("a", "x", 8, {"given": 1e-16, "reverse": 4e-15}, floor=2e-15).factor == 2.0
+
+
+def test_changes_beyond_noise_are_named():
+    old = records_of(
+        record("a", "x", 1.0, 1e-7), record("a", "y", 1.0, 1e-7), record("a", "z", 1.0, 1e-2, success=False),
+        record("a", "w", 1.0, 1e-7), record("a", "v", 1.0, 1e-7, time_median=1.5), record("b", "x", 1.0, 1e-7),
+    )  # fmt: skip
+    new = records_of(
+        record("a", "x", 3.0, 1e-7), record("a", "y", 1.1, 1e-7), record("a", "z", 1.0, 1e-7),
+        record("a", "w", 1.0, 1e-4, success=False), record("a", "v", 1.9, 1e-7),
+    )  # fmt: skip
+    found = {c.solver: c for c in statistics.changes(old, new) if c.level == 1e-6}
+    kinds = {"x": "slower", "y": "same", "z": "reached", "w": "lost", "v": "same"}
+    assert {s: c.kind for s, c in found.items()} == kinds
+    assert found["v"].noise == 2.0  # its repeats spread by half
+    # A case whose numbers have changed is not compared.
+    changed = records_of(record("a", "x", 3.0, 1e-7))
+    changed.add(info("a", sha="another"))
+    assert statistics.changes(old, changed) == []
+
+
+def test_a_slower_machine_is_no_slower_code():
+    old = records_of(*(record("a", solver, 1e-3, 1e-7, pace=1e-4) for solver in ("pgs", "auto")))
+    slower = [dataclasses.replace(r, time_min=1.6 * r.time_min) for r in old]
+    by = [dataclasses.replace(r, pace=1.6 * r.pace) for r in slower]
+    assert {c.kind for c in statistics.changes(old, records_of(*by))} == {"same"}
+    assert {c.kind for c in statistics.changes(old, records_of(*slower))} == {"slower"}
+    assert statistics.drift(old, records_of(*by)) == pytest.approx(1.6)
+
+
+@pytest.fixture(scope="module")
+def measured():
+    return bench.run(["stack(n=6)"], ["auto", "osqp"], bench.Plan(levels=(1e-6,), budgets=(), repeats=2))
+
+
+def test_backends_have_the_time_of_their_own_interface_too(measured):
+    (osqp,) = statistics.backends(measured)
+    (r,) = (r for r in measured if r.solver == "osqp")
+    assert 0.0 < r.own_min < r.time_min
+    assert (osqp.solver, osqp.solved) == ("osqp", 1)
+    assert (osqp.own, osqp.whole) == (pytest.approx(r.own_min), pytest.approx(r.time_min))
+
+
+def test_each_run_has_the_load_of_the_machine_and_a_row_of_the_frame(measured):
+    assert all(r.load is None or r.load >= 1.0 for r in measured)  # this process at least
+    assert sys.platform != "linux" or not any(r.load is None for r in measured)
+    pytest.importorskip("pandas", reason="a frame needs pandas (extra: frame)")
+    assert measured.frame()["relative"].tolist() == [r.relative for r in measured]
