@@ -65,12 +65,12 @@ if TYPE_CHECKING:
     from lavender.lab.motion import MotionError, Motions, motion_error, motions
     from lavender.lab.proof import Enclosure, prove
     from lavender.problem import cones as cones
+    from lavender.programs.quadratic import solve_qp
     from lavender.sim import engine, scene
     from lavender.sim.engine import SOLVER_FIELDS, Simulation, Snapshot
     from lavender.sim.scene import Scene
     from lavender.solvers import registry as registry
     from lavender.solving.plan import Plan, explain
-    from lavender.solving.quadratic import solve_qp
 
 # Module -> public names in it, imported when a name is first used.
 _LAZY_NAMES = {
@@ -87,7 +87,7 @@ _LAZY_NAMES = {
     "lavender.sim.engine": ("SOLVER_FIELDS", "Simulation", "Snapshot"),
     "lavender.sim.scene": ("Scene",),
     "lavender.solving.plan": ("Plan", "explain"),
-    "lavender.solving.quadratic": ("solve_qp",),
+    "lavender.programs.quadratic": ("solve_qp",),
 }
 _MODULE_OF_NAME = {name: module for module, names in _LAZY_NAMES.items() for name in names}
 

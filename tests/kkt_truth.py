@@ -319,3 +319,42 @@ def of_program(qp, answer):
     if answer.z_box is not None:
         force = force + answer.z_box
     return max(short), max(*wrong, np.abs(force).max()), abs(value)
+
+
+def relative_of_program(qp, answer):
+    """(primal, dual, gap) as OSQP and Clarabel have them: over the largest of their terms, the gap over |objective|.
+
+    And |objective| over the sum of its terms' sizes, which says how far they cancel.
+    """
+    x, px, y = answer.x, qp["P"] @ answer.x, [np.zeros(0)]
+    dense = {k: np.zeros((0, len(x))) if qp[k] is None else np.asarray(qp[k]) for k in ("G", "A")}
+    rows = [(dense["A"], qp["b"], answer.y), (dense["G"], qp["h"], answer.z)]
+    short, size, force, forces = [0.0], [1e-300], px + qp["q"], [np.abs(px).max(), np.abs(qp["q"]).max()]
+    value, terms = x @ (px + qp["q"]), np.abs(x) @ (np.abs(px) + np.abs(qp["q"]))
+    for (matrix, side, y), is_equation in zip(rows, (True, False), strict=True):
+        if side is None:
+            continue
+        on = np.isfinite(side)
+        along = matrix[on] @ x - side[on]
+        short.extend(np.abs(along) if is_equation else along)
+        size.extend(np.abs(side[on]))
+        size.extend(np.abs(matrix[on] @ x))
+        pull = matrix.T @ y
+        force, value = force + pull, value + side[on] @ y[on]
+        terms += np.abs(side[on]) @ np.abs(y[on])
+        forces.append(np.abs(pull).max())
+    if answer.z_box is not None:
+        force = force + answer.z_box
+        forces.append(np.abs(answer.z_box).max())
+        size.append(np.abs(x).max())
+        for bound, sign in (("ub", 1.0), ("lb", -1.0)):
+            if qp[bound] is not None:
+                on = np.isfinite(qp[bound])
+                push = np.maximum(sign * answer.z_box[on], 0.0)
+                short.extend(sign * (x[on] - qp[bound][on]))
+                value += sign * qp[bound][on] @ push
+                terms += np.abs(qp[bound][on]) @ push
+    objective = abs(0.5 * x @ px + qp["q"] @ x)
+    tiny = 1e-300
+    gap = abs(value) / max(objective, tiny) if value else 0.0
+    return max(short) / max(size), np.abs(force).max() / max(*forces, tiny), gap, objective / max(terms, tiny)

@@ -1,6 +1,6 @@
-"""A problem as a convex program, in two forms. Pure conversion: nothing here solves.
+"""A problem as a convex program, in three forms. Pure conversion: nothing here solves.
 
-Both are written as
+All are written as
 
     min 1/2 x.P x + q.x    subject to   A x + s = b,  s in {0}^z x R+^k x second-order cones,   lb <= x <= ub
 
@@ -23,7 +23,12 @@ Velocity form, from `Problem.velocity_form` (K, theta, g; y = M^1/2 times the ch
 and z = r + T zeta, lambda = sigma S z, where the rows are A = -T^T K~ (t aside). Its size is that of
 the velocities, and J is never squared.
 
-sigma = max(E0 / sqrt(m), V0 sqrt(heaviest mass)) makes both free of units, with unknowns near 1 also at
+Program form, of a quadratic program with a singular P (`Problem.from_qp`; (5) of `problem/program.py`): the program
+itself, with lb and ub for the bounds. S is one number for all variables and another for all rows, the geometric mean of
+r^-1/2, where r_i is the largest entry of row i of (5); sigma is the root mean square of r^-1/2 times the violation of
+the rows of (5) at zero.
+
+sigma = max(E0 / sqrt(m), V0 sqrt(heaviest mass)) makes the first two free of units, with unknowns near 1 also at
 large mass ratios; a residual of x times sigma is a residual of the judge. Rows whose impulse is known
 (lower = upper, friction with mu = 0, rows of A that are all zero) are taken out first. So are rows and contacts that b
 pushes to a bound by more than FAR_FROM_BOUND times the size of the unknowns, as placeholder bounds do: a tolerance of
@@ -32,7 +37,8 @@ the backend is relative to its largest number. `QPSolver` checks them at the ans
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import itertools
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -41,6 +47,7 @@ import numpy.typing as npt
 from lavender.base.arrays import FloatArray, one_of
 from lavender.base.errors import CapabilityError
 from lavender.base.lazy_import import sparse as sp
+from lavender.judge.certificates import check_certificate
 from lavender.judge.residuals import reference
 from lavender.problem import Problem
 
@@ -50,6 +57,8 @@ LARGEST = 1e20  # of a program's numbers: from there on backends read infinity, 
 # A row whose scaled |b| is larger is assumed to stay at its bound: backends lose as many digits as the largest b has,
 # and rows that act have b near 1. If the assumption fails, the backend is called once more with all rows.
 FAR_FROM_BOUND = 1e2
+# The same for the rows of a program: x is often larger than the bounds that act.
+PROGRAM_FAR_FROM_BOUND = 1e6
 MASS_RATIO = 1e3  # from here on the velocity form is more accurate, whatever the sizes
 
 
@@ -107,7 +116,8 @@ class _Parts:
         known[c.friction_rows] = c.reach[c.friction_rows] == 0.0
         sigma, assumed = _sigma(problem), np.zeros(0, np.intp)
         if assume:
-            assumed, at = _far_rows(problem, sigma)
+            far = PROGRAM_FAR_FROM_BOUND if problem.has_singular_program else FAR_FROM_BOUND
+            assumed, at = _far_rows(problem, sigma, far)
             assumed, at = assumed[~known[assumed]], at[~known[assumed]]
             known[assumed], fixed[assumed] = True, at
         kept = np.flatnonzero(~known)
@@ -139,7 +149,7 @@ class _Parts:
 class QP(_Parts):
     """A convex program and the way back; see the module. All arrays are free of units."""
 
-    form: str  # "impulse" or "velocity"
+    form: str  # "impulse", "velocity" or "program"
     P: sp.csc_matrix  # (n, n) symmetric, both triangles
     q: FloatArray  # (n,)
     A: sp.csc_matrix  # (r, n)
@@ -193,8 +203,8 @@ class QP(_Parts):
         """Velocity form: P has no zero on its diagonal, as no row needs a t."""
         return self.form == "velocity" and self.n == self.lift.shape[1]
 
-    def impulse(self, x: FloatArray, zeta: FloatArray) -> FloatArray:
-        """lambda (m,) [N s] of an answer, rounding outside constant bounds clipped."""
+    def impulse(self, x: FloatArray, zeta: FloatArray, xi: FloatArray) -> FloatArray:
+        """lambda (m,) [N s] of an answer, rounding outside constant bounds clipped; xi matters to a program alone."""
         lam = self.fixed.copy()
         z = x if self.form == "impulse" else self.shift + self.back @ zeta
         lam[self.kept] = self.sigma * self.root * z
@@ -406,6 +416,133 @@ def velocity_form(problem: Problem, *, assume: bool = False) -> QP:
     )
 
 
+@dataclass(frozen=True)
+class ProgramQP(QP):
+    """The program form: a quadratic program in the units S, sigma, and the way back to x and the multipliers."""
+
+    n_x: int  # rows of the problem that are kept and are variables; they come first in `kept`
+    general: IntpArray  # (r,) rows of the problem that are rows of A
+    signs: FloatArray  # (r,) -1 for equations, 1 for G: multipliers over zeta
+    bounds: tuple[tuple[float, IntpArray, IntpArray], ...]  # sign of xi, rows of the problem, their unknowns
+
+    def impulse(self, x: FloatArray, zeta: FloatArray, xi: FloatArray) -> FloatArray:
+        """x and the multipliers (m,), rounding outside constant bounds clipped."""
+        c, lam = self.problem.cones, self.fixed.copy()
+        lam[self.kept[: self.n_x]] = self.sigma * self.root[: self.n_x] * x
+        lam += self.sigma * self._multipliers(zeta, xi)
+        return np.clip(lam, c.lower, c.upper, out=lam)
+
+    def _multipliers(self, zeta: FloatArray, xi: FloatArray) -> FloatArray:
+        """(m,) over sigma, 0 for variables; of a bound with a multiplier of the other sign 0."""
+        lam, scale = np.zeros(self.problem.m), np.zeros(self.problem.m)
+        scale[self.kept] = self.root
+        lam[self.general] = scale[self.general] * self.signs * zeta
+        for sign, rows, at in self.bounds:
+            force = xi[at] / self.root[at]
+            lam[rows] = -force if sign == 0.0 else np.maximum(sign * force, 0.0)
+        return lam
+
+    def direction(self, x: FloatArray | None, zeta: FloatArray | None) -> FloatArray | None:
+        """Certificate (m,) that no solution exists: contradicting rows, or a direction of unlimited decrease."""
+        candidates = []
+        if zeta is not None and len(zeta) == len(self.b):
+            # Backends return multipliers of rows alone; those of the bounds balance them.
+            candidates.append(self._multipliers(zeta, -(self.A.T @ zeta)))
+        if x is not None and len(x) == self.n:
+            y = np.zeros(self.problem.m)
+            y[self.kept[: self.n_x]] = self.root[: self.n_x] * x
+            candidates.append(y)
+        c = self.problem.cones
+        candidates = [np.where(np.isfinite(c.lower), np.maximum(y, 0.0), y) for y in candidates]
+        candidates = [y / np.abs(y).max() for y in candidates if 0.0 < np.abs(y).max() < np.inf]
+        proofs = (y for y in candidates if check_certificate(self.problem, y) is None)
+        return next(proofs, candidates[0] if candidates else None)
+
+    def multiplier(self, x: FloatArray, xi: FloatArray) -> FloatArray:
+        """Not defined for x and multipliers together: NaN (m,)."""
+        return np.full(self.problem.m, np.nan)
+
+    def start(self, impulse: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """(x, zeta, xi) of a start (m,)."""
+        scaled = np.zeros(self.problem.m)
+        scaled[self.kept] = impulse[self.kept] / (self.sigma * self.root)
+        xi = np.zeros(self.n)
+        for sign, rows, at in self.bounds:
+            np.add.at(xi, at, (sign or -1.0) * impulse[rows] * self.root[at] / self.sigma)
+        return scaled[self.kept[: self.n_x]], self.signs * scaled[self.general], xi
+
+
+def program_form(problem: Problem, *, assume: bool = False) -> ProgramQP:
+    """Write a quadratic program with a singular P in the units of its problem; `assume` as in `impulse_form`."""
+    parts, qp = _Parts.of(problem, True, assume), problem.qp
+    kept, n = parts.kept, len(qp.q)
+    n_x = int(np.searchsorted(kept, n))
+    # One unit for all variables and one for all rows: backends balance what they get, and with rows and columns that
+    # are balanced twice, piqp 0.7 called a public program infeasible.
+    row_size = abs(problem.csr[kept]).max(axis=1).toarray().ravel()
+    root = 1.0 / np.sqrt(row_size)
+    wrong = np.where(
+        kept < n + qp.free, np.abs(problem.b[kept]), np.maximum(problem.b[kept], 0.0)
+    )  # at x = 0
+    sigma = float(np.sqrt(np.mean((root * wrong) ** 2))) or 1.0
+    for part in (root[:n_x], root[n_x:]):
+        if len(part):
+            part[:] = np.exp(np.mean(np.log(part)))
+    parts = replace(parts, root=root, sigma=sigma)
+    unit = root[:n_x]
+    scale = np.zeros(problem.m)
+    scale[kept] = root
+    place = np.full(n, -1)
+    place[kept[:n_x]] = np.arange(n_x)
+    is_kept = np.zeros(problem.m, bool)
+    is_kept[kept] = True
+    # Rows of (2) of problem/program.py, one kind after the other.
+    none = np.zeros(0, np.intp)
+    fixed, lower, upper = (none if at is None else at for at in (qp.fixed, qp.lower, qp.upper))
+    n_a, n_g = qp.free - len(fixed), len(qp.target) - qp.free - len(lower) - len(upper)
+    ends = n + np.cumsum([0, n_a, len(fixed), n_g, len(lower), len(upper)])
+    rows_a, rows_f, rows_g, rows_l, rows_u = (np.arange(*of) for of in itertools.pairwise(ends))
+    rows_a, rows_g = rows_a[is_kept[rows_a]], rows_g[is_kept[rows_g]]
+    bounds = []
+    lb, ub = np.full(n_x, -np.inf), np.full(n_x, np.inf)
+    for sign, rows, at, sides in (
+        (0.0, rows_f, fixed, (lb, ub)), (-1.0, rows_l, lower, (lb,)), (1.0, rows_u, upper, (ub,)),
+    ):  # fmt: skip
+        on = is_kept[rows] & is_kept[at]
+        rows, at = rows[on], place[at[on]]
+        for side in sides:
+            side[at] = (-1.0 if sign > 0.0 else 1.0) * problem.b[rows] / (sigma * unit[at])
+        bounds.append((sign, rows, at))
+    general = np.concatenate([rows_a, rows_g])
+    signs = np.concatenate([np.full(len(rows_a), -1.0), np.ones(len(rows_g))])
+    jac = (
+        sp.diags_array(-signs * scale[general])
+        @ qp.jacobian[general - n][:, kept[:n_x]]
+        @ sp.diags_array(unit)
+    )
+    has_bounds = any(len(rows) for _, rows, _ in bounds)
+    return ProgramQP(
+        **vars(parts),
+        form="program",
+        P=sp.csc_matrix(sp.diags_array(unit) @ qp.hessian[kept[:n_x]][:, kept[:n_x]] @ sp.diags_array(unit)),
+        q=qp.q[kept[:n_x]] * unit / sigma,
+        A=sp.csc_matrix(jac),
+        b=-signs * scale[general] * qp.target[general - n] / sigma,
+        n_zero=len(rows_a),
+        n_nonneg=len(rows_g),
+        soc=(),
+        lb=lb if has_bounds else None,
+        ub=ub if has_bounds else None,
+        back=sp.csr_matrix((len(kept), len(general))),
+        shift=np.zeros(len(kept)),
+        lift=sp.csr_matrix((len(kept), 0)),
+        n_x=n_x,
+        general=general,
+        signs=signs,
+        bounds=tuple(bounds),
+    )
+
+
 def _velocity_rows(
     rows: _FrictionRows, free: IntpArray, lower: IntpArray, both: IntpArray, upper: IntpArray, ny: int
 ) -> tuple[_Entries, _Entries, int, int]:
@@ -449,11 +586,11 @@ def _velocity_rows(
     return put, slack, n, len(alone)
 
 
-def _far_rows(problem: Problem, sigma: float) -> tuple[IntpArray, FloatArray]:
-    """Find rows (contacts as a whole) that b pushes to a bound by more than FAR_FROM_BOUND, and their impulses."""
+def _far_rows(problem: Problem, sigma: float, threshold: float) -> tuple[IntpArray, FloatArray]:
+    """Find rows (contacts as a whole) that b pushes to a bound by more than the threshold, and their impulses."""
     c, push = problem.cones, problem.b / (np.sqrt(problem.d) * sigma)
     at = np.where(push < 0.0, c.lower, c.upper)
-    far = (np.abs(push) > FAR_FROM_BOUND) & np.isfinite(at) & ~c.friction_rows
+    far = (np.abs(push) > threshold) & np.isfinite(at) & ~c.friction_rows
     # All of a contact whose normal row is far; a contact of which only friction is far stays.
     first = np.repeat(c.ptr[:-1], np.diff(c.ptr))
     of_contact = c.friction_rows & far[first]
@@ -463,7 +600,9 @@ def _far_rows(problem: Problem, sigma: float) -> tuple[IntpArray, FloatArray]:
 
 def _sigma(problem: Problem) -> float:
     energy, velocity = reference(problem)
-    if problem.rows is None:
+    if problem.has_singular_program:
+        heaviest = 0.0
+    elif problem.rows is None:
         d = problem.d
         heaviest = 1.0 / d.min() if len(d) else 0.0
     else:

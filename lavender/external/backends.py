@@ -114,6 +114,7 @@ def _spec(backend: Backend) -> SolverSpec:
         resumable=False,
         external=True,
         impulse=backend.warm,
+        singular_programs=not (backend.definite or backend.cones),
         round_cones=backend.cones,
         parts=backend.cones,
         max_iter=backend.max_iter,

@@ -12,7 +12,7 @@ from lavender.base.arrays import FloatArray, flag
 from lavender.base.deadline import Deadline
 from lavender.base.errors import CapabilityError, InputError
 from lavender.base.lazy_import import import_numerics
-from lavender.external.as_qp import QP, impulse_form, pick_form, velocity_form
+from lavender.external.as_qp import QP, impulse_form, pick_form, program_form, velocity_form
 from lavender.external.backend import Backend
 from lavender.external.isolated import ENTRY_SIZE, TRANSFER_RATE, IsolatedBackend, start_process
 from lavender.external.running import ask
@@ -26,7 +26,7 @@ FORM_TIME = 1e-3  # s. Forming any program takes up to this, 1.5 times the measu
 FORM_TIME_PER_ENTRY = 1.2e-7  # s. Additional time for each entry of A, 1.5 times the measured time.
 OPTIONS = {
     "isolate": "given a time_limit, run the backend in another process, which is killed at the limit; default True",
-    "form": "'impulse', 'velocity' (needs rows) or 'auto' (default): by size, mass ratio and backend",
+    "form": "'impulse', 'velocity' (needs rows) or 'auto' (default): by size, mass ratio and backend; not of programs",
     "unit_diagonal": "impulse form: scale A to a unit diagonal, default True",
     "settings": "mapping passed to the backend, over those that tol gives",
 }
@@ -59,8 +59,11 @@ class QPSolver(Solver):
         return self._form(problem, True)
 
     def _form(self, problem: Problem, assume: bool) -> QP:
-        b, qp = self.backend, None
-        if pick_form(problem, self.form, b.definite) == "velocity":
+        b = self.backend
+        qp: QP | None = None
+        if problem.has_singular_program:
+            qp = program_form(problem, assume=assume)
+        elif pick_form(problem, self.form, b.definite) == "velocity":
             qp = velocity_form(problem, assume=assume)
         if qp is not None and b.definite and self.form == "auto" and not qp.is_definite:
             qp = None
@@ -131,6 +134,8 @@ def _assumption_fails(qp: QP, impulse: FloatArray, claim: Claim) -> bool:
 
 def refusal(problem: Problem) -> str | None:
     """Return why no QP backend accepts this problem, before any conversion; a factorisation finds other causes."""
+    if problem.has_singular_program:
+        return None
     if not problem.is_symmetric:
         return (
             f"needs a symmetric A; here A - A^T is {problem.asymmetry:.1e} of A "

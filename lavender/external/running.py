@@ -139,7 +139,8 @@ def ask(
         if limits:
             impulse[:] = start
     assert best is not None
-    if last is not best[1] and last.status is Status.INFEASIBLE:
+    # A program keeps the answer that it has: `auto` would call this backend again to check the claim.
+    if last is not best[1] and last.status is Status.INFEASIBLE and qp.form != "program":
         infeasible, proved, _ = check_infeasible(problem, last, tol, deadline)
         if proved:
             return replace(infeasible, work=work, iterations=work.get("iterations", 0))
@@ -199,19 +200,19 @@ def _once(
     if status is Status.INFEASIBLE:
         certificate = qp.direction(answer.direction, answer.contradiction)
     x, zeta = answer.x, answer.zeta
+    unknown = np.full(qp.n, 0.0 if qp.lb is None else np.nan)
+    xi = answer.xi if answer.xi is not None and len(answer.xi) == qp.n else unknown
     found = x is not None and len(x) == qp.n and bool(np.isfinite(x).all())
-    if qp.form == "velocity":
+    if qp.form != "impulse":
         found = found and zeta is not None and len(zeta) == len(qp.b) and bool(np.isfinite(zeta).all())
     dual, lam = None, impulse
     if found:
         assert x is not None
-        lam = qp.impulse(x, np.zeros(0) if zeta is None else zeta)
+        lam = qp.impulse(x, np.zeros(0) if zeta is None else zeta, xi)
         found = bool(np.isfinite(lam).all())
     if found and status is not Status.INFEASIBLE:
         assert x is not None
         impulse[:] = lam
-        unknown = np.full(qp.n, 0.0 if qp.lb is None else np.nan)
-        xi = answer.xi if answer.xi is not None and len(answer.xi) == qp.n else unknown
         dual = qp.multiplier(x, xi)
     elif status is not Status.INFEASIBLE:
         if status not in (Status.TIME_LIMIT, Status.INTERRUPTED):

@@ -14,7 +14,7 @@ import struct
 import zipfile
 import zlib
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from tokenize import TokenError
 from typing import IO, Any
@@ -22,7 +22,7 @@ from typing import IO, Any
 import numpy as np
 from numpy.lib import format as npy
 
-from lavender.base.arrays import FloatArray, as_array
+from lavender.base.arrays import FloatArray, as_array, whole_number
 from lavender.base.errors import InputError
 from lavender.base.lazy_import import issparse
 from lavender.base.lazy_import import sparse as sp
@@ -30,6 +30,7 @@ from lavender.io.stored import MAX_BYTES, NUMBER, Budget, Stored, write_arrays
 from lavender.problem import PRECISIONS, Problem, check_problem
 from lavender.problem.cones import Cones, kinds_of
 from lavender.problem.generalized import Generalized
+from lavender.problem.program import program_of_matrix
 from lavender.problem.rows import Rows
 
 VERSION = 1
@@ -248,6 +249,8 @@ def write(problem: Problem, path: str | os.PathLike[str], *, impulse: Any = None
         meta["precision"] = problem.precision
     if problem.generalized is not None:
         meta["dof_names"] = problem.generalized.names
+    if problem.has_singular_program:
+        meta["program"] = len(problem.qp.q)
     arrays["meta"] = np.frombuffer(json.dumps(meta).encode("ascii"), np.uint8)
     write_arrays(path, arrays)
 
@@ -289,6 +292,9 @@ def _read_own(archive: Archive) -> Stored:
     given = [*CONES, *(["cones_rolling"] if "cones_rolling" in archive else [])]
     cones = Cones(**{name.removeprefix("cones_"): archive[name] for name in given})
     problem = Problem(b, cones, friction=meta["friction"], names=meta["names"], name=meta["name"], **more)
+    if "program" in meta:
+        n = whole_number("program", meta["program"], high=problem.m)
+        problem = replace(problem, qp=program_of_matrix(problem.csr, problem.b, problem.cones, n), copy=False)
     return Stored(problem, "lavender", impulse=_vector(archive, "impulse", problem))
 
 
@@ -299,7 +305,7 @@ def _meta(archive: Archive) -> dict[str, Any]:
         raise InputError(f"entry 'meta' is not JSON text in bytes ({error})") from None
     if (
         not isinstance(meta, dict)
-        or set(meta) - {"dof_names", "precision"} != {"operator", "friction", "name", "names"}
+        or set(meta) - {"dof_names", "precision", "program"} != {"operator", "friction", "name", "names"}
         or meta["operator"] not in ("dense", "csr", "rows", "generalized")
         or ("dof_names" in meta) != (meta["operator"] == "generalized")
         or not _is_names(meta.get("dof_names"))
@@ -307,10 +313,12 @@ def _meta(archive: Archive) -> dict[str, Any]:
         or not isinstance(meta["friction"], str)
         or not _is_names(meta["names"])
         or meta.get("precision", "float64") not in PRECISIONS
+        or type(meta.get("program", 0)) is not int
+        or ("program" in meta and meta["operator"] != "csr")
     ):
         raise InputError(
             "entry 'meta' must hold operator (dense, csr, rows or generalized), friction, name and names; a precision "
-            f"in it is {' or '.join(PRECISIONS)}"
+            f"in it is {' or '.join(PRECISIONS)}, and program a number of variables, with the operator csr"
         )
     return meta
 

@@ -174,7 +174,8 @@ def cross_check(
     -------
     CrossCheck
         A solver of free rows is run as the one that is the same method with bounds ("gauss_seidel → pgs"), and `ran`
-        names it. Distances, slack and objective only for symmetric positive semidefinite A without Coulomb friction.
+        names it. Distances, slack and objective only for symmetric positive semidefinite A without Coulomb friction
+        and for quadratic programs.
 
     Raises
     ------
@@ -232,9 +233,9 @@ def _reference(
     """(solution, solver, how good) of the first that passes, or (None, None, why none does)."""
     if problem.law == "coulomb":
         return None, None, "Coulomb friction is not the optimality condition of a QP"
-    if not problem.is_symmetric:
+    if not (problem.has_singular_program or problem.is_symmetric):
         return None, None, f"A is not symmetric (by {problem.asymmetry:.1e}), so the problem is no QP"
-    if not problem.is_semidefinite:
+    if not (problem.has_singular_program or problem.is_semidefinite):
         return None, None, "A is not positive semidefinite: solutions may be many, of different motions"
     usual = CONE_REFERENCES if problem.law == "cone" else REFERENCES
     chain = (first, *(r for r in usual if r != first))
@@ -303,6 +304,8 @@ def compare(problem: Problem, name: str, solution: Solution, optimum: Solution |
 
 
 def _objective(problem: Problem, solution: Solution) -> float:
-    """1/2 l.A l - b.l [J]."""
+    """1/2 l.A l - b.l [J], or 1/2 x.P x + q.x of a program with a singular P."""
+    if problem.has_singular_program:
+        return float(problem.qp.solution(solution).objective)
     lam = solution.impulse
     return float(0.5 * (lam @ (solution.slack - problem.b)))

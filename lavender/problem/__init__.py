@@ -6,12 +6,12 @@
 (`lavender/problem/generalized.py`) or a matrix, one of them, and derives the rest on first use.
 
 Files, each over the one before: `data.py` (fields and their checks), `operators.py` (A, J and the metric),
-`quadratic.py` (quadratic programs), `builders.py` (ways to make one), `problem.py` (`Problem` and its other forms).
+`program.py` (quadratic programs), `builders.py` (ways to make one), `problem.py` (`Problem` and its other forms).
 """
 
 from lavender.problem.data import FRICTION, LAWS, OPERATORS, PRECISIONS, Names, check_problem
 from lavender.problem.problem import Problem, VelocityForm
-from lavender.problem.quadratic import QPSolution
+from lavender.problem.program import QPSolution
 
 __all__ = [
     "FRICTION",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any, TypeVar
 
 import numpy as np
@@ -19,12 +20,12 @@ from lavender.base.arrays import (
 )
 from lavender.base.errors import InputError
 from lavender.problem.cones import Cones, kinds_of
-from lavender.problem.data import checked_matrix
+from lavender.problem.data import Names, checked_matrix
 from lavender.problem.findex import arrays_of, blocks_of, order_of
 from lavender.problem.friction import check_shape
 from lavender.problem.generalized import Generalized
 from lavender.problem.operators import Operators
-from lavender.problem.quadratic import quadratic, unpacked
+from lavender.problem.program import convert_program, unpack_program
 from lavender.problem.rows import Rows
 from lavender_ext.core.problem import rows_velocity
 
@@ -379,14 +380,16 @@ class Builders(Operators):
     ) -> P:
         """A convex quadratic program: min 1/2 x.P x + q.x subject to G x <= h, A x = b, lb <= x <= ub.
 
-        x are generalised velocities of the mass matrix P; `lavender.solve_qp` gives x and the multipliers, or
-        `problem.qp.solution(solution)` those of a solution by `lavender.solve`.
+        If P is positive definite, x are generalised velocities of the mass matrix P, and every solver of bounded rows
+        takes the problem. `lavender.solve_qp` gives x and the multipliers, or `problem.qp.solution(solution)` those of
+        a solution by `lavender.solve`.
 
         Parameters
         ----------
         P : (n, n) array or sparse, or a `qpsolvers.Problem`, which is given alone
-            Symmetric, both triangles, positive semidefinite. Where it is singular a diagonal D is added, 1e-9 of the
-            diagonal of P, and the problem is one step of the proximal point method; `lavender.solve_qp` repeats it.
+            Symmetric, both triangles, positive semidefinite. If it is singular (its Cholesky factor has a pivot of at
+            most 1e-13 of the diagonal entry), the problem has x and the multipliers as unknowns, and only solvers of
+            quadratic programs take it: `auto` selects piqp, clarabel or osqp, the first that is installed.
         q : (n,)
         G, h : (mi, n) array or sparse, and (mi,), optional
             Entries of h may be inf; from 1e20 on they are.
@@ -415,8 +418,11 @@ class Builders(Operators):
         ([0.3, 0.7], [-1.95], [0.0, 0.1])
         """
         check_keywords("from_qp", more, ("P", "q", "G", "h", "A", "b", "lb", "ub"))
-        qp = quadratic(unpacked((P, q, G, h, A, b, lb, ub)))
-        return cls(qp.generalized.bias(qp.target), qp.cones, generalized=qp.generalized, qp=qp, **more)
+        qp = convert_program(unpack_program((P, q, G, h, A, b, lb, ub)))
+        if qp.is_singular:
+            n, m = len(qp.q), len(qp.target)
+            more.setdefault("names", Names(n + m, partial(_names_of_program, n, m)))
+        return cls(**qp.problem_fields(), qp=qp, **more)
 
     def updated(
         self: P,
@@ -473,7 +479,12 @@ class Builders(Operators):
         # Private here, so that nothing else is copied a second time.
         given = self.b if b is None else as_array("b", b, (self.m,), unit="m/s")
         warm = None if guess is None else as_array("guess", guess, (self.m,), unit="N s")
-        return replace(self, generalized=general, b=given, guess=warm, qp=None, copy=False)
+        qp = self.qp.with_bias(given) if self.has_singular_program else None
+        return replace(self, generalized=general, b=given, guess=warm, qp=qp, copy=False)
+
+
+def _names_of_program(n: int, m: int) -> list[str]:
+    return [f"variable {i}" for i in range(n)] + [f"constraint {i}" for i in range(m)]
 
 
 def _joints(rows: Rows, lower: ArrayLike, upper: ArrayLike) -> Cones:

@@ -206,6 +206,11 @@ class ProblemData:
         return "rows" if self.rows is not None else "matrix" if self.generalized is None else "generalized"
 
     @property
+    def has_singular_program(self) -> bool:
+        """Whether this is a quadratic program with a singular P, which only solvers of quadratic programs take."""
+        return self.qp is not None and self.qp.is_singular
+
+    @property
     def n_blocks(self) -> int:
         """Number of blocks, k."""
         return self.cones.n_blocks

@@ -73,7 +73,7 @@ class Problem(Builders):
         Precision in which an engine computed these numbers and computes its answers; `lavender.residual` then knows
         which error rounding alone explains. Default: that of `rows`. Problems are always solved in float64.
     qp : QuadraticProgram, optional
-        The program that `Problem.from_qp` made this problem of; files do not hold it.
+        The program that `Problem.from_qp` made this problem of; files hold it if P is singular.
 
     Raises
     ------

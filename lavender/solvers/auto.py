@@ -1,6 +1,8 @@
 """Chooses and combines other solvers: this tree, by two counted costs (`costs.py`).
 
     the start is a solution     nothing is done
+    a program with a singular P PROGRAM_BACKENDS, one after the other, and a certificate by a linear program if none
+                                finds a solution
     a small problem             at most 64 rows, or small islands under friction, or velocities that cost less than 100
                                 sweeps, but not many contacts of bodies: one compiled call (`small.py`); if that does
                                 not solve it, as any other
@@ -51,7 +53,7 @@ from lavender.solvers import costs
 from lavender.solvers.certify import LINEAR_PROGRAM, certify, least_violation, linear_programs
 from lavender.solvers.islands import pairs
 from lavender.solvers.newton import WARM, NewtonState
-from lavender.solvers.registry import SMALL_ROWS, Solver, SolverSpec, get
+from lavender.solvers.registry import SMALL_ROWS, Solver, SolverSpec, get, specs
 from lavender.solvers.setup_times import first_factor, formed_once, forming, over_rows, sweeping
 from lavender.solvers.small import AUTO, NO_TIME, QUARTER, call_ends_within
 from lavender.solvers.solve_log import GAIN, SolveLog
@@ -72,6 +74,9 @@ EARLY = 0.25  # of the counted cost, after which an interior point has an impuls
 # Sweeps start from a given guess up to this relative residual, even if doing nothing has less, because the guess tells
 # which rows are free.
 STALE = 1e3
+# A quadratic program with a singular P is solved by the first of these that is installed and solves it; osqp always
+# is installed.
+PROGRAM_BACKENDS = ("piqp", "clarabel", "osqp")
 ONE_CALL = 200  # iterations that a problem of few rows, solved in one call, takes, unless its path is long
 
 
@@ -282,10 +287,18 @@ class Auto(Solver):
         """Nothing."""
         return problem
 
+    def ready(self, problem: Problem, time_limit: float) -> None:
+        """Have the process of the backend started that solves a program with a singular P."""
+        if problem.has_singular_program:
+            for spec in program_backends()[:1]:
+                spec.load()().ready(problem, time_limit)
+
     def run(
         self, problem: Problem, impulse: FloatArray, max_iter: int, tol: float, time_limit: float | None
     ) -> Claim:
         deadline, failed = Deadline(time_limit), list[tuple[str, Claim]]()
+        if problem.has_singular_program:
+            return run_backends(problem, impulse, max_iter, tol, deadline)
         if max_iter >= ONE_CALL and call_ends_within(problem, deadline.left()):
             share = 1.0 if problem.m <= SMALL_ROWS else QUARTER
             found, counts = AUTO.attempt(problem, impulse, tol, share * deadline.nanoseconds())
@@ -320,6 +333,58 @@ class Auto(Solver):
         else:
             impulse[:] = log.impulse
         return log.claim()
+
+
+def program_backends() -> list[SolverSpec]:
+    """Return the installed of PROGRAM_BACKENDS."""
+    return [get(name) for name in PROGRAM_BACKENDS if not specs()[name].missing()]
+
+
+@np.errstate(all="ignore")  # what overflows is judged
+def run_backends(
+    problem: Problem, impulse: FloatArray, max_iter: int, tol: float, deadline: Deadline
+) -> Claim:
+    """Solve a program with a singular P by the first backend that reaches tol, or look for a certificate.
+
+    If none reaches tol, the result is the one with the least error of the program.
+    """
+    log, start = SolveLog(problem, tol, max_iter, deadline), impulse.copy()
+    log.offer(impulse)
+    error, best = program_error(problem, log.impulse), log.impulse
+    try:
+        for spec in program_backends():
+            if log.done() and (log.status is not Status.FLOOR or error <= tol):
+                break
+            solver, before, trial = spec.load()(), log.best, start.copy()
+            state = solver.prepare(problem)
+            claim = solver.run(state, trial, min(log.left, spec.max_iter), tol, log.time_left)
+            log.offer(trial)
+            log.note(spec.name, claim, before)
+            for result in (trial, log.impulse if log.result is None else log.result):
+                if program_error(problem, result) < error:
+                    error, best = program_error(problem, result), result.copy()
+            if tol == 0.0:
+                break
+        if error > tol > 0.0 and not log.done():
+            linear_programs(log)
+    except KeyboardInterrupt:
+        log.interrupted = True
+    except BREAKDOWN as failure:
+        log.failure = last_words(failure)
+    claim = log.claim()
+    if log.best <= tol:
+        impulse[:] = log.impulse
+    else:
+        impulse[:] = best
+        if claim.status is Status.FLOOR:  # true of the impulse of the log
+            claim = replace(claim, status=Status.STALLED)
+    return claim
+
+
+def program_error(problem: Problem, impulse: FloatArray) -> float:
+    """Return `QPSolution.error` of x and the multipliers (n + m,); inf if it is not a number."""
+    error = float(problem.qp.solution(impulse).error)
+    return error if error == error else inf
 
 
 @np.errstate(all="ignore")  # what overflows is judged
@@ -389,6 +454,7 @@ SPEC = SolverSpec(
     round_cones=True,
     parts=True,
     small=AUTO,
+    singular_programs=True,
     resumable=False,
     delegates=True,
     max_iter=1_000_000,

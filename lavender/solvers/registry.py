@@ -169,6 +169,8 @@ class SolverSpec:
         solvers/polyhedral.py).
     parts : bool
         It accepts contacts with rolling friction, or with torsional friction beside several tangents.
+    singular_programs : bool
+        It accepts quadratic programs with a singular P (`Problem.from_qp`).
     external : bool
         The code of another project solves; its claims are not ours.
     max_iter : int
@@ -220,6 +222,7 @@ class SolverSpec:
     round_cones: bool = False
     boxes: frozenset[str] = frozenset()
     parts: bool = False
+    singular_programs: bool = False
     external: bool = False
     max_iter: int = 1000
     options: Mapping[str, str] = field(default_factory=dict)
@@ -298,6 +301,8 @@ class SolverSpec:
             Compare only the kind of the problem with the spec: nothing is computed from its data, and `refusal` is not
             called.
         """
+        if not self.singular_programs and getattr(problem, "has_singular_program", False):
+            return f"needs a positive definite P, and P of this program is singular: use auto, or {_program_solvers()}"
         if self.takes_all:
             return None
         check_problem(problem)
@@ -365,6 +370,14 @@ class SolverSpec:
             raise SolverUnavailable(
                 f"solver {self.name!r} cannot be imported from {self.factory!r}: {last_words(error)}"
             ) from error
+
+
+def _program_solvers() -> str:
+    """Return the names of installed solvers that take a singular P: "clarabel, osqp or piqp"."""
+    names = sorted(
+        name for name, s in specs().items() if s.singular_programs and not s.delegates and not s.missing()
+    )
+    return " or ".join(filter(None, (", ".join(names[:-1]), names[-1]))) if names else "install osqp"
 
 
 def _alternative_for(law: str, laws: frozenset[str]) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from itertools import islice
+from math import inf
 from typing import Any
 
 from lavender.base.arrays import number
@@ -12,7 +13,7 @@ from lavender.base.deadline import seconds
 from lavender.base.errors import CapabilityError, InputError
 from lavender.judge.residuals import reference
 from lavender.problem import Problem
-from lavender.solvers.auto import Stage, Tree
+from lavender.solvers.auto import Stage, Tree, program_backends
 from lavender.solvers.registry import get
 from lavender.solvers.small import who
 
@@ -42,14 +43,17 @@ class Plan:
         lines = [f"{self.rows} rows, law {self.law!r}, given as {self.operator}; tol {self.tol:.0e}"]
         if self.small:
             lines.append(f"first one compiled call: {self.small}")
-        lines.append(
-            f"newton is counted to take {seconds(1e-9 * self.newton)}, a sweep {seconds(1e-9 * self.sweep)}"
-        )
+        if self.in_turn:  # not a program with a singular P, which only backends solve
+            lines.append(
+                f"newton is counted to take {seconds(1e-9 * self.newton)}, a sweep {seconds(1e-9 * self.sweep)}"
+            )
         for stage in self.stages:
             most = "to its end"
             if stage.iterations < 1e9:
                 most = f"up to {max(1.0, float(round(stage.iterations))):.3g} iterations"
             lines.append(f"  {stage.solver:<23}{most:<26}{stage.why}")
+        if not self.in_turn:
+            return "\n".join([*lines, "then a linear program for a certificate that there is no solution"])
         told = ", ".join(self.in_turn)
         lines.append(f"then {told} in turn with doubled work, and a certificate that there is no solution")
         return "\n".join(lines)
@@ -91,6 +95,13 @@ def explain(problem: Problem, tol: float = 1e-6) -> Plan:
     reason = get("auto").refuses(problem)
     if reason is not None:
         raise CapabilityError(f"solver 'auto' {reason}")
+    if problem.has_singular_program:
+        why = "a quadratic program with a singular P: if those before it failed"
+        stages = tuple(Stage(spec.name, inf, inf, why) for spec in program_backends())
+        return Plan(
+            rows=problem.m, law=problem.law, operator=problem.operator, tol=tol, small="", newton=inf, sweep=inf,
+            stages=stages, in_turn=(),
+        )  # fmt: skip
     problem = problem.disk  # where it has ellipses
     reference(problem)
     tree, small = Tree(problem), who(problem)

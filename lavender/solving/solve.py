@@ -532,18 +532,16 @@ def solve_small(
     impulse: Any,
     tol: float,
     limit: float = math.inf,
-    most: float = math.inf,
 ) -> Solution | None:
     """The solution of a small problem by one compiled call, judged there; None if `Prepared` has to solve it.
 
-    most: counted cost [ns] after which it is given up.
     If its counted cost is more than the limit [s], the result is the best of what was found by then and of the start.
     The fields of claim, counts and residual are made when they are first read.
     """
     small = spec.small
     if small is None or not spec.own or type(problem) is not Problem or not isinstance(tol, float):
         return None
-    if not 0.0 < tol < math.inf:
+    if not 0.0 < tol < math.inf or problem.has_singular_program:
         return None
     if problem.cones._blocks.has_ellipse or (
         len(problem.b) > SMALL_ROWS and (problem.generalized is None or limit < math.inf)
@@ -559,7 +557,7 @@ def solve_small(
         given = impulse
     else:
         given = problem.impulse_array(impulse)
-    judged, counts = small.attempt(problem, given, tol, min(COUNTED * limit, most))
+    judged, counts = small.attempt(problem, given, tol, COUNTED * limit)
     if judged is None:
         return None
     status = CONVERGED

@@ -69,13 +69,9 @@ cdef inline double range_dot_size(const csr_t* a, int32_t p, int32_t end, const 
     return (s0 + s1) + (s2 + s3)
 
 
-cdef inline double csr_dot_size(const csr_t* a, int32_t i, const double* x, double* size) noexcept nogil:
-    # csr_dot, to the bit, and sum_j |A_ij x_j| into size.
-    return range_dot_size(a, a.indptr[i], a.indptr[i + 1], x, size)
-
-
 cdef inline double csr_dot_long(const csr_t* a, int32_t i, const double* x, double* size) noexcept nogil:
-    # csr_dot_size; a row of more than LONG_ROW entries is summed in parts, and the sum of the parts is compensated.
+    # csr_dot, to the bit, and sum_j |A_ij x_j| into size. A row of more than LONG_ROW entries is summed in parts, and the
+    # sum of the parts is compensated.
     cdef int32_t p = a.indptr[i], last = a.indptr[i + 1], end
     cdef double high = 0.0, low = 0.0, term, part, total, back
     if last - p <= LONG_ROW:

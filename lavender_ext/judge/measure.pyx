@@ -354,12 +354,13 @@ cdef inline double ratio(double x, double scale) noexcept nogil:
 cdef double SHARE_OF_LARGEST = 1e-3
 cdef double EQUATION_SHARE = 1e-3
 cdef double TARGET_ROUNDING = 1e-12
-# Share of the sum of |terms| that the gap is compared with at least: an objective whose terms cancel has no size.
+# The gap is compared with at least this share of the sum of |terms|: an objective whose terms cancel has no size of its
+# own. Of 81 public programs the largest sum is 1000 times the objective.
 cdef double SHARE_OF_TERMS = 1e-3
 
 
 def program_residuals(x_, q_, px_, force_, jx_, target_, lam_, int32_t free, jac, ordered_,
-                      sizes_without_rows, double curved):
+                      sizes_without_rows, double least_force):
     """Compute the residuals of a quadratic program, and each relative to its own terms.
 
     Rows: J x = target (the first `free`), J x >= target (the others). Row i acts if it is one of the first, is violated,
@@ -367,16 +368,20 @@ def program_residuals(x_, q_, px_, force_, jx_, target_, lam_, int32_t free, jac
 
     r_p    max_i of |J x - target|, of target - J x;           row i over scale_i
     r_d    max_j |P x + q - J^T lambda|, max_i -lambda_i;      over max |P x|, |q|, |J^T lambda|; -lambda_i max_j |J_ij|
-    gap    |x.(P x + q) - target.lambda|;                      over the largest of |x.P x|, |q.x|, |target.lambda| and
-                                                               1e-3 (sum_j |x_j| forces_j + sum_i |lambda_i| scale_i)
+    gap    |x.(P x + q) - target.lambda|;                      over |1/2 x.P x + q.x|, or 1e-3 of the sum of its terms,
+                                                               sum_j |x_j| forces_j + sum_i |lambda_i| scale_i
+
+    The relative gap is that of |x.(P x + q - J^T lambda)| + sum_i |lambda_i (J x - target)_i|, whose parts do not cancel.
 
     scale_i = max(terms_i, c max_j |J_ij| max(size_j, 1e-3 max |x|)),  terms_i = max(|target_i|, max_j |J_ij x_j|),
     c = 1e-3 for equations with a target above rounding, else 1
-    size_j = max terms_k / |J_kj| over the rows k that act; at least `unbounded` (n,) if all of these have target 0
+    size_j = max terms_k / |J_kj| over the rows k that act; at least `unbounded` (n,) if all of these have target 0, else
+             scale_i is at most the largest of |J x|_k, |target_k| and |x_j| over the rows that act: terms that cancel, or
+             a small J_kj, are no reason to accept more than OSQP and Clarabel do
 
     px (n,) = P x, force (n,) = J^T lambda, jx (m,); jac: (indptr, indices, data) of J, with `ordered` (n,) = x in the
-    order of its columns; `sizes_without_rows()` returns `unbounded` in this order. Forces are at least `curved` max |x|,
-    and the gap's terms this times sum |x_j|.
+    order of its columns; `sizes_without_rows()` returns `unbounded` in this order. Each force counts as `least_force` at
+    least.
 
     Returns
     -------
@@ -400,21 +405,22 @@ def program_residuals(x_, q_, px_, force_, jx_, target_, lam_, int32_t free, jac
     cdef double* terms = size + n
     cdef double* acts = terms + m                       # 1 of a row that acts, else 0
     cdef double primal = 0.0, dual = 0.0, gap = 0.0, row_error = 0.0, force_error = 0.0, negative = 0.0
-    cdef double forces = 0.0, far = 0.0, curvature = 0.0, linear = 0.0, multiplied = 0.0, sums = 0.0, total = 0.0
-    cdef double violation, own, scale, largest, floor
+    cdef double forces = 0.0, far = 0.0, curvature = 0.0, linear = 0.0, sums = 0.0
+    cdef double uncancelled = 0.0, rows = 0.0, violation, own, scale, largest, floor
     cdef bint homogeneous = True
     for j in range(n):
         force_error = max_nan(force_error, fabs(px[j] + q[j] - force[j]))
         curvature += x[j] * px[j]
         linear += q[j] * x[j]
+        uncancelled += x[j] * (px[j] + q[j] - force[j])
         own = max_nan(max_nan(fabs(px[j]), fabs(q[j])), fabs(force[j]))
+        own = max_nan(own, least_force)
         forces = max_nan(forces, own)
         sums += fabs(x[j]) * own
-        total += fabs(x[j])
         size[j] = 0.0
         far = max_nan(far, fabs(x[j]))
-    forces = max_nan(forces, curved * far)
     gap = curvature + linear
+    uncancelled, rows = fabs(uncancelled), far
     for i in range(m):
         own = fabs(target[i])
         for k in range(ptr[i], ptr[i + 1]):
@@ -423,10 +429,11 @@ def program_residuals(x_, q_, px_, force_, jx_, target_, lam_, int32_t free, jac
         violation = target[i] - jx[i]
         acts[i] = i < free or violation > 0.0 or (lam[i] > 0.0 and -violation <= 0.5 * own)
         gap -= target[i] * lam[i]
+        uncancelled += fabs(lam[i] * violation)
         if acts[i] == 0.0:
             continue
-        multiplied += target[i] * lam[i]
         homogeneous = homogeneous and target[i] == 0.0
+        rows = max_nan(rows, max_nan(fabs(jx[i]), fabs(target[i])))
         for k in range(ptr[i], ptr[i + 1]):
             if value[k] != 0.0:
                 size[column[k]] = max_nan(size[column[k]], own / fabs(value[k]))
@@ -448,6 +455,8 @@ def program_residuals(x_, q_, px_, force_, jx_, target_, lam_, int32_t free, jac
         if i < free and fabs(target[i]) > TARGET_ROUNDING * scale:
             scale *= EQUATION_SHARE
         scale = max_nan(terms[i], scale)
+        if not homogeneous:
+            scale = min(scale, rows)
         primal = max_nan(primal, violation)
         row_error = max_nan(row_error, ratio(violation, scale))
         if acts[i] != 0.0:
@@ -456,9 +465,8 @@ def program_residuals(x_, q_, px_, force_, jx_, target_, lam_, int32_t free, jac
             dual = max_nan(dual, -lam[i])
             negative = max_nan(negative, -lam[i] * largest)
     dual = max_nan(dual, force_error)
-    scale = max_nan(max_nan(fabs(curvature), fabs(linear)), max_nan(fabs(multiplied), SHARE_OF_TERMS * sums))
-    scale = max_nan(scale, curved * far * total)
+    scale = max_nan(fabs(0.5 * curvature + linear), SHARE_OF_TERMS * sums)
     gap = fabs(gap)
     force_error = ratio(max_nan(force_error, negative), forces)
-    scale = ratio(gap, scale)
+    scale = ratio(uncancelled, scale)
     return primal, dual, gap, row_error, force_error, scale, max_nan(max_nan(row_error, force_error), scale)

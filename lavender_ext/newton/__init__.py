@@ -1,1 +1,1 @@
-"""Newton's method by turns: systems of bodies, rows and programs, interior points, exchanges, rounds, and when."""
+"""Newton's method by turns: systems of bodies and rows, interior points, exchanges, rounds, and when."""

@@ -193,6 +193,8 @@ def data_of(list problems, kind):
         if type(problem) is not kind or (<Blocks>problem.cones._blocks).has_ellipse:
             continue
         if p is None:
+            if problem.has_singular_program:
+                continue
             p = problem.__dict__.get("data", True)
         data[i] = p
     return data, sizes

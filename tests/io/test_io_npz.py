@@ -49,6 +49,13 @@ def variants():
             dof_names=["hip", "knee", "ankle", "toe"],
         ),
     )  # fmt: skip
+    for rows in (
+        {},
+        {"A": [[1.0, 1.0]], "b": [1.0]},
+        {"G": [[1.0, -1.0]], "h": [1.0], "lb": [0.0, 1.0], "ub": [2.0, 1.0]},
+    ):
+        program = lv.Problem.from_qp(np.diag([1.0, 0.0]), [1.0, -1.0], **rows, name="flat")
+        yield f"a program with a singular P and {', '.join(rows) or 'no rows'}", program
     yield "empty", lv.Problem.linear(np.zeros((0, 0)), [])
     yield "empty csr", lv.Problem.linear(sp.csr_array((0, 0)), [])
     yield (
@@ -250,6 +257,8 @@ META = {"operator": "dense", "friction": "coulomb", "name": "", "names": None}
         ({"meta": META | {"friction": "glue"}}, "'coulomb' or 'cone'"),
         ({"meta": META | {"precision": "float16"}}, "precision in it is float64 or float32"),
         ({"meta": META | {"names": ["one"]}}, "names for 12 blocks"),
+        ({"meta": META | {"program": 2}}, "program a number of variables, with the operator csr"),
+        ({"meta": META | {"operator": "csr", "program": True}}, "program a number of variables"),
         ({"b": np.full(12, np.nan)}, "finite"),
         ({"b": np.array(["1"] * 12)}, "numbers are needed"),
         ({"b": np.zeros(11)}, "b .*shape"),
@@ -287,6 +296,38 @@ def test_an_inconsistent_file_of_our_own_is_refused_by_name(tmp_path, changes, s
     with pytest.raises(lv.InputError, match=sign) as error:
         lavender.io.load(own(tmp_path, problem, **changes))
     assert "own.npz" in str(error.value)
+
+
+def test_a_program_with_a_singular_hessian_comes_back_and_its_form_is_checked(tmp_path):
+    given = {
+        "P": np.diag([1.0, 0.0]),
+        "q": [1.0, -1.0],
+        "A": [[1.0, 2.0]],
+        "b": [1.0],
+        "lb": [0.0, 0.0],
+        "ub": [9.0, 9.0],
+    }
+    problem = lv.Problem.from_qp(**given)
+    loaded = lavender.io.load(own(tmp_path, problem))
+    answer, before = lv.solve_qp(loaded), lv.solve_qp(problem)
+    assert answer.found
+    np.testing.assert_allclose([*answer.x, *answer.y], [*before.x, *before.y], atol=1e-9)
+    assert (answer.z >= 0.0).all() and answer.z_box is None  # bounds count as rows of G
+    with pytest.raises(lv.CapabilityError, match="singular"):
+        lv.solve(loaded, "newton")
+    meta = {"operator": "csr", "friction": "coulomb", "name": "", "names": None}
+    for n, sign in (
+        (1, "not that of a quadratic program of 1 "),
+        (99, "program is 99"),
+        (-1, "program is -1"),
+    ):
+        changed = {"meta": np.frombuffer(json.dumps(meta | {"program": n}).encode(), np.uint8)}
+        with pytest.raises(lv.InputError, match=sign):
+            lavender.io.load(own(tmp_path, problem, **changed))
+    data = problem.csr.data.copy()
+    data[0] = -1.0  # P
+    with pytest.raises(lv.InputError, match="P is not positive semidefinite"):
+        lavender.io.load(own(tmp_path, problem, A_data=data))
 
 
 # -- plain box format -----------------------------------------------------------------------------

@@ -24,7 +24,7 @@ from lavender_ext.sweep import serial
 SHARE = 0.5  # of the machine's memory, which the processes of backends may take together
 LEAST = 2 * 2**30  # bytes: below that, packages of compiled code do not start
 
-BASE = ("numpy", "scipy", "qpsolvers", "osqp", "qdldl")
+BASE = ("numpy", "scipy", "qpsolvers", "osqp")
 
 
 def _cpuinfo(name: str) -> str:

@@ -34,7 +34,9 @@ Between two answers l1, l2 with errors e1, e2, and Delta = l1 - l2, eps = e1 - e
     |Delta|_A^2 <= |Delta|_A |eps|_A + |eps|_D |Delta|_D                                          (3)
 
 Both p = l - e are projections of l - w/d in the metric of D, so (w1 - w2 - D eps).(Delta - eps) <= 0; expand and use
-Cauchy-Schwarz.
+Cauchy-Schwarz. If A is not symmetric, as in a quadratic program with a singular P, Delta.A Delta >= 0 all the same:
+
+    Delta.A Delta <= |eps.A Delta| + |eps|_D |Delta|_D                                            (4)
 """
 
 from __future__ import annotations
@@ -102,7 +104,7 @@ def _rounding_of_projection(problem: Problem, y: FloatArray, w: FloatArray) -> F
 
 
 def separation(problem: Problem, one: Any, two: Any) -> tuple[float, float]:
-    """|Delta|_A of two judged answers and the largest value of it that (3) allows, rounding included [sqrt J]."""
+    """|Delta|_A of two judged answers and the largest value of it that (3), (4) allow, rounding included [sqrt J]."""
     delta = problem.on_disk(one.impulse - two.impulse)
     eps = problem.on_disk(one.residual.error - two.residual.error)
     problem = problem.disk
@@ -116,6 +118,9 @@ def separation(problem: Problem, one: Any, two: Any) -> tuple[float, float]:
     eps_d = float(np.sqrt(np.sum(d * eps * eps))) + fuzz
     eps_a = float(np.sqrt(max(eps @ a_eps, 0.0))) + stiff * fuzz
     delta_d = float(np.sqrt(np.sum(d * delta * delta)))
+    if problem.has_singular_program:
+        most = abs(eps @ a_delta) + fuzz * np.sqrt(np.sum((root * a_delta) ** 2)) + eps_d * delta_d
+        return apart, float(np.sqrt((1.0 + 1e-9) * most + 2.0**-50 * (stiff * delta_d) ** 2))
     # x^2 <= x eps_a + eps_d delta_d bounds x by the larger root. Rounding of Delta.A Delta itself:
     rounding = 2.0**-50 * stiff * delta_d
     allowed = 0.5 * (eps_a + np.sqrt(eps_a * eps_a + 4.0 * eps_d * delta_d))

@@ -44,7 +44,7 @@ print(json.dumps([{name: sorted(of) for name, of in seen.items()}, names, lv.reg
 #: Backends and what draws, reads files or prints: what a listing must not load.
 HEAVY = {
     "matplotlib", "h5py", "qpsolvers", "osqp", "clarabel", "piqp", "daqp", "quadprog", "scs", "pandas", "proxsuite",
-    "highspy", "qpalm", "qdldl", "rich", "click",
+    "highspy", "qpalm", "rich", "click",
 }  # fmt: skip
 
 

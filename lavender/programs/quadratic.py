@@ -1,0 +1,237 @@
+"""`solve_qp`: quadratic programs through `solve`, to an error of the program itself.
+
+`solve` ends at a residual relative to that of the zero impulse; `QPSolution.error` is relative to the terms of the
+program. While the error is above tol, the solve is continued from its result with a smaller tol. If this does not
+reach tol with `auto` and a positive definite P, the program in the form (5) of `problem/program.py` is given to the
+backend that solves programs with a singular P.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from time import perf_counter
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from lavender.base.arrays import number, read_only
+from lavender.base.errors import InputError
+from lavender.base.lazy_import import sparse as sp
+from lavender.judge.solution import CONFIRMED, CONVERGED, Claim, Solution, Status, summed
+from lavender.problem import Problem, QPSolution
+from lavender.problem.generalized import Generalized
+from lavender.problem.program import QuadraticProgram
+from lavender.solvers.registry import get
+from lavender.solvers.small import told
+from lavender.solving.outcome import finish
+from lavender.solving.solve import seconds_of, solve
+
+MAX_SOLVES = 5  # solves of one constraint problem, each with a smaller tol
+MIN_TOL = 1e-15  # the smallest tol of such a solve
+TOL_RATIO = 0.1  # the next tol over the one with which the error would be tol, if both fall together
+# The backend is called first if n 2^-53 cond(M) is above this share of tol, as the judge then refines M^-1.
+MAX_LOSS = 0.1
+# A solve that ends otherwise has used up its budget, or a smaller tol does not change its result.
+CONTINUED = (Status.CONVERGED, Status.STALLED)
+# Of the constraint problem, whatever the program's error is.
+FINAL_STATUSES = (Status.FLOOR, Status.INTERRUPTED)
+FEASIBLE_TOL = 1e-7  # relative residual of a point that shows that an unbounded program has a feasible point
+
+
+def solve_qp(
+    problem: Problem,
+    solver: str = "auto",
+    *,
+    tol: float = 1e-9,
+    time_limit: float | None = None,
+    **options: Any,
+) -> QPSolution:
+    """Solve a quadratic program made by `Problem.from_qp`.
+
+    Parameters
+    ----------
+    problem : Problem
+    solver : str
+        As in `lavender.solve`.
+    tol : float
+        `QPSolution.error` to reach.
+    time_limit : float, optional, s
+    **options
+        Of the solver; impulse= starts from the impulses of an earlier program (`answer.solution.impulse`).
+
+    Returns
+    -------
+    QPSolution
+        x, y, z, z_box with their `error`; `solution.status` is CONVERGED if the error is at most `tol`.
+        `solution.setup_time` and `solution.solve_time` add up to the time of this call. INFEASIBLE: no x satisfies the
+        constraints, and `problem.qp.multipliers(answer.solution.certificate)` proves it, if `solution.claim_check` is
+        "confirmed". An unbounded program has a `ray`.
+
+    Raises
+    ------
+    InputError
+        A problem that `Problem.from_qp` did not make.
+    CapabilityError
+        P is singular, and the solver needs a positive definite one.
+
+    Examples
+    --------
+    A linear program, P = 0:
+
+    >>> import numpy as np
+    >>> import lavender as lv
+    >>> problem = lv.Problem.from_qp(np.zeros((2, 2)), [-1.0, -2.0], G=[[1.0, 1.0]], h=[1.0], lb=[0.0, 0.0])
+    >>> (lv.solve_qp(problem).x.round(9) + 0.0).tolist()
+    [0.0, 1.0]
+    """
+    qp = getattr(problem, "qp", None)
+    if qp is None:
+        raise InputError(
+            "problem is not a quadratic program: make it with Problem.from_qp; updated() and files keep the "
+            "constraint problem alone"
+        )
+    begun = perf_counter()
+    tol, end = number("tol", tol, low=0.0), begun + seconds_of(time_limit)
+    start = options.pop("impulse", None)
+    is_auto = isinstance(solver, str) and solver == "auto"
+    if is_auto and tol > 0.0 and not options and not qp.is_singular:
+        answer = _solve_definite(problem, tol, end, start)
+    else:
+        answer = _solve_to_error(problem, solver, tol, end, start, options)
+    if qp.is_singular:
+        answer = _find_ray(problem, answer, end)
+    _complete(answer, perf_counter() - begun)
+    return answer
+
+
+def _complete(answer: QPSolution, seconds: float) -> None:
+    """Set the time of the whole call, and CONVERGED if the program's error is within `tol`, in the answer's solution.
+
+    Residuals of the constraint problem are relative to those of the zero impulse; the program's error decides.
+    """
+    solution: Solution = answer.solution
+    values = solution.__dict__
+    values["solve_time"] = seconds - solution.setup_time
+    if solution.status in FINAL_STATUSES or (solution.status is CONVERGED and not solution.is_contradicted):
+        return
+    if answer.ray is None and answer.error <= answer.tol:
+        relative = solution.residual.relative
+        if solution.certificate is None and relative < math.inf:
+            values |= {"status": CONVERGED, "tol": max(solution.tol, relative)}
+            values |= {"claim_check": CONFIRMED, "status_conflict": ""}
+
+
+def _solve_to_error(
+    problem: Problem, solver: str, tol: float, end: float, impulse: Any, options: dict[str, Any]
+) -> QPSolution:
+    """Solve the constraint problem, with smaller tol until the error of the program is at most `tol`."""
+    best: QPSolution | None = None
+    inner = tol
+    for _ in range(MAX_SOLVES):
+        left = None if end == math.inf else max(end - perf_counter(), 1e-6)
+        solution = solve(problem, solver, impulse=impulse, tol=inner, time_limit=left, **options)
+        answer = problem.qp.solution(solution, tol)
+        if best is None or answer.error < best.error or _is_refuted(answer):
+            best = answer
+        if answer.error <= tol or not _is_continued(answer, end):
+            break
+        smaller = max(TOL_RATIO * inner * tol / answer.error, MIN_TOL)
+        if not smaller < inner:
+            break
+        inner, impulse = smaller, solution.impulse
+    assert best is not None
+    return best
+
+
+def _is_refuted(answer: QPSolution) -> bool:
+    """Whether a certificate that the judge has checked shows that there is no solution."""
+    solution = answer.solution
+    return bool(solution.status is Status.INFEASIBLE and solution.claim_check == CONFIRMED)
+
+
+def _is_continued(answer: QPSolution, end: float) -> bool:
+    """Whether another solve may lower the error, and has time."""
+    return answer.solution.status in CONTINUED and perf_counter() < end
+
+
+def _solve_definite(problem: Problem, tol: float, end: float, impulse: Any) -> QPSolution:
+    """Solve a program with a positive definite P over J and M and, if that fails, in the form (5) by a backend.
+
+    The backend comes first if M is so ill-conditioned that a solve by its factor loses the digits that tol needs.
+    """
+    operator = problem.qp.generalized.operator
+    is_lossy = operator.n * 2.0**-53 * operator.condition > MAX_LOSS * tol
+    first, second = _solve_over_velocities, _solve_by_backend
+    if is_lossy:
+        first, second = second, first
+    answer = first(problem, tol, end, impulse)
+    if answer.error <= tol or _is_refuted(answer) or answer.solution.status is Status.INTERRUPTED:
+        return answer
+    if not perf_counter() < end:
+        return answer
+    other = second(problem, tol, end, answer.impulse)
+    ran = [answer.solution, other.solution]
+    if other.error < answer.error or _is_refuted(other):
+        answer = other
+    turns = tuple(turn for solution in ran for turn in solution.turns)
+    work = MappingProxyType(summed(solution.work for solution in ran))
+    message = f"{told(turns)}; {answer.solution.message}".rstrip("; ")
+    answer.solution.__dict__.update(turns=turns, work=work, message=message)
+    return answer
+
+
+def _solve_over_velocities(problem: Problem, tol: float, end: float, impulse: Any) -> QPSolution:
+    return _solve_to_error(problem, "auto", tol, end, impulse, {})
+
+
+def _solve_by_backend(problem: Problem, tol: float, end: float, impulse: Any) -> QPSolution:
+    """Solve the program in the form (5) by a backend, which works on P instead of its inverse."""
+    qp: QuadraticProgram = problem.qp.with_saddle()
+    program = Problem(**qp.problem_fields(), qp=qp, copy=False)
+    start = None
+    if impulse is not None:
+        given = problem.impulse_array(impulse)
+        start = np.concatenate([problem.qp.variables(given), given])
+        start = start if np.isfinite(start).all() else None
+    answer = _solve_to_error(program, "auto", tol, end, start, {})
+    solution: Solution = answer.solution
+    certificate = solution.certificate if _is_refuted(answer) else None
+    claim = Claim(
+        solution.status if certificate is not None else Status.STALLED,
+        solution.iterations,
+        solution.work,
+        told(solution.turns),
+        certificate=None if certificate is None else qp.of_rows(certificate),
+        turns=solution.turns,
+    )
+    impulse = qp.of_rows(answer.impulse).copy()
+    judged = finish(problem, get("auto"), {}, impulse, claim, tol, solution.setup_time, 0.0, None)
+    return replace(answer, solution=judged, impulse=judged.impulse, qp=problem.qp)
+
+
+def _find_ray(problem: Problem, answer: QPSolution, end: float) -> QPSolution:
+    """Return the answer with its ray, if a certificate shows that the objective decreases without end.
+
+    A certificate of (5) has a part along x and one along the multipliers. If the second does not prove by itself that
+    the rows contradict each other, the first is a ray, and the program is unbounded if it has a feasible point.
+    """
+    solution, qp = answer.solution, problem.qp
+    if not _is_refuted(answer) or solution.certificate is None:
+        return answer
+    direction, rows = solution.certificate[: len(qp.q)], qp.of_rows(solution.certificate)
+    if qp.target @ rows > 0.0 or not qp.q @ direction < 0.0:
+        return answer
+    unit = problem.d[: len(qp.q)]  # min sum unit_i x_i^2 under the same constraints
+    general = Generalized(qp.jacobian, sp.diags_array(unit), np.zeros(len(unit)))
+    cones = problem.cones.take(np.arange(len(qp.q), problem.n_blocks))
+    nearest = Problem(qp.target, cones, generalized=general, copy=False)
+    left = None if end == math.inf else max(end - perf_counter(), 1e-6)
+    point = solve(nearest, tol=FEASIBLE_TOL, time_limit=left)
+    if point.status is Status.INFEASIBLE and point.claim_check == CONFIRMED:
+        certificate = np.concatenate([np.zeros(len(unit)), point.certificate])
+        return replace(answer, solution=replace(solution, certificate=certificate, message=point.message))
+    if not (point.success or point.residual.at_floor):
+        return answer
+    return replace(answer, ray=read_only(direction / np.abs(direction).max()))
