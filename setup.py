@@ -47,7 +47,7 @@ DIRECTIVES = OPTIONS["directives"](debug=DEBUG)
 SHARED = "lavender_ext._utility"
 
 #: Modules whose loops take the update of a block whole, however much they have inlined before it: with gcc's own limits
-#: 2 to 12 % more instructions, elsewhere within 0.7 %, in two thirds of the time. Not warm/substep, 8 % more: natively
+#: 2 to 12 % more instructions, elsewhere within 0.7 %, in two thirds of the time. Not engine/newton_substep, 8 % more: natively
 #: the engine takes a few sweeps of a warm start there.
 WHOLE = ("sweep/", "local/", "judge/", "driver/", "engine/substep")
 #: Modules without a loop that counts.

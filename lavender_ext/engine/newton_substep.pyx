@@ -4,7 +4,7 @@ After `prepare` and `solve` without sweeps:
 
     index_room      whole numbers that the next call needs
     plan            bands, elements, elimination order; doubles that the next call needs
-    solve           the first phase of `newton` (start.pxd), then its steps (newton/method.pxd); the judge's residual decides
+    solve           the first phase of `newton` (newton/warm_start.pxd), then its steps (newton/solve.pyx); the judge's residual decides
 
 Natively and in WebAssembly the same lines, the same bits. What asks for another library, the augmented system, is left out;
 where that or `BUDGET` leaves the residual above tol, the best impulse found stays, and is told as such.
@@ -23,8 +23,8 @@ from lavender_ext.engine.arrays cimport S_OUT, bind, engine_t
 from lavender_ext.engine.view cimport view
 from lavender_ext.judge.reference cimport reference_of
 from lavender_ext.judge.score cimport new_score, score_rows, score_t
-from lavender_ext.newton.method cimport bodies_room, bodies_start, system_step
-from lavender_ext.warm.start cimport (FACTORED, JUDGED, MOST_TRACED, UNDECIDED, band_width, judged, lay_out,
+from lavender_ext.newton.solve cimport bodies_room, bodies_start, system_step
+from lavender_ext.newton.warm_start cimport (FACTORED, JUDGED, MOST_TRACED, UNDECIDED, band_width, judged, lay_out,
                                       observe, room_of, start_errors, warm_solve, warm_t)
 
 

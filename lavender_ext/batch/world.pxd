@@ -15,7 +15,7 @@ from lavender_ext.core.parts cimport blocks_t, from_block, is_rows
 from lavender_ext.core.rows cimport rows_t, rows_times
 from lavender_ext.judge.rounding cimport mass_t
 from lavender_ext.small.room cimport has_room
-from lavender_ext.small.thin cimport thin
+from lavender_ext.batch.thin cimport thin
 
 
 cdef enum:                      # what became of a world

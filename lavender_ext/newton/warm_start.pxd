@@ -35,7 +35,7 @@ cpdef enum:                     # how it ended
     JUDGED = 1                  # met tol as it came
     SWEPT = 2                   # met it after some sweeps
     SOLVED = 3                  # met it after one factorisation
-    FACTORED = 5                # met it after turns of Newton's method (substep.pyx)
+    FACTORED = 5                # met it after turns of Newton's method (engine/newton_substep.pyx)
 
 
 cdef struct warm_t:

@@ -1,10 +1,10 @@
-"""Warm starts of warm/start.pxd on a problem's data."""
+"""Warm starts of newton/warm_start.pxd on a problem's data."""
 from libc.stdint cimport int32_t
 
 import numpy as np
 
 from lavender_ext.core.problem cimport Data
-from lavender_ext.warm.start cimport band_width, lay_out, room_of, warm_solve, warm_t
+from lavender_ext.newton.warm_start cimport band_width, lay_out, room_of, warm_solve, warm_t
 
 
 def from_guess(Data data, double[::1] impulse, double tol):

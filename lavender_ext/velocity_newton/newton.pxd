@@ -29,9 +29,9 @@ from lavender_ext.core.generalized cimport dot, generalized_t
 from lavender_ext.core.method cimport BROKEN, LOST, MORE, REACHED, STUCK
 from lavender_ext.core.parts cimport CONE, COULOMB, blocks_t, is_rows, parts_of, parts_t
 from lavender_ext.core.start cimport is_nothing, zero_impulse
-from lavender_ext.generalized.flow cimport (NOWHERE, blank, block_end, block_from, descent_t, flow_t, gather, keep,
+from lavender_ext.velocity_newton.flow cimport (NOWHERE, blank, block_end, block_from, descent_t, flow_t, gather, keep,
                                             measure, renew, respond_all, row_end, row_from, wait_t)
-from lavender_ext.generalized.normal cimport factor, form, is_held, newton_step
+from lavender_ext.velocity_newton.normal cimport factor, form, is_held, newton_step
 
 
 cdef enum:                      # a round of Coulomb friction

@@ -20,7 +20,7 @@ from lavender_ext.core.rows cimport rows_t
 from lavender_ext.core.view cimport view_t
 from lavender_ext.driver.driver cimport NEWTON, lav_room, lav_start, lav_step
 from lavender_ext.factor.tiles cimport has_wide
-from lavender_ext.generalized.newton cimport is_soft
+from lavender_ext.velocity_newton.newton cimport is_soft
 from lavender_ext.judge.measure cimport (above_floor_of, do_nothing, floor_of, general_score, general_slack, judge_nothing,
                                          relative_of, scratch_of)
 from lavender_ext.judge.refine cimport refine_view
@@ -29,7 +29,7 @@ from lavender_ext.small.call cimport (COUNTS, ENDED, KEPT, are_bounded, few_rule
                                       run_few)
 from lavender_ext.small.limits cimport allowed, cost_of, limits_t, step_cost, work_within
 from lavender_ext.small.room cimport has_room
-from lavender_ext.small.world cimport BESIDE, LEFT, READY, STARTED, TRIED, rows_of
+from lavender_ext.batch.world cimport BESIDE, LEFT, READY, STARTED, TRIED, rows_of
 
 
 cdef enum:
