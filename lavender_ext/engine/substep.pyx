@@ -39,8 +39,9 @@ from lavender_ext.engine.projection cimport normal_speed, project_positions
 from lavender_ext.engine.soft_step cimport relax, restitute, soften
 from lavender_ext.engine.view cimport view
 from lavender_ext.engine.xpbd cimport correct_all
-from lavender_ext.judge.measure cimport rows_slack
-from lavender_ext.judge.score cimport new_score, score_rows, score_t
+from lavender_ext.judge.measure cimport score_slack
+from lavender_ext.judge.score cimport new_score, score_t
+from lavender_ext.judge.slack cimport rows_slack
 from lavender_ext.sweep.packed cimport MOST, room_for, sweep_packed
 
 
@@ -134,7 +135,7 @@ cdef inline void note_sweep(const engine_t* e, const blocks_t* p, const rows_t* 
     cdef score_t s = new_score()
     measure(e, out, &violation)
     rows_slack(p, r, e.impulse, e.dv, scratch)
-    score_rows(p, e.impulse, scratch, scratch + p.n_rows, &s)
+    score_slack(p, e.impulse, scratch, scratch + p.n_rows, &s)
     out[1] = s.energy
 
 

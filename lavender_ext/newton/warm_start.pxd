@@ -9,17 +9,10 @@ An impulse is scored by the judge's own lines (judge/measure.pxd, judge/score.px
 judge's. What is not decided here (dependent joints, numbers near the ends of the range, a residual that stays above
 tol) is left to the caller, with lam as it came.
 """
-from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t, int64_t
 
-from lavender_ext.core.block cimport row_error
-from lavender_ext.core.parts cimport COULOMB, blocks_t, is_rows
-from lavender_ext.core.rows cimport dot6, relax_rows_block, rows_t
-from lavender_ext.core.start cimport is_nothing
-from lavender_ext.core.velocity cimport rows_velocity
-from lavender_ext.factor.band cimport ldl_factor, ldl_solve, pivots_t
-from lavender_ext.judge.measure cimport rows_slack
-from lavender_ext.judge.score cimport new_score, nothing, relative, score_rows, score_t, tally_row, tally_t
+from lavender_ext.core.parts cimport blocks_t
+from lavender_ext.core.rows cimport rows_t
 
 
 cpdef enum:
@@ -53,46 +46,6 @@ cdef struct warm_t:
     int32_t traced              # scores noted
 
 
-cdef inline int32_t start_errors(const blocks_t* p, double* energy, double* velocity) noexcept nogil:
-    """E0, V0 of lam = 0, w = -b; 0 where they are not plainly the judge's."""
-    cdef int32_t i, j
-    cdef double e, rhs = 0.0, least = 1.0 / 0.0, inf = 1.0 / 0.0
-    cdef tally_t s = nothing()
-    for i in range(p.n_blocks):
-        for j in range(p.ptr[i], p.ptr[i + 1]):
-            if not 0.0 < p.d[j] < inf:
-                return 0
-            least = p.d[j] if p.d[j] < least else least
-            rhs += p.b[j] * p.b[j]
-            if is_rows(p, i):
-                if not p.lower[j] <= 0.0 <= p.upper[j]:
-                    return 0
-                e = row_error(0.0, -p.b[j], p.d[j], p.lower[j], p.upper[j])
-            elif j == p.ptr[i]:
-                e = row_error(0.0, -p.b[j], p.d[j], 0.0, inf)
-            else:
-                continue                                # a disk of radius 0 holds it: e = 0
-            tally_row(p, j, e, &s)
-    energy[0] = sqrt(s.energy)
-    velocity[0] = sqrt(s.fast)
-    # below 2^-48 of the norm of b the judge measures by that
-    return s.energy < inf and s.energy * least > 1.3e-29 * rhs
-
-
-cdef inline void observe(const blocks_t* p, const rows_t* r, const warm_t* s, double* residual,
-                         double* violation) noexcept nogil:
-    # as the engine measures its own sweeps: max |e_n| [N s] and max(0, -w_n) [m/s] over the contacts
-    cdef int32_t i, j
-    cdef double x, big = 0.0, low = 0.0
-    for i in range(r.n_joints, p.n_blocks):
-        j = p.ptr[i]
-        x = fabs(s.error[j])
-        big = x if x > big else big
-        low = -s.slack[j] if -s.slack[j] > low else low
-    residual[0] = big
-    violation[0] = low
-
-
 cdef inline int64_t room_of(const blocks_t* p, int32_t width) noexcept nogil:
     # doubles that `lay_out` hands out
     return (3 + <int64_t>width) * p.n_rows
@@ -108,175 +61,11 @@ cdef inline void lay_out(warm_t* s, double* real, int32_t* index, const blocks_t
     s.before = index + r.n_bodies
 
 
-cdef inline void note_score(const blocks_t* p, const rows_t* r, warm_t* s, double energy) noexcept nogil:
-    # the last score of as much work counts
-    cdef int32_t i
-    cdef double x, big = 0.0, work = s.sweeps + s.factorisations
-    cdef double* out
-    if s.traced > 0 and s.trace[3 * s.traced - 3] == work:
-        s.traced -= 1
-    if s.traced == MOST_TRACED:
-        return
-    for i in range(r.n_joints, p.n_blocks):
-        x = fabs(s.error[p.ptr[i]])
-        big = x if x > big else big
-    out = s.trace + 3 * s.traced
-    out[0] = work
-    out[1] = energy
-    out[2] = big
-    s.traced += 1
-
-
-cdef inline double scored(const blocks_t* p, const rows_t* r, warm_t* s, const double* lam, const double* v, double e0,
-                          double v0) noexcept nogil:
-    """Relative residual of lam as the judge has it, v = M^-1 J^T lam; infinite where it is not finite."""
-    cdef score_t x = new_score()
-    rows_slack(p, r, lam, v, s.slack)
-    score_rows(p, lam, s.slack, s.error, &x)
-    if s.trace != NULL:
-        note_score(p, r, s, x.energy)
-    if x.relative >= 0.0:                               # of the worst island
-        return x.relative
-    return relative(x.energy, x.velocity, e0, v0) if x.finite else 1.0 / 0.0
-
-
-cdef inline int32_t band_width(const blocks_t* p, const rows_t* r, int32_t* last) noexcept nogil:
-    """Width of the band of A in the given order, joints alone and all free; 0 where there are others."""
-    cdef int32_t i, j, h, b, width = 1
-    if r.n_contacts > 0 or r.n_joints == 0:
-        return 0
-    for b in range(r.n_bodies):
-        last[b] = -1
-    for i in range(r.n_joints):
-        for j in range(p.ptr[i], p.ptr[i + 1]):
-            if p.lower[j] > -1.0 / 0.0 or p.upper[j] < 1.0 / 0.0:
-                return 0
-        if p.ptr[i + 1] - p.ptr[i] > width:
-            width = p.ptr[i + 1] - p.ptr[i]
-        for h in range(2):
-            b = r.joint_body[2 * i + h]
-            if b < 0:
-                continue
-            if last[b] < 0:
-                last[b] = p.ptr[i]
-            elif p.ptr[i + 1] - last[b] > width:
-                width = p.ptr[i + 1] - last[b]
-    return width if width <= MOST_BAND else 0
-
-
-cdef inline void fill_band(const blocks_t* p, const rows_t* r, warm_t* s) noexcept nogil:
-    # band[i width + t] = A[i + t, i], over the joints of each body
-    cdef int32_t i, k, q, j, h, g, b, at
-    for b in range(r.n_bodies):
-        s.last[b] = -1
-    for i in range(p.n_rows * s.width):
-        s.band[i] = 0.0
-    for i in range(r.n_joints):
-        for h in range(2):
-            b = r.joint_body[2 * i + h]
-            if b < 0:
-                continue
-            s.before[2 * i + h] = s.last[b]
-            s.last[b] = 2 * i + h
-            at = s.last[b]
-            while at >= 0:
-                k = at >> 1
-                g = at & 1
-                for j in range(p.ptr[i], p.ptr[i + 1]):
-                    for q in range(p.ptr[k], p.ptr[k + 1]):
-                        if q <= j:
-                            s.band[<int64_t>q * s.width + (j - q)] += dot6(r.jac + 12 * j + 6 * h,
-                                                                           r.minv_jac + 12 * q + 6 * g)
-                at = s.before[at]
-    for j in range(p.n_rows):
-        s.band[<int64_t>j * s.width] += r.compliance[j]
-
-
-cdef inline double judged(const blocks_t* p, const rows_t* r, warm_t* s, const double* lam, double* v, double e0,
-                          double v0) noexcept nogil:
-    # with v formed anew, as the judge does
-    rows_velocity(p, r, lam, v)
-    return scored(p, r, s, lam, v, e0, v0)
-
-
-cdef inline int32_t solve_joints(const blocks_t* p, const rows_t* r, warm_t* s, double tol, double e0, double v0,
-                                 double* lam, double* v) noexcept nogil:
-    """(3)"""
-    cdef pivots_t pivot
-    cdef int32_t j, turn
-    fill_band(p, r, s)
-    s.factorisations = 1
-    ldl_factor(p.n_rows, s.width, s.band, p.d, 1e-13, NULL, &pivot)
-    if pivot.small or pivot.negative:
-        return UNDECIDED
-    for j in range(p.n_rows):
-        lam[j] = p.b[j]
-    ldl_solve(p.n_rows, s.width, s.band, lam)
-    for turn in range(2):
-        s.relative = judged(p, r, s, lam, v, e0, v0)
-        if s.relative <= tol:
-            return SOLVED
-        if turn == 0:                                   # lam <- lam - A^-1 w
-            ldl_solve(p.n_rows, s.width, s.band, s.slack)
-            for j in range(p.n_rows):
-                lam[j] -= s.slack[j]
-    return UNDECIDED
-
-
-cdef inline int32_t sweep_contacts(const blocks_t* p, const rows_t* r, warm_t* s, double tol, double e0, double v0,
-                                   double* lam, double* v) noexcept nogil:
-    """(2)"""
-    cdef int32_t i, n = 0, last = 0, next_ = FIRST_SWEEPS
-    cdef double before, now = s.relative, ahead
-    while n < MOST_SWEEPS:
-        while n < next_:
-            for i in range(p.n_blocks):
-                relax_rows_block(p, r, i, lam, v)
-            n += 1
-        s.sweeps = n
-        before = now
-        now = scored(p, r, s, lam, v, e0, v0)
-        if now <= tol:
-            s.relative = judged(p, r, s, lam, v, e0, v0)
-            if s.relative <= tol:
-                return SWEPT
-        if n >= PATIENT_SWEEPS:
-            ahead = now
-            i = n
-            while i < MOST_SWEEPS:
-                ahead = ahead * (now / before)
-                i += n - last
-            if not ahead <= tol:
-                return UNDECIDED
-        last = n
-        next_ = 2 * n
-    return UNDECIDED
-
-
-cdef inline int32_t warm_solve(const blocks_t* p, const rows_t* r, warm_t* s, double tol, double* lam, double* v,
-                               int32_t has_velocity) noexcept nogil:
-    """lam (m), not all zero, to tol; v (n_bodies, 6) is left M^-1 J^T lam, given so with `has_velocity`."""
-    cdef double e0, v0
-    cdef int32_t j, found
-    s.sweeps = 0
-    s.factorisations = 0
-    s.traced = 0
-    if is_nothing(p, lam) or p.n_rows > MOST_ROWS or p.law != COULOMB or not start_errors(p, &e0, &v0):
-        return UNDECIDED
-    if not has_velocity:
-        rows_velocity(p, r, lam, v)
-    s.relative = scored(p, r, s, lam, v, e0, v0)
-    if s.relative <= tol:
-        return JUDGED
-    for j in range(p.n_rows):
-        s.kept[j] = lam[j]
-    found = UNDECIDED
-    if r.n_contacts > 0:
-        found = sweep_contacts(p, r, s, tol, e0, v0, lam, v)
-    elif s.width > 0:
-        found = solve_joints(p, r, s, tol, e0, v0, lam, v)
-    if found == UNDECIDED:
-        for j in range(p.n_rows):
-            lam[j] = s.kept[j]
-        rows_velocity(p, r, lam, v)
-    return found
+cdef int32_t start_errors(const blocks_t* p, double* energy, double* velocity) noexcept nogil
+cdef void observe(const blocks_t* p, const rows_t* r, const warm_t* s, double* residual,
+                         double* violation) noexcept nogil
+cdef int32_t band_width(const blocks_t* p, const rows_t* r, int32_t* last) noexcept nogil
+cdef double judged(const blocks_t* p, const rows_t* r, warm_t* s, const double* lam, double* v, double e0,
+                          double v0) noexcept nogil
+cdef int32_t warm_solve(const blocks_t* p, const rows_t* r, warm_t* s, double tol, double* lam, double* v,
+                               int32_t has_velocity) noexcept nogil

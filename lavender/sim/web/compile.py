@@ -38,7 +38,7 @@ from threading import get_native_id
 from typing import Any
 
 #: Modules of lavender_ext that the page uses.
-MODULES = ("engine.arrays", "engine.substep", "host.memory")
+MODULES = ("engine.arrays", "engine.substep", "host.memory", "judge.measure")
 #: Largest size of a finished module [bytes].
 LARGEST = 220_000
 
@@ -54,7 +54,7 @@ class Part:
 #: Modules of the page by name; the first stands alone.
 PARTS = {
     "lavender": Part(MODULES),
-    "newton": Part(("engine.newton_substep", "judge.measure", "newton.solve"), beside=True),
+    "newton": Part(("engine.newton_substep", "judge.measure", "newton.solve", "newton.warm_start"), beside=True),
 }
 EXTRACT_C: dict[str, Any] = runpy.run_path(str(Path(__file__).resolve().with_name("extract_c.py")))
 #: Name of the custom section with the hash of the sources, which ends the file.
