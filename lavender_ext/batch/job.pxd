@@ -9,18 +9,14 @@ from libc.math cimport INFINITY, NAN, fabs, sqrt
 from libc.string cimport memset
 
 from lavender_ext.core.assemble cimport lav_assemble, lav_body_blocks, lav_expand_rows
-from lavender_ext.core.csr cimport csr_t
 from lavender_ext.core.door cimport first_outside
-from lavender_ext.core.generalized cimport generalized_t
 from lavender_ext.core.method cimport MORE, REACHED, ROOM, options_t, room_t, said_t
 from lavender_ext.core.islands cimport islands_index
 from lavender_ext.core.parts cimport CONE, blocks_t, is_rows, islands_t
 from lavender_ext.core.problem cimport MADE, lav_rows_diagonal, made_t, make_numbers, matrix_numbers
-from lavender_ext.core.rows cimport rows_t
-from lavender_ext.core.view cimport view_t
+from lavender_ext.core.view cimport csr_t, generalized_t, rows_t, view_t
 from lavender_ext.driver.driver cimport NEWTON, lav_room, lav_start, lav_step
 from lavender_ext.factor.tiles cimport has_wide
-from lavender_ext.velocity_newton.newton cimport is_soft
 from lavender_ext.judge.measure cimport (above_floor_of, do_nothing, floor_of, general_score, judge_nothing, refine_view,
                                          relative_of, scratch_of)
 from lavender_ext.judge.score cimport new_score, score_t
@@ -30,6 +26,7 @@ from lavender_ext.small.call cimport (COUNTS, ENDED, KEPT, are_bounded, few_rule
 from lavender_ext.small.limits cimport allowed, cost_of, limits_t, step_cost, work_within
 from lavender_ext.small.room cimport has_room
 from lavender_ext.batch.world cimport BESIDE, LEFT, READY, STARTED, TRIED, rows_of
+from lavender_ext.velocity_newton.soft cimport is_soft
 
 
 cdef enum:

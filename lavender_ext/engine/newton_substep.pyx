@@ -16,8 +16,7 @@ import numpy as np
 from lavender_ext.core.method cimport CERTIFICATE, MORE, options_t, room_t, said_t
 from lavender_ext.core.islands cimport find_islands, islands_index
 from lavender_ext.core.parts cimport blocks_t, is_rows, islands_t
-from lavender_ext.core.rows cimport rows_t
-from lavender_ext.core.view cimport view_t
+from lavender_ext.core.view cimport rows_t, view_t
 from lavender_ext.core.weights cimport block_weights, joint_weights
 from lavender_ext.engine.arrays cimport S_OUT, bind, engine_t
 from lavender_ext.engine.view cimport view

@@ -22,8 +22,9 @@ from lavender_ext.core.door cimport all_finite
 from lavender_ext.core.order cimport (RANDOM, SYMMETRIC, advance_order, block_levels, body_levels,
                                       color_by_bodies, reverse, sort_by_level)
 from lavender_ext.core.parts cimport blocks_t
-from lavender_ext.core.rows cimport relax_contact_block, relax_joint, rows_t
+from lavender_ext.core.rows cimport relax_contact_block, relax_joint
 from lavender_ext.core.velocity cimport rows_velocity
+from lavender_ext.core.view cimport rows_t
 from lavender_ext.engine.arrays cimport (AT_RANDOM, AVBD, BOTTOM_UP, CAP_CONTACT, CAP_PAIR, COLORED, H_CONTACTS,
                                          H_CONTACT_ROWS, H_ITERATIONS, H_LOST, H_MATCHES, H_RELAXING, H_STEPPER,
                                          H_NEED_CONTACTS, H_NEED_PAIRS, H_ORDER, H_SEED, H_SOLVED, H_STEP,

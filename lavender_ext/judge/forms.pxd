@@ -12,15 +12,17 @@ from libc.math cimport fabs
 from libc.stdint cimport int32_t
 
 from lavender_ext.core.block cimport block_error
-from lavender_ext.core.csr cimport csr_dot, csr_dot_long, csr_t
-from lavender_ext.core.generalized cimport generalized_t, panel_push_size, panel_size
+from lavender_ext.core.csr cimport csr_dot, csr_dot_long
+from lavender_ext.core.generalized cimport panel_push_size, panel_size
 from lavender_ext.core.parts cimport blocks_t, is_rows, n_directions, n_turns
-from lavender_ext.core.rows cimport cross, rows_t
+from lavender_ext.core.rows cimport cross
 from lavender_ext.core.velocity cimport add6, rows_velocity
-from lavender_ext.judge.score cimport (add_block_floor, add_row_floor, begin_islands, block_at, close_island, floor_from,
-                                       floor_t, island_begin, island_end, no_floor, nothing, score_from, score_rows,
-                                       score_t, tally_block, tally_t)
+from lavender_ext.core.view cimport csr_t, generalized_t, rows_t
+from lavender_ext.judge.score cimport score_t
 from lavender_ext.judge.slack cimport general_slack, rows_slack
+from lavender_ext.judge.tally cimport (add_block_floor, add_row_floor, begin_islands, block_at, close_island,
+                                       floor_from, floor_t, island_begin, island_end, no_floor, nothing, score_from,
+                                       score_rows, tally_block, tally_t)
 
 
 # -- islands --------------------------------------------------------------------------------------------

@@ -7,21 +7,21 @@ import numpy as np
 
 from lavender_ext.core cimport door
 from lavender_ext.core.arrays cimport doubles, ints
-from lavender_ext.core.generalized cimport generalized_t, whitened_gather
+from lavender_ext.core.generalized cimport whitened_gather
 from lavender_ext.core.islands cimport find_islands, is_immovable, islands_index, list_one_island
 from lavender_ext.core.parts cimport blocks_t, islands_t
 from lavender_ext.core.problem cimport Data, Room, room_for
 from lavender_ext.core.velocity cimport rows_velocity
-from lavender_ext.core.view cimport view_t
+from lavender_ext.core.view cimport generalized_t, view_t
 from lavender_ext.judge.best cimport best_room, best_t, bind_best, count_islands, note_score, see_impulse, see_start
 from lavender_ext.judge.forms cimport csr_judge, csr_slack, general_errors, general_judge, rows_judge
 from lavender_ext.judge.measure cimport above_floor_of, do_nothing, floor_of, relative_of, scratch_of
 from lavender_ext.judge.reference cimport needs_rows, reference_of
 from lavender_ext.judge.refine cimport loss_by_factor, refine_general
 from lavender_ext.judge.rounding cimport mass_t, relative_size, squares32
-from lavender_ext.judge.score cimport (are_numbers, is_at_floor, new_score, norms_of_rhs, nothing, relative,
-                                       score_rows, score_t, tally_block, tally_t)
+from lavender_ext.judge.score cimport are_numbers, is_at_floor, new_score, relative, score_t
 from lavender_ext.judge.slack cimport general_slack, rows_slack
+from lavender_ext.judge.tally cimport norms_of_rhs, nothing, score_rows, tally_block, tally_t
 
 
 cdef void judge_view(const view_t* v, const double* lam, double* w, double* e, double* scratch, bint floor,

@@ -23,8 +23,10 @@ from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t, uint64_t
 from libc.string cimport memcpy
 
-from lavender_ext.core.generalized cimport bound_condition, dot, generalized_t, get_condition, tree_solve
+from lavender_ext.core.dot cimport dot
+from lavender_ext.core.generalized cimport bound_condition, get_condition, tree_solve
 from lavender_ext.core.parts cimport blocks_t
+from lavender_ext.core.view cimport generalized_t
 from lavender_ext.judge.forms cimport general_errors
 from lavender_ext.judge.score cimport relative, score_t, smallest_reference, unit_roundoff
 

@@ -1,9 +1,10 @@
 """The slack w = A lam - b over bodies, and over J and M."""
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.generalized cimport generalized_t, jac_push, jac_row, tree_solve
+from lavender_ext.core.generalized cimport jac_push, jac_row, tree_solve
 from lavender_ext.core.parts cimport blocks_t
-from lavender_ext.core.rows cimport rows_t, rows_times
+from lavender_ext.core.rows cimport rows_times
+from lavender_ext.core.view cimport generalized_t, rows_t
 
 
 cdef inline void rows_slack(const blocks_t* p, const rows_t* r, const double* lam, const double* v,

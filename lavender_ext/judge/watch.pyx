@@ -1,4 +1,4 @@
-"""The watch of judge/watch.pxd for Python: where a run of sweeps stands, and the loop of sweeps and checks."""
+"""The checks of judge/watch.pxd, compiled once, and the same for Python: where a run of sweeps stands."""
 from libc.math cimport NAN, log10
 from libc.stdint cimport int32_t
 from libc.string cimport memcpy

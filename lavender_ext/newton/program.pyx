@@ -12,8 +12,9 @@ from libc.stdint cimport int32_t
 
 import numpy as np
 
-from lavender_ext.core.csr cimport csr_dot, csr_dot_size, csr_t
+from lavender_ext.core.csr cimport csr_dot, csr_dot_size
 from lavender_ext.core.door cimport widest
+from lavender_ext.core.view cimport csr_t
 
 
 cdef double FLOOR = 1e-10       # of what is pushed inside,

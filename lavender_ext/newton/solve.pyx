@@ -17,8 +17,7 @@ from lavender_ext.core.arrays cimport address, zeros
 from lavender_ext.core.method cimport CERTIFICATE, MORE, ROOM, Method, grant, method_t, options_t, room_t, said_t
 from lavender_ext.core.parts cimport COULOMB
 from lavender_ext.core.problem cimport Data
-from lavender_ext.core.rows cimport rows_t
-from lavender_ext.core.view cimport view_t
+from lavender_ext.core.view cimport rows_t, view_t
 from lavender_ext.factor.blocks cimport sparse_t
 from lavender_ext.factor.sparse cimport SparsePanels
 from lavender_ext.factor.symbolic cimport block_pattern

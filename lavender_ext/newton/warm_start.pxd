@@ -5,14 +5,14 @@
                  where r_s (r_s / r_s/2)^(2 (64 - s)/s), what 64 would leave, is above tol       (2)
     free joints  A lam = b by LDL^T on the band of A, one round of refinement                   (3)
 
-An impulse is scored by the judge's own lines (judge/measure.pxd, judge/score.pxd): the residual found here is the
+An impulse is scored by the judge's own lines (judge/measure.pyx, judge/score.pxd): the residual found here is the
 judge's. What is not decided here (dependent joints, numbers near the ends of the range, a residual that stays above
 tol) is left to the caller, with lam as it came.
 """
 from libc.stdint cimport int32_t, int64_t
 
 from lavender_ext.core.parts cimport blocks_t
-from lavender_ext.core.rows cimport rows_t
+from lavender_ext.core.view cimport rows_t
 
 
 cpdef enum:

@@ -7,13 +7,15 @@ import numpy as np
 from lavender_ext.core.block cimport row_error
 from lavender_ext.core.parts cimport COULOMB, blocks_t, is_rows
 from lavender_ext.core.problem cimport Data
-from lavender_ext.core.rows cimport dot6, relax_rows_block, rows_t
+from lavender_ext.core.rows cimport dot6, relax_rows_block
 from lavender_ext.core.start cimport is_nothing
 from lavender_ext.core.velocity cimport rows_velocity
+from lavender_ext.core.view cimport rows_t
 from lavender_ext.factor.band cimport ldl_factor, ldl_solve, pivots_t
 from lavender_ext.judge.measure cimport score_slack
-from lavender_ext.judge.score cimport new_score, nothing, relative, score_t, tally_row, tally_t
+from lavender_ext.judge.score cimport new_score, relative, score_t
 from lavender_ext.judge.slack cimport rows_slack
+from lavender_ext.judge.tally cimport nothing, tally_row, tally_t
 from lavender_ext.newton.warm_start cimport (FIRST_SWEEPS, JUDGED, MOST_ROWS, MOST_BAND, MOST_SWEEPS, MOST_TRACED, PATIENT_SWEEPS,
                                              SOLVED, SWEPT, UNDECIDED, lay_out, room_of, warm_t)
 

@@ -7,10 +7,9 @@ from libc.string cimport memcmp, memcpy, memset
 
 from lavender_ext.accelerate.accelerated cimport lav_anderson, sweep_data_t
 from lavender_ext.accelerate.mixing cimport CONTROL, MAX_MEMORY, UNDONE
-from lavender_ext.core.csr cimport csr_t
 from lavender_ext.core.method cimport CERTIFICATE, MORE, ROOM, options_t, room_t, said_t
 from lavender_ext.core.parts cimport CONE, blocks_t
-from lavender_ext.core.view cimport view_t
+from lavender_ext.core.view cimport csr_t, view_t
 from lavender_ext.driver.driver cimport NEWTON, lav_room, lav_start, lav_step
 from lavender_ext.small.room cimport has_room
 from lavender_ext.judge.measure cimport do_nothing, find_reference, judge_view, relative_of

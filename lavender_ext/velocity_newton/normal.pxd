@@ -13,7 +13,7 @@ and where blocks of V may be full, as those of contacts, a the rows of those tha
 from libc.stdint cimport int32_t
 from libc.string cimport memcpy
 
-from lavender_ext.core.generalized cimport dot
+from lavender_ext.core.dot cimport dot
 from lavender_ext.core.tree cimport ldl_solve, take_two
 from lavender_ext.core.parts cimport is_rows
 from lavender_ext.factor.dense_lu cimport lu_factor, lu_solve
