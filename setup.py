@@ -262,8 +262,16 @@ class ReproducibleArchive(sdist):
     """A source distribution whose bytes follow from its files alone: no clock, owner, umask or order of a folder."""
 
     def run(self):
-        """The C library is made first, so that whoever unpacks the archive has it without Cython."""
+        """Make the C library and the WebAssembly modules first: an unpacked archive needs no compiler for them."""
         make_library()
+        for name, part in WASM["PARTS"].items():
+            path = Path("lavender", "sim", "web", f"{name}.wasm")
+            if not WASM["is_current"](path, Path(), part):
+                if reason := WASM["why_not"]():
+                    raise CompileError(
+                        f"a source distribution contains {path}, which cannot be built here: {reason}"
+                    )
+                WASM["build"](path, Path().resolve(), part.modules, beside=part.beside)
         super().run()
 
     def make_archive(self, base_name, format, root_dir=None, base_dir=None, owner=None, group=None):  # noqa: A002

@@ -54,7 +54,9 @@ class Part:
 #: Modules of the page by name; the first stands alone.
 PARTS = {
     "lavender": Part(MODULES),
-    "newton": Part(("engine.newton_substep", "judge.measure", "newton.solve", "newton.warm_start"), beside=True),
+    "newton": Part(
+        ("engine.newton_substep", "judge.measure", "newton.solve", "newton.warm_start"), beside=True
+    ),
 }
 EXTRACT_C: dict[str, Any] = runpy.run_path(str(Path(__file__).resolve().with_name("extract_c.py")))
 #: Name of the custom section with the hash of the sources, which ends the file.
