@@ -4,7 +4,7 @@ After `prepare` and `solve` without sweeps:
 
     index_room      whole numbers that the next call needs
     plan            bands, elements, elimination order; doubles that the next call needs
-    solve           the first phase of `newton` (newton/warm_start.pxd), then its steps (newton/solve.pyx); the judge's residual decides
+    solve           the first phase of `newton` (newton/warm_start.pxd), then its steps (newton/solve.pyx); the judge decides
 
 Natively and in WebAssembly the same lines, the same bits. What asks for another library, the augmented system, is left out;
 where that or `BUDGET` leaves the residual above tol, the best impulse found stays, and is told as such.

@@ -1,4 +1,4 @@
-"""The judge's pass over each form of A: w = A lam - b formed anew, error e of every block, their sums (score.pxd) and what rounding leaves.
+"""The judge's pass over each form of A: w = A lam - b formed anew, error e of every block, their sums, and round-off limits.
 
     F_i = 2^-53 (|A| |lam| + |b|)_i             [m/s]; factored: |J| |M^-1| |J|^T |lam| + c |lam| for |A| |lam|;
                                                 at least d_i |lam_i| if a pair is cut to its bound;

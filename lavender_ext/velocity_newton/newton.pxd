@@ -33,7 +33,7 @@ from lavender_ext.core.view cimport generalized_t
 from lavender_ext.velocity_newton.flow cimport (NOWHERE, blank, block_end, block_from, descent_t, flow_t, gather, keep,
                                             measure, renew, respond_all, row_end, row_from, wait_t)
 from lavender_ext.velocity_newton.normal cimport factor, form, is_held, newton_step
-from lavender_ext.velocity_newton.soft cimport enough
+from lavender_ext.velocity_newton.soft cimport least_softness
 
 
 cdef enum:                      # a round of Coulomb friction
@@ -179,7 +179,7 @@ cdef inline void one_theta(double* theta, int32_t first, int32_t end) noexcept n
 
 
 cdef inline void soften(const flow_t* f, int32_t island, double share) noexcept nogil:
-    """theta' of (2): rho is `share` d on rows with less than `enough` of their own.
+    """theta' of (2): rho is `share` d on rows with less than `least_softness` of their own.
 
     Rows of one part get the largest.
     """
@@ -196,7 +196,7 @@ cdef inline void soften(const flow_t* f, int32_t island, double share) noexcept 
         for i in range(block_from(f, a), last):
             j = f.p.ptr[i]
             end = f.p.ptr[i + 1]
-            low = enough(&f.p, i)
+            low = least_softness(&f.p, i)
             if share < low:
                 low = share
             for k in range(j, end):

@@ -5,7 +5,7 @@ from lavender_ext.core.parts cimport blocks_t, is_rows
 from lavender_ext.core.view cimport generalized_t
 
 
-cdef inline double enough(const blocks_t* p, int32_t i) noexcept nogil:
+cdef inline double least_softness(const blocks_t* p, int32_t i) noexcept nogil:
     """Compliance over d with which a block needs no proximal term."""
     return 1e-6 if is_rows(p, i) else 1e-3
 
@@ -15,6 +15,6 @@ cdef inline bint is_soft(const blocks_t* p, const generalized_t* g) noexcept nog
     cdef int32_t i, k
     for i in range(p.n_blocks):
         for k in range(p.ptr[i], p.ptr[i + 1]):
-            if not g.compliance[k] >= enough(p, i) * p.d[k]:
+            if not g.compliance[k] >= least_softness(p, i) * p.d[k]:
                 return False
     return True
