@@ -101,7 +101,7 @@ static double energy_of(lav_solver *s, const double *x, double *v, double *out, 
   double whole = 0.0, moving = 0.0;
   int32_t i;
   change_of(s, x, v);
-  if (s->form == LAV_BODIES) core_view_rows_times(&s->p, &s->r, v, out);
+  if (s->form == LAV_BODIES) core_rows_rows_times(&s->p, &s->r, v, out);
   for (i = 0; i < s->p.n_rows; i++) {
     if (s->form == LAV_MATRIX) out[i] = core_csr_csr_dot(&s->a, i, x);
 #ifndef LAV_SWEEPS_ONLY

@@ -217,7 +217,7 @@ static void fill_bodies(lav_solver *s, const lav_problem *q) {
   copy_or(s->v_free, q->velocity, 6 * n, 0.0);
   copy_or(b, q->b, q->n_rows, 0.0);
   if (!q->b) {
-    core_view_rows_times(&s->p, &s->r, s->v_free, s->watch.w);
+    core_rows_rows_times(&s->p, &s->r, s->v_free, s->watch.w);
     for (i = 0; i < q->n_rows; i++) b[i] = (q->target ? q->target[i] : 0.0) - s->watch.w[i];
   }
   k_rows_diagonal(&s->p, &s->r, (double *)(uintptr_t)s->p.d, (double *)(uintptr_t)s->p.nu, (double *)(uintptr_t)s->p.step,
