@@ -56,7 +56,7 @@ ci:  ## what the continuous integration runs
 	bash .ci/run
 
 release:  ## what a release is made of, in dist/; stops where a person must act
-	$(PYTHON) .ci/release dist
+	PYTHON=$(PYTHON) .ci/release dist
 
 clean:  ## what builds leave behind
 	rm -rf build site docs/generated

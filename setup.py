@@ -46,11 +46,13 @@ DIRECTIVES = OPTIONS["directives"](debug=DEBUG)
 #: Holds what Cython would otherwise write into every module (memoryviews): half of all that is compiled.
 SHARED = "lavender_ext._utility"
 
-#: Modules whose loops take the update of a block whole, however much they have inlined before it: with gcc's own limits
-#: 2 to 12 % more instructions, elsewhere within 0.7 %, in two thirds of the time. Not warm/substep, 8 % more: natively
-#: the engine takes a few sweeps of a warm start there.
-WHOLE = ("sweep/", "local/", "judge/", "driver/", "engine/substep")
-#: Modules without a loop that counts.
+#: Modules whose loops need the update of a block inlined into them: -O3 and gcc's inlining limits raised (INLINE).
+#: With lower limits they execute 2 to 12 % more instructions; at -O2 a sweep takes up to 1.7 times as long.
+HOT = ("sweep/", "local/", "judge/measure", "driver/", "engine/substep")
+#: -O3 with lower inlining limits: at -O2 a solve by Newton's method takes twice as long.
+FAST = ("newton/solve",)
+#: Modules without a loop that costs time: -O1. All others are compiled at -O2 with gcc's full vectoriser; times of
+#: solves stay within 1 % of -O3, which takes a sixth longer to compile.
 COLD = (
     "_utility",
     "host/",
@@ -103,7 +105,7 @@ class BuildKernels(build_ext):
         out = Path("build", "cython")
         stamp = out / "how.json"
         how = json.dumps(
-            [Cython.__version__, SHARED, DIRECTIVES, COMPILE_ARGS, LINK_ARGS, INLINE, LIMITS, WHOLE, COLD]
+            [Cython.__version__, SHARED, DIRECTIVES, COMPILE_ARGS, LINK_ARGS, INLINE, LIMITS, HOT, FAST, COLD]
         )
         current = stamp.exists() and stamp.read_text() == how
         if not current:
@@ -260,8 +262,16 @@ class ReproducibleArchive(sdist):
     """A source distribution whose bytes follow from its files alone: no clock, owner, umask or order of a folder."""
 
     def run(self):
-        """The C library is made first, so that whoever unpacks the archive has it without Cython."""
+        """Make the C library and the WebAssembly modules first: an unpacked archive needs no compiler for them."""
         make_library()
+        for name, part in WASM["PARTS"].items():
+            path = Path("lavender", "sim", "web", f"{name}.wasm")
+            if not WASM["is_current"](path, Path(), part):
+                if reason := WASM["why_not"]():
+                    raise CompileError(
+                        f"a source distribution contains {path}, which cannot be built here: {reason}"
+                    )
+                WASM["build"](path, Path().resolve(), part.modules, beside=part.beside)
         super().run()
 
     def make_archive(self, base_name, format, root_dir=None, base_dir=None, owner=None, group=None):  # noqa: A002
@@ -291,12 +301,18 @@ build.sub_commands = [*build.sub_commands, ("build_wasm", None), ("build_library
 def extension(path):
     """One module, named after its file."""
     name = path.as_posix().removeprefix("lavender_ext/")
-    limits = INLINE if name.startswith(WHOLE) else LIMITS
-    level = ["-O2"] if limits and name.startswith(COLD) else []
+    options = []
+    if LIMITS and name.startswith(COLD):
+        options = ["-O1"]
+    elif LIMITS and name.startswith(HOT):
+        options = INLINE
+    elif LIMITS:
+        level = [] if name.startswith(FAST) else ["-O2", "-fvect-cost-model=dynamic"]
+        options = [*level, *LIMITS]
     return Extension(
         ".".join(path.with_suffix("").parts),
         [path.as_posix()],
-        extra_compile_args=[*COMPILE_ARGS, *level, *limits],
+        extra_compile_args=[*COMPILE_ARGS, *options],
         extra_link_args=LINK_ARGS,
     )
 

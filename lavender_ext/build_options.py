@@ -37,5 +37,6 @@ def directives(*, debug: bool = False) -> dict[str, Any]:
         "initializedcheck": debug,
         "cdivision": True,
         "embedsignature": True,
+        "auto_pickle": False,  # what is copied says itself how (lavender.problem, lavender.judge)
         "freethreading_compatible": True,
     }

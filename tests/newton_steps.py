@@ -1,11 +1,11 @@
-"""A scene stepped by the solve that a browser has of `newton`: lavender_ext.warm.substep on the engine's own arrays."""
+"""A scene stepped by the solve that a browser has of `newton`: `lavender_ext.engine.newton_substep` on its arrays."""
 
 import numpy as np
 
 import lavender as lv
 from lavender.sim.engine.layout import HEAD, SETTING
 from lavender.sim.engine.stepping import TOL
-from lavender_ext.warm.substep import Substep
+from lavender_ext.engine.newton_substep import Substep
 
 OK, NEED_ROOM = 0, 1
 

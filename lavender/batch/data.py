@@ -31,8 +31,8 @@ from lavender.problem import FRICTION, Problem
 from lavender.problem.cones import Cones
 from lavender.problem.generalized import ASYMMETRY, ASYMMETRY32
 from lavender.problem.rows import Rows
+from lavender_ext.batch.many import PLACE, Worlds
 from lavender_ext.core.problem import LAWS, nothing_done
-from lavender_ext.small.many import PLACE, Worlds
 
 __all__ = ["Batch"]
 

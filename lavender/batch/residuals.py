@@ -29,7 +29,7 @@ from lavender.batch.data import ERRORS, Batch
 from lavender.judge.residuals import AT_REST, ENOUGH, TOL, VERDICTS, Residual, residual, verdict_of
 from lavender.problem import PRECISIONS, Problem, check_problem
 from lavender.problem.derived import cached_property
-from lavender_ext.small.many import CODE, NUMBER, PLACE, Hand, Worlds, data_of
+from lavender_ext.batch.many import CODE, NUMBER, PLACE, Hand, Worlds, data_of
 
 DONE_ALL = -1  # of `Hand`: there are no more worlds
 

@@ -33,8 +33,8 @@ from lavender.solving.solve import (
     solve,
     unjudged,
 )
+from lavender_ext.batch.many import CODE, NUMBER, PLACE, Hand
 from lavender_ext.judge.measure import all_finite
-from lavender_ext.small.many import CODE, NUMBER, PLACE, Hand
 
 __all__ = ["Solutions", "solve_many"]
 

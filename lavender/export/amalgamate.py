@@ -28,6 +28,7 @@ MODULES = (
     "accelerate.accelerated",
     "accelerate.admm",
     "driver.driver",
+    "newton.solve",
     "pivot.direct",
     "pivot.lemke",
     "pivot.principal",

@@ -58,7 +58,7 @@ from lavender.problem import Names, Problem
 from lavender.problem.cones import Cones
 from lavender.problem.generalized import Generalized
 from lavender.problem.operators import USUAL
-from lavender_ext.generalized import export
+from lavender_ext.io import mujoco_rows
 
 ROUNDING = 2.0**-46  # 64 roundings: M a0 against the smooth force, which MuJoCo solved for by the same factor
 SAME = 1e-9  # -, R D - 1
@@ -136,7 +136,7 @@ def from_mujoco(model: Any, data: Any, *, name: str = "mujoco") -> Problem:
     mass = _mass(seen, model, data, smooth, NO_TRIANGLE if like is None else like.mass[:2])
     cones, scale, key = _blocks(seen, data, contacts, dt)
     jac = _rows(seen, model, data, m, scale)
-    rhs, softness, v_free, sound, gap, gaps = export.numbers(
+    rhs, softness, v_free, sound, gap, gaps = mujoco_rows.numbers(
         *jac, scale, dt, _before(seen, data), smooth, data.efc_aref, data.efc_R, data.efc_D, data.efc_force,
         _speed(model, data, m), data.efc_b, data.qfrc_constraint, data.qacc, USUAL,
     )  # fmt: skip
@@ -256,7 +256,7 @@ def _mass(seen: _Model, model: Any, data: Any, smooth: Any, like: Any) -> Any:
 
     M a0 must be the smooth force: otherwise another matrix than M has made a0, and made the problem.
     """
-    made = export.lower(*seen.mass, data.M, smooth, data.qfrc_smooth, ROUNDING, like)
+    made = mujoco_rows.lower(*seen.mass, data.M, smooth, data.qfrc_smooth, ROUNDING, like)
     if made is None:
         raise InputError(f"M_rowadr, M_rownnz and M_colind are no lower triangle of M. {OTHER_MODEL}")
     mass, gap = made
@@ -281,14 +281,14 @@ def _rows(seen: _Model, model: Any, data: Any, m: int, scale: FloatArray) -> Any
             raise InputError(
                 f"efc_J holds {len(values)} numbers; {m} x {n} are needed where opt.jacobian says dense. {CHANGED}"
             )
-        return export.rows_of_dense(values, m, n, scale)
+        return mujoco_rows.rows_of_dense(values, m, n, scale)
     count, first, columns = data.efc_J_rownnz, data.efc_J_rowadr, data.efc_J_colind
     columns = columns if columns.ndim == 1 else np.ravel(columns)
     if not len(count) == len(first) == m:
         raise InputError(
             f"efc_J_rownnz and efc_J_rowadr hold {len(count)} and {len(first)} of {m} rows. {CHANGED} {LAYOUT}"
         )
-    found = export.rows_of_sparse(values, count, first, columns, scale, n)
+    found = mujoco_rows.rows_of_sparse(values, count, first, columns, scale, n)
     if isinstance(found, int):
         raise InputError(
             f"row {found} of efc_J has {count[found]} entries from place {first[found]} of {len(columns)}, in columns "
@@ -320,13 +320,13 @@ def _before(seen: _Model, data: Any) -> FloatArray:
     """Velocities (nv,) of the forward pass: qvel, or after a step what those of bodies, made before it, tell."""
     parent, bodies = seen.tree
     axis, spatial, v = data.cdof, data.cvel, data.qvel
-    gap, size = export.motion_gap(parent, bodies, axis, spatial, v)
+    gap, size = mujoco_rows.motion_gap(parent, bodies, axis, spatial, v)
     if gap < 0.0:
         raise InputError(f"dof_bodyid and body_parentid are no tree of these bodies. {OTHER_MODEL}")
     if gap <= SUMMED * size or (not np.any(spatial) and np.any(data.efc_vel)):  # not filled by a copy
         return v
-    v = export.motion_before(parent, bodies, axis, spatial, ALIKE)
-    if v is None or not export.motion_gap(parent, bodies, axis, spatial, v)[0] <= SUMMED * size:
+    v = mujoco_rows.motion_before(parent, bodies, axis, spatial, ALIKE)
+    if v is None or not mujoco_rows.motion_gap(parent, bodies, axis, spatial, v)[0] <= SUMMED * size:
         raise CapabilityError(
             "the velocity before the step cannot be told from cvel and cdof: joints of one body move it alike, or "
             "MjData was changed since its forward pass: run mj_forward"
@@ -363,7 +363,7 @@ def _blocks(seen: _Model, data: Any, contacts: int, dt: float) -> tuple[Cones, F
     contact = data.contact if contacts else NO_CONTACT
     most = (*seen.most, contacts, contacts, contacts)
     types, ids, dims, codes = data.efc_type, data.efc_id, contact.dim, _codes(seen.mj)
-    found = export.blocks(
+    found = mujoco_rows.blocks(
         types, ids, codes, most, dims, contact.friction, contact.geom, data.efc_frictionloss, dt
     )
     if isinstance(found, int):
@@ -382,7 +382,7 @@ def _blocks(seen: _Model, data: Any, contacts: int, dt: float) -> tuple[Cones, F
     return Cones._of(blocks), scale, key
 
 
-def _words(mj: Any, model: Any, held: IntArray, m: int, joined: int = export.JOINED) -> list[str]:
+def _words(mj: Any, model: Any, held: IntArray, m: int, joined: int = mujoco_rows.JOINED) -> list[str]:
     types, ids, contacts = held[:m].tolist(), held[m : 2 * m].tolist(), (len(held) - 2 * m) // 3
     dim = held[2 * m : 2 * m + contacts]
     geom = held[2 * m + contacts : 2 * m + 3 * contacts].reshape(-1, 2)

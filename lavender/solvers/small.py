@@ -1,7 +1,7 @@
 """Small problems in one compiled call, and the claim that goes with its counts.
 
 It is used for few rows of bodies or of A and for small islands under friction (`lavender_ext/small/call.pyx`), and
-for generalised coordinates if Newton's method is counted to cost no more than others (`lavender_ext/small/many.pyx`),
+for generalised coordinates if Newton's method is counted to cost no more than others (`lavender_ext/batch/many.pyx`),
 because Python would cost more than such a solve. If the call does not find a solution it returns nothing, and the
 solver runs as on any other problem, from the beginning.
 """
@@ -26,8 +26,8 @@ from lavender.solvers.newton_systems import general
 from lavender.solvers.newton_systems.systems import DENSE_ROWS
 from lavender.solvers.registry import SMALL_ROWS
 from lavender.solvers.setup_times import forming
+from lavender_ext.batch.many import Limits, solve_first
 from lavender_ext.small.call import Islands, Rules, Small
-from lavender_ext.small.many import Limits, solve_first
 
 # Keys of `Derived.cache`.
 COMPILED_CALL_KEY = (

@@ -1,7 +1,7 @@
 """The first phase of `newton` from a warm start: judge it, a few sweeps; or free joints at once.
 
-It solves steps of a simulation at rest, or of a chain. `lavender_ext/warm/start.pxd` has the equations. If the result
-is not within tol, `newton` continues from the original start.
+It solves steps of a simulation at rest, or of a chain. `lavender_ext/newton/warm_start.pxd` has the equations. If the
+result is not within tol, `newton` continues from the original start.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 from lavender.base.arrays import FloatArray
 from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
-from lavender_ext.warm.start import (
+from lavender_ext.newton.warm_start import (
     JUDGED,
     MOST_SWEEPS,
     SOLVED,

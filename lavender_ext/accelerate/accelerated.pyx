@@ -6,7 +6,7 @@
     anderson  x_k = Pi(y - sum_i gamma_i (y_i+1 - y_i)),  gamma least squares of f = sum_i gamma_i (f_i+1 - f_i),
               f = D^1/2 (y - x), over the last `memory` sweeps                                        (2)
 
-D = diag d, so that both work in energy. S is a sweep of pgs or of exact blocks (local/gauss_seidel.pxd), over A in
+D = diag d, so that both work in energy. S is a sweep of pgs or of exact blocks (local/gauss_seidel.pyx), over A in
 compressed rows, over the factored form with v = M^-1 J^T lam, or over J and M with v = Y^T lam; with the symmetric
 order a sweep and the same sweep backwards. An iterate that is shown is always a swept one, y. All sums run in a fixed
 order.

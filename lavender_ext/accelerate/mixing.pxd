@@ -11,7 +11,7 @@ All sums run in a fixed order.
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.generalized cimport dot
+from lavender_ext.core.dot cimport dot
 
 
 cdef enum:

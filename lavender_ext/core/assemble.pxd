@@ -2,7 +2,7 @@
 from libc.stdint cimport int32_t, int64_t
 
 from lavender_ext.core.parts cimport blocks_t
-from lavender_ext.core.rows cimport rows_t
+from lavender_ext.core.view cimport rows_t
 
 
 cdef public void lav_expand_rows(const blocks_t* p, const rows_t* r, double* jac, double* minv_jac) noexcept nogil

@@ -13,7 +13,8 @@ from lavender_ext.core.csr cimport by_columns
 from lavender_ext.core.door cimport is_number
 from lavender_ext.core.parts cimport blocks_t, n_directions, n_turns
 from lavender_ext.core.problem cimport Data
-from lavender_ext.core.rows cimport bodies_of, contact_jacobian, dot6, minv_times, rows_t
+from lavender_ext.core.rows cimport contact_jacobian, dot6, minv_times
+from lavender_ext.core.view cimport bodies_of, rows_t
 
 cdef object F8 = np.dtype(np.float64), I4 = np.dtype(np.int32)
 

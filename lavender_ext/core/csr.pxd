@@ -2,15 +2,11 @@
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
 
+from lavender_ext.core.view cimport csr_t
+
 
 cdef enum:
     LONG_ROW = 128              # Entries that one running sum rounds to about the floor of the judge; longer rows are split.
-
-
-cdef struct csr_t:
-    const int32_t* indptr       # (m + 1)
-    const int32_t* indices      # (nnz)
-    const double* data          # (nnz) 1/kg
 
 
 cdef inline double csr_dot(const csr_t* a, int32_t i, const double* x) noexcept nogil:

@@ -11,38 +11,14 @@ from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t, uint64_t
 
 from lavender_ext.core.bits cimport lowest
+from lavender_ext.core.dot cimport dot
 from lavender_ext.core.tree cimport ldl_solve, take_from, take_two
+from lavender_ext.core.view cimport generalized_t
 
 
 cdef enum:
     PANEL_ROWS = 16             # most rows of a panel, unless one block has more
     NEAR = 64                   # columns of a panel that are copied together where several rows need them
-
-
-cdef struct generalized_t:
-    int32_t n                   # velocities, nv
-    int32_t m                   # rows
-    const int32_t* jptr         # (m + 1) rows of J
-    const int32_t* jidx         # columns, ascending
-    const double* jval
-    const int32_t* lptr         # (n + 1) rows of L, left of the diagonal
-    const int32_t* lidx         # columns, ascending
-    const double* lval
-    const int32_t* parent       # (n) last column of the row of L, -1 at a root
-    const double* inv_pivot     # (n) 1 / D
-    const double* root          # (n) D^-1/2
-    const int32_t* mptr         # (n + 1) rows of M up to its diagonal
-    const int32_t* midx         # columns, ascending
-    const double* mval
-    double condition            # `estimate_condition` of M, 0 before it is known
-    const double* compliance    # (m) 1/kg, >= 0
-    int32_t n_panels
-    const int32_t* prow         # (n_panels + 1) first row of each panel
-    const int32_t* pcol         # (n_panels + 1) its first place in `cols`
-    const int32_t* pval         # (n_panels + 1) its first place in `y`
-    const int32_t* cols         # columns of each panel, ascending
-    const double* y             # Y
-    const int32_t* home         # (k) panel of each block
 
 
 cdef inline void tree_solve(const generalized_t* g, double* x) noexcept nogil:
@@ -271,22 +247,6 @@ cdef inline void panel_whiten(const generalized_t* g, int32_t panel, int32_t* pl
                     x[a] *= z
                 x += nc
         a -= 1
-
-
-cdef inline double dot(const double* x, const double* y, int32_t n) noexcept nogil:
-    # Four running sums: a fixed order of additions.
-    cdef double s0 = 0.0, s1 = 0.0, s2 = 0.0, s3 = 0.0
-    cdef int32_t i = 0
-    while i + 4 <= n:
-        s0 += x[i] * y[i]
-        s1 += x[i + 1] * y[i + 1]
-        s2 += x[i + 2] * y[i + 2]
-        s3 += x[i + 3] * y[i + 3]
-        i += 4
-    while i < n:
-        s0 += x[i] * y[i]
-        i += 1
-    return (s0 + s1) + (s2 + s3)
 
 
 cdef inline double indexed_dot(const double* y, const int32_t* cols, const double* x, int32_t n) noexcept nogil:

@@ -6,13 +6,10 @@ path halving; islands are numbered in the order of their first block.
 """
 from libc.stdint cimport int32_t, int64_t
 
-from lavender_ext.core.csr cimport csr_t
-from lavender_ext.core.generalized cimport generalized_t
 from lavender_ext.core.order cimport sort_by_level
 from lavender_ext.core.parts cimport blocks_t, islands_t
 from lavender_ext.core.roots cimport root_of
-from lavender_ext.core.rows cimport bodies_of, rows_t
-from lavender_ext.core.view cimport view_t
+from lavender_ext.core.view cimport bodies_of, csr_t, generalized_t, rows_t, view_t
 
 
 cdef inline int32_t join(int32_t* parent, int32_t i, int32_t j) noexcept nogil:

@@ -1,11 +1,8 @@
 """What the kernels know of a problem: plain pointers into arrays that a `Data` keeps alive."""
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.csr cimport csr_t
-from lavender_ext.core.generalized cimport generalized_t
 from lavender_ext.core.parts cimport blocks_t, islands_t
-from lavender_ext.core.rows cimport rows_t
-from lavender_ext.core.view cimport view_t
+from lavender_ext.core.view cimport csr_t, generalized_t, rows_t, view_t
 
 
 cdef class Room:

@@ -17,14 +17,14 @@ import numpy as np
 
 from lavender_ext.core.arrays cimport doubles
 from lavender_ext.core.blocks cimport Blocks
-from lavender_ext.core.csr cimport csr_t
 from lavender_ext.core.door cimport first_outside, least
-from lavender_ext.core.generalized cimport Operator, dot, generalized_t, panel_pattern, panel_whiten
+from lavender_ext.core.dot cimport dot
+from lavender_ext.core.generalized cimport Operator, panel_pattern, panel_whiten
 from lavender_ext.core.islands cimport find_islands, islands_index
 from lavender_ext.core.parts cimport CONE, COULOMB, blocks_t, is_box, islands_t, n_directions, n_turns, parts_of, parts_t
-from lavender_ext.core.rows cimport contact_diagonal, dot12, largest_eigenvalue, minv_times, rows_t, rows_times
+from lavender_ext.core.rows cimport contact_diagonal, dot12, largest_eigenvalue, minv_times, rows_times
 from lavender_ext.core.steps cimport block_steps, csr_largest, pair_means
-from lavender_ext.core.view cimport view_t
+from lavender_ext.core.view cimport csr_t, generalized_t, rows_t, view_t
 from lavender_ext.core.weights cimport block_weights, joint_weights
 
 

@@ -21,30 +21,7 @@ from libc.stdint cimport int32_t
 
 from lavender_ext.core.block cimport relax_normal, relax_row, relax_tangents
 from lavender_ext.core.parts cimport blocks_t, is_box, is_disk, n_directions, n_turns, parts_of, parts_t
-
-
-cdef struct rows_t:
-    int32_t n_bodies            # n
-    int32_t n_joints            # kj: the first kj blocks are joints, the others contacts
-    int32_t n_contacts          # c
-    const double* jac           # (mj, 12) rows of a joint: linear and angular on a, then on b
-    const double* minv_jac      # (mj, 12) M^-1 J^T, same layout
-    const int32_t* joint_body   # (kj, 2)
-    const double* normal        # (c, 3) unit, from a to b
-    const double* tangent       # (c, 3) unit, normal to `normal`; t2 = n x t1
-    const double* arm_a         # (c, 3) m, contact point minus centre of a
-    const double* arm_b         # (c, 3) m
-    const int32_t* contact_body  # (c, 2)
-    const double* coupling      # (c, 5) 1/kg: A_t1n, A_t2n, A_sn (of a box A_t2t1), A_st1, A_st2 without compliance
-    const double* swing         # (contact rows, 6) 1/(kg m): change of -omega_a and omega_b by a unit impulse
-    const double* inv_mass      # (n) 1/kg
-    const double* inv_inertia   # (n, 9) 1/(kg m^2), world
-    const double* compliance    # (m) 1/kg
-
-
-cdef inline const int32_t* bodies_of(const rows_t* r, int32_t i) noexcept nogil:
-    """The two of block i."""
-    return r.joint_body + 2 * i if i < r.n_joints else r.contact_body + 2 * (i - r.n_joints)
+from lavender_ext.core.view cimport rows_t
 
 
 cdef inline double dot3(const double* a, const double* b) noexcept nogil:

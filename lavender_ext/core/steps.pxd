@@ -6,9 +6,9 @@
 """
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.csr cimport csr_t
 from lavender_ext.core.parts cimport blocks_t, groups_of, parts_t
 from lavender_ext.core.rows cimport largest_eigenvalue, reciprocal
+from lavender_ext.core.view cimport csr_t
 
 
 cdef inline double csr_entry(const csr_t* a, int32_t i, int32_t j) noexcept nogil:

@@ -6,7 +6,8 @@
 from libc.stdint cimport int32_t
 
 from lavender_ext.core.parts cimport blocks_t, n_directions, n_turns
-from lavender_ext.core.rows cimport cross, dot3, rows_t
+from lavender_ext.core.rows cimport cross, dot3
+from lavender_ext.core.view cimport rows_t
 
 
 cdef inline void add6(double* to, const double* x) noexcept nogil:

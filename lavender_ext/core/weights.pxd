@@ -7,7 +7,7 @@ from libc.math cimport fabs
 from libc.stdint cimport int32_t
 
 from lavender_ext.core.parts cimport blocks_t, n_turns
-from lavender_ext.core.rows cimport rows_t
+from lavender_ext.core.view cimport rows_t
 
 
 cdef inline void block_weights(const blocks_t* p, const double* d, double* nu) noexcept nogil:

@@ -18,12 +18,12 @@ import numpy as np
 
 from lavender_ext.core.arrays cimport ndarray as Array
 from lavender_ext.core.door cimport all_finite, first_outside
-from lavender_ext.core.generalized cimport generalized_t, jac_push, whitened_dot
+from lavender_ext.core.generalized cimport jac_push, whitened_dot
 from lavender_ext.core.parts cimport blocks_t, is_rows
 from lavender_ext.core.problem cimport Data, Room, room_for
 from lavender_ext.core.rows cimport rows_times
 from lavender_ext.core.velocity cimport rows_wrench, wrenches_to_velocity
-from lavender_ext.core.view cimport view_t
+from lavender_ext.core.view cimport generalized_t, view_t
 from lavender_ext.derivative.natural cimport (CLOSED, FREE, HIGH, LOW, OPEN, SLIDES, STICKS, block_times, linear_t,
                                               natural_all, natural_t, place_rows, scaled_csr, scaled_general, system_rows)
 from lavender_ext.factor.dense cimport PANEL, dense_lu, dense_lu_solve, dense_lu_solve_back

@@ -20,10 +20,9 @@ from libc.stdint cimport int8_t, int32_t
 
 from lavender_ext.core.block cimport length
 from lavender_ext.core.contact_map cimport contact_map
-from lavender_ext.core.csr cimport csr_t
-from lavender_ext.core.generalized cimport dot, generalized_t
+from lavender_ext.core.dot cimport dot
 from lavender_ext.core.parts cimport CONE, blocks_t, is_rows, parts_of, parts_t
-from lavender_ext.core.view cimport view_t
+from lavender_ext.core.view cimport csr_t, generalized_t, view_t
 
 
 cdef enum:                      # the case of a row

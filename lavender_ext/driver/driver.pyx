@@ -7,9 +7,9 @@ from lavender_ext.core.problem cimport Data, Room, room_for
 from lavender_ext.core.view cimport view_t
 from lavender_ext.driver.driver cimport NEWTON
 from lavender_ext.factor.tiles cimport has_wide
-from lavender_ext.generalized.method cimport general_room, general_start, general_step
-from lavender_ext.generalized.newton cimport is_soft
-from lavender_ext.newton.method cimport bodies_room, bodies_start, rows_room, rows_start, system_step
+from lavender_ext.velocity_newton.method cimport general_room, general_start, general_step
+from lavender_ext.newton.solve cimport bodies_room, bodies_start, rows_room, rows_start, system_step
+from lavender_ext.velocity_newton.soft cimport is_soft
 
 
 cdef inline method_t row_of(const view_t* v) noexcept nogil:

@@ -1,1 +1,1 @@
-"""LavenderSim's substep: its arrays, broad and narrow phase, contacts, joints, projection, integration."""
+"""LavenderSim's substep: its arrays, broad and narrow phase, contacts, joints, projection, integration; Newton."""

@@ -29,8 +29,9 @@ from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t, uint64_t
 
 from lavender_ext.core.parts cimport contact_kind
-from lavender_ext.core.rows cimport (contact_diagonal, contact_slack, cross, dot3, largest_eigenvalue,
-                                     reciprocal, relative_velocity, rows_t)
+from lavender_ext.core.rows cimport (contact_diagonal, contact_slack, cross, dot3, largest_eigenvalue, reciprocal,
+                                     relative_velocity)
+from lavender_ext.core.view cimport rows_t
 from lavender_ext.engine.arrays cimport (ALTERNATING, AVBD, BOX, CAP_CONTACT, H_CACHED, H_CONTACTS, H_CONTACT_ROWS,
                                          H_FRICTION_SHAPE, H_MATCHES, H_ORDER, H_PAIRS, H_STEP, H_STEPPER, H_WARM_START,
                                          N_CACHE_IMPULSE, N_JOINT, N_JOINT_ROW, ROWS_PER_CONTACT,

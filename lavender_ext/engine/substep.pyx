@@ -22,8 +22,9 @@ from lavender_ext.core.door cimport all_finite
 from lavender_ext.core.order cimport (RANDOM, SYMMETRIC, advance_order, block_levels, body_levels,
                                       color_by_bodies, reverse, sort_by_level)
 from lavender_ext.core.parts cimport blocks_t
-from lavender_ext.core.rows cimport relax_contact_block, relax_joint, rows_t
+from lavender_ext.core.rows cimport relax_contact_block, relax_joint
 from lavender_ext.core.velocity cimport rows_velocity
+from lavender_ext.core.view cimport rows_t
 from lavender_ext.engine.arrays cimport (AT_RANDOM, AVBD, BOTTOM_UP, CAP_CONTACT, CAP_PAIR, COLORED, H_CONTACTS,
                                          H_CONTACT_ROWS, H_ITERATIONS, H_LOST, H_MATCHES, H_RELAXING, H_STEPPER,
                                          H_NEED_CONTACTS, H_NEED_PAIRS, H_ORDER, H_SEED, H_SOLVED, H_STEP,
@@ -39,8 +40,9 @@ from lavender_ext.engine.projection cimport normal_speed, project_positions
 from lavender_ext.engine.soft_step cimport relax, restitute, soften
 from lavender_ext.engine.view cimport view
 from lavender_ext.engine.xpbd cimport correct_all
-from lavender_ext.judge.measure cimport rows_slack
-from lavender_ext.judge.score cimport new_score, score_rows, score_t
+from lavender_ext.judge.measure cimport score_slack
+from lavender_ext.judge.score cimport new_score, score_t
+from lavender_ext.judge.slack cimport rows_slack
 from lavender_ext.sweep.packed cimport MOST, room_for, sweep_packed
 
 
@@ -134,7 +136,7 @@ cdef inline void note_sweep(const engine_t* e, const blocks_t* p, const rows_t* 
     cdef score_t s = new_score()
     measure(e, out, &violation)
     rows_slack(p, r, e.impulse, e.dv, scratch)
-    score_rows(p, e.impulse, scratch, scratch + p.n_rows, &s)
+    score_slack(p, e.impulse, scratch, scratch + p.n_rows, &s)
     out[1] = s.energy
 
 

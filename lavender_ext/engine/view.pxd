@@ -1,6 +1,6 @@
 """The engine's velocity problem as the shared kernels see it."""
 from lavender_ext.core.parts cimport COULOMB, blocks_t
-from lavender_ext.core.rows cimport rows_t
+from lavender_ext.core.view cimport rows_t
 from lavender_ext.engine.arrays cimport H_CONTACTS, H_CONTACT_ROWS, N_DYNAMIC, N_JOINT, N_JOINT_ROW, engine_t
 
 

@@ -9,7 +9,7 @@ run in one order at every width: the same bits everywhere.
 from libc.math cimport fabs
 from libc.stdint cimport int32_t, int64_t
 
-from lavender_ext.core.generalized cimport dot
+from lavender_ext.core.dot cimport dot
 from lavender_ext.factor.supernodal cimport dense_panel, less_lower
 from lavender_ext.factor.tiles cimport less, take
 

@@ -2,7 +2,7 @@
 from libc.math cimport fabs
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.generalized cimport dot
+from lavender_ext.core.dot cimport dot
 from lavender_ext.factor.tiles cimport take
 
 

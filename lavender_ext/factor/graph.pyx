@@ -3,9 +3,9 @@ from libc.stdint cimport int32_t
 
 import numpy as np
 
-from lavender_ext.core.generalized cimport generalized_t
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.islands cimport join, number_components
+from lavender_ext.core.view cimport generalized_t
 from lavender_ext.factor.graph cimport order_graph, order_room
 
 

@@ -17,7 +17,8 @@ import numpy as np
 
 from lavender_ext.factor.symbolic import analysed
 
-from lavender_ext.core.csr cimport by_columns, csr_t, scan_entries
+from lavender_ext.core.csr cimport by_columns, scan_entries
+from lavender_ext.core.view cimport csr_t
 from lavender_ext.factor.blocks cimport sparse_t
 from lavender_ext.factor.dense cimport cholesky_room, dense_cholesky, dense_cholesky_solve
 from lavender_ext.factor.supernodal cimport begin_panels, dense_panel, hand_on, place_rows, sparse_solve, take_panels

@@ -1,4 +1,4 @@
-"""The judge for Python: thin entries of judge/measure.pxd, and the residuals of quadratic programs."""
+"""The judge: its pass over any form of A, compiled once, its entries for Python, and the residuals of quadratic programs."""
 from libc.math cimport NAN, fabs, sqrt
 from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memcmp, memcpy
@@ -8,18 +8,20 @@ import numpy as np
 from lavender_ext.core cimport door
 from lavender_ext.core.arrays cimport doubles, ints
 from lavender_ext.core.generalized cimport whitened_gather
-from lavender_ext.core.islands cimport islands_index
-from lavender_ext.core.parts cimport islands_t
+from lavender_ext.core.islands cimport find_islands, is_immovable, islands_index, list_one_island
+from lavender_ext.core.parts cimport blocks_t, islands_t
 from lavender_ext.core.problem cimport Data, Room, room_for
 from lavender_ext.core.velocity cimport rows_velocity
-from lavender_ext.core.view cimport view_t
+from lavender_ext.core.view cimport generalized_t, view_t
 from lavender_ext.judge.best cimport best_room, best_t, bind_best, count_islands, note_score, see_impulse, see_start
-from lavender_ext.judge.measure cimport (above_floor_of, csr_judge, csr_slack, floor_of, general_judge, general_slack,
-                                         judge_nothing, relative_of, rows_judge, rows_slack, scratch_of)
+from lavender_ext.judge.forms cimport csr_judge, csr_slack, general_errors, general_judge, rows_judge
+from lavender_ext.judge.measure cimport above_floor_of, do_nothing, floor_of, relative_of, scratch_of
+from lavender_ext.judge.reference cimport needs_rows, reference_of
 from lavender_ext.judge.refine cimport loss_by_factor, refine_general
 from lavender_ext.judge.rounding cimport mass_t, relative_size, squares32
-from lavender_ext.judge.score cimport (are_numbers, is_at_floor, new_score, norms_of_rhs, nothing, relative,
-                                       score_rows, score_t, tally_block, tally_t)
+from lavender_ext.judge.score cimport are_numbers, is_at_floor, new_score, relative, score_t
+from lavender_ext.judge.slack cimport general_slack, rows_slack
+from lavender_ext.judge.tally cimport norms_of_rhs, nothing, score_rows, tally_block, tally_t
 
 
 cdef void judge_view(const view_t* v, const double* lam, double* w, double* e, double* scratch, bint floor,
@@ -31,6 +33,63 @@ cdef void judge_view(const view_t* v, const double* lam, double* w, double* e, d
         rows_judge(&v.p, v.r, lam, w, e, scratch, floor, out)
     else:
         csr_judge(&v.p, v.a, lam, w, e, floor, out)
+
+
+cdef bint refine_view(const view_t* v, const double* lam, double* w, double* e, double* scratch, double start_energy,
+                      double start_velocity, double tol, double found, score_t* out) noexcept nogil:
+    """The refined pass in place of that of `judge_view` if (2) asks for it; w, e and out are of that, found its residual.
+
+    scratch: `scratch_of`. Nothing is written if the pass is not repeated; A and bodies have no factor that loses anything.
+    """
+    if v.g == NULL or v.p.n_rows == 0 or not found < 1.0 / 0.0:
+        return False
+    if loss_by_factor(&v.p, v.g, lam, w, scratch, start_energy, start_velocity, 0.1 * (tol if tol > found else found)) == 0.0:
+        return False
+    refine_general(&v.p, v.g, lam, w, e, scratch, out)
+    return True
+
+
+cdef void general_score(const blocks_t* p, const generalized_t* g, const double* lam, const double* w, double* e, double* x,
+                        score_t* out) noexcept nogil:
+    """Errors e (m) of the slack w over J and M, their sums and the floor; x (n + m) is scratch."""
+    general_errors(p, g, lam, w, e, x, NULL, out)
+
+
+cdef void score_slack(const blocks_t* p, const double* lam, const double* w, double* e, score_t* out) noexcept nogil:
+    """Errors e (m) of the slack w and their sums, without a floor."""
+    score_rows(p, lam, w, e, out)
+
+
+cdef void find_reference(blocks_t* p, const double* x, const double* w, const double* e, double* out) noexcept nogil:
+    """`reference_of` of judge/reference.pxd."""
+    reference_of(p, x, w, e, out)
+
+
+cdef void judge_nothing(view_t* v, int32_t* index, islands_t* islands, double* reference, double* x, double* w, double* e,
+                        double* scratch, double* out) noexcept nogil:
+    """The zero impulse into x (m), and of it (3) of `reference_of`; with several islands v.p has them, and their references.
+
+    index (`islands_index`), islands and reference (2 k) must live as long as v; w, e (m); scratch as `judge_view`, without floor.
+    """
+    cdef score_t s = new_score()
+    cdef int32_t i
+    v.p.islands = NULL
+    if do_nothing(&v.p, x, w):
+        judge_view(v, x, w, e, scratch, False, &s)
+    else:
+        score_rows(&v.p, x, w, e, &s)
+    islands.reference = reference
+    if find_islands(v, index, islands) > 1:
+        v.p.islands = islands
+    reference_of(&v.p, x, w, e, out)
+    if needs_rows(&v.p, out):
+        list_one_island(v.p.n_blocks, index, islands)
+        v.p.islands = islands
+        reference_of(&v.p, x, w, e, out)
+    if v.p.islands != NULL:
+        for i in range(islands.n):
+            if is_immovable(v, islands.order[islands.ptr[i]]):
+                reference[2 * i], reference[2 * i + 1] = out[0], out[1]
 
 
 def slack(Data p, const double[::1] lam, double[::1] w):

@@ -25,7 +25,8 @@ from libc.stdint cimport int32_t
 
 from lavender_ext.core.block cimport length
 from lavender_ext.core.parts cimport CONE, blocks_t, groups_of, is_rows, islands_t, parts_of, parts_t
-from lavender_ext.judge.score cimport block_at, nothing, relative, relative_by_rows, tally_block, tally_t
+from lavender_ext.judge.score cimport relative
+from lavender_ext.judge.tally cimport block_at, nothing, relative_by_rows, tally_block, tally_t
 
 
 cdef inline double reference_rounding() noexcept nogil:

@@ -23,10 +23,11 @@ from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t, uint64_t
 from libc.string cimport memcpy
 
-from lavender_ext.core.generalized cimport bound_condition, dot, generalized_t, get_condition, tree_solve
+from lavender_ext.core.dot cimport dot
+from lavender_ext.core.generalized cimport bound_condition, get_condition, tree_solve
 from lavender_ext.core.parts cimport blocks_t
-from lavender_ext.core.view cimport view_t
-from lavender_ext.judge.measure cimport general_score
+from lavender_ext.core.view cimport generalized_t
+from lavender_ext.judge.forms cimport general_errors
 from lavender_ext.judge.score cimport relative, score_t, smallest_reference, unit_roundoff
 
 
@@ -177,18 +178,4 @@ cdef inline void refine_general(const blocks_t* p, const generalized_t* g, const
         high += low
         more[i] = (fabs(high - w[i]) + sqrt(2.0 * p.d[i]) * left) / unit_roundoff()
         w[i] = high
-    general_score(p, g, lam, w, e, x, more, out)
-
-
-cdef inline bint refine_view(const view_t* v, const double* lam, double* w, double* e, double* scratch, double start_energy,
-                             double start_velocity, double tol, double found, score_t* out) noexcept nogil:
-    """The refined pass in place of that of `judge_view` if (2) asks for it; w, e and out are of that, found its residual.
-
-    scratch: `scratch_of`. Nothing is written if the pass is not repeated; A and bodies have no factor that loses anything.
-    """
-    if v.g == NULL or v.p.n_rows == 0 or not found < 1.0 / 0.0:
-        return False
-    if loss_by_factor(&v.p, v.g, lam, w, scratch, start_energy, start_velocity, 0.1 * (tol if tol > found else found)) == 0.0:
-        return False
-    refine_general(&v.p, v.g, lam, w, e, scratch, out)
-    return True
+    general_errors(p, g, lam, w, e, x, more, out)

@@ -10,9 +10,11 @@ squared entry by entry, and u = 2^-24 (the formulas of lavender/judge/residuals.
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.generalized cimport generalized_t, jac_push, jac_row, tree_solve, whitened_push
+from lavender_ext.core.generalized cimport jac_push, jac_row, tree_solve, whitened_push
 from lavender_ext.core.parts cimport blocks_t
-from lavender_ext.judge.score cimport block_at, relative, score_t
+from lavender_ext.core.view cimport generalized_t
+from lavender_ext.judge.score cimport relative, score_t
+from lavender_ext.judge.tally cimport block_at
 
 
 cdef struct mass_t:             # the lower triangle of M with its diagonal, columns ascending

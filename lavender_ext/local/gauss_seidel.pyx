@@ -1,4 +1,15 @@
-"""Sweeps of block Gauss-Seidel: each block solved exactly with the others held still (local/exact.pxd).
+"""Block Gauss-Seidel: one block's own part of A, prepared once, and its update in a sweep.
+
+Prepared numbers of block i stand from g[start[i]] on:
+
+    one row                      nothing: lam <- clip(lam - w / d)
+    rows, 2 to 8, all free       W^-1 (n, n), then 1; where W is singular W, then 0
+    rows, 2 to 8, bounded        W (n, n), then 0
+    normal, two tangents, disk or box    prepare3 of local/exact.pxd; g[15] = 1 where the rows of A share one pattern
+    round cones                  prepare_round of local/round.pxd
+    other contacts               W (n, n)
+
+A sweep solves each block exactly with the others held still (local/exact.pxd):
 
     over A in compressed rows    w = A lam - b of the block's rows                                  (1)
     over the factored form       w = J v + c lam - b, then v += M^-1 J^T (change)                   (2)
@@ -6,14 +17,303 @@
 """
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.csr cimport csr_t
-from lavender_ext.core.generalized cimport dot, generalized_t
-from lavender_ext.core.parts cimport blocks_t, n_directions, n_turns
-from lavender_ext.core.rows cimport contact_jacobian, dot12, minv_times, rows_t
-from lavender_ext.core.view cimport view_t
-from lavender_ext.local.small cimport MAX_ROWS
-from lavender_ext.local.gauss_seidel cimport (prepare_block, prepared_size, solve_csr_block, solve_general_block,
-                                              solve_rows_block)
+from lavender_ext.core.block cimport relax_normal, relax_row
+from lavender_ext.core.csr cimport csr_dot
+from lavender_ext.core.dot cimport dot
+from lavender_ext.core.generalized cimport whitened_dot, whitened_push
+from lavender_ext.core.parts cimport (CONE, blocks_t, is_box, is_disk, is_round, is_rows, n_directions, n_turns,
+                                      parts_of, parts_t)
+from lavender_ext.core.rows cimport (contact_jacobian, contact_slack, cross, dot12, dot3, joint_push, joint_velocity,
+                                     minv_times, push_bodies, relative_velocity, relax_joint, swing_body)
+from lavender_ext.core.view cimport csr_t, generalized_t, rows_t, view_t
+from lavender_ext.local.box cimport box3_from
+from lavender_ext.local.cone cimport cone3
+from lavender_ext.local.coulomb cimport PREPARED, coulomb3_from, prepare3
+from lavender_ext.local.exact cimport boxed_rows, exact_contact, project_locally
+from lavender_ext.local.round cimport prepare_round, round_contact
+from lavender_ext.local.small cimport FAILED, MAX_ROWS, eliminate
+
+
+cdef inline bint is_plain3(const blocks_t* p, int32_t i) noexcept nogil:
+    # a normal and two tangents, in a disk or a box
+    return is_disk(p, i) or is_box(p, i)
+
+
+cdef inline int32_t coulomb_block3(const blocks_t* p, int32_t i, const double* g, const double* w, double* lam) noexcept nogil:
+    cdef parts_t q
+    if is_disk(p, i):
+        return coulomb3_from(g, w, p.mu[i], lam)
+    parts_of(p, i, &q)
+    return box3_from(g, w, q.reach[0], q.reach[1], lam)
+
+
+cdef inline int32_t prepared_size(const blocks_t* p, int32_t i) noexcept nogil:
+    cdef int32_t n = p.ptr[i + 1] - p.ptr[i]
+    if is_rows(p, i):
+        return n * n + 1 if 1 < n <= MAX_ROWS else 0
+    if is_plain3(p, i):
+        return PREPARED
+    if is_round(p, i):
+        return n * n + (n - 1) * n
+    return n * n
+
+
+cdef inline void prepare_block(const blocks_t* p, int32_t i, const double* W, int32_t one_pattern,
+                               double* g) noexcept nogil:
+    """g from the block's part W (n, n) of A; not for blocks of one row or of more than MAX_ROWS."""
+    cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, q, k, free = 1
+    cdef double inf = 1.0 / 0.0
+    cdef double a[MAX_ROWS * MAX_ROWS]
+    cdef double x[MAX_ROWS]
+    if not is_rows(p, i):
+        if is_plain3(p, i):
+            prepare3(W, g)
+            # A normal whose d falls back has no trustworthy W_nn to divide by.
+            if W[0] != p.d[j]:
+                g[9] = 0.0
+                if is_box(p, i):
+                    g[0] = 0.0
+            g[15] = one_pattern
+        elif is_round(p, i):
+            prepare_round(n, W, g)
+            if W[0] != p.d[j]:
+                g[0] = 0.0
+        else:
+            for q in range(n * n):
+                g[q] = W[q]
+            if W[0] != p.d[j]:
+                g[0] = 0.0
+        return
+    for q in range(j, p.ptr[i + 1]):
+        if p.lower[q] != -inf or p.upper[q] != inf:
+            free = 0
+    g[n * n] = free
+    if free:
+        for k in range(n):
+            for q in range(n * n):
+                a[q] = W[q]
+            for q in range(n):
+                x[q] = 1.0 if q == k else 0.0
+            if eliminate(n, a, x) < n:
+                g[n * n] = 0.0
+                break
+            for q in range(n):
+                g[n * q + k] = x[q]
+    if g[n * n] == 0.0:
+        for q in range(n * n):
+            g[q] = W[q]
+
+
+cdef inline int32_t solve_block(const blocks_t* p, int32_t i, const double* g, const double* w,
+                                double* lam) noexcept nogil:
+    """The exact update of block i from its slack w; lam at its first row. 1 where it fell back."""
+    cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, k, t, found = FAILED
+    cdef parts_t part
+    cdef double q[MAX_ROWS]
+    cdef double x[MAX_ROWS]
+    cdef double s
+    if is_rows(p, i):
+        if n == 1:
+            lam[0] = relax_row(lam[0], w[0], p.step[j], p.lower[j], p.upper[j])
+            return 0
+        if g[n * n] != 0.0:
+            for k in range(n):
+                s = 0.0
+                for t in range(n):
+                    s += g[n * k + t] * w[t]
+                x[k] = s
+            for k in range(n):
+                lam[k] -= x[k]
+            return 0
+        return boxed_rows(n, g, w, p.step + j, p.lower + j, p.upper + j, lam) == FAILED
+    if n == 1:
+        lam[0] = relax_normal(lam[0], w[0], p.step[j])
+        return 0
+    if is_plain3(p, i) and p.law != CONE:
+        if coulomb_block3(p, i, g, w, lam) != FAILED:
+            return 0
+    # q = w - W lam
+    for k in range(n):
+        s = w[k]
+        for t in range(n):
+            s -= g[n * k + t] * lam[t]
+        q[k] = s
+    parts_of(p, i, &part)
+    if is_round(p, i):
+        found = round_contact(n, g, q, p.d + j, p.mu[i], lam)
+    elif not is_disk(p, i):
+        found = exact_contact(p.law, n, g, q, p.d + j, &part, lam)
+    elif p.law == CONE:
+        found = cone3(g, q, p.mu[i], lam) if g[9] > 0.0 or q[0] >= 0.0 else FAILED
+    if found == FAILED:
+        project_locally(p.law, is_round(p, i), n, g, q, p.d + j, p.step + j, &part, lam)
+        return 1
+    return 0
+
+
+cdef inline void csr_dot3(const csr_t* a, int32_t i, const double* x, double* out) noexcept nogil:
+    # Rows i, i + 1, i + 2 of one pattern.
+    cdef int32_t p, n = a.indptr[i + 1] - a.indptr[i]
+    cdef const int32_t* idx = a.indices + a.indptr[i]
+    cdef const double* u = a.data + a.indptr[i]
+    cdef const double* v = a.data + a.indptr[i + 1]
+    cdef const double* w = a.data + a.indptr[i + 2]
+    cdef double s0 = 0.0, s1 = 0.0, s2 = 0.0, t0 = 0.0, t1 = 0.0, t2 = 0.0, y
+    p = 0
+    while p + 2 <= n:
+        y = x[idx[p]]
+        s0 += u[p] * y
+        s1 += v[p] * y
+        s2 += w[p] * y
+        y = x[idx[p + 1]]
+        t0 += u[p + 1] * y
+        t1 += v[p + 1] * y
+        t2 += w[p + 1] * y
+        p += 2
+    if p < n:
+        y = x[idx[p]]
+        s0 += u[p] * y
+        s1 += v[p] * y
+        s2 += w[p] * y
+    out[0] = s0 + t0
+    out[1] = s1 + t1
+    out[2] = s2 + t2
+
+
+cdef inline int32_t solve_csr_block(const blocks_t* p, const csr_t* a, int32_t i, const double* g,
+                                    double* lam) noexcept nogil:
+    cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, k
+    cdef double w[MAX_ROWS]
+    if n > MAX_ROWS:                                    # bounded rows, one by one
+        for k in range(j, j + n):
+            lam[k] = relax_row(lam[k], csr_dot(a, k, lam) - p.b[k], p.step[k], p.lower[k], p.upper[k])
+        return 1
+    if is_plain3(p, i) and g[15] != 0.0:
+        csr_dot3(a, j, lam, w)
+        w[0] -= p.b[j]
+        w[1] -= p.b[j + 1]
+        w[2] -= p.b[j + 2]
+    else:
+        for k in range(n):
+            w[k] = csr_dot(a, j + k, lam) - p.b[j + k]
+    return solve_block(p, i, g, w, lam + j)
+
+
+cdef inline int32_t solve_general_block(const blocks_t* p, const generalized_t* o, int32_t i, const double* g, double* lam,
+                                        double* u) noexcept nogil:
+    """Over J and M, u (nv) = Y^T lam."""
+    cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, b = o.home[i], k, found
+    cdef double w[MAX_ROWS]
+    cdef double old[MAX_ROWS]
+    cdef double now
+    if n > MAX_ROWS:                                    # bounded rows, one by one
+        for k in range(j, j + n):
+            now = relax_row(lam[k], whitened_dot(o, b, k, u) + (o.compliance[k] * lam[k] - p.b[k]), p.step[k],
+                            p.lower[k], p.upper[k])
+            whitened_push(o, b, k, now - lam[k], u)
+            lam[k] = now
+        return 1
+    for k in range(n):
+        w[k] = whitened_dot(o, b, j + k, u) + (o.compliance[j + k] * lam[j + k] - p.b[j + k])
+        old[k] = lam[j + k]
+    found = solve_block(p, i, g, w, lam + j)
+    for k in range(n):
+        whitened_push(o, b, j + k, lam[j + k] - old[k], u)
+    return found
+
+
+cdef inline int32_t solve_sliding_contact(const blocks_t* p, const rows_t* r, int32_t i, const double* g, double* lam,
+                                          double* v) noexcept nogil:
+    # The common kinds, normal and two tangents under Coulomb's law; lam at its normal.
+    cdef int32_t j = p.ptr[i], c = i - r.n_joints, a = r.contact_body[2 * c], b = r.contact_body[2 * c + 1], k
+    cdef double w[3]
+    cdef double u[3]
+    cdef double omega[3]
+    cdef double t2[3]
+    cdef double impulse[3]
+    cdef double n = lam[0], x = lam[1], y = lam[2]
+    cdef const double* normal = r.normal + 3 * c
+    cdef const double* t1 = r.tangent + 3 * c
+    cdef const double* swing = r.swing + 6 * (j - p.ptr[r.n_joints])
+    relative_velocity(v, a, b, r.arm_a + 3 * c, r.arm_b + 3 * c, u, omega)
+    cross(normal, t1, t2)
+    w[0] = dot3(normal, u) + (r.compliance[j] * n - p.b[j])
+    w[1] = dot3(t1, u) + (r.compliance[j + 1] * x - p.b[j + 1])
+    w[2] = dot3(t2, u) + (r.compliance[j + 2] * y - p.b[j + 2])
+    k = 0
+    if coulomb_block3(p, i, g, w, lam) == FAILED:
+        k = solve_block(p, i, g, w, lam)
+    n = lam[0] - n
+    x = lam[1] - x
+    y = lam[2] - y
+    impulse[0] = n * normal[0] + x * t1[0] + y * t2[0]
+    impulse[1] = n * normal[1] + x * t1[1] + y * t2[1]
+    impulse[2] = n * normal[2] + x * t1[2] + y * t2[2]
+    if a >= 0:
+        swing_body(v + 6 * a, r.inv_mass[a], swing, impulse, n, x, y, 0.0, 2, 0, -1.0)
+    if b >= 0:
+        swing_body(v + 6 * b, r.inv_mass[b], swing + 3, impulse, n, x, y, 0.0, 2, 0, 1.0)
+    return k
+
+
+cdef inline int32_t solve_rows_block(const blocks_t* p, const rows_t* r, int32_t i, const double* g, double* lam,
+                                     double* v) noexcept nogil:
+    cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, c = i - r.n_joints, k, a, b, nt, turns, roll, found
+    cdef double w[MAX_ROWS]
+    cdef double old[MAX_ROWS]
+    cdef double t2[3]
+    cdef double impulse[3]
+    cdef double twist[3]
+    cdef const double* normal
+    cdef const double* t1
+    t2[0] = t2[1] = t2[2] = 0.0
+    if c >= 0 and is_plain3(p, i) and p.law != CONE:
+        return solve_sliding_contact(p, r, i, g, lam + j, v)
+    if c < 0:
+        if n > MAX_ROWS:
+            relax_joint(p, r, i, lam, v)
+            return 1
+        a = r.joint_body[2 * i]
+        b = r.joint_body[2 * i + 1]
+        for k in range(n):
+            w[k] = joint_velocity(r.jac + 12 * (j + k), v, a, b) + r.compliance[j + k] * lam[j + k] - p.b[j + k]
+            old[k] = lam[j + k]
+        found = solve_block(p, i, g, w, lam + j)
+        for k in range(n):
+            joint_push(r.minv_jac + 12 * (j + k), lam[j + k] - old[k], v, a, b)
+        return found
+    a = r.contact_body[2 * c]
+    b = r.contact_body[2 * c + 1]
+    turns = n_turns(p, i)
+    nt = n_directions(p, i)
+    roll = 1 + nt + (turns & 1)
+    normal = r.normal + 3 * c
+    t1 = r.tangent + 3 * c
+    contact_slack(r, c, nt, turns, v, w)
+    for k in range(n):
+        w[k] += r.compliance[j + k] * lam[j + k] - p.b[j + k]
+        old[k] = lam[j + k]
+    found = solve_block(p, i, g, w, lam + j)
+    for k in range(n):
+        w[k] = lam[j + k] - old[k]
+    for k in range(3):
+        impulse[k] = w[0] * normal[k]
+        twist[k] = 0.0
+    if nt > 0:
+        for k in range(3):
+            impulse[k] += w[1] * t1[k]
+    if nt > 1:
+        cross(normal, t1, t2)
+        for k in range(3):
+            impulse[k] += w[2] * t2[k]
+    if turns & 1:
+        for k in range(3):
+            twist[k] = w[1 + nt] * normal[k]
+    if turns & 2:
+        for k in range(3):
+            twist[k] += w[roll] * t1[k] + w[roll + 1] * t2[k]
+    push_bodies(v, a, b, r.inv_mass, r.inv_inertia, r.arm_a + 3 * c, r.arm_b + 3 * c, impulse, twist)
+    return found
 
 
 cdef double prepared_sizes(const blocks_t* p, int32_t* start) noexcept nogil:

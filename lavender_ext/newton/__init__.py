@@ -1,1 +1,1 @@
-"""Newton's method by turns: systems of bodies and rows, interior points, exchanges, rounds, and when."""
+"""Newton's method over rows and bodies, in phases: linear systems, interior points, exchanges; warm starts."""

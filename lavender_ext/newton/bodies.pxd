@@ -8,10 +8,8 @@ from libc.math cimport sqrt
 from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memset
 
-from lavender_ext.core.generalized cimport generalized_t
 from lavender_ext.core.parts cimport blocks_t
-from lavender_ext.core.rows cimport bodies_of, rows_t
-from lavender_ext.core.view cimport view_t
+from lavender_ext.core.view cimport bodies_of, generalized_t, rows_t, view_t
 from lavender_ext.factor.blocks cimport factor_t, sparse_t
 from lavender_ext.factor.graph cimport eliminate_bodies, pattern_room
 from lavender_ext.factor.symbolic cimport block_pattern, block_tree

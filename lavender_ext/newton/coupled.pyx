@@ -9,7 +9,7 @@ from libc.stdint cimport int32_t
 import numpy as np
 
 from lavender_ext.newton.elements cimport elements_t
-from lavender_ext.newton.solve cimport Solve
+from lavender_ext.newton.solve cimport elements_of
 
 
 cdef public void lav_coupled_rows(int32_t n, const int32_t* ptr, const int32_t* to, const int32_t* other,
@@ -144,13 +144,14 @@ def coupled_entries(const int32_t[::1] aptr, const int32_t[::1] aind, const doub
     return out_array
 
 
-def coupled(Solve s, const int32_t[::1] to, const int32_t[::1] other, const int32_t[::1] indptr,
+def coupled(s, const int32_t[::1] to, const int32_t[::1] other, const int32_t[::1] indptr,
             const double[::1] h, const double[::1] left, right, double own, double[::1] out):
-    """(1); right may be None."""
+    """(1) for the elements of a `newton.solve.Solve`; right may be None."""
+    cdef const elements_t* e = elements_of(s)
     cdef const double[::1] r
     cdef const double* second = NULL
     if right is not None:
         r = right
         second = &r[0]
     with nogil:
-        lav_coupled(s.n.s.e, &to[0], &other[0], &indptr[0], &h[0], &left[0], second, own, &out[0])
+        lav_coupled(e, &to[0], &other[0], &indptr[0], &h[0], &left[0], second, own, &out[0])

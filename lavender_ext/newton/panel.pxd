@@ -3,7 +3,8 @@ from libc.math cimport sqrt
 from libc.stdint cimport int32_t, int64_t
 
 from lavender_ext.core.parts cimport blocks_t, n_directions, n_turns
-from lavender_ext.core.rows cimport bodies_of, contact_jacobian, rows_t
+from lavender_ext.core.rows cimport contact_jacobian
+from lavender_ext.core.view cimport bodies_of, rows_t
 from lavender_ext.newton.elements cimport elements_t
 
 

@@ -6,11 +6,8 @@ at a time, so that whoever asked can look at a clock in between.
 from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memcpy, memset
 
-from lavender_ext.core.csr cimport csr_t
-from lavender_ext.core.generalized cimport generalized_t
 from lavender_ext.core.parts cimport blocks_t
-from lavender_ext.core.rows cimport rows_t
-from lavender_ext.core.view cimport view_t
+from lavender_ext.core.view cimport csr_t, generalized_t, rows_t, view_t
 from lavender_ext.factor.blocks cimport factor_t
 from lavender_ext.judge.best cimport best_room, best_t, bind_best, note_score, relative_of_best, see_impulse
 from lavender_ext.judge.measure cimport above_floor_of, floor_of, judge_view, relative_of

@@ -10,12 +10,10 @@ from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memset
 
-from lavender_ext.core.csr cimport csr_t
 from lavender_ext.core.parts cimport blocks_t, is_round, is_rows, parts_of, parts_t
-from lavender_ext.core.rows cimport rows_t
 from lavender_ext.core.velocity cimport rows_velocity
-from lavender_ext.core.view cimport view_t
-from lavender_ext.judge.measure cimport general_slack, rows_slack
+from lavender_ext.core.view cimport csr_t, rows_t, view_t
+from lavender_ext.judge.slack cimport general_slack, rows_slack
 from lavender_ext.newton.cones cimport KEPT
 from lavender_ext.newton.elements cimport elements_t
 

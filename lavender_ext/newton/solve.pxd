@@ -1,27 +1,15 @@
-"""Newton's method on one problem for Python: arrays that `newton_t` points into."""
+"""Newton's method over rows and bodies as room, start and step (`core/method.pxd`), compiled once, in `solve.pyx`."""
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.method cimport Method
-from lavender_ext.newton.bodies cimport pattern_t
-from lavender_ext.newton.run cimport newton_t
-from lavender_ext.newton.system cimport others_t
+from lavender_ext.core.method cimport options_t, room_t, said_t
+from lavender_ext.core.view cimport view_t
+from lavender_ext.newton.elements cimport elements_t
 
 
-cdef class Layout:
-    cdef pattern_t a
-    cdef object index, filled
-    cdef readonly object body, node, turned             # (k, 2) bodies, block columns, and (k,) which were changed over
-    cdef readonly object nptr, lptr                     # (n + 1) blocks of N by rows, and of L by columns
-    cdef readonly object panels                         # of `symbolic.block_panels`, or None
-    cdef readonly int n, s
-    cdef readonly double work                           # multiply-adds of a factor
-
-
-cdef class Solve(Method):
-    cdef newton_t* n
-    cdef others_t calls
-    cdef list held
-    cdef object others, raised, real, index
-    cdef readonly object keep, block, ptr, part, wptr, fixed, scale, theta, g, lower, upper, reach
-    cdef readonly object v, einv, p, pair, bt           # small matrices of every element
-    cdef readonly int m
+cdef int32_t rows_room(const view_t* v, const options_t* o, room_t* r) noexcept nogil
+cdef int32_t rows_start(const view_t* v, const options_t* o, room_t* r, const double* lam) noexcept nogil
+cdef int32_t bodies_room(const view_t* v, const options_t* o, room_t* r) noexcept nogil
+cdef int32_t bodies_start(const view_t* v, const options_t* o, room_t* r, const double* lam) noexcept nogil
+cdef int32_t system_step(const view_t* v, const options_t* o, const room_t* r, int32_t work, double* lam,
+                         said_t* said) noexcept nogil
+cdef const elements_t* elements_of(object solve) except NULL

@@ -1,31 +1,39 @@
-"""Newton's method on one scaled problem for Python: `plan.pxd` turn by turn, and its systems one by one for tests."""
+"""Newton's method over the rows of A, dense, or over up to 1,500 bodies, as room, start and step (`core/method.pxd`).
+
+The unit of work is a factorisation; a step may do one or two more than it was asked for. After CERTIFICATE `options_t.proven`
+= 1 ends it; without, the next step goes on.
+
+Everything of the method is compiled here once: other modules call the functions that `solve.pxd` declares by pointer. The
+classes are the same for Python, over arrays that `newton_t` points into, and its systems one by one for tests.
+"""
 from libc.stdint cimport int32_t, int64_t
-from libc.string cimport memcpy
+from libc.string cimport memcpy, memset
 
 import numpy as np
 
 from lavender_ext.factor.symbolic import block_panels
 
 from lavender_ext.core.arrays cimport address, zeros
-from lavender_ext.core.method cimport Method, method_t
+from lavender_ext.core.method cimport CERTIFICATE, MORE, ROOM, Method, grant, method_t, options_t, room_t, said_t
 from lavender_ext.core.parts cimport COULOMB
 from lavender_ext.core.problem cimport Data
-from lavender_ext.core.rows cimport rows_t
-from lavender_ext.core.view cimport view_t
+from lavender_ext.core.view cimport rows_t, view_t
 from lavender_ext.factor.blocks cimport sparse_t
 from lavender_ext.factor.sparse cimport SparsePanels
 from lavender_ext.factor.symbolic cimport block_pattern
 from lavender_ext.factor.tiles cimport has_wide
-from lavender_ext.newton.bodies cimport (PARTS, factor_room, furnish_factor, lay_pattern, order_bodies, order_index,
-                                         panel_of, panel_of_velocities, pattern_t)
+from lavender_ext.newton.bodies cimport (PARTS, body_room, factor_room, furnish_bodies, furnish_factor, index_room,
+                                         lay_bodies, lay_pattern, make_pattern, order_bodies, order_index, panel_of,
+                                         panel_of_velocities, pattern_t)
+from lavender_ext.newton.elements cimport elements_t
 from lavender_ext.newton.interior cimport ipm_scale
-from lavender_ext.newton.method cimport begin, head, state_of, system_step
 from lavender_ext.newton.path cimport path_compliance, smooth
 from lavender_ext.newton.phases cimport begin_exchanges, exchange_once, sides
+from lavender_ext.newton.plan cimport newton_start, newton_step
 from lavender_ext.newton.run cimport (APPROACH, DE_SAXCE, EXCHANGES, INTERIOR, N_COUNTED, PATH, POLISH, PROXIMAL, PURSUIT,
-                                      RELAXED, aim, furnish, judge_room, lay_index, lay_judge, newton_t, own_index,
-                                      own_room, relative_at, set_reference)
-from lavender_ext.newton.scaling cimport find_elements
+                                      RELAXED, aim, furnish, impulse_of, judge_room, lay_index, lay_judge, newton_t,
+                                      own_index, own_room, proof_of, relative_at, set_reference)
+from lavender_ext.newton.scaling cimport dense_matrix, find_elements, is_known
 from lavender_ext.newton.steps cimport begin_interior, duals, interior_step, slips, turn
 from lavender_ext.newton.system cimport (DENSE, OF_BARRIER, OF_NATURAL, OF_PAIR, SPARSE, dense_room,
                                          natural_times, others_t, solve_natural, solve_refined, system_factor,
@@ -59,6 +67,107 @@ COUNTED = (
     "augmented steps",
     "path steps",
 )
+
+
+# -- the method on plain structs --------------------------------------------------------------------------------
+
+
+cdef struct state_t:            # at the beginning of the room's whole numbers
+    newton_t n
+    pattern_t a
+
+
+cdef inline int64_t head() noexcept nogil:
+    """Whole numbers of it."""
+    return sizeof(state_t) // sizeof(int32_t)
+
+
+cdef inline newton_t* state_of(const room_t* r) noexcept nogil:
+    return &(<state_t*>r.index).n
+
+
+cdef inline int32_t begin(newton_t* n, const options_t* o, const double* lam) noexcept nogil:
+    """From lam (m), furnished."""
+    n.tol, n.budget = o.tol, o.budget
+    set_reference(&n.problem, o.e0, o.v0)
+    newton_start(n, lam)
+    return MORE
+
+
+cdef int32_t system_step(const view_t* v, const options_t* o, const room_t* r, int32_t work, double* lam,
+                                said_t* said) noexcept nogil:
+    cdef newton_t* n = state_of(r)
+    cdef int32_t how
+    n.budget, n.proven, n.stop = o.budget, o.proven, o.stop
+    how = newton_step(n, work)
+    if n.best <= n.tol or n.kept.seen == 0:
+        impulse_of(n, n.best_z, lam)
+    else:
+        memcpy(lam, n.kept.impulse, v.p.n_rows * sizeof(double))
+    said.work = said.factorisations = n.s.factorisations
+    said.relative, said.tried = n.best, n.lam
+    said.direction = proof_of(n) if how == CERTIFICATE else NULL
+    return how
+
+
+cdef int32_t rows_room(const view_t* v, const options_t* o, room_t* r) noexcept nogil:
+    """More than enough, whatever the numbers: as if every row moved, in contacts of six rows that rub."""
+    cdef int64_t m = v.p.n_rows
+    r.n_index = head() + own_index(m)
+    r.n_real = judge_room(&v.p, NULL, NULL) + own_room(m, 6 * m) + 2 * m * m + dense_room(m, True) + 8
+    return is_known(&v.p)
+
+
+cdef int32_t rows_start(const view_t* v, const options_t* o, room_t* r, const double* lam) noexcept nogil:
+    cdef newton_t* n = state_of(r)
+    cdef int64_t m = v.p.n_rows
+    cdef room_t need
+    cdef double* x
+    rows_room(v, o, &need)
+    if not grant(r, need.n_index, need.n_real):
+        return ROOM
+    memset(n, 0, sizeof(newton_t))
+    aim(n, &v.p, v.a, NULL, NULL)
+    x = lay_judge(n, r.real)
+    lay_index(n, m, r.index + head())
+    find_elements(&n.sc, v)
+    memset(x, 0, own_room(m, n.sc.small) * sizeof(double))
+    x = furnish(n, v, x)
+    n.s.form, n.s.wide = DENSE, o.wide
+    n.s.h, n.s.whole, n.s.lower = x, x + m * m, x + 2 * m * m
+    n.s.symmetric = dense_matrix(&n.sc, v.a, <int32_t>m, n.s.swap, x)
+    return begin(n, o, lam)
+
+
+cdef int32_t bodies_room(const view_t* v, const options_t* o, room_t* r) noexcept nogil:
+    """Whole numbers; the others are known when the pattern of the factor is."""
+    cdef int64_t most = index_room(&v.p, v.r)
+    r.n_index, r.n_real = head() + most, 0
+    return most > 0
+
+
+cdef int32_t bodies_start(const view_t* v, const options_t* o, room_t* r, const double* lam) noexcept nogil:
+    cdef newton_t* n = state_of(r)
+    cdef pattern_t* a = &(<state_t*>r.index).a
+    if not r.laid:
+        if not grant(r, head() + index_room(&v.p, v.r), 0):
+            return ROOM
+        memset(n, 0, sizeof(newton_t))
+        lay_bodies(n, a, r.index + head(), &v.p, v.r)
+        find_elements(&n.sc, v)
+        make_pattern(&n.sc, a, v.r)
+        r.laid = 1
+    if not grant(r, r.n_index, judge_room(&v.p, v.r, NULL) + body_room(n, a, &v.p, v.r)):
+        return ROOM
+    aim(n, &v.p, NULL, v.r, NULL)
+    furnish_bodies(n, a, lay_judge(n, r.real), v)
+    return begin(n, o, lam)
+
+
+# -- for Python ------------------------------------------------------------------------------------------------
+
+
+cdef class Solve(Method)        # defined below
 
 
 cdef int32_t call_factor(void* at, int32_t augmented, int32_t what, double eps) noexcept with gil:
@@ -95,6 +204,13 @@ cdef class Layout:
     body (k, 2) are those of each element, -1 static. A factor of `least` multiply-adds stands in dense panels, by few and
     share of `symbolic.block_panels`.
     """
+    cdef pattern_t a
+    cdef object index, filled
+    cdef readonly object body, node, turned             # (k, 2) bodies, block columns, and (k,) which were changed over
+    cdef readonly object nptr, lptr                     # (n + 1) blocks of N by rows, and of L by columns
+    cdef readonly object panels                         # of `symbolic.block_panels`, or None
+    cdef readonly int n, s
+    cdef readonly double work                           # multiply-adds of a factor
 
     def __init__(self, const int32_t[:, ::1] body, int n, int s, double least=float("inf"), int few=1, double share=0.0):
         cdef pattern_t* a = &self.a
@@ -129,7 +245,7 @@ cdef class Layout:
         return self.n == n and self.s == s and np.array_equal(self.body, body)
 
 
-cdef class Solve:
+cdef class Solve(Method):
     """A problem as Newton's method has it, and what factors it by one of `over_...`; `start`, then `step` after `step`.
 
     Fixed rows (equal bounds, mu = 0 tangents, empty rows) are taken out: keep (m,) are the rows that move, block (n,) that
@@ -143,6 +259,13 @@ cdef class Solve:
     matrix : Data or None
         Of A in compressed rows; None: over the bodies of `data`, or what `graph.bodies_in` tells of its velocities.
     """
+    cdef newton_t* n
+    cdef others_t calls
+    cdef list held
+    cdef object others, raised, real, index
+    cdef readonly object keep, block, ptr, part, wptr, fixed, scale, theta, g, lower, upper, reach
+    cdef readonly object v, einv, p, pair, bt           # small matrices of every element
+    cdef readonly int m
 
     def __init__(self, Data data, Data matrix=None):
         cdef newton_t* n
@@ -387,3 +510,8 @@ cdef class Solve:
         slips(self.n.s.e, self.n.u, share, self.n.c, self.n.psi)
         turn(&self.n.s, self.n.psi)
         return np.asarray(<double[:self.m]>self.n.psi).copy()
+
+
+cdef const elements_t* elements_of(object solve) except NULL:
+    """Elements of a `Solve`."""
+    return &(<Solve?>solve).n.sc.e

@@ -12,10 +12,11 @@ from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memcpy, memset
 
-from lavender_ext.core.csr cimport csr_dot, csr_t
+from lavender_ext.core.csr cimport csr_dot
 from lavender_ext.core.door cimport largest
-from lavender_ext.core.generalized cimport dot
+from lavender_ext.core.dot cimport dot
 from lavender_ext.core.parts cimport CONE
+from lavender_ext.core.view cimport csr_t
 from lavender_ext.factor.blocks cimport factor_t
 from lavender_ext.factor.cholesky cimport block_cholesky, block_solve
 from lavender_ext.factor.dense cimport PANEL, cholesky_room, dense_cholesky, dense_cholesky_solve, dense_lu, dense_lu_solve

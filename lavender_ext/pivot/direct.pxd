@@ -12,10 +12,9 @@ The best judged impulse stands in `best` after each call.
 """
 from libc.stdint cimport int32_t, int64_t
 
-from lavender_ext.core.csr cimport csr_t
 from lavender_ext.core.parts cimport blocks_t
 from lavender_ext.core.problem cimport Data
-from lavender_ext.core.view cimport view_t
+from lavender_ext.core.view cimport csr_t, view_t
 from lavender_ext.judge.score cimport score_t
 from lavender_ext.pivot.principal cimport pivoting_t
 

@@ -1,1 +1,1 @@
-"""Small problems: check the start, solve and judge in one call, over kernels of other rooms; batches of them."""
+"""One small problem in one call: check its start, solve and judge it, over kernels of other packages."""

@@ -16,12 +16,12 @@ from libc.string cimport memcmp, memcpy, memset
 import numpy as np
 
 from lavender_ext.core.arrays cimport doubles
-from lavender_ext.core.csr cimport csr_t, scan_entries
+from lavender_ext.core.csr cimport scan_entries
 from lavender_ext.core.order cimport sort_by_level
 from lavender_ext.core.parts cimport CONE, CONTACT_ROLLING, FRICTIONS, ROUND, blocks_t, frictions_of, is_rows, lay_frictions
 from lavender_ext.core.problem cimport Data
-from lavender_ext.core.rows cimport bodies_of, rows_t
 from lavender_ext.core.method cimport room_t
+from lavender_ext.core.view cimport bodies_of, csr_t, rows_t
 from lavender_ext.factor.tiles cimport has_wide
 from lavender_ext.small.call cimport COUNTS, ENDED, FAILED, KEPT, Rules, few_rules_t, few_t, rooms_t
 from lavender_ext.small.friction cimport ask_t, part_t, solve_part, work_of

@@ -7,14 +7,12 @@ from libc.string cimport memcmp, memcpy, memset
 
 from lavender_ext.accelerate.accelerated cimport lav_anderson, sweep_data_t
 from lavender_ext.accelerate.mixing cimport CONTROL, MAX_MEMORY, UNDONE
-from lavender_ext.core.csr cimport csr_t
 from lavender_ext.core.method cimport CERTIFICATE, MORE, ROOM, options_t, room_t, said_t
 from lavender_ext.core.parts cimport CONE, blocks_t
-from lavender_ext.core.view cimport view_t
+from lavender_ext.core.view cimport csr_t, view_t
 from lavender_ext.driver.driver cimport NEWTON, lav_room, lav_start, lav_step
 from lavender_ext.small.room cimport has_room
-from lavender_ext.judge.measure cimport do_nothing, judge_view, relative_of
-from lavender_ext.judge.reference cimport reference_of
+from lavender_ext.judge.measure cimport do_nothing, find_reference, judge_view, relative_of
 from lavender_ext.judge.score cimport new_score, score_t
 from lavender_ext.sweep.serial cimport context_t, form_velocity
 
@@ -196,7 +194,7 @@ cdef inline bint solve_part(part_t* s, ask_t* o, room_t* r, double* work, int32_
     begun[0], begun[1], begun[2] = s.e0, s.v0, now
     if now < 0.0:
         judge_view(&s.v, s.answer, t.w, t.error, t.scratch, False, &nothing)
-        reference_of(p, s.answer, t.w, t.error, begun)
+        find_reference(p, s.answer, t.w, t.error, begun)
         if begun[2] <= o.tol:
             return True                                 # the zero impulse is a solution
     t.e0, t.v0 = begun[0], begun[1]

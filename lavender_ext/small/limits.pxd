@@ -7,8 +7,8 @@ Y entries, m rows, w multiply-adds of a factor of each island; count as in `lave
 from libc.math cimport INFINITY
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.generalized cimport generalized_t
 from lavender_ext.core.parts cimport COULOMB, blocks_t, has_friction, is_rows
+from lavender_ext.core.view cimport generalized_t
 
 
 cdef struct limits_t:           # ns, as in lavender/solvers/costs.py

@@ -19,7 +19,8 @@ from libc.stdint cimport int32_t, int64_t
 
 from lavender_ext.core.block cimport relax_tangents
 from lavender_ext.core.parts cimport blocks_t, is_box, n_directions, parts_of, parts_t
-from lavender_ext.core.rows cimport bodies_of, cross, relax_rows_block, rows_t
+from lavender_ext.core.rows cimport cross, relax_rows_block
+from lavender_ext.core.view cimport bodies_of, rows_t
 from lavender_ext.sweep.pair cimport (LANES, all_within, any_beyond, at, both, clip_pair, gather, gather_six,
                                       not_below_zero, pair_t, scatter_six)
 

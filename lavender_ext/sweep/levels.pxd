@@ -8,7 +8,7 @@ round. Impulses stay where they are, and a record holds where.
 from libc.stdint cimport int32_t, int64_t
 
 from lavender_ext.core.parts cimport blocks_t
-from lavender_ext.core.rows cimport rows_t
+from lavender_ext.core.view cimport rows_t
 from lavender_ext.sweep.lanes cimport MOST_ROWS, P_CODE, P_OWN, P_WRITE, relax_record, rows_of
 from lavender_ext.sweep.packed cimport packed_t
 from lavender_ext.sweep.pair cimport LANES, gather, pair_t, scatter

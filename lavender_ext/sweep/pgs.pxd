@@ -9,10 +9,10 @@ Over J and M the whitened velocities u = Y^T lam are kept: w = Y u + c lam - b, 
 from libc.stdint cimport int32_t
 
 from lavender_ext.core.block cimport relax_normal, relax_row, relax_tangents
-from lavender_ext.core.csr cimport csr_dot, csr_t
-from lavender_ext.core.generalized cimport generalized_t, whitened_dot, whitened_push
+from lavender_ext.core.csr cimport csr_dot
+from lavender_ext.core.generalized cimport whitened_dot, whitened_push
 from lavender_ext.core.parts cimport blocks_t, is_rows, parts_of, parts_t
-from lavender_ext.core.rows cimport rows_t
+from lavender_ext.core.view cimport csr_t, generalized_t, rows_t
 
 
 cdef inline void relax_csr_block(const blocks_t* p, const csr_t* a, int32_t i, double* lam) noexcept nogil:

@@ -5,10 +5,10 @@ A module of their own, since that is what a compiler has room for: beside other 
 from libc.stdint cimport int32_t
 
 from lavender_ext.core.block cimport relax_row
-from lavender_ext.core.csr cimport csr_dot, csr_t
-from lavender_ext.core.generalized cimport generalized_t
+from lavender_ext.core.csr cimport csr_dot
 from lavender_ext.core.parts cimport blocks_t
-from lavender_ext.core.rows cimport relax_rows_block, rows_t
+from lavender_ext.core.rows cimport relax_rows_block
+from lavender_ext.core.view cimport csr_t, generalized_t, rows_t
 from lavender_ext.sweep.pgs cimport relax_csr_block, relax_general_block
 
 

@@ -8,14 +8,12 @@
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t, int64_t, uint64_t
 
-from lavender_ext.core.csr cimport csr_t
-from lavender_ext.core.generalized cimport generalized_t, whitened_gather
+from lavender_ext.core.generalized cimport whitened_gather
 from lavender_ext.core.order cimport GIVEN, SYMMETRIC, advance_order
 from lavender_ext.core.parts cimport blocks_t
 from lavender_ext.core.problem cimport Data
-from lavender_ext.core.rows cimport rows_t
 from lavender_ext.core.velocity cimport rows_velocity
-from lavender_ext.core.view cimport view_t
+from lavender_ext.core.view cimport csr_t, generalized_t, rows_t, view_t
 from lavender_ext.judge.watch cimport STALLED, begins_again, sweep_t, watch_t, watched
 from lavender_ext.local.gauss_seidel cimport prepare_blocks, prepared_sizes
 from lavender_ext.sweep.packed cimport MOST, pack_order, packed_t

@@ -2,7 +2,7 @@
 
     pgs                   block i, then the next, each on w = A lam - b with the lam of now          (1)
     sequential impulses   the same sweep on v = M^-1 J^T lam: w = J v + c lam - b, A never formed     (2)
-    block gauss seidel    as (1) or (2), each block solved exactly (local/gauss_seidel.pxd)
+    block gauss seidel    as (1) or (2), each block solved exactly (local/gauss_seidel.pyx)
     jacobi                all blocks on the w of before the sweep, each step times omega              (3)
     sor                   lam_i <- lam_i - omega w_i / d_i on free rows                              (4)
 

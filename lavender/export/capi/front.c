@@ -1,9 +1,9 @@
 /* -- from here on: the functions of lavender.h over the kernels above ------------------------------------------------- */
 
 typedef struct core_parts_blocks_t blocks_t;
-typedef struct core_csr_csr_t csr_t;
-typedef struct core_rows_rows_t rows_t;
-typedef struct core_generalized_generalized_t general_t;
+typedef struct core_view_csr_t csr_t;
+typedef struct core_view_rows_t rows_t;
+typedef struct core_view_generalized_t general_t;
 typedef struct judge_score_score_t score_t;
 typedef void (*sweep_t)(void *, double *, int32_t, int32_t);
 

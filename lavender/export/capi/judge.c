@@ -14,7 +14,7 @@ static double judge(lav_solver *s, const double *impulse, int32_t floor, double 
   if (s->p.n_rows > 0) judge_measure_judge_view(&s->read, impulse, s->watch.w, s->watch.e, s->watch.v, floor, &t);
 #ifndef LAV_SWEEPS_ONLY
   found = judge_measure_relative_of(&t, s->watch.w, s->p.n_rows, s->start[0], s->start[1]);
-  if (floor && judge_refine_refine_view(&s->read, impulse, s->watch.w, s->watch.e, s->watch.v, s->start[0], s->start[1], tol,
+  if (floor && judge_measure_refine_view(&s->read, impulse, s->watch.w, s->watch.e, s->watch.v, s->start[0], s->start[1], tol,
                                         found, &t))
     first = found;
 #else

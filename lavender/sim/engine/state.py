@@ -28,8 +28,8 @@ from lavender_ext.engine.arrays import (
     TOO_MANY,
     lengths,
 )
+from lavender_ext.engine.newton_substep import Substep
 from lavender_ext.host import memory
-from lavender_ext.warm.substep import Substep
 
 Copy = Callable[[], np.ndarray]
 

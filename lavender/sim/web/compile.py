@@ -38,7 +38,7 @@ from threading import get_native_id
 from typing import Any
 
 #: Modules of lavender_ext that the page uses.
-MODULES = ("engine.arrays", "engine.substep", "host.memory")
+MODULES = ("engine.arrays", "engine.substep", "host.memory", "judge.measure")
 #: Largest size of a finished module [bytes].
 LARGEST = 220_000
 
@@ -52,7 +52,12 @@ class Part:
 
 
 #: Modules of the page by name; the first stands alone.
-PARTS = {"lavender": Part(MODULES), "newton": Part(("warm.substep", "judge.measure"), beside=True)}
+PARTS = {
+    "lavender": Part(MODULES),
+    "newton": Part(
+        ("engine.newton_substep", "judge.measure", "newton.solve", "newton.warm_start"), beside=True
+    ),
+}
 EXTRACT_C: dict[str, Any] = runpy.run_path(str(Path(__file__).resolve().with_name("extract_c.py")))
 #: Name of the custom section with the hash of the sources, which ends the file.
 SECTION = "lavender.sources"

@@ -1,4 +1,4 @@
-"""Newton's method over the velocities of generalised coordinates; equations in `lavender_ext/generalized/newton.pxd`.
+"""Newton's method over the velocities of generalised coordinates (`lavender_ext/velocity_newton/newton.pxd`).
 
 One compiled call solves every island of trees; here stand the clock and the words of the claim.
 """

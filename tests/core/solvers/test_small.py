@@ -18,7 +18,7 @@ from benchmarks.core_problems import forms, fresh, stacks
 from lavender import registry
 from lavender.solvers.costs import newton_cost
 from lavender.solvers.small import AUTO, SmallCall, call_ends_within, limits, who
-from lavender_ext.small.many import solve_first
+from lavender_ext.batch.many import solve_first
 
 
 def draw(kind, seed):

@@ -17,7 +17,7 @@ from lavender.solvers.newton_systems import general
 from lavender.solvers.newton_systems.systems import make_system
 from lavender.solvers.small import AUTO, FAILED_CALL_KEY
 from lavender.solvers.solve_log import SolveLog
-from lavender_ext.small.many import solve_first
+from lavender_ext.batch.many import solve_first
 
 
 def test_under_a_limit_nothing_long_is_begun_in_setting_up():

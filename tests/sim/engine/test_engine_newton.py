@@ -92,20 +92,20 @@ def test_a_warm_start_within_tol_comes_back_as_it_is():
 
 
 def test_what_the_first_phase_does_not_reach_is_left_as_it_came():
-    from lavender_ext.warm import start
+    from lavender_ext.newton import warm_start
 
     sim = lv.Simulation(lv.Scene("four_bar", solver="newton"))  # a closed loop: its rows depend on each other
     sim.step()
     problem = sim.constraint_problem()
     lam = problem.guess.copy()
-    how, _, factorisations = start.from_guess(problem.data, lam, 1e-6)
+    how, _, factorisations = warm_start.from_guess(problem.data, lam, 1e-6)
     assert (how, factorisations) == (0, 1)
     np.testing.assert_array_equal(lam, problem.guess)
     # nothing reaches a millionth of what float64 can hold
     problem = lv.Simulation(lv.Scene("stack", n=10)).constraint_problem()
     lam = 0.2 * lv.solve(problem, "newton", tol=1e-10).impulse
     before = lam.copy()
-    how, sweeps, factorisations = start.from_guess(problem.data, lam, 1e-22)
+    how, sweeps, factorisations = warm_start.from_guess(problem.data, lam, 1e-22)
     assert how == 0 and sweeps > 0
     np.testing.assert_array_equal(lam, before)
     found = lv.solve(problem, "newton", impulse=before, tol=1e-22)

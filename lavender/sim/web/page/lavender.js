@@ -5,7 +5,7 @@
 
 const SIZES = 10; // entries of size[], see lavender_ext/engine/arrays.pxd
 const MOST_SWEEPS = 64;
-const MOST_TRACED = 256; // scores of one solve by Newton's method, see lavender_ext/warm/start.pxd
+const MOST_TRACED = 256; // scores of one solve by Newton's method, see lavender_ext/newton/warm_start.pxd
 export const TOL = 1e-6; // relative residual at which such a solve ends, as in Python
 const OK = 0;
 const NEED_ROOM = 1;

@@ -17,18 +17,18 @@ from lavender_ext.core.method cimport room_t
 from lavender_ext.core.problem cimport Data, made_t
 from lavender_ext.core.problem import LAWS
 from lavender_ext.core.view cimport view_t
-from lavender_ext.generalized.newton cimport is_soft
 from lavender_ext.small.call cimport COUNTS, Rules, few_rules_t, few_t, judge_few
-from lavender_ext.small.job cimport (few_rooms_t, begin, found_by, has_numbers, job_t, judge_job, judging_size, prepare_few,
+from lavender_ext.batch.job cimport (few_rooms_t, begin, found_by, has_numbers, job_t, judge_job, judging_size, prepare_few,
                                      solve_few, solve_job)
 from lavender_ext.small.limits cimport allowed, cost_of, limits_t
 from lavender_ext.small.room cimport has_room, leave
-from lavender_ext.small.world cimport (BAD, BLOCK, BLOCKS, CONE_ROW, FREE, JAC, LATE, LEFT, MASS, MU, N_ARRAYS, PLACES,
+from lavender_ext.batch.world cimport (BAD, BLOCK, BLOCKS, CONE_ROW, FREE, JAC, LATE, LEFT, MASS, MU, N_ARRAYS, PLACES,
                                        READY, AT_ROW, FIELDS, ROWS, SOFT, STARTED, TARGET, TRIED, VELOCITIES, VELOCITY,
                                        desk_t, lay_bodies, lay_matrix, lay_world, worlds_t)
 from lavender_ext.judge.measure cimport do_nothing, judged_from, scratch_of
 from lavender_ext.judge.rounding cimport floor_in_float32, squares32
-from lavender_ext.judge.score cimport norms_of_rhs
+from lavender_ext.judge.tally cimport norms_of_rhs
+from lavender_ext.velocity_newton.soft cimport is_soft
 
 cdef object new = np.empty
 

@@ -4,7 +4,7 @@ After `prepare` and `solve` without sweeps:
 
     index_room      whole numbers that the next call needs
     plan            bands, elements, elimination order; doubles that the next call needs
-    solve           the first phase of `newton` (start.pxd), then its steps (newton/method.pxd); the judge's residual decides
+    solve           the first phase of `newton` (newton/warm_start.pxd), then its steps (newton/solve.pyx); the judge decides
 
 Natively and in WebAssembly the same lines, the same bits. What asks for another library, the augmented system, is left out;
 where that or `BUDGET` leaves the residual above tol, the best impulse found stays, and is told as such.
@@ -16,15 +16,14 @@ import numpy as np
 from lavender_ext.core.method cimport CERTIFICATE, MORE, options_t, room_t, said_t
 from lavender_ext.core.islands cimport find_islands, islands_index
 from lavender_ext.core.parts cimport blocks_t, is_rows, islands_t
-from lavender_ext.core.rows cimport rows_t
-from lavender_ext.core.view cimport view_t
+from lavender_ext.core.view cimport rows_t, view_t
 from lavender_ext.core.weights cimport block_weights, joint_weights
 from lavender_ext.engine.arrays cimport S_OUT, bind, engine_t
 from lavender_ext.engine.view cimport view
-from lavender_ext.judge.reference cimport reference_of
-from lavender_ext.judge.score cimport new_score, score_rows, score_t
-from lavender_ext.newton.method cimport bodies_room, bodies_start, system_step
-from lavender_ext.warm.start cimport (FACTORED, JUDGED, MOST_TRACED, UNDECIDED, band_width, judged, lay_out,
+from lavender_ext.judge.measure cimport find_reference, score_slack
+from lavender_ext.judge.score cimport new_score, score_t
+from lavender_ext.newton.solve cimport bodies_room, bodies_start, system_step
+from lavender_ext.newton.warm_start cimport (FACTORED, JUDGED, MOST_TRACED, UNDECIDED, band_width, judged, lay_out,
                                       observe, room_of, start_errors, warm_solve, warm_t)
 
 
@@ -140,10 +139,10 @@ cdef inline void bind_islands(blocks_t* p, const rows_t* r, warm_t* s, int32_t* 
             s.kept[j], s.slack[j] = 0.0, -p.b[j]
             if is_rows(p, i) and not p.lower[j] <= 0.0 <= p.upper[j]:
                 return
-    score_rows(p, s.kept, s.slack, s.error, &score)
+    score_slack(p, s.kept, s.slack, s.error, &score)
     islands.reference = reference
     p.islands = islands
-    reference_of(p, s.kept, s.slack, s.error, start)
+    find_reference(p, s.kept, s.slack, s.error, start)
 
 
 cdef public int32_t lav_newton_substep(const int32_t* size, double* real, int32_t* index, uint64_t* keys, double tol,

@@ -8,14 +8,15 @@ from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memcmp, memcpy, memset
 
 from lavender_ext.core.door cimport are_pairs, first_unsized, has_outside, is_definite, is_frame, is_size, largest, least
-from lavender_ext.core.generalized cimport generalized_t, jac_row
+from lavender_ext.core.generalized cimport jac_row
 from lavender_ext.core.tree cimport tree_factor, tree_pattern
 from lavender_ext.core.method cimport room_t
 from lavender_ext.core.parts cimport blocks_t, from_block, is_rows
-from lavender_ext.core.rows cimport rows_t, rows_times
+from lavender_ext.core.rows cimport rows_times
 from lavender_ext.judge.rounding cimport mass_t
 from lavender_ext.small.room cimport has_room
-from lavender_ext.small.thin cimport thin
+from lavender_ext.batch.thin cimport thin
+from lavender_ext.core.view cimport generalized_t, rows_t
 
 
 cdef enum:                      # what became of a world

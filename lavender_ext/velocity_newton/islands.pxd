@@ -4,12 +4,12 @@ Panels that share a column, directly or through others, are an island: its veloc
 """
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.generalized cimport generalized_t
 from lavender_ext.core.order cimport sort_by_level
 from lavender_ext.core.parts cimport CONE, COULOMB, blocks_t, has_friction, is_rows
 from lavender_ext.core.roots cimport root_of
-from lavender_ext.generalized.flow cimport flow_t, row_end, row_from
-from lavender_ext.generalized.sparse cimport factor_work, find_pattern, pattern_marks
+from lavender_ext.core.view cimport generalized_t
+from lavender_ext.velocity_newton.flow cimport flow_t, row_end, row_from
+from lavender_ext.velocity_newton.sparse cimport factor_work, find_pattern, pattern_marks
 
 
 cdef inline void join_trees(const generalized_t* g, int32_t* up) noexcept nogil:

@@ -13,13 +13,13 @@ and where blocks of V may be full, as those of contacts, a the rows of those tha
 from libc.stdint cimport int32_t
 from libc.string cimport memcpy
 
-from lavender_ext.core.generalized cimport dot
+from lavender_ext.core.dot cimport dot
 from lavender_ext.core.tree cimport ldl_solve, take_two
 from lavender_ext.core.parts cimport is_rows
 from lavender_ext.factor.dense_lu cimport lu_factor, lu_solve
 from lavender_ext.factor.tiles cimport combine
-from lavender_ext.generalized.flow cimport block_end, block_from, find_column, flow_t, spread
-from lavender_ext.generalized.sparse cimport sparse_factor, take_row
+from lavender_ext.velocity_newton.flow cimport block_end, block_from, find_column, flow_t, spread
+from lavender_ext.velocity_newton.sparse cimport sparse_factor, take_row
 
 
 cdef inline void scale_row(double* out, const double* x, double f, int32_t n) noexcept nogil:

@@ -25,13 +25,15 @@ from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
 
 from lavender_ext.core.block cimport length
-from lavender_ext.core.generalized cimport dot, generalized_t
+from lavender_ext.core.dot cimport dot
 from lavender_ext.core.method cimport BROKEN, LOST, MORE, REACHED, STUCK
 from lavender_ext.core.parts cimport CONE, COULOMB, blocks_t, is_rows, parts_of, parts_t
 from lavender_ext.core.start cimport is_nothing, zero_impulse
-from lavender_ext.generalized.flow cimport (NOWHERE, blank, block_end, block_from, descent_t, flow_t, gather, keep,
+from lavender_ext.core.view cimport generalized_t
+from lavender_ext.velocity_newton.flow cimport (NOWHERE, blank, block_end, block_from, descent_t, flow_t, gather, keep,
                                             measure, renew, respond_all, row_end, row_from, wait_t)
-from lavender_ext.generalized.normal cimport factor, form, is_held, newton_step
+from lavender_ext.velocity_newton.normal cimport factor, form, is_held, newton_step
+from lavender_ext.velocity_newton.soft cimport least_softness
 
 
 cdef enum:                      # a round of Coulomb friction
@@ -176,23 +178,8 @@ cdef inline void one_theta(double* theta, int32_t first, int32_t end) noexcept n
         theta[k] = big
 
 
-cdef inline double enough(const blocks_t* p, int32_t i) noexcept nogil:
-    """Compliance over d with which a block needs no proximal term."""
-    return 1e-6 if is_rows(p, i) else 1e-3
-
-
-cdef inline bint is_soft(const blocks_t* p, const generalized_t* g) noexcept nogil:
-    """Needs no block one?"""
-    cdef int32_t i, k
-    for i in range(p.n_blocks):
-        for k in range(p.ptr[i], p.ptr[i + 1]):
-            if not g.compliance[k] >= enough(p, i) * p.d[k]:
-                return False
-    return True
-
-
 cdef inline void soften(const flow_t* f, int32_t island, double share) noexcept nogil:
-    """theta' of (2): rho is `share` d on rows with less than `enough` of their own.
+    """theta' of (2): rho is `share` d on rows with less than `least_softness` of their own.
 
     Rows of one part get the largest.
     """
@@ -209,7 +196,7 @@ cdef inline void soften(const flow_t* f, int32_t island, double share) noexcept 
         for i in range(block_from(f, a), last):
             j = f.p.ptr[i]
             end = f.p.ptr[i + 1]
-            low = enough(&f.p, i)
+            low = least_softness(&f.p, i)
             if share < low:
                 low = share
             for k in range(j, end):

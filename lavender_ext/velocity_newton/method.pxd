@@ -6,10 +6,10 @@ from libc.stdint cimport int32_t
 
 from lavender_ext.core.method cimport MORE, ROOM, SPENT, UNFIT, grant, options_t, room_t, said_t
 from lavender_ext.core.view cimport view_t
-from lavender_ext.generalized.flow cimport flow_t
-from lavender_ext.generalized.islands cimport aim_at, furnish, marks_of, need_t, numbers_of, settle
-from lavender_ext.generalized.newton cimport descend_all
-from lavender_ext.generalized.sparse cimport per_column
+from lavender_ext.velocity_newton.flow cimport flow_t
+from lavender_ext.velocity_newton.islands cimport aim_at, furnish, marks_of, need_t, numbers_of, settle
+from lavender_ext.velocity_newton.newton cimport descend_all
+from lavender_ext.velocity_newton.sparse cimport per_column
 
 
 cdef struct state_t:            # at the beginning of the room's whole numbers

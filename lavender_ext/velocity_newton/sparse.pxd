@@ -9,8 +9,8 @@ than a dense one would.
 """
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.generalized cimport generalized_t
 from lavender_ext.core.tree cimport take_two, tree_pattern
+from lavender_ext.core.view cimport generalized_t
 
 
 cdef enum:

@@ -1,59 +1,26 @@
-"""A warm start carried to the judge's tolerance, on the factored form: few sweeps, or one banded solve.
-
-    judge        lam as it came: relative residual max(E/E0, V/V0) <= tol?                      (1)
-    contacts     sequential impulses, judged after 4, 8, 16, 32 and 64 sweeps; from 16 on given up
-                 where r_s (r_s / r_s/2)^(2 (64 - s)/s), what 64 would leave, is above tol       (2)
-    free joints  A lam = b by LDL^T on the band of A, one round of refinement                   (3)
-
-An impulse is scored by the judge's own lines (judge/measure.pxd, judge/score.pxd): the residual found here is the
-judge's. What is not decided here (dependent joints, numbers near the ends of the range, a residual that stays above
-tol) is left to the caller, with lam as it came.
-"""
+"""The first phase of Newton's method from a warm start: equations in `warm_start.pxd`, whose functions are compiled here."""
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t, int64_t
 
+import numpy as np
+
 from lavender_ext.core.block cimport row_error
 from lavender_ext.core.parts cimport COULOMB, blocks_t, is_rows
-from lavender_ext.core.rows cimport dot6, relax_rows_block, rows_t
+from lavender_ext.core.problem cimport Data
+from lavender_ext.core.rows cimport dot6, relax_rows_block
 from lavender_ext.core.start cimport is_nothing
 from lavender_ext.core.velocity cimport rows_velocity
+from lavender_ext.core.view cimport rows_t
 from lavender_ext.factor.band cimport ldl_factor, ldl_solve, pivots_t
-from lavender_ext.judge.measure cimport rows_slack
-from lavender_ext.judge.score cimport new_score, nothing, relative, score_rows, score_t, tally_row, tally_t
+from lavender_ext.judge.measure cimport score_slack
+from lavender_ext.judge.score cimport new_score, relative, score_t
+from lavender_ext.judge.slack cimport rows_slack
+from lavender_ext.judge.tally cimport nothing, tally_row, tally_t
+from lavender_ext.newton.warm_start cimport (FIRST_SWEEPS, JUDGED, MOST_ROWS, MOST_BAND, MOST_SWEEPS, MOST_TRACED, PATIENT_SWEEPS,
+                                             SOLVED, SWEPT, UNDECIDED, lay_out, room_of, warm_t)
 
 
-cpdef enum:
-    FIRST_SWEEPS = 4            # of (2); fewer leave a residual just below tol, and the next step begins above it
-    PATIENT_SWEEPS = 16         # from here on (2) is given up where it will not do
-    MOST_SWEEPS = 64
-    MOST_ROWS = 200000          # so that all of it takes a fraction of a second
-    MOST_BAND = 48              # rows between the first and the last of one body's joints, for (3)
-    MOST_TRACED = 256           # scores of one solve that are noted
-
-cpdef enum:                     # how it ended
-    UNDECIDED = 0
-    JUDGED = 1                  # met tol as it came
-    SWEPT = 2                   # met it after some sweeps
-    SOLVED = 3                  # met it after one factorisation
-    FACTORED = 5                # met it after turns of Newton's method (substep.pyx)
-
-
-cdef struct warm_t:
-    double* kept                # (m) lam as it came
-    double* band                # (m, width) of (3)
-    double* slack               # (m) w of the impulse that was scored last
-    double* error               # (m) e of it
-    int32_t* last               # (n_bodies) last joint seen on a body
-    int32_t* before             # (2 kj) the one before on the same body: 2 joint + side, or -1
-    int32_t width               # of the band, 0 where (3) does not apply
-    int32_t sweeps              # done
-    int32_t factorisations      # done
-    double relative             # of lam as it is left
-    double* trace               # (MOST_TRACED, 3) or NULL: sweeps and factorisations so far, E [sqrt J], max |e_n| [N s]
-    int32_t traced              # scores noted
-
-
-cdef inline int32_t start_errors(const blocks_t* p, double* energy, double* velocity) noexcept nogil:
+cdef int32_t start_errors(const blocks_t* p, double* energy, double* velocity) noexcept nogil:
     """E0, V0 of lam = 0, w = -b; 0 where they are not plainly the judge's."""
     cdef int32_t i, j
     cdef double e, rhs = 0.0, least = 1.0 / 0.0, inf = 1.0 / 0.0
@@ -79,7 +46,7 @@ cdef inline int32_t start_errors(const blocks_t* p, double* energy, double* velo
     return s.energy < inf and s.energy * least > 1.3e-29 * rhs
 
 
-cdef inline void observe(const blocks_t* p, const rows_t* r, const warm_t* s, double* residual,
+cdef void observe(const blocks_t* p, const rows_t* r, const warm_t* s, double* residual,
                          double* violation) noexcept nogil:
     # as the engine measures its own sweeps: max |e_n| [N s] and max(0, -w_n) [m/s] over the contacts
     cdef int32_t i, j
@@ -91,21 +58,6 @@ cdef inline void observe(const blocks_t* p, const rows_t* r, const warm_t* s, do
         low = -s.slack[j] if -s.slack[j] > low else low
     residual[0] = big
     violation[0] = low
-
-
-cdef inline int64_t room_of(const blocks_t* p, int32_t width) noexcept nogil:
-    # doubles that `lay_out` hands out
-    return (3 + <int64_t>width) * p.n_rows
-
-
-cdef inline void lay_out(warm_t* s, double* real, int32_t* index, const blocks_t* p, const rows_t* r) noexcept nogil:
-    # index (n_bodies + 2 joints)
-    s.kept = real
-    s.slack = real + p.n_rows
-    s.error = s.slack + p.n_rows
-    s.band = s.error + p.n_rows
-    s.last = index
-    s.before = index + r.n_bodies
 
 
 cdef inline void note_score(const blocks_t* p, const rows_t* r, warm_t* s, double energy) noexcept nogil:
@@ -132,7 +84,7 @@ cdef inline double scored(const blocks_t* p, const rows_t* r, warm_t* s, const d
     """Relative residual of lam as the judge has it, v = M^-1 J^T lam; infinite where it is not finite."""
     cdef score_t x = new_score()
     rows_slack(p, r, lam, v, s.slack)
-    score_rows(p, lam, s.slack, s.error, &x)
+    score_slack(p, lam, s.slack, s.error, &x)
     if s.trace != NULL:
         note_score(p, r, s, x.energy)
     if x.relative >= 0.0:                               # of the worst island
@@ -140,7 +92,7 @@ cdef inline double scored(const blocks_t* p, const rows_t* r, warm_t* s, const d
     return relative(x.energy, x.velocity, e0, v0) if x.finite else 1.0 / 0.0
 
 
-cdef inline int32_t band_width(const blocks_t* p, const rows_t* r, int32_t* last) noexcept nogil:
+cdef int32_t band_width(const blocks_t* p, const rows_t* r, int32_t* last) noexcept nogil:
     """Width of the band of A in the given order, joints alone and all free; 0 where there are others."""
     cdef int32_t i, j, h, b, width = 1
     if r.n_contacts > 0 or r.n_joints == 0:
@@ -192,7 +144,7 @@ cdef inline void fill_band(const blocks_t* p, const rows_t* r, warm_t* s) noexce
         s.band[<int64_t>j * s.width] += r.compliance[j]
 
 
-cdef inline double judged(const blocks_t* p, const rows_t* r, warm_t* s, const double* lam, double* v, double e0,
+cdef double judged(const blocks_t* p, const rows_t* r, warm_t* s, const double* lam, double* v, double e0,
                           double v0) noexcept nogil:
     # with v formed anew, as the judge does
     rows_velocity(p, r, lam, v)
@@ -253,7 +205,7 @@ cdef inline int32_t sweep_contacts(const blocks_t* p, const rows_t* r, warm_t* s
     return UNDECIDED
 
 
-cdef inline int32_t warm_solve(const blocks_t* p, const rows_t* r, warm_t* s, double tol, double* lam, double* v,
+cdef int32_t warm_solve(const blocks_t* p, const rows_t* r, warm_t* s, double tol, double* lam, double* v,
                                int32_t has_velocity) noexcept nogil:
     """lam (m), not all zero, to tol; v (n_bodies, 6) is left M^-1 J^T lam, given so with `has_velocity`."""
     cdef double e0, v0
@@ -280,3 +232,19 @@ cdef inline int32_t warm_solve(const blocks_t* p, const rows_t* r, warm_t* s, do
             lam[j] = s.kept[j]
         rows_velocity(p, r, lam, v)
     return found
+
+
+def from_guess(Data data, double[::1] impulse, double tol):
+    """impulse (m,) of a factored problem to tol: (how it ended, sweeps, factorisations); as it came where 0."""
+    cdef int32_t m = data.blocks.n_rows, how
+    cdef warm_t s
+    if m == 0 or not data.factored:
+        return 0, 0, 0
+    cdef int32_t[::1] index = np.empty(data.rows.n_bodies + 2 * data.rows.n_joints + 1, np.int32)
+    s.width = band_width(&data.blocks, &data.rows, &index[0])
+    cdef double[::1] real = np.empty(6 * data.rows.n_bodies + room_of(&data.blocks, s.width))
+    s.trace = NULL
+    lay_out(&s, &real[6 * data.rows.n_bodies], &index[0], &data.blocks, &data.rows)
+    with nogil:
+        how = warm_solve(&data.blocks, &data.rows, &s, tol, &impulse[0], &real[0], 0)
+    return how, s.sweeps, s.factorisations

@@ -9,27 +9,24 @@ from libc.math cimport INFINITY, NAN, fabs, sqrt
 from libc.string cimport memset
 
 from lavender_ext.core.assemble cimport lav_assemble, lav_body_blocks, lav_expand_rows
-from lavender_ext.core.csr cimport csr_t
 from lavender_ext.core.door cimport first_outside
-from lavender_ext.core.generalized cimport generalized_t
 from lavender_ext.core.method cimport MORE, REACHED, ROOM, options_t, room_t, said_t
 from lavender_ext.core.islands cimport islands_index
 from lavender_ext.core.parts cimport CONE, blocks_t, is_rows, islands_t
 from lavender_ext.core.problem cimport MADE, lav_rows_diagonal, made_t, make_numbers, matrix_numbers
-from lavender_ext.core.rows cimport rows_t
-from lavender_ext.core.view cimport view_t
+from lavender_ext.core.view cimport csr_t, generalized_t, rows_t, view_t
 from lavender_ext.driver.driver cimport NEWTON, lav_room, lav_start, lav_step
 from lavender_ext.factor.tiles cimport has_wide
-from lavender_ext.generalized.newton cimport is_soft
-from lavender_ext.judge.measure cimport (above_floor_of, do_nothing, floor_of, general_score, general_slack, judge_nothing,
+from lavender_ext.judge.measure cimport (above_floor_of, do_nothing, floor_of, general_score, judge_nothing, refine_view,
                                          relative_of, scratch_of)
-from lavender_ext.judge.refine cimport refine_view
 from lavender_ext.judge.score cimport new_score, score_t
+from lavender_ext.judge.slack cimport general_slack
 from lavender_ext.small.call cimport (COUNTS, ENDED, KEPT, are_bounded, few_rules_t, few_t, has_call, lay_few, rooms_t,
                                       run_few)
 from lavender_ext.small.limits cimport allowed, cost_of, limits_t, step_cost, work_within
 from lavender_ext.small.room cimport has_room
-from lavender_ext.small.world cimport BESIDE, LEFT, READY, STARTED, TRIED, rows_of
+from lavender_ext.batch.world cimport BESIDE, LEFT, READY, STARTED, TRIED, rows_of
+from lavender_ext.velocity_newton.soft cimport is_soft
 
 
 cdef enum:
@@ -151,7 +148,7 @@ cdef inline void judge_job(job_t* j, double tol, double* x) noexcept nogil:
     j.score = new_score()
     j.score.by_island = j.by_island
     general_slack(&j.p, &j.g, j.lam, x, j.both)
-    general_score(&j.p, &j.g, j.lam, j.both, j.both + m, x + j.g.n, NULL, &j.score)
+    general_score(&j.p, &j.g, j.lam, j.both, j.both + m, x + j.g.n, &j.score)
     j.push = x
     j.relative = relative_of(&j.score, j.both, m, j.begin[0], j.begin[1])
     j.float64_relative = NAN

@@ -16,10 +16,11 @@ from libc.string cimport memcpy, memset
 
 from lavender_ext.core.block cimport block_error, row_error
 from lavender_ext.core.contact_map cimport contact_map
-from lavender_ext.core.generalized cimport generalized_t, panel_push, panel_times
+from lavender_ext.core.generalized cimport panel_push, panel_times
 from lavender_ext.core.parts cimport blocks_t, is_rows, parts_of, parts_t
+from lavender_ext.core.view cimport generalized_t
 from lavender_ext.factor.tiles cimport combine
-from lavender_ext.judge.score cimport nothing, tally_block, tally_row, tally_t
+from lavender_ext.judge.tally cimport nothing, tally_block, tally_row, tally_t
 
 
 cdef struct descent_t:          # Newton steps under one law

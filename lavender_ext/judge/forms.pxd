@@ -1,0 +1,349 @@
+"""The judge's pass over each form of A: w = A lam - b formed anew, error e of every block, their sums, and round-off limits.
+
+    F_i = 2^-53 (|A| |lam| + |b|)_i             [m/s]; factored: |J| |M^-1| |J|^T |lam| + c |lam| for |A| |lam|;
+                                                at least d_i |lam_i| if a pair is cut to its bound;
+                                                0 if w_i holds the row at its bound by more than F_i
+    floor energy sqrt(sum F^2 / d), floor velocity max F sqrt(nu / d)
+
+A row's products serve w and F: A is read once. Factored, core/velocity.pxd forms M^-1 J^T lam, and a second loop reads
+J v.
+"""
+from libc.math cimport fabs
+from libc.stdint cimport int32_t
+
+from lavender_ext.core.block cimport block_error
+from lavender_ext.core.csr cimport csr_dot, csr_dot_long
+from lavender_ext.core.generalized cimport panel_push_size, panel_size
+from lavender_ext.core.parts cimport blocks_t, is_rows, n_directions, n_turns
+from lavender_ext.core.rows cimport cross
+from lavender_ext.core.velocity cimport add6, rows_velocity
+from lavender_ext.core.view cimport csr_t, generalized_t, rows_t
+from lavender_ext.judge.score cimport score_t
+from lavender_ext.judge.slack cimport general_slack, rows_slack
+from lavender_ext.judge.tally cimport (add_block_floor, add_row_floor, begin_islands, block_at, close_island,
+                                       floor_from, floor_t, island_begin, island_end, no_floor, nothing, score_from,
+                                       score_rows, tally_block, tally_t)
+
+
+# -- islands --------------------------------------------------------------------------------------------
+
+
+cdef inline void join_floor(const floor_t* own, floor_t* all_) noexcept nogil:
+    """Add an island's floor to that of all."""
+    all_.energy += own.energy
+    if own.fast > all_.fast:
+        all_.fast = own.fast
+
+
+cdef inline void score_with_floor(const blocks_t* p, const rows_t* r, const double* lam, const double* w, double* e,
+                                  const double* sizes, score_t* out) noexcept nogil:
+    """Errors from the slack w, sums and floors, island by island.
+
+    sizes: `velocity_size` over bodies r; r NULL: |A| |lam| of every row, or what is no less.
+    """
+    cdef int32_t island, a, i, end, n = begin_islands(p, out)
+    cdef const int32_t* order = p.islands.order if p.islands != NULL else NULL
+    cdef tally_t own, s = nothing()
+    cdef floor_t floor, f = no_floor()
+    for island in range(n):
+        own = nothing()
+        floor = no_floor()
+        end = island_end(p, island)
+        for a in range(island_begin(p, island), end):
+            i = block_at(order, a)
+            block_error(p, i, lam, w, e)
+            tally_block(p, i, e, &own)
+            if r == NULL:
+                add_block_floor(p, i, lam, w, e, sizes + p.ptr[i], &floor)
+            elif i < r.n_joints:
+                joint_floor(p, r, i, lam, w, sizes, &floor)
+            else:
+                contact_floor(p, r, i - r.n_joints, lam, w, e, sizes, &floor)
+        close_island(p, island, w, e, &own, &floor, &s, out)
+        join_floor(&floor, &f)
+    score_from(p, e, &s, out)
+    floor_from(&f, out)
+
+
+# -- A in compressed rows ----------------------------------------------------------------------------
+
+
+cdef inline void csr_slack(const blocks_t* p, const csr_t* a, const double* lam, double* w) noexcept nogil:
+    cdef int32_t i
+    for i in range(p.n_rows):
+        w[i] = csr_dot(a, i, lam) - p.b[i]
+
+
+cdef inline void csr_block(const blocks_t* p, const csr_t* a, int32_t i, const double* lam, double* w, double* e, tally_t* s,
+                           floor_t* f) noexcept nogil:
+    """Slack, error and floor of block i."""
+    cdef int32_t j = p.ptr[i], k
+    cdef double size[6]
+    for k in range(j, p.ptr[i + 1]):
+        w[k] = csr_dot_long(a, k, lam, size + (0 if is_rows(p, i) else k - j)) - p.b[k]
+        if is_rows(p, i):                               # of any number
+            add_row_floor(p, k, lam[k], w[k], size[0], f)
+    block_error(p, i, lam, w, e)
+    tally_block(p, i, e, s)
+    if not is_rows(p, i):
+        add_block_floor(p, i, lam, w, e, size, f)
+
+
+cdef inline void csr_judge(const blocks_t* p, const csr_t* a, const double* lam, double* w, double* e, bint floor,
+                           score_t* out) noexcept nogil:
+    cdef int32_t island, k, end, n
+    cdef const int32_t* order = p.islands.order if p.islands != NULL else NULL
+    cdef tally_t own, s = nothing()
+    cdef floor_t least, f = no_floor()
+    if not floor:
+        csr_slack(p, a, lam, w)
+        score_rows(p, lam, w, e, out)
+        return
+    n = begin_islands(p, out)
+    for island in range(n):
+        own = nothing()
+        least = no_floor()
+        end = island_end(p, island)
+        for k in range(island_begin(p, island), end):
+            csr_block(p, a, block_at(order, k), lam, w, e, &own, &least)
+        close_island(p, island, w, e, &own, &least, &s, out)
+        join_floor(&least, &f)
+    score_from(p, e, &s, out)
+    floor_from(&f, out)
+
+
+# -- the factored form -------------------------------------------------------------------------------
+
+
+cdef inline void joint_wrench_size(const blocks_t* p, const rows_t* r, int32_t i, const double* lam,
+                                   double* size) noexcept nogil:
+    # |J|^T |lam| of joint i
+    cdef double x[12]
+    cdef const double* row
+    cdef int32_t j, k, a = r.joint_body[2 * i], b = r.joint_body[2 * i + 1]
+    for k in range(12):
+        x[k] = 0.0
+    for j in range(p.ptr[i], p.ptr[i + 1]):
+        row = r.jac + 12 * j
+        for k in range(12):
+            x[k] += fabs(row[k] * lam[j])
+    if a >= 0:
+        add6(size + 6 * a, x)
+    if b >= 0:
+        add6(size + 6 * b, x + 6)
+
+
+cdef inline double abs_cross(const double* x, const double* y, int32_t k) noexcept nogil:
+    # |(x x y)_k|
+    if k == 0:
+        return fabs(x[1] * y[2] - x[2] * y[1])
+    if k == 1:
+        return fabs(x[2] * y[0] - x[0] * y[2])
+    return fabs(x[0] * y[1] - x[1] * y[0])
+
+
+cdef inline void side_wrench_size(const double* n, const double* t1, const double* t2, const double* arm, int32_t nt,
+                                  int32_t turns, double x, double y, double z, const double* turn, double* out) noexcept nogil:
+    # x, y, z: |lam| of normal and tangents; turn (turns): of spin and of what rolls.
+    cdef int32_t k
+    cdef double s, l
+    for k in range(3):
+        s = fabs(n[k]) * x
+        l = abs_cross(arm, n, k) * x
+        if nt > 0:
+            s += fabs(t1[k]) * y
+            l += abs_cross(arm, t1, k) * y
+        if nt > 1:
+            s += fabs(t2[k]) * z
+            l += abs_cross(arm, t2, k) * z
+        if turns & 1:
+            l += fabs(n[k]) * fabs(turn[0])
+        if turns & 2:
+            l += fabs(t1[k]) * fabs(turn[turns & 1]) + fabs(t2[k]) * fabs(turn[1 + (turns & 1)])
+        out[k] += s
+        out[3 + k] += l
+
+
+cdef inline void contact_wrench_size(const rows_t* r, int32_t c, int32_t nt, int32_t turns, const double* lam,
+                                     double* size) noexcept nogil:
+    # |J|^T |lam| of one contact.
+    cdef double t2[3]
+    cdef double y = 0.0, z = 0.0
+    cdef const double* n = r.normal + 3 * c
+    cdef const double* t1 = r.tangent + 3 * c
+    cdef int32_t a = r.contact_body[2 * c], b = r.contact_body[2 * c + 1]
+    if nt > 0:
+        y = fabs(lam[1])
+    if nt > 1:
+        z = fabs(lam[2])
+        cross(n, t1, t2)
+    if a >= 0:
+        side_wrench_size(n, t1, t2, r.arm_a + 3 * c, nt, turns, fabs(lam[0]), y, z, lam + 1 + nt, size + 6 * a)
+    if b >= 0:
+        side_wrench_size(n, t1, t2, r.arm_b + 3 * c, nt, turns, fabs(lam[0]), y, z, lam + 1 + nt, size + 6 * b)
+
+
+cdef inline void velocity_size(const blocks_t* p, const rows_t* r, const double* lam, double* size) noexcept nogil:
+    """|M^-1| |J|^T |lam|, (n, 6)."""
+    cdef int32_t i, j, c, k, nt, turns
+    cdef double* x
+    cdef const double* inv
+    cdef double t[3]
+    for i in range(6 * r.n_bodies):
+        size[i] = 0.0
+    for i in range(r.n_joints):
+        joint_wrench_size(p, r, i, lam, size)
+    for c in range(r.n_contacts):
+        i = r.n_joints + c
+        j = p.ptr[i]
+        nt = n_directions(p, i)
+        turns = n_turns(p, i)
+        if turns or nt == 1:                            # the two common kinds with their sizes as constants
+            contact_wrench_size(r, c, nt, turns, lam + j, size)
+        elif nt == 2:
+            contact_wrench_size(r, c, 2, 0, lam + j, size)
+        else:
+            contact_wrench_size(r, c, 0, 0, lam + j, size)
+    for i in range(r.n_bodies):
+        x = size + 6 * <ssize_t>i
+        inv = r.inv_inertia + 9 * <ssize_t>i
+        for k in range(3):
+            x[k] *= r.inv_mass[i]
+            t[k] = x[3 + k]
+        for k in range(3):
+            x[3 + k] = (fabs(inv[3 * k]) * t[0] + fabs(inv[3 * k + 1]) * t[1]) + fabs(inv[3 * k + 2]) * t[2]
+
+
+cdef inline double joint_size(const double* jac, const double* size, int32_t a, int32_t b) noexcept nogil:
+    # |J| size of one row; two sums side by side, for two lanes.
+    cdef double s = 0.0, t = 0.0
+    cdef const double* x
+    cdef int32_t k
+    if a >= 0:
+        x = size + 6 * a
+        for k in range(3):
+            s += fabs(jac[2 * k]) * x[2 * k]
+            t += fabs(jac[2 * k + 1]) * x[2 * k + 1]
+    if b >= 0:
+        x = size + 6 * b
+        for k in range(3):
+            s += fabs(jac[6 + 2 * k]) * x[2 * k]
+            t += fabs(jac[7 + 2 * k]) * x[2 * k + 1]
+    return s + t
+
+
+cdef inline double side_size(const double* axis, const double* arm, const double* size) noexcept nogil:
+    # |axis| . linear + |arm x axis| . angular
+    cdef double s = 0.0, t = 0.0
+    cdef int32_t k
+    for k in range(3):
+        s += fabs(axis[k]) * size[k]
+        t += abs_cross(arm, axis, k) * size[3 + k]
+    return s + t
+
+
+cdef inline void contact_sizes(const rows_t* r, int32_t c, int32_t nt, int32_t turns, const double* size,
+                               double* out) noexcept nogil:
+    # |J| size of the rows of one contact
+    cdef double t2[3]
+    cdef const double* n = r.normal + 3 * c
+    cdef const double* t1 = r.tangent + 3 * c
+    cdef const double* arm
+    cdef const double* x
+    cdef int32_t k, side, body, roll = 1 + nt + (turns & 1)
+    if nt > 1:
+        cross(n, t1, t2)
+    for k in range(1 + nt + turns):
+        out[k] = 0.0
+    for side in range(2):
+        body = r.contact_body[2 * c + side]
+        if body < 0:
+            continue
+        arm = r.arm_b + 3 * c if side else r.arm_a + 3 * c
+        x = size + 6 * body
+        out[0] += side_size(n, arm, x)
+        if nt > 0:
+            out[1] += side_size(t1, arm, x)
+        if nt > 1:
+            out[2] += side_size(t2, arm, x)
+        if turns & 1:
+            for k in range(3):
+                out[1 + nt] += fabs(n[k]) * x[3 + k]
+        if turns & 2:
+            for k in range(3):
+                out[roll] += fabs(t1[k]) * x[3 + k]
+                out[roll + 1] += fabs(t2[k]) * x[3 + k]
+
+
+cdef inline void joint_floor(const blocks_t* p, const rows_t* r, int32_t i, const double* lam, const double* w,
+                             const double* sizes, floor_t* f) noexcept nogil:
+    # (|J| |M^-1| |J|^T |lam| + c |lam|) of the rows of joint i; sizes of `velocity_size`
+    cdef int32_t j, a = r.joint_body[2 * i], b = r.joint_body[2 * i + 1]
+    for j in range(p.ptr[i], p.ptr[i + 1]):
+        add_row_floor(p, j, lam[j], w[j], r.compliance[j] * fabs(lam[j]) + joint_size(r.jac + 12 * j, sizes, a, b), f)
+
+
+cdef inline void contact_floor(const blocks_t* p, const rows_t* r, int32_t c, const double* lam, const double* w,
+                               const double* e, const double* sizes, floor_t* f) noexcept nogil:
+    # the same of contact c
+    cdef int32_t k, i = r.n_joints + c, j = p.ptr[i], n = p.ptr[i + 1] - j, nt = n_directions(p, i), turns = n_turns(p, i)
+    cdef double size[6]
+    if turns or nt == 1:                                # the two common kinds with their sizes as constants
+        contact_sizes(r, c, nt, turns, sizes, size)
+    elif nt == 2:
+        contact_sizes(r, c, 2, 0, sizes, size)
+    else:
+        contact_sizes(r, c, 0, 0, sizes, size)
+    for k in range(n):
+        size[k] = r.compliance[j + k] * fabs(lam[j + k]) + size[k]
+    add_block_floor(p, i, lam, w, e, size, f)
+
+
+cdef inline void rows_judge(const blocks_t* p, const rows_t* r, const double* lam, double* w, double* e, double* v,
+                            bint floor, score_t* out) noexcept nogil:
+    cdef double* sizes = v + 6 * <ssize_t>r.n_bodies
+    rows_velocity(p, r, lam, v)
+    rows_slack(p, r, lam, v, w)
+    if not floor:
+        score_rows(p, lam, w, e, out)
+        return
+    velocity_size(p, r, lam, sizes)
+    score_with_floor(p, r, lam, w, e, sizes, out)
+
+
+# -- generalised coordinates ---------------------------------------------------------------------------
+
+
+cdef inline const double* general_sizes(const blocks_t* p, const generalized_t* g, const double* lam, const double* more,
+                                        double* x) noexcept nogil:
+    """|Y| |Y|^T |lam| + c |lam| + more (m), a bound of |A| |lam|, in x (n + m); more: (m) or NULL."""
+    cdef int32_t i
+    cdef double* size = x + g.n
+    for i in range(g.n):
+        x[i] = 0.0
+    for i in range(g.n_panels):
+        panel_push_size(g, i, lam, x)
+    for i in range(g.n_panels):
+        panel_size(g, i, x, size)
+    for i in range(p.n_rows):
+        size[i] += g.compliance[i] * fabs(lam[i])
+    if more != NULL:
+        for i in range(p.n_rows):
+            size[i] += more[i]
+    return size
+
+
+cdef inline void general_errors(const blocks_t* p, const generalized_t* g, const double* lam, const double* w, double* e,
+                               double* x, const double* more, score_t* out) noexcept nogil:
+    """Errors from the slack w, their sums and the floor; more as `general_sizes`. x (n + m) is scratch."""
+    score_with_floor(p, NULL, lam, w, e, general_sizes(p, g, lam, more, x), out)
+
+
+cdef inline void general_judge(const blocks_t* p, const generalized_t* g, const double* lam, double* w, double* e,
+                               double* x, bint floor, score_t* out) noexcept nogil:
+    """The pass over J and M. x (n) is scratch, with the floor (n + m)."""
+    general_slack(p, g, lam, x, w)
+    if floor:
+        general_errors(p, g, lam, w, e, x, NULL, out)
+    else:
+        score_rows(p, lam, w, e, out)

@@ -1,0 +1,321 @@
+"""Sums over the errors of blocks and over what rounding leaves of them, island by island: how a `score_t` is made."""
+from libc.math cimport fabs, sqrt
+from libc.stdint cimport int32_t
+
+from lavender_ext.core.block cimport block_error, length
+from lavender_ext.core.parts cimport CONE, blocks_t, disk_of, groups_of, is_disk, is_rows, parts_of, parts_t
+from lavender_ext.judge.score cimport above_floor, hides, is_at_floor, ratio, relative, score_t, unit_roundoff
+
+
+cdef struct tally_t:
+    double energy               # sum (d e) e
+    double fast                 # max (d e) (nu e)
+    int32_t worst
+
+
+cdef struct floor_t:            # of F, what rounding leaves of a slack
+    double energy               # sum (F / d) F
+    double fast                 # max nu (F / d) F
+    double own                  # max F / |b|, with islands, of a contact's rows over b of its normal
+
+
+cdef inline int32_t block_at(const int32_t* order, int32_t a) noexcept nogil:
+    """Block number `a` of a list; NULL: of all blocks."""
+    return a if order == NULL else order[a]
+
+
+cdef inline double ratio_by_row(double size, double own, double scale) noexcept nogil:
+    """Size of an error [m/s] over the row's own terms; without these sqrt(d) |e| over the E0 of all rows (scale)."""
+    return ratio(size, own) if own > 0.0 or size == 0.0 else scale
+
+
+cdef inline double relative_by_rows(const blocks_t* p, const int32_t* order, int32_t first, int32_t end, const double* e,
+                                    double whole) noexcept nogil:
+    """(3) of judge/reference.pxd over blocks order[first:end]; order NULL: blocks first to end. whole: E0 of all rows."""
+    cdef int32_t a, i, j, k
+    cdef double r, worst = 0.0, s
+    for a in range(first, end):
+        i = block_at(order, a)
+        j = p.ptr[i]
+        if is_rows(p, i):
+            for k in range(j, p.ptr[i + 1]):
+                r = ratio_by_row(p.d[k] * fabs(e[k]), fabs(p.b[k]), ratio(sqrt(p.d[k]) * fabs(e[k]), whole))
+                worst = r if r > worst else worst
+            continue
+        s = 0.0
+        for k in range(j, p.ptr[i + 1]):
+            s += (p.d[k] * e[k]) * e[k]
+        r = ratio_by_row(sqrt(p.d[j]) * sqrt(s), fabs(p.b[j]), ratio(sqrt(s), whole))
+        worst = r if r > worst else worst
+    return worst
+
+
+cdef inline tally_t nothing() noexcept nogil:
+    cdef tally_t s
+    s.energy = 0.0
+    s.fast = -1.0
+    s.worst = -1
+    return s
+
+
+cdef inline void tally_row(const blocks_t* p, int32_t k, double e, tally_t* s) noexcept nogil:
+    cdef double v = p.d[k] * e, t = v * (p.nu[k] * e)
+    s.energy += v * e
+    if t > s.fast:
+        s.fast = t
+        s.worst = k
+
+
+cdef inline void tally_pair(const blocks_t* p, int32_t k, const double* e, tally_t* s) noexcept nogil:
+    # Rows k, k + 1, by the norm of the two in the maximum.
+    cdef double x = p.d[k] * e[k], y = p.d[k] * e[k + 1]
+    s.energy += x * e[k] + y * e[k + 1]
+    x = x * (p.nu[k] * e[k]) + y * (p.nu[k] * e[k + 1])
+    if x > s.fast:
+        s.fast = x
+        s.worst = k
+
+
+cdef inline void tally_block(const blocks_t* p, int32_t i, const double* e, tally_t* s) noexcept nogil:
+    cdef int32_t k, g, j = p.ptr[i]
+    cdef parts_t q
+    if is_rows(p, i):
+        for k in range(j, p.ptr[i + 1]):
+            tally_row(p, k, e[k], s)
+        return
+    tally_row(p, j, e[j], s)
+    if is_disk(p, i):                                   # compiled apart
+        tally_pair(p, j + 1, e, s)
+        return
+    groups_of(p, i, &q)
+    for g in range(q.n):
+        if q.size[g] == 2:
+            tally_pair(p, j + q.first[g], e, s)
+        else:
+            tally_row(p, j + q.first[g], e[j + q.first[g]], s)
+
+
+cdef inline int32_t lost_row(const double* e, int32_t m) noexcept nogil:
+    """The first row whose error is no number, or -1."""
+    cdef int32_t i
+    for i in range(m):
+        if not fabs(e[i]) < 1.0 / 0.0:
+            return i
+    return -1
+
+
+cdef inline void score_from(const blocks_t* p, const double* e, const tally_t* s, score_t* out) noexcept nogil:
+    """The two sums over e (m); the floor entries are left alone."""
+    out.energy = sqrt(s.energy)
+    out.velocity = sqrt(s.fast) if s.fast > 0.0 else 0.0
+    out.worst = s.worst
+    out.finite = out.energy + out.velocity < 1.0 / 0.0
+    if not out.finite:
+        out.velocity = 1.0 / 0.0
+        out.worst = lost_row(e, p.n_rows)
+        if out.worst < 0:
+            out.worst = s.worst
+
+
+cdef inline void norms_of_rhs(const blocks_t* p, double* energy, double* velocity) noexcept nogil:
+    """sqrt(sum b^2 / d) and max |b| sqrt(nu / d), of two rows of a part by their norm."""
+    cdef int32_t i, j, k, g
+    cdef double t, pair, sum_ = 0.0, fast = 0.0
+    cdef parts_t q
+    for i in range(p.n_blocks):
+        j = p.ptr[i]
+        for k in range(j, p.ptr[i + 1]):
+            t = (p.b[k] / p.d[k]) * p.b[k]
+            sum_ += t
+            t = t * p.nu[k]
+            if t > fast:
+                fast = t
+        groups_of(p, i, &q)
+        for g in range(q.n):
+            if q.size[g] == 2:
+                k = j + q.first[g]
+                pair = (p.b[k] / p.d[k]) * p.b[k] + (p.b[k + 1] / p.d[k + 1]) * p.b[k + 1]
+                pair = pair * p.nu[k]
+                if pair > fast:
+                    fast = pair
+    energy[0] = sqrt(sum_)
+    velocity[0] = sqrt(fast)
+
+
+cdef inline floor_t no_floor() noexcept nogil:
+    return floor_t(0.0, 0.0, 0.0)
+
+
+cdef inline double row_rounding(const blocks_t* p, int32_t k, double size) noexcept nogil:
+    """F_k: rounding of the slack of row k, size = (|A| |lam|)_k."""
+    return unit_roundoff() * (size + fabs(p.b[k]))
+
+
+cdef inline void add_floor(const blocks_t* p, int32_t k, int32_t first, double f, floor_t* s) noexcept nogil:
+    """Add the rounding f of the slack of row k to the floor; first: the normal of a contact, else k."""
+    cdef double t = f / p.d[k]
+    s.energy += t * f
+    t = p.nu[k] * t * f
+    if t > s.fast:
+        s.fast = t
+    if p.islands != NULL:
+        t = ratio_by_row(f * sqrt(p.d[first] / p.d[k]), fabs(p.b[first]), ratio(f / sqrt(p.d[k]), p.islands.energy))
+        if t > s.own:
+            s.own = t
+
+
+cdef inline void add_row_floor(const blocks_t* p, int32_t k, double lam, double w, double size, floor_t* s) noexcept nogil:
+    """Add the rounding of the bounded row k, unless its slack holds it at a bound by more than that: its error is then 0."""
+    cdef double f = row_rounding(p, k, size)
+    # without branches: which rows are held is hard to predict
+    cdef bint held = ((lam == p.lower[k]) & (w > f)) | ((lam == p.upper[k]) & (-w > f))
+    add_floor(p, k, k, 0.0 if held else f, s)
+
+
+cdef inline bint holds_at_zero(const blocks_t* p, int32_t i, const double* lam, const double* w, const double* size) noexcept nogil:
+    """Whether contact i has no impulse, and its slack keeps it there by more than rounding: its error is then 0."""
+    cdef int32_t k, g, j = p.ptr[i], n = p.ptr[i + 1] - j
+    cdef double gap = w[j], rounding
+    cdef parts_t q
+    for k in range(n):
+        if lam[j + k] != 0.0:
+            return False
+    rounding = row_rounding(p, j, size[0])
+    if p.law == CONE:
+        parts_of(p, i, &q)
+        for g in range(q.n):
+            gap -= q.reach[g] * length(w + j + q.first[g], q.size[g])
+            for k in range(q.first[g], q.first[g] + q.size[g]):
+                rounding += q.reach[g] * row_rounding(p, j + k, size[k])
+    return gap > rounding
+
+
+cdef inline void add_block_floor(const blocks_t* p, int32_t i, const double* lam, const double* w, const double* e,
+                                 const double* size, floor_t* s) noexcept nogil:
+    """Add the rounding of a block's rows, of those whose error it changes; size from its first row on, at least |A_kk| |lam_k|.
+
+    If the norm of two rows is cut to its bound, e = lam - Pi has the rounding of lam itself, (2^-53 |lam_k|) d_k as a
+    velocity; d_k, of both rows, may be far above A_kk.
+    """
+    cdef int32_t k, g, j = p.ptr[i], n = p.ptr[i + 1] - j
+    cdef parts_t q
+    cdef double x, own
+    cdef bint held
+    if is_rows(p, i):
+        for k in range(n):
+            add_row_floor(p, j + k, lam[j + k], w[j + k], size[k], s)
+        return
+    if n == 1:
+        x = row_rounding(p, j, size[0])
+        held = (lam[j] == 0.0) & (w[j] > x)
+        add_floor(p, j, j, 0.0 if held else x, s)
+        return
+    if holds_at_zero(p, i, lam, w, size):
+        return
+    add_floor(p, j, j, row_rounding(p, j, size[0]), s)
+    if is_disk(p, i):                                   # compiled apart
+        disk_of(p, i, &q)
+    else:
+        groups_of(p, i, &q)
+    for g in range(q.n):
+        for k in range(q.first[g], q.first[g] + q.size[g]):
+            x = size[k]
+            if q.size[g] == 2 and e[j + k] != w[j + k] / p.d[j + k]:
+                own = p.d[j + k] * fabs(lam[j + k])
+                x = own if own > x else x
+            add_floor(p, j + k, j, row_rounding(p, j + k, x), s)
+
+
+cdef inline void floor_from(const floor_t* s, score_t* out) noexcept nogil:
+    """The floor entries of out."""
+    out.floor_energy = sqrt(s.energy)
+    out.floor_velocity = sqrt(s.fast)
+
+
+cdef inline int32_t begin_islands(const blocks_t* p, score_t* out) noexcept nogil:
+    """Before the first `close_island`: the number of islands."""
+    if p.islands == NULL:
+        return 1
+    out.relative = out.floor = out.above_floor = 0.0
+    out.island = 0
+    return p.islands.n
+
+
+cdef inline int32_t island_begin(const blocks_t* p, int32_t island) noexcept nogil:
+    """Place in `order` of the first block of an island; without islands all blocks are one, in their order."""
+    return p.islands.ptr[island] if p.islands != NULL else 0
+
+
+cdef inline int32_t island_end(const blocks_t* p, int32_t island) noexcept nogil:
+    return p.islands.ptr[island + 1] if p.islands != NULL else p.n_blocks
+
+
+cdef inline double island_relative(const blocks_t* p, int32_t island, const double* e, const tally_t* s) noexcept nogil:
+    """(1) of one island."""
+    cdef const double* reference = p.islands.reference + 2 * island
+    cdef double energy = sqrt(s.energy), velocity = sqrt(s.fast) if s.fast > 0.0 else 0.0
+    if not energy + velocity < 1.0 / 0.0:
+        return 1.0 / 0.0
+    if reference[0] < 0.0:
+        return relative_by_rows(p, p.islands.order, p.islands.ptr[island], p.islands.ptr[island + 1], e,
+                                p.islands.energy)
+    return relative(energy, velocity, reference[0], reference[1])
+
+
+cdef inline double island_floor(const blocks_t* p, int32_t island, const floor_t* f) noexcept nogil:
+    """The floor of one island, as a relative residual."""
+    cdef const double* reference = p.islands.reference + 2 * island
+    if reference[0] < 0.0:
+        return f.own
+    return relative(sqrt(f.energy), sqrt(f.fast), reference[0], reference[1])
+
+
+cdef inline void close_island(const blocks_t* p, int32_t island, const double* w, const double* e, const tally_t* s,
+                              const floor_t* f, tally_t* total, score_t* out) noexcept nogil:
+    """Add an island's sums to those of all and its (1) to the score; f NULL: without its floor.
+
+    Of a problem that is one island the sums alone, from which callers make (1).
+    """
+    cdef double now, floor = 0.0
+    cdef double check = 0.0                             # stays 0, or becomes NaN
+    cdef int32_t a, i, k
+    if p.islands == NULL:
+        total[0] = s[0]
+        return
+    now = island_relative(p, island, e, s)
+    for a in range(p.islands.ptr[island], p.islands.ptr[island + 1]):
+        i = p.islands.order[a]
+        for k in range(p.ptr[i], p.ptr[i + 1]):
+            check += 0.0 * w[k]
+    if check != 0.0:
+        now = 1.0 / 0.0
+    if f != NULL:
+        floor = island_floor(p, island, f)
+        if hides(floor) and now < floor < 1.0 / 0.0:
+            now = floor
+        if not is_at_floor(now, floor) and now > out.above_floor:
+            out.above_floor = now
+    if out.by_island != NULL:
+        out.by_island[2 * island] = now
+        out.by_island[2 * island + 1] = sqrt(s.energy)
+    if now > out.relative or island == 0:
+        out.relative, out.floor, out.island = now, floor, island
+    total.energy += s.energy
+    if s.fast > total.fast:
+        total.fast, total.worst = s.fast, s.worst
+
+
+cdef inline void score_rows(const blocks_t* p, const double* lam, const double* w, double* e, score_t* out) noexcept nogil:
+    """Errors e (m) of all blocks and their two sums; the floor entries are left alone."""
+    cdef int32_t island, a, i, end, n = begin_islands(p, out)
+    cdef const int32_t* order = p.islands.order if p.islands != NULL else NULL
+    cdef tally_t own, s = nothing()
+    for island in range(n):
+        own = nothing()
+        end = island_end(p, island)
+        for a in range(island_begin(p, island), end):
+            i = block_at(order, a)
+            block_error(p, i, lam, w, e)
+            tally_block(p, i, e, &own)
+        close_island(p, island, w, e, &own, NULL, &s, out)
+    score_from(p, e, &s, out)

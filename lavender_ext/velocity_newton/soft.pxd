@@ -1,0 +1,20 @@
+"""Rows of J and M that are soft enough to need no proximal term."""
+from libc.stdint cimport int32_t
+
+from lavender_ext.core.parts cimport blocks_t, is_rows
+from lavender_ext.core.view cimport generalized_t
+
+
+cdef inline double least_softness(const blocks_t* p, int32_t i) noexcept nogil:
+    """Compliance over d with which a block needs no proximal term."""
+    return 1e-6 if is_rows(p, i) else 1e-3
+
+
+cdef inline bint is_soft(const blocks_t* p, const generalized_t* g) noexcept nogil:
+    """Needs no block one?"""
+    cdef int32_t i, k
+    for i in range(p.n_blocks):
+        for k in range(p.ptr[i], p.ptr[i + 1]):
+            if not g.compliance[k] >= least_softness(p, i) * p.d[k]:
+                return False
+    return True

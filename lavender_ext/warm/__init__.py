@@ -1,1 +1,0 @@
-"""A warm start carried to the judge's tolerance, on a problem's data, in the engine's arrays, in a browser."""
