@@ -60,7 +60,7 @@ if TYPE_CHECKING:
     from lavender.io import load
     from lavender.lab import bench, motion, phenomena, report, suite
     from lavender.lab.check import CrossCheck, cross_check
-    from lavender.lab.diagnostics import Suspicion, diagnose
+    from lavender.lab.diagnostics import Diagnostic, diagnose
     from lavender.lab.diagnostics.redundancy import Redundancy, redundancy
     from lavender.lab.motion import MotionError, Motions, motion_error, motions
     from lavender.lab.proof import Enclosure, prove
@@ -80,7 +80,7 @@ _LAZY_NAMES = {
     "lavender.gradient": ("Derivative", "derivative", "derivatives"),
     "lavender.io": ("load",),
     "lavender.lab.check": ("CrossCheck", "cross_check"),
-    "lavender.lab.diagnostics": ("Suspicion", "diagnose"),
+    "lavender.lab.diagnostics": ("Diagnostic", "diagnose"),
     "lavender.lab.diagnostics.redundancy": ("Redundancy", "redundancy"),
     "lavender.lab.motion": ("MotionError", "Motions", "motion_error", "motions"),
     "lavender.lab.proof": ("Enclosure", "prove"),
@@ -122,6 +122,7 @@ __all__ = [
     "Cones",
     "CrossCheck",
     "Derivative",
+    "Diagnostic",
     "Enclosure",
     "Generalized",
     "InUse",
@@ -145,7 +146,6 @@ __all__ = [
     "SolverSpec",
     "SolverUnavailable",
     "Status",
-    "Suspicion",
     "Turn",
     "UnknownName",
     "__version__",

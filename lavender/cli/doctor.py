@@ -19,7 +19,7 @@ def doctor(files: tuple[str, ...], as_json: bool) -> None:
     Without arguments, exit code 1: the self-test gives other bits than on other machines.
 
     With problems, print what looks like a mistake in their data (flipped normals, masses in place of their
-    inverses, rows out of order, ...). Exit code 1: there is a suspicion, or a file in a folder cannot be read.
+    inverses, rows out of order, ...). Exit code 1: there is a diagnostic, or a file in a folder cannot be read.
     Exit code 2: a named file cannot be read.
     """
     if files:
@@ -53,8 +53,8 @@ def _suspect(files: tuple[str, ...], as_json: bool) -> None:
     for item in bench.resolve(files):
         with reading(item):
             found[item.name] = diagnose(item.problem)
-            for suspicion in () if as_json else found[item.name]:
-                say(f"{item.name}: {suspicion}")
+            for diagnostic in () if as_json else found[item.name]:
+                say(f"{item.name}: {diagnostic}")
     suspect = sum(map(bool, found.values()))
     if as_json:
         click.echo(json.dumps({name: list(map(asdict, told)) for name, told in found.items()}, indent=2))

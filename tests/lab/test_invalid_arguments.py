@@ -86,7 +86,7 @@ CALLS = {
 #: Public calls that are not in the table, and why.
 NOT_CALLED = {
     **dict.fromkeys(
-        ("CrossCheck", "Enclosure", "MotionError", "Motions", "Redundancy", "Suspicion"),
+        ("CrossCheck", "Enclosure", "MotionError", "Motions", "Redundancy", "Diagnostic"),
         "a result: the package makes it",
     ),
     "CrossCheck.__getitem__": "a mapping by the names of solvers",

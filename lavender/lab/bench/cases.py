@@ -383,7 +383,7 @@ def describe(item: Item, run: str) -> CaseInfo:
         stored=math.nan if answer is None else answer.relative,
         stored_verdict=answer.verdict_in_words if answer and answer.rounding else "",
         nothing_to_do=nothing_to_do(p),
-        suspicions=tuple(map(str, diagnose(p))),
+        diagnostics=tuple(map(str, diagnose(p))),
         guess=_guess_of(item),
         condition=condition(p),
     )

@@ -131,7 +131,7 @@ class CaseInfo(_Texts):
     identity: str = ""  # of the sequence, from the numbers of all its steps: steps of two are never one
     # of a stored answer in float32: at its floor, stopped before convergence (by how much) or wrong
     stored_verdict: str = ""
-    suspicions: tuple[str, ...] = ()  # what looks like a mistake in its data
+    diagnostics: tuple[str, ...] = ()  # what looks like a mistake in its data
     guess: str = ""  # to begin at: a "start"; an "answer", from which nothing is measured; or nothing
     # of A, scaled to a diagonal of 1, over its range; None where it was not computed
     condition: float | None = None
@@ -236,7 +236,7 @@ def measurement_key(what: Any) -> tuple[Any, ...]:
 
 Entry = Run | CaseInfo | Skip | Record
 #: Fields of records by the names that earlier versions wrote.
-RENAMED_FIELDS = {"contradicted": "status_conflict"}
+RENAMED_FIELDS = {"suspicions": "diagnostics", "contradicted": "status_conflict"}
 REMOVED_KINDS = ("done",)  # Earlier versions marked complete pairs of a campaign; such lines are ignored.
 KINDS: dict[str, type] = {"run": Run, "case": CaseInfo, "skip": Skip, "record": Record}
 

@@ -1,4 +1,4 @@
-"""Possible mistakes in a problem's data, reported as suspicions and never as errors.
+"""Possible mistakes in a problem's data, reported as diagnostics and never as errors.
 
 A solver converges on a problem whose normal points the wrong way as well as on any other. `diagnose` checks relations
 that hold for the data of real bodies:
@@ -13,7 +13,7 @@ For a problem in J and M, (1) is checked if all contacts belong to free rigid bo
 coupled to no others, three of them with equal mass. A row of direction d then has J = (d, r x d) with the arm r.
 
 Every threshold keeps a distance from the values in the built-in suite, the scenes of the gallery, robots and recorded
-problems. If the numbers would be ordinary under another interpretation (M^-1 read as M), the suspicion says so.
+problems. If the numbers would be ordinary under another interpretation (M^-1 read as M), the diagnostic says so.
 """
 
 from __future__ import annotations
@@ -24,22 +24,22 @@ from typing import Any
 import numpy as np
 
 from lavender.lab.diagnostics import blocks, bodies, motion
-from lavender.lab.diagnostics.diagnostic import Suspicion
+from lavender.lab.diagnostics.diagnostic import Diagnostic
 from lavender.problem import Problem, check_problem
 
-__all__ = ["Suspicion", "diagnose"]
+__all__ = ["Diagnostic", "diagnose"]
 
 CHECKS = (*blocks.CHECKS, *motion.CHECKS, *bodies.CHECKS, blocks.conflict)
 
 
 def diagnose(
     problem: Problem, impulse: Any = None, *, velocity: Any = None, gap: Any = None, dt: float | None = None
-) -> tuple[Suspicion, ...]:
+) -> tuple[Diagnostic, ...]:
     """Look for mistakes in a problem's data, or in the impulses that a solver found for it.
 
     Examines signs and order of normals, bodies and their sizes, masses, order of rows, targets, coefficients, keys and
     the guess. Up to 1000 rows, it also searches a proof that the convex relaxation has no solution (Newton's method)
-    and names the conflicting blocks. A suspicion need not be an error: a hook has normals against its arms, a conveyor
+    and names the conflicting blocks. A diagnostic need not be an error: a hook has normals against its arms, a conveyor
     has targets on tangents. An empty result proves nothing.
 
     Parameters
@@ -57,7 +57,7 @@ def diagnose(
 
     Returns
     -------
-    tuple of Suspicion
+    tuple of Diagnostic
         Empty if nothing is suspicious.
 
     Raises
@@ -81,8 +81,8 @@ def diagnose(
         cached = problem.derived.cache.get(__name__)
         if cached is None:
             cached = problem.derived.cache[__name__] = tuple(s for check in CHECKS for s in check(problem))
-        suspicions = [replace(s, data=dict(s.data)) for s in cached]
-        suspicions += motion.check_state(problem, *state)
+        diagnostics = [replace(s, data=dict(s.data)) for s in cached]
+        diagnostics += motion.check_state(problem, *state)
         if solution is not None:
-            suspicions += blocks.check_impulses(problem, solution)
-    return tuple(suspicions)
+            diagnostics += blocks.check_impulses(problem, solution)
+    return tuple(diagnostics)

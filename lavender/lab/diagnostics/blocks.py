@@ -9,7 +9,7 @@ import numpy as np
 from lavender.base.arrays import FloatArray
 from lavender.judge.residuals import residual
 from lavender.lab.diagnostics.bodies import are_grouped
-from lavender.lab.diagnostics.diagnostic import Suspicion, suspect
+from lavender.lab.diagnostics.diagnostic import Diagnostic, make_diagnostic
 from lavender.problem import Problem
 from lavender.solvers.certify import conflict_of
 
@@ -20,18 +20,20 @@ MAX_CONFLICT_ROWS = (
 CONFLICT_TOL = 1e-6  # -, the proof must exclude answers with this relative residual
 
 
-def friction(p: Problem) -> Iterator[Suspicion]:
-    """Yield a suspicion if friction coefficients exceed those of materials."""
+def friction(p: Problem) -> Iterator[Diagnostic]:
+    """Yield a diagnostic if friction coefficients exceed those of materials."""
     c = p.cones
     mu = c.coefficients.max(axis=1)
     blocks = np.flatnonzero(mu > MAX_PLAUSIBLE_FRICTION)
     if len(blocks):
         largest = float(mu[blocks].max())
-        yield suspect(p, "friction", f"mu up to {largest:g}; dry materials have 0.1 to 2", blocks, mu=largest)
+        yield make_diagnostic(
+            p, "friction", f"mu up to {largest:g}; dry materials have 0.1 to 2", blocks, mu=largest
+        )
 
 
-def keys(p: Problem) -> Iterator[Suspicion]:
-    """Yield a suspicion if several blocks have the same key."""
+def keys(p: Problem) -> Iterator[Diagnostic]:
+    """Yield a diagnostic if several blocks have the same key."""
     if p.key is None:
         return
     values, first, count = np.unique(p.key, return_index=True, return_counts=True)
@@ -39,18 +41,20 @@ def keys(p: Problem) -> Iterator[Suspicion]:
         worst = int(np.argmax(count))
         blocks = np.flatnonzero(np.isin(p.key, values[count > 1]))
         reason = f"{len(p.key) - len(values)} of {len(p.key)} keys repeat another block's: {count[worst]} blocks have "
-        yield suspect(p, "duplicate keys", reason + f"the key of block {first[worst]}", blocks)
+        yield make_diagnostic(p, "duplicate keys", reason + f"the key of block {first[worst]}", blocks)
 
 
-def order_of_rows(p: Problem) -> Iterator[Suspicion]:
-    """Yield a suspicion if the rows of contacts do not have the order normal, tangent, tangent."""
+def order_of_rows(p: Problem) -> Iterator[Diagnostic]:
+    """Yield a diagnostic if the rows of contacts do not have the order normal, tangent, tangent."""
     c = p.cones
     full = np.flatnonzero(c.n_tangents == 2)
     if p.rows is not None or len(full) < 2:
         return
     if are_grouped(p):
         reason = "J has the rows of rigid bodies if all normals come first; the order is contact by contact: normal, "
-        yield suspect(p, "all normals first", reason + "tangent, tangent, then the next contact", full)
+        yield make_diagnostic(
+            p, "all normals first", reason + "tangent, tangent, then the next contact", full
+        )
         return
     # Only b is left to check. Along a normal it is an approach velocity: gravity, a bounce, a penetration depth.
     b = p.b[c.ptr[full][:, None] + np.arange(3)]
@@ -65,20 +69,22 @@ def order_of_rows(p: Problem) -> Iterator[Suspicion]:
             and toward[0] < 0.1 * whole[0] + 1e-9 * size
         ):
             reason = f"bodies approach along the {place} row of contacts, not the first; the rows of a contact are "
-            yield suspect(p, "tangents first", reason + "normal, tangent, tangent", full, b=b[0].tolist())
+            yield make_diagnostic(
+                p, "tangents first", reason + "normal, tangent, tangent", full, b=b[0].tolist()
+            )
             return
     flat = b.ravel()
     k = len(full)
     late = np.count_nonzero(np.abs(flat[k:]) > 1e-6 * np.abs(flat).max())
     if np.abs(flat[:k]).sum() > 0.9 * size and (flat[:k] > 0.0).mean() > 0.9 and 2 * late <= k:
         reason = f"the first {k} contact rows approach, the other {2 * k} hardly; the order is contact by contact: "
-        yield suspect(
+        yield make_diagnostic(
             p, "all normals first", reason + "normal, tangent, tangent, then the next contact", full
         )
 
 
-def duplicate_rows(p: Problem) -> Iterator[Suspicion]:
-    """Yield suspicions about contacts with equal rows, or with opposite rows that cannot both hold."""
+def duplicate_rows(p: Problem) -> Iterator[Diagnostic]:
+    """Yield diagnostics about contacts with equal rows, or with opposite rows that cannot both hold."""
     c = p.cones
     contacts = np.flatnonzero(c.is_contact)
     if p.rows is not None or len(contacts) < 2:
@@ -98,16 +104,16 @@ def duplicate_rows(p: Problem) -> Iterator[Suspicion]:
         if other is not None and len(a.data[row]) and p.b[j] + p.b[c.ptr[other]] > 1e-9 * np.abs(p.b).max():
             opposed += [other, i]
     if len(again) > max(2, 0.3 * len(contacts)):  # collision detection occasionally repeats a point
-        yield suspect(
+        yield make_diagnostic(
             p, "duplicate rows", f"{len(again)} contacts have the same rows as an earlier one", again
         )
     if opposed:
         reason = "two normals require the same relative motion in opposite directions"
-        yield suspect(p, "opposed normals", reason, opposed)
+        yield make_diagnostic(p, "opposed normals", reason, opposed)
 
 
-def check_impulses(p: Problem, impulse: FloatArray) -> Iterator[Suspicion]:
-    """Yield a suspicion if impulses (m,) [N s] are implausibly large."""
+def check_impulses(p: Problem, impulse: FloatArray) -> Iterator[Diagnostic]:
+    """Yield a diagnostic if impulses (m,) [N s] are implausibly large."""
     r = residual(p, impulse)
     b = float(np.max(np.abs(p.b), initial=0.0))
     if r.nothing_to_do or b == 0.0:
@@ -117,14 +123,14 @@ def check_impulses(p: Problem, impulse: FloatArray) -> Iterator[Suspicion]:
         reason = (
             f"their error is {r.relative:.2g} times that of the zero impulse: are they forces [N], not [N s]?"
         )
-        yield suspect(p, "impulses", reason, [p.block_of(r.worst_row)], relative=r.relative)
+        yield make_diagnostic(p, "impulses", reason, [p.block_of(r.worst_row)], relative=r.relative)
         return
     row_velocity = np.abs(impulse) * np.where(p.d > 0.0, p.d, 0.0)
     i = int(np.argmax(row_velocity))
     # At the foot of a stack of n bodies, impulses are n times those of one body.
     if row_velocity[i] > 1e4 * b * max(1.0, p.m / 100):
         reason = f"an impulse of {impulse[i]:.3g} N s changes its row by {row_velocity[i]:.3g} m/s, while b is at most "
-        yield suspect(
+        yield make_diagnostic(
             p,
             "impulses",
             reason + f"{b:.3g} m/s: far beyond the momentum that is present",
@@ -133,8 +139,8 @@ def check_impulses(p: Problem, impulse: FloatArray) -> Iterator[Suspicion]:
         )
 
 
-def conflict(p: Problem) -> Iterator[Suspicion]:
-    """Yield a suspicion that names the conflicting blocks if the problem provably has no solution."""
+def conflict(p: Problem) -> Iterator[Diagnostic]:
+    """Yield a diagnostic that names the conflicting blocks if the problem provably has no solution."""
     if not 0 < p.m <= MAX_CONFLICT_ROWS or not np.isfinite(p.b).all():
         return
     proof = conflict_of(p, CONFLICT_TOL)
@@ -142,7 +148,9 @@ def conflict(p: Problem) -> Iterator[Suspicion]:
         law = "Of the convex relaxation, " if p.law == "coulomb" else ""
         reason = law + proof.proof.words + (f"; {proof.advice}" if proof.advice else "")
         soft = [p.row_name(i) for i in proof.soft_rows]
-        yield suspect(p, "conflict", reason, proof.blocks, compliance=proof.compliance, soft_rows=soft)
+        yield make_diagnostic(
+            p, "conflict", reason, proof.blocks, compliance=proof.compliance, soft_rows=soft
+        )
 
 
 CHECKS = (friction, keys, order_of_rows, duplicate_rows)

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from lavender.base.arrays import FloatArray
 from lavender.base.lazy_import import sparse as sp
 from lavender.base.lu import sparse_lu
-from lavender.lab.diagnostics.diagnostic import Suspicion, suspect
+from lavender.lab.diagnostics.diagnostic import Diagnostic, make_diagnostic
 from lavender.problem import Problem
 from lavender.problem.rows import Rows
 
@@ -88,8 +88,8 @@ def are_grouped(p: Problem) -> bool:
     return any(_bodies_of(p, first + order) is not None for order in (each, alike))
 
 
-def geometry(p: Problem) -> Iterator[Suspicion]:
-    """Yield suspicions about normals, arms and centres that contradict each other."""
+def geometry(p: Problem) -> Iterator[Diagnostic]:
+    """Yield diagnostics about normals, arms and centres that contradict each other."""
     r = bodies_of(p)
     if r is None or not r.n_contacts:
         return
@@ -105,23 +105,23 @@ def geometry(p: Problem) -> Iterator[Suspicion]:
             if len(along) > 2 and np.all(sign * other > 1e-3 * size) and not np.all(along > 1e-6 * size):
                 reason = f"the second body lies along the {row} row of the contacts, not along the first; the rows of "
                 reason += "a contact are normal, tangent, tangent"
-                yield suspect(p, "tangents first", reason, blocks)
+                yield make_diagnostic(p, "tangents first", reason, blocks)
                 return
     against = np.flatnonzero(along < -0.1 * size)  # (1)
     if len(against):
         i = int(against[np.argmin(along[against] / size[against])])
         reason = f"{len(against)} of {len(along)} normals point from body b to body a by their arms: body {a[i]} to "
         reason += f"{b[i]}, {along[i]:.3g} m; a normal points from a to b, arms from the centres to the point"
-        yield suspect(p, "normals", reason, blocks[against], along=float(along[i]))
+        yield make_diagnostic(p, "normals", reason, blocks[against], along=float(along[i]))
     if p.rows is None:
         return  # `blocks.duplicate_rows` compares the rows of J
     again, opposed = _find_coincident(r, size)
     if len(again):
         reason = f"{len(again)} contacts are at the position of another contact of the pair"
-        yield suspect(p, "duplicate rows", reason, blocks[again])
+        yield make_diagnostic(p, "duplicate rows", reason, blocks[again])
     if len(opposed):
         reason = "two contacts of a pair at one position have opposite normals"
-        yield suspect(p, "opposed normals", reason, blocks[opposed])
+        yield make_diagnostic(p, "opposed normals", reason, blocks[opposed])
     moving = np.flatnonzero((a >= 0) & (b >= 0))
     off = _centre_deviations(r.contact_body[moving], (r.arm_a - r.arm_b)[moving], r.n_bodies)
     wrong = moving[off > MAX_CENTRE_DISTANCE * size[moving]]
@@ -130,7 +130,7 @@ def geometry(p: Problem) -> Iterator[Suspicion]:
         reason = (
             f"the arms of contact {i} put the centres of bodies {a[i]} and {b[i]} elsewhere than the other "
         )
-        yield suspect(
+        yield make_diagnostic(
             p,
             "bodies",
             reason + "contacts do: does it name a wrong body?",
@@ -189,8 +189,8 @@ def _centre_deviations(pair: Any, between: FloatArray, n: int) -> FloatArray:
     return scale * off
 
 
-def masses(p: Problem) -> Iterator[Suspicion]:
-    """Yield suspicions about masses and inertias that no real body has."""
+def masses(p: Problem) -> Iterator[Diagnostic]:
+    """Yield diagnostics about masses and inertias that no real body has."""
     r = bodies_of(p)
     if r is None or not r.n_bodies:
         return
@@ -198,7 +198,7 @@ def masses(p: Problem) -> Iterator[Suspicion]:
     still = np.flatnonzero((r.inv_mass == 0.0) & turning)
     if len(still):
         reason = f"body {still[0]} has a finite inertia and an infinite mass (inv_mass 0): it turns and never moves"
-        yield suspect(p, "masses", reason, bodies=still.tolist())
+        yield make_diagnostic(p, "masses", reason, bodies=still.tolist())
     eigen = np.linalg.eigvalsh(r.inv_inertia)
     size = _sizes(r)
     known = np.flatnonzero((r.inv_mass > 0.0) & (eigen[:, 0] > 1e-9 * eigen[:, -1]) & (size > 0.0))
@@ -219,7 +219,7 @@ def masses(p: Problem) -> Iterator[Suspicion]:
         reason = (
             f"radii of gyration are {10 ** (0.5 * own):.2g} times the arms of contacts and joints; ordinary "
         )
-        yield suspect(
+        yield make_diagnostic(
             p,
             "masses",
             reason + f"({10 ** (0.5 * share[best]):.2g}) if {best} was given",
@@ -229,7 +229,7 @@ def masses(p: Problem) -> Iterator[Suspicion]:
     density = np.median(1.0 / m / s2**1.5)
     if density < 0.05 and 10.0 < np.median(m / s2**1.5) < 3e4:
         reason = f"bodies are lighter than air ({density:.2g} kg/m^3 by the arms), ordinary with {given[0]}"
-        yield suspect(p, "masses", reason, density=float(density))
+        yield make_diagnostic(p, "masses", reason, density=float(density))
 
 
 def _sizes(r: Any) -> FloatArray:
@@ -246,8 +246,8 @@ def _sizes(r: Any) -> FloatArray:
     return size
 
 
-def inverse(p: Problem) -> Iterator[Suspicion]:
-    """Yield suspicions that M is the inverse of the mass matrix, or J the transpose of the Jacobian."""
+def inverse(p: Problem) -> Iterator[Diagnostic]:
+    """Yield diagnostics that M is the inverse of the mass matrix, or J the transpose of the Jacobian."""
     g = p.generalized
     if g is None or not 3 <= g.nv <= MAX_DENSE_VELOCITIES:
         return
@@ -262,7 +262,7 @@ def inverse(p: Problem) -> Iterator[Suspicion]:
         reason = (
             "contacts' rows are orthogonal unit vectors of a free body in J^T and not in J: is J transposed?"
         )
-        yield suspect(p, "J transposed", reason)
+        yield make_diagnostic(p, "J transposed", reason)
     weight = np.abs(g.jac).max(axis=0).toarray().ravel() if p.m else np.zeros(g.nv)
     seen = weight > 0.0
 
@@ -276,11 +276,11 @@ def inverse(p: Problem) -> Iterator[Suspicion]:
     other = free_bodies(inverse)
     if len(other) and not len(given):
         reason = "three uncoupled velocities have equal masses in the inverse of M but not in M: was M^-1 given for M?"
-        yield suspect(p, "masses", reason, velocities=other)
+        yield make_diagnostic(p, "masses", reason, velocities=other)
     narrow = spread(inverse) if wide > 2.0 else wide
     if len(other) <= len(given) and narrow < 0.25 * wide:
         reason = f"effective masses of the velocities span 10^{wide:.1f} with M and 10^{narrow:.1f} with M^-1"
-        yield suspect(p, "masses", reason + ": was M^-1 given for M?", spread=[wide, narrow])
+        yield make_diagnostic(p, "masses", reason + ": was M^-1 given for M?", spread=[wide, narrow])
 
 
 def free_bodies(mass: FloatArray) -> list[int]:

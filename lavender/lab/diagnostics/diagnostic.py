@@ -11,7 +11,7 @@ from lavender.problem import Problem
 
 
 @dataclass(frozen=True)
-class Suspicion:
+class Diagnostic:
     """One possible mistake in a problem's data; `str()` is one line.
 
     Parameters
@@ -25,7 +25,7 @@ class Suspicion:
     names : tuple of str
         Names of these blocks, at most 100.
     data : dict
-        Numbers that led to the suspicion.
+        Numbers that led to the diagnostic.
     """
 
     kind: str
@@ -39,8 +39,8 @@ class Suspicion:
         return f"{self.kind}: {self.reason}" + (f" ({names})" if names else "")
 
 
-def suspect(problem: Problem, kind: str, reason: str, blocks: Any = (), **data: Any) -> Suspicion:
-    """Build a suspicion of these blocks (empty: of the whole problem), with their names."""
+def make_diagnostic(problem: Problem, kind: str, reason: str, blocks: Any = (), **data: Any) -> Diagnostic:
+    """Build a diagnostic of these blocks (empty: of the whole problem), with their names."""
     at = tuple(int(i) for i in np.unique(np.asarray(blocks, int)))
     names = tuple(problem.row_name(int(problem.cones.ptr[i])).rsplit(", ", 1)[0] for i in at[:100])
-    return Suspicion(kind, reason, at, names, data)
+    return Diagnostic(kind, reason, at, names, data)

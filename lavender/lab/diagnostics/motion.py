@@ -11,7 +11,7 @@ import numpy.typing as npt
 from lavender.base.arrays import FloatArray, as_array, number
 from lavender.base.errors import InputError
 from lavender.lab.diagnostics.bodies import MAX_DENSE_VELOCITIES, bodies_of, free_bodies
-from lavender.lab.diagnostics.diagnostic import Suspicion, suspect
+from lavender.lab.diagnostics.diagnostic import Diagnostic, make_diagnostic
 from lavender.problem import Problem
 from lavender.problem.rows import Rows
 
@@ -42,8 +42,8 @@ def motion_of(p: Problem) -> tuple[FloatArray, FloatArray, FloatArray] | None:
     return u, target, v
 
 
-def targets(p: Problem) -> Iterator[Suspicion]:
-    """Yield suspicions about implausible targets of contacts."""
+def targets(p: Problem) -> Iterator[Diagnostic]:
+    """Yield diagnostics about implausible targets of contacts."""
     c = p.cones
     motion = motion_of(p)
     contact = c.is_contact
@@ -56,7 +56,7 @@ def targets(p: Problem) -> Iterator[Suspicion]:
         reason = (
             f"tangents have targets up to {np.abs(target[tangent]).max():.3g} m/s, and none if the {joints} "
         )
-        yield suspect(p, "targets", reason + "targets of joints come first, in the order of the rows")
+        yield make_diagnostic(p, "targets", reason + "targets of joints come first, in the order of the rows")
         return
     full = np.flatnonzero(c.n_tangents == 2)
     each = np.abs(target[c.ptr[full][:, None] + np.arange(3)])
@@ -66,7 +66,7 @@ def targets(p: Problem) -> Iterator[Suspicion]:
         reason = (
             f"the {'second' if used[1] else 'third'} row of contacts has targets, the first never; the rows "
         )
-        yield suspect(p, "tangents first", reason + "of a contact are normal, tangent, tangent", full)
+        yield make_diagnostic(p, "tangents first", reason + "of a contact are normal, tangent, tangent", full)
         return
     un, tn = u[normal], target[normal]
     r = bodies_of(p)
@@ -77,7 +77,7 @@ def targets(p: Problem) -> Iterator[Suspicion]:
         largest = float(tn[np.argmax(np.abs(tn) * wild)])
         reason = f"{np.count_nonzero(wild)} contacts have targets up to {largest:.3g} m/s, faster than bodies there; "
         reason += "divide a penetration depth or a gap in m by dt once, and count a gap as negative"
-        yield suspect(p, "targets", reason, np.flatnonzero(contact)[wild], target=largest)
+        yield make_diagnostic(p, "targets", reason, np.flatnonzero(contact)[wild], target=largest)
         return
     if r is None or speed is None:
         return
@@ -88,11 +88,11 @@ def targets(p: Problem) -> Iterator[Suspicion]:
                 f"targets let bodies at rest approach at every contact ({tn.min():.3g} m/s), as over a gap; "
             )
             reason += "the target of a depth that is positive inside is +depth/dt"
-            yield suspect(p, "targets", reason, np.flatnonzero(contact), target=float(tn.min()))
+            yield make_diagnostic(p, "targets", reason, np.flatnonzero(contact), target=float(tn.min()))
 
 
-def speeds(p: Problem) -> Iterator[Suspicion]:
-    """Yield a suspicion if v* looks like an acceleration."""
+def speeds(p: Problem) -> Iterator[Diagnostic]:
+    """Yield a diagnostic if v* looks like an acceleration."""
     motion, r = motion_of(p), bodies_of(p)
     contact = np.flatnonzero(p.cones.is_contact)
     if motion is None or not len(contact):
@@ -101,7 +101,7 @@ def speeds(p: Problem) -> Iterator[Suspicion]:
         v = np.linalg.norm(r.v_free[r.inv_mass > 0.0, :3], axis=1)
         if np.median(np.abs(v - G)) <= 0.01 * G:
             reason = f"v* of bodies is {np.median(v):.3g} m/s, the number of g in m/s^2: is it v + dt a?"
-            yield suspect(p, "v_free", reason, speed=float(np.median(v)))
+            yield make_diagnostic(p, "v_free", reason, speed=float(np.median(v)))
             return
     toward = -motion[0][p.cones.normal_rows]
     slowest, fastest = SUSPICIOUS_APPROACH
@@ -110,11 +110,11 @@ def speeds(p: Problem) -> Iterator[Suspicion]:
         reason = (
             f"bodies approach each other with {toward[i]:.3g} m/s; v* is v + dt a: do accelerations lack dt?"
         )
-        yield suspect(p, "v_free", reason, contact[toward > slowest], speed=float(toward[i]))
+        yield make_diagnostic(p, "v_free", reason, contact[toward > slowest], speed=float(toward[i]))
 
 
-def flipped_normals(p: Problem) -> Iterator[Suspicion]:
-    """Yield a suspicion if static bodies push falling bodies further down.
+def flipped_normals(p: Problem) -> Iterator[Diagnostic]:
+    """Yield a diagnostic if static bodies push falling bodies further down.
 
     Checked if most bodies have the same v*, the velocity change of gravity in one step: static bodies then support them
     from below.
@@ -131,7 +131,7 @@ def flipped_normals(p: Problem) -> Iterator[Suspicion]:
     toward = np.where(r.contact_body[still, 1:] < 0, -1.0, 1.0) * r.normal[still] @ fall[:, None] / size
     if toward.mean() > 0.3 and (toward > -0.1).mean() > 0.9:
         reason = "static bodies push others in the direction of their fall: are normals flipped, or bodies swapped?"
-        yield suspect(
+        yield make_diagnostic(
             p, "normals", reason, np.flatnonzero(p.cones.is_contact)[still], along=float(toward.mean())
         )
 
@@ -164,8 +164,8 @@ def state_before(
     return velocity, gap, 0.0 if dt is None else number("dt [s]", dt, above=0.0)
 
 
-def check_state(p: Problem, velocity: Any, gap: Any, dt: float) -> Iterator[Suspicion]:
-    """Yield suspicions if v* is not v + dt a, or targets of normals are not -gap/dt (or a share of it on overlap)."""
+def check_state(p: Problem, velocity: Any, gap: Any, dt: float) -> Iterator[Diagnostic]:
+    """Yield diagnostics if v* is not v + dt a, or targets of normals are not -gap/dt (or a share of it on overlap)."""
     motion = None if velocity is None and gap is None else motion_of(p)
     contact = np.flatnonzero(p.cones.is_contact)
     if motion is None or not len(contact):
@@ -186,14 +186,14 @@ def check_state(p: Problem, velocity: Any, gap: Any, dt: float) -> Iterator[Susp
         fall = fall[fall > 0.01 * fall.max()]  # ignore bodies on which no force acts
         typical = float(np.median(fall)) if len(fall) else 0.0
         if not step.any():
-            yield suspect(
+            yield make_diagnostic(
                 p,
                 "v_free",
                 "v* equals v: are the accelerations of the step, dt a, missing? (or no force acts)",
             )
         elif typical > 0.5 * G:
             reason = f"v* differs from v by {typical:.3g} m/s in the median: do accelerations lack dt?"
-            yield suspect(p, "v_free", reason, change=typical)
+            yield make_diagnostic(p, "v_free", reason, change=typical)
     if gap is None:
         return
     target = motion[1][normal]
@@ -204,12 +204,12 @@ def check_state(p: Problem, velocity: Any, gap: Any, dt: float) -> Iterator[Susp
         return
     if np.mean(target[comparable] * gap[comparable] > 0.0) > 0.7:
         reason = "targets have the sign of the gaps: distant bodies may approach (-gap/dt), overlapping ones separate"
-        yield suspect(p, "targets", reason, contact[comparable])
+        yield make_diagnostic(p, "targets", reason, contact[comparable])
     share = float(np.median(np.abs(target[comparable] / gap[comparable]))) * dt
     if not 1.5 * dt <= share <= 0.1 / dt:
         reason = f"targets are {share:.2g} times gap/dt in the median; 1 is expected: "
         reason += "are they divided by dt twice?" if share > 1.0 else "are they multiplied by dt once more?"
-        yield suspect(p, "targets", reason, contact[comparable], share=share)
+        yield make_diagnostic(p, "targets", reason, contact[comparable], share=share)
 
 
 def _find_bounces(target: FloatArray, before: FloatArray) -> npt.NDArray[np.bool_]:

@@ -21,7 +21,7 @@ from lavender.lab.report.text import (
     format_left_out,
     format_residual,
     list_left_out,
-    list_suspicions,
+    list_diagnostics,
 )
 from lavender.lab.report.verdict import Verdict
 
@@ -67,7 +67,7 @@ def render_page(report: Report, figures: Figures, saved: bool = True) -> str:
     return create_environment().get_template("index.html.j2").render(
         report=report, records=records, verdict=report.verdict, levels=report.levels, saved=saved,
         level=report.levels[len(report.levels) // 2], links=_list_links(report.lines), left_out=list_left_out(records),
-        suspicions=list_suspicions(records), **_render_drawings(records, figures, report.verdict),
+        diagnostics=list_diagnostics(records), **_render_drawings(records, figures, report.verdict),
         **_describe_cases(report),
     )  # fmt: skip
 

@@ -13,7 +13,7 @@ from lavender.lab.report.findings import Report
 from lavender.lab.report.motion_tables import list_idle_cases
 from lavender.lab.report.table import COLOURS, Cell, Table
 from lavender.lab.report.table_specs import NOT_COMPARED, build_short_table, list_sections
-from lavender.lab.report.text import format_count, format_residual, list_left_out, list_suspicions
+from lavender.lab.report.text import format_count, format_residual, list_left_out, list_diagnostics
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -125,7 +125,7 @@ def _list_notes(report: Report, most: int) -> Iterator[tuple[str, str]]:
     ]
     kinds = {
         "false claim": ("red", false_claims),
-        "suspicious": ("yellow", [f"{case}: {reason}" for case, reason in list_suspicions(records)]),
+        "suspicious": ("yellow", [f"{case}: {reason}" for case, reason in list_diagnostics(records)]),
         "same answer without an iteration": (
             "yellow",
             [f"{d.case}: {', '.join(d.same)}" for d in statistics.difficulties(records) if d.same],

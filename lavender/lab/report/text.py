@@ -38,13 +38,13 @@ def format_count(n: int, what: str, plural: str = "") -> str:
     return f"{n} {what if n == 1 else plural or what + 's'}"
 
 
-def list_suspicions(records: Records) -> list[tuple[str, str]]:
+def list_diagnostics(records: Records) -> list[tuple[str, str]]:
     """Return (case, possible mistake in its data); a sequence has its first step and the number of further steps."""
     seen: dict[tuple[str, str], list[tuple[str, str]]] = {}
     for name, info in records.cases.items():
-        for suspicion in info.suspicions:
-            kind = suspicion.partition(":")[0]
-            seen.setdefault((info.sequence or name, kind), []).append((name, suspicion))
+        for diagnostic in info.diagnostics:
+            kind = diagnostic.partition(":")[0]
+            seen.setdefault((info.sequence or name, kind), []).append((name, diagnostic))
     return [
         (
             f"{some[0][0]} and {format_count(len(some) - 1, 'more step')}" if len(some) > 1 else some[0][0],

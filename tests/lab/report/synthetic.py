@@ -91,7 +91,7 @@ def example(folder):
         "pile": {
             "source": str(folder / "pile.npz"),
             "stored": 1e-4,
-            "suspicions": ("duplicate rows: two of <3>",),
+            "diagnostics": ("duplicate rows: two of <3>",),
         },
         EVIL: {"source": "chains/one.npz", "guess": "answer", "condition": 41.0, "proof": "within 1e-12"},
         "idle": {"nothing_to_do": True},

@@ -186,7 +186,7 @@ def test_in_short_the_terminal_shows_25_lines_within_its_width(cases, width):
             made.append(record(name, f"solver_{j}", 1e-3 * (1 + j), 1e-7, **more))
     found = records_of(*made, structure={name: (f"structure {i}",) for i, name in enumerate(names)})
     for name in names:
-        found.add(dataclasses.replace(found.cases[name], suspicions=("something looks wrong",)))
+        found.add(dataclasses.replace(found.cases[name], diagnostics=("something looks wrong",)))
         found.add(bench.Skip("run", name + "b", "", "did not load: " + "x" * 100))
         found.add(bench.Skip("run", name, "newton", "takes laws linear"))
     lines = shown(Report(found), width).splitlines()
