@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING
 
 import lavender.base.check_build
 from lavender.base.lazy_import import import_locked
+from lavender.base.renamed import build_attribute_error
 from lavender._version import __version__
 from lavender.problem.cones import (
     CONTACT,
@@ -46,7 +47,7 @@ from lavender.problem import Problem, QPSolution
 from lavender.solvers.registry import SolverSpec, available, get, known, register
 from lavender.judge.residuals import Residual, residual
 from lavender.problem.rows import Rows
-from lavender.judge.solution import Claim, Solution, Status, Turn
+from lavender.judge.solution import Claim, Solution, Status, SolverStage
 from lavender.solving.solve import prepare, solve
 
 if TYPE_CHECKING:
@@ -144,9 +145,9 @@ __all__ = [
     "Solutions",
     "SolveFailed",
     "SolverSpec",
+    "SolverStage",
     "SolverUnavailable",
     "Status",
-    "Turn",
     "UnknownName",
     "__version__",
     "available",
@@ -188,7 +189,7 @@ if not TYPE_CHECKING:  # Type checkers report unknown names.
         elif name in _MODULE_OF_NAME:
             value = getattr(import_locked(_MODULE_OF_NAME[name]), name)
         else:
-            raise AttributeError(f"module 'lavender' has no attribute {name!r}")
+            raise build_attribute_error("lavender", "module 'lavender'", name)
         globals()[name] = value
         return value
 

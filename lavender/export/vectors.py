@@ -88,11 +88,11 @@ def steps_of(found: lv.Solution, step: Step) -> list[Step]:
     if step.solver != "auto":
         return [step]
     done: dict[str, int] = {}
-    for turn in found.turns:
-        name, _, _ = turn.solver.partition(" on ")
+    for stage in found.stages:
+        name, _, _ = stage.solver.partition(" on ")
         solver = CANDIDATES.get(name, (name, {}))[0]
         pivots = solver in ("direct", "lemke")  # which end by themselves
-        counted = 0 if pivots else max((turn.work.get(kind, 0) for kind in COUNTED), default=0)
+        counted = 0 if pivots else max((stage.work.get(kind, 0) for kind in COUNTED), default=0)
         done[name] = done.get(name, 0) + (2 * counted or registry.specs()[solver].max_iter)
     steps = []
     for name, count in (done or {"anderson": 1}).items():

@@ -134,7 +134,7 @@ class Foreign(Solver):
             certificate=certificate,
             message=_one_line(claim.message),
             form=_one_line(claim.form),
-            turns=(),
+            stages=(),
         )
 
 

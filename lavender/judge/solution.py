@@ -13,6 +13,7 @@ import numpy as np
 from lavender.base.arrays import FloatArray, one_of, read_only, table_of
 from lavender.base.errors import SolveFailed
 from lavender.base.lazy_import import lazy_module
+from lavender.base.renamed import build_attribute_error
 from lavender.judge.residuals import Residual, residual
 from lavender.problem import Problem
 
@@ -54,7 +55,7 @@ CLAIM_CHECKS = CONFIRMED, NOT_PROVEN, CONTRADICTED = "confirmed", "not proven", 
 
 
 @dataclass(frozen=True)
-class Turn:
+class SolverStage:
     """One stage of `auto`: the solver that ran, its work and the residual before and after.
 
     Parameters
@@ -92,7 +93,7 @@ class Claim:
     certificate : (m,) array, optional
         With INFEASIBLE: proof that no solution exists. With STALLED: a direction that bounds the impulse of every
         solution.
-    turns : tuple of Turn
+    stages : tuple of SolverStage
         Stages of a solver that calls others.
     """
 
@@ -103,7 +104,7 @@ class Claim:
     form: str = ""
     dual: Any = None
     certificate: FloatArray | None = None
-    turns: tuple[Turn, ...] = ()
+    stages: tuple[SolverStage, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,7 +214,7 @@ class Solution:
         Reason if the claim is contradicted, else empty.
     sweeps_per_decade : float
         Sweeps in which the residual fell tenfold at the last checks; NaN if it did not fall or was not checked.
-    turns : tuple of Turn
+    stages : tuple of SolverStage
         Stages of `auto` in the order in which they ran; empty for other solvers.
 
     Examples
@@ -244,7 +245,7 @@ class Solution:
     claim_check: str
     status_conflict: str
     sweeps_per_decade: float
-    turns: tuple[Turn, ...]
+    stages: tuple[SolverStage, ...]
 
     @classmethod
     def of(cls, values: dict[str, Any]) -> Solution:
@@ -280,7 +281,7 @@ class Solution:
             kept.pop("_rest", None)
         if name in kept:
             return kept[name]
-        raise AttributeError(f"{type(self).__name__!r} has no attribute {name!r}")
+        raise build_attribute_error("Solution", repr(type(self).__name__), name)
 
     def __reduce__(self) -> tuple[Any, ...]:
         # A read-only view of a dict cannot be pickled.

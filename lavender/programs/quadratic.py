@@ -175,10 +175,10 @@ def _solve_definite(problem: Problem, tol: float, end: float, impulse: Any) -> Q
     ran = [answer.solution, other.solution]
     if other.error < answer.error or _is_refuted(other):
         answer = other
-    turns = tuple(turn for solution in ran for turn in solution.turns)
+    stages = tuple(stage for solution in ran for stage in solution.stages)
     work = MappingProxyType(summed(solution.work for solution in ran))
-    message = f"{told(turns)}; {answer.solution.message}".rstrip("; ")
-    answer.solution.__dict__.update(turns=turns, work=work, message=message)
+    message = f"{told(stages)}; {answer.solution.message}".rstrip("; ")
+    answer.solution.__dict__.update(stages=stages, work=work, message=message)
     return answer
 
 
@@ -202,9 +202,9 @@ def _solve_by_backend(problem: Problem, tol: float, end: float, impulse: Any) ->
         solution.status if certificate is not None else Status.STALLED,
         solution.iterations,
         solution.work,
-        told(solution.turns),
+        told(solution.stages),
         certificate=None if certificate is None else qp.of_rows(certificate),
-        turns=solution.turns,
+        stages=solution.stages,
     )
     impulse = qp.of_rows(answer.impulse).copy()
     judged = finish(problem, get("auto"), {}, impulse, claim, tol, solution.setup_time, 0.0, None)

@@ -20,9 +20,9 @@
     a certificate               of J and M with a rigid row: does the least violation prove that none solves it? After
                                 SURE times that cost, or MOST where it costs more; of others under Coulomb's law, if
                                 more than NEAR is left: does a linear program?
-    all in turn                 with doubled work, until nobody gains in two turns: `newton` (of J and M over rows, too,
-                                at up to MOST times the cost or LITTLE, which comes sooner if the compiled call failed,
-                                or before the end), `admm` (of J and M once a factor of A costs no more), `nncg`, and
+    alternately                 with doubled work, until no solver gains in two stages: `newton` (of J and M also over
+                                rows, at up to MOST times the cost or LITTLE; sooner if the compiled call failed, or
+                                before the end), `admm` (of J and M once a factor of A costs no more), `nncg`, and
                                 sweeps as long as these gain; all together LAST times Newton's cost, no longer than LONG
     at last                     a certificate of others, by a linear program, if none was asked (`certify.py`)
 
@@ -30,7 +30,7 @@ Each goes on where it stopped, and the result is the best impulse of all. Costs 
 problem is solved in the same way on every machine. Under a time limit the tree is the same, but whoever factors begins
 only if a result would be there in time, all are swept first where SURE times its cost do not fit, sweeps before it
 have at most half of what is left, and sweeps have the rest if it had no time.
-`Solution.turns` lists what ran, `lavender.explain` what would run.
+`Solution.stages` lists what ran, `lavender.explain` what would run.
 """
 
 from __future__ import annotations
@@ -281,7 +281,7 @@ class Tree:
 
 @dataclass(frozen=True)
 class Auto(Solver):
-    """Chooses and combines other solvers; the solution's message and `turns` name them."""
+    """Chooses and combines other solvers; the solution's message and `stages` name them."""
 
     def prepare(self, problem: Problem) -> Problem:
         """Nothing."""

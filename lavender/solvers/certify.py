@@ -182,7 +182,7 @@ def least_violation(log: SolveLog) -> None:
 def certify(log: SolveLog) -> None:
     """Look for a certificate that a problem has no solution; under Coulomb's law, else of its relaxation."""
     problem = log.problem
-    if problem.generalized is None and LINEAR not in [turn.solver for turn in log.turns]:
+    if problem.generalized is None and LINEAR not in [stage.solver for stage in log.stages]:
         linear_programs(log)
     if (
         log.certificate is None

@@ -292,7 +292,7 @@ class _Run:
             self.state.is_running = True
         while True:
             most = 0 if late else min(BATCH, self.max_iter - self.iterations)
-            code, self.late = pivot.turn(self.deadline, most)
+            code, self.late = pivot.advance(self.deadline, most)
             self.iterations = rows.n_rounds - before
             if code == SMALL and rows.passes == 0:
                 self.note_singular(pivot, self.patient or pivot.symmetric)

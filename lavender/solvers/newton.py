@@ -200,7 +200,7 @@ class Newton(Solver):
         return self._run_system(problem, system, impulse, max_iter, tol, time_limit)
 
     @np.errstate(all="ignore")  # what overflows is judged
-    def turn(
+    def advance(
         self,
         state: NewtonState,
         impulse: FloatArray,
@@ -275,7 +275,7 @@ class Newton(Solver):
             if claim is not None and general.confirmed(problem, impulse, tol):
                 return claim
         max_iter -= worked
-        status, certificate = _turns(problem, system, impulse, max_iter, tol, time_limit, again, more)
+        status, certificate = _stages(problem, system, impulse, max_iter, tol, time_limit, again, more)
         solve = system.solve
         factorisations = worked + solve.done - before
         message = ", ".join(
@@ -294,7 +294,7 @@ def _rows_of_j(problem: Problem) -> float:
     return newton_cost(rows, problem.law)
 
 
-def _turns(
+def _stages(
     problem: Problem,
     system: System,
     impulse: FloatArray,

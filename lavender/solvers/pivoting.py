@@ -108,14 +108,20 @@ class PivotState:
         """Whether the sweeps before the first factor would end after the deadline."""
         return deadline.passed(self.sweeps * SWEEP * self.problem.csr_data.work)
 
-    def turn(self, deadline: Deadline, most: int) -> tuple[int, bool]:
-        """`Pivoting.turn` of those of `most` rounds that are expected to end before the deadline; whether none is."""
+    def advance(self, deadline: Deadline, most: int) -> tuple[int, bool]:
+        """Run the rounds, at most `most`, that are expected to end before the deadline.
+
+        Returns
+        -------
+        (int, bool)
+            Code of `Pivoting.advance`, and whether no round fits.
+        """
         left, before, watch = deadline.left(), self.rows.n_rounds, Stopwatch()
         if left is None or self.outside is not None:  # which asks the clock itself
-            return self.rows.turn(most), most == 0
+            return self.rows.advance(most), most == 0
         n = int(left / self.seconds)
         n = min(most, max(1, n // 2) if n else 0)  # then it is asked again
-        code = self.rows.turn(n)
+        code = self.rows.advance(n)
         if self.rows.n_rounds > before:
             self.seconds = watch.seconds / (self.rows.n_rounds - before)
         return code, n == 0

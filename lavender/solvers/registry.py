@@ -114,7 +114,7 @@ class Solver:
     def until(self, state: Any, deadline: Deadline) -> None:
         """Set the deadline of the next `run` of a resumable solver: it starts no long step that would end later."""
 
-    def turn(
+    def advance(
         self, state: Any, impulse: FloatArray, n: int, tol: float, time_limit: float | None, left: int | None
     ) -> Claim:
         """Run about `n` iterations for `auto`, at most `left`, continuing where the last call ended."""

@@ -18,7 +18,7 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray
 from lavender.judge.residuals import judged, reference
-from lavender.judge.solution import Claim, Status, Turn, counted, summed
+from lavender.judge.solution import Claim, SolverStage, Status, counted, summed
 from lavender.problem import Problem
 from lavender.solvers.costs import RATES, SOFT, STEPS, SWEEPS, factorisations, sweep_cost
 from lavender.solvers.islands import islands
@@ -232,8 +232,10 @@ class SmallCall:
             elif shifts and problem.law != "linear":
                 note = "A is singular on the free rows: shifted and refined"
             return Claim(status, done, ran[0][1], note, form="band" if symmetric else "LU")
-        turns = _turns(problem, ran, start, after)
-        return Claim(status, done, summed(turn.work for turn in turns), told(turns) or nothing, turns=turns)
+        stages = _stages(problem, ran, start, after)
+        return Claim(
+            status, done, summed(stage.work for stage in stages), told(stages) or nothing, stages=stages
+        )
 
 
 Ran = list[tuple[str, dict[str, int]]]  # who, and what it did
@@ -263,21 +265,21 @@ def _in_turns(counts: tuple[int, ...]) -> tuple[int, Ran]:
     return done, ran
 
 
-def _turns(problem: Problem, ran: Ran, start: FloatArray | None, after: float) -> tuple[Turn, ...]:
+def _stages(problem: Problem, ran: Ran, start: FloatArray | None, after: float) -> tuple[SolverStage, ...]:
     """Turns of one compiled call; nothing was measured between two."""
     if start is None or np.array_equal(start, problem._start):
         before = float(problem.metric.start_relative)
     else:
         before = float(judged(problem, start.copy()).relative)
     at = [before, *(len(ran) - 1) * [nan], after]
-    return tuple(Turn(*of, *at[i : i + 2]) for i, of in enumerate(ran))
+    return tuple(SolverStage(*of, *at[i : i + 2]) for i, of in enumerate(ran))
 
 
-def told(turns: Sequence[Turn]) -> str:
+def told(stages: Sequence[SolverStage]) -> str:
     """What ran, in words: turns of one solver in a row are one."""
     return " -> ".join(
-        said(name, summed(turn.work for turn in of))
-        for name, of in groupby(turns, key=lambda turn: turn.solver)
+        said(name, summed(stage.work for stage in of))
+        for name, of in groupby(stages, key=lambda stage: stage.solver)
     )
 
 

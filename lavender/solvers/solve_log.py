@@ -10,7 +10,7 @@ from lavender.base.arrays import FloatArray
 from lavender.base.deadline import NEVER, Deadline
 from lavender.judge.certificates import check_certificate
 from lavender.judge.residuals import FLOOR_MOST, best_of_islands, judged, known, remember, remembered
-from lavender.judge.solution import Claim, Status, Turn, summed
+from lavender.judge.solution import Claim, SolverStage, Status, summed
 from lavender.problem import Problem
 from lavender.solvers.small import NO_TIME, NOTHING, told
 
@@ -30,7 +30,7 @@ class SolveLog:
         self.best, self.impulse = np.inf, problem._start  # lowest relative residual, (m,) N s
         self.result: FloatArray | None = None  # (m,) N s, while nothing met tol: the best of each island
         self.given: FloatArray | None = None  # (m,) N s, a start that is worse than doing nothing
-        self.turns: list[Turn] = []
+        self.stages: list[SolverStage] = []
         self.work: dict[str, int] = {}
         self.iterations = 0
         self.certificate: FloatArray | None = None  # (m,)
@@ -55,7 +55,7 @@ class SolveLog:
         """Record a turn that has ended; the residual was `before`."""
         self.iterations += claim.iterations
         self.work = summed((self.work, claim.work))
-        self.turns.append(Turn(name, dict(claim.work), before, self.best))
+        self.stages.append(SolverStage(name, dict(claim.work), before, self.best))
         if claim.certificate is not None:
             if check_certificate(self.problem, claim.certificate, self.tol, self.deadline) is None:
                 self.certificate = claim.certificate
@@ -83,7 +83,7 @@ class SolveLog:
     @property
     def vain(self) -> bool:
         """The last turn gained next to nothing."""
-        return bool(self.turns) and self.best > GAIN * self.turns[-1].before
+        return bool(self.stages) and self.best > GAIN * self.stages[-1].before
 
     def done(self) -> bool:
         """Solved, proved infeasible, or out of time, iterations or progress."""
@@ -113,14 +113,14 @@ class SolveLog:
         """The claim of the whole solve."""
         status = self.status
         nothing = NOTHING.get(status, NO_TIME if self.budget > 0 else "no iterations were asked for")
-        message = told(self.turns) or ("" if self.failure else nothing)
+        message = told(self.stages) or ("" if self.failure else nothing)
         return Claim(
             Status.INTERRUPTED if self.interrupted else status,
             self.iterations,
             self.work,
             "; ".join(filter(None, (message, self.failure, *self._fights()))),
             certificate=self.direction if self.certificate is None else self.certificate,
-            turns=tuple(self.turns),
+            stages=tuple(self.stages),
         )
 
     def _fights(self) -> list[str]:

@@ -79,7 +79,7 @@ class Step:
         """At most n iterations, offered to the log."""
         log, before = self.log, self.log.best
         try:
-            claim = self.turn(int(min(max(n, 1.0), log.left, MOST)))
+            claim = self.advance(int(min(max(n, 1.0), log.left, MOST)))
         except BREAKDOWN as error:
             log.failure, self.over = last_words(error), True
             claim = Claim(Status.NUMERICAL_ERROR, 0)
@@ -87,7 +87,7 @@ class Step:
         self.late = claim.status is Status.TIME_LIMIT
         log.note(self.name, claim, before)
 
-    def turn(self, n: int) -> Claim:
+    def advance(self, n: int) -> Claim:
         """Run and offer what came of it."""
         log = self.log
         if self.state is None:
@@ -114,13 +114,13 @@ class Newton(Step):
             self.anew, self.over, self.state.begun = True, False, False
             super().run(n - (log.iterations - done))
 
-    def turn(self, n: int) -> Claim:
+    def advance(self, n: int) -> Claim:
         log = self.log
         if not self.state.begun:
             far = log.best > NEAR
             self.impulse = log.problem.start() if self.anew or far else log.impulse.copy()
             self.anew = not (self.impulse - log.problem.start()).any()
-        claim = self.solver.turn(self.state, self.impulse, n, log.tol, log.time_left, log.left)
+        claim = self.solver.advance(self.state, self.impulse, n, log.tol, log.time_left, log.left)
         self.lost = claim.status is Status.STALLED
         self.offer()
         return claim
@@ -131,7 +131,7 @@ class Iterations(Step):
 
     share = 1.0  # of the time left, that a turn may take
 
-    def turn(self, n: int) -> Claim:
+    def advance(self, n: int) -> Claim:
         log, left = self.log, self.log.deadline.left()
         if self.state is None:
             self.begin()

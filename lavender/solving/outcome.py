@@ -151,7 +151,7 @@ def finish(
             "claim_check": CONTRADICTED if status_conflict else NOT_PROVEN if unproven else CONFIRMED,
             "status_conflict": status_conflict,
             "sweeps_per_decade": sweeps_per_decade,
-            "turns": claim.turns,
+            "stages": claim.stages,
         }
     )
 

@@ -53,7 +53,7 @@ from lavender_ext.judge.measure import all_finite, by_island
 from lavender_ext.judge.watch import Watch
 
 LATER = ("iterations", "work", "solver", "message", "history", "dual", "certificate", "impulse_bound",
-         "claim_check", "status_conflict", "sweeps_per_decade", "turns")  # fmt: skip
+         "claim_check", "status_conflict", "sweeps_per_decade", "stages")  # fmt: skip
 COUNTED = 0.9e9  # ns that a small call may be counted for, for each second of its limit
 SET_UP_LATE = "what has to be set up first takes longer than the time limit"
 NO_TURN = "the time limit was over before its turn: the start"
@@ -602,7 +602,7 @@ def rest_of(
         "claim_check": CONFIRMED,
         "status_conflict": "",
         "sweeps_per_decade": math.nan,
-        "turns": claim.turns,
+        "stages": claim.stages,
     }
 
 

@@ -186,7 +186,7 @@ cdef public int32_t lav_newton_substep(const int32_t* size, double* real, int32_
 
 
 cdef class Substep:
-    """The same for Python, beside an engine's three buffers; `turns`: after the first phase, noting each score."""
+    """The same for Python, beside an engine's three buffers; `stages`: after the first phase, noting each score."""
     cdef const int32_t[::1] size
     cdef double[::1] real
     cdef int32_t[::1] index

@@ -485,7 +485,7 @@ cdef class Pivoting:
         self.t.least, self.t.sweeps = least, sweeps
         memcpy(self.t.start, &start[0], self.t.s.n * sizeof(double))
 
-    def turn(self, int n):
+    def advance(self, int n):
         """At most n rounds, refined and judged, as `direct_turn` says."""
         cdef int32_t code
         with nogil:

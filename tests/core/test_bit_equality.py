@@ -163,10 +163,10 @@ def test_every_way_to_solve_has_the_bits_of_a_fresh_solve(name, way):
 
 
 def run_solver(problem, sizes, name, tol=1e-9, budget=1000, **options):
-    """`run` of a solver, `turn` of newton, until another claim than MAX_ITERATIONS or the end of the budget."""
+    """`run` of a solver, `advance` of newton, until another claim than MAX_ITERATIONS or the end of the budget."""
     solver, impulse, done, status = registry.get(name).load()(**options), problem.start(), 0, None
     state = solver.prepare(problem)
-    call = solver.turn if name == "newton" else solver.run
+    call = solver.advance if name == "newton" else solver.run
     for size in itertools.chain(sizes, itertools.repeat(sizes[-1])):
         claim = call(state, impulse, min(size, budget - done), tol, None)
         done, status = done + claim.iterations, claim.status

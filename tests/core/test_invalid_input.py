@@ -246,7 +246,7 @@ CALLS = {
 #: Public calls that are not in the table, and why.
 NOT_CALLED = {
     **dict.fromkeys(
-        ("Claim", "Derivative", "Plan", "QPSolution", "Residual", "Residuals", "Solution", "Solutions", "Turn"),
+        ("Claim", "Derivative", "Plan", "QPSolution", "Residual", "Residuals", "Solution", "Solutions", "SolverStage"),
         "a result: the package makes it",
     ),
     **dict.fromkeys(

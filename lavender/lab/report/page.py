@@ -20,8 +20,8 @@ from lavender.lab.report.text import (
     format_count,
     format_left_out,
     format_residual,
-    list_left_out,
     list_diagnostics,
+    list_left_out,
 )
 from lavender.lab.report.verdict import Verdict
 

@@ -13,7 +13,7 @@ from lavender.lab.report.findings import Report
 from lavender.lab.report.motion_tables import list_idle_cases
 from lavender.lab.report.table import COLOURS, Cell, Table
 from lavender.lab.report.table_specs import NOT_COMPARED, build_short_table, list_sections
-from lavender.lab.report.text import format_count, format_residual, list_left_out, list_diagnostics
+from lavender.lab.report.text import format_count, format_residual, list_diagnostics, list_left_out
 
 if TYPE_CHECKING:
     from rich.console import Console

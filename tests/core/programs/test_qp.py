@@ -467,7 +467,7 @@ def test_a_singular_hessian_is_kept_and_auto_names_the_backend_that_ran():
     np.testing.assert_array_equal(problem.qp.hessian.toarray(), P)
     first = next(name for name in ("piqp", "clarabel", "osqp") if name in BACKENDS)
     for solution in (lv.solve(problem, tol=1e-9), lv.solve_qp(problem).solution, lv.prepare(problem).solve()):
-        assert solution.turns[0].solver == first and first in solution.message
+        assert solution.stages[0].solver == first and first in solution.message
         assert (
             solution.success and solution.residual.relative == lv.residual(problem, solution.impulse).relative
         )

@@ -461,9 +461,9 @@ def test_auto_goes_on_with_the_others_where_one_breaks_down(limit, error, monkey
     kinds = {steps.Newton, steps.Step, steps.Iterations, steps.Sweeps}
     for broken in [{kind} for kind in kinds] + [kinds]:
         for kind in broken:
-            monkeypatch.setattr(kind, "turn", breaks)
+            monkeypatch.setattr(kind, "advance", breaks)
         found = lv.solve(problem, tol=1e-13, time_limit=limit)  # the compiled call leaves that to the others
-        ran = {turn.solver for turn in found.turns if turn.work}
+        ran = {stage.solver for stage in found.stages if stage.work}
         if len(broken) == 1:
             assert found.residual.relative <= 1e-6
             assert ran

@@ -91,7 +91,7 @@ def test_the_compiled_factorisation_solves_any_free_set(seed, m, band, bound):
     for p, width in ((np.arange(m, dtype=np.int32), max(problem.bandwidth)), (order, m - 1)):
         rows = direct.Pivoting(problem.csr_data, width, p, 1e-13)
         rows.begin(np.zeros(m), np.inf, 0)  # whatever is found is good: nothing is refined
-        assert rows.turn(1) == principal.SOLVED
+        assert rows.advance(1) == principal.SOLVED
         expected = np.zeros(m)
         expected[free] = np.linalg.solve(a[np.ix_(free, free)], problem.b[free])
         # Condition of 1 + L L^T with |L| of a few: far below 1e4.
@@ -259,7 +259,7 @@ def test_a_shifted_matrix_that_is_singular_is_found_to_be(m):
     a[2:4, 2:4] = 1.0  # and without one
     state = PivotState(lv.Problem.lcp(a, np.ones(m), -np.inf, 1e9))
     state.rows.begin(np.zeros(m), 1e-13, 0)
-    assert [state.rows.turn(4) for _ in range(2)] == [SMALL, SMALL]
+    assert [state.rows.advance(4) for _ in range(2)] == [SMALL, SMALL]
     assert (state.rows.n_rounds, state.rows.passes) == (2, 1)
 
 
@@ -272,9 +272,9 @@ def test_rounds_on_a_compiled_band_end_before_the_deadline(share, clock, monkeyp
     each = 6e-4  # s a round
 
     class Played(direct.Pivoting):
-        def turn(self, n):
+        def advance(self, n):
             before = self.n_rounds
-            code = super().turn(n)
+            code = super().advance(n)
             clock.now += each * (self.n_rounds - before)
             return code
 

@@ -47,7 +47,7 @@ def assert_same(many, i, single):
     assert many.status[i] is own.status is single.status
     assert many.iterations[i] == own.iterations == single.iterations
     assert (own.message, own.work) == (single.message, single.work)
-    assert repr(own.turns) == repr(single.turns)  # what nobody judged in between is NaN
+    assert repr(own.stages) == repr(single.stages)  # what nobody judged in between is NaN
     assert own.status_conflict == single.status_conflict
 
 

@@ -47,7 +47,7 @@ def play(monkeypatch, clock, pace, problem):
         return found
 
     def turned(kind):
-        turn = kind.turn
+        turn = kind.advance
 
         def played(self, n):
             claim = turn(self, n)
@@ -64,8 +64,8 @@ def play(monkeypatch, clock, pace, problem):
         return prepare(self, of)
 
     monkeypatch.setattr(Swept, "run", swept)
-    monkeypatch.setattr(Newton, "turn", turned(Newton))
-    monkeypatch.setattr(Step, "turn", turned(Step))  # of `direct`
+    monkeypatch.setattr(Newton, "advance", turned(Newton))
+    monkeypatch.setattr(Step, "advance", turned(Step))  # of `direct`
     monkeypatch.setattr(newton, "prepare", prepared)
 
 

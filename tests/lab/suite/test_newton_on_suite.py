@@ -64,18 +64,18 @@ def test_turns_say_what_ran_and_what_came_of_it(problem):
     solution = lv.solve(problem, "auto", tol=1e-6)
     assert solution.success, solution
     work: dict[str, int] = {}
-    for turn in solution.turns:
-        assert turn.solver.split()[0] in registry.specs() and turn.solver in solution.message
-        assert not turn.after > turn.before  # the least so far; nan where nobody looked
-        for kind, count in turn.work.items():
+    for stage in solution.stages:
+        assert stage.solver.split()[0] in registry.specs() and stage.solver in solution.message
+        assert not stage.after > stage.before  # the least so far; nan where nobody looked
+        for kind, count in stage.work.items():
             work[kind] = work.get(kind, 0) + count
     assert {kind: count for kind, count in work.items() if count} == {
         kind: count for kind, count in solution.work.items() if count
     }
-    assert solution.turns[-1].after == solution.residual.relative
+    assert solution.stages[-1].after == solution.residual.relative
     begun = lv.residual(problem, problem.start()).relative
-    assert solution.turns[0].before == pytest.approx(begun, rel=1e-12)
-    assert lv.solve(problem, "newton").turns == ()
+    assert solution.stages[0].before == pytest.approx(begun, rel=1e-12)
+    assert lv.solve(problem, "newton").stages == ()
 
 
 def test_a_looser_tolerance_costs_no_more():
@@ -174,9 +174,9 @@ def test_a_turn_after_the_last_of_all_steps_is_an_end(monkeypatch):
     newton = Newton()
     monkeypatch.setattr("lavender.solvers.newton.SPEC", replace(SPEC, max_iter=4))
     state, lam = newton.prepare(problem), problem.start()
-    assert newton.turn(state, lam, 2, 1e-15).status is lv.Status.MAX_ITERATIONS
+    assert newton.advance(state, lam, 2, 1e-15).status is lv.Status.MAX_ITERATIONS
     for _ in range(3):
-        claim = newton.turn(state, lam, 2, 1e-15)
+        claim = newton.advance(state, lam, 2, 1e-15)
         if claim.status is not lv.Status.MAX_ITERATIONS:
             break
     assert claim.status is lv.Status.STALLED

@@ -92,7 +92,7 @@ def test_an_island_without_a_solution_is_proof_enough():
     certify(log)
     assert log.certificate is not None
     assert not log.certificate[2:].any()
-    assert [turn.solver for turn in log.turns] == ["linear program"] and log.work == {"certificates": 1}
+    assert [stage.solver for stage in log.stages] == ["linear program"] and log.work == {"certificates": 1}
     large = lv.solve(wild(seed=141, rows=600).problem, tol=1e-6)  # 360 asymmetric rows in many islands
     assert large.status is lv.Status.INFEASIBLE and large.claim_check == "confirmed"
 
@@ -216,7 +216,7 @@ def test_steps_over_few_velocities_that_were_in_vain_are_not_taken_twice_in_one_
     assert registry.get("auto").small.attempt(fresh, None, 1e-6)[0] is None
     assert FAILED_CALL_KEY in fresh.derived.cache
     solution = check(problem, "auto", tol=1e-6)
-    first = solution.turns[0]
+    first = solution.stages[0]
     assert first.solver == "newton" and first.before == first.after == 1.0, "the call that failed is told"
     assert first.work["factorisations"] == counts[1]
 
@@ -226,7 +226,7 @@ def test_what_a_line_needs_is_not_made_where_the_one_before_has_solved_it():
     problem = drawn(seed=7338, part="tuned").problem
     assert problem.generalized is not None
     solution = lv.solve(problem, tol=1e-3)
-    assert solution.success and solution.turns[-1].solver == "newton"
+    assert solution.success and solution.stages[-1].solver == "newton"
     assert not {"csr", "csr_data"} & set(problem.__dict__)
 
 

@@ -86,7 +86,7 @@ def test_each_line_is_reached_and_named(name):
     found = lv.prepare(make(), "auto").solve(tol=1e-6)
     assert found.success
     compiled = {"lemke", "direct", "anderson", "newton"} if problem.m <= registry.SMALL_ROWS else set()
-    assert {turn.solver.partition(" ")[0] for turn in found.turns} <= set(expected) | compiled
+    assert {stage.solver.partition(" ")[0] for stage in found.stages} <= set(expected) | compiled
 
 
 @pytest.mark.parametrize("name", FIRST)
@@ -157,13 +157,13 @@ def test_a_small_problem_is_told_by_who_solves_it(make, names):
     told = lv.explain(problem).small
     assert told and all(name in told for name in names), told
     solution = lv.solve(problem)
-    assert solution.success and all(turn.solver.partition(" ")[0] in names for turn in solution.turns)
+    assert solution.success and all(stage.solver.partition(" ")[0] in names for stage in solution.stages)
 
 
 class Made(Step):
     """A step that is told what to find."""
 
-    def turn(self, n):
+    def advance(self, n):
         self.impulse = self.log.problem.start() + self.found.pop(0)
         self.asked.append(n)
         self.offer()
@@ -187,7 +187,7 @@ def test_every_step_goes_on_and_the_best_of_all_is_returned(monkeypatch):
         "one of each, asked again and again"
     )
     np.testing.assert_array_equal(log.impulse, found[-1] * solved + problem.start())
-    after = [turn.after for turn in log.turns]
+    after = [stage.after for stage in log.stages]
     assert (np.diff(after) <= 0.0).all() and len(after) == len(found)
 
 
@@ -229,7 +229,7 @@ def test_what_would_not_end_in_time_is_neither_counted_nor_begun(make):
     log.offer(problem.start())
     solve(log, tree)
     assert log.iterations > 0
-    assert [turn.solver for turn in log.turns] == ["anderson"]
+    assert [stage.solver for stage in log.stages] == ["anderson"]
 
 
 @pytest.mark.parametrize(
@@ -246,7 +246,7 @@ def test_what_would_not_end_in_time_is_neither_counted_nor_begun(make):
 )
 def test_what_only_late_turns_solve_is_solved(make):
     solution = lv.solve(make().problem, tol=1e-6)
-    assert solution.success, solution.turns
+    assert solution.success, solution.stages
 
 
 def test_rows_of_a_follow_where_newton_over_velocities_ends_in_vain():
@@ -260,7 +260,7 @@ def test_rows_of_a_follow_where_newton_over_velocities_ends_in_vain():
     cones = lv.Cones.bounded(np.zeros(400), np.full(400, np.inf))
     problem = lv.Problem.from_jacobian(jac, half @ half.T, np.zeros(150), target=target, cones=cones)
     solution = lv.solve(problem, tol=1e-6)
-    assert solution.success and solution.turns[-1].solver == "newton over rows", solution.turns
+    assert solution.success and solution.stages[-1].solver == "newton over rows", solution.stages
 
 
 @pytest.mark.parametrize("friction", ["cone", "coulomb"])
@@ -327,7 +327,7 @@ def test_squeezed_bodies_are_proved_to_have_no_solution_before_all_go_in_turn():
     problem = lv.Problem(np.tile([1.0, 0.1, 0.0], 40), lv.Cones.contacts(np.full(40, 0.5)), a)
     found = lv.solve(problem)
     assert found.status is lv.Status.INFEASIBLE and found.claim_check == "confirmed"
-    assert [turn.solver for turn in found.turns][-2:] == ["newton", "linear program"]
+    assert [stage.solver for stage in found.stages][-2:] == ["newton", "linear program"]
 
 
 @pytest.mark.parametrize("n", [3, 5, 8])
@@ -370,7 +370,7 @@ def test_no_certificate_is_begun_that_would_end_late(monkeypatch):
     log.offer(problem.start())
     monkeypatch.setattr("lavender.solvers.certify.find_direction", lambda *asked: 1 / 0)
     certify(log)
-    assert not log.turns
+    assert not log.stages
 
 
 def test_cones_that_sweeps_do_not_take_have_steps_that_do():

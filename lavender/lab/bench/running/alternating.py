@@ -83,7 +83,7 @@ def time_alternately(
 
 
 class _Alternation:
-    """Repeats all lines on the cases of a part; `turns` identifies the lines and cases that are timed together."""
+    """Repeats all lines on the cases of a part; `stages` identifies the lines and cases that are timed together."""
 
     def __init__(self, runner: Runner, asks: Sequence[Ask], turns: str) -> None:
         self.runner, self.asks, self.turns = runner, asks, turns

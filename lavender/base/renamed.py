@@ -1,0 +1,34 @@
+"""Names that users try, and the names to use: earlier names of this package, and names of similar packages."""
+
+from __future__ import annotations
+
+#: Owner -> {name that does not exist: name to use}.
+INSTEAD = {
+    "lavender": {
+        "Motions": "SolutionSet",
+        "Suspicion": "Diagnostic",
+        "Turn": "SolverStage",
+        "motions": "find_solutions",
+        "solvers": "available or known",
+    },
+    "Solution": {
+        "contradicted": "status_conflict",
+        "impulses": "impulse",
+        "lam": "impulse",
+        "turns": "stages",
+        "x": "impulse",
+    },
+    "Residual": {
+        "energy_start": "energy_at_zero",
+        "floor": "roundoff_floor",
+        "velocity_start": "velocity_at_zero",
+    },
+    "Status": {"FLOOR": "ROUNDOFF_LIMIT", "REFUSED": "INVALID_PROBLEM"},
+}
+
+
+def build_attribute_error(owner: str, subject: str, name: str) -> AttributeError:
+    """Build the error for a missing attribute `name` of `subject`, with the name to use if `INSTEAD[owner]` has one."""
+    instead = INSTEAD[owner].get(name)
+    hint = f"; use {instead}" if instead else ""
+    return AttributeError(f"{subject} has no attribute {name!r}{hint}")
