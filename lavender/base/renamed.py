@@ -19,9 +19,9 @@ INSTEAD = {
         "x": "impulse",
     },
     "Residual": {
-        "energy_start": "energy_at_zero",
+        "energy_at_zero": "energy_at_zero",
         "floor": "roundoff_floor",
-        "velocity_start": "velocity_at_zero",
+        "velocity_at_zero": "velocity_at_zero",
     },
     "Status": {"FLOOR": "ROUNDOFF_LIMIT", "REFUSED": "INVALID_PROBLEM"},
 }

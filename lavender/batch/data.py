@@ -32,7 +32,7 @@ from lavender.problem.cones import Cones
 from lavender.problem.generalized import ASYMMETRY, ASYMMETRY32
 from lavender.problem.rows import Rows
 from lavender_ext.batch.many import PLACE, Worlds
-from lavender_ext.core.problem import LAWS, nothing_done
+from lavender_ext.core.problem import LAWS, zero_impulse
 
 __all__ = ["Batch"]
 
@@ -389,7 +389,7 @@ class Batch(Sequence[Problem]):
         if self._arrays is None:
             return self[i].start()
         first, m = (int(self.at[i, PLACE[name]]) for name in ("cone_row", "rows"))
-        return nothing_done(self.cones.lower[first : first + m], self.cones.upper[first : first + m])
+        return zero_impulse(self.cones.lower[first : first + m], self.cones.upper[first : first + m])
 
     def impulses(self, name: str, given: Any) -> FloatArray:
         """Impulses of all worlds [N s], of the batch's shape, finite or not, as a new flat array."""

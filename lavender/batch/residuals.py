@@ -101,7 +101,7 @@ class Many:
         """What the judge found of a world that the loop left."""
         known = {
             "relative": found.relative, "energy": found.energy, "speed": found.velocity, "floor": found.floor,
-            "start_energy": found.energy_start, "start_speed": found.velocity_start,
+            "reference_energy": found.energy_at_zero, "reference_speed": found.velocity_at_zero,
             "above_floor": found.above_floor,
             "push": abs(found.error[found.worst_row]) if found.worst_row >= 0 else 0.0,
         }  # fmt: skip
@@ -188,7 +188,7 @@ class Residuals(Many):
     @cached_property
     def verdict(self) -> np.ndarray:
         """(n,) as `Residual.verdict`; "" of a bad world."""
-        nothing = (self._numbers("start_relative") < 0.5) | (self._numbers("start_speed") < AT_REST)
+        nothing = (self._numbers("relative_at_zero") < 0.5) | (self._numbers("reference_speed") < AT_REST)
         for i, known in self._nothing.items():
             nothing[i] = known
         names = "relative", "floor", "above_floor", "energy", "speed", "rhs_energy"

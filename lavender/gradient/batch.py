@@ -169,6 +169,6 @@ def _data(problem: Problem) -> Any:
         return None
     view = problem.derived.view
     assert view is not None
-    if view.start_energy < 0.0:
+    if view.reference_energy < 0.0:
         reference(problem)
     return view

@@ -116,9 +116,9 @@ class Islands(NamedTuple):
         E.
     velocity : (n,), m/s
         V.
-    energy_start : (n,), sqrt J
+    energy_at_zero : (n,), sqrt J
         E0; -1 if no row is active: each row is then compared with its own b.
-    velocity_start : (n,), m/s
+    velocity_at_zero : (n,), m/s
         V0.
     """
 
@@ -126,8 +126,8 @@ class Islands(NamedTuple):
     relative: FloatArray
     energy: FloatArray
     velocity: FloatArray
-    energy_start: FloatArray
-    velocity_start: FloatArray
+    energy_at_zero: FloatArray
+    velocity_at_zero: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,9 +138,9 @@ class Residual:
     ----------
     relative : float, -
         Larger of E / E0 and V / V0, maximum over the islands.
-    energy, energy_start : float, sqrt J
+    energy, energy_at_zero : float, sqrt J
         E of the impulse and of the zero impulse, over all rows.
-    velocity, velocity_start : float, m/s
+    velocity, velocity_at_zero : float, m/s
         V of the impulse (the error of its worst row) and of the zero impulse, over all rows.
     floor : float, -
         Relative residual that rounding to `precision` alone can cause, in the island of `relative`.
@@ -169,8 +169,8 @@ class Residual:
     velocity: float
     floor: float
     worst_row: int
-    energy_start: float
-    velocity_start: float
+    energy_at_zero: float
+    velocity_at_zero: float
     error: FloatArray = field(repr=False)
     slack: FloatArray = field(repr=False)
     _problem: Problem = field(repr=False)
@@ -301,19 +301,19 @@ def verdict_of(
 
 def relative_of(data: Any, energy: float, velocity: float) -> float:
     """Compute the relative residual of two errors [sqrt J, m/s]; inf if one is not finite or has no reference."""
-    return measure.compare(energy, velocity, data.start_energy, data.start_velocity)
+    return measure.compare(energy, velocity, data.reference_energy, data.reference_velocity)
 
 
 def reference(problem: Problem) -> tuple[float, float]:
     """Return E0 [sqrt J] and V0 [m/s] over all rows; the references of all islands are computed once per problem."""
     data = problem.metric
-    if data.start_energy < 0.0:
+    if data.reference_energy < 0.0:
         start = measure.begin(data)
         if problem.derived.start is None:
             problem.derived.start = start
         if problem.generalized is not None and "csr_data" in problem.__dict__:
             problem.csr_data.share_reference(data)
-    return data.start_energy, data.start_velocity
+    return data.reference_energy, data.reference_velocity
 
 
 def nothing_to_do(problem: Problem) -> bool:
@@ -324,13 +324,13 @@ def nothing_to_do(problem: Problem) -> bool:
     problem = problem.disk
     reference(problem)
     data = problem.metric
-    return bool(data.start_relative < 0.5 or data.start_velocity < AT_REST)
+    return bool(data.relative_at_zero < 0.5 or data.reference_velocity < AT_REST)
 
 
 def judged(problem: Problem, impulse: FloatArray) -> measure.Judged:
     """Judge an impulse (m,) [N s]. The result refers to the array, which must not change afterwards."""
     data = problem.metric
-    if data.start_energy < 0.0:
+    if data.reference_energy < 0.0:
         reference(problem)
     return measure.Judged(data, impulse)
 
@@ -400,7 +400,7 @@ def known(problem: Problem, impulse: FloatArray) -> float | None:
     last = remembered(problem, impulse)
     if last is not None:
         return float(last.relative)
-    start: float = problem.metric.start_relative
+    start: float = problem.metric.relative_at_zero
     return start if start >= 0.0 and measure.same_bits(problem._start, impulse) else None
 
 
@@ -547,8 +547,8 @@ def told(problem: Problem, last: measure.Judged) -> Residual:
         "worst_island": last.island,
         "floor_energy": last.floor_energy,
         "worst_row": last.worst,
-        "energy_start": problem.metric.start_energy,
-        "velocity_start": problem.metric.start_velocity,
+        "energy_at_zero": problem.metric.reference_energy,
+        "velocity_at_zero": problem.metric.reference_velocity,
         "error": read_only(last.error),
         "slack": read_only(last.slack),
         "_problem": problem,

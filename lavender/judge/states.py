@@ -159,7 +159,7 @@ class States(Sequence[State]):
 def linear_of(problem: Problem, impulse: FloatArray, most: int = 0) -> Linear:
     """Judge and linearise an impulse (m,) [N s]; ellipses are treated as disks. `most` is as in `Linears`."""
     data = problem.disk.metric
-    if data.start_energy < 0.0:
+    if data.reference_energy < 0.0:
         reference(problem.disk)
     return Linears([data], [problem.on_disk(impulse)], most).one(0)
 

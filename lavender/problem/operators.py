@@ -16,7 +16,7 @@ from lavender_ext.core import assemble
 from lavender_ext.core.assemble import dense_to_csr
 from lavender_ext.core.checks import MOST, largest
 from lavender_ext.core.problem import LAWS as FRICTION_NUMBER
-from lavender_ext.core.problem import Data, general_data, nothing_done
+from lavender_ext.core.problem import Data, general_data, zero_impulse
 from lavender_ext.factor import sparse
 from lavender_ext.judge import measure
 
@@ -123,7 +123,7 @@ class Operators(ProblemData):
         data = self._data(csr=self._compressed)
         if self.rows is not None:
             data.weigh_as(self.metric)
-        if self.generalized is not None and self.metric.start_energy >= 0.0:
+        if self.generalized is not None and self.metric.reference_energy >= 0.0:
             data.share_reference(self.metric)
         return data
 
@@ -299,7 +299,7 @@ class Operators(ProblemData):
     def _start(self) -> FloatArray:
         kept = self.derived
         if kept.start is None:
-            kept.start = nothing_done(self.cones.lower, self.cones.upper)
+            kept.start = zero_impulse(self.cones.lower, self.cones.upper)
         return kept.start
 
 

@@ -100,7 +100,7 @@ def _make(problem: Problem) -> Small | None:
             return None
     reference(problem)
     data = problem.metric
-    if len(data.empty) or data.start_relative < 0.0:
+    if len(data.empty) or data.relative_at_zero < 0.0:
         return None
     if bounded or count == 1:
         return Small(data, problem.csr_data if bounded else data)
@@ -268,7 +268,7 @@ def _in_turns(counts: tuple[int, ...]) -> tuple[int, Ran]:
 def _stages(problem: Problem, ran: Ran, start: FloatArray | None, after: float) -> tuple[SolverStage, ...]:
     """Turns of one compiled call; nothing was measured between two."""
     if start is None or np.array_equal(start, problem._start):
-        before = float(problem.metric.start_relative)
+        before = float(problem.metric.relative_at_zero)
     else:
         before = float(judged(problem, start.copy()).relative)
     at = [before, *(len(ran) - 1) * [nan], after]

@@ -423,7 +423,7 @@ class Prepared:
 
     def _set_up(self, problem: Problem, anew: bool, deadline: Deadline) -> None:
         """Prepare, or update the state of a problem of the same structure, if that is counted to end in time."""
-        if problem.metric.start_energy < 0.0:
+        if problem.metric.reference_energy < 0.0:
             reference(problem)  # of the judge, before any solver has the problem in its hands
         anew, self._broken = anew or bool(self._broken), ""
         if deadline.is_set:

@@ -17,7 +17,7 @@ from lavender_ext.core.problem cimport MADE, lav_rows_diagonal, made_t, make_num
 from lavender_ext.core.view cimport csr_t, generalized_t, rows_t, view_t
 from lavender_ext.driver.driver cimport NEWTON, lav_room, lav_start, lav_step
 from lavender_ext.factor.tiles cimport has_wide
-from lavender_ext.judge.measure cimport (above_floor_of, do_nothing, floor_of, general_score, judge_nothing, refine_view,
+from lavender_ext.judge.measure cimport (above_floor_of, set_zero_impulse, floor_of, general_score, judge_zero_impulse, refine_view,
                                          relative_of, scratch_of)
 from lavender_ext.judge.score cimport new_score, score_t
 from lavender_ext.judge.slack cimport general_slack
@@ -81,7 +81,7 @@ cdef inline bint begin(job_t* j, view_t* v, room_t* islands, double* w) noexcept
     cdef ssize_t m = j.p.n_rows
     if not has_room(islands, islands_index(v), 2 * <int64_t>j.p.n_blocks):
         return False
-    judge_nothing(v, islands.index, &j.islands, islands.real, w + 2 * m, w, w + m, w + 3 * m, j.begin)
+    judge_zero_impulse(v, islands.index, &j.islands, islands.real, w + 2 * m, w, w + m, w + 3 * m, j.begin)
     j.p.islands = v.p.islands
     return True
 
@@ -198,7 +198,7 @@ cdef inline void solve_job(job_t* j, room_t* room, room_t* islands, const limits
     o.budget = <int32_t>min(<double>STEPS * r.islands, limits.steps)
     o.e0, o.v0 = j.begin[0], j.begin[1]
     if j.cold:
-        do_nothing(&j.p, j.lam, j.both)
+        set_zero_impulse(&j.p, j.lam, j.both)
     if j.made.n_empty and not settle_empty_rows(j, tol):
         return
     lav_start(&v, &o, &r, j.lam)

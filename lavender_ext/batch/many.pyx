@@ -25,7 +25,7 @@ from lavender_ext.small.room cimport has_room, leave
 from lavender_ext.batch.world cimport (BAD, BLOCK, BLOCKS, CONE_ROW, FREE, JAC, LATE, LEFT, MASS, MU, N_ARRAYS, PLACES,
                                        READY, AT_ROW, FIELDS, ROWS, SOFT, STARTED, TARGET, TRIED, VELOCITIES, VELOCITY,
                                        desk_t, lay_bodies, lay_matrix, lay_world, worlds_t)
-from lavender_ext.judge.measure cimport do_nothing, judged_from, scratch_of
+from lavender_ext.judge.measure cimport set_zero_impulse, judged_from, scratch_of
 from lavender_ext.judge.rounding cimport floor_in_float32, squares32
 from lavender_ext.judge.tally cimport norms_of_rhs
 from lavender_ext.velocity_newton.soft cimport is_soft
@@ -78,7 +78,7 @@ cdef int take(job_t* j, Data p, start, double* lam, double* both) except -1:
     j.made = p.made
     if not p.is_general:
         j.made.n_empty = <int32_t>len(p.empty)
-    j.begin[0], j.begin[1], j.begin[2] = p.start_energy, p.start_velocity, p.start_relative
+    j.begin[0], j.begin[1], j.begin[2] = p.reference_energy, p.reference_velocity, p.relative_at_zero
     return take_start(j, start, lam, both)
 
 
@@ -104,7 +104,7 @@ cdef result(job_t* j, Data p, impulse, both):
 
 
 cdef void remember(job_t* j, Data p):
-    if p.start_energy < 0.0 and j.begin[0] >= 0.0:
+    if p.reference_energy < 0.0 and j.begin[0] >= 0.0:
         p.keep_reference(j.p.islands, j.begin)
 
 
@@ -169,8 +169,8 @@ PLACE = {"rows": ROWS, "velocities": VELOCITIES, "blocks": BLOCKS, "jac": JAC, "
 
 
 #: Rows of `Worlds.numbers` and codes of worlds by their names.
-NUMBER = {"relative": RELATIVE, "energy": ENERGY, "speed": SPEED, "floor": FLOOR, "start_energy": START_ENERGY,
-          "start_speed": START_SPEED, "start_relative": START_RELATIVE, "rhs_energy": RHS_ENERGY, "push": PUSH,
+NUMBER = {"relative": RELATIVE, "energy": ENERGY, "speed": SPEED, "floor": FLOOR, "reference_energy": START_ENERGY,
+          "reference_speed": START_SPEED, "relative_at_zero": START_RELATIVE, "rhs_energy": RHS_ENERGY, "push": PUSH,
           "above_floor": ABOVE_FLOOR}
 CODE = {"left": LEFT, "ready": READY, "bad": BAD, "tried": TRIED, "late": LATE, "started": STARTED}
 
@@ -435,7 +435,7 @@ cdef class Worlds:
             if not has_room(&h.few.call.work, 0, scratch_of(&s.v)):
                 return LEFT
             if j.cold:
-                do_nothing(&j.p, j.lam, j.both)
+                set_zero_impulse(&j.p, j.lam, j.both)
             code = READY
             judge_few(&s, j.lam, j.both, h.few.call.work.real)
             found_by(&j, &s)
@@ -445,7 +445,7 @@ cdef class Worlds:
               and has_room(&h.by_island, 0, 2 * <int64_t>j.p.n_blocks) and begin_world(&j, h)):
             code, x = READY, h.room.real
             if j.cold:
-                do_nothing(&j.p, j.lam, j.both)
+                set_zero_impulse(&j.p, j.lam, j.both)
             j.by_island = h.by_island.real
             judge_job(&j, tol, x)
             if narrow:

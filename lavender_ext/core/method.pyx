@@ -14,7 +14,7 @@ cdef class Method:
         """For a start: to a relative residual of tol, by `budget` units of work; nothing is said yet."""
         cdef options_t* o = &self.options
         o.tol, o.budget, o.proven, o.stop = tol, budget, 0, 0
-        o.e0, o.v0 = self.data.start_energy, self.data.start_velocity
+        o.e0, o.v0 = self.data.reference_energy, self.data.reference_velocity
         self.said = said_t(0, 0, 0, 0, 1.0 / 0.0, NULL, NULL)
         self.how = MORE
 

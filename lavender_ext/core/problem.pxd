@@ -49,7 +49,7 @@ cdef class Data:
     cdef readonly object empty
     cdef object _numbers, _d, _nu, _step
     cdef made_t made            # where is_general and ready
-    cdef readonly double start_energy, start_velocity, start_relative   # negative where not known
+    cdef readonly double reference_energy, reference_velocity, relative_at_zero   # negative where not known
     cdef islands_t islands_at           # what blocks.islands points to, if it is not NULL
     cdef object _weight
     cdef list keep

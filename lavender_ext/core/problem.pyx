@@ -302,7 +302,7 @@ cdef class Data:
         self.blocks.step = step
         if m > 0:
             self.blocks.b = &b[0]
-        self.start_energy = self.start_velocity = self.start_relative = -1.0
+        self.reference_energy = self.reference_velocity = self.relative_at_zero = -1.0
         self.ready = True
         self.factored = rows is not None
         self.single_rows = blocks.single_rows
@@ -517,7 +517,7 @@ cdef class Data:
         cdef Room numbers, marks
         cdef int32_t* at
         with cython.critical_section(self):
-            if self.start_energy >= 0.0:
+            if self.reference_energy >= 0.0:
                 return
             if islands != NULL:
                 numbers = room_for(2 * islands.n * sizeof(double))
@@ -530,14 +530,14 @@ cdef class Data:
                 self.islands_at = islands_t(islands.n, at, at + 2 * k, at + k, <double*>numbers.at, islands.energy)
                 self.keep += [numbers, marks]
                 self.blocks.islands = &self.islands_at
-            self.start_velocity, self.start_relative = start[1], start[2]
-            self.start_energy = start[0]
+            self.reference_velocity, self.relative_at_zero = start[1], start[2]
+            self.reference_energy = start[0]
 
     def share_reference(self, Data other):
         """Take islands and references of the same problem in another form, which must know them."""
         cdef double start[3]
         if other is not self:
-            start[0], start[1], start[2] = other.start_energy, other.start_velocity, other.start_relative
+            start[0], start[1], start[2] = other.reference_energy, other.reference_velocity, other.relative_at_zero
             self.keep_reference(other.blocks.islands, start)
 
     def islands(self):
@@ -564,7 +564,7 @@ def general_data(Blocks blocks, b, Operator operator, compliance, int law):
     made.general = operator.g
     made.is_general = True
     made.single_rows = blocks.single_rows
-    made.start_energy = made.start_velocity = made.start_relative = -1.0
+    made.reference_energy = made.reference_velocity = made.relative_at_zero = -1.0
     made.empty = _NONE
     if blocks.at.n_rows:
         made.blocks.b = doubles(b, blocks.at.n_rows)
@@ -572,7 +572,7 @@ def general_data(Blocks blocks, b, Operator operator, compliance, int law):
     return made
 
 
-def nothing_done(const double[::1] lower, const double[::1] upper):
+def zero_impulse(const double[::1] lower, const double[::1] upper):
     """Pi(0) (m,) [N s]: zero clipped to the bounds, read-only."""
     cdef Py_ssize_t i, m = lower.shape[0]
     out = np.zeros(m)

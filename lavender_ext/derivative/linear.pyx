@@ -442,7 +442,7 @@ cdef class Linears:
                 if not a.known:
                     continue
                 with nogil:
-                    linearise(a, lam, p.start_energy, p.start_velocity, to, <double*>spare.at)
+                    linearise(a, lam, p.reference_energy, p.reference_velocity, to, <double*>spare.at)
             finally:
                 PyBuffer_Release(&held)
             to += room_of(&a.v.p, values_of(&a.v.p))

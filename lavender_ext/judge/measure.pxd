@@ -14,20 +14,20 @@ cdef inline int64_t scratch_of(const view_t* v) noexcept nogil:
 
 cdef void judge_view(const view_t* v, const double* lam, double* w, double* e, double* scratch, bint floor,
                      score_t* out) noexcept nogil
-cdef bint refine_view(const view_t* v, const double* lam, double* w, double* e, double* scratch, double start_energy,
-                      double start_velocity, double tol, double found, score_t* out) noexcept nogil
+cdef bint refine_view(const view_t* v, const double* lam, double* w, double* e, double* scratch, double reference_energy,
+                      double reference_velocity, double tol, double found, score_t* out) noexcept nogil
 cdef void general_score(const blocks_t* p, const generalized_t* g, const double* lam, const double* w, double* e, double* x,
                         score_t* out) noexcept nogil
 cdef void score_slack(const blocks_t* p, const double* lam, const double* w, double* e, score_t* out) noexcept nogil
 cdef void find_reference(blocks_t* p, const double* x, const double* w, const double* e, double* out) noexcept nogil
-cdef void judge_nothing(view_t* v, int32_t* index, islands_t* islands, double* reference, double* x, double* w, double* e,
+cdef void judge_zero_impulse(view_t* v, int32_t* index, islands_t* islands, double* reference, double* x, double* w, double* e,
                         double* scratch, double* out) noexcept nogil
 
 
 # -- the zero impulse, and a pass over an impulse relative to it -----------------------------------------
 
 
-cdef inline bint do_nothing(const blocks_t* p, double* x, double* w) noexcept nogil:
+cdef inline bint set_zero_impulse(const blocks_t* p, double* x, double* w) noexcept nogil:
     """x (m) = Pi(0), and w (m) = -b, its slack without a pass over A; is x other than 0?"""
     cdef int32_t i
     cdef bint moves = False
@@ -42,8 +42,8 @@ cdef inline bint do_nothing(const blocks_t* p, double* x, double* w) noexcept no
     return moves
 
 
-cdef inline double relative_of(const score_t* s, const double* w, int32_t m, double start_energy,
-                               double start_velocity) noexcept nogil:
+cdef inline double relative_of(const score_t* s, const double* w, int32_t m, double reference_energy,
+                               double reference_velocity) noexcept nogil:
     """Relative residual of a pass, slack w (m); inf where a number of it is not finite.
 
     No less than a floor of 1e-3 and more, where the pass made one: the impulse is so large that rounding hides a thousandth
@@ -55,15 +55,15 @@ cdef inline double relative_of(const score_t* s, const double* w, int32_t m, dou
     if m > 0 and not are_numbers(w, m):
         return 1.0 / 0.0
     if not s.finite:
-        return relative(1.0 / 0.0, 1.0 / 0.0, start_energy, start_velocity)
-    now = relative(s.energy, s.velocity, start_energy, start_velocity)
-    floor = relative(s.floor_energy, s.floor_velocity, start_energy, start_velocity)
+        return relative(1.0 / 0.0, 1.0 / 0.0, reference_energy, reference_velocity)
+    now = relative(s.energy, s.velocity, reference_energy, reference_velocity)
+    floor = relative(s.floor_energy, s.floor_velocity, reference_energy, reference_velocity)
     return floor if hides(floor) and floor < 1.0 / 0.0 and floor > now else now
 
 
-cdef inline double floor_of(const score_t* s, double start_energy, double start_velocity) noexcept nogil:
+cdef inline double floor_of(const score_t* s, double reference_energy, double reference_velocity) noexcept nogil:
     """Floor of a pass that made one, as a relative residual: with islands of the one with the largest residual."""
-    return s.floor if s.relative >= 0.0 else relative(s.floor_energy, s.floor_velocity, start_energy, start_velocity)
+    return s.floor if s.relative >= 0.0 else relative(s.floor_energy, s.floor_velocity, reference_energy, reference_velocity)
 
 
 cdef inline double above_floor_of(const score_t* s, double now, double floor) noexcept nogil:

@@ -15,7 +15,7 @@ from lavender_ext.core.velocity cimport rows_velocity
 from lavender_ext.core.view cimport generalized_t, view_t
 from lavender_ext.judge.best cimport best_room, best_t, bind_best, count_islands, note_score, see_impulse, see_start
 from lavender_ext.judge.forms cimport csr_judge, csr_slack, general_errors, general_judge, rows_judge
-from lavender_ext.judge.measure cimport above_floor_of, do_nothing, floor_of, relative_of, scratch_of
+from lavender_ext.judge.measure cimport above_floor_of, set_zero_impulse, floor_of, relative_of, scratch_of
 from lavender_ext.judge.reference cimport needs_rows, reference_of
 from lavender_ext.judge.refine cimport loss_by_factor, refine_general
 from lavender_ext.judge.rounding cimport mass_t, relative_size, squares32
@@ -35,15 +35,15 @@ cdef void judge_view(const view_t* v, const double* lam, double* w, double* e, d
         csr_judge(&v.p, v.a, lam, w, e, floor, out)
 
 
-cdef bint refine_view(const view_t* v, const double* lam, double* w, double* e, double* scratch, double start_energy,
-                      double start_velocity, double tol, double found, score_t* out) noexcept nogil:
+cdef bint refine_view(const view_t* v, const double* lam, double* w, double* e, double* scratch, double reference_energy,
+                      double reference_velocity, double tol, double found, score_t* out) noexcept nogil:
     """The refined pass in place of that of `judge_view` if (2) asks for it; w, e and out are of that, found its residual.
 
     scratch: `scratch_of`. Nothing is written if the pass is not repeated; A and bodies have no factor that loses anything.
     """
     if v.g == NULL or v.p.n_rows == 0 or not found < 1.0 / 0.0:
         return False
-    if loss_by_factor(&v.p, v.g, lam, w, scratch, start_energy, start_velocity, 0.1 * (tol if tol > found else found)) == 0.0:
+    if loss_by_factor(&v.p, v.g, lam, w, scratch, reference_energy, reference_velocity, 0.1 * (tol if tol > found else found)) == 0.0:
         return False
     refine_general(&v.p, v.g, lam, w, e, scratch, out)
     return True
@@ -65,7 +65,7 @@ cdef void find_reference(blocks_t* p, const double* x, const double* w, const do
     reference_of(p, x, w, e, out)
 
 
-cdef void judge_nothing(view_t* v, int32_t* index, islands_t* islands, double* reference, double* x, double* w, double* e,
+cdef void judge_zero_impulse(view_t* v, int32_t* index, islands_t* islands, double* reference, double* x, double* w, double* e,
                         double* scratch, double* out) noexcept nogil:
     """The zero impulse into x (m), and of it (3) of `reference_of`; with several islands v.p has them, and their references.
 
@@ -74,7 +74,7 @@ cdef void judge_nothing(view_t* v, int32_t* index, islands_t* islands, double* r
     cdef score_t s = new_score()
     cdef int32_t i
     v.p.islands = NULL
-    if do_nothing(&v.p, x, w):
+    if set_zero_impulse(&v.p, x, w):
         judge_view(v, x, w, e, scratch, False, &s)
     else:
         score_rows(&v.p, x, w, e, &s)
@@ -132,8 +132,8 @@ def judge(Data p, const double[::1] lam, double[::1] w, double[::1] e, bint floo
         judge_view(&v, &lam[0], &w[0], &e[0], &scratch[0], floor, &s)
     if not s.finite or not are_numbers(&w[0], p.blocks.n_rows):
         return np.inf, np.inf, np.inf, np.inf
-    now = relative_of(&s, &w[0], p.blocks.n_rows, p.start_energy, p.start_velocity)
-    above = above_floor_of(&s, now, floor_of(&s, p.start_energy, p.start_velocity)) if floor else now
+    now = relative_of(&s, &w[0], p.blocks.n_rows, p.reference_energy, p.reference_velocity)
+    above = above_floor_of(&s, now, floor_of(&s, p.reference_energy, p.reference_velocity)) if floor else now
     return s.energy, s.velocity, now, above
 
 
@@ -144,7 +144,7 @@ cdef double loss_of(Data p, impulse, both) except -1.0:
     if p.blocks.n_rows == 0:
         return 0.0
     room = room_for(2 * <Py_ssize_t>p.general.n * sizeof(double))
-    return loss_by_factor(&p.blocks, &p.general, &lam[0], &w[0], <double*>room.at, p.start_energy, p.start_velocity, 0.0)
+    return loss_by_factor(&p.blocks, &p.general, &lam[0], &w[0], <double*>room.at, p.reference_energy, p.reference_velocity, 0.0)
 
 
 cdef Judged judged_from(Data p, impulse, both, const score_t* s, double relative_, double floor, double float64_relative=NAN):
@@ -189,13 +189,13 @@ cdef class Judged:
         self.velocity = s.velocity if s.finite else 1.0 / 0.0
         self.floor_energy = s.floor_energy
         self.worst, self.island = s.worst, s.island
-        self.floor = floor_of(&s, p.start_energy, p.start_velocity)
-        self.relative = relative_of(&s, w, p.blocks.n_rows, p.start_energy, p.start_velocity)
+        self.floor = floor_of(&s, p.reference_energy, p.reference_velocity)
+        self.relative = relative_of(&s, w, p.blocks.n_rows, p.reference_energy, p.reference_velocity)
         self.above_floor = above_floor_of(&s, self.relative, self.floor)
         self.float64_relative, self.known_loss = NAN, 0.0
         if p.is_general and m > 0:
-            self.known_loss = loss_by_factor(&p.blocks, &p.general, &lam[0], w, <double*>room.at, p.start_energy,
-                                             p.start_velocity, 0.0)
+            self.known_loss = loss_by_factor(&p.blocks, &p.general, &lam[0], w, <double*>room.at, p.reference_energy,
+                                             p.reference_velocity, 0.0)
 
     @property
     def loss(self):
@@ -224,8 +224,8 @@ cdef class Judged:
         results = both = np.empty(2 * m + 1)
         memcpy(&both[0], room.at, 2 * m * sizeof(double))
         return judged_from(p, self.impulse, results, &s,
-                           relative_of(&s, &both[0], m, p.start_energy, p.start_velocity),
-                           floor_of(&s, p.start_energy, p.start_velocity), self.relative)
+                           relative_of(&s, &both[0], m, p.reference_energy, p.reference_velocity),
+                           floor_of(&s, p.reference_energy, p.reference_velocity), self.relative)
 
     @property
     def slack(self):
@@ -238,9 +238,9 @@ cdef class Judged:
         return self.both[self.data.blocks.n_rows:2 * self.data.blocks.n_rows]
 
 
-def compare(double energy, double velocity, double start_energy, double start_velocity):
+def compare(double energy, double velocity, double reference_energy, double reference_velocity):
     """Relative residual: the larger of both errors over those of doing nothing; inf where one is not finite."""
-    return relative(energy, velocity, start_energy, start_velocity)
+    return relative(energy, velocity, reference_energy, reference_velocity)
 
 
 def all_finite(const double[::1] x):
@@ -284,7 +284,7 @@ def begin(Data p):
     cdef double* w = <double*>room.at
     start = np.zeros(m)
     x = start
-    judge_nothing(&v, <int32_t*>marks.at, &islands, w + 2 * m, &x[0] if m else NULL, w, w + m, w + 2 * m + 2 * k, out)
+    judge_zero_impulse(&v, <int32_t*>marks.at, &islands, w + 2 * m, &x[0] if m else NULL, w, w + m, w + 2 * m + 2 * k, out)
     start.setflags(write=False)
     p.keep_reference(v.p.islands, out)
     return start
@@ -310,9 +310,9 @@ def by_island(Data p, const double[::1] lam):
     score.by_island = &w[2 * m]
     judge_view(&v, &lam[0], &w[0], &w[m], &w[2 * m + 2 * n], False, &score)
     if s == NULL:
-        table[0, 0] = relative_of(&score, &w[0], m, p.start_energy, p.start_velocity)
+        table[0, 0] = relative_of(&score, &w[0], m, p.reference_energy, p.reference_velocity)
         table[0, 1], table[0, 2] = score.energy, score.velocity
-        table[0, 3], table[0, 4] = p.start_energy, p.start_velocity
+        table[0, 3], table[0, 4] = p.reference_energy, p.reference_velocity
         return label_, table_
     for i in range(p.blocks.n_blocks):
         label[i] = s.label[i]
@@ -343,7 +343,7 @@ def best_of_islands(Data p, list starts, list impulses, double tol):
         s = new_score()
         s.by_island = best.now
         judge_view(&v, lam, w, w + m, w + 2 * m, False, &s)
-        now = relative_of(&s, w, <int32_t>m, p.start_energy, p.start_velocity)
+        now = relative_of(&s, w, <int32_t>m, p.reference_energy, p.reference_velocity)
         note_score(&best, &p.blocks, &s, now)
         if best.seen < len(starts):
             see_start(&best, &p.blocks, lam)
@@ -394,7 +394,7 @@ def size_of_square(Data p, const double[::1] square):
     cdef const islands_t* s = p.blocks.islands
     cdef int32_t i
     if s == NULL:
-        return [relative_size(&p.blocks, -1, x, p.start_energy, p.start_velocity)]
+        return [relative_size(&p.blocks, -1, x, p.reference_energy, p.reference_velocity)]
     return [relative_size(&p.blocks, i, x, s.reference[2 * i], s.reference[2 * i + 1]) for i in range(s.n)]
 
 

@@ -95,7 +95,7 @@ cdef inline void subtract_momentum(const generalized_t* g, const double* x, cons
 
 
 cdef inline double loss_by_factor(const blocks_t* p, const generalized_t* g, const double* lam, const double* w, double* x,
-                                  double start_energy, double start_velocity, double enough) noexcept nogil:
+                                  double reference_energy, double reference_velocity, double enough) noexcept nogil:
     """The left of (2), or 0 if it is at most `enough`; w (m) is the slack of the first pass, x (2 n) scratch."""
     cdef int32_t i = 0
     cdef double energy = 0.0, other = 0.0, nu = 0.0, size
@@ -112,8 +112,8 @@ cdef inline double loss_by_factor(const blocks_t* p, const generalized_t* g, con
     if g.n == 0 or energy == 0.0:                       # no impulse, or none that moves anything
         return 0.0
     energy = sqrt(fabs(energy))                         # negative only by rounding
-    smallest_reference(p, &start_energy, &start_velocity)
-    size = 0.1 * relative(energy, sqrt(nu) * energy, start_energy, start_velocity)
+    smallest_reference(p, &reference_energy, &reference_velocity)
+    size = 0.1 * relative(energy, sqrt(nu) * energy, reference_energy, reference_velocity)
     size = g.n * unit_roundoff() * (size if size > 1.0 else 1.0)
     if g.condition == 0.0 and size * bound_condition(g) <= enough:
         return 0.0

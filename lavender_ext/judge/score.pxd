@@ -52,9 +52,9 @@ cdef inline double ratio(double x, double reference) noexcept nogil:
     return x / reference if x < 1.0 / 0.0 and reference > 0.0 else 1.0 / 0.0
 
 
-cdef inline double relative(double energy, double velocity, double start_energy, double start_velocity) noexcept nogil:
+cdef inline double relative(double energy, double velocity, double reference_energy, double reference_velocity) noexcept nogil:
     """(1)"""
-    cdef double x = ratio(energy, start_energy), y = ratio(velocity, start_velocity)
+    cdef double x = ratio(energy, reference_energy), y = ratio(velocity, reference_velocity)
     return x if x > y else y
 
 

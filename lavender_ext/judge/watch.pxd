@@ -51,8 +51,8 @@ cdef struct watch_t:
     double last                 # at the last one
     double best_relative        # of `best`
     double lowest               # r of all checks
-    double start_energy         # sqrt J, of doing nothing
-    double start_velocity       # m/s
+    double reference_energy         # sqrt J, of doing nothing
+    double reference_velocity       # m/s
     best_t best
     double* marked              # (n) sqrt J, E of each island's best at the last better check
     double* w                   # (m) scratch
@@ -69,7 +69,7 @@ cdef inline int64_t watch_room(int64_t m, int64_t n) noexcept nogil:
     return best_room(m, n) + n + 2 * m
 
 
-cdef inline void begin_watch(watch_t* s, const blocks_t* p, double start_energy, double start_velocity, int32_t patience,
+cdef inline void begin_watch(watch_t* s, const blocks_t* p, double reference_energy, double reference_velocity, int32_t patience,
                              double* room) noexcept nogil:
     """Before the first sweep; room (`watch_room`)."""
     s.total = s.check_at = s.last_at = 0
@@ -78,8 +78,8 @@ cdef inline void begin_watch(watch_t* s, const blocks_t* p, double start_energy,
     s.best_at = -1
     s.again_at = 0
     s.patience = patience
-    s.start_energy = start_energy
-    s.start_velocity = start_velocity
+    s.reference_energy = reference_energy
+    s.reference_velocity = reference_velocity
     bind_best(&s.best, p, room)
     s.marked = room + best_room(p.n_rows, s.best.n)
     open_progress(&s.progress, s.marked + s.best.n, p.n_rows)

@@ -20,33 +20,33 @@ cdef inline double relative_to_start(const watch_t* s, const score_t* x) noexcep
     """Relative residual of a pass without floor; inf if an error is not finite."""
     if x.relative >= 0.0:
         return x.relative
-    return relative(x.energy, x.velocity, s.start_energy, s.start_velocity) if x.finite else 1.0 / 0.0
+    return relative(x.energy, x.velocity, s.reference_energy, s.reference_velocity) if x.finite else 1.0 / 0.0
 
 
 cdef inline bint is_rounding(const watch_t* s, const score_t* x, double now, double tol) noexcept nogil:
     """Whether rounding explains what a pass with its floor found above tol, in each island."""
-    return above_floor_of(x, now, floor_of(x, s.start_energy, s.start_velocity)) <= tol
+    return above_floor_of(x, now, floor_of(x, s.reference_energy, s.reference_velocity)) <= tol
 
 
 cdef inline double judge_with_floor(const watch_t* s, const view_t* v, const double* lam, score_t* x) noexcept nogil:
     """The judge's relative residual with its floor."""
     judge_view(v, lam, s.w, s.e, s.v, True, x)
-    return relative_of(x, s.w, v.p.n_rows, s.start_energy, s.start_velocity)
+    return relative_of(x, s.w, v.p.n_rows, s.reference_energy, s.reference_velocity)
 
 
 cdef inline double judge_closely(const watch_t* s, const view_t* v, const double* lam, double tol, score_t* x,
                                  bint* refined) noexcept nogil:
     """The judge's relative residual with its floor, refined if an ill-conditioned M needs it."""
     cdef double now = judge_with_floor(s, v, lam, x)
-    refined[0] = refine_view(v, lam, s.w, s.e, s.v, s.start_energy, s.start_velocity, tol, now, x)
+    refined[0] = refine_view(v, lam, s.w, s.e, s.v, s.reference_energy, s.reference_velocity, tol, now, x)
     if refined[0]:
-        now = relative_of(x, s.w, v.p.n_rows, s.start_energy, s.start_velocity)
+        now = relative_of(x, s.w, v.p.n_rows, s.reference_energy, s.reference_velocity)
     return now
 
 
 cdef inline bint rounds_much(const watch_t* s, const blocks_t* p, const double* lam) noexcept nogil:
     """Whether rounding of so large an impulse may hide the residual: 2^-53 sqrt(sum d lam^2) > 1e-7 E0 of some island."""
-    cdef double size = 0.0, energy = s.start_energy, velocity = s.start_velocity
+    cdef double size = 0.0, energy = s.reference_energy, velocity = s.reference_velocity
     cdef int32_t k
     for k in range(p.n_rows):
         size += p.d[k] * lam[k] * lam[k]
@@ -60,7 +60,7 @@ cdef inline int32_t end_refined(const watch_t* s, const score_t* x, double now, 
         return CONVERGED
     if is_rounding(s, x, now, tol):
         return AT_FLOOR
-    return STALLED if not floor_of(x, s.start_energy, s.start_velocity) <= tol else RUNNING
+    return STALLED if not floor_of(x, s.reference_energy, s.reference_velocity) <= tol else RUNNING
 
 
 cdef inline int32_t until_next(const watch_t* s, double now, double tol) noexcept nogil:
@@ -108,7 +108,7 @@ cdef inline int32_t check(watch_t* s, const view_t* v, double* lam, double tol) 
     elif rounds_much(s, p, lam):
         now = judge_with_floor(s, v, lam, &x)
     note_score(&s.best, p, &x, now)
-    lost = not now < inf and (s.start_energy > 0.0 or not x.finite)
+    lost = not now < inf and (s.reference_energy > 0.0 or not x.finite)
     if s.total <= EARLY and s.start < now < inf:
         s.start = now
     see(&s.progress, s.total, now)
@@ -159,9 +159,9 @@ cdef inline int32_t confirmed(const watch_t* s, const view_t* v, const double* l
     cdef bint within
     judge_view(v, lam, s.w, s.e, s.v, status == AT_FLOOR, &x)
     now = relative_to_start(s, &x)
-    if refine_view(v, lam, s.w, s.e, s.v, s.start_energy, s.start_velocity, tol, now, &x):
+    if refine_view(v, lam, s.w, s.e, s.v, s.reference_energy, s.reference_velocity, tol, now, &x):
         within = now <= tol
-        now = relative_of(&x, s.w, v.p.n_rows, s.start_energy, s.start_velocity)
+        now = relative_of(&x, s.w, v.p.n_rows, s.reference_energy, s.reference_velocity)
         if within:
             return end_refined(s, &x, now, tol)
     if now <= tol:
@@ -220,7 +220,7 @@ cdef class Watch:
         room = watch_room(m, count_islands(&self.view.p))
         scratch = np.empty(room + 2 * m + scratch_of(&self.other) + 4)
         self.keep = data, confirm, scratch
-        begin_watch(&self.state, &self.view.p, data.start_energy, data.start_velocity, patience, &scratch[0])
+        begin_watch(&self.state, &self.view.p, data.reference_energy, data.reference_velocity, patience, &scratch[0])
         self.state.w = &scratch[room]
         self.state.e = &scratch[room + m]
         self.state.v = &scratch[room + 2 * m]

@@ -276,7 +276,7 @@ cdef class Solve(Method):
         self.space.index = <int32_t*>address(self.index)
         n = self.n = state_of(&self.space)
         aim(n, &self.view.p, self.view.a, self.view.r, self.view.g)
-        set_reference(&n.problem, data.start_energy, data.start_velocity)
+        set_reference(&n.problem, data.reference_energy, data.reference_velocity)
         judge = zeros(judge_room(&n.problem.p, n.problem.r, n.problem.g))
         self.held = [matrix, judge]
         lay_judge(n, <double*>address(judge))

@@ -456,7 +456,7 @@ cdef class Pivoting:
         self.reals = np.zeros(direct_real(&v, band))
         self.ints = np.zeros(direct_index(&v), np.int32)
         reals, ints = self.reals, self.ints
-        self.t.e0, self.t.v0 = self.judged.start_energy, self.judged.start_velocity
+        self.t.e0, self.t.v0 = self.judged.reference_energy, self.judged.reference_velocity
         self.t.least = 1e-13
         self.t.linear, self.t.symmetric = linear, symmetric
         direct_lay(&self.t, &v, &p.csr, &p.blocks, band, first, tiny, &reals[0], &ints[0])

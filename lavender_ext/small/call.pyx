@@ -27,7 +27,7 @@ from lavender_ext.small.call cimport COUNTS, ENDED, FAILED, KEPT, Rules, few_rul
 from lavender_ext.small.friction cimport ask_t, part_t, solve_part, work_of
 from lavender_ext.small.limits cimport is_linear
 from lavender_ext.small.room cimport has_room, leave
-from lavender_ext.judge.measure cimport do_nothing, floor_of, judge_view, judged_from, relative_of, scratch_of
+from lavender_ext.judge.measure cimport set_zero_impulse, floor_of, judge_view, judged_from, relative_of, scratch_of
 from lavender_ext.judge.score cimport new_score
 from lavender_ext.local.gauss_seidel cimport prepare_blocks, prepared_sizes
 from lavender_ext.pivot.direct cimport (HALVED, direct_begin, direct_begin_passes, direct_factor, direct_first,
@@ -105,7 +105,7 @@ cdef bint begin_few(few_t* s, const few_rules_t* rules, double* own, bint cold, 
     """
     cdef int32_t m = s.v.p.n_rows
     cdef double before = s.begin[2]
-    do_nothing(&s.v.p, scratch, both)
+    set_zero_impulse(&s.v.p, scratch, both)
     if cold:
         memcpy(own, scratch, m * sizeof(double))
     if not rules.follows:
@@ -437,7 +437,7 @@ cdef class Small:
     def __init__(self, Data data, Data over):
         self.data, self.over, self.count = data, over, 1
         self.at.v, self.at.over = data.view(), over.view()
-        self.at.begin[0], self.at.begin[1], self.at.begin[2] = data.start_energy, data.start_velocity, data.start_relative
+        self.at.begin[0], self.at.begin[1], self.at.begin[2] = data.reference_energy, data.reference_velocity, data.relative_at_zero
         if not lay_few(&self.at, &self.room):
             raise MemoryError(f"{data.blocks.n_rows} rows")
 

@@ -12,7 +12,7 @@ from lavender_ext.core.parts cimport CONE, blocks_t
 from lavender_ext.core.view cimport csr_t, view_t
 from lavender_ext.driver.driver cimport NEWTON, lav_room, lav_start, lav_step
 from lavender_ext.small.room cimport has_room
-from lavender_ext.judge.measure cimport do_nothing, find_reference, judge_view, relative_of
+from lavender_ext.judge.measure cimport set_zero_impulse, find_reference, judge_view, relative_of
 from lavender_ext.judge.score cimport new_score, score_t
 from lavender_ext.sweep.serial cimport context_t, form_velocity
 
@@ -190,7 +190,7 @@ cdef inline bint solve_part(part_t* s, ask_t* o, room_t* r, double* work, int32_
     cdef double begun[3]
     t.s, t.o, t.r = s, o, r
     lay_turns(&t, work, order, &rng)
-    do_nothing(p, s.answer, t.w)
+    set_zero_impulse(p, s.answer, t.w)
     begun[0], begun[1], begun[2] = s.e0, s.v0, now
     if now < 0.0:
         judge_view(&s.v, s.answer, t.w, t.error, t.scratch, False, &nothing)

@@ -111,8 +111,8 @@ cdef struct flow_t:
     double* across              # (s, rows) Y^T
     double* sum                 # (2 rows) scratch
     double tol                  # relative residual asked of each island
-    double start_energy         # reference of a problem of one island, sqrt J
-    double start_velocity       # m/s
+    double reference_energy         # reference of a problem of one island, sqrt J
+    double reference_velocity       # m/s
     double energy_limit         # of the present island, sqrt J
     double velocity_limit       # m/s
     int32_t steps               # Newton steps left

@@ -285,9 +285,9 @@ cdef inline void furnish(flow_t* f, const need_t* need, double* x) noexcept nogi
     f.a = NULL
 
 
-cdef inline void aim_at(flow_t* f, double tol, int32_t steps, double start_energy, double start_velocity) noexcept nogil:
+cdef inline void aim_at(flow_t* f, double tol, int32_t steps, double reference_energy, double reference_velocity) noexcept nogil:
     """The relative residual asked of each island, and the reference of a problem that is one; counts start at zero."""
-    f.tol, f.start_energy, f.start_velocity = tol, start_energy, start_velocity
+    f.tol, f.reference_energy, f.reference_velocity = tol, reference_energy, reference_velocity
     f.steps = steps
     f.wait.island = -1
     f.factorisations = f.rounds = f.evaluations = 0

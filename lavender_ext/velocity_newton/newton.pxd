@@ -492,7 +492,7 @@ cdef inline int32_t with_coulomb(flow_t* f, int32_t island, double* impulse) noe
 cdef inline void set_limits(flow_t* f, int32_t island) noexcept nogil:
     """Largest errors with which an island's relative residual is at most tol; 0 if each row is compared with its own terms."""
     cdef const double* own
-    cdef double energy = f.start_energy, velocity = f.start_velocity
+    cdef double energy = f.reference_energy, velocity = f.reference_velocity
     if f.p.islands != NULL:
         own = f.p.islands.reference + 2 * f.p.islands.label[block_from(f, f.iptr[island])]
         energy, velocity = max(own[0], 0.0), max(own[1], 0.0)

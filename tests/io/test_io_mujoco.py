@@ -31,7 +31,7 @@ def test_the_solution_of_newton_is_a_solution_here(cone, condim, jacobian):
     assert data.ncon >= 3
     assert problem.law == ("cone" if cone == "elliptic" and condim > 1 else "lcp")
     assert found.relative < NEWTON
-    assert found.velocity_start > 1e-3  # m/s: there was something to do
+    assert found.velocity_at_zero > 1e-3  # m/s: there was something to do
 
 
 def test_friction_slides_and_sticks_in_the_scene():

@@ -262,7 +262,7 @@ static int32_t set_problem(lav_solver *s, const lav_problem *q) {
   if (q->form == LAV_MATRIX) s->read.a = &s->a;
   else if (q->form == LAV_BODIES) s->read.r = &s->r;
   else s->read.g = general_of(s);
-  judge_measure_judge_nothing(&s->read, s->island_marks, &s->islands, s->reference, s->impulse, s->watch.w, s->watch.e,
+  judge_measure_judge_zero_impulse(&s->read, s->island_marks, &s->islands, s->reference, s->impulse, s->watch.w, s->watch.e,
                               s->watch.v, s->start);
   s->p.islands = s->read.p.islands;
   if (q->impulse) COPY(s->impulse, q->impulse, q->n_rows);

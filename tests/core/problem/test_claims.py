@@ -154,7 +154,7 @@ def test_the_impulse_of_an_infeasible_problem_is_within_its_bounds(name, seed, m
     if solution.status is lv.Status.INFEASIBLE:
         assert (solution.impulse >= 0.0).all()
         # Sums over the rows in another order round differently.
-        assert solution.residual.energy <= solution.residual.energy_start * (1.0 + 1e-14)
+        assert solution.residual.energy <= solution.residual.energy_at_zero * (1.0 + 1e-14)
         assert solution.claim_check == "confirmed" and solution.certificate is not None
 
 

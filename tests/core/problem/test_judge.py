@@ -75,8 +75,8 @@ def error_of_the_pass(problem, lam):
     """How far the judge's slack is from the exact one, as a relative residual, over its floor."""
     found, twin = lv.residual(problem, lam), judge_twin.Problem(spec_of(problem))
     lost = np.abs(found.slack * twin.stretch - twin.slack(lam / twin.stretch))
-    energy = np.sqrt((lost**2 / twin.d).sum()) / found.energy_start
-    velocity = (lost * np.sqrt(twin.nu / twin.d)).max() / found.velocity_start
+    energy = np.sqrt((lost**2 / twin.d).sum()) / found.energy_at_zero
+    velocity = (lost * np.sqrt(twin.nu / twin.d)).max() / found.velocity_at_zero
     return float(max(energy, velocity)) / found.floor
 
 

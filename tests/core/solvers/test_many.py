@@ -37,7 +37,15 @@ def assert_same(many, i, single):
     """The arrays and the Solution of world i have the bits of a single solve."""
     own, found = many[i], single.residual
     assert own.impulse.tobytes() == single.impulse.tobytes()
-    for name in ("relative", "energy", "velocity", "floor", "worst_row", "energy_start", "velocity_start"):
+    for name in (
+        "relative",
+        "energy",
+        "velocity",
+        "floor",
+        "worst_row",
+        "energy_at_zero",
+        "velocity_at_zero",
+    ):
         assert getattr(own.residual, name) == getattr(found, name), name
     assert own.residual.slack.tobytes() == found.slack.tobytes()
     assert many.impulse_error[i] == (abs(found.error[found.worst_row]) if found.worst_row >= 0 else 0.0)

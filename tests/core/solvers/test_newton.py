@@ -172,8 +172,8 @@ def test_interior_point_system_is_solved_and_its_steps_stay_inside_and_know_the_
         lam[sc.keep] = whole * sc.scale
         truth = lv.residual(problem, lam)
         # The running slack against one computed afresh; fixed rows are right by construction.
-        assert energy == pytest.approx(truth.energy, rel=1e-6, abs=1e-9 * truth.energy_start)
-        assert velocity == pytest.approx(truth.velocity, rel=1e-6, abs=1e-9 * truth.velocity_start)
+        assert energy == pytest.approx(truth.energy, rel=1e-6, abs=1e-9 * truth.energy_at_zero)
+        assert velocity == pytest.approx(truth.velocity, rel=1e-6, abs=1e-9 * truth.velocity_at_zero)
         z = whole[sc.ptr[:-1]]
         assert np.all(z[row] > sc.lower[sc.ptr[:-1]][row])
         assert np.all(z[row] < sc.upper[sc.ptr[:-1]][row])

@@ -147,7 +147,7 @@ def test_ctrl_c_returns_the_best_iterate(name, case, interrupted_newton):
     solution = lv.solve(lv.suite.case(case).problem, name, tol=1e-12)
     assert solution.status is lv.Status.INTERRUPTED
     assert len(looks) == 5
-    assert min(looks) < 1.0 and solution.residual.energy < solution.residual.energy_start
+    assert min(looks) < 1.0 and solution.residual.energy < solution.residual.energy_at_zero
     assert solution.residual.relative < 1.0
 
 
