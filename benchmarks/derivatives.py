@@ -140,7 +140,9 @@ def compared(source: str, problem: lv.Problem, seed: int = 0) -> Compared | None
             continue
         now = (high.slack - low.slack) / (2.0 * h)
         # What the residuals leave in w, or rounding does: sqrt(J), as `norm` has it.
-        left = sum(max(x.residual.energy, x.residual.floor * x.residual.energy_at_zero) for x in (low, high))
+        left = sum(
+            max(x.residual.energy, x.residual.roundoff_floor * x.residual.energy_at_zero) for x in (low, high)
+        )
         if before is not None and max(norm(now - before), left / (2.0 * h)) < error:
             best, error = now, max(norm(now - before), left / (2.0 * h))
         before = now

@@ -151,4 +151,4 @@ def _unfinished(problem: Problem, impulses: Sequence[Any], exact: Any, last: int
 
 def _judged(problem: Problem, kind: str, impulse: Any) -> Stop:
     r: Residual = residual(problem, impulse, precision="float32")
-    return Stop(problem.name, kind, r.relative, r.floor, r.verdict)
+    return Stop(problem.name, kind, r.relative, r.roundoff_floor, r.verdict)

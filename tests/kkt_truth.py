@@ -166,7 +166,7 @@ def solution_in(problem, a, b, numbers):
     """(lambda, w) of the problem with matrix a and right-hand side b; None where no conditions were found to hold."""
     plain = lv.Problem(b.astype(float), problem.cones, a.astype(float), friction=problem.friction)
     rough = lv.solve(plain, "auto", tol=1e-15)
-    if not rough.residual.relative <= max(1e-12, 2 * rough.residual.floor):
+    if not rough.residual.relative <= max(1e-12, 2 * rough.residual.roundoff_floor):
         return None
     x, d = numbers.array(rough.impulse), numbers.array(plain.d)
     modes = conditions(problem, x, a @ x - b, d, numbers)

@@ -216,7 +216,7 @@ def without_solution(seed, m):
 def good(solution, tol=1e-12):
     """Within tol, or twice what rounding lambda to float64 costs, and not contradicted."""
     return (
-        solution.residual.relative <= max(tol, 2.0 * solution.residual.floor)
+        solution.residual.relative <= max(tol, 2.0 * solution.residual.roundoff_floor)
         and solution.claim_check == "confirmed"
     )
 

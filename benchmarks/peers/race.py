@@ -24,7 +24,7 @@ def _child(pipe: Any, contestant: Contestant, problem: Problem, limit: float) ->
     # In a process of its own: (seconds, residual) of each setting, then None or why it stopped.
     try:
         with one_thread(contestant.name), quiet(noisy=True):
-            least = max(min(TARGETS), 2.0 * residual(problem, problem.start()).floor)
+            least = max(min(TARGETS), 2.0 * residual(problem, problem.start()).roundoff_floor)
             for call in contestant.runs(problem, limit):
                 began = monotonic()
                 seconds, impulse = call()

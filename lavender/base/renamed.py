@@ -23,7 +23,7 @@ INSTEAD = {
         "floor": "roundoff_floor",
         "velocity_at_zero": "velocity_at_zero",
     },
-    "Status": {"FLOOR": "ROUNDOFF_LIMIT", "REFUSED": "INVALID_PROBLEM"},
+    "Status": {"ROUNDOFF_LIMIT": "ROUNDOFF_LIMIT", "INVALID_PROBLEM": "INVALID_PROBLEM"},
 }
 
 

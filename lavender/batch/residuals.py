@@ -77,9 +77,9 @@ class Many:
         return self._numbers("push")
 
     @property
-    def floor(self) -> FloatArray:
+    def roundoff_floor(self) -> FloatArray:
         """(n,) relative residual that rounding alone costs."""
-        return self._numbers("floor")
+        return self._numbers("roundoff_floor")
 
     @property
     def worst_row(self) -> np.ndarray:
@@ -100,7 +100,8 @@ class Many:
     def _keep(self, i: int, found: Residual) -> None:
         """What the judge found of a world that the loop left."""
         known = {
-            "relative": found.relative, "energy": found.energy, "speed": found.velocity, "floor": found.floor,
+            "relative": found.relative, "energy": found.energy, "speed": found.velocity,
+            "roundoff_floor": found.roundoff_floor,
             "reference_energy": found.energy_at_zero, "reference_speed": found.velocity_at_zero,
             "above_floor": found.above_floor,
             "push": abs(found.error[found.worst_row]) if found.worst_row >= 0 else 0.0,
@@ -191,7 +192,7 @@ class Residuals(Many):
         nothing = (self._numbers("relative_at_zero") < 0.5) | (self._numbers("reference_speed") < AT_REST)
         for i, known in self._nothing.items():
             nothing[i] = known
-        names = "relative", "floor", "above_floor", "energy", "speed", "rhs_energy"
+        names = "relative", "roundoff_floor", "above_floor", "energy", "speed", "rhs_energy"
         each = zip(
             *(self._numbers(name).tolist() for name in names), nothing.tolist(), self.precision, strict=True
         )
@@ -204,7 +205,7 @@ class Residuals(Many):
     def excess(self) -> FloatArray:
         """(n,) relative residual over its floor."""
         with np.errstate(divide="ignore", invalid="ignore"):
-            return np.where(self.relative == 0.0, 0.0, self.relative / self.floor)
+            return np.where(self.relative == 0.0, 0.0, self.relative / self.roundoff_floor)
 
     def keep(self, i: int, found: Residual) -> None:
         """The residual of a world that the loop left."""

@@ -50,21 +50,22 @@ NUMBER_OF = {status: i for i, status in enumerate(Status)}
 class Solutions(Many, Sequence[Solution]):
     """Results of `solve_many`, in read-only arrays; `many[i]` is the `Solution` of world i.
 
-    `many[many.success]`, `many[2:5]` and `many[[0, 7]]` are lists of them; faults of those that are REFUSED are raised.
+    `many[many.success]`, `many[2:5]` and `many[[0, 7]]` are lists of solutions. Access to a world whose status is
+    INVALID_PROBLEM raises its error.
 
     Parameters
     ----------
     impulse : N s
         Of a stacked batch (n, m), 0 beyond the rows of a world that has fewer; else of all rows, where `ptr` says which
-        world they are of. NaN of a world that is REFUSED, like all its numbers; its counts are 0.
+        world they are of. NaN of a world that is INVALID_PROBLEM, like all its numbers; its counts are 0.
     status : (n,) of Status
-        REFUSED where the data of a world are no problem's.
+        INVALID_PROBLEM where the data of a world are no problem's.
     relative, energy, velocity_error, impulse_error, floor : (n,)
         Of the judge: -, sqrt J, m/s and N s of the worst row, -.
     worst_row, iterations : (n,) int
     tol : float, -
     faults : dict
-        What is wrong with the worlds that are REFUSED, by their numbers.
+        What is wrong with the worlds that are INVALID_PROBLEM, by their numbers.
     """
 
     def __init__(
@@ -119,7 +120,7 @@ class Solutions(Many, Sequence[Solution]):
         for i, solution in self._kept.items():
             out[i] = NUMBER_OF[solution.status]
         for i in self.faults:
-            out[i] = NUMBER_OF[Status.REFUSED]
+            out[i] = NUMBER_OF[Status.INVALID_PROBLEM]
         return read_only(STATUS[out])
 
     @property
@@ -195,7 +196,7 @@ class Solutions(Many, Sequence[Solution]):
         return sum(LATE + reading_time(p) if data and p.generalized else UNREAD for p, data in both)
 
     def empty_refused(self) -> None:
-        """What stands in the arrays for worlds that are REFUSED is no answer."""
+        """What stands in the arrays for worlds that are INVALID_PROBLEM is no answer."""
         for i in self.faults:
             self._impulse[self._rows(i)] = np.nan
             self._worlds.counts[i], self._worlds.worst[i] = 0, -1
@@ -290,7 +291,7 @@ def solve_many(
         may be checked only when its numbers are read.
     errors : {"raise", "status"}
         Of a world whose data or start are refused (NaN, an M that is not definite, a negative mu): raise what is wrong
-        with the first, or go on and give it the status REFUSED; `Solutions.faults` has the words.
+        with the first, or go on and give it the status INVALID_PROBLEM; `Solutions.faults` has the words.
 
     Returns
     -------

@@ -11,7 +11,7 @@ from lavender.base.errors import InputError
 from lavender.cli.options import EXIT_INFEASIBLE, EXIT_INTERRUPTED, EXIT_UNMET, PATH, one_thread, say
 from lavender.io.stored import writable, write_atomically
 
-RESIDUAL = ("error", "relative", "energy", "velocity", "floor")  # what is written of it
+RESIDUAL = ("error", "relative", "energy", "velocity", "roundoff_floor")  # what is written of it
 
 
 @click.command()

@@ -101,10 +101,10 @@ class Foreign(Solver):
         work, certificate, dual = said.work, said.certificate, said.dual
         if not isinstance(said.status, Status):
             wrong = wrong or f"claims the status {claim.status!r:.60}; a lavender.Status is needed"
-        elif said.status is Status.REFUSED:
+        elif said.status is Status.INVALID_PROBLEM:
             wrong = (
                 wrong
-                or "claims the status REFUSED, which only `solve_many` gives, to data that are no problem"
+                or "claims the status INVALID_PROBLEM, which only `solve_many` gives, to data that are no problem"
             )
         elif not _counts(claim.iterations):
             wrong = wrong or f"claims {claim.iterations!r:.60} iterations; a whole number from 0 is needed"

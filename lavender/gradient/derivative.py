@@ -568,7 +568,7 @@ def derivative(problem: Problem, solution: Any) -> Derivative:
         if not (found.nothing_to_do and found.rounds):
             raise InputError(
                 f"this is no solution of this problem: its relative residual is {found.relative:.2e}; a derivative "
-                f"needs {ACCEPTED:g} or the floor ({found.floor:.1e}): solve with tol=1e-10, or give the problem that "
-                "it solves"
+                f"needs {ACCEPTED:g} or the floor ({found.roundoff_floor:.1e}): solve with tol=1e-10, or give the "
+                "problem that it solves"
             )
     return Derivative(problem, linear)

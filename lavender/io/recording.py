@@ -182,7 +182,7 @@ def _solved(
     told = {
         "rows": problem.m, "iterations": int(np.sum(data.solver_niter)), "seconds": seconds,
         "relative": judged.relative, "velocity": judged.velocity, "worst": judged.worst_name,
-        "floor": judged.floor, "verdict": judged.verdict, "precision": precision, "threshold": threshold,
+        "floor": judged.roundoff_floor, "verdict": judged.verdict, "precision": precision, "threshold": threshold,
         "solver": mj.mjtSolver(int(model.opt.solver)).name.removeprefix("mjSOL_"),
     }  # fmt: skip
     return problem, own, told

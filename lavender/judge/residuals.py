@@ -54,6 +54,7 @@ import numpy as np
 
 from lavender.base.arrays import ArrayLike, FloatArray, IntArray, as_array, number, one_of, read_only
 from lavender.base.errors import InputError
+from lavender.base.renamed import build_attribute_error
 from lavender.problem import PRECISIONS, Problem, check_problem
 from lavender.problem.derived import cached_property
 from lavender_ext.judge import measure
@@ -167,7 +168,7 @@ class Residual:
     relative: float
     energy: float
     velocity: float
-    floor: float
+    roundoff_floor: float
     worst_row: int
     energy_at_zero: float
     velocity_at_zero: float
@@ -183,6 +184,9 @@ class Residual:
     threshold: float = ENOUGH
     _float64_relative: float = field(default=math.nan, repr=False)  # before an ill-conditioned M was refined
 
+    def __getattr__(self, name: str) -> Any:
+        raise build_attribute_error("Residual", repr(type(self).__name__), name)
+
     @property
     def at_floor(self) -> bool:
         """Whether rounding explains the residual, and the impulse is better than the zero impulse (float64: 1e5 times).
@@ -197,7 +201,7 @@ class Residual:
     @property
     def rounds(self) -> bool:
         """Whether rounding explains the residual, also if the impulse is no better than the zero impulse."""
-        return _rounds(self.relative, self.floor, self.precision)
+        return _rounds(self.relative, self.roundoff_floor, self.precision)
 
     @property
     def verdict(self) -> str:
@@ -208,7 +212,7 @@ class Residual:
         mistake from a stop before convergence: a different mu, for example, leaves the same error.
         """
         return verdict_of(
-            self.relative, self.floor, self.above_floor, self.energy, self.velocity, self.energy_rhs,
+            self.relative, self.roundoff_floor, self.above_floor, self.energy, self.velocity, self.energy_rhs,
             self.nothing_to_do, self.precision, self.threshold,
         )  # fmt: skip
 
@@ -223,7 +227,7 @@ class Residual:
         """Relative residual divided by its floor [-]; 0 for an exact answer."""
         if self.relative == 0.0:
             return 0.0
-        return self.relative / self.floor if self.floor > 0.0 else math.inf
+        return self.relative / self.roundoff_floor if self.roundoff_floor > 0.0 else math.inf
 
     @property
     def nothing_to_do(self) -> bool:
@@ -256,9 +260,7 @@ class Residual:
 
     def __str__(self) -> str:
         worst = f", worst {self.worst_name} ({self.velocity:.2g} m/s)" if self.worst_row >= 0 else ""
-        text = (
-            f"relative {self.relative:.2e}, energy {self.energy:.2e} sqrt(J){worst}, floor {self.floor:.1e}"
-        )
+        text = f"relative {self.relative:.2e}, energy {self.energy:.2e} sqrt(J){worst}, floor {self.roundoff_floor:.1e}"
         if self.rounding is None:
             return text
         return f"{text} of {self.precision} ({self.rounding}): {self.verdict_in_words}"
@@ -501,7 +503,9 @@ def _in_float32(problem: Problem, found: Residual, impulse: FloatArray) -> Resid
         _rounds(x, least, "float32") and x < 1.0 for x, least in zip(relative, sizes[-1], strict=True)
     ]
     above = max((x for x, rounds in zip(relative, explained, strict=True) if not rounds), default=0.0)
-    return replace(found, precision="float32", floor=floor, above_floor=above, rounding=Rounding(*parts))
+    return replace(
+        found, precision="float32", roundoff_floor=floor, above_floor=above, rounding=Rounding(*parts)
+    )
 
 
 def rounded(problem: Problem, impulse: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -542,7 +546,7 @@ def told(problem: Problem, last: measure.Judged) -> Residual:
         "relative": last.relative,
         "energy": last.energy,
         "velocity": last.velocity,
-        "floor": last.floor,
+        "roundoff_floor": last.roundoff_floor,
         "above_floor": last.above_floor,
         "worst_island": last.island,
         "floor_energy": last.floor_energy,

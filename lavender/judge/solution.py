@@ -25,7 +25,7 @@ class Status(str, Enum):
     """The solver's claim about how a solve ended; the value describes it."""
 
     CONVERGED = "the solver's own test at tol was met"
-    FLOOR = "above tol, but within twice the error of rounding to float64"
+    ROUNDOFF_LIMIT = "above tol, but within twice the error of rounding to float64"
     MAX_ITERATIONS = "the iteration budget was used up"
     TIME_LIMIT = "the time limit was reached"
     STALLED = "no further progress"
@@ -33,7 +33,7 @@ class Status(str, Enum):
     INFEASIBLE = "no solution exists; `certificate` proves it, unless `claim_check` says otherwise"
     NUMERICAL_ERROR = "a factorisation or the backend failed"
     INTERRUPTED = "stopped by Ctrl-C or by the callback"
-    REFUSED = "the data of one world of a batch are not a valid problem"
+    INVALID_PROBLEM = "the data of one world of a batch are not a valid problem"
 
     def __str__(self) -> str:
         return self.name
@@ -42,7 +42,7 @@ class Status(str, Enum):
 # Module names of the members: access through the class costs 600 instructions, a dozen times per solve.
 CONVERGED = Status.CONVERGED
 DIVERGED = Status.DIVERGED
-FLOOR = Status.FLOOR
+ROUNDOFF_LIMIT = Status.ROUNDOFF_LIMIT
 INFEASIBLE = Status.INFEASIBLE
 INTERRUPTED = Status.INTERRUPTED
 MAX_ITERATIONS = Status.MAX_ITERATIONS
@@ -360,7 +360,7 @@ class Solution:
             "status": self.status.name,
             "relative residual": f"{self.residual.relative:.2e} (asked for {self.tol:.0e})",
             "worst row": f"{self.residual.worst_name}, {self.residual.velocity:.2g} m/s",
-            "floor of float64": f"{self.residual.floor:.1e}",
+            "floor of float64": f"{self.residual.roundoff_floor:.1e}",
             "work": self._done,
             "time": self._took,
         }

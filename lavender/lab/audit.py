@@ -519,7 +519,7 @@ def _judged(
 ) -> Piece:
     """Judge some steps."""
     found = residual_many(batch, impulse, precision=how[0], threshold=how[1], errors="status")
-    numbers = np.array([found.velocity_error, found.impulse_error, found.relative, found.floor])
+    numbers = np.array([found.velocity_error, found.impulse_error, found.relative, found.roundoff_floor])
     words = found.verdict
     verdict = np.full(len(words), NOT_JUDGED, np.int8)
     measured = np.isfinite(numbers[0])

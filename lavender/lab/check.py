@@ -49,7 +49,7 @@ class CrossCheckRow:
     verdict: str
     status: str = ""
     relative: float | None = None  # -, the judge's
-    floor: float | None = None  # -
+    roundoff_floor: float | None = None  # -
     distance: float | None = None  # sqrt J, |Delta|_A to the reference
     allowed: float | None = None  # sqrt J, largest distance that (3) allows
     slack: float | None = None  # m/s, largest difference of slack
@@ -121,7 +121,7 @@ class CrossCheck:
         body = [
             (
                 f"{r.solver} → {r.ran}" if r.ran else r.solver, r.verdict, r.status,
-                _short(r.relative), _short(r.floor), _short(r.distance),
+                _short(r.relative), _short(r.roundoff_floor), _short(r.distance),
                 _short(r.allowed), _short(r.objective), "" if r.time is None else f"{1e3 * r.time:.3g}", r.note,
             )
             for r in self.rows
@@ -255,7 +255,7 @@ def _reference(
             failed.append(f"{name}: {last_words(error)}")
             continue
         r = solution.residual
-        needed = max(REFERENCE_TOL, min(10.0 * r.floor, FLOOR_MOST))
+        needed = max(REFERENCE_TOL, min(10.0 * r.roundoff_floor, FLOOR_MOST))
         if r.relative <= needed:
             note = f"relative {r.relative:.1e}"
             return solution, name, note + (f" ({'; '.join(failed)})" if failed else "")
@@ -272,7 +272,7 @@ def compare(problem: Problem, name: str, solution: Solution, optimum: Solution |
     shared: dict[str, Any] = {
         "status": solution.status.name,
         "relative": r.relative,
-        "floor": r.floor,
+        "roundoff_floor": r.roundoff_floor,
         "time": solution.setup_time + solution.solve_time,
         "solution": solution,
     }

@@ -36,7 +36,7 @@ MAX_LOSS = 0.1
 # A solve that ends otherwise has used up its budget, or a smaller tol does not change its result.
 CONTINUED = (Status.CONVERGED, Status.STALLED)
 # Of the constraint problem, whatever the program's error is.
-FINAL_STATUSES = (Status.FLOOR, Status.INTERRUPTED)
+FINAL_STATUSES = (Status.ROUNDOFF_LIMIT, Status.INTERRUPTED)
 FEASIBLE_TOL = 1e-7  # relative residual of a point that shows that an unbounded program has a feasible point
 
 

@@ -353,7 +353,7 @@ def run_backends(
     error, best = program_error(problem, log.impulse), log.impulse
     try:
         for spec in program_backends():
-            if log.done() and (log.status is not Status.FLOOR or error <= tol):
+            if log.done() and (log.status is not Status.ROUNDOFF_LIMIT or error <= tol):
                 break
             solver, before, trial = spec.load()(), log.best, start.copy()
             state = solver.prepare(problem)
@@ -376,7 +376,7 @@ def run_backends(
         impulse[:] = log.impulse
     else:
         impulse[:] = best
-        if claim.status is Status.FLOOR:  # true of the impulse of the log
+        if claim.status is Status.ROUNDOFF_LIMIT:  # true of the impulse of the log
             claim = replace(claim, status=Status.STALLED)
     return claim
 

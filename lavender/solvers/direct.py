@@ -228,7 +228,7 @@ class _Run:
         if self.best <= self.tol:
             return self.claim(Status.CONVERGED)
         if self.at_floor():
-            return self.claim(Status.FLOOR)
+            return self.claim(Status.ROUNDOFF_LIMIT)
         return self.claim(Status.STALLED)
 
     # -- linear systems that are not symmetric definite -------------------------------------------

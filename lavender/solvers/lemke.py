@@ -110,7 +110,7 @@ class Lemke(Solver):
             elif code == DONE and rows.relative <= tol:
                 status, message = Status.CONVERGED, ""
             elif code == DONE:
-                status = Status.FLOOR if rows.above_floor <= tol else Status.STALLED
+                status = Status.ROUNDOFF_LIMIT if rows.above_floor <= tol else Status.STALLED
             elif code == LATE or deadline.passed():
                 status = Status.TIME_LIMIT
             elif paths.pivots >= max_iter:

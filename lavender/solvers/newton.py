@@ -65,7 +65,7 @@ WATCHED = 0.05  # s between two looks at Ctrl-C, as factors are counted
 TIME_SHARE = 0.5  # of the time left that one turn may take
 _ENDS = {
     OUTCOMES["reached"]: Status.CONVERGED,
-    OUTCOMES["floor"]: Status.FLOOR,
+    OUTCOMES["floor"]: Status.ROUNDOFF_LIMIT,
     OUTCOMES["stuck"]: Status.STALLED,
 }
 WARM = 1e-3  # relative residual from which rows of A go on from what velocities left

@@ -184,7 +184,7 @@ class ThroughRows(Solver):
             return self.solver.run(held, impulse, max_iter, tol, time_limit)
         given = impulse.copy()
         claim = self._through(held, impulse, max_iter, tol, time_limit)
-        if claim.status in (Status.CONVERGED, Status.FLOOR):
+        if claim.status in (Status.CONVERGED, Status.ROUNDOFF_LIMIT):
             return claim
         room = np.empty_like(given), np.empty_like(given)
         before, after = (quick(held.form.problem, x, *room)[0] for x in (given, impulse))
@@ -223,13 +223,13 @@ class ThroughRows(Solver):
         if relative <= tol:
             status = Status.CONVERGED
         elif above <= tol:
-            status = Status.FLOOR
+            status = Status.ROUNDOFF_LIMIT
         elif status is Status.INFEASIBLE and claim.certificate is not None:
             proof = _whole(form.back @ claim.certificate)
             if check_certificate(form.problem, proof, tol) is not None:
                 status, proof = Status.STALLED, None
                 words += ": of the friction as rows, which proves nothing of the problem itself"
-        elif status in (Status.CONVERGED, Status.FLOOR):
+        elif status in (Status.CONVERGED, Status.ROUNDOFF_LIMIT):
             status = Status.STALLED
         name = "edges of the cones" if form.problem.law == "cone" else "rows with slack"
         return replace(

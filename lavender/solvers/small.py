@@ -39,7 +39,7 @@ FAILED_CALL_KEY = "lavender.solvers.small: failed call"
 #: Why nothing ran, by the status of a start.
 NOTHING = {
     Status.CONVERGED: "the start is a solution",
-    Status.FLOOR: "the start is at its floor: what is left is rounding",
+    Status.ROUNDOFF_LIMIT: "the start is at its floor: what is left is rounding",
 }
 NO_TIME = "the time limit left no time for a solver"
 WARM = 1e-3  # relative residual from which an iterate is worth starting from

@@ -102,7 +102,7 @@ class SolveLog:
         if self.best <= self.tol:
             return Status.CONVERGED
         if self.at_floor():
-            return Status.FLOOR
+            return Status.ROUNDOFF_LIMIT
         if self.timed_out or self.deadline.passed():
             return Status.TIME_LIMIT
         if self.left <= 0:

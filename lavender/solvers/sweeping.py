@@ -24,7 +24,7 @@ STATUS = {
     CONVERGED: Status.CONVERGED,
     DIVERGED: Status.DIVERGED,
     STALLED: Status.STALLED,
-    AT_FLOOR: Status.FLOOR,
+    AT_FLOOR: Status.ROUNDOFF_LIMIT,
 }
 PATIENCE = 64  # sweeps that may always pass without a better check
 

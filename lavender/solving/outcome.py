@@ -18,11 +18,11 @@ from lavender.judge.solution import (
     CONTRADICTED,
     CONVERGED,
     DIVERGED,
-    FLOOR,
     INFEASIBLE,
     MAX_ITERATIONS,
     NOT_PROVEN,
     NUMERICAL_ERROR,
+    ROUNDOFF_LIMIT,
     STALLED,
     TIME_LIMIT,
     Claim,
@@ -70,7 +70,7 @@ def finish(
     relative = judged.relative
     if (
         status in (CONVERGED, STALLED)
-        and tol < relative == judged.floor
+        and tol < relative == judged.roundoff_floor
         and relative_of(problem.metric, judged.energy, judged.velocity) <= tol
     ):
         status = DIVERGED
@@ -79,22 +79,25 @@ def finish(
         status = CONVERGED
     elif tol < relative and (
         (status in (CONVERGED, STALLED, MAX_ITERATIONS, TIME_LIMIT) and judged._float64_relative <= tol)
-        or (status is FLOOR and judged._float64_relative < math.inf)
+        or (status is ROUNDOFF_LIMIT and judged._float64_relative < math.inf)
     ):  # the claim is true of the first pass in float64
         status = STALLED
         message = _joined(
             message,
-            f"M is ill-conditioned: residuals below {judged.floor:.1e} are rounding errors of float64",
+            f"M is ill-conditioned: residuals below {judged.roundoff_floor:.1e} are rounding errors of float64",
         )
     elif (
         problem.operator not in spec.operators
-        and ((status is CONVERGED and relative > tol) or (status is FLOOR and not judged.above_floor <= tol))
+        and (
+            (status is CONVERGED and relative > tol)
+            or (status is ROUNDOFF_LIMIT and not judged.above_floor <= tol)
+        )
         and _holds_as_formed(problem, impulse, tol)
     ):
         status = STALLED
         message = _joined(message, "its test was met only on A as it was formed, not on the given data")
     if status in (CONVERGED, STALLED) and judged.above_floor <= tol < relative:
-        status = FLOOR
+        status = ROUNDOFF_LIMIT
     certificate, bound, unproven, status_conflict = claim.certificate, None, "", ""
     if status is INFEASIBLE and relative <= tol:
         # What meets tol is a solution to tol, whatever can be said of an exact one.
@@ -118,16 +121,16 @@ def finish(
         status_conflict = f"says INFEASIBLE, {refutation}" if refutation else ""
     if status is CONVERGED and not relative <= tol:
         status_conflict = f"says CONVERGED, relative residual {relative:.2e} is above tol {tol:.1e}"
-    elif status is FLOOR and not judged.above_floor <= tol:
+    elif status is ROUNDOFF_LIMIT and not judged.above_floor <= tol:
         status_conflict = (
-            f"says FLOOR, rounding does not explain a relative residual of {judged.above_floor:.2e}"
+            f"says ROUNDOFF_LIMIT, rounding does not explain a relative residual of {judged.above_floor:.2e}"
         )
     if status in (DIVERGED, STALLED) and not message and spec.resumable:
         message = describe_end(problem, status, claim.iterations)
     if status is MAX_ITERATIONS:
         way = _way_left(problem, relative, tol, claim.iterations, sweeps_per_decade)
         message = _joined(message, way)
-    unfinished = status not in (CONVERGED, FLOOR, NUMERICAL_ERROR) and judged.worst_island >= 0
+    unfinished = status not in (CONVERGED, ROUNDOFF_LIMIT, NUMERICAL_ERROR) and judged.worst_island >= 0
     if tol > 0.0 and unfinished and not relative <= tol:
         message = _joined(message, describe_islands(judged, tol))
     order = order_name(options.get("order", "given")) if spec.order else ""

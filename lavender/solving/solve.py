@@ -32,9 +32,9 @@ from lavender.judge.residuals import (
 from lavender.judge.solution import (
     CONFIRMED,
     CONVERGED,
-    FLOOR,
     INFEASIBLE,
     NUMERICAL_ERROR,
+    ROUNDOFF_LIMIT,
     TIME_LIMIT,
     Claim,
     Solution,
@@ -351,7 +351,7 @@ class Prepared:
         else:
             start = loop.impulse.copy()
             claim = loop.run(max_iter) if spec.resumable else loop.run_once(max_iter)
-            if loop.tol > 0.0 and claim.status not in (CONVERGED, FLOOR):
+            if loop.tol > 0.0 and claim.status not in (CONVERGED, ROUNDOFF_LIMIT):
                 claim = name_lost_row(problem, loop.impulse, claim)
                 # The checks of sweeps keep the best of each island, from the start on.
                 if claim.status is TIME_LIMIT or not isinstance(getattr(self.state, "watch", None), Watch):
@@ -562,7 +562,7 @@ def solve_small(
         return None
     status = CONVERGED
     if judged.relative > tol:
-        if limit == math.inf or judged.relative == judged.floor:
+        if limit == math.inf or judged.relative == judged.roundoff_floor:
             return None  # not the limit: beside such impulses rounding hides b
         status, judged = TIME_LIMIT, best_of(problem, judged, given, tol)
     kept = given if given is None or impulse is None else given.copy()  # the caller may write into his own

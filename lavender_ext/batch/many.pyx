@@ -169,7 +169,7 @@ PLACE = {"rows": ROWS, "velocities": VELOCITIES, "blocks": BLOCKS, "jac": JAC, "
 
 
 #: Rows of `Worlds.numbers` and codes of worlds by their names.
-NUMBER = {"relative": RELATIVE, "energy": ENERGY, "speed": SPEED, "floor": FLOOR, "reference_energy": START_ENERGY,
+NUMBER = {"relative": RELATIVE, "energy": ENERGY, "speed": SPEED, "roundoff_floor": FLOOR, "reference_energy": START_ENERGY,
           "reference_speed": START_SPEED, "relative_at_zero": START_RELATIVE, "rhs_energy": RHS_ENERGY, "push": PUSH,
           "above_floor": ABOVE_FLOOR}
 CODE = {"left": LEFT, "ready": READY, "bad": BAD, "tried": TRIED, "late": LATE, "started": STARTED}

@@ -20,7 +20,7 @@ from lavender_ext.core.view cimport view_t
 cdef enum:                      # outcomes
     MORE = 0
     REACHED = 1                 # tol
-    FLOOR = 2                   # within twice what rounding leaves
+    ROUNDOFF_LIMIT = 2                   # within twice what rounding leaves
     STUCK = 3
     CERTIFICATE = 4             # `direction` may prove that there is no solution: the caller looks, and calls again
     SPENT = 5                   # the budget, or `stop`

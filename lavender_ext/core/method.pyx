@@ -1,9 +1,9 @@
 """A method that was started on a problem, for Python: its steps, and what they say."""
 import numpy as np
 
-from lavender_ext.core.method cimport (BROKEN, CERTIFICATE, FLOOR, LOST, MORE, REACHED, SPENT, STUCK, options_t, said_t)
+from lavender_ext.core.method cimport (BROKEN, CERTIFICATE, ROUNDOFF_LIMIT, LOST, MORE, REACHED, SPENT, STUCK, options_t, said_t)
 
-OUTCOMES = {"more": MORE, "reached": REACHED, "floor": FLOOR, "stuck": STUCK, "certificate": CERTIFICATE, "spent": SPENT,
+OUTCOMES = {"more": MORE, "reached": REACHED, "floor": ROUNDOFF_LIMIT, "stuck": STUCK, "certificate": CERTIFICATE, "spent": SPENT,
             "broken": BROKEN, "lost": LOST}
 
 

@@ -77,7 +77,7 @@ cdef class Judged:
     cdef object both                                    # w (m,) m/s, then e (m,) N s
     cdef readonly double energy, velocity               # sqrt J, m/s; inf where e is not finite
     cdef readonly double floor_energy                   # sqrt J, what rounding leaves
-    cdef readonly double relative, floor                # -
+    cdef readonly double relative, roundoff_floor                # -
     cdef readonly double above_floor                    # - that rounding does not explain
     cdef readonly double float64_relative               # of the first pass, by float64 alone; NaN if it was not refined
     cdef double known_loss                              # `loss`, negative before it is computed

@@ -155,7 +155,7 @@ cdef Judged judged_from(Data p, impulse, both, const score_t* s, double relative
     made.velocity = s.velocity if s.finite else 1.0 / 0.0
     made.floor_energy = s.floor_energy
     made.worst, made.island = s.worst, s.island
-    made.relative, made.floor, made.above_floor = relative_, floor, above_floor_of(s, relative_, floor)
+    made.relative, made.roundoff_floor, made.above_floor = relative_, floor, above_floor_of(s, relative_, floor)
     made.float64_relative = float64_relative
     made.known_loss = -1.0 if p.is_general and float64_relative != float64_relative else 0.0
     return made
@@ -189,9 +189,9 @@ cdef class Judged:
         self.velocity = s.velocity if s.finite else 1.0 / 0.0
         self.floor_energy = s.floor_energy
         self.worst, self.island = s.worst, s.island
-        self.floor = floor_of(&s, p.reference_energy, p.reference_velocity)
+        self.roundoff_floor = floor_of(&s, p.reference_energy, p.reference_velocity)
         self.relative = relative_of(&s, w, p.blocks.n_rows, p.reference_energy, p.reference_velocity)
-        self.above_floor = above_floor_of(&s, self.relative, self.floor)
+        self.above_floor = above_floor_of(&s, self.relative, self.roundoff_floor)
         self.float64_relative, self.known_loss = NAN, 0.0
         if p.is_general and m > 0:
             self.known_loss = loss_by_factor(&p.blocks, &p.general, &lam[0], w, <double*>room.at, p.reference_energy,

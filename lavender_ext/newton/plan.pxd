@@ -13,7 +13,7 @@ from libc.math cimport sqrt
 from libc.stdint cimport int32_t
 from libc.string cimport memset
 
-from lavender_ext.core.method cimport CERTIFICATE, FLOOR, MORE, REACHED, SPENT, STUCK
+from lavender_ext.core.method cimport CERTIFICATE, ROUNDOFF_LIMIT, MORE, REACHED, SPENT, STUCK
 from lavender_ext.core.parts cimport CONE, COULOMB
 from lavender_ext.core.start cimport is_nothing
 from lavender_ext.judge.score cimport relative
@@ -359,5 +359,5 @@ cdef inline int32_t newton_step(newton_t* n, int32_t work) noexcept nogil:
     if n.best <= n.tol:
         return REACHED
     if at_floor(n):
-        return FLOOR
+        return ROUNDOFF_LIMIT
     return SPENT if spent(n) else STUCK

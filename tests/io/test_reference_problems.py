@@ -37,7 +37,7 @@ def test_a_reference_problem_loads_and_its_solution_is_one(problem_dir, name, tm
     judged = lv.residual(problem, stored.impulse)
     # Of a global form b = -(w + J M^-1 f) has roundings of its own, in another order than the file's solver added them.
     floors = 4.0 if stored.format == "fclib_global" else 2.0
-    assert judged.relative <= max(1e-11, floors * judged.floor), str(judged)
+    assert judged.relative <= max(1e-11, floors * judged.roundoff_floor), str(judged)
     assert (judged.relative > 1e-11) == (name in AT_FLOOR)
     # Their u is that of the same r, formed by another code: rounding of the largest sums, and where M had to
     # be inverted its condition number on top.
@@ -86,7 +86,7 @@ def test_exact_solvers_end_on_every_problem_without_friction(problem_dir, solver
         elif solver == "direct" and found.status is lv.Status.STALLED:
             assert not problem.is_symmetric, name  # where A is not monotone either, exchanges may have no end
         else:
-            assert found.success or found.status is lv.Status.FLOOR, (name, found)
+            assert found.success or found.status is lv.Status.ROUNDOFF_LIMIT, (name, found)
 
 
 #: Real friction problems on which 20,000 sweeps fail or take thousands.

@@ -96,7 +96,7 @@ enum { /* how a run ended; a claim, which `relative` beside it may contradict */
   LAV_CONVERGED = 1,
   LAV_DIVERGED = 2,
   LAV_STALLED = 3,
-  LAV_FLOOR = 4,               /* as good as rounding lets it be */
+  LAV_ROUNDOFF_LIMIT = 4,      /* as good as rounding lets it be */
   LAV_TIME_LIMIT = 5,
   LAV_FAILED = 6               /* a factorisation failed */
 };

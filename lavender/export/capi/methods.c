@@ -216,11 +216,11 @@ static void run_newton(lav_solver *s, const lav_budget *budget, lav_result *out)
         closer *= 0.25;
         begin_newton(s, closer * budget->tol, budget->iterations - before);
       }
-    } else if (how == core_method_FLOOR) out->outcome = LAV_FLOOR;
+    } else if (how == core_method_ROUNDOFF_LIMIT) out->outcome = LAV_ROUNDOFF_LIMIT;
     else if (how != core_method_MORE && how != core_method_CERTIFICATE) out->outcome = LAV_STALLED;
     else if (is_late(s, budget)) out->outcome = LAV_TIME_LIMIT;
   }
-  if (out->outcome != LAV_CONVERGED && out->outcome != LAV_FLOOR) keep_better(s, s->compare, budget->tol);
+  if (out->outcome != LAV_CONVERGED && out->outcome != LAV_ROUNDOFF_LIMIT) keep_better(s, s->compare, budget->tol);
   s->newton_options.tol = budget->tol;
   s->newton_options.budget = budget->iterations;
   out->restarts = out->iterations;

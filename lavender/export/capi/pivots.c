@@ -72,7 +72,7 @@ static void run_pivots(lav_solver *s, const lav_budget *budget, lav_result *out)
   if (t->relative < INFINITY) COPY(s->impulse, t->best, s->p.n_rows);
   if (out->outcome == LAV_CONVERGED || out->outcome == LAV_STALLED)
     out->outcome = t->relative <= budget->tol || (budget->tol == 0.0 && pivot_direct_is_end(t)) ? LAV_CONVERGED
-                   : judge_score_is_at_floor(t->relative, t->floor)                            ? LAV_FLOOR
+                   : judge_score_is_at_floor(t->relative, t->floor)                            ? LAV_ROUNDOFF_LIMIT
                                                                                                 : LAV_STALLED;
   out->iterations = s->options.method == LAV_LEMKE ? s->lemke.pivots : t->s.n_rounds;
   out->restarts = t->s.factorisations;

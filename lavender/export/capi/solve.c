@@ -313,10 +313,10 @@ static int32_t run(lav_solver *s, const lav_budget *budget, lav_result *out) {
       && (out->outcome == LAV_MAX_ITERATIONS || out->outcome == LAV_TIME_LIMIT || out->outcome == LAV_STALLED))
     out->outcome = LAV_CONVERGED; /* between two checks of its own */
   if (budget->tol > 0.0 && budget->tol < out->verdict.relative /* a claim that held in float64 alone */
-      && (out->outcome == LAV_FLOOR ? first == first
+      && (out->outcome == LAV_ROUNDOFF_LIMIT ? first == first
           : first <= budget->tol && (out->outcome == LAV_CONVERGED || out->outcome == LAV_STALLED
                                      || out->outcome == LAV_MAX_ITERATIONS || out->outcome == LAV_TIME_LIMIT)))
-    out->outcome = judge_score_is_at_floor(out->verdict.relative, out->verdict.floor) ? LAV_FLOOR : LAV_STALLED;
+    out->outcome = judge_score_is_at_floor(out->verdict.relative, out->verdict.floor) ? LAV_ROUNDOFF_LIMIT : LAV_STALLED;
   return LAV_OK;
 }
 

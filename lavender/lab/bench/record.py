@@ -172,7 +172,7 @@ class Record(_Texts):
     relative: float = math.inf  # -
     energy: float = math.inf  # sqrt J
     velocity: float = math.inf  # m/s
-    floor: float = math.nan  # -
+    roundoff_floor: float = math.nan  # -
     motion: float | None = None  # -, relative motion error; None if it was not requested, or if there is none
     motion_speed: float | None = None  # m/s, of the body that is furthest off (row, without bodies)
     bound: float | None = None  # sqrt J, proved bound of the motion error
@@ -183,7 +183,7 @@ class Record(_Texts):
     success: bool = False  # the judge: relative <= tol (a budget: false)
     claim_check: str = CONFIRMED  # "confirmed", "not proven" or "contradicted", as in a Solution
     status_conflict: str = ""  # why the judge's figures exclude what the status claims; empty if they do not
-    claims: bool = False  # the solver claims a solution: CONVERGED, FLOOR or INFEASIBLE
+    claims: bool = False  # the solver claims a solution: CONVERGED, ROUNDOFF_LIMIT or INFEASIBLE
     iterations: int = 0
     work: Mapping[str, int] = field(default_factory=dict)
     form: str = ""
@@ -236,8 +236,9 @@ def measurement_key(what: Any) -> tuple[Any, ...]:
 
 Entry = Run | CaseInfo | Skip | Record
 #: Fields of records by the names that earlier versions wrote.
-RENAMED_FIELDS = {"suspicions": "diagnostics", "contradicted": "status_conflict"}
+RENAMED_FIELDS = {"floor": "roundoff_floor", "suspicions": "diagnostics", "contradicted": "status_conflict"}
 REMOVED_KINDS = ("done",)  # Earlier versions marked complete pairs of a campaign; such lines are ignored.
+RENAMED_STATUSES = {"FLOOR": "ROUNDOFF_LIMIT", "REFUSED": "INVALID_PROBLEM"}
 KINDS: dict[str, type] = {"run": Run, "case": CaseInfo, "skip": Skip, "record": Record}
 
 
@@ -272,6 +273,9 @@ def from_json(line: Any) -> Entry:
 def _with_new_names(line: Mapping[str, Any]) -> Mapping[str, Any]:
     """Return a line of an earlier version with the fields' names of this one."""
     renamed = {RENAMED_FIELDS.get(name, name): value for name, value in line.items()}
+    status = renamed.get("status")
+    if isinstance(status, str):
+        renamed["status"] = RENAMED_STATUSES.get(status, status)
     conflict = line.get("contradicted")
     if not conflict or "claim_check" in line:
         return renamed

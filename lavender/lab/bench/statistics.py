@@ -93,7 +93,7 @@ class Reach:
     start: str
     times: Mapping[float, float]  # s to each level, inf where it was not reached
     best: float  # smallest relative residual of any run
-    floor: float  # of that run
+    roundoff_floor: float  # of that run
     status: str  # of the run to the tightest level asked for
     claim_check: str  # the worst of all runs
     status_conflict: str
@@ -104,7 +104,7 @@ class Reach:
     @property
     def at_floor(self) -> bool:
         """No better residual can be asked of float64."""
-        return at_floor(self.best, self.floor)
+        return at_floor(self.best, self.roundoff_floor)
 
 
 @dataclass(frozen=True)
@@ -128,7 +128,7 @@ class Claims:
 
     solver: str
     runs: int
-    claims: int  # says CONVERGED, FLOOR or INFEASIBLE
+    claims: int  # says CONVERGED, ROUNDOFF_LIMIT or INFEASIBLE
     wrong: int
     reached: int  # runs to a level that the judge confirms
     asked: int
@@ -143,12 +143,14 @@ class Spread:
     solver: str
     budget: int
     by_order: Mapping[str, float]
-    floor: float = 0.0  # below it residuals are rounding
+    roundoff_floor: float = 0.0  # below it residuals are rounding
 
     @property
     def factor(self) -> float:
         """Worst over best order, neither counted as better than the floor."""
-        values = [max(v, self.floor) for v in self.by_order.values() if max(v, self.floor) > 0.0]
+        values = [
+            max(v, self.roundoff_floor) for v in self.by_order.values() if max(v, self.roundoff_floor) > 0.0
+        ]
         return max(values) / min(values) if values else 1.0
 
 
@@ -171,7 +173,7 @@ def reaches(records: Records, levels: Sequence[float] | None = None) -> list[Rea
                     for level in levels
                 },
                 best=best.relative if best else math.inf,
-                floor=best.floor if best else math.nan,
+                roundoff_floor=best.roundoff_floor if best else math.nan,
                 status=last.status,
                 claim_check=max((r.claim_check for r in group), key=CLAIM_CHECKS.index),
                 status_conflict=next((r.status_conflict for r in group if r.status_conflict), ""),
@@ -194,7 +196,7 @@ def failures(records: Records) -> list[Record]:
     for r in records:
         if _is_again(r):
             continue
-        missed = r.mode == "tol" and not r.success and not at_floor(r.relative, r.floor)
+        missed = r.mode == "tol" and not r.success and not at_floor(r.relative, r.roundoff_floor)
         proven = r.status == "INFEASIBLE" and r.claim_check == CONFIRMED
         lost = not math.isfinite(r.relative) or r.status.startswith(DEATH_STATUSES)
         if (missed and not proven) or lost or r.status_conflict:
@@ -260,7 +262,7 @@ def spreads(records: Records) -> list[Spread]:
             name = f"{r.order} {r.seed}" if r.order == "random" else r.order
             groups[r.case, r.solver, r.max_iter][name] = r
     return [
-        Spread(*key, {name: r.relative for name, r in by.items()}, max(r.floor for r in by.values()))
+        Spread(*key, {name: r.relative for name, r in by.items()}, max(r.roundoff_floor for r in by.values()))
         for key, by in groups.items()
         if len(by) > 1
     ]

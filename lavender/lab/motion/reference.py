@@ -55,8 +55,9 @@ class Reference:
 
     def __str__(self) -> str:
         quality = "" if self.accepted else ", no solution"
+        residual = self.residual
         return (
-            f"{self.solver}, relative {self.residual.relative:.1e}, floor {self.residual.floor:.1e}{quality}"
+            f"{self.solver}, relative {residual.relative:.1e}, floor {residual.roundoff_floor:.1e}{quality}"
         )
 
 

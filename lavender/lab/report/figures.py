@@ -64,7 +64,7 @@ class Figure:
     x_log: bool = True
     y_log: bool = True
     levels: tuple[float, ...] = ()
-    floor: float = math.nan
+    roundoff_floor: float = math.nan
     left_out: tuple[str, ...] = ()  # solvers without a curve, so that the others can be distinguished
 
     @property
@@ -97,10 +97,13 @@ def build_work_precision(records: Records, case: str) -> Figure:
 def _build_case_figure(name: str, x_title: str, records: Records, case: str, curves: list[Curve]) -> Figure:
     """Create a figure of a case, with the round-off floor of its best run."""
     runs = (r for (of, _, _), some in statistics.pairs(records).items() if of == case for r in some)
-    best = min(((r.relative, r.floor) for r in runs if r.usable and r.floor > 0.0), default=(0.0, math.nan))
+    best = min(
+        ((r.relative, r.roundoff_floor) for r in runs if r.usable and r.roundoff_floor > 0.0),
+        default=(0.0, math.nan),
+    )
     return Figure(
         f"{name} {case}", case, x_title, "relative residual [-]", tuple(curves),
-        levels=statistics.levels_of(records), floor=best[1],
+        levels=statistics.levels_of(records), roundoff_floor=best[1],
     )  # fmt: skip
 
 

@@ -43,7 +43,7 @@ def convert_to_motion_errors(records: Records) -> Records:
     if not levels:
         return Records()
     converted = records.having(
-        replace(r, relative=math.inf if r.motion_speed is None else r.motion_speed, floor=0.0)
+        replace(r, relative=math.inf if r.motion_speed is None else r.motion_speed, roundoff_floor=0.0)
         for r in records
         if not r.turns
     )

@@ -122,12 +122,12 @@ def _draw(axes: Any, figure: Figure) -> list[tuple[Curve, list[tuple[float, floa
         artists.append((c, points, line, band))
     axes.set(xlim=x_limits, ylim=y_limits)
     levels = [level for level in figure.levels if y_limits[0] <= level <= y_limits[1]]
-    has_floor = figure.floor > 0.0 and y_limits[0] <= figure.floor <= y_limits[1]
+    has_floor = figure.roundoff_floor > 0.0 and y_limits[0] <= figure.roundoff_floor <= y_limits[1]
     for level in levels:
         axes.axhline(level, color="0.8", linewidth=0.6, zorder=0, gid="@ l")
     if has_floor:
         style: dict[str, Any] = {"color": "0.35", "linewidth": 1.0, "linestyle": (0, (1, 1))}
-        axes.axhline(figure.floor, label="floor of float64", zorder=0, gid="@ f", **style)
+        axes.axhline(figure.roundoff_floor, label="floor of float64", zorder=0, gid="@ f", **style)
     return artists
 
 
@@ -184,7 +184,7 @@ def plot_figure(
     The legend is to the right of the axes; without a title it takes the title's place above the axes.
     """
     canvas = _create_canvas(size)
-    entries = len(figure.curves) + (figure.floor > 0.0)
+    entries = len(figure.curves) + (figure.roundoff_floor > 0.0)
     rows = -(-entries // LEGEND_COLUMNS) + bool(figure.left_out)
     right, top = (2.05, 0.41) if figure.title else (0.15, 0.17 * rows + 0.1)
     # The axes have a fixed place: fitting it to the labels would take most of the time of a figure.
@@ -338,9 +338,9 @@ def _tag_axes(axes: Any, figure: Figure) -> None:
     axes.text(0.0, 1.0 + 8.0 / (HEIGHT - TOP - BOTTOM), axes.get_ylabel(), parse_math=False, **place)
     axes.set_ylabel("")
     low, high = axes.get_ylim()
-    if low <= figure.floor <= high:
+    if low <= figure.roundoff_floor <= high:
         place["transform"] = axes.get_yaxis_transform()
-        axes.text(0.99, figure.floor, "floor", ha="right", va="bottom", **place)
+        axes.text(0.99, figure.roundoff_floor, "roundoff_floor", ha="right", va="bottom", **place)
 
 
 def _describe_axis(limits: tuple[float, float], log: bool, first: int, last: int) -> str:

@@ -33,7 +33,7 @@ from lavender.lab.report.text import (
 )
 
 Rows = list[Sequence[str | Cell]]
-GOOD = ("CONVERGED", "FLOOR")
+GOOD = ("CONVERGED", "ROUNDOFF_LIMIT")
 CLAIM_MARKS = {CONFIRMED: "", NOT_PROVEN: NOT_PROVEN, CONTRADICTED: "✗ contradicted"}
 SHOWN_TIES = 2
 DIFFICULTY = (
@@ -340,14 +340,16 @@ def tabulate_failures(failures: Sequence[Record], campaign: bool) -> Table:
     rows: Rows = [
         [
             Cell(f.case, link="" if campaign else f"case-{file_name(f.case)}"), name_run(f.solver, f.start), f.asked,
-            f.status, format_residual(f.relative), format_residual(f.floor), f.worst_name,
+            f.status, format_residual(f.relative), format_residual(f.roundoff_floor), f.worst_name,
             (f"✗ {f.status_conflict}. " if f.status_conflict else "") + f.message,
         ]
         for f in failures
     ]  # fmt: skip
     marks = ["bad" if f.status_conflict else "" for f in failures]
     return Table(
-        ["case", "solver", "asked", "status", "residual", "floor", "worst row", "message"], rows, marks
+        ["case", "solver", "asked", "status", "residual", "roundoff_floor", "worst row", "message"],
+        rows,
+        marks,
     )
 
 

@@ -103,7 +103,7 @@ def judged(problem: Problem, impulse: FloatArray) -> dict[str, Any]:
         "relative": found.relative,
         "energy": found.energy,
         "velocity": found.velocity,
-        "floor": found.floor,
+        "floor": found.roundoff_floor,
         "worst": found.worst_name,
         "share": _shares(problem, found),
     }

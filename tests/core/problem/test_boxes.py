@@ -128,7 +128,7 @@ def test_pivoting_ends_nowhere_worse_than_it_starts(law, name, seed, iterations)
     start = project(problem.cones, near)
     end = lv.solve(problem, name, impulse=start, tol=1e-8, max_iter=iterations)
     # a solution at the floor of rounding may be as far above zero as the start
-    bound = max(lv.residual(problem, start).relative, 1e-8, 2.0 * end.residual.floor)
+    bound = max(lv.residual(problem, start).relative, 1e-8, 2.0 * end.residual.roundoff_floor)
     assert end.residual.relative <= bound, end
 
 

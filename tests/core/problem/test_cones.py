@@ -9,7 +9,7 @@ from random_problems import random_contact_problem, seeds
 import lavender as lv
 from lavender.problem.cones import project
 
-REFUSED = {
+INVALID_PROBLEM = {
     "a kind that does not exist": (lambda: lv.Cones([0, 1], [9], [0], [1], [0], [0]), "9"),
     "ptr that falls": (lambda: lv.Cones([0, 2, 1], [0, 0], [0], [1], [0, 0], [0, 0]), "increase"),
     "an empty block": (lambda: lv.Cones([0, 0], [0], [], [], [0], [0]), "increase"),
@@ -89,9 +89,9 @@ REFUSED = {
 }
 
 
-@pytest.mark.parametrize("name", REFUSED)
+@pytest.mark.parametrize("name", INVALID_PROBLEM)
 def test_what_makes_no_cone_is_refused_with_its_reason(name):
-    make, sign = REFUSED[name]
+    make, sign = INVALID_PROBLEM[name]
     with pytest.raises((lv.InputError, lv.UnknownName), match=sign):
         make()
 

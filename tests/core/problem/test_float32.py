@@ -63,11 +63,11 @@ def test_a_solution_rounded_to_float32_is_at_its_floor_and_one_further_off_is_no
         return
     there = lv.residual(p, exact.impulse.astype(np.float32), precision="float32")
     assert there.verdict == "at its floor", there
-    assert there.relative <= 4.0 * there.floor
+    assert there.relative <= 4.0 * there.roundoff_floor
     off = lv.residual(p, 0.99 * exact.impulse, precision="float32")
     if off.relative > 1e-4:  # of what 1 % less does; rounding is below that here
         assert off.verdict == "stopped before convergence"
-        assert off.excess == off.relative / off.floor > 4.0
+        assert off.excess == off.relative / off.roundoff_floor > 4.0
         assert f"stopped before convergence, {off.excess:.2g} times its floor" in str(off)
 
 

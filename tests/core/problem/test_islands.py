@@ -98,7 +98,7 @@ def test_the_residual_of_two_problems_side_by_side_is_the_larger_one(form, kind,
     found = lv.residual(both, np.concatenate(lam)[rows])
     worst = max(r.relative for r in alone)
     # The residual of a solved problem is rounding, which the order of additions changes: as much as its floor.
-    slack = ROUNDING * worst + 4.0 * max(r.floor for r in alone)
+    slack = ROUNDING * worst + 4.0 * max(r.roundoff_floor for r in alone)
     assert abs(found.relative - worst) <= slack
     if kind != "ellipses":  # whose numbers are those of stretched rows
         count = sum(islands(p)[0] for p in (first, second))
@@ -170,7 +170,7 @@ def test_inactive_rows_change_no_relative_residual(form, friction, seed, sizes, 
     for impulse in (lam, problem.start(), lv.solve(problem, tol=1e-9).impulse):
         alone = lv.residual(convert(problem), impulse)
         found = lv.residual(convert(more), np.concatenate([impulse, np.zeros(more.m - problem.m)]))
-        assert found.relative == pytest.approx(alone.relative, rel=1e-9, abs=4.0 * alone.floor)
+        assert found.relative == pytest.approx(alone.relative, rel=1e-9, abs=4.0 * alone.roundoff_floor)
 
 
 @pytest.mark.parametrize("form", ["matrix", "J and M"])

@@ -48,7 +48,11 @@ def equals_the_twin(problem, lam):
         first = min(said.unrefined, 0.1 * said.relative)  # of a pass that need not be refined
         assert abs(found.relative - said.relative) <= 1e-9 * said.relative + said.allowed + first
         # The floor takes absolute products of three factors; sizes of arms stand for those of their products here.
-        assert 0.1 * found.floor <= said.floors[max(found.worst_island, 0)] <= 100.0 * found.floor
+        assert (
+            0.1 * found.roundoff_floor
+            <= said.floors[max(found.worst_island, 0)]
+            <= 100.0 * found.roundoff_floor
+        )
 
 
 @pytest.mark.parametrize("friction", ["coulomb", "cone"])
@@ -77,7 +81,7 @@ def error_of_the_pass(problem, lam):
     lost = np.abs(found.slack * twin.stretch - twin.slack(lam / twin.stretch))
     energy = np.sqrt((lost**2 / twin.d).sum()) / found.energy_at_zero
     velocity = (lost * np.sqrt(twin.nu / twin.d)).max() / found.velocity_at_zero
-    return float(max(energy, velocity)) / found.floor
+    return float(max(energy, velocity)) / found.roundoff_floor
 
 
 @pytest.mark.parametrize("m", [10, 100, 1000])
@@ -159,8 +163,8 @@ def test_floor_bounds_the_rounded_exact_solution(seed):
     for _ in range(20):  # refinement: each step gains the digits of the float64 factorisation
         exact += np.linalg.solve(a, (lb - la @ exact).astype(float))
     judged = lv.residual(lv.Problem.linear(a, b), exact.astype(float))
-    assert judged.relative <= 2.0 * judged.floor
-    assert judged.floor <= 1e-6
+    assert judged.relative <= 2.0 * judged.roundoff_floor
+    assert judged.roundoff_floor <= 1e-6
 
 
 @pytest.mark.parametrize("friction", ["coulomb", "cone"])
@@ -176,10 +180,10 @@ def test_floor_bounds_the_rounded_slider_between_tangents_of_unlike_mass(frictio
     exact = np.array([x, 0.0, mu * x], float)
     judged = lv.residual(problem, exact)
     # A disk: both lambda_t and mu lambda_n are rounded. The projection on a cone rounds in five more operations.
-    assert judged.relative <= (2.0 if friction == "coulomb" else 7.0) * judged.floor
+    assert judged.relative <= (2.0 if friction == "coulomb" else 7.0) * judged.roundoff_floor
     if friction == "coulomb":  # a wide cone's nearest point follows the tangents
         off = lv.residual(problem, exact * [1.0, 1.0, 1.0 + 2.0**-46])  # by 64 units of the last place
-        assert off.relative > 2.0 * off.floor
+        assert off.relative > 2.0 * off.roundoff_floor
 
 
 # -- other measures --------------------------------------------------------------------------------------
@@ -278,8 +282,8 @@ def test_a_remembered_result_serves_its_own_impulse_alone():
     remember(problem, judged(problem, first.copy()))
     for x, expected in ((other, fresh[1]), (first, fresh[0])):
         found = lv.residual(problem, x)
-        assert (found.relative, found.floor, found.worst_row) == (
-            expected.relative, expected.floor, expected.worst_row
+        assert (found.relative, found.roundoff_floor, found.worst_row) == (
+            expected.relative, expected.roundoff_floor, expected.worst_row
         )  # fmt: skip
         np.testing.assert_array_equal(found.error, expected.error)
         np.testing.assert_array_equal(found.slack, expected.slack)

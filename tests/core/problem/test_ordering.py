@@ -85,7 +85,7 @@ def test_ranks_are_a_permutation_that_brings_neighbours_near():
     assert np.abs(np.diff(rank[body], axis=1)).max() == 1
 
 
-REFUSED = {
+INVALID_PROBLEM = {
     "no such order": ({"order": "bottomup"}, lv.UnknownName, "bottom_up"),
     "a block twice": ({"order": [0, 0, 2]}, lv.InputError, "once"),
     "too few": ({"order": [0, 1]}, lv.InputError, "shape"),
@@ -97,9 +97,9 @@ REFUSED = {
 }
 
 
-@pytest.mark.parametrize("name", REFUSED)
+@pytest.mark.parametrize("name", INVALID_PROBLEM)
 def test_what_makes_no_order_is_refused_with_its_reason(name):
-    options, error, sign = REFUSED[name]
+    options, error, sign = INVALID_PROBLEM[name]
     problem = lv.Problem.lcp(np.eye(3), np.ones(3))
     with pytest.raises(error, match=sign):
         block_order(problem, **options)

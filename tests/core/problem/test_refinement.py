@@ -65,16 +65,16 @@ def false_claim(problem, solution):
     r, status = solution.residual, solution.status
     if status is lv.Status.CONVERGED and not solution.status_conflict:
         most = CLOSE * solution.tol + found.allowed
-    elif status is lv.Status.FLOOR and not solution.status_conflict:
-        most = CLOSE * 2.0 * r.floor + found.allowed
+    elif status is lv.Status.ROUNDOFF_LIMIT and not solution.status_conflict:
+        most = CLOSE * 2.0 * r.roundoff_floor + found.allowed
         most = found.floors_most[max(r.worst_island, 0)]
-        if not r.floor <= most:
-            return f"a floor of {r.floor:.1e}, where rounding explains {most:.1e}"
+        if not r.roundoff_floor <= most:
+            return f"a floor of {r.roundoff_floor:.1e}, where rounding explains {most:.1e}"
     else:
         return None
     if found.relative <= most:
         return None
-    return f"{status.name} at {r.relative:.1e}, floor {r.floor:.1e}; in long double {found.relative:.1e}"
+    return f"{status.name} at {r.relative:.1e}, floor {r.roundoff_floor:.1e}; in long double {found.relative:.1e}"
 
 
 # -- claims ----------------------------------------------------------------------------------------
@@ -126,8 +126,8 @@ def test_sweeps_end_where_float64_loses_the_residual(name):
                 continue
             solution = lv.solve(problem, name, tol=1e-9, max_iter=300_000)
             if judged(problem, solution.impulse).relative <= 1e-9 < solution.residual.relative:
-                assert solution.status is lv.Status.FLOOR, (seed, law, str(solution))
-                assert solution.residual.relative <= 2.0 * solution.residual.floor <= 1e-4
+                assert solution.status is lv.Status.ROUNDOFF_LIMIT, (seed, law, str(solution))
+                assert solution.residual.relative <= 2.0 * solution.residual.roundoff_floor <= 1e-4
                 assert solution.iterations < 300_000
                 assert "ill-conditioned" in solution.message
                 count += 1
@@ -140,7 +140,7 @@ def test_a_residual_that_no_floor_excuses_is_no_claim():
     for seed in range(30):
         problem = ill_problem(seed, 1e13)
         solution = lv.solve(problem, tol=1e-9)
-        assert solution.status in (lv.Status.FLOOR, lv.Status.STALLED) or not solution.impulse.any()
+        assert solution.status in (lv.Status.ROUNDOFF_LIMIT, lv.Status.STALLED) or not solution.impulse.any()
         if solution.status is lv.Status.STALLED and solution.residual.relative > 1e-5:
             assert not solution.residual.at_floor
             seen += "ill-conditioned" in solution.message
@@ -185,7 +185,7 @@ def test_the_floor_bounds_what_the_first_pass_loses(seed, condition):
     # Of errors: rows that their slack holds at a bound have none, whatever is lost of it.
     lost = np.sqrt(np.sum(problem.metric.d * (first.error - found.error) ** 2))
     assert lost <= found.floor_energy
-    assert abs(first.relative - found.relative) <= found.floor
+    assert abs(first.relative - found.relative) <= found.roundoff_floor
 
 
 def test_a_well_conditioned_m_is_not_refined():
@@ -194,7 +194,7 @@ def test_a_well_conditioned_m_is_not_refined():
         solution = lv.solve(problem, tol=1e-9)
         for found in (solution.residual, lv.residual(problem, solution.impulse)):
             first = judged(problem, solution.impulse)
-            assert (found.relative, found.floor) == (first.relative, first.floor)
+            assert (found.relative, found.roundoff_floor) == (first.relative, first.roundoff_floor)
             assert first.refine(1e-9) is first
 
 

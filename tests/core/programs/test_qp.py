@@ -621,7 +621,7 @@ def test_rows_that_contradict_each_other_among_many_are_proven(seed):
 # -- what is refused -------------------------------------------------------------------------------
 
 EYE, TWO = np.eye(2), np.zeros(2)
-REFUSED = [
+INVALID_PROBLEM = [
     ({"P": np.array([[1.0, 0.5], [0.0, 1.0]])}, r"P is not symmetric: at \(1, 0\) .*0\.5"),
     ({"P": sp.csc_matrix([[1.0, 0.5], [0.0, 1.0]])}, r"P is not symmetric: at .*0\.5"),
     (
@@ -656,7 +656,7 @@ REFUSED = [
 ]
 
 
-@pytest.mark.parametrize(("given", "words"), REFUSED)
+@pytest.mark.parametrize(("given", "words"), INVALID_PROBLEM)
 def test_what_is_no_convex_program_is_refused_with_its_figure(given, words):
     with pytest.raises(lv.InputError, match=words):
         lv.Problem.from_qp(**({"P": EYE, "q": TWO} | given))

@@ -41,7 +41,7 @@ def assert_same(many, i, single):
         "relative",
         "energy",
         "velocity",
-        "floor",
+        "roundoff_floor",
         "worst_row",
         "energy_at_zero",
         "velocity_at_zero",
@@ -49,8 +49,8 @@ def assert_same(many, i, single):
         assert getattr(own.residual, name) == getattr(found, name), name
     assert own.residual.slack.tobytes() == found.slack.tobytes()
     assert many.impulse_error[i] == (abs(found.error[found.worst_row]) if found.worst_row >= 0 else 0.0)
-    assert (many.relative[i], many.energy[i], many.velocity_error[i], many.floor[i], many.worst_row[i]) == (
-        found.relative, found.energy, found.velocity, found.floor, found.worst_row,
+    assert (many.relative[i], many.energy[i], many.velocity_error[i], many.roundoff_floor[i], many.worst_row[i]) == (
+        found.relative, found.energy, found.velocity, found.roundoff_floor, found.worst_row,
     )  # fmt: skip
     assert many.status[i] is own.status is single.status
     assert many.iterations[i] == own.iterations == single.iterations
@@ -232,9 +232,9 @@ def test_a_world_has_the_bits_of_its_single_solve(name):
         found = lv.residual_many(given, listed, precision=precision, threads=2)
         for i, (problem, impulse) in enumerate(zip(single, impulses, strict=True)):
             one = lv.residual(problem, impulse, precision=precision)
-            assert (one.relative, one.energy, one.velocity, one.worst_row, one.verdict, one.floor) == (
+            assert (one.relative, one.energy, one.velocity, one.worst_row, one.verdict, one.roundoff_floor) == (
                 found.relative[i], found.energy[i], found.velocity_error[i], found.worst_row[i], found.verdict[i],
-                found.floor[i],
+                found.roundoff_floor[i],
             )  # fmt: skip
             assert found[i].verdict == one.verdict
 
@@ -306,7 +306,11 @@ def test_a_bad_world_is_named_and_harms_no_other(threads):
     for i in range(10):
         if i in words:
             assert words[i] in str(many.faults[i]) and f"world {i}:" in str(many.faults[i])
-            assert many.status[i] is lv.Status.REFUSED and np.isnan(many.relative[i]) and not many.success[i]
+            assert (
+                many.status[i] is lv.Status.INVALID_PROBLEM
+                and np.isnan(many.relative[i])
+                and not many.success[i]
+            )
             assert found.verdict[i] == "" and np.isnan(found.relative[i]) and i in found.faults
             with pytest.raises(lv.InputError, match=f"world {i}:"):
                 many[i]

@@ -133,9 +133,9 @@ def test_the_row_whose_impulse_is_not_finite_is_named(plug_in):
 
 def test_refused_is_no_claim_of_a_solver(plug_in):
     # It is said of the data of a world: callers that meet it do not look at the residual.
-    solution = lv.solve(TINY, plug_in(lambda problem, impulse: lv.Claim(lv.Status.REFUSED, 1)))
+    solution = lv.solve(TINY, plug_in(lambda problem, impulse: lv.Claim(lv.Status.INVALID_PROBLEM, 1)))
     assert solution.status is lv.Status.NUMERICAL_ERROR
-    assert "claims the status REFUSED" in solution.message
+    assert "claims the status INVALID_PROBLEM" in solution.message
 
 
 @pytest.mark.parametrize("where", ["prepare", "update", "run"])

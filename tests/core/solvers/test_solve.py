@@ -15,7 +15,7 @@ from lavender.batch import solve as many
 
 TINY = lv.Problem.lcp([[2.0, 1.0], [1.0, 2.0]], [1.0, -1.0])
 
-REFUSED = {
+INVALID_PROBLEM = {
     "no problem": (lambda: lv.solve(np.eye(2), "pgs"), lv.InputError, "Problem"),
     "a matrix and a vector": (lambda: lv.solve(np.eye(2), [1.0, -1.0]), lv.InputError, "Problem.lcp"),
     "no such solver": (lambda: lv.solve(TINY, "psg"), lv.UnknownName, "pgs"),
@@ -66,9 +66,9 @@ REFUSED = {
 }
 
 
-@pytest.mark.parametrize("name", REFUSED)
+@pytest.mark.parametrize("name", INVALID_PROBLEM)
 def test_a_senseless_request_is_refused_with_its_reason(name):
-    call, error, sign = REFUSED[name]
+    call, error, sign = INVALID_PROBLEM[name]
     with pytest.raises(error, match=sign):
         call()
 

@@ -55,11 +55,11 @@ def test_a_record_holds_what_the_judge_says_and_what_it_cost():
     ]
     for r in records:
         again = lv.solve(p, "pgs", tol=r.tol, max_iter=r.max_iter, order=r.order)
-        assert (r.relative, r.energy, r.velocity, r.floor, r.worst_row) == (
+        assert (r.relative, r.energy, r.velocity, r.roundoff_floor, r.worst_row) == (
             again.residual.relative,
             again.residual.energy,
             again.residual.velocity,
-            again.residual.floor,
+            again.residual.roundoff_floor,
             again.residual.worst_row,
         )
         assert r.status == again.status.name

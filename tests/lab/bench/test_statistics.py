@@ -84,8 +84,9 @@ def test_claims_failures_and_spreads():
     found = records_of(
         record("a", "x", 1.0, 1e-7), record("a", "x", 1.0, 1e-2, **FALSE_CLAIM),
         record("a", "y", math.nan, math.inf, status="CRASHED (SIGSEGV)", claims=False, success=False, message="died"),
-        record("a", "z", 1.0, 1e-5, status="FLOOR", floor=1e-5),  # excused
-        record("a", "w", 1.0, math.inf, status="INFEASIBLE", floor=math.nan, success=False, worst_name="row 3"),
+        record("a", "z", 1.0, 1e-5, status="ROUNDOFF_LIMIT", roundoff_floor=1e-5),  # excused
+        record("a", "w", 1.0, math.inf, status="INFEASIBLE", roundoff_floor=math.nan, success=False,
+               worst_name="row 3"),
         *(record("a", "x", 1.0, r, order=o, **BUDGET) for o, r in (("given", 1e-2), ("reverse", 4e-2))),
     )  # fmt: skip
     by = {c.solver: c for c in report.claims(found)}
@@ -100,7 +101,9 @@ def test_claims_failures_and_spreads():
     assert failed == [("x", "CONVERGED"), ("y", "CRASHED (SIGSEGV)"), ("w", "INFEASIBLE")]
     (spread,) = report.spreads(found)
     assert (spread.budget, spread.factor) == (8, 4.0)
-    assert statistics.Spread("a", "x", 8, {"given": 1e-16, "reverse": 4e-15}, floor=2e-15).factor == 2.0
+    assert (
+        statistics.Spread("a", "x", 8, {"given": 1e-16, "reverse": 4e-15}, roundoff_floor=2e-15).factor == 2.0
+    )
 
 
 def test_changes_beyond_noise_are_named():

@@ -112,7 +112,7 @@ def test_a_good_reference_moves_targets_by_rounding_alone():
         e = lv.motion_error(p, p.start())
         assert e.reference.accepted, name
         # The floor adds rounding as it may fall, the bound as it must not exceed: some hundred sums of it.
-        assert e.moved <= 300 * e.reference.residual.floor * np.abs(p.b).max(), name
+        assert e.moved <= 300 * e.reference.residual.roundoff_floor * np.abs(p.b).max(), name
         assert e.bound == pytest.approx(e.energy, rel=1e-6), name
 
 

@@ -29,7 +29,7 @@ def record(case, solver, time, relative, **more):
         "run": "run", "case": case, "sha": "sha" + case, "solver": solver, "options": {}, "start": "cold",
         "mode": "tol",
         "tol": 1e-6, "max_iter": 0, "time_limit": 2.0, "order": "given", "seed": 0, "relative": relative,
-        "energy": relative, "velocity": relative, "floor": 1e-15, "status": "CONVERGED", "claims": True,
+        "energy": relative, "velocity": relative, "roundoff_floor": 1e-15, "status": "CONVERGED", "claims": True,
         "time_min": time, "time_median": time, "setup_min": time / 2, "solve_min": time / 2, "setup_median": time / 2,
         "solve_median": time / 2, "repeats": 1, "success": relative <= more.get("tol", 1e-6),
     }  # fmt: skip

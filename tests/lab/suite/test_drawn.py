@@ -77,4 +77,4 @@ def test_a_drawn_problem_can_be_solved(cases, seed):
         return  # errors of a recorded matrix: where rows depend on each other there need be no solution
     solution = lv.solve(problem, "auto", tol=1e-6)
     # What rounding alone costs bounds what can be asked for at mass ratios of 1e8.
-    assert solution.residual.relative <= max(1e-6, 2.0 * solution.residual.floor)
+    assert solution.residual.relative <= max(1e-6, 2.0 * solution.residual.roundoff_floor)

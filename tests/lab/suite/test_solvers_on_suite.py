@@ -80,7 +80,7 @@ def test_floor_over_bodies_is_that_of_the_formula(kind, scale):
         energy = np.sqrt(np.sum(f**2 / problem.d)) / start.energy_at_zero
         velocity = np.max(f * problem.metric.weight / problem.d) / start.velocity_at_zero
         found = lv.residual(scaled, lam * 2.0**scale)
-        assert found.floor == pytest.approx(
+        assert found.roundoff_floor == pytest.approx(
             max(energy, velocity), rel=1e-12, abs=0.0
         )  # sums in another order
 

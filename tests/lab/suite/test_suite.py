@@ -146,7 +146,7 @@ def test_a_reference_is_a_solution(name):
     judged = lv.residual(case.problem, reference.impulse)
     # 1e-14: the sums of the judge itself, of up to a hundred terms, where the floor is as low as 1e-16.
     least = 1e-14 if name in hard.SET else 1e-15
-    assert judged.relative <= max(least, 2.0 * judged.floor), str(judged)
+    assert judged.relative <= max(least, 2.0 * judged.roundoff_floor), str(judged)
     assert reference.compare in ("impulse", "slack", "error")
 
 
@@ -186,6 +186,6 @@ def test_a_boxed_solution_is_proved_or_refused():
     assert rough.success
     proved = exact.solve_boxed(problem, rough.impulse)
     judged = lv.residual(problem, proved)
-    assert judged.relative <= 2.0 * judged.floor, str(judged)
+    assert judged.relative <= 2.0 * judged.roundoff_floor, str(judged)
     with pytest.raises(lv.InputError, match="active set"):
         exact.solve_boxed(problem, np.zeros(problem.m))

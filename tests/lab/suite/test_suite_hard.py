@@ -42,7 +42,7 @@ def test_a_cube_on_a_ramp_slides_with_the_speed_of_the_textbook(angle):
     assert v[0] == pytest.approx(expected, abs=1e-16)
     assert np.abs(v[1:]).max() <= 1e-16  # it neither lifts nor tips
     judged = lv.residual(case.problem, case.reference.impulse)
-    assert judged.relative <= 2.0 * judged.floor
+    assert judged.relative <= 2.0 * judged.roundoff_floor
 
 
 def test_the_threshold_is_between_stick_and_slip():
@@ -59,7 +59,7 @@ def test_painleve_has_three_solutions():
     presses_and_moves = set()
     for lam in (motion.impulse for motion in lv.motions(problem)):
         judged = lv.residual(problem, lam)
-        assert judged.relative <= max(1e-15, 2.0 * judged.floor)
+        assert judged.relative <= max(1e-15, 2.0 * judged.roundoff_floor)
         presses_and_moves.add((lam[0] > 1e-9, abs(problem.slack(lam)[1]) > 1e-9))
     assert presses_and_moves == {(False, True), (True, False), (True, True)}  # open, stuck, slides
     (only,) = lv.motions(painleve(slide=0.5).problem)

@@ -34,7 +34,7 @@ from lavender.solving.outcome import finish
 from lavender.solving.solve import prepare, solve
 
 MAX_WARM_UP_TIME = 5e-3  # s; a line that took longer is not called once more to warm the caches.
-CLAIMS = (Status.CONVERGED, Status.FLOOR, Status.INFEASIBLE)
+CLAIMS = (Status.CONVERGED, Status.ROUNDOFF_LIMIT, Status.INFEASIBLE)
 
 
 @dataclass(frozen=True)
@@ -352,7 +352,7 @@ def record_of(task: Task, s: Solution, found: Outcome) -> Record:
         relative=float(r.relative),
         energy=float(r.energy),
         velocity=float(r.velocity),
-        floor=float(r.floor),
+        roundoff_floor=float(r.roundoff_floor),
         worst_row=int(r.worst_row),
         worst_name=r.worst_name,
         success=bool(s.success) and task.mode == "tol",
