@@ -320,7 +320,9 @@ def solve_many(
         deadline.keep(made._reading())
     more = {"tol": tol, "max_iter": max_iter, **options}
     # What `solve` would ask of one compiled call.
-    together = spec.own and not options and max_iter is None and isinstance(tol, float) and 0.0 < tol < np.inf
+    together = (
+        spec.builtin and not options and max_iter is None and isinstance(tol, float) and 0.0 < tol < np.inf
+    )
     small = spec.small if together else None
     asked = (small.limits, small.rules) if small is not None else (None, None)
 

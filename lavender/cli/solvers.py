@@ -26,7 +26,7 @@ def solvers() -> None:
             word
             for word, has in (
                 ("exact", spec.exact),
-                ("boxes", bool(spec.boxes)),
+                ("boxes", bool(spec.box_friction_laws)),
                 ("warm start", spec.impulse),
                 ("budget", spec.resumable),
                 ("order", spec.order),

@@ -26,7 +26,7 @@ ARRAYS: dict[str, Any] = {
 METHODS = {
     name: constants(_HEADER)[f"LAV_{name.upper()}"]
     for name, spec in registry.specs().items()
-    if spec.own and not spec.external and not spec.delegates
+    if spec.builtin and not spec.external and not spec.delegates
 }
 #: Those whose factor is another in the package, or which stand for steps of others: other bits, the same judge.
 OTHER_BITS = ("admm", "auto")

@@ -110,13 +110,15 @@ def _spec(backend: Backend) -> SolverSpec:
         name=backend.name,
         factory=partial(QPSolver, backend),
         laws=frozenset(laws),
-        boxes=frozenset() if backend.definite else frozenset({"cone"}),  # as edges of cones A is singular
+        box_friction_laws=frozenset()
+        if backend.definite
+        else frozenset({"cone"}),  # as edges of cones A is singular
         resumable=False,
         external=True,
         impulse=backend.warm,
         singular_programs=not (backend.definite or backend.cones),
         round_cones=backend.cones,
-        parts=backend.cones,
+        supports_rolling=backend.cones,
         max_iter=backend.max_iter,
         options=OPTIONS,
         requires=backend.modules,

@@ -57,13 +57,13 @@ class Foreign(Solver):
         counted = self._if_there("setup_time", problem)
         return 0.0 if counted is None else number(f"setup_time of solver {self.name!r}", counted, low=0.0)
 
-    def ready(self, held: Held, time_limit: float) -> None:
+    def start_workers(self, held: Held, time_limit: float) -> None:
         """Start processes."""
-        self._if_there("ready", held.state, time_limit)
+        self._if_there("start_workers", held.state, time_limit)
 
-    def until(self, held: Held, deadline: Deadline) -> None:
+    def set_deadline(self, held: Held, deadline: Deadline) -> None:
         """Begin no long step that would end after that."""
-        self._if_there("until", held.state, deadline)
+        self._if_there("set_deadline", held.state, deadline)
 
     def prepare(self, problem: Problem) -> Held:
         """Factor, colour, allocate, for a copy of the problem."""

@@ -115,7 +115,7 @@ class QPSolver(Solver):
         place = "to its end" if isolated is None else isolated.place
         return replace(claim, message=f"{claim.message}; takes no time limit and ran {place}")
 
-    def ready(self, qp: QP, time_limit: float) -> None:
+    def start_workers(self, qp: QP, time_limit: float) -> None:
         """Import the backend's code, in the process that runs it, before the clock of a time limit starts."""
         if self.isolate:
             start_process(self.backend)

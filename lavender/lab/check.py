@@ -220,7 +220,7 @@ def _row(
             return CrossCheckRow(name, NOT_SOLVED, error.status, note=error.text)
         if isinstance(error, LavenderError) and not isinstance(error, InputError):
             return CrossCheckRow(name, REFUSED, note=str(error))  # only after a look at the numbers
-        if get(run).own:
+        if get(run).builtin:
             raise
         # a plug-in may raise anything: it costs its own row
         return CrossCheckRow(name, NOT_SOLVED, note=last_words(error))
@@ -250,7 +250,7 @@ def _reference(
             budget = 100 * spec.max_iter if spec.resumable else None  # a reference may take its time
             solution = uninterrupted(solver(name, tol=0.1 * REFERENCE_TOL, max_iter=budget))
         except Exception as error:
-            if spec.own and not isinstance(error, LavenderError):
+            if spec.builtin and not isinstance(error, LavenderError):
                 raise
             failed.append(f"{name}: {last_words(error)}")
             continue

@@ -254,7 +254,7 @@ class ADMM(Solver):
         return AdmmState(problem, self.memory, self.relaxation)
 
     @np.errstate(all="ignore")  # what overflows is judged
-    def until(self, state: AdmmState, deadline: Deadline) -> None:
+    def set_deadline(self, state: AdmmState, deadline: Deadline) -> None:
         """Let nothing begin that is expected to end after `deadline`; what ends before it is set up here."""
         state.deadline = deadline
         with suppress(TooLate, _Failed, *BREAKDOWN):  # which `run` meets again, and tells
@@ -309,9 +309,9 @@ SPEC = SolverSpec(
     name="admm",
     factory=ADMM,
     laws=frozenset({"linear", "lcp", "coulomb", "cone"}),
-    boxes=frozenset({"coulomb", "cone"}),
+    box_friction_laws=frozenset({"coulomb", "cone"}),
     round_cones=True,
-    parts=True,
+    supports_rolling=True,
     max_iter=2000,
     options={
         "memory": "iterations that Anderson mixing combines, 0 (none) to 16; default 10",

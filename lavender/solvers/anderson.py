@@ -34,11 +34,11 @@ SPEC = SolverSpec(
     name="anderson",
     factory=Anderson,
     laws=frozenset({"linear", "lcp", "coulomb", "cone"}),
-    boxes=frozenset({"coulomb", "cone"}),
+    box_friction_laws=frozenset({"coulomb", "cone"}),
     operators=frozenset({"rows", "matrix", "generalized"}),
     order=True,
     seed=True,
-    parts=True,
+    supports_rolling=True,
     max_iter=1000,
     options={
         "sweep": SWEEP_OPTION,

@@ -287,11 +287,11 @@ class Auto(Solver):
         """Nothing."""
         return problem
 
-    def ready(self, problem: Problem, time_limit: float) -> None:
-        """Have the process of the backend started that solves a program with a singular P."""
+    def start_workers(self, problem: Problem, time_limit: float) -> None:
+        """Start the process of the backend that solves a program with a singular P."""
         if problem.has_singular_program:
             for spec in program_backends()[:1]:
-                spec.load()().ready(problem, time_limit)
+                spec.load()().start_workers(problem, time_limit)
 
     def run(
         self, problem: Problem, impulse: FloatArray, max_iter: int, tol: float, time_limit: float | None
@@ -449,10 +449,10 @@ SPEC = SolverSpec(
     name="auto",
     factory=Auto,
     laws=frozenset({"linear", "lcp", "coulomb", "cone"}),
-    boxes=frozenset({"coulomb", "cone"}),
+    box_friction_laws=frozenset({"coulomb", "cone"}),
     operators=frozenset(OPERATORS),
     round_cones=True,
-    parts=True,
+    supports_rolling=True,
     small=AUTO,
     singular_programs=True,
     resumable=False,

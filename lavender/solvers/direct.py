@@ -65,7 +65,7 @@ class Direct(Solver):
     patience: ClassVar[bool] = True  # to go on where pivoting on one shift is stuck
     exact: ClassVar[bool] = True  # to rounding, whatever the tolerance
 
-    def otherwise(self) -> Solver:
+    def fallback(self) -> Solver:
         """What follows where exchanges go round in circles on friction as bounded rows: one pivot after the other."""
         from lavender.solvers.lemke import Lemke
 
@@ -282,7 +282,7 @@ class _Run:
     def pivoting(self, pivot: PivotState) -> Claim:
         """Turns of the kernel, on from where the last run of this state has stopped."""
         rows, before = pivot.rows, pivot.rows.n_rounds
-        pivot.until(self.deadline)
+        pivot.set_deadline(self.deadline)
         late = False
         if self.state.is_running:
             self.told = rows.work
@@ -370,7 +370,7 @@ SPEC = SolverSpec(
     name="direct",
     factory=Direct,
     laws=frozenset({"linear", "lcp"}),
-    boxes=frozenset({"coulomb", "cone"}),
+    box_friction_laws=frozenset({"coulomb", "cone"}),
     operators=frozenset({"matrix"}),
     exact=True,
     resumable=False,

@@ -23,8 +23,8 @@ SPEC = SolverSpec(
     order=True,
     seed=True,
     max_iter=1000,
-    bounded=": 'pgs' is this method with bounds",
-    with_bounds="pgs",
+    bounded_hint=": 'pgs' is this method with bounds",
+    bounded_variant="pgs",
     summary="Gauss-Seidel iteration of a linear system",
     reference="Saad 2003, Iterative Methods for Sparse Linear Systems, section 4.1",
 )

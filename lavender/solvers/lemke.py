@@ -77,7 +77,7 @@ class Lemke(Solver):
             return Claim(
                 Status.TIME_LIMIT, 0, {"pivots": 0}, "the dictionary alone would take longer", form="dense"
             )
-        state.until(deadline)
+        state.set_deadline(deadline)
         paths = lemke.Lemke(state.rows)
         paths.begin(impulse)
         try:
@@ -158,7 +158,7 @@ SPEC = SolverSpec(
     name="lemke",
     factory=Lemke,
     laws=frozenset({"linear", "lcp"}),
-    boxes=frozenset({"coulomb", "cone"}),
+    box_friction_laws=frozenset({"coulomb", "cone"}),
     operators=frozenset({"matrix"}),
     exact=True,
     resumable=False,

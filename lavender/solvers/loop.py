@@ -105,7 +105,7 @@ class Loop:
         try:
             if self.deadline.is_set:
                 watch = Stopwatch()
-                self.solver.until(self.state, self.deadline)
+                self.solver.set_deadline(self.state, self.deadline)
                 self.time += watch.seconds
             if records and self._record():
                 return self._total(Claim(INTERRUPTED, 0, {}, "stopped by the callback"))

@@ -311,7 +311,7 @@ def _stages(
     deadline = Deadline(time_limit)
     solve, certificate, proven = system.solve, None, False
     late = interrupted = False
-    system.until(deadline)
+    system.set_deadline(deadline)
     last = max_iter + (solve.done if again else 0)
     if not again:
         solve.start(impulse, tol, SPEC.max_iter if more else max_iter)
@@ -369,10 +369,10 @@ SPEC = SolverSpec(
     name="newton",
     factory=Newton,
     laws=frozenset({"linear", "lcp", "coulomb", "cone"}),
-    boxes=frozenset({"coulomb", "cone"}),
+    box_friction_laws=frozenset({"coulomb", "cone"}),
     operators=frozenset(OPERATORS),
     round_cones=True,
-    parts=True,
+    supports_rolling=True,
     refusal=_refusal,
     small=NEWTON,
     resumable=False,

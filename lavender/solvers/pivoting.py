@@ -126,7 +126,7 @@ class PivotState:
             self.seconds = watch.seconds / (self.rows.n_rounds - before)
         return code, n == 0
 
-    def until(self, deadline: Deadline) -> None:
+    def set_deadline(self, deadline: Deadline) -> None:
         """Let no factor by Python begin that is expected to end after `deadline`."""
         if self.outside is not None:
             self.outside.deadline = deadline

@@ -161,9 +161,9 @@ class ThroughRows(Solver):
         own = self.solver.setup_time(problem)
         return own if problem.law in ("linear", "lcp") else FEW * own + ROW_TIME * problem.m
 
-    def ready(self, held: Any, time_limit: float) -> None:
+    def start_workers(self, held: Any, time_limit: float) -> None:
         """Start processes."""
-        self.solver.ready(held.state if isinstance(held, Held) else held, time_limit)
+        self.solver.start_workers(held.state if isinstance(held, Held) else held, time_limit)
 
     def prepare(self, problem: Problem) -> Any:
         """Its state, of the problem or of (1), (2)."""
@@ -201,7 +201,7 @@ class ThroughRows(Solver):
         claim = self._judged(form, claim, z, impulse, tol)
         if claim.status not in (Status.STALLED, Status.NUMERICAL_ERROR):
             return claim
-        path = self.solver.otherwise()
+        path = self.solver.fallback()
         if path is None:
             return claim
         z = form.start(impulse)

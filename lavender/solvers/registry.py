@@ -108,10 +108,10 @@ class Solver:
         """Estimate the time of `prepare` [s] from the size of the problem; a time limit decides whether it starts."""
         return 0.0
 
-    def ready(self, state: Any, time_limit: float) -> None:
+    def start_workers(self, state: Any, time_limit: float) -> None:
         """Start worker processes for a solve with a limit [s]; this time does not count."""
 
-    def until(self, state: Any, deadline: Deadline) -> None:
+    def set_deadline(self, state: Any, deadline: Deadline) -> None:
         """Set the deadline of the next `run` of a resumable solver: it starts no long step that would end later."""
 
     def advance(
@@ -120,7 +120,7 @@ class Solver:
         """Run about `n` iterations for `auto`, at most `left`, continuing where the last call ended."""
         return self.run(state, impulse, n, tol, time_limit)
 
-    def otherwise(self) -> Solver | None:
+    def fallback(self) -> Solver | None:
         """Return the solver that continues if this one stalls on friction as bounded rows (`polyhedral.py`)."""
         return None
 
@@ -163,11 +163,11 @@ class SolverSpec:
         It calls other solvers (only "auto" does).
     round_cones : bool
         It accepts contacts of more than two tangents in one cone.
-    boxes : set of str
+    box_friction_laws : set of str
         Laws, of "coulomb" and "cone", under which it accepts boxes: contacts that bound each tangent separately. A law
         that is not in `laws` is accepted only without disks (own solvers solve boxes as bounded rows:
         solvers/polyhedral.py).
-    parts : bool
+    supports_rolling : bool
         It accepts contacts with rolling friction, or with torsional friction beside several tangents.
     singular_programs : bool
         It accepts quadratic programs with a singular P (`Problem.from_qp`).
@@ -181,9 +181,9 @@ class SolverSpec:
         Modules that must be importable.
     install : str
         Arguments of `pip install` if they are not.
-    bounded : str
+    bounded_hint : str
         For a solver of free rows: what the error message recommends for bounded rows.
-    with_bounds : str
+    bounded_variant : str
         Name of the same method with bounds; `standing_in` uses it.
     refusal : callable, optional
         Returns a reason not to accept a problem, or None; called after all other checks.
@@ -192,9 +192,9 @@ class SolverSpec:
 
     Attributes
     ----------
-    plugged : bool
+    from_entry_point : bool
         Found by its entry point, so that another process finds it, too.
-    own : bool
+    builtin : bool
         Part of this package. Other solvers get copies of the data, and their results are checked
         (`external/foreign.py`).
 
@@ -220,34 +220,38 @@ class SolverSpec:
     history: bool = True
     delegates: bool = False
     round_cones: bool = False
-    boxes: frozenset[str] = frozenset()
-    parts: bool = False
+    box_friction_laws: frozenset[str] = frozenset()
+    supports_rolling: bool = False
     singular_programs: bool = False
     external: bool = False
     max_iter: int = 1000
     options: Mapping[str, str] = field(default_factory=dict)
     requires: tuple[str, ...] = ()
     install: str = ""
-    bounded: str = ""
-    with_bounds: str = ""
+    bounded_hint: str = ""
+    bounded_variant: str = ""
     refusal: Callable[[Problem], str | None] | None = None
     small: SmallCall | None = None
-    plugged = False
-    own = False
+    from_entry_point = False
+    builtin = False
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name:
             raise InputError(f"a solver's name is {self.name!r}; a text that is not empty is needed")
         if not isinstance(self.summary, str):
             raise InputError(f"summary of solver {self.name!r} is {self.summary!r:.80}; a text is needed")
-        for name, choices in (("laws", LAWS), ("operators", OPERATORS), ("boxes", ("coulomb", "cone"))):
+        for name, choices in (
+            ("laws", LAWS),
+            ("operators", OPERATORS),
+            ("box_friction_laws", ("coulomb", "cone")),
+        ):
             values = getattr(self, name)
             is_set = isinstance(values, Collection) and not isinstance(values, (str, bytes))
             if not is_set or not all(isinstance(value, str) and value in choices for value in values):
                 raise InputError(
                     f"{name} of solver {self.name!r} are {values!r:.80}; a set of {', '.join(choices)} is needed"
                 )
-            if not values and name != "boxes":
+            if not values and name != "box_friction_laws":
                 raise InputError(f"solver {self.name!r} has no {name}; of {', '.join(choices)} one is needed")
             object.__setattr__(self, name, frozenset(values))
         if not isinstance(self.requires, (tuple, list)) or not all(isinstance(n, str) for n in self.requires):
@@ -288,7 +292,7 @@ class SolverSpec:
     @cached_property
     def takes_all(self) -> bool:
         """Whether the solver accepts every problem."""
-        kinds = self.boxes == {"coulomb", "cone"} and self.round_cones and self.parts
+        kinds = self.box_friction_laws == {"coulomb", "cone"} and self.round_cones and self.supports_rolling
         return kinds and self.laws == set(LAWS) and "matrix" in self.operators and self.refusal is None
 
     def refuses(self, problem: Problem, kind_alone: bool = False) -> str | None:
@@ -309,17 +313,21 @@ class SolverSpec:
         law, operator = problem.law, problem.operator
         if operator == "rows" and problem.cones.has_ellipse:
             operator = "matrix"  # of `problem.disk`, which is what solvers get
-        if law in self.laws and law not in ("linear", "lcp", *self.boxes) and problem.cones.has_box:
+        if (
+            law in self.laws
+            and law not in ("linear", "lcp", *self.box_friction_laws)
+            and problem.cones.has_box
+        ):
             return (
                 "takes no boxes, contacts that bound each tangent by itself: use one of those that do, "
                 "lavender.available(problem) lists them, or give the problem cones.shaped('disk')"
             )
-        if law not in self.laws and not (law in self.boxes and problem.cones.is_polyhedral):
+        if law not in self.laws and not (law in self.box_friction_laws and problem.cones.is_polyhedral):
             takes = ", ".join(law for law in LAWS if law in self.laws)
             way = _alternative_for(law, self.laws)
-            if law == "coulomb" and "cone" in self.boxes and problem.cones.is_polyhedral:
+            if law == "coulomb" and "cone" in self.box_friction_laws and problem.cones.is_polyhedral:
                 way = ": pass problem.relaxed('cone'), or use a solver for Coulomb friction"
-            return f"takes laws {takes}, not {law!r}{self.bounded or way}"
+            return f"takes laws {takes}, not {law!r}{self.bounded_hint or way}"
         if "matrix" not in self.operators and operator not in self.operators:
             makers = {"rows": "Problem.from_rows", "generalized": "Problem.from_jacobian"}
             needs = " or ".join(f"{o} ({makers[o]})" for o in OPERATORS if o in self.operators)
@@ -332,7 +340,7 @@ class SolverSpec:
                 "takes no round cones (more than two tangents in one): use one of those that do, "
                 "lavender.available(problem) lists them, or give the edges of a pyramid as rows"
             )
-        if problem.cones.has_more_parts and not self.parts:
+        if problem.cones.has_more_parts and not self.supports_rolling:
             return (
                 "takes no contacts that resist what rolls: use one of those that do, lavender.available(problem) lists "
                 "them, or leave the rows that roll out"
@@ -342,14 +350,14 @@ class SolverSpec:
         try:
             return self.refusal(problem.disk) or None
         except Exception as error:
-            if self.own:
+            if self.builtin:
                 raise
             return f"cannot say whether it takes the problem: {last_words(error)}"
 
     def standing_in(self, problem: Problem) -> SolverSpec | None:
         """Return the variant of this method with bounds if this one refuses the problem only for its bounds."""
         check_problem(problem)
-        other = specs().get(self.with_bounds)
+        other = specs().get(self.bounded_variant)
         bounds = other is not None and problem.law not in self.laws and other.refuses(problem) is None
         return other if bounds else None
 
@@ -413,7 +421,7 @@ def load_table(table: str) -> None:
 
 
 def _add_own(spec: SolverSpec) -> None:
-    object.__setattr__(spec, "own", True)
+    object.__setattr__(spec, "builtin", True)
     registered[spec.name] = spec
 
 
@@ -435,7 +443,7 @@ def fill() -> None:
             spec = entry.load()
             spec = spec if isinstance(spec, SolverSpec) else spec()
             _add(spec, replace=False)
-            object.__setattr__(spec, "plugged", True)
+            object.__setattr__(spec, "from_entry_point", True)
         except Exception as error:  # a plug-in may fail in any way; it must not take lavender with it
             warnings.warn(
                 f"solver plug-in {entry.name!r} ({entry.value}) was left out: {error}", stacklevel=4

@@ -320,7 +320,7 @@ class Prepared:
         left = deadline.left()
         if left is not None and not self._late and not self._broken:
             watch = Stopwatch()
-            self.solver.ready(self.state, left)
+            self.solver.start_workers(self.state, left)
             deadline.keep(-watch.seconds)
             self.setup_time += watch.seconds
         records: list[Record] | None = [] if history else None
@@ -359,7 +359,7 @@ class Prepared:
             if claim.status is TIME_LIMIT and spec.delegates and problem.m > SMALL_ROWS and loading(*SCIPY):
                 claim = replace(claim, message=f"{claim.message}; {WITHOUT_SCIPY}")
         refutation = ""
-        if claim.status is INFEASIBLE and (spec.external or not spec.own):
+        if claim.status is INFEASIBLE and (spec.external or not spec.builtin):
             claim, _, refutation = check_infeasible(problem, claim, loop.tol, loop.deadline)
         if claim.status is INFEASIBLE and claim.certificate is not None and loop.tol > 0.0 and proof is None:
             claim = self._without_infeasible_islands(loop, claim, max_iter)
@@ -481,9 +481,9 @@ def _make(spec: SolverSpec, options: dict[str, Any]) -> Solver:
         if isinstance(error, InputError):
             raise
         raise InputError(f"solver {spec.name!r} cannot take the options {options}: {error}") from error
-    if not spec.own:
+    if not spec.builtin:
         return Foreign(spec.name, made)
-    if spec.boxes <= spec.laws:
+    if spec.box_friction_laws <= spec.laws:
         return made
     from lavender.solvers.polyhedral import (
         ThroughRows,  # with the table of solvers, which is imported by then
@@ -539,7 +539,7 @@ def solve_small(
     The fields of claim, counts and residual are made when they are first read.
     """
     small = spec.small
-    if small is None or not spec.own or type(problem) is not Problem or not isinstance(tol, float):
+    if small is None or not spec.builtin or type(problem) is not Problem or not isinstance(tol, float):
         return None
     if not 0.0 < tol < math.inf or problem.has_singular_program:
         return None
@@ -658,7 +658,7 @@ def _deadline(spec: SolverSpec, limit: float, begun: float | None = None) -> Dea
     """Of a call with that limit [s]; code of others, and what it needs of SciPy, is imported before its clock."""
     if limit == math.inf:
         return NEVER
-    if spec.external or not spec.own:
+    if spec.external or not spec.builtin:
         spec.load()
         import_numerics(*(() if spec.external else spec.requires))
         begun = None

@@ -315,7 +315,7 @@ def _add_code(records: Records, call: TimedCall, text: str, asked: bool = False)
         text += " Records of an earlier version: the line itself was not timed."
     line, reason, in_c = call.line, _explain_missing_c(records, call), ""
     spec = specs().get(line.solver)
-    if spec is not None and spec.own and not spec.external and line.mode == "tol" and line.way != "batch":
+    if spec is not None and spec.builtin and not spec.external and line.mode == "tol" and line.way != "batch":
         source = quote(records.source or "records.jsonl")
         command = f"lavender export c liblavender --solver {line.solver} --for {source}"
         in_c = f"not in C: {reason}" if reason else command

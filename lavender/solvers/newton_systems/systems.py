@@ -76,7 +76,7 @@ class System:
         """What the next factor takes, at that pace."""
         return self.pace * self.work
 
-    def until(self, deadline: Deadline) -> None:
+    def set_deadline(self, deadline: Deadline) -> None:
         """Let no factor by Python begin that is expected to end after `deadline`."""
 
     def took(self, seconds: float) -> None:
@@ -104,7 +104,7 @@ class VelocitySystem(System):
         self.augmented = Augmented(solve, self.layout, bodies)
         solve.ask(self.augmented)
 
-    def until(self, deadline: Deadline) -> None:
+    def set_deadline(self, deadline: Deadline) -> None:
         self.augmented.deadline = deadline
 
 

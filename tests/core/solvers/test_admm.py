@@ -52,7 +52,7 @@ def test_pivots_across_panels_take_no_longer_than_the_time_limit(m):
     problem = lv.Problem(np.linspace(0.5, 1.5, m), lv.Cones.free(m), sp.csr_array(a))
     prepared = lv.prepare(problem, "admm")
     state = prepared.state
-    prepared.solver.until(state, Deadline(60.0 if m == 60 else 0.05))
+    prepared.solver.set_deadline(state, Deadline(60.0 if m == 60 else 0.05))
     assert (state.factor is None) == (m > 1000)
     if m == 60:
         assert state.full

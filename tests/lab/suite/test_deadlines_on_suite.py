@@ -19,7 +19,9 @@ from lavender.solvers.newton_systems import augmented
 from lavender.solvers.steps import Newton, Step, setup_time
 from lavender.solvers.sweeping import Swept
 
-OWN = [name for name, spec in registry.specs().items() if spec.own and not spec.external and name != "auto"]
+OWN = [
+    name for name, spec in registry.specs().items() if spec.builtin and not spec.external and name != "auto"
+]
 
 
 LIMITS = [1e-4, 3e-4, 1e-3, 3e-3, 1e-2, 3e-2, 0.1, 0.3]  # s

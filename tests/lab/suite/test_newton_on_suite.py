@@ -32,14 +32,14 @@ def test_a_factor_that_would_end_after_the_deadline_is_not_begun():
     solver, state = prepared.solver, prepared.state
     impulse, made = problem.start(), state.factorisations
     state.factor = None  # as of a problem whose first factor is large
-    solver.until(state, Deadline(-1.0))
+    solver.set_deadline(state, Deadline(-1.0))
     claim = solver.run(state, impulse, 50, 1e-6)
     assert claim.status is lv.Status.TIME_LIMIT
     assert claim.iterations == 0
     assert state.factorisations == made
     assert "factorisation" in claim.message
     # With time it goes on from there, with the bits of one that had its factor from the start.
-    solver.until(state, Deadline())
+    solver.set_deadline(state, Deadline())
     assert solver.run(state, impulse, 500, 1e-6).work["factorisations"] > 0
     twin, other = lv.prepare(problem, "admm"), problem.start()
     twin.solver.run(twin.state, other, 500, 1e-6)

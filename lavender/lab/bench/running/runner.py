@@ -116,7 +116,7 @@ def without_times(record: Record, time_limit: float) -> Record:
 
 def is_foreign(spec: SolverSpec) -> bool:
     """Whether a solver is code of another package that a separate process can import by its name."""
-    return spec.plugged or (spec.own and (spec.external or bool(spec.requires)))
+    return spec.from_entry_point or (spec.builtin and (spec.external or bool(spec.requires)))
 
 
 def solver_names(names: str | Sequence[str] | None) -> list[str]:
@@ -292,7 +292,9 @@ class Runner:
 
         if backend == "loky" and memory is None:
             memory = machine.memory_share(joblib.effective_n_jobs(workers))
-        local = tuple(spec for n in self.names if not ((spec := self.specs[n]).own or spec.plugged))
+        local = tuple(
+            spec for n in self.names if not ((spec := self.specs[n]).builtin or spec.from_entry_point)
+        )
         order = Order(self.plan, self.this, memory, local)
         known: dict[tuple[str, str], list[Record]] = {}
         for record in self.known.values():

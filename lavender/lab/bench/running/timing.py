@@ -191,7 +191,7 @@ def attempt(problem: Problem, task: Task, impulse: Any = None) -> Outcome | str:
             begun = perf_counter()
             if task.way and task.guarded:
                 # A plug-in may test nothing: then its own budget ends its line, and a larger one never would.
-                tests = registry.get(task.solver).own or task.mode != "tol"
+                tests = registry.get(task.solver).builtin or task.mode != "tol"
                 guard = uninterrupted(
                     _prepare_and_solve(problem, task if tests else replace(task, max_iter=0), impulse)
                 )

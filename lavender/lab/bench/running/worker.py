@@ -135,7 +135,7 @@ def solve_isolated(
         The solver raised an exception, did not end, or ended the worker.
     """
     spec = registry.get(name)
-    if not spec.plugged or max_iter == 0:  # In a task, 0 means the solver's own max_iter.
+    if not spec.from_entry_point or max_iter == 0:  # In a task, 0 means the solver's own max_iter.
         import_numerics(*spec.requires)  # otherwise a part of the time of a first solve
         return solve(problem, name, tol=tol, max_iter=max_iter, time_limit=time_limit, **options)
     Prepared(problem, spec, options, begin=False)  # raises if the solver rejects the problem or an option
