@@ -38,8 +38,8 @@ def places(problem):
 def numbers():
     """The motions, who picks which, what the rules choose, and the motion of the cone law."""
     problem = suite.case(CASE).problem
-    found = lv.motions(problem)
-    cone = lv.motions(problem.relaxed("cone"))[0]
+    found = lv.find_solutions(problem)
+    cone = lv.find_solutions(problem.relaxed("cone"))[0]
     return {
         "problem": problem,
         "motions": found,
@@ -107,7 +107,7 @@ def main(path="two_motions.png"):
         )
         print(f"{solver:<20} {where}")
     cone, error = found["cone"], found["cone distance"]
-    print(f"cone law: one motion, lift {cone.lift:.2g} m/s, {error.speed:.2g} m/s from motion 0")
+    print(f"cone law: one motion, lift {cone.separation_speed:.2g} m/s, {error.speed:.2g} m/s from motion 0")
     figure(found, path)
     print(f"figure: {path}")
 

@@ -63,7 +63,7 @@ if TYPE_CHECKING:
     from lavender.lab.check import CrossCheck, cross_check
     from lavender.lab.diagnostics import Diagnostic, diagnose
     from lavender.lab.diagnostics.redundancy import Redundancy, redundancy
-    from lavender.lab.motion import MotionError, Motions, motion_error, motions
+    from lavender.lab.motion import MotionError, SolutionSet, find_solutions, motion_error
     from lavender.lab.proof import Enclosure, prove
     from lavender.problem import cones as cones
     from lavender.programs.quadratic import solve_qp
@@ -83,7 +83,7 @@ _LAZY_NAMES = {
     "lavender.lab.check": ("CrossCheck", "cross_check"),
     "lavender.lab.diagnostics": ("Diagnostic", "diagnose"),
     "lavender.lab.diagnostics.redundancy": ("Redundancy", "redundancy"),
-    "lavender.lab.motion": ("MotionError", "Motions", "motion_error", "motions"),
+    "lavender.lab.motion": ("MotionError", "SolutionSet", "find_solutions", "motion_error"),
     "lavender.lab.proof": ("Enclosure", "prove"),
     "lavender.sim.engine": ("SOLVER_FIELDS", "Simulation", "Snapshot"),
     "lavender.sim.scene": ("Scene",),
@@ -130,7 +130,6 @@ __all__ = [
     "InputError",
     "LavenderError",
     "MotionError",
-    "Motions",
     "Plan",
     "Problem",
     "QPSolution",
@@ -142,6 +141,7 @@ __all__ = [
     "Simulation",
     "Snapshot",
     "Solution",
+    "SolutionSet",
     "Solutions",
     "SolveFailed",
     "SolverSpec",
@@ -158,13 +158,13 @@ __all__ = [
     "diagnose",
     "engine",
     "explain",
+    "find_solutions",
     "get",
     "io",
     "known",
     "load",
     "motion",
     "motion_error",
-    "motions",
     "phenomena",
     "prepare",
     "prove",

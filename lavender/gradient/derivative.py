@@ -502,11 +502,11 @@ class Derivative:
 
     @property
     def motions(self) -> Any:
-        """The `Motions` that solve this problem, as `lavender.motions` finds them when first asked.
+        """The `SolutionSet` that solve this problem, as `lavender.find_solutions` finds them when first asked.
 
         Under Coulomb's law there may be several: a gradient is then of this one, whose choice it does not know.
         """
-        return lazy_module("lavender.lab.motion").motions_of(self.problem.disk)
+        return lazy_module("lavender.lab.motion").get_solutions(self.problem.disk)
 
     def __repr__(self) -> str:
         return f"<Derivative of {self.m} rows: {self}>"

@@ -109,7 +109,7 @@ class CrossCheck:
         """Every solver that takes the problem solves it, and agrees with the reference; False where none takes it.
 
         Where there is no reference, nothing is compared: `reference` is None, as always under Coulomb's law, and
-        solvers may have found different motions (see `motions`).
+        solvers may have found different motions (see `lavender.find_solutions`).
         """
         asked = {row.verdict for row in self.rows} - {REFUSED}
         return bool(asked) and asked <= {AGREES, AGREES_UNCOMPARED, NOTHING}

@@ -24,7 +24,7 @@ from lavender.io.stored import whole_file, write_text
 from lavender.judge.solution import CONFIRMED, Status
 from lavender.lab import suite
 from lavender.lab.bench.cases import condition, fingerprint, is_path, resolve
-from lavender.lab.motion import motions
+from lavender.lab.motion import find_solutions
 from lavender.lab.proof import prove
 from lavender.problem import Problem
 from lavender.solving.solve import solve
@@ -94,7 +94,7 @@ def certified(problem: Problem, name: str, group: str) -> Entry:
     if found.proven:
         base |= {"known": "enclosed", "radius": found.velocity_radius}
     if problem.law == "coulomb" and not found.unique and problem.m <= SEARCHED:
-        several = motions(problem.disk)
+        several = find_solutions(problem.disk)
         base |= {"motions": len(several), "apart": several.spread, "unique": bool(several.unique)}
     return Entry(**base)
 

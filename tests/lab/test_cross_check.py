@@ -242,7 +242,7 @@ def test_ctrl_c_ends_what_solves_one_problem_after_another(plug_in):
     for ask in (
         lambda: lv.solve_many([random_lcp(14)] * 3, name),
         lambda: lv.cross_check(random_lcp(14), [name, "pgs"]),
-        lambda: lv.motions(random_lcp(14)).picks([name, "pgs"]),
+        lambda: lv.find_solutions(random_lcp(14)).picks([name, "pgs"]),
     ):
         before = len(asked)
         with pytest.raises(KeyboardInterrupt):
@@ -264,7 +264,7 @@ def test_an_impulse_no_better_than_none_is_excused_by_nobody():
     reference = lv.motion.adopt(problem, problem.guess)
     assert not reference.accepted
     assert lv.motion_error(problem, [0.5, 0.0], reference=reference).relative is None
-    assert len(lv.motions(problem)) == 0
+    assert len(lv.find_solutions(problem)) == 0
     assert lv.cross_check(problem, ["pgs"]).agreed == ()
 
 
@@ -301,7 +301,7 @@ def test_known_tells_of_everybody_and_available_of_those_that_can():
 @pytest.mark.parametrize(
     "ask",
     [
-        lv.solve, lv.available, lv.known, lv.cross_check, lv.explain, lv.diagnose, lv.redundancy, lv.motions,
+        lv.solve, lv.available, lv.known, lv.cross_check, lv.explain, lv.diagnose, lv.redundancy, lv.find_solutions,
         lambda p: lv.motion_error(p, [0.0, 0.0]), lambda p: lv.residual(p, [0.0, 0.0]),
     ],
 )  # fmt: skip

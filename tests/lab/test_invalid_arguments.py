@@ -24,14 +24,14 @@ from lavender.lab.suite import hard
 A, B = np.array([[2.0, 1.0], [1.0, 2.0]]), np.array([1.0, -1.0])
 LCP = lv.Problem.lcp(A, B)
 CONTACT = random_contact_problem(3)
-MOTIONS = lv.motions(LCP, n=1)
+MOTIONS = lv.find_solutions(LCP, n=1)
 ANY_SEED = {"seed": ("very large",)}
 
 CALLS = {
-    "Motions.__getitem__": Call(MOTIONS.__getitem__, {"i": 0}, {"i": "motions?"}),
-    "Motions.nearest": Call(MOTIONS.nearest, {"impulse": B}, {"impulse": "x"}),
-    "Motions.picks": Call(MOTIONS.picks, {"solvers": ["pgs"], "tol": 1e-6, "max_iter": 100}),
-    "Motions.select": Call(MOTIONS.select, {"choice": "nearest", "impulse": B}),
+    "SolutionSet.__getitem__": Call(MOTIONS.__getitem__, {"i": 0}, {"i": "find_solutions?"}),
+    "SolutionSet.nearest": Call(MOTIONS.nearest, {"impulse": B}, {"impulse": "x"}),
+    "SolutionSet.picks": Call(MOTIONS.picks, {"solvers": ["pgs"], "tol": 1e-6, "max_iter": 100}),
+    "SolutionSet.select": Call(MOTIONS.select, {"choice": "nearest", "impulse": B}),
     "Solution.motion_error": Call(lv.solve(LCP, tol=1e-12).motion_error, {"reference": B}),
     "cross_check": Call(
         lv.cross_check,
@@ -44,8 +44,8 @@ CALLS = {
          "gap": np.zeros(len(CONTACT.rows.normal)), "dt": 0.01},
     ),
     "motion_error": Call(lv.motion_error, {"problem": LCP, "impulse": B, "reference": B}),
-    "motions": Call(
-        lv.motions, {"problem": LCP, "n": 1, "seed": 1, "always": True}, accepts=ANY_SEED
+    "find_solutions": Call(
+        lv.find_solutions, {"problem": LCP, "n": 1, "seed": 1, "always": True}, accepts=ANY_SEED
     ),
     "redundancy": Call(lv.redundancy, {"problem": LCP, "tol": 1e-12}),
     "bench.Plan": Call(
@@ -86,7 +86,7 @@ CALLS = {
 #: Public calls that are not in the table, and why.
 NOT_CALLED = {
     **dict.fromkeys(
-        ("CrossCheck", "Enclosure", "MotionError", "Motions", "Redundancy", "Diagnostic"),
+        ("CrossCheck", "Enclosure", "MotionError", "SolutionSet", "Redundancy", "Diagnostic"),
         "a result: the package makes it",
     ),
     "CrossCheck.__getitem__": "a mapping by the names of solvers",

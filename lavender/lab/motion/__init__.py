@@ -3,7 +3,7 @@
 ```python
 error = lv.motion_error(problem, solution.impulse)     # or solution.motion_error()
 error.relative, error.speed, error.bound
-lv.motions(problem).spread                             # m/s that Coulomb's law leaves open
+lv.find_solutions(problem).spread                             # m/s that Coulomb's law leaves open
 ```
 """
 
@@ -11,12 +11,12 @@ from lavender.lab.motion.bound import Witness
 from lavender.lab.motion.error import MotionError, measure
 from lavender.lab.motion.multiple_solutions import (
     Motion,
-    Motions,
+    SolutionSet,
     branch,
     distance,
+    find_solutions,
+    get_solutions,
     motion_error,
-    motions,
-    motions_of,
     nearest,
 )
 from lavender.lab.motion.reference import Reference, adopt, load_reference, reference, save_reference
@@ -25,17 +25,17 @@ from lavender.lab.motion.unique import uniqueness
 __all__ = [
     "Motion",
     "MotionError",
-    "Motions",
     "Reference",
+    "SolutionSet",
     "Witness",
     "adopt",
     "branch",
     "distance",
+    "find_solutions",
+    "get_solutions",
     "load_reference",
     "measure",
     "motion_error",
-    "motions",
-    "motions_of",
     "nearest",
     "reference",
     "save_reference",

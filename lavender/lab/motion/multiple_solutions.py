@@ -39,7 +39,7 @@ SWEEPS = (400, 20_000)  # least and most of one run
 CHOICES = ("nearest", "dissipation", "compliant")
 SOFTEST, STEP = 1.0, 0.1  # softness of "compliant" as a share of d, and what each round leaves of it
 HARDEST = 1e-12
-BESIDE = 1e-6  # -, of `Distance.share`: an enumerated end that rounding alone keeps from being a solution
+BESIDE = 1e-6  # -, of `Distance.relative_distance`: an enumerated end that rounding alone keeps from being a solution
 MANY = 100  # motions of an enumeration that are compared with each other
 
 
@@ -54,14 +54,14 @@ class Motion:
     energy: float  # J, 1/2 lambda.A lambda - b.lambda: what the constraints add to the bodies' energy at rest targets
     dissipation: float  # J, -sum w.lambda over friction rows
     # m/s, largest normal slack of a contact that presses: what the cone law pays for being convex
-    lift: float
+    separation_speed: float
     count: int  # runs that ended here
     found_by: tuple[str, ...]  # their solvers, orders and starts
 
     def __str__(self) -> str:
         return (
             f"relative {self.relative:.1e}, energy {self.energy:.6g} J, friction takes {self.dissipation:.4g} J, "
-            f"lift {self.lift:.1e} m/s, found {self.count} times"
+            f"separation {self.separation_speed:.1e} m/s, found {self.count} times"
         )
 
 
@@ -70,7 +70,7 @@ class Distance(NamedTuple):
 
     speed: float  # m/s of a body; of a row where bodies are not known
     energy: float  # sqrt J, sqrt(1/2) |.|_A; m/s of a row where A is no energy
-    share: float  # -, that over the larger of the same of both
+    relative_distance: float  # -, that over the larger of the same of both
 
 
 class Pick(NamedTuple):
@@ -81,7 +81,7 @@ class Pick(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Motions:
+class SolutionSet:
     """Motions that all solve one problem, most often found first; `str()` is a line each."""
 
     problem: Problem = field(repr=False)
@@ -184,10 +184,10 @@ class Motions:
 
 
 @np.errstate(over="ignore", invalid="ignore")  # what is not finite is no solution
-def motions(problem: Problem, n: int = RUNS, seed: int = 0, *, always: bool = False) -> Motions:
+def find_solutions(problem: Problem, n: int = RUNS, seed: int = 0, *, always: bool = False) -> SolutionSet:
     """The motions that solve a problem: from several starts, in several orders, by several solvers, or all of them.
 
-    Up to eight contacts with at most one tangent each are enumerated: `Motions.all` is then true, and no run is
+    Up to eight contacts with at most one tangent each are enumerated: `SolutionSet.all` is then true, and no run is
     needed. Otherwise there are at least those that are found.
 
     Parameters
@@ -202,7 +202,7 @@ def motions(problem: Problem, n: int = RUNS, seed: int = 0, *, always: bool = Fa
 
     Returns
     -------
-    Motions
+    SolutionSet
         Kept with the problem, for `motion_error`.
 
     Raises
@@ -225,7 +225,8 @@ def motions(problem: Problem, n: int = RUNS, seed: int = 0, *, always: bool = Fa
         found += [(end, "every mode") for end in solved]
         # what rounding lets pass an inequality lies beside a motion that it would otherwise have missed
         beside = (
-            min((distance(problem, e.impulse, s.impulse).share for s in solved), default=1.0) for e in ends
+            min((distance(problem, e.impulse, s.impulse).relative_distance for s in solved), default=1.0)
+            for e in ends
         )
         whole |= modes[1] and len(single) <= MANY and max(beside, default=1.0) < BESIDE
     if always or not whole:
@@ -241,7 +242,7 @@ def motions(problem: Problem, n: int = RUNS, seed: int = 0, *, always: bool = Fa
         for two in merged[:i]:
             apart = distance(problem, one.impulse, two.impulse)
             speed, energy = max(speed, apart.speed), max(energy, apart.energy)
-    result = Motions(
+    result = SolutionSet(
         problem=problem,
         motions=tuple(merged),
         spread=speed,
@@ -264,9 +265,9 @@ def _rounded(problem: Problem, x: FloatArray) -> bytes:
     return np.concatenate(parts).tobytes()
 
 
-def motions_of(problem: Problem, n: int = RUNS) -> Motions:
+def get_solutions(problem: Problem, n: int = RUNS) -> SolutionSet:
     """The motions that were searched already, whatever their number of runs, or a search of `n` runs."""
-    return kept(problem).motions or motions(problem, n)
+    return kept(problem).motions or find_solutions(problem, n)
 
 
 def branch(problem: Problem, impulse: Any) -> Reference:
@@ -350,7 +351,7 @@ def _merge(problem: Problem, found: list[tuple[Reference, str]]) -> list[Motion]
     groups: list[list[tuple[Reference, str]]] = []
     for one in found:
         for group in groups:
-            if distance(problem, one[0].impulse, group[0][0].impulse).share <= SAME:
+            if distance(problem, one[0].impulse, group[0][0].impulse).relative_distance <= SAME:
                 group.append(one)
                 break
         else:
@@ -374,7 +375,7 @@ def _motion(problem: Problem, reference: Reference, labels: tuple[str, ...]) -> 
         relative=reference.residual.relative,
         energy=float(0.5 * (x @ (w - problem.b))),
         dissipation=-float(w[friction] @ x[friction]),
-        lift=float(np.max(w[pressed], initial=0.0)),
+        separation_speed=float(np.max(w[pressed], initial=0.0)),
         count=len(labels),
         found_by=labels,
     )
@@ -417,7 +418,7 @@ def motion_error(problem: Problem, impulse: Any, reference: Any = None) -> Motio
     impulse : (m,) N s
     reference : (m,) N s, Solution or Reference, optional
         What stands for the solution. Default: what `auto` finds at the floor, solved for once and kept
-        with the problem; under Coulomb's law the nearest of the motions that `lavender.motions` finds and of the
+        with the problem; under Coulomb's law the nearest of the motions that `lavender.find_solutions` finds and of the
         one that the impulse itself leads to.
 
     Returns
@@ -447,17 +448,17 @@ def motion_error(problem: Problem, impulse: Any, reference: Any = None) -> Motio
             return measure(problem, x, as_reference(problem, reference))
         if problem.law != "coulomb":
             return measure(problem, x, reference_of(problem))
-        return nearest(problem, x, motions_of(problem))
+        return nearest(problem, x, get_solutions(problem))
 
 
-def nearest(problem: Problem, x: FloatArray, found: Motions) -> MotionError:
+def nearest(problem: Problem, x: FloatArray, found: SolutionSet) -> MotionError:
     """The distance of an impulse x (m,) to the nearest of several motions, and of the one that it leads to."""
     references = [motion.reference for motion in found]
     spread, energy = found.spread, found.spread_energy
     if not found.unique:
         own = branch(problem, x)
         far = [distance(problem, own.impulse, motion.impulse) for motion in found]
-        if own.accepted and all(d.share > SAME for d in far):
+        if own.accepted and all(d.relative_distance > SAME for d in far):
             references.append(own)
             spread = max([spread, *(d.speed for d in far)])
             energy = None if energy is None else max([energy, *(d.energy for d in far)])

@@ -68,7 +68,7 @@ class Kept:
     operator: operators.Operator
     refusal: str
     reference: Reference | None = None
-    motions: Any = None  # `Motions` of a search, or None
+    motions: Any = None  # `SolutionSet` of a search, or None
 
 
 def kept(problem: Problem) -> Kept:

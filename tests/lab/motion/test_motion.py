@@ -246,13 +246,13 @@ def test_an_empty_problem_has_no_error():
 def test_coulombs_law_leaves_several_motions():
     """Two solutions by the judge's word, at the floor, decimetres per second apart."""
     p = suite.case("granularF(n=3, sliding=0.5)").problem
-    found = lv.motions(p, n=6)
+    found = lv.find_solutions(p, n=6)
     assert len(found) >= 2
     assert found.spread > 0.1
     assert not found.unique
     for motion in found:
         assert lv.residual(p, motion.impulse).relative <= 1e-10
-        assert motion.lift < 1e-9  # Coulomb's law lifts nothing that presses
+        assert motion.separation_speed < 1e-9  # Coulomb's law lifts nothing that presses
     one, two = found[0], found[1]
     dv = np.linalg.norm((p.velocity(one.impulse) - p.velocity(two.impulse))[:, :3], axis=1).max()
     assert dv == pytest.approx(found.spread, rel=1e-6)
@@ -267,13 +267,13 @@ def test_a_rod_that_can_stay_slide_or_leave_has_its_three_motions_by_default():
     """A_nn < mu A_nt: with b = (-1, c), lambda = 0, (1, 1) and A^-1 b all solve where c >= 3, worked out by hand."""
     rod = np.array([[1.0, -2.0], [-2.0, 5.0]])
     for c in np.linspace(3.5, 9.0, 18):
-        found = lv.motions(lv.Problem.contact(rod, [-1.0, c], mu=[1.0]))
+        found = lv.find_solutions(lv.Problem.contact(rod, [-1.0, c], mu=[1.0]))
         exact = [np.zeros(2), np.ones(2), np.linalg.solve(rod, [-1.0, c])]
         assert found.all
         assert "3 motions, all that there are" in str(found)
         for x in exact:
             assert min(np.abs(one.impulse - x).max() for one in found) < 1e-12
-    three = lv.motions(lv.Problem.contact(np.kron(np.eye(3), rod), [-1.0, 4.0] * 3, mu=[1.0] * 3))
+    three = lv.find_solutions(lv.Problem.contact(np.kron(np.eye(3), rod), [-1.0, 4.0] * 3, mu=[1.0] * 3))
     assert (len(three), three.all) == (27, True)
 
 
@@ -285,15 +285,17 @@ def test_every_mode_holds_what_a_search_finds_and_beyond_them_there_are_at_least
         x = 0.3 * rng.normal(size=(2 * k, 2 * k))
         a = np.kron(np.eye(k), [[1.0, -2.0], [-2.0, 5.0]]) + x @ x.T
         problem = lv.Problem.contact(a, [-1.0, 4.0] * k + rng.normal(size=2 * k), mu=rng.uniform(0.5, 1.5, k))
-        found = lv.motions(problem)
+        found = lv.find_solutions(problem)
         assert found.all
         several += len(found) > 1
         for label, end in search(problem, found[0].reference, 6, 1):
             if lv.residual(problem, end).relative < 1e-9:
-                assert min(distance(problem, end, one.impulse).share for one in found) < 1e-6, label
+                assert min(distance(problem, end, one.impulse).relative_distance for one in found) < 1e-6, (
+                    label
+                )
     assert several > 3  # else the draw asks for nothing
     rods = np.kron(np.eye(9), [[1.0, -2.0], [-2.0, 5.0]])
-    nine = lv.motions(lv.Problem.contact(rods, [-1.0, 4.0] * 9, mu=[1.0] * 9))
+    nine = lv.find_solutions(lv.Problem.contact(rods, [-1.0, 4.0] * 9, mu=[1.0] * 9))
     assert not nine.all
     assert "at least" in str(nine)
 
@@ -313,14 +315,14 @@ def test_a_box_without_a_unique_impulse_has_its_motion_by_all_modes():
 
 def test_equal_seeds_find_equal_motions():
     p = suite.case("box_stackF(n=4)").problem
-    one, two = (lv.motions(p, n=8, seed=3) for _ in range(2))
+    one, two = (lv.find_solutions(p, n=8, seed=3) for _ in range(2))
     assert [m.impulse.tobytes() for m in one] == [m.impulse.tobytes() for m in two]
     assert [m.count for m in one] == [m.count for m in two]
 
 
 def test_choices_have_names_and_are_motions():
     p = suite.case("granularF(n=2, sliding=0.5)").problem
-    found = lv.motions(p, n=6)
+    found = lv.find_solutions(p, n=6)
     most = found.select("dissipation")
     assert most.dissipation == max(m.dissipation for m in found)
     for motion in found:
@@ -329,7 +331,7 @@ def test_choices_have_names_and_are_motions():
     with pytest.raises(lv.InputError, match="choice is"):
         found.select("best")
     with pytest.raises(lv.LavenderError, match=r"problem\.disk"):
-        lv.motions(dragged(0, 3))  # ellipses
+        lv.find_solutions(dragged(0, 3))  # ellipses
     picks = found.picks(["anderson", "admm", "jacobi"], max_iter=1000)
     assert picks["jacobi"] is None  # 1000 sweeps end before it gets there
     assert picks["anderson"].motion != picks["admm"].motion
@@ -337,10 +339,10 @@ def test_choices_have_names_and_are_motions():
 
 def test_the_cone_law_has_one_motion_and_shows_its_lift():
     p = suite.case("pyramidF(k=6, sliding=0.5)").problem.relaxed("cone")
-    found = lv.motions(p)
+    found = lv.find_solutions(p)
     assert len(found) == 1
     assert found.unique == "the law is convex"
-    assert found[0].lift > 1e-3
+    assert found[0].separation_speed > 1e-3
 
 
 def one_contact(a, mu, b=(1.0, 0.5, -0.3)):
@@ -349,7 +351,7 @@ def one_contact(a, mu, b=(1.0, 0.5, -0.3)):
 
 def test_uniqueness_names_its_criterion():
     sphere = np.diag([1.0, 3.5, 3.5])
-    assert "normals feel no friction" in lv.motions(one_contact(sphere, 5.0)).unique
+    assert "normals feel no friction" in lv.find_solutions(one_contact(sphere, 5.0)).unique
     coupled = sphere + 0.3 * (np.eye(3)[:, [0]] @ np.eye(3)[[1]] + np.eye(3)[:, [1]] @ np.eye(3)[[0]])
     small = lv.motion.uniqueness(one_contact(coupled, 0.1))
     assert small
@@ -399,7 +401,7 @@ def test_where_nothing_slides_and_friction_is_left_over_no_search_finds_another(
     p = lv.Problem.contact(a, a @ x, mu)
     proof = lv.motion.uniqueness(p)
     if proof:
-        assert len(lv.motions(p, 6, always=True)) == 1
+        assert len(lv.find_solutions(p, 6, always=True)) == 1
 
 
 def test_nothing_slides_proves_more_than_small_friction():
@@ -410,7 +412,7 @@ def test_nothing_slides_proves_more_than_small_friction():
     proof = lv.motion.uniqueness(rest)
     assert proof.kappa > 1.0
     assert "nothing slides" in proof.reason
-    assert "nothing slides" in lv.motions(rest).unique
+    assert "nothing slides" in lv.find_solutions(rest).unique
     sliding = lv.Problem.contact(coupled, coupled @ [1.0, 0.0, 0.0] + [0.0, 5.0, 0.0], [0.6])
     assert not lv.motion.uniqueness(sliding)
     rim = lv.Problem.contact(coupled, coupled @ [1.0, 0.599, 0.0], [0.6])  # hardly any friction left over
@@ -511,7 +513,7 @@ def test_motions_of_a_heavy_body_are_told_beside_a_fast_one(slow, light):
     """The three of a slow, heavy body differ by 1e-11 of the fastest row, and by as much energy as there is."""
     p, fast = suite.case("painleve").problem, lv.Problem.contact(np.eye(2), [1.0, 0.1], [0.5])
     both = sp.block_diag([light * p.csr, fast.csr], format="csr")
-    found = lv.motions(lv.Problem(np.concatenate([slow * p.b, fast.b]), p.cones + fast.cones, both))
+    found = lv.find_solutions(lv.Problem(np.concatenate([slow * p.b, fast.b]), p.cones + fast.cones, both))
     assert len(found) == 3 and found.all
 
 
@@ -520,5 +522,5 @@ def test_all_motions_are_all_at_every_size(size):
     p = suite.case("painleve").problem
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        found = lv.motions(replace(p, b=p.b * size))
+        found = lv.find_solutions(replace(p, b=p.b * size))
     assert (len(found), found.all) == (3, True)

@@ -1,4 +1,4 @@
-"""Motions of problems that other rooms are tested on: ellipses, rolling, float32, derivatives."""
+"""SolutionSet of problems that other rooms are tested on: ellipses, rolling, float32, derivatives."""
 
 import dataclasses
 
@@ -14,7 +14,7 @@ from lavender.lab.motion.unique import uniqueness
 def test_several_motions_are_told():
     # Painleve's kind: friction and normal couple so that a contact may stick or lift
     p = lv.Problem.contact(np.array([[1.0, -2.5], [-2.5, 8.0]]), [1.0, -4.0], mu=[1.0])
-    found = lv.motions(p)
+    found = lv.find_solutions(p)
     d = lv.derivative(p, found[0].impulse)
     assert len(d.motions) == len(found) and d.motions.all == found.all
 
@@ -56,8 +56,8 @@ def test_where_one_motion_is_proven_starts_find_no_other():
     few = lv.Problem(b, lv.Cones.contacts(0.01, rolling=0.01, count=2), a)
     assert uniqueness(few)
     assert not uniqueness(lv.Problem(b, lv.Cones.contacts(0.01, rolling=5.0, count=2), a))
-    assert len(lv.motions(few)) == 1
-    for motion in lv.motions(lv.Problem(b, lv.Cones.contacts(2.0, rolling=3.0, count=2), a)):
+    assert len(lv.find_solutions(few)) == 1
+    for motion in lv.find_solutions(lv.Problem(b, lv.Cones.contacts(2.0, rolling=3.0, count=2), a)):
         assert motion.reference.residual.relative <= 1e-9
 
 

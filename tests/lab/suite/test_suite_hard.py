@@ -57,12 +57,12 @@ def test_painleve_has_three_solutions():
     a = problem.dense()
     assert a[0, 0] - 2.0 * a[0, 1] < 0.0  # the condition of the paradox
     presses_and_moves = set()
-    for lam in (motion.impulse for motion in lv.motions(problem)):
+    for lam in (motion.impulse for motion in lv.find_solutions(problem)):
         judged = lv.residual(problem, lam)
         assert judged.relative <= max(1e-15, 2.0 * judged.roundoff_floor)
         presses_and_moves.add((lam[0] > 1e-9, abs(problem.slack(lam)[1]) > 1e-9))
     assert presses_and_moves == {(False, True), (True, False), (True, True)}  # open, stuck, slides
-    (only,) = lv.motions(painleve(slide=0.5).problem)
+    (only,) = lv.find_solutions(painleve(slide=0.5).problem)
     assert not only.impulse.any()
 
 

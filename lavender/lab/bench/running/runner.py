@@ -75,7 +75,7 @@ def add_motion_error(record: Record, problem: Problem, impulse: Any) -> Record:
     if impulse is None:
         return record
     problem, impulse = problem.disk, problem.on_disk(impulse)
-    found = motion.motions_of(problem, MOTION_SEARCH_RUNS) if problem.law == "coulomb" else None
+    found = motion.get_solutions(problem, MOTION_SEARCH_RUNS) if problem.law == "coulomb" else None
     error = (
         motion.motion_error(problem, impulse) if found is None else motion.nearest(problem, impulse, found)
     )
