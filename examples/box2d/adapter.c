@@ -179,8 +179,8 @@ static void set_problem(b2StepContext *context, int push) {
   p.compliance = run.theta, p.impulse = run.impulse;
   p.index_ptr = run.ptr, p.index = run.column, p.value = run.value;
   p.mass_ptr = run.mass_ptr, p.mass_index = run.mass_index, p.mass_value = run.mass;
-  int32_t code = run.solver == NULL ? LAV_ERROR_ROOM : lav_set(run.solver, &p);
-  while (code == LAV_ERROR_ROOM || code == LAV_ERROR_COUNT) {  /* more contacts than before, or another fill */
+  int32_t code = run.solver == NULL ? LAV_ERROR_WORKSPACE : lav_set(run.solver, &p);
+  while (code == LAV_ERROR_WORKSPACE || code == LAV_ERROR_COUNT) {  /* more contacts than before, or another fill */
     uint64_t bytes = 0, asked = run.solver == NULL ? 0 : lav_needed(run.solver);
     check(lav_room(&p, &o, &bytes), "room");
     run.bytes = 2 * (bytes > asked ? bytes : asked);

@@ -166,14 +166,14 @@ class Newton(Solver):
             return NewtonState(problem, None, kernel)
         if bodies is None and over_velocities and self.form == "velocity":
             raise CapabilityError(
-                f"form='velocity' has room for a matrix of {general.ROOM:.1e} values over the velocities of an "
+                f"form='velocity' accepts a matrix of {general.MAX_MATRIX_ENTRIES:.1e} values over the velocities of an "
                 "island (dense or with the factor's own fill); this problem has a larger one: use form='impulse' "
                 "or sweeps"
             )
         if problem.cones.has_round:
             raise CapabilityError(
                 "round cones of more than two tangents are solved over velocities alone: form='impulse' does not take "
-                f"them, and form='velocity' has room for {general.ROOM:.1e} values of an island's matrix"
+                f"them, and form='velocity' accepts {general.MAX_MATRIX_ENTRIES:.1e} values of an island's matrix"
             )
         form = "impulse" if bodies is None else "velocity"
         system = make_system(problem, form, like, bodies)

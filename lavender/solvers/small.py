@@ -62,7 +62,7 @@ def limits(sweeps: float, most: float = MOST, steps: float = NEWTON_STEPS) -> Li
     sweep = TREE, RATES["sweep row"], RATES["sweep cone"], sweeps
     step = RATES["entry"], RATES["work"]["velocities"], factorisations("lcp")
     rows = SMALL_ROWS, DENSE_ROWS, SHARED, COLUMNS
-    return Limits(np.array([*step, STEPS, SOFT, *sweep, general.ROOM, most, *rows, steps]))
+    return Limits(np.array([*step, STEPS, SOFT, *sweep, general.MAX_MATRIX_ENTRIES, most, *rows, steps]))
 
 
 def call_ends_within(problem: Problem, seconds: float | None) -> bool:

@@ -24,21 +24,24 @@ cdef void forget_all(void* context, const double* lam) noexcept nogil
 cdef double undone_of(const sweep_data_t* c) noexcept nogil
 
 
-cdef inline int64_t accelerated_room(int64_t m, int64_t n_v, int64_t memory) noexcept nogil:
+cdef inline int64_t accelerated_workspace_size(int64_t m, int64_t n_v, int64_t memory) noexcept nogil:
     """Numbers of a run."""
     return 3 * (m + n_v) + (1 + 2 * memory) * m + CONTROL + MAX_MEMORY * MAX_MEMORY
 
 
 cdef inline void accelerate(sweeping_t* x, sweep_data_t* c, int32_t memory, int32_t convex, int32_t keeps,
-                            double* room) noexcept nogil:
-    """A run of sweeps, started, before its first iteration, in room (`accelerated_room`, zeroed); memory 0 is nncg."""
+                            double* workspace) noexcept nogil:
+    """A run of sweeps, started, before its first iteration, in workspace (`accelerated_workspace_size`, zeroed).
+
+    memory 0 is nncg.
+    """
     cdef context_t* sweeps = &x.c
     x.step, x.of, x.forget = lav_nncg if memory == 0 else lav_anderson, c, forget_all
     c.sweeps, c.cone = sweeps, sweeps.blocks[0]
     c.cone.law = CONE
     c.memory, c.convex, c.keeps, c.turn = memory, convex, keeps, 0
-    c.work = room
-    c.gram = room + 3 * (sweeps.blocks.n_rows + sweeps.n_v) + (1 + 2 * <int64_t>memory) * sweeps.blocks.n_rows
+    c.work = workspace
+    c.gram = workspace + 3 * (sweeps.blocks.n_rows + sweeps.n_v) + (1 + 2 * <int64_t>memory) * sweeps.blocks.n_rows
     c.control = c.gram + MAX_MEMORY * MAX_MEMORY
 
 

@@ -17,7 +17,7 @@ where contacts stick, its answer is Coulomb's.
 from libc.math cimport sqrt
 from libc.stdint cimport int32_t, int64_t, uint64_t
 
-from lavender_ext.accelerate.accelerated cimport accelerate, accelerated_room, sweep_data_t
+from lavender_ext.accelerate.accelerated cimport accelerate, accelerated_workspace_size, sweep_data_t
 from lavender_ext.accelerate.mixing cimport CONTROL, UNDONE, forget, mix, mixing_t, take
 from lavender_ext.core.block cimport clip, length
 from lavender_ext.core.order cimport SYMMETRIC
@@ -234,7 +234,7 @@ cdef class AcceleratedSweeps(Sweeps):
     def __init__(self, Data p, int32_t[::1] order, int split, int mode, uint64_t[::1] rng, bint exact=False, int memory=0,
                  int convex=0, bint keeps=False):
         cdef view_t v = p.view()
-        cdef int64_t n = accelerated_room(v.p.n_rows, velocities_of(&v), memory)
+        cdef int64_t n = accelerated_workspace_size(v.p.n_rows, velocities_of(&v), memory)
         self.x.packing.single = True
         accelerate(&self.x, &self.fast, memory, convex, keeps,
                    self.lay(p, order, split, mode, rng, exact, exact or convex > 0, n))

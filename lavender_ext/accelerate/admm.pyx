@@ -198,24 +198,25 @@ cdef inline double weighed(const admm_t* c) noexcept nogil:
     return s if s > 3.0 * c.rho or 3.0 * s < c.rho else c.rho
 
 
-cdef public double lav_admm_room(int32_t m, int32_t memory) noexcept nogil:
+cdef public double lav_admm_workspace_size(int32_t m, int32_t memory) noexcept nogil:
     """Numbers of a run, a whole number (no 64-bit integer by value)."""
     return (10.0 + 2.0 * memory) * m + CONTROL + MAX_MEMORY * MAX_MEMORY
 
 
-cdef public void lav_admm_lay(admm_t* c, const blocks_t* p, int32_t memory, double rho, double alpha, double* room) noexcept nogil:
-    """A run over p before its first iteration, in room (`lav_admm_room`, zeroed)."""
+cdef public void lav_admm_lay(admm_t* c, const blocks_t* p, int32_t memory, double rho, double alpha,
+                              double* workspace) noexcept nogil:
+    """A run over p before its first iteration, in workspace (`lav_admm_workspace_size`, zeroed)."""
     cdef int64_t m = p.n_rows
     cdef int32_t i
     c.blocks = p
     c.rho, c.alpha = rho, alpha
     c.done = c.next = 0.0
     c.mixed = c.shifted = 0
-    c.root, c.c, c.u, c.z, c.y = room, room + m, room + 2 * m, room + 3 * m, room + 4 * m
-    c.x, c.g, c.before = room + 5 * m, room + 6 * m, room + 7 * m
+    c.root, c.c, c.u, c.z, c.y = workspace, workspace + m, workspace + 2 * m, workspace + 3 * m, workspace + 4 * m
+    c.x, c.g, c.before = workspace + 5 * m, workspace + 6 * m, workspace + 7 * m
     c.work = NULL
     c.mixing.m, c.mixing.memory = <int32_t>m, memory
-    c.mixing.v, c.mixing.g, c.mixing.dv = room + 8 * m, room + 9 * m, room + 10 * m
+    c.mixing.v, c.mixing.g, c.mixing.dv = workspace + 8 * m, workspace + 9 * m, workspace + 10 * m
     c.mixing.dg = c.mixing.dv + memory * m
     c.mixing.control = c.mixing.dg + memory * m
     c.mixing.gram = c.mixing.control + CONTROL
@@ -337,12 +338,12 @@ cdef class Splitting:
     cdef object keep
 
     def __init__(self, Data p, int memory, double rho, double alpha):
-        cdef double[::1] room
+        cdef double[::1] workspace
         if not 0 <= memory <= MAX_MEMORY:
             raise ValueError(f"memory is {memory}; 0 to {MAX_MEMORY} is needed")
-        room = np.zeros(<Py_ssize_t>lav_admm_room(p.blocks.n_rows, memory))
-        self.keep = p, room
-        lav_admm_lay(&self.c, &p.blocks, memory, rho, alpha, &room[0])
+        workspace = np.zeros(<Py_ssize_t>lav_admm_workspace_size(p.blocks.n_rows, memory))
+        self.keep = p, workspace
+        lav_admm_lay(&self.c, &p.blocks, memory, rho, alpha, &workspace[0])
 
     @property
     def rho(self):

@@ -1,6 +1,6 @@
 """One problem by J and M, by A or by bodies, without the interpreter: what is worked out of it, its solve, its judgement.
 
-The kernels of a single solve in their order, so the same bits and counts. Room is the caller's, and the next problem takes it.
+The kernels of a single solve in their order, so the same bits and counts. Workspace is the caller's, and the next problem takes it.
 What does not end below tol on the judge's own measure, has an empty row that b asks for or is counted to cost more than is
 asked for, is left to the caller.
 """
@@ -10,12 +10,12 @@ from libc.string cimport memset
 
 from lavender_ext.core.assemble cimport lav_assemble, lav_body_blocks, lav_expand_rows
 from lavender_ext.core.door cimport first_outside
-from lavender_ext.core.method cimport MORE, REACHED, ROOM, options_t, room_t, said_t
+from lavender_ext.core.method cimport MORE, REACHED, NEEDS_WORKSPACE, options_t, workspace_t, said_t
 from lavender_ext.core.islands cimport islands_index
 from lavender_ext.core.parts cimport CONE, blocks_t, is_rows, islands_t
 from lavender_ext.core.problem cimport MADE, lav_rows_diagonal, made_t, make_numbers, matrix_numbers
 from lavender_ext.core.view cimport csr_t, generalized_t, rows_t, view_t
-from lavender_ext.driver.driver cimport NEWTON, lav_room, lav_start, lav_step
+from lavender_ext.driver.driver cimport NEWTON, lav_workspace_size, lav_start, lav_step
 from lavender_ext.factor.tiles cimport has_wide
 from lavender_ext.judge.measure cimport (above_floor_of, set_zero_impulse, floor_of, general_score, judge_zero_impulse, refine_view,
                                          relative_of, scratch_of)
@@ -24,7 +24,7 @@ from lavender_ext.judge.slack cimport general_slack
 from lavender_ext.small.call cimport (COUNTS, ENDED, KEPT, are_bounded, few_rules_t, few_t, has_call, lay_few, rooms_t,
                                       run_few)
 from lavender_ext.small.limits cimport allowed, cost_of, limits_t, step_cost, work_within
-from lavender_ext.small.room cimport has_room
+from lavender_ext.small.workspace cimport has_workspace_size
 from lavender_ext.batch.world cimport BESIDE, LEFT, READY, STARTED, TRIED, rows_of
 from lavender_ext.velocity_newton.soft cimport is_soft
 
@@ -59,27 +59,27 @@ cdef struct job_t:
     int32_t counts[COUNTS]      # steps, factorisations, rounds, evaluations; or as of `run_few`
     double* lam                 # (m)
     double* both                # (2 m + 1) w, e
-    const double* push          # (n) M^-1 J^T lam of the judge, not of A; in room that the next world takes
+    const double* push          # (n) M^-1 J^T lam of the judge, not of A; in workspace that the next world takes
     score_t score
     double relative, floor, above_floor
     double float64_relative     # of the first pass; NaN if it was not refined
 
 
 cdef struct few_rooms_t:        # of one thread
-    room_t islands              # of `begin`
-    room_t made                 # A, d, nu and step
-    room_t formed               # of `form_matrix`
-    room_t kept                 # of `lay_few`
+    workspace_t islands              # of `begin`
+    workspace_t made                 # A, d, nu and step
+    workspace_t formed               # of `form_matrix`
+    workspace_t kept                 # of `lay_few`
     rooms_t call
 
 
-cdef inline bint begin(job_t* j, view_t* v, room_t* islands, double* w) noexcept nogil:
+cdef inline bint begin(job_t* j, view_t* v, workspace_t* islands, double* w) noexcept nogil:
     """E0, V0 and the relative residual of the zero impulse, with islands in that workspace; False without memory for it.
 
     v: the view of the job's data; w (3 m + `scratch_of`) is scratch.
     """
     cdef ssize_t m = j.p.n_rows
-    if not has_room(islands, islands_index(v), 2 * <int64_t>j.p.n_blocks):
+    if not has_workspace_size(islands, islands_index(v), 2 * <int64_t>j.p.n_blocks):
         return False
     judge_zero_impulse(v, islands.index, &j.islands, islands.real, w + 2 * m, w, w + m, w + 3 * m, j.begin)
     j.p.islands = v.p.islands
@@ -92,7 +92,8 @@ cdef inline double spent_by(const job_t* j, const limits_t* l, double work, int3
     return (READ + FORMED * factored) * once + 0.5 * factored * l.work * work + LINE * l.entry * j.p.n_rows * lines
 
 
-cdef inline int32_t step_within(job_t* j, const view_t* v, const options_t* o, const room_t* r, const limits_t* l) noexcept nogil:
+cdef inline int32_t step_within(job_t* j, const view_t* v, const options_t* o, const workspace_t* r,
+                                const limits_t* l) noexcept nogil:
     """Steps for as long as what they did is counted to cost less than `most` of the job: `spent` where it is not over then.
 
     Those that factor nothing are cheap, so it is asked again for as many as what is left is for if each did.
@@ -166,35 +167,36 @@ cdef inline bint has_numbers(job_t* j) noexcept nogil:
     return j.known and first_outside(j.p.d, j.p.n_rows) < 0
 
 
-cdef inline void solve_job(job_t* j, room_t* room, room_t* islands, const limits_t* limits, double tol) noexcept nogil:
+cdef inline void solve_job(job_t* j, workspace_t* workspace, workspace_t* islands, const limits_t* limits,
+                           double tol) noexcept nogil:
     cdef view_t v
     cdef options_t o = options_t(NEWTON, STEPS, 0, 0, has_wide(), tol, 0.0, 0.0, limits.values, 0.0)
-    cdef room_t r
-    cdef int32_t m = j.p.n_rows, code = ROOM
+    cdef workspace_t r
+    cdef int32_t m = j.p.n_rows, code = NEEDS_WORKSPACE
     cdef bint soft
     j.counts[0] = j.counts[1] = j.counts[2] = j.counts[3] = 0
     if not has_numbers(j):
         return
-    if not has_room(room, 0, 3 * <ssize_t>m + j.g.n):
+    if not has_workspace_size(workspace, 0, 3 * <ssize_t>m + j.g.n):
         return
     v = view_t(j.p, NULL, NULL, &j.g)
-    if j.begin[0] < 0.0 and not begin(j, &v, islands, room.real):
+    if j.begin[0] < 0.0 and not begin(j, &v, islands, workspace.real):
         return
     soft = is_soft(&j.p, &j.g)
     o.work = work_within(&j.p, &j.g, limits, soft)
     if not o.work > 0.0:
         return
-    lav_room(&v, &o, &r)
-    while code == ROOM and not r.laid:
-        if not has_room(room, r.n_index, 0):
+    lav_workspace_size(&v, &o, &r)
+    while code == NEEDS_WORKSPACE and not r.laid:
+        if not has_workspace_size(workspace, r.n_index, 0):
             return
-        r.index = room.index
+        r.index = workspace.index
         code = lav_start(&v, &o, &r, j.lam)
-    if code != ROOM or cost_of(&j.p, &j.g, limits, r.work, soft) > allowed(&j.p, &j.g, limits, r.islands, soft):
+    if code != NEEDS_WORKSPACE or cost_of(&j.p, &j.g, limits, r.work, soft) > allowed(&j.p, &j.g, limits, r.islands, soft):
         return
-    if not has_room(room, 0, r.n_real):
+    if not has_workspace_size(workspace, 0, r.n_real):
         return
-    r.real = room.real
+    r.real = workspace.real
     o.budget = <int32_t>min(<double>STEPS * r.islands, limits.steps)
     o.e0, o.v0 = j.begin[0], j.begin[1]
     if j.cold:
@@ -205,20 +207,20 @@ cdef inline void solve_job(job_t* j, room_t* room, room_t* islands, const limits
     code = step_within(j, &v, &o, &r, limits)
     if code != REACHED and not j.spent:
         return
-    if not has_room(room, 0, judging_size(j)):
+    if not has_workspace_size(workspace, 0, judging_size(j)):
         return
-    judge_job(j, tol, room.real)
+    judge_job(j, tol, workspace.real)
     j.solved = j.relative <= tol
 
 
-cdef inline bint make_matrix(job_t* j, room_t* room) noexcept nogil:
-    """A in compressed rows, d, nu and step in `room`."""
+cdef inline bint make_matrix(job_t* j, workspace_t* workspace) noexcept nogil:
+    """A in compressed rows, d, nu and step in `workspace`."""
     cdef int64_t m = j.p.n_rows, entries = m * m + BESIDE if j.dense != NULL else 0
     cdef double* x
     cdef int32_t* empty
-    if not has_room(room, 2 * (m + 1) + entries, 3 * (m + 1) + entries):
+    if not has_workspace_size(workspace, 2 * (m + 1) + entries, 3 * (m + 1) + entries):
         return False
-    x, empty = room.real, room.index
+    x, empty = workspace.real, workspace.index
     if j.dense != NULL:
         j.a.indptr, j.a.indices, j.a.data = empty + m + 1, empty + 2 * (m + 1), x + 3 * (m + 1)
         rows_of(j.dense, j.row, j.p.n_rows, j.p.n_rows, <int32_t*>j.a.indptr, <int32_t*>j.a.indices, <double*>j.a.data)
@@ -227,34 +229,35 @@ cdef inline bint make_matrix(job_t* j, room_t* room) noexcept nogil:
     return True
 
 
-cdef inline bint make_bodies(job_t* j, room_t* room) noexcept nogil:
-    """d, nu, step, M^-1 J^T of joints, coupling and swing of contacts in `room`; within the door?"""
+cdef inline bint make_bodies(job_t* j, workspace_t* workspace) noexcept nogil:
+    """d, nu, step, M^-1 J^T of joints, coupling and swing of contacts in `workspace`; within the door?"""
     cdef int64_t m = j.p.n_rows, joints = j.p.ptr[j.r.n_joints], c = j.r.n_contacts
     cdef int64_t n = 3 * (m + 1) + 12 * joints + 5 * c + 6 * (m - joints)
     cdef double* x
     cdef double* of_joints
-    if not has_room(room, m + 1, n):
+    if not has_workspace_size(workspace, m + 1, n):
         return False
-    x, of_joints = room.real, room.real + 3 * (m + 1)
+    x, of_joints = workspace.real, workspace.real + 3 * (m + 1)
     memset(x, 0, n * sizeof(double))
     j.p.d, j.p.nu, j.p.step = x, x + m + 1, x + 2 * (m + 1)
     j.r.minv_jac, j.r.coupling, j.r.swing = of_joints, of_joints + 12 * joints, of_joints + 12 * joints + 5 * c
-    j.made.n_empty = lav_rows_diagonal(&j.p, &j.r, x, x + m + 1, x + 2 * (m + 1), room.index, of_joints, of_joints + 12 * joints,
+    j.made.n_empty = lav_rows_diagonal(&j.p, &j.r, x, x + m + 1, x + 2 * (m + 1), workspace.index, of_joints,
+                                       of_joints + 12 * joints,
                                        of_joints + 12 * joints + 5 * c)
     return first_outside(j.p.d, m) < 0
 
 
-cdef inline bint form_matrix(job_t* j, few_t* s, room_t* room) noexcept nogil:
-    """A of bodies in `room`, to be solved in their stead: d of its own, and nu of theirs."""
+cdef inline bint form_matrix(job_t* j, few_t* s, workspace_t* workspace) noexcept nogil:
+    """A of bodies in `workspace`, to be solved in their stead: d of its own, and nu of theirs."""
     cdef int64_t m = j.p.n_rows, k = j.p.n_blocks, most
     cdef int32_t* start
     cdef int32_t* blocks
     cdef int32_t* near
     cdef int32_t* ptr
     cdef double* x
-    if not has_room(room, j.r.n_bodies + 6 * k + 3 * m + m * m + 7, 3 * (m + 1) + 24 * m + m * m + 1):
+    if not has_workspace_size(workspace, j.r.n_bodies + 6 * k + 3 * m + m * m + 7, 3 * (m + 1) + 24 * m + m * m + 1):
         return False
-    start, x = room.index, room.real
+    start, x = workspace.index, workspace.real
     blocks = start + j.r.n_bodies + 1
     near = blocks + 2 * k + 1
     ptr = near + 4 * k + 2 + m
@@ -290,7 +293,7 @@ cdef inline bint prepare_few(job_t* j, few_t* s, few_rooms_t* rooms) noexcept no
         return False
     s.v = view_of(j)
     if j.begin[0] < 0.0:
-        if not has_room(&rooms.call.work, 0, 3 * m + scratch_of(&s.v)):
+        if not has_workspace_size(&rooms.call.work, 0, 3 * m + scratch_of(&s.v)):
             return False
         if not begin(j, &s.v, &rooms.islands, rooms.call.work.real):
             return False

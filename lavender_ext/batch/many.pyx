@@ -13,7 +13,7 @@ import numpy as np
 
 from lavender_ext.core.arrays cimport doubles, ints, ndarray
 from lavender_ext.core.blocks cimport Blocks
-from lavender_ext.core.method cimport room_t
+from lavender_ext.core.method cimport workspace_t
 from lavender_ext.core.problem cimport Data, made_t
 from lavender_ext.core.problem import LAWS
 from lavender_ext.core.view cimport view_t
@@ -21,7 +21,7 @@ from lavender_ext.small.call cimport COUNTS, Rules, few_rules_t, few_t, judge_fe
 from lavender_ext.batch.job cimport (few_rooms_t, begin, found_by, has_numbers, job_t, judge_job, judging_size, prepare_few,
                                      solve_few, solve_job)
 from lavender_ext.small.limits cimport allowed, cost_of, limits_t
-from lavender_ext.small.room cimport has_room, leave
+from lavender_ext.small.workspace cimport has_workspace_size, leave
 from lavender_ext.batch.world cimport (BAD, BLOCK, BLOCKS, CONE_ROW, FREE, JAC, LATE, LEFT, MASS, MU, N_ARRAYS, PLACES,
                                        READY, AT_ROW, FIELDS, ROWS, SOFT, STARTED, TARGET, TRIED, VELOCITIES, VELOCITY,
                                        desk_t, lay_bodies, lay_matrix, lay_world, worlds_t)
@@ -130,15 +130,15 @@ def solve_first(Data p, start, double tol, Limits limits, double most=INFINITY):
     is the result. d, Y and the error of doing nothing stay with the data.
     """
     cdef job_t j
-    cdef room_t room = room_t(0, 0, NULL, NULL, 0, 0, 0, 0.0), islands = room
+    cdef workspace_t workspace = workspace_t(0, 0, NULL, NULL, 0, 0, 0, 0.0), islands = workspace
     cdef Py_ssize_t m = p.blocks.n_rows
     cdef bint known = p.ready
     impulse, results = new(m), new(2 * m + 1)
     take(&j, p, start, doubles(impulse, m), doubles(results, 2 * m + 1))
     j.most = most
     with nogil:
-        solve_job(&j, &room, &islands, &limits.at, tol)
-        leave(&room)
+        solve_job(&j, &workspace, &islands, &limits.at, tol)
+        leave(&workspace)
     if not known and j.known:
         p.adopt(&j.made)
     elif not known:
@@ -201,18 +201,18 @@ def data_of(list problems, kind):
 
 
 cdef struct hand_t:             # rooms of one thread
-    room_t room
-    room_t both
+    workspace_t workspace
+    workspace_t both
     made_t made
     desk_t desk
     few_rooms_t few
-    room_t by_island
+    workspace_t by_island
 
 
 cdef inline bint begin_world(job_t* j, hand_t* h) noexcept nogil:
     """`begin` of a world by J and M."""
     cdef view_t v = view_t(j.p, NULL, NULL, &j.g)
-    return begin(j, &v, &h.few.islands, h.room.real)
+    return begin(j, &v, &h.few.islands, h.workspace.real)
 
 
 cdef class Worlds:
@@ -333,7 +333,7 @@ cdef class Worlds:
     cdef bint is_general(self, int64_t i) noexcept nogil:
         return self.jobs[i].general if self.jobs != NULL else self.w.general
 
-    cdef int32_t lay(self, int64_t i, desk_t* desk, room_t* both, const made_t* made, job_t* j) noexcept nogil:
+    cdef int32_t lay(self, int64_t i, desk_t* desk, workspace_t* both, const made_t* made, job_t* j) noexcept nogil:
         """World i for a solve or for the judge."""
         cdef const int64_t* at = self.w.at + i * PLACES
         cdef int32_t code = READY
@@ -355,7 +355,7 @@ cdef class Worlds:
         if not j.known and j.general:
             j.made = made[0]
         j.most = INFINITY
-        if not has_room(both, 0, 2 * at[ROWS] + 1):
+        if not has_workspace_size(both, 0, 2 * at[ROWS] + 1):
             return LEFT
         j.both = both.real
         return code
@@ -399,9 +399,9 @@ cdef class Worlds:
             return self.empty(i, &h.desk)
         known, j.most = j.known, most
         if j.general:
-            solve_job(&j, &h.room, &h.few.islands, limits, tol)
+            solve_job(&j, &h.workspace, &h.few.islands, limits, tol)
             if not known:
-                h.made = j.made                         # whose room the next one has
+                h.made = j.made                         # whose workspace the next one has
             code = READY if j.solved else TRIED
         else:
             code = solve_few(&j, &h.few, rules, tol)
@@ -432,7 +432,7 @@ cdef class Worlds:
         if not j.general:
             if narrow or (late and self.jobs != NULL) or not prepare_few(&j, &s, &h.few):
                 return LEFT
-            if not has_room(&h.few.call.work, 0, scratch_of(&s.v)):
+            if not has_workspace_size(&h.few.call.work, 0, scratch_of(&s.v)):
                 return LEFT
             if j.cold:
                 set_zero_impulse(&j.p, j.lam, j.both)
@@ -441,9 +441,9 @@ cdef class Worlds:
             found_by(&j, &s)
             j.push = h.few.call.work.real
         elif (has_numbers(&j) and j.made.n_empty == 0
-              and has_room(&h.room, 0, max(judging_size(&j), 4 * <int64_t>m + 5 * j.g.n))
-              and has_room(&h.by_island, 0, 2 * <int64_t>j.p.n_blocks) and begin_world(&j, h)):
-            code, x = READY, h.room.real
+              and has_workspace_size(&h.workspace, 0, max(judging_size(&j), 4 * <int64_t>m + 5 * j.g.n))
+              and has_workspace_size(&h.by_island, 0, 2 * <int64_t>j.p.n_blocks) and begin_world(&j, h)):
+            code, x = READY, h.workspace.real
             if j.cold:
                 set_zero_impulse(&j.p, j.lam, j.both)
             j.by_island = h.by_island.real
@@ -480,9 +480,9 @@ cdef class Hand:
         self.worlds, self.stop, self.h.desk.n_tree = worlds, stop, -1
 
     def __dealloc__(self):
-        leave(&self.h.room)
+        leave(&self.h.workspace)
         leave(&self.h.both)
-        leave(&self.h.desk.room)
+        leave(&self.h.desk.workspace)
         leave(&self.h.desk.tree)
         leave(&self.h.by_island)
         leave(&self.h.few.islands)

@@ -39,5 +39,5 @@ cdef extern from *:
         return q;
     }
     """
-    # How many of x (n) are not 0; with their columns (NULL: 0, 1 ...) into idx and val, which have room for n + 8.
+    # How many of x (n) are not 0; with their columns (NULL: 0, 1 ...) into idx and val, which have workspace for n + 8.
     int32_t thin "lavender_thin"(int32_t n, const double* x, const int32_t* col, int32_t* idx, double* val) noexcept nogil

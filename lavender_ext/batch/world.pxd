@@ -10,11 +10,11 @@ from libc.string cimport memcmp, memcpy, memset
 from lavender_ext.core.door cimport are_pairs, first_unsized, has_outside, is_definite, is_frame, is_size, largest, least
 from lavender_ext.core.generalized cimport jac_row
 from lavender_ext.core.tree cimport tree_factor, tree_pattern
-from lavender_ext.core.method cimport room_t
+from lavender_ext.core.method cimport workspace_t
 from lavender_ext.core.parts cimport blocks_t, from_block, is_rows
 from lavender_ext.core.rows cimport rows_times
 from lavender_ext.judge.rounding cimport mass_t
-from lavender_ext.small.room cimport has_room
+from lavender_ext.small.workspace cimport has_workspace_size
 from lavender_ext.batch.thin cimport thin
 from lavender_ext.core.view cimport generalized_t, rows_t
 
@@ -91,8 +91,8 @@ cdef struct worlds_t:
 
 
 cdef struct desk_t:             # of one thread
-    room_t room                 # of the world at hand
-    room_t tree                 # and the pattern of the last M's factor
+    workspace_t workspace                 # of the world at hand
+    workspace_t tree                 # and the pattern of the last M's factor
     int32_t n_tree              # velocities of that, -1: none
     int32_t splits              # L of a shared M has another pattern where entries are 0
     mass_t mass                 # of the world at hand
@@ -202,10 +202,10 @@ cdef inline void point_at_tree(const int32_t* t, int32_t n, generalized_t* g) no
 
 
 cdef inline bint tree_of(desk_t* d, int32_t n, const int32_t* ptr, const int32_t* idx, generalized_t* g) noexcept nogil:
-    """The pattern of L, that of the world before where M has its entries in the same places; is there room for it?"""
+    """The pattern of L, that of the world before where M has its entries in the same places; is there workspace for it?"""
     cdef int64_t most = <int64_t>n * (n + 1) // 2
     cdef int32_t* t
-    if not has_room(&d.tree, 6 * <int64_t>n + 2 + 2 * most, 0):
+    if not has_workspace_size(&d.tree, 6 * <int64_t>n + 2 + 2 * most, 0):
         return False
     point_at_tree(d.tree.index, n, g)
     t = d.tree.index + 5 * n + 1 + most                 # M's
@@ -232,7 +232,7 @@ cdef inline int32_t zeros_of(const double* x, int32_t n, const int64_t* known, i
 
 
 cdef inline int32_t whole_tree(const worlds_t* w, desk_t* d, int32_t n, const double* x, generalized_t* g) noexcept nogil:
-    """Entries of a shared M without zeros; -1 where L has not the pattern that it has of the whole M, or there is no room.
+    """Entries of a shared M without zeros; -1 where L has not the pattern that it has of the whole M, or there is no workspace.
 
     That it has with so many zeros it has with fewer: M is read where it stands, and looked at once.
     """
@@ -242,7 +242,7 @@ cdef inline int32_t whole_tree(const worlds_t* w, desk_t* d, int32_t n, const do
     cdef int32_t* other
     cdef int32_t* ptr
     cdef int64_t* known                                 # places of zeros that L's pattern does without
-    if d.splits or not has_room(&d.tree, 2 * (6 * <int64_t>n + 2 + 2 * most), 2 * <int64_t>count):
+    if d.splits or not has_workspace_size(&d.tree, 2 * (6 * <int64_t>n + 2 + 2 * most), 2 * <int64_t>count):
         return -1
     t, known = d.tree.index, <int64_t*>d.tree.real
     point_at_tree(t, n, g)
@@ -301,9 +301,9 @@ cdef inline int32_t lay_world(const worlds_t* w, int64_t i, desk_t* d, blocks_t*
     cdef int32_t* idx
     cdef double* x
     cdef double* b
-    if n >= MESH or not has_room(&d.room, m + 1 + all + n + 1 + half + k + 1 + BESIDE, numbers + wide):
+    if n >= MESH or not has_workspace_size(&d.workspace, m + 1 + all + n + 1 + half + k + 1 + BESIDE, numbers + wide):
         return LEFT
-    ptr, x = d.room.index, d.room.real
+    ptr, x = d.workspace.index, d.workspace.real
     idx = ptr + m + 1
     g.n, g.m, g.jptr, g.jidx, g.jval = n, m, ptr, idx, x
     a = widened(w, 0, at[JAC], m, n, &row, x + numbers)
@@ -314,7 +314,7 @@ cdef inline int32_t lay_world(const worlds_t* w, int64_t i, desk_t* d, blocks_t*
     idx = ptr + n + 1
     if w.mass_ptr != NULL:
         row = entries = w.mass_ptr[n]
-        a = widened(w, 1, at[MASS], 1, entries, &row, d.room.real + numbers)
+        a = widened(w, 1, at[MASS], 1, entries, &row, d.workspace.real + numbers)
         if has_outside(a, entries):
             return BAD
         d.mass.ptr, d.mass.idx, d.mass.val = w.mass_ptr, w.mass_col, a
@@ -325,7 +325,7 @@ cdef inline int32_t lay_world(const worlds_t* w, int64_t i, desk_t* d, blocks_t*
             whole = False
     else:
         row = w.mass_row
-        a = widened(w, 1, at[MASS], n, n, &row, d.room.real + numbers)
+        a = widened(w, 1, at[MASS], n, n, &row, d.workspace.real + numbers)
         entries = triangle_of(a, row, w.asymmetry, n, ptr, idx, x)
         if entries < 0 or has_outside(x, entries):
             return BAD
@@ -361,9 +361,9 @@ cdef inline int32_t lay_matrix(const worlds_t* w, int64_t i, desk_t* d, blocks_t
     cdef const int64_t* at = w.at + i * PLACES
     cdef int32_t m = <int32_t>at[ROWS], k = <int32_t>at[BLOCKS], j
     cdef double* b
-    if not has_room(&d.room, k + 1, m + k + <int64_t>m * m):
+    if not has_workspace_size(&d.workspace, k + 1, m + k + <int64_t>m * m):
         return LEFT
-    b, row[0] = d.room.real, w.jac_row
+    b, row[0] = d.workspace.real, w.jac_row
     a[0] = widened(w, 0, at[JAC], m, m, row, b + m + k)
     for j in range(m):
         if has_outside(a[0] + j * row[0], m):
@@ -371,7 +371,7 @@ cdef inline int32_t lay_matrix(const worlds_t* w, int64_t i, desk_t* d, blocks_t
     widen(w, 3, at[TARGET], m, b)
     if has_outside(b, m) or 0.0 < largest(b, m) < least():
         return BAD
-    return lay_blocks(w, at, p, b, d.room.index, b + m)
+    return lay_blocks(w, at, p, b, d.workspace.index, b + m)
 
 
 cdef inline int32_t lay_bodies(const worlds_t* w, int64_t i, desk_t* d, blocks_t* p, rows_t* r) noexcept nogil:
@@ -384,7 +384,7 @@ cdef inline int32_t lay_bodies(const worlds_t* w, int64_t i, desk_t* d, blocks_t
     cdef double* b
     cdef double* mu
     size[:] = [o.n, 9 * o.n, 6 * o.n, 12 * w.blocks.ptr[kj], 3 * c, 3 * c, 3 * c, 3 * c, m, m, c]
-    if not has_room(&d.room, kj + c + 1, m + kj + c):
+    if not has_workspace_size(&d.workspace, kj + c + 1, m + kj + c):
         return LEFT
     for k in range(FIELDS):
         x[k] = o.field[k] + i * o.step[k]
@@ -404,10 +404,10 @@ cdef inline int32_t lay_bodies(const worlds_t* w, int64_t i, desk_t* d, blocks_t
     for k in range(c):
         if not is_frame(r.normal + 3 * k, r.tangent + 3 * k, 5e-10):
             return LEFT
-    b, mu = d.room.real, d.room.real + m
+    b, mu = d.workspace.real, d.workspace.real + m
     memset(mu, 0, kj * sizeof(double))
     memcpy(mu + kj, x[RUB], c * sizeof(double))
-    if lay_blocks(w, at, p, b, d.room.index, mu, True) != READY:
+    if lay_blocks(w, at, p, b, d.workspace.index, mu, True) != READY:
         return LEFT
     d.free = <double*>x[V_FREE]
     rows_times(p, r, d.free, b)

@@ -223,7 +223,7 @@ def delassus(Data p, Py_ssize_t most, int32_t[::1] start, int32_t[::1] blocks):
                      &data[0])
     nnz = indptr[m]
     found = indices_[:nnz], data_[:nnz]
-    if nnz < 0.75 * most:                               # a copy costs more than a quarter of unused room
+    if nnz < 0.75 * most:                               # a copy costs more than a quarter of unused workspace
         found = found[0].copy(), found[1].copy()
     return (indptr_, *found)
 

@@ -109,7 +109,7 @@ cdef class Blocks:
 
 
 cdef Blocks room_of(Py_ssize_t k, Py_ssize_t m, Py_ssize_t ints=0, Py_ssize_t numbers=0):
-    """Blocks over new arrays, read-only for everybody else, whose numbers are still to be written; behind them more room."""
+    """Blocks over new arrays, read-only for everybody else, whose numbers are still to be written; behind them more workspace."""
     cdef Blocks made = Blocks.__new__(Blocks)
     made.ints, made.numbers = frozen(new(2 * k + 1 + ints, I4)), frozen(new(2 * m + 3 * k + numbers))
     made.at.n_blocks = <int32_t>k

@@ -93,7 +93,7 @@ cdef inline void sort_falling(int32_t* x, int32_t n) noexcept nogil:
 
 
 cdef inline int32_t few_panels(const generalized_t* g, int32_t n_blocks, const int32_t* ptr, uint64_t* above,
-                               int32_t* prow, int32_t* pcol, int32_t* pval, int32_t* cols, int32_t room,
+                               int32_t* prow, int32_t* pcol, int32_t* pval, int32_t* cols, int32_t workspace,
                                int32_t* n_cols, double* n_values) noexcept nogil:
     """`panel_pattern` of at most 64 velocities, sets of columns as bits; above (n) is scratch."""
     cdef int32_t i, q, k, first, last, count = 0, before = -1, at = 0, n = 0, nv = g.n, end, entries, odd
@@ -125,7 +125,7 @@ cdef inline int32_t few_panels(const generalized_t* g, int32_t n_blocks, const i
         if n > 0 and on == held and last - prow[n - 1] <= PANEL_ROWS:
             prow[n] = last                              # the panel grows
         else:
-            if at + nv > room:
+            if at + nv > workspace:
                 return -1
             count = 0
             left = on
@@ -148,16 +148,16 @@ cdef inline int32_t few_panels(const generalized_t* g, int32_t n_blocks, const i
 
 
 cdef inline int32_t panel_pattern(const generalized_t* g, int32_t n_blocks, const int32_t* ptr, int32_t* mark,
-                                  int32_t* prow, int32_t* pcol, int32_t* pval, int32_t* cols, int32_t room,
+                                  int32_t* prow, int32_t* pcol, int32_t* pval, int32_t* cols, int32_t workspace,
                                   int32_t* n_cols, double* n_values) noexcept nogil:
-    """Panels of consecutive blocks that reach the same columns; how many, or -1 where `room` columns do not suffice.
+    """Panels of consecutive blocks that reach the same columns; how many, or -1 where `workspace` columns do not suffice.
 
     mark (2 n) is scratch, aligned to 8 bytes; of n_cols and n_values the caller makes arrays.
     """
     cdef int32_t i, first, last, count, same, before = -1, held = 0, at = 0, n = 0, stamp = 0
     cdef int32_t* out = mark + g.n
     if g.n <= 64:
-        return few_panels(g, n_blocks, ptr, <uint64_t*>mark, prow, pcol, pval, cols, room, n_cols, n_values)
+        return few_panels(g, n_blocks, ptr, <uint64_t*>mark, prow, pcol, pval, cols, workspace, n_cols, n_values)
     n_values[0] = 0.0
     prow[0] = 0
     pcol[0] = 0
@@ -172,7 +172,7 @@ cdef inline int32_t panel_pattern(const generalized_t* g, int32_t n_blocks, cons
         if n > 0 and count == held and same == count and last - prow[n - 1] <= PANEL_ROWS:
             prow[n] = last                                  # the panel grows
         else:
-            if at + count > room:
+            if at + count > workspace:
                 return -1
             sort_falling(out, count)
             for same in range(count):

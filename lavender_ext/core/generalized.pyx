@@ -17,20 +17,20 @@ cdef int64_t MOST = 2**31 - 1   # entries of L that 32-bit indices reach
 
 cdef object pattern_of(int32_t n, const int32_t* mptr, const int32_t* midx, int64_t most=MOST):
     """L's columns by the elimination of M, in one array: lptr (n + 1), parent (n), scratch (3 n), then lidx."""
-    cdef int64_t room = mptr[n] + 1
+    cdef int64_t workspace = mptr[n] + 1
     cdef int32_t count = -1
     cdef int32_t[::1] whole
     most = min(<int64_t>n * n // 2 + 1, most)
     while True:                                         # again where M's pattern is no tree's: L has more entries
-        marks = new(5 * <int64_t>n + 1 + room, I4)
+        marks = new(5 * <int64_t>n + 1 + workspace, I4)
         whole = marks
-        count = tree_pattern(n, mptr, midx, <int32_t>room, &whole[0], &whole[5 * n + 1], &whole[n + 1],
+        count = tree_pattern(n, mptr, midx, <int32_t>workspace, &whole[0], &whole[5 * n + 1], &whole[n + 1],
                              &whole[2 * n + 1], &whole[3 * n + 1], &whole[4 * n + 1])
         if count >= 0:
             return marks
-        if room >= most:
+        if workspace >= most:
             raise MemoryError(f"the factor of M ({n}, {n}) has more than {most} entries")
-        room = min(2 * room, most)
+        workspace = min(2 * workspace, most)
 
 
 cdef class Operator:

@@ -1,15 +1,15 @@
-"""A method as three functions on plain structs: room, start, step. Nothing here needs Python, allocates, or looks at a clock.
+"""A method as three functions on plain structs: workspace, start, step. Nothing here needs Python, allocates, or looks at a clock.
 
     view_t v          a problem: its blocks with d and nu, and one of A, bodies, J and M
     options_t o       which method, to what tolerance, with how much work
-    room_t r          the caller's arrays
-    room(&v, &o, &r)            -> r.n_index, r.n_real as a first guess; 0: the method does not take this problem
-    start(&v, &o, &r, lambda)   -> MORE | ROOM (r.n_index, r.n_real say how much; give it, start again) | an end
+    workspace_t r          the caller's arrays
+    workspace(&v, &o, &r)            -> r.n_index, r.n_real as a first guess; 0: the method does not take this problem
+    start(&v, &o, &r, lambda)   -> MORE | NEEDS_WORKSPACE (r.n_index, r.n_real say how much; give it, start again) | an end
     step(&v, &o, &r, work, lambda, &s) -> MORE | another outcome, lambda the best so far
 
-What a start finds before it knows how much room it needs stands in r.index, and is found once: what r says of the problem
-(`laid`) is true from the first answer of ROOM that asks for no more whole numbers. What a method keeps stands in r, which
-may not move between start and the last step, as little as the arrays of v.
+A start stores its findings in r.index before it knows the size of its workspace, once: r describes the problem (`laid`) from
+the first NEEDS_WORKSPACE on that asks for no more integers. A method keeps its state in r, which must not move between the start
+and the last step, nor may the arrays of v.
 """
 from libc.stdint cimport int32_t, int64_t
 
@@ -24,7 +24,7 @@ cdef enum:                      # outcomes
     STUCK = 3
     CERTIFICATE = 4             # `direction` may prove that there is no solution: the caller looks, and calls again
     SPENT = 5                   # the budget, or `stop`
-    ROOM = 6
+    NEEDS_WORKSPACE = 6
     UNFIT = 7                   # the method does not take this problem
     BROKEN = 8                  # a factor has no sound pivots
     LOST = 9                    # numbers are not finite
@@ -43,7 +43,7 @@ cdef struct options_t:
     double work                 # multiply-adds of one, above which it need not be laid out; 0: however many
 
 
-cdef struct room_t:
+cdef struct workspace_t:
     int64_t n_index
     int64_t n_real
     int32_t* index              # a multiple of 8 bytes
@@ -65,12 +65,12 @@ cdef struct said_t:             # since the start
 
 
 cdef struct method_t:
-    int32_t (*room)(const view_t*, const options_t*, room_t*) noexcept nogil
-    int32_t (*start)(const view_t*, const options_t*, room_t*, const double*) noexcept nogil
-    int32_t (*step)(const view_t*, const options_t*, const room_t*, int32_t, double*, said_t*) noexcept nogil
+    int32_t (*workspace)(const view_t*, const options_t*, workspace_t*) noexcept nogil
+    int32_t (*start)(const view_t*, const options_t*, workspace_t*, const double*) noexcept nogil
+    int32_t (*step)(const view_t*, const options_t*, const workspace_t*, int32_t, double*, said_t*) noexcept nogil
 
 
-cdef inline bint grant(room_t* r, int64_t n_index, int64_t n_real) noexcept nogil:
+cdef inline bint grant(workspace_t* r, int64_t n_index, int64_t n_real) noexcept nogil:
     """Is there as much? Else that is what is needed."""
     cdef bint enough = r.n_index >= n_index and r.n_real >= n_real and (r.real != NULL or n_real == 0)
     if not enough:
@@ -82,7 +82,7 @@ cdef class Method:
     cdef Data data
     cdef view_t view
     cdef options_t options
-    cdef room_t space
+    cdef workspace_t space
     cdef said_t said
     cdef method_t own
     cdef readonly int how       # it stands: one of `OUTCOMES`

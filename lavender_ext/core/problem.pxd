@@ -5,11 +5,11 @@ from lavender_ext.core.parts cimport blocks_t, islands_t
 from lavender_ext.core.view cimport csr_t, generalized_t, rows_t, view_t
 
 
-cdef class Room:
+cdef class Workspace:
     cdef void* at               # freed with the object
 
 
-cdef Room room_for(Py_ssize_t bytes)
+cdef Workspace allocate_workspace(Py_ssize_t bytes)
 
 
 cdef enum:                      # how `make_numbers` ended
@@ -21,7 +21,7 @@ cdef enum:                      # how `make_numbers` ended
 cdef struct made_t:             # of a problem in generalised coordinates; `free` both, of which the next may be made
     int32_t* marks              # scratch (2 n), prow, pcol, pval (k + 1 each), empty (m + 1), home (k), cols
     double* numbers             # d, nu, step (m + 1 each), Y
-    ssize_t n_marks             # as many as there is room for,
+    ssize_t n_marks             # as many as there is workspace for,
     ssize_t n_numbers           # 0 at first
     int32_t* empty              # inside marks
     int32_t n_empty

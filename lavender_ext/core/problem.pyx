@@ -220,24 +220,24 @@ cdef int32_t make_numbers(blocks_t* p, generalized_t* g, made_t* out) noexcept n
     """
     cdef int32_t n = g.n, k = p.n_blocks, m = p.n_rows, n_cols, i, b = 0
     cdef int32_t* home
-    cdef ssize_t head = 2 * <ssize_t>n + 3 * (<ssize_t>k + 1) + m + 1 + k, room = 2 * <ssize_t>g.jptr[m] + 64, most, size
+    cdef ssize_t head = 2 * <ssize_t>n + 3 * (<ssize_t>k + 1) + m + 1 + k, workspace = 2 * <ssize_t>g.jptr[m] + 64, most, size
     cdef int32_t* w
     most = 2147483647 - head
     while True:
-        if out.n_marks < head + room:
+        if out.n_marks < head + workspace:
             free(out.marks)
-            out.marks = <int32_t*>malloc((head + room) * sizeof(int32_t))
-            out.n_marks = head + room if out.marks != NULL else 0
+            out.marks = <int32_t*>malloc((head + workspace) * sizeof(int32_t))
+            out.n_marks = head + workspace if out.marks != NULL else 0
         w = out.marks
         if w == NULL:
             return NO_MEMORY
         out.n_panels = panel_pattern(g, k, p.ptr, w, w + 2 * n, w + 2 * n + k + 1, w + 2 * n + 2 * (k + 1), w + head,
-                                     <int32_t>room, &n_cols, &out.values)
+                                     <int32_t>workspace, &n_cols, &out.values)
         if out.n_panels >= 0:
             break
-        if room >= most:
+        if workspace >= most:
             return TOO_MANY
-        room = 2 * room if 2 * room < most else most
+        workspace = 2 * workspace if 2 * workspace < most else most
     if out.values >= 2147483647.0:
         return TOO_MANY
     size = 3 * (<ssize_t>m + 1) + <ssize_t>out.values + 1
@@ -258,15 +258,15 @@ cdef int32_t make_numbers(blocks_t* p, generalized_t* g, made_t* out) noexcept n
     return MADE
 
 
-cdef class Room:
+cdef class Workspace:
     """Memory that lives as long as this: a quarter of what an array of NumPy and a view of it cost to make."""
 
     def __dealloc__(self):
         free(self.at)
 
 
-cdef Room room_for(Py_ssize_t bytes):
-    cdef Room made = Room.__new__(Room)
+cdef Workspace allocate_workspace(Py_ssize_t bytes):
+    cdef Workspace made = Workspace.__new__(Workspace)
     made.at = malloc(bytes if bytes > 0 else 1)
     if made.at == NULL:
         raise MemoryError(f"{bytes} bytes")
@@ -290,7 +290,7 @@ cdef class Data:
         cdef double* d = &numbers[0]
         cdef double* nu = d + m + 1
         cdef double* step = nu + m + 1
-        cdef Room marks = room_for((<Py_ssize_t>m + 1) * sizeof(int32_t))
+        cdef Workspace marks = allocate_workspace((<Py_ssize_t>m + 1) * sizeof(int32_t))
         cdef int32_t* empty = <int32_t*>marks.at
         cdef const int32_t[::1] indptr, indices
         cdef const double[::1] data
@@ -514,14 +514,14 @@ cdef class Data:
     cdef void keep_reference(self, const islands_t* islands, const double* start):
         """Keep a copy of the islands with their references, or NULL, and (3) of `reference_of`, unless they are known."""
         cdef Py_ssize_t k = self.blocks.n_blocks
-        cdef Room numbers, marks
+        cdef Workspace numbers, marks
         cdef int32_t* at
         with cython.critical_section(self):
             if self.reference_energy >= 0.0:
                 return
             if islands != NULL:
-                numbers = room_for(2 * islands.n * sizeof(double))
-                marks = room_for((2 * k + islands.n + 1) * sizeof(int32_t))
+                numbers = allocate_workspace(2 * islands.n * sizeof(double))
+                marks = allocate_workspace((2 * k + islands.n + 1) * sizeof(int32_t))
                 memcpy(numbers.at, islands.reference, 2 * islands.n * sizeof(double))
                 at = <int32_t*>marks.at
                 memcpy(at, islands.label, k * sizeof(int32_t))
@@ -545,7 +545,7 @@ cdef class Data:
         cdef view_t v = self.view()
         cdef islands_t found
         cdef Py_ssize_t i, k = self.blocks.n_blocks
-        cdef Room marks = room_for(islands_index(&v) * sizeof(int32_t))
+        cdef Workspace marks = allocate_workspace(islands_index(&v) * sizeof(int32_t))
         cdef int32_t count = find_islands(&v, <int32_t*>marks.at, &found)
         label_ = np.zeros(k, np.int32)
         cdef int32_t[::1] label = label_

@@ -41,15 +41,15 @@ cdef inline void put_in_order(int32_t k, const int32_t* mark, int32_t count, int
         i += 1
 
 
-cdef inline int32_t tree_pattern(int32_t n, const int32_t* mptr, const int32_t* midx, int32_t room, int32_t* lptr,
+cdef inline int32_t tree_pattern(int32_t n, const int32_t* mptr, const int32_t* midx, int32_t workspace, int32_t* lptr,
                                  int32_t* lidx, int32_t* parent, int32_t* mark, int32_t* next_child,
                                  int32_t* first_child) noexcept nogil:
-    """Pattern of L from the lower triangle of M; entries of L, or -1 where `room` does not hold them.
+    """Pattern of L from the lower triangle of M; entries of L, or -1 where `workspace` does not hold them.
 
     Rows are found from the last: row k has the entries of M and those that rows below it, whose last column is k,
     leave there. They are written from the end of `lidx` backwards; `lptr` counts from the front afterwards.
     """
-    cdef int32_t k, q, c, j, at = room, start, end
+    cdef int32_t k, q, c, j, at = workspace, start, end
     for k in range(n):
         mark[k] = -1
         first_child[k] = -1
@@ -85,8 +85,8 @@ cdef inline int32_t tree_pattern(int32_t n, const int32_t* mptr, const int32_t* 
             first_child[j] = k
     for k in range(n):
         lptr[k] -= at
-    lptr[n] = room - at
-    for q in range(at, room):
+    lptr[n] = workspace - at
+    for q in range(at, workspace):
         lidx[q - at] = lidx[q]
     for k in range(n):
         parent[k] = lidx[lptr[k + 1] - 1] if lptr[k + 1] > lptr[k] else -1

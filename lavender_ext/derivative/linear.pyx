@@ -20,7 +20,7 @@ from lavender_ext.core.arrays cimport ndarray as Array
 from lavender_ext.core.door cimport all_finite, first_outside
 from lavender_ext.core.generalized cimport jac_push, whitened_dot
 from lavender_ext.core.parts cimport blocks_t, is_rows
-from lavender_ext.core.problem cimport Data, Room, room_for
+from lavender_ext.core.problem cimport Data, Workspace, allocate_workspace
 from lavender_ext.core.rows cimport rows_times
 from lavender_ext.core.velocity cimport rows_wrench, wrenches_to_velocity
 from lavender_ext.core.view cimport generalized_t, view_t
@@ -256,7 +256,7 @@ cdef class Linear:
     """One of `Linears`. `solve` and `adjoint` are of the factor that was found last."""
     cdef linear_t at
     cdef Data judge, data                               # data: with the A of G
-    cdef Room room, factor
+    cdef Workspace workspace, factor
 
     @property
     def rows(self):
@@ -286,8 +286,8 @@ cdef class Linear:
     def prepare(self, Data data, double shift=0.0):
         """Factor G of H + shift, A of the data in rows or J and M; whether it is regular."""
         cdef view_t v = data.view()
-        cdef Room spare = room_for(scratch_of_factor(self.at.rows, &v) * sizeof(double))
-        self.data, self.factor = data, room_for(room_of_factor(self.at.rows) * sizeof(double))
+        cdef Workspace spare = allocate_workspace(scratch_of_factor(self.at.rows, &v) * sizeof(double))
+        self.data, self.factor = data, allocate_workspace(room_of_factor(self.at.rows) * sizeof(double))
         with nogil:
             factorise(&self.at, &v, shift, <double*>self.factor.at, <double*>spare.at)
         return self.at.regular
@@ -320,9 +320,9 @@ cdef class Linear:
         out_ = np.empty((self.at.rows, self.at.rows))
         cdef double[:, ::1] out = out_
         cdef view_t v = self.data.view()
-        cdef Room work
+        cdef Workspace work
         if self.at.rows:
-            work = room_for(scratch_of_factor(self.at.rows, &v) * sizeof(double))
+            work = allocate_workspace(scratch_of_factor(self.at.rows, &v) * sizeof(double))
             form(&self.at, &v, 0.0, &out[0, 0], <double*>work.at)
         return out_
 
@@ -393,7 +393,7 @@ cdef class Linears:
     and M and G has at most `most` rows. Left to the caller are data that are None, an impulse that is no array of its rows,
     A_ii out of reach: `one` is None.
     """
-    cdef Room table, room, factors
+    cdef Workspace table, workspace, factors
     cdef list data
     cdef linear_t* at
     cdef readonly Py_ssize_t n, size                    # how many impulses; numbers of `adjoint`
@@ -406,14 +406,14 @@ cdef class Linears:
         cdef Py_buffer held
         cdef double* to
         cdef double* work
-        cdef Room spare
+        cdef Workspace spare
         cdef list each = impulses if type(impulses) is list else None
         cdef const double[::1] flat
         cdef const int64_t[:] first, sizes
         if each is None:
             flat, first, sizes = impulses
         self.data, self.n = data, n
-        self.table = room_for(n * sizeof(linear_t))
+        self.table = allocate_workspace(n * sizeof(linear_t))
         self.at = <linear_t*>self.table.at
         memset(self.at, 0, n * sizeof(linear_t))
         for i in range(n):
@@ -425,8 +425,8 @@ cdef class Linears:
             a.n = a.v.g.n if a.v.g != NULL else 6 * a.v.r.n_bodies if a.v.r != NULL else 0
             size += room_of(&a.v.p, values_of(&a.v.p))
             scratch = max(scratch, a.v.p.n_rows + scratch_of(&a.v))
-        self.room, spare = room_for(size * sizeof(double)), room_for(scratch * sizeof(double))
-        to = <double*>self.room.at
+        self.workspace, spare = allocate_workspace(size * sizeof(double)), allocate_workspace(scratch * sizeof(double))
+        to = <double*>self.workspace.at
         for i in range(n):
             a = self.at + i
             if not a.known:
@@ -449,7 +449,7 @@ cdef class Linears:
             if a.v.g != NULL and a.rows <= most:
                 more += room_of_factor(a.rows)
                 scratch = max(scratch, scratch_of_factor(a.rows, &a.v))
-        self.factors, spare = room_for(more * sizeof(double)), room_for(scratch * sizeof(double))
+        self.factors, spare = allocate_workspace(more * sizeof(double)), allocate_workspace(scratch * sizeof(double))
         to, work = <double*>self.factors.at, <double*>spare.at
         with nogil:
             for i in range(n):
@@ -465,7 +465,7 @@ cdef class Linears:
             return None
         made = Linear.__new__(Linear)
         made.at, made.judge, made.data = self.at[i], self.data[i], self.data[i]
-        made.room, made.factor = self.room, self.factors
+        made.workspace, made.factor = self.workspace, self.factors
         return made
 
     def leave(self, double accepted):

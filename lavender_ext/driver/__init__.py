@@ -1,1 +1,1 @@
-"""Methods as room, start and step on plain structs, for any host: `driver.pxd` says which, over what."""
+"""Methods as workspace, start and step on plain structs, for any host: `driver.pxd` says which, over what."""

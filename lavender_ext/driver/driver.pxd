@@ -1,4 +1,4 @@
-"""The table of methods, each as room, start and step (`core/method.pxd`), and the three calls that lead any of them.
+"""The table of methods, each as workspace, start and step (`core/method.pxd`), and the three calls that lead any of them.
 
 | method | over A | over bodies | over J and M |
 |---|---|---|---|
@@ -6,7 +6,7 @@
 """
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.method cimport options_t, room_t, said_t
+from lavender_ext.core.method cimport options_t, workspace_t, said_t
 from lavender_ext.core.view cimport view_t
 
 
@@ -14,7 +14,7 @@ cdef enum:                      # methods
     NEWTON = 0
 
 
-cdef public int32_t lav_room(const view_t* v, const options_t* o, room_t* r) noexcept nogil
-cdef public int32_t lav_start(const view_t* v, const options_t* o, room_t* r, const double* lam) noexcept nogil
-cdef public int32_t lav_step(const view_t* v, const options_t* o, const room_t* r, int32_t work, double* lam,
+cdef public int32_t lav_workspace_size(const view_t* v, const options_t* o, workspace_t* r) noexcept nogil
+cdef public int32_t lav_start(const view_t* v, const options_t* o, workspace_t* r, const double* lam) noexcept nogil
+cdef public int32_t lav_step(const view_t* v, const options_t* o, const workspace_t* r, int32_t work, double* lam,
                              said_t* said) noexcept nogil

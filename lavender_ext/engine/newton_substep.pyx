@@ -2,7 +2,7 @@
 
 After `prepare` and `solve` without sweeps:
 
-    index_room      whole numbers that the next call needs
+    index_workspace_size      whole numbers that the next call needs
     plan            bands, elements, elimination order; doubles that the next call needs
     solve           the first phase of `newton` (newton/warm_start.pxd), then its steps (newton/solve.pyx); the judge decides
 
@@ -13,7 +13,7 @@ from libc.stdint cimport int32_t, int64_t, uint64_t
 
 import numpy as np
 
-from lavender_ext.core.method cimport CERTIFICATE, MORE, options_t, room_t, said_t
+from lavender_ext.core.method cimport CERTIFICATE, MORE, options_t, workspace_t, said_t
 from lavender_ext.core.islands cimport find_islands, islands_index
 from lavender_ext.core.parts cimport blocks_t, is_rows, islands_t
 from lavender_ext.core.view cimport rows_t, view_t
@@ -22,7 +22,7 @@ from lavender_ext.engine.arrays cimport S_OUT, bind, engine_t
 from lavender_ext.engine.view cimport view
 from lavender_ext.judge.measure cimport find_reference, score_slack
 from lavender_ext.judge.score cimport new_score, score_t
-from lavender_ext.newton.solve cimport bodies_room, bodies_start, system_step
+from lavender_ext.newton.solve cimport bodies_workspace_size, bodies_start, system_step
 from lavender_ext.newton.warm_start cimport (FACTORED, JUDGED, MOST_TRACED, UNDECIDED, band_width, judged, lay_out,
                                       observe, room_of, start_errors, warm_solve, warm_t)
 
@@ -33,29 +33,31 @@ cdef enum:
     BUDGET = 200                # factorisations: a picture waits for them
 
 
-cdef inline room_t method_room(const blocks_t* p, const rows_t* r) noexcept nogil:
+cdef inline workspace_t method_workspace_size(const blocks_t* p, const rows_t* r) noexcept nogil:
     """Whole numbers of Newton's method, 0 where it does not take the problem."""
     cdef view_t v = view_t(p[0], NULL, r, NULL)
-    cdef room_t room = room_t(0, 0, NULL, NULL, 0, 0, 0, 0.0)
-    if not bodies_room(&v, NULL, &room):
-        room.n_index = 0
-    return room
+    cdef workspace_t workspace = workspace_t(0, 0, NULL, NULL, 0, 0, 0, 0.0)
+    if not bodies_workspace_size(&v, NULL, &workspace):
+        workspace.n_index = 0
+    return workspace
 
 
-cdef public int32_t lav_newton_index_room(const int32_t* size, double* real, int32_t* index, uint64_t* keys,
+cdef public int32_t lav_newton_index_workspace_size(const int32_t* size, double* real, int32_t* index, uint64_t* keys,
                                           int32_t turns) noexcept nogil:
     """Whole numbers of scratch for the prepared substep, -1 for 2^31 and more; turns 0: the first phase alone."""
     cdef engine_t e
     cdef int64_t used[3]
-    cdef int64_t room
+    cdef int64_t workspace
     cdef blocks_t p
     cdef rows_t r
     cdef view_t v
     bind(size, real, index, keys, &e, used)
     view(&e, &p, &r)
     v = view_t(p, NULL, &r, NULL)
-    room = HEAD + (method_room(&p, &r).n_index if turns else 0) + r.n_bodies + 2 * <int64_t>r.n_joints + 1 + islands_index(&v)
-    return <int32_t>room if room < MOST else -1
+    workspace = HEAD + r.n_bodies + 2 * <int64_t>r.n_joints + 1 + islands_index(&v)
+    if turns:
+        workspace += method_workspace_size(&p, &r).n_index
+    return <int32_t>workspace if workspace < MOST else -1
 
 
 cdef public int32_t lav_newton_plan(const int32_t* size, double* real, int32_t* index, uint64_t* keys, int32_t turns,
@@ -63,32 +65,32 @@ cdef public int32_t lav_newton_plan(const int32_t* size, double* real, int32_t* 
     """Fills scratch, which begins at a multiple of 8 bytes; doubles that the solve needs, -1 for 2^31 and more."""
     cdef engine_t e
     cdef int64_t used[3]
-    cdef int64_t room
+    cdef int64_t workspace
     cdef blocks_t p
     cdef rows_t r
     cdef view_t v
-    cdef room_t n
+    cdef workspace_t n
     bind(size, real, index, keys, &e, used)
     view(&e, &p, &r)
-    n = method_room(&p, &r)
+    n = method_workspace_size(&p, &r)
     scratch[1] = <int32_t>n.n_index if turns else 0
     scratch[0] = band_width(&p, &r, scratch + HEAD + scratch[1])
-    room = room_of(&p, scratch[0]) + p.n_rows + 2 * <int64_t>p.n_blocks
+    workspace = room_of(&p, scratch[0]) + p.n_rows + 2 * <int64_t>p.n_blocks
     if scratch[1] > 0:
         v = view_t(p, NULL, &r, NULL)
         n.index = scratch + HEAD
-        bodies_start(&v, NULL, &n, NULL)                # finds the pattern, and how much more room it needs
-        room += n.n_real
-    return <int32_t>room if room < MOST else -1
+        bodies_start(&v, NULL, &n, NULL)                # finds the pattern, and how much more workspace it needs
+        workspace += n.n_real
+    return <int32_t>workspace if workspace < MOST else -1
 
 
-cdef inline int32_t solve_in_turns(const view_t* problem, const options_t* o, room_t* room, warm_t* s, double* lam,
+cdef inline int32_t solve_in_turns(const view_t* problem, const options_t* o, workspace_t* workspace, warm_t* s, double* lam,
                                    double* v) noexcept nogil:
     """What `warm_solve` has left undecided, also from lam = 0; UNDECIDED short of tol: lam is then the best that was scored."""
     cdef said_t said
-    cdef int32_t how = bodies_start(problem, o, room, lam)
+    cdef int32_t how = bodies_start(problem, o, workspace, lam)
     while how == MORE or how == CERTIFICATE:
-        how = system_step(problem, o, room, 1, lam, &said)
+        how = system_step(problem, o, workspace, 1, lam, &said)
         s.factorisations = said.factorisations
         if s.trace != NULL:
             judged(&problem.p, problem.r, s, said.tried, v, o.e0, o.v0)
@@ -97,12 +99,12 @@ cdef inline int32_t solve_in_turns(const view_t* problem, const options_t* o, ro
 
 
 cdef inline int32_t newton_substep(const blocks_t* p, const rows_t* r, warm_t* s, double tol, int32_t turns,
-                                   int32_t* scratch, double* room, double* lam, double* v) noexcept nogil:
+                                   int32_t* scratch, double* workspace, double* lam, double* v) noexcept nogil:
     cdef int32_t j, how = warm_solve(p, r, s, tol, lam, v, 1)
     cdef double e0 = 1.0, v0 = 1.0
     cdef view_t problem
     cdef options_t o
-    cdef room_t n
+    cdef workspace_t n
     if how != UNDECIDED or p.n_rows == 0 or not turns:
         return how
     s.relative = 1.0 / 0.0
@@ -118,7 +120,7 @@ cdef inline int32_t newton_substep(const blocks_t* p, const rows_t* r, warm_t* s
         return UNDECIDED
     problem = view_t(p[0], NULL, r, NULL)
     o = options_t(0, BUDGET, 0, 0, 0, tol, e0, v0, 1.0 / 0.0, 0.0)
-    n = room_t(scratch[1], MOST, scratch + HEAD, room, 1, 0, 0, 0.0)    # the pattern stands from `lav_newton_plan`
+    n = workspace_t(scratch[1], MOST, scratch + HEAD, workspace, 1, 0, 0, 0.0)    # the pattern stands from `lav_newton_plan`
     return solve_in_turns(&problem, &o, &n, s, lam, v)
 
 
@@ -146,11 +148,11 @@ cdef inline void bind_islands(blocks_t* p, const rows_t* r, warm_t* s, int32_t* 
 
 
 cdef public int32_t lav_newton_substep(const int32_t* size, double* real, int32_t* index, uint64_t* keys, double tol,
-                                       int32_t turns, int32_t* scratch, double* room, double* trace,
+                                       int32_t turns, int32_t* scratch, double* workspace, double* trace,
                                        double* said) noexcept nogil:
     """Impulses, dv and the solver values of the prepared substep; how it ended, UNDECIDED where short of tol.
 
-    Of the first phase alone (turns 0) UNDECIDED leaves all of it as it was. scratch and room as `lav_newton_plan` has them;
+    Of the first phase alone (turns 0) UNDECIDED leaves all of it as it was. scratch and workspace as `lav_newton_plan` has them;
     trace (MOST_TRACED, 3) or NULL takes work, E [sqrt J] and max |e_n| [N s] of each score; said (4) takes sweeps,
     factorisations, relative residual and scores noted.
     """
@@ -164,18 +166,18 @@ cdef public int32_t lav_newton_substep(const int32_t* size, double* real, int32_
     cdef int32_t how, marks
     bind(size, real, index, keys, &e, used)
     view(&e, &p, &r)
-    block_weights(&p, p.d, room)
-    joint_weights(&p, &r, room)
-    p.nu = room
+    block_weights(&p, p.d, workspace)
+    joint_weights(&p, &r, workspace)
+    p.nu = workspace
     s.width = scratch[0]
     s.trace = trace
     s.relative = 0.0
     own = room_of(&p, s.width) + p.n_rows
     marks = HEAD + scratch[1]
-    lay_out(&s, room + p.n_rows, scratch + marks, &p, &r)
-    bind_islands(&p, &r, &s, scratch + marks + r.n_bodies + 2 * r.n_joints + 1, room + own, &islands)
+    lay_out(&s, workspace + p.n_rows, scratch + marks, &p, &r)
+    bind_islands(&p, &r, &s, scratch + marks + r.n_bodies + 2 * r.n_joints + 1, workspace + own, &islands)
     own += 2 * <int64_t>p.n_blocks
-    how = newton_substep(&p, &r, &s, tol, turns, scratch, room + own, e.impulse, e.dv)
+    how = newton_substep(&p, &r, &s, tol, turns, scratch, workspace + own, e.impulse, e.dv)
     if p.n_rows > 0 and (turns or how != UNDECIDED):
         observe(&p, &r, &s, e.setting + S_OUT + 5, e.setting + S_OUT + 7)
     said[0] = s.sweeps
@@ -191,18 +193,18 @@ cdef class Substep:
     cdef double[::1] real
     cdef int32_t[::1] index
     cdef uint64_t[::1] keys
-    cdef double[::1] scratch, room
+    cdef double[::1] scratch, workspace
     cdef double[:, ::1] noted
     cdef double[4] said
     cdef int32_t turns
 
     def __init__(self, const int32_t[::1] size, double[::1] real, int32_t[::1] index, uint64_t[::1] keys, bint turns):
         self.size, self.real, self.index, self.keys, self.turns = size, real, index, keys, turns
-        self.scratch, self.room = np.empty(1), np.empty(1)
+        self.scratch, self.workspace = np.empty(1), np.empty(1)
         self.noted = np.zeros((MOST_TRACED if turns else 0, 3))
 
     cdef int _make_scratch(self) except -1:
-        cdef int32_t n = lav_newton_index_room(&self.size[0], &self.real[0], &self.index[0], &self.keys[0], self.turns)
+        cdef int32_t n = lav_newton_index_workspace_size(&self.size[0], &self.real[0], &self.index[0], &self.keys[0], self.turns)
         if n < 0:
             raise MemoryError("the substep needs more than 2^31 numbers of scratch")
         if 2 * self.scratch.shape[0] < n:
@@ -220,11 +222,11 @@ cdef class Substep:
                             <int32_t*>&self.scratch[0])
         if n < 0:
             raise MemoryError("the substep needs more than 2^31 numbers of scratch")
-        if self.room.shape[0] < n:
-            self.room = np.empty(n + n // 4)
+        if self.workspace.shape[0] < n:
+            self.workspace = np.empty(n + n // 4)
         with nogil:
             how = lav_newton_substep(&self.size[0], &self.real[0], &self.index[0], &self.keys[0], tol, self.turns,
-                                     <int32_t*>&self.scratch[0], &self.room[0], trace, self.said)
+                                     <int32_t*>&self.scratch[0], &self.workspace[0], trace, self.said)
         return how, <int>self.said[0], <int>self.said[1], self.said[2]
 
     @property

@@ -43,7 +43,7 @@ from lavender_ext.engine.xpbd cimport correct_all
 from lavender_ext.judge.measure cimport score_slack
 from lavender_ext.judge.score cimport new_score, score_t
 from lavender_ext.judge.slack cimport rows_slack
-from lavender_ext.sweep.packed cimport MOST, room_for, sweep_packed
+from lavender_ext.sweep.packed cimport MOST, allocate_workspace, sweep_packed
 
 
 cdef enum:
@@ -160,18 +160,18 @@ cdef void sweep_all(engine_t* e, const blocks_t* p, const rows_t* r, int32_t swe
 
 
 cdef inline int32_t sweep_fast(engine_t* e, const blocks_t* p, const rows_t* r, int32_t sweeps,
-                               double* room) noexcept nogil:
+                               double* workspace) noexcept nogil:
     # the same bits by packed blocks; 0 where these are few, or the order changes
     if e.head[H_ORDER] == SYMMETRICALLY or e.head[H_ORDER] == AT_RANDOM:
         return 0
-    return sweep_packed(p, r, e.order, sweeps, room, e.impulse, e.dv)
+    return sweep_packed(p, r, e.order, sweeps, workspace, e.impulse, e.dv)
 
 
-cdef inline void sweep(engine_t* e, const blocks_t* p, const rows_t* r, int32_t sweeps, double* room, double* curve,
+cdef inline void sweep(engine_t* e, const blocks_t* p, const rows_t* r, int32_t sweeps, double* workspace, double* curve,
                        double* scratch) noexcept nogil:
     order_blocks(e)
     # to pack costs what some sweeps do
-    if room == NULL or sweeps < SWEEPS_PACKED or not sweep_fast(e, p, r, sweeps, room):
+    if workspace == NULL or sweeps < SWEEPS_PACKED or not sweep_fast(e, p, r, sweeps, workspace):
         sweep_all(e, p, r, sweeps, curve, scratch)
 
 
@@ -188,7 +188,7 @@ cdef inline void move(engine_t* e) noexcept nogil:
         memcpy(e.setting + S_OUT + k, &nan, sizeof(nan))
 
 
-cdef inline void solve(engine_t* e, int32_t sweeps, double* room, double* curve, double* scratch) noexcept nogil:
+cdef inline void solve(engine_t* e, int32_t sweeps, double* workspace, double* curve, double* scratch) noexcept nogil:
     """What the stepper does before positions move for good; sweeps = 0: guesses and first measures alone."""
     cdef blocks_t p
     cdef rows_t r
@@ -203,10 +203,10 @@ cdef inline void solve(engine_t* e, int32_t sweeps, double* room, double* curve,
         note_sweep(e, &p, &r, curve, scratch)
     if not sweeps:
         return
-    sweep(e, &p, &r, e.head[H_ITERATIONS], room, curve, scratch)
+    sweep(e, &p, &r, e.head[H_ITERATIONS], workspace, curve, scratch)
     if e.head[H_STEPPER] == SOFT_STEP:
         relax(e)
-        sweep(e, &p, &r, e.head[H_RELAXING], room, NULL, NULL)
+        sweep(e, &p, &r, e.head[H_RELAXING], workspace, NULL, NULL)
         restitute(e)
     measure(e, out + 5, out + 7)
 
@@ -294,15 +294,15 @@ cdef public int32_t lav_engine_finish(const int32_t* size, double* real, int32_t
     return finish(&e)
 
 
-cdef inline int32_t substeps(engine_t* e, int32_t n, double* room, int32_t* done) noexcept nogil:
-    # room: of packed blocks, `room_for` the capacities, or NULL: the same bits in more time
+cdef inline int32_t substeps(engine_t* e, int32_t n, double* workspace, int32_t* done) noexcept nogil:
+    # workspace: of packed blocks, `allocate_workspace` the capacities, or NULL: the same bits in more time
     cdef int32_t status
     done[0] = 0
     while done[0] < n:
         status = prepare(e)
         if status != OK:
             return status
-        solve(e, 1, room, NULL, NULL)
+        solve(e, 1, workspace, NULL, NULL)
         status = finish(e)
         done[0] += 1
         if status != OK:
@@ -329,7 +329,7 @@ cdef class Buffers:
     cdef double[::1] real
     cdef int32_t[::1] index
     cdef uint64_t[::1] keys
-    cdef double[::1] room
+    cdef double[::1] workspace
 
     def __init__(self, const int32_t[::1] size, double[::1] real, int32_t[::1] index, uint64_t[::1] keys):
         self.size = size
@@ -339,7 +339,7 @@ cdef class Buffers:
         cdef int64_t used[3]
         bind(&size[0], &real[0], &index[0], &keys[0], &self.e, used)
         cdef int64_t contacts = min(<int64_t>size[CAP_CONTACT], MOST), joints = size[N_JOINT]
-        self.room = np.empty(room_for(joints, size[N_JOINT_ROW], contacts, contacts * size[ROWS_PER_CONTACT],
+        self.workspace = np.empty(allocate_workspace(joints, size[N_JOINT_ROW], contacts, contacts * size[ROWS_PER_CONTACT],
                                       size[N_DYNAMIC]) if joints <= MOST else 1)
 
     def pairs(self):
@@ -386,7 +386,7 @@ cdef class Buffers:
         """Run n substeps; returns (status, how many were completed)."""
         cdef int32_t status, done = 0
         with nogil:
-            status = substeps(&self.e, n, &self.room[0], &done)
+            status = substeps(&self.e, n, &self.workspace[0], &done)
         return status, done
 
     def arrays(self):

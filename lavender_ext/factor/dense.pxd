@@ -23,14 +23,14 @@ cdef inline int64_t panel_at(int32_t n, int32_t k) noexcept nogil:
     return <int64_t>k * n - <int64_t>PANEL * (k // PANEL) * (k // PANEL - 1) // 2 * PANEL
 
 
-cdef inline int64_t cholesky_room(int32_t n) noexcept nogil:
+cdef inline int64_t cholesky_workspace_size(int32_t n) noexcept nogil:
     """Values of L in its panels."""
     cdef int32_t k = n - 1 - (n - 1) % PANEL if n > 0 else 0
     return panel_at(n, k) + <int64_t>(n - k) * (n - k)
 
 
 cdef inline int32_t dense_cholesky(int32_t wide, int32_t n, const double* a, const double* least, double* l) noexcept nogil:
-    """(1) of a symmetric a (n, n) into l (`cholesky_room`), 1 / L_jj on its diagonal; how many pivots are lost.
+    """(1) of a symmetric a (n, n) into l (`cholesky_workspace_size`), 1 / L_jj on its diagonal; how many pivots are lost.
 
     These are not above least (n) and leave a column of zeros; where that is NULL, not positive, and the first is the last.
     """
@@ -113,8 +113,8 @@ cdef inline int32_t lu_panel(int32_t n, int32_t k, int32_t w, double* a, int32_t
     return 1
 
 
-cdef inline int32_t dense_lu(int32_t wide, int32_t n, double* a, int32_t* swap, double* room) noexcept nogil:
-    """P N^T = L U in place of N (n, n), row-major, that is N^T by columns; room (PANEL n); 0 where a pivot is lost."""
+cdef inline int32_t dense_lu(int32_t wide, int32_t n, double* a, int32_t* swap, double* workspace) noexcept nogil:
+    """P N^T = L U in place of N (n, n), row-major, that is N^T by columns; workspace (PANEL n); 0 where a pivot is lost."""
     cdef int32_t k = 0, j, t, w, rest
     cdef double x
     cdef double* y
@@ -135,9 +135,9 @@ cdef inline int32_t dense_lu(int32_t wide, int32_t n, double* a, int32_t* swap, 
             if j > k:
                 for t in range(k, k + w):
                     take(k + w - t - 1, y[t], a + <int64_t>t * n + t + 1, y + t + 1)
-                    room[<int64_t>(t - k) * rest + (j - k - w)] = y[t]
+                    workspace[<int64_t>(t - k) * rest + (j - k - w)] = y[t]
         if rest > 0:
-            less(wide, rest, rest, w, a + <int64_t>k * n + k + w, n, room, rest, a + <int64_t>(k + w) * n + k + w, n)
+            less(wide, rest, rest, w, a + <int64_t>k * n + k + w, n, workspace, rest, a + <int64_t>(k + w) * n + k + w, n)
         k += w
     return 1
 

@@ -10,7 +10,7 @@ from lavender_ext.factor.minimum_degree cimport degree_order
 from lavender_ext.factor.symbolic cimport postordered
 
 
-cdef inline int64_t order_room(int64_t n, int64_t neighbours) noexcept nogil:
+cdef inline int64_t order_workspace_size(int64_t n, int64_t neighbours) noexcept nogil:
     """Whole numbers of scratch that `order_graph` takes, from a multiple of 8 bytes on."""
     return 13 * n + 2 + neighbours + neighbours // 4
 
@@ -19,7 +19,7 @@ cdef inline void order_graph(int32_t n, const int32_t* ptr, const int32_t* near,
                              int32_t* rank, int32_t* nptr, int32_t* nind, int32_t* parent) noexcept nogil:
     """An order of elimination (n) of a graph's vertices, the place (n) of each, and the lower pattern in it.
 
-    near[ptr[i]:ptr[i + 1]] are the neighbours of i, without i; scratch (`order_room`); nind (half of near and n).
+    near[ptr[i]:ptr[i + 1]] are the neighbours of i, without i; scratch (`order_workspace_size`); nind (half of near and n).
     """
     cdef int64_t* left = <int64_t*>scratch
     cdef int32_t* whole = scratch + 2 * n               # 8 n + 1
@@ -36,9 +36,9 @@ cdef inline void order_graph(int32_t n, const int32_t* ptr, const int32_t* near,
     postordered(n, ptr, near, order, rank, nptr, nind, parent, whole)
 
 
-cdef inline int64_t pattern_room(int64_t n, int64_t k) noexcept nogil:
+cdef inline int64_t pattern_workspace_size(int64_t n, int64_t k) noexcept nogil:
     """Whole numbers of scratch that `eliminate_bodies` takes for n bodies and k blocks, from a multiple of 8 bytes on."""
-    return order_room(n, 2 * k) + 3 * n + 1 + 2 * k
+    return order_workspace_size(n, 2 * k) + 3 * n + 1 + 2 * k
 
 
 cdef inline void find_neighbours(int32_t k, const int32_t* body, int32_t n, int32_t* mark, int32_t* ptr,
@@ -81,10 +81,10 @@ cdef inline void eliminate_bodies(int32_t k, const int32_t* body, int32_t n, int
                                   int32_t* nptr, int32_t* nind, int32_t* node, int32_t* slot, int32_t* turned) noexcept nogil:
     """Lower block rows in elimination order, and of each block its two places (larger first) and three slots.
 
-    body (k, 2), -1 static; scratch (`pattern_room`); parent (n), nptr (n + 1), nind (n + k), node (k, 2), slot (k, 3),
+    body (k, 2), -1 static; scratch (`pattern_workspace_size`); parent (n), nptr (n + 1), nind (n + k), node (k, 2), slot (k, 3),
     turned (k).
     """
-    cdef int32_t* order = scratch + order_room(n, 2 * k)
+    cdef int32_t* order = scratch + order_workspace_size(n, 2 * k)
     cdef int32_t* rank = order + n
     cdef int32_t* ptr = rank + n                        # n + 1
     cdef int32_t* near = ptr + n + 1                    # 2 k

@@ -6,13 +6,13 @@ import numpy as np
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.islands cimport join, number_components
 from lavender_ext.core.view cimport generalized_t
-from lavender_ext.factor.graph cimport order_graph, order_room
+from lavender_ext.factor.graph cimport order_graph, order_workspace_size
 
 
 def least_degree(const int32_t[::1] ptr, const int32_t[::1] near):
     """(n,) vertices in their order of elimination; near[ptr[i]:ptr[i + 1]] are the neighbours of i, without i."""
     cdef int32_t n = <int32_t>ptr.shape[0] - 1, all_ = <int32_t>near.shape[0]
-    cdef double[::1] scratch = np.empty(order_room(n, all_) // 2 + 1)
+    cdef double[::1] scratch = np.empty(order_workspace_size(n, all_) // 2 + 1)
     order_array = np.empty(n, np.int32)
     cdef int32_t[::1] order = order_array, index = np.empty(4 * n + all_ // 2 + 4, np.int32)
     cdef const int32_t* entries = &near[0] if all_ else NULL

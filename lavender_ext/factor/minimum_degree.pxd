@@ -73,7 +73,7 @@ cdef inline void compact(quotient_t* g) noexcept nogil:
     g.free = to
 
 
-cdef inline int32_t gather(quotient_t* g, int32_t p, int32_t room) noexcept nogil:
+cdef inline int32_t gather(quotient_t* g, int32_t p, int32_t workspace) noexcept nogil:
     """(1) as the list of p, which is an element from now on; its weight is not known yet."""
     cdef int32_t k, q, i, e, need = 0, begin
     for k in range(g.elements[p]):
@@ -81,7 +81,7 @@ cdef inline int32_t gather(quotient_t* g, int32_t p, int32_t room) noexcept nogi
     need += g.length[p]
     if need > g.n:
         need = g.n
-    if g.free + need > room:
+    if g.free + need > workspace:
         compact(g)
     begin = g.free
     for k in range(g.length[p]):
@@ -148,11 +148,11 @@ cdef inline int32_t begin_graph(quotient_t* g, const int32_t* size, int32_t* who
     return total
 
 
-cdef inline void degree_order(int32_t n, const int32_t* size, int32_t room, int32_t* list, int32_t* whole, int64_t* left,
+cdef inline void degree_order(int32_t n, const int32_t* size, int32_t workspace, int32_t* list, int32_t* whole, int64_t* left,
                               int32_t* head, int32_t* order) noexcept nogil:
     """order (n): the vertex eliminated first, second, ...
 
-    list (room): the neighbours of each, without itself, at list[whole[i]:whole[i + 1]]; room is their number and n or
+    list (workspace): the neighbours of each, without itself, at list[whole[i]:whole[i + 1]]; workspace is their number and n or
     more. size (n) > 0 is the weight of each. whole (8 n + 1), left (n), head (sum of size + 1) are scratch.
     """
     cdef quotient_t g
@@ -168,7 +168,7 @@ cdef inline void degree_order(int32_t n, const int32_t* size, int32_t room, int3
         order[count] = p
         count += 1
         rest -= size[p]
-        gather(&g, p, room)
+        gather(&g, p, workspace)
         first = g.at[p]
         weight = 0
         for k in range(first, first + g.length[p]):

@@ -14,4 +14,4 @@ cdef class SparsePanels:
     @staticmethod
     cdef SparsePanels of_blocks(analysis, int32_t n, bint wide)
     cdef _hold(self, analysis, int32_t n, bint lu, bint wide)
-    cdef _make_room(self)
+    cdef _make_workspace(self)

@@ -20,7 +20,7 @@ from lavender_ext.factor.symbolic import analysed
 from lavender_ext.core.csr cimport by_columns, scan_entries
 from lavender_ext.core.view cimport csr_t
 from lavender_ext.factor.blocks cimport sparse_t
-from lavender_ext.factor.dense cimport cholesky_room, dense_cholesky, dense_cholesky_solve
+from lavender_ext.factor.dense cimport cholesky_workspace_size, dense_cholesky, dense_cholesky_solve
 from lavender_ext.factor.supernodal cimport begin_panels, dense_panel, hand_on, place_rows, sparse_solve, take_panels
 from lavender_ext.factor.tiles cimport has_wide, less, take
 
@@ -157,7 +157,7 @@ cdef public int32_t lav_sparse_factor(const sparse_t* f, const int32_t* indptr, 
     return lost
 
 
-cdef inline int64_t panel_room(const sparse_t* f) noexcept nogil:
+cdef inline int64_t panel_workspace_size(const sparse_t* f) noexcept nogil:
     # for what one panel takes from another, for the rows below it, and of L U for the tops of a strip
     cdef int32_t i, j, run
     cdef int64_t most = 0, needed
@@ -297,15 +297,15 @@ cdef class SparsePanels:
 
     @staticmethod
     cdef SparsePanels of_blocks(analysis, int32_t n, bint wide):
-        """With room for the values of n rows, by `symbolic.block_panels`."""
+        """With workspace for the values of n rows, by `symbolic.block_panels`."""
         cdef SparsePanels made = SparsePanels.__new__(SparsePanels)
         made._hold((analysis[0].copy(), *analysis[1:]), n, False, wide)
-        made._make_room()
+        made._make_workspace()
         return made
 
-    cdef _make_room(self):
+    cdef _make_workspace(self):
         # What is counted and never factored holds no numbers.
-        cdef int64_t most = panel_room(&self.f)
+        cdef int64_t most = panel_workspace_size(&self.f)
         cdef double[::1] numbers
         numbers = self.numbers = np.empty(self.entries + most + 2 * self.f.n + 1)
         self.f.val = &numbers[0]
@@ -325,7 +325,7 @@ cdef class SparsePanels:
         if data.shape[0] == 0:
             return self.f.n
         if self.numbers is None:
-            self._make_room()
+            self._make_workspace()
         tptr, tind, tdata = np.empty(1, np.int32), np.empty(1, np.int32), np.empty(1)
         if self.f.lu:
             tptr = np.empty(self.f.n + 2, np.int32)
@@ -387,7 +387,7 @@ cdef class FullCholesky:
         cdef int32_t n = <int32_t>a.shape[0]
         if n < 1 or a.shape[1] != n or least.shape[0] != n:
             raise ValueError("a square matrix of one row or more, and what each of its pivots must be above")
-        self.n, self.lower = n, np.empty(cholesky_room(n))
+        self.n, self.lower = n, np.empty(cholesky_workspace_size(n))
         with nogil:
             self.lost = dense_cholesky(wide and has_wide(), n, &a[0, 0], &least[0], &self.lower[0])
 

@@ -56,13 +56,13 @@ cdef public int32_t lav_node_graph(int32_t count, const int32_t* indptr, const i
     return total
 
 
-cdef public int32_t lav_sparse_order(int32_t n, const int32_t* indptr, const int32_t* indices, int32_t room,
+cdef public int32_t lav_sparse_order(int32_t n, const int32_t* indptr, const int32_t* indices, int32_t workspace,
                                      int32_t* scratch, int64_t* left, int32_t* begin, int32_t* order, int32_t* size,
                                      int32_t* nptr, int32_t* nind, int32_t* parent, int32_t* lptr) noexcept nogil:
     """Runs of rows with the same columns, in their order of elimination, and how many vertices are below each.
 
     begin (n + 1): the first row of each run as they stand; order, size (n), nptr (n + 1), nind (nnz / 2 + n + 1),
-    parent (n) and lptr (n + 1) belong to the order. scratch has 11 n + 2 + room numbers, room is nnz and n or more; left
+    parent (n) and lptr (n + 1) belong to the order. scratch has 11 n + 2 + workspace numbers, workspace is nnz and n or more; left
     (n). The number of runs, or -1 where the factor has 2^31 entries or more.
     """
     cdef int32_t* node = scratch
@@ -79,7 +79,7 @@ cdef public int32_t lav_sparse_order(int32_t n, const int32_t* indptr, const int
         whole[i] = gptr[i]
         size[i] = begin[i + 1] - begin[i]
     whole[count] = total
-    degree_order(count, size, room, near, whole, left, head, order)
+    degree_order(count, size, workspace, near, whole, left, head, order)
     # The quotient graph has used up its lists: once more.
     total = lav_node_graph(count, indptr, indices, node, begin, gptr, near)
     postordered(count, gptr, near, order, rank, nptr, nind, parent, whole)
@@ -183,12 +183,12 @@ cdef public void lav_panel_rows(int32_t n, int32_t count, int32_t panels, const 
 
 def analysed(indptr, indices):
     """(numbers, places in the values, work of L L^T) of `sparse_t`, for a matrix whose pattern is symmetric."""
-    cdef int32_t n = <int32_t>len(indptr) - 1, nnz = <int32_t>len(indices), count, k, room = nnz + nnz // 4 + n + 1
+    cdef int32_t n = <int32_t>len(indptr) - 1, nnz = <int32_t>len(indices), count, k, workspace = nnz + nnz // 4 + n + 1
     cdef const int32_t[::1] ptr = indptr, ind = indices
     cdef const int32_t* entries = &ind[0] if nnz else NULL
     cdef int64_t below
     cdef double work, share = ZEROS
-    cdef int32_t[::1] scratch = np.empty(19 * n + nnz // 2 + room + 9, np.int32), lind, whole
+    cdef int32_t[::1] scratch = np.empty(19 * n + nnz // 2 + workspace + 9, np.int32), lind, whole
     cdef int64_t[::1] left = np.empty(2 * n + 2, np.int64), places
     cdef int32_t* begin = &scratch[0]                   # n + 1
     cdef int32_t* order = begin + n + 1
@@ -198,11 +198,11 @@ def analysed(indptr, indices):
     cdef int32_t* lptr = nptr + n + 1                   # n + 1
     cdef int32_t* group = lptr + n + 1                  # n + 1
     cdef int32_t* nind = group + n + 1                  # nnz / 2 + n + 1
-    cdef int32_t* s = nind + nnz // 2 + n + 1           # 11 n + 3 + room
+    cdef int32_t* s = nind + nnz // 2 + n + 1           # 11 n + 3 + workspace
     cdef int32_t* first
     cdef int32_t* rptr
     with nogil:
-        count = lav_sparse_order(n, &ptr[0], entries, room, s, &left[0], begin, order, size, nptr, nind, parent, lptr)
+        count = lav_sparse_order(n, &ptr[0], entries, workspace, s, &left[0], begin, order, size, nptr, nind, parent, lptr)
     if count < 0:
         raise OverflowError("the factor has 2^31 entries or more")
     lind = np.empty(lptr[count] + 1, np.int32)

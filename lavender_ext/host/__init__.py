@@ -1,1 +1,1 @@
-"""What a host without Python needs beside the kernels: where numbers lie, values, room."""
+"""What a host without Python needs beside the kernels: where numbers lie, values, workspace."""

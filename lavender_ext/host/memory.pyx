@@ -1,4 +1,4 @@
-"""What a host without Python needs beside the engine's kernels: its values, and more room.
+"""What a host without Python needs beside the engine's kernels: its values, and more workspace.
 
 Such a host (WebAssembly, C) allocates every buffer itself. Where arrays lie tells engine/arrays.pyx, in the order of
 `bind`: the length of an array is the distance to the next one of the same buffer.
@@ -25,13 +25,13 @@ cdef public void lav_engine_values(const int32_t* size, double* real, int32_t* i
 
 
 cdef inline int32_t quarter_more(int32_t need) noexcept nogil:
-    cdef double room = need * 1.25
-    return 2147483647 if room > 2147483000.0 else <int32_t>room + 16
+    cdef double workspace = need * 1.25
+    return 2147483647 if workspace > 2147483000.0 else <int32_t>workspace + 16
 
 
-cdef public void lav_engine_more_room(const int32_t* size, double* real, int32_t* index, uint64_t* keys,
+cdef public void lav_engine_grow_workspace(const int32_t* size, double* real, int32_t* index, uint64_t* keys,
                                       int32_t* out) noexcept nogil:
-    """Sizes (N_SIZES) with room for what the last substep found missing, and a quarter more."""
+    """Sizes (N_SIZES) with workspace for what the last substep found missing, and a quarter more."""
     cdef engine_t e
     cdef int64_t n[3]
     cdef int32_t k
@@ -47,13 +47,13 @@ cdef public void lav_engine_more_room(const int32_t* size, double* real, int32_t
 cdef public void lav_engine_move(const int32_t* size, double* real, int32_t* index, uint64_t* keys,
                                  const int32_t* to_size, double* to_real, int32_t* to_index,
                                  uint64_t* to_keys) noexcept nogil:
-    """Into zeroed buffers with more room: what is carried from one substep to the next; scratch stays behind."""
+    """Into zeroed buffers with more workspace: what is carried from one substep to the next; scratch stays behind."""
     cdef engine_t a, b
     cdef int64_t used[3]
     cdef int64_t kj = size[N_JOINT], c = size[CAP_CONTACT]
     bind(size, real, index, keys, &a, used)
     bind(to_size, to_real, to_index, to_keys, &b, used)
-    # What lies side by side and does not depend on the room at once.
+    # What lies side by side and does not depend on the workspace at once.
     memcpy(b.setting, a.setting, (a.rot - a.setting) * sizeof(double))
     memcpy(b.fat, a.fat, (a.joint_error - a.fat) * sizeof(double))
     memcpy(b.joint_impulse, a.joint_impulse, (a.v_free - a.joint_impulse) * sizeof(double))
@@ -68,10 +68,10 @@ cdef public void lav_engine_move(const int32_t* size, double* real, int32_t* ind
     b.head[H_PAIRS_VALID] = 0
 
 
-def more_room(const int32_t[::1] size, double[::1] real, int32_t[::1] index, uint64_t[::1] keys):
-    """Sizes (10,) with room for what the last substep found missing."""
+def grow_workspace(const int32_t[::1] size, double[::1] real, int32_t[::1] index, uint64_t[::1] keys):
+    """Sizes (10,) with workspace for what the last substep found missing."""
     cdef int32_t[::1] out = np.empty(N_SIZES, np.int32)
-    lav_engine_more_room(&size[0], &real[0], &index[0], &keys[0], &out[0])
+    lav_engine_grow_workspace(&size[0], &real[0], &index[0], &keys[0], &out[0])
     return np.asarray(out)
 
 

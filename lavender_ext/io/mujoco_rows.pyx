@@ -15,7 +15,7 @@ from lavender_ext.core.arrays cimport DOUBLE, INT, doubles, frozen, ints, ndarra
 from lavender_ext.core.blocks cimport Blocks, room_of
 from lavender_ext.core.door cimport is_number, is_size, widest
 from lavender_ext.core.parts cimport ROW, blocks_t, contact_kind, spell_bounds
-from lavender_ext.core.problem cimport Room, room_for
+from lavender_ext.core.problem cimport Workspace, allocate_workspace
 
 
 cpdef enum:
@@ -34,7 +34,7 @@ cdef public int32_t lav_export_blocks(int32_t m, const int32_t* type_, const int
 
     codes (8): equality, friction of a joint, of a tendon, limit of a joint, of a tendon, contact without friction,
     pyramidal, elliptic; most (8): how many there are of what rows of each code name. A contact's dim is from 1 to 6, and
-    its rows end with the m. Of ptr room for m + 1.
+    its rows end with the m. Of ptr workspace for m + 1.
     """
     cdef int32_t i = 0, j, _j, k = 0, t, of, size, count, nth, code
     cdef double inf = 1.0 / 0.0
@@ -183,12 +183,12 @@ def rows_of_dense(values, int32_t m, int32_t n, scale):
 
 
 def rows_of_sparse(values, count_, first_, columns, scale, int32_t n):
-    """The same of compressed rows of n columns that may have room between them; None where columns do not ascend.
+    """The same of compressed rows of n columns that may have workspace between them; None where columns do not ascend.
 
     Of rows that cannot be followed, the first one's number.
     """
     cdef int32_t i, m = <int32_t>len(scale), stray
-    cdef Py_ssize_t q, begin, end, at = 0, total = 0, room = min(values.size, columns.size)
+    cdef Py_ssize_t q, begin, end, at = 0, total = 0, workspace = min(values.size, columns.size)
     cdef double x, factor
     cdef bint ascend = True
     cdef const int32_t* count = ints(count_, m)
@@ -197,7 +197,7 @@ def rows_of_sparse(values, count_, first_, columns, scale, int32_t n):
     cdef const int32_t* column = ints(columns, columns.size)
     cdef const double* value = doubles(values, values.size)
     for i in range(m):
-        if not 0 <= count[i] <= room or not 0 <= first[i] <= room - count[i]:
+        if not 0 <= count[i] <= workspace or not 0 <= first[i] <= workspace - count[i]:
             return i
         total += count[i]
     indptr_, indices_, data_ = new(m + 1, I4), new(total, I4), new(total)
@@ -237,7 +237,7 @@ def lower(first_, count_, columns, values, x, y, double bound, tuple like):
     """
     cdef int32_t i, q, last, n = <int32_t>len(first_), nnz = <int32_t>len(columns)
     cdef double gap = 0.0, big = 0.0
-    cdef Room scratch
+    cdef Workspace scratch
     cdef const int32_t* first = ints(first_, n)
     cdef const int32_t* given = ints(columns, nnz)
     cdef const int32_t* count
@@ -271,7 +271,7 @@ def lower(first_, count_, columns, values, x, y, double bound, tuple like):
         for made_ in like:
             frozen(made_)
     at, column = ints(like[0], n + 1), ints(like[1], nnz)
-    copy, scratch = new(nnz), room_for(n * sizeof(double))
+    copy, scratch = new(nnz), allocate_workspace(n * sizeof(double))
     out, made = doubles(copy, nnz), <double*>scratch.at
     memcpy(out, doubles(values, nnz), nnz * sizeof(double))
     multiply(n, at, column, out, v, False, made)
@@ -329,7 +329,7 @@ def motion_gap(parent, body, axis, spatial, v_):
     cdef double[6] big, gap, lost                       # of each component; lost: 0, or NaN
     if not len(body) == len(axis) == n or len(parent) != bodies or bodies == 0:
         return -1.0, 0.0
-    cdef Room scratch = room_for(6 * bodies * sizeof(double))
+    cdef Workspace scratch = allocate_workspace(6 * bodies * sizeof(double))
     cdef double* made = <double*>scratch.at
     cdef const double* c = doubles(spatial, 6 * bodies)
     cdef const double* s = doubles(axis, 6 * n)
@@ -464,7 +464,7 @@ def numbers(jptr_, jidx_, jval_, scale_, double dt, v_, smooth_, aref_, r_, inve
     cdef double* rhs = doubles(rhs_, m)
     cdef double* compliance = doubles(compliance_, m)
     cdef double* free = doubles(free_, n)
-    cdef Room scratch = room_for(3 * n * sizeof(double))
+    cdef Workspace scratch = allocate_workspace(3 * n * sizeof(double))
     cdef double* pushed = <double*>scratch.at           # J^T f, and the same of absolute values
     cdef double* change = pushed + 2 * n                # dt a0
     for j in range(n):

@@ -30,16 +30,16 @@ cdef inline int32_t count_islands(const blocks_t* p) noexcept nogil:
     return p.islands.n if p.islands != NULL else 1
 
 
-cdef inline int64_t best_room(int64_t m, int64_t n) noexcept nogil:
+cdef inline int64_t best_workspace_size(int64_t m, int64_t n) noexcept nogil:
     """Number of doubles for m rows in n islands."""
     return m + 5 * n
 
 
-cdef inline void bind_best(best_t* s, const blocks_t* p, double* room) noexcept nogil:
-    """Before the first impulse; room (`best_room`)."""
+cdef inline void bind_best(best_t* s, const blocks_t* p, double* workspace) noexcept nogil:
+    """Before the first impulse; workspace (`best_workspace_size`)."""
     cdef int32_t n = count_islands(p)
     s.n, s.seen = n, 0
-    s.impulse, s.relative = room, room + p.n_rows
+    s.impulse, s.relative = workspace, workspace + p.n_rows
     s.energy, s.start, s.now = s.relative + n, s.relative + 2 * n, s.relative + 3 * n
 
 

@@ -10,10 +10,10 @@ from lavender_ext.core.arrays cimport doubles, ints
 from lavender_ext.core.generalized cimport whitened_gather
 from lavender_ext.core.islands cimport find_islands, is_immovable, islands_index, list_one_island
 from lavender_ext.core.parts cimport blocks_t, islands_t
-from lavender_ext.core.problem cimport Data, Room, room_for
+from lavender_ext.core.problem cimport Data, Workspace, allocate_workspace
 from lavender_ext.core.velocity cimport rows_velocity
 from lavender_ext.core.view cimport generalized_t, view_t
-from lavender_ext.judge.best cimport best_room, best_t, bind_best, count_islands, note_score, see_impulse, see_start
+from lavender_ext.judge.best cimport best_workspace_size, best_t, bind_best, count_islands, note_score, see_impulse, see_start
 from lavender_ext.judge.forms cimport csr_judge, csr_slack, general_errors, general_judge, rows_judge
 from lavender_ext.judge.measure cimport above_floor_of, set_zero_impulse, floor_of, relative_of, scratch_of
 from lavender_ext.judge.reference cimport needs_rows, reference_of
@@ -43,7 +43,8 @@ cdef bint refine_view(const view_t* v, const double* lam, double* w, double* e, 
     """
     if v.g == NULL or v.p.n_rows == 0 or not found < 1.0 / 0.0:
         return False
-    if loss_by_factor(&v.p, v.g, lam, w, scratch, reference_energy, reference_velocity, 0.1 * (tol if tol > found else found)) == 0.0:
+    if loss_by_factor(&v.p, v.g, lam, w, scratch, reference_energy, reference_velocity,
+                      0.1 * (tol if tol > found else found)) == 0.0:
         return False
     refine_general(&v.p, v.g, lam, w, e, scratch, out)
     return True
@@ -140,11 +141,12 @@ def judge(Data p, const double[::1] lam, double[::1] w, double[::1] e, bint floo
 cdef double loss_of(Data p, impulse, both) except -1.0:
     """What M's factor may lose of the slack in `both`, as a relative residual."""
     cdef const double[::1] lam = impulse, w = both
-    cdef Room room
+    cdef Workspace workspace
     if p.blocks.n_rows == 0:
         return 0.0
-    room = room_for(2 * <Py_ssize_t>p.general.n * sizeof(double))
-    return loss_by_factor(&p.blocks, &p.general, &lam[0], &w[0], <double*>room.at, p.reference_energy, p.reference_velocity, 0.0)
+    workspace = allocate_workspace(2 * <Py_ssize_t>p.general.n * sizeof(double))
+    return loss_by_factor(&p.blocks, &p.general, &lam[0], &w[0], <double*>workspace.at, p.reference_energy, p.reference_velocity,
+                          0.0)
 
 
 cdef Judged judged_from(Data p, impulse, both, const score_t* s, double relative_, double floor, double float64_relative=NAN):
@@ -173,7 +175,7 @@ cdef class Judged:
         cdef double[::1] both
         cdef double* w
         cdef double* e
-        cdef Room room
+        cdef Workspace workspace
         cdef view_t v = p.view()
         cdef score_t s = new_score()
         self.data = p
@@ -182,9 +184,9 @@ cdef class Judged:
         w = &both[0]
         e = w + m
         if m > 0:
-            room = room_for(scratch_of(&v) * sizeof(double))
+            workspace = allocate_workspace(scratch_of(&v) * sizeof(double))
             with nogil:
-                judge_view(&v, &lam[0], w, e, <double*>room.at, True, &s)
+                judge_view(&v, &lam[0], w, e, <double*>workspace.at, True, &s)
         self.energy = s.energy if s.finite else 1.0 / 0.0
         self.velocity = s.velocity if s.finite else 1.0 / 0.0
         self.floor_energy = s.floor_energy
@@ -194,7 +196,7 @@ cdef class Judged:
         self.above_floor = above_floor_of(&s, self.relative, self.roundoff_floor)
         self.float64_relative, self.known_loss = NAN, 0.0
         if p.is_general and m > 0:
-            self.known_loss = loss_by_factor(&p.blocks, &p.general, &lam[0], w, <double*>room.at, p.reference_energy,
+            self.known_loss = loss_by_factor(&p.blocks, &p.general, &lam[0], w, <double*>workspace.at, p.reference_energy,
                                              p.reference_velocity, 0.0)
 
     @property
@@ -213,16 +215,17 @@ cdef class Judged:
         cdef const double[::1] lam
         cdef const double[::1] first
         cdef double[::1] both
-        cdef Room room
+        cdef Workspace workspace
         if not (self.relative < 1.0 / 0.0 and self.loss > 0.1 * max(tol, self.relative)):
             return self
         lam, first = self.impulse, self.both
-        room = room_for((2 * m + scratch_of(&v)) * sizeof(double))
-        memcpy(room.at, &first[0], m * sizeof(double))
+        workspace = allocate_workspace((2 * m + scratch_of(&v)) * sizeof(double))
+        memcpy(workspace.at, &first[0], m * sizeof(double))
         with nogil:
-            refine_general(&p.blocks, &p.general, &lam[0], <double*>room.at, <double*>room.at + m, <double*>room.at + 2 * m, &s)
+            refine_general(&p.blocks, &p.general, &lam[0], <double*>workspace.at, <double*>workspace.at + m,
+                           <double*>workspace.at + 2 * m, &s)
         results = both = np.empty(2 * m + 1)
-        memcpy(&both[0], room.at, 2 * m * sizeof(double))
+        memcpy(&both[0], workspace.at, 2 * m * sizeof(double))
         return judged_from(p, self.impulse, results, &s,
                            relative_of(&s, &both[0], m, p.reference_energy, p.reference_velocity),
                            floor_of(&s, p.reference_energy, p.reference_velocity), self.relative)
@@ -279,9 +282,9 @@ def begin(Data p):
     cdef double[::1] x
     cdef double out[3]
     cdef islands_t islands
-    cdef Room room = room_for((2 * m + 2 * k + scratch_of(&v)) * sizeof(double))
-    cdef Room marks = room_for(islands_index(&v) * sizeof(int32_t))
-    cdef double* w = <double*>room.at
+    cdef Workspace workspace = allocate_workspace((2 * m + 2 * k + scratch_of(&v)) * sizeof(double))
+    cdef Workspace marks = allocate_workspace(islands_index(&v) * sizeof(int32_t))
+    cdef double* w = <double*>workspace.at
     start = np.zeros(m)
     x = start
     judge_zero_impulse(&v, <int32_t*>marks.at, &islands, w + 2 * m, &x[0] if m else NULL, w, w + m, w + 2 * m + 2 * k, out)
@@ -332,9 +335,9 @@ def best_of_islands(Data p, list starts, list impulses, double tol):
     cdef view_t v = p.view()
     cdef best_t best
     cdef score_t s
-    cdef int64_t room = best_room(m, count_islands(&p.blocks))
-    cdef double[::1] x = np.empty(room + 2 * m + scratch_of(&v) + 1)
-    cdef double* w = &x[room]
+    cdef int64_t workspace = best_workspace_size(m, count_islands(&p.blocks))
+    cdef double[::1] x = np.empty(workspace + 2 * m + scratch_of(&v) + 1)
+    cdef double* w = &x[workspace]
     cdef double now
     cdef const double* lam
     bind_best(&best, &p.blocks, &x[0])
@@ -459,8 +462,8 @@ def program_residuals(x_, q_, px_, force_, jx_, target_, lam_, int32_t free, jac
     cdef const int32_t* ptr = ints(jac[0], m + 1)
     cdef const int32_t* column = ints(jac[1], len(jac[1]))
     cdef const double* value = doubles(jac[2], len(jac[2]))
-    cdef Room room = room_for((n + 2 * m) * sizeof(double))
-    cdef double* size = <double*>room.at
+    cdef Workspace workspace = allocate_workspace((n + 2 * m) * sizeof(double))
+    cdef double* size = <double*>workspace.at
     cdef double* terms = size + n
     cdef double* acts = terms + m                       # 1 of a row that acts, else 0
     cdef double primal = 0.0, dual = 0.0, gap = 0.0, row_error = 0.0, force_error = 0.0, negative = 0.0

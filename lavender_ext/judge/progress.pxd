@@ -33,12 +33,12 @@ cdef struct progress_t:
     double* before              # (m) N s, of the one before
 
 
-cdef inline void open_progress(progress_t* s, double* room, int32_t m) noexcept nogil:
-    """Before the first check; room (2 m)."""
+cdef inline void open_progress(progress_t* s, double* workspace, int32_t m) noexcept nogil:
+    """Before the first check; workspace (2 m)."""
     s.n = 0
     s.last_at = s.before_at = -1
-    s.last = room
-    s.before = room + m
+    s.last = workspace
+    s.before = workspace + m
 
 
 cdef inline void see(progress_t* s, int32_t at, double r) noexcept nogil:

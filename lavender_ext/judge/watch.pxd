@@ -24,7 +24,7 @@ from libc.stdint cimport int32_t, int64_t
 
 from lavender_ext.core.parts cimport blocks_t
 from lavender_ext.core.view cimport view_t
-from lavender_ext.judge.best cimport best_room, best_t, bind_best
+from lavender_ext.judge.best cimport best_workspace_size, best_t, bind_best
 from lavender_ext.judge.progress cimport open_progress, progress_t
 
 
@@ -64,14 +64,14 @@ cdef struct watch_t:
 ctypedef void (*sweep_t)(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil
 
 
-cdef inline int64_t watch_room(int64_t m, int64_t n) noexcept nogil:
+cdef inline int64_t watch_workspace_size(int64_t m, int64_t n) noexcept nogil:
     """Number of doubles that `begin_watch` needs for m rows in n islands."""
-    return best_room(m, n) + n + 2 * m
+    return best_workspace_size(m, n) + n + 2 * m
 
 
 cdef inline void begin_watch(watch_t* s, const blocks_t* p, double reference_energy, double reference_velocity, int32_t patience,
-                             double* room) noexcept nogil:
-    """Before the first sweep; room (`watch_room`)."""
+                             double* workspace) noexcept nogil:
+    """Before the first sweep; workspace (`watch_workspace_size`)."""
     s.total = s.check_at = s.last_at = 0
     s.start = 0.0
     s.last = s.best_relative = s.lowest = 1.0 / 0.0
@@ -80,8 +80,8 @@ cdef inline void begin_watch(watch_t* s, const blocks_t* p, double reference_ene
     s.patience = patience
     s.reference_energy = reference_energy
     s.reference_velocity = reference_velocity
-    bind_best(&s.best, p, room)
-    s.marked = room + best_room(p.n_rows, s.best.n)
+    bind_best(&s.best, p, workspace)
+    s.marked = workspace + best_workspace_size(p.n_rows, s.best.n)
     open_progress(&s.progress, s.marked + s.best.n, p.n_rows)
 
 

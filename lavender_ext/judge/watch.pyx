@@ -12,7 +12,8 @@ from lavender_ext.judge.best cimport count_islands, note_score, relative_of_best
 from lavender_ext.judge.measure cimport above_floor_of, floor_of, judge_view, refine_view, relative_of, scratch_of
 from lavender_ext.judge.progress cimport envelope, keep, rests, see
 from lavender_ext.judge.score cimport new_score, relative, score_t, smallest_reference
-from lavender_ext.judge.watch cimport (AT_FLOOR, CONVERGED, DIVERGED, EARLY, RUNNING, STALLED, begin_watch, sweep_t, watch_room,
+from lavender_ext.judge.watch cimport (AT_FLOOR, CONVERGED, DIVERGED, EARLY, RUNNING, STALLED, begin_watch, sweep_t,
+                                       watch_workspace_size,
                                        watch_t)
 
 
@@ -211,19 +212,19 @@ cdef class Watch:
     """
 
     def __init__(self, Data data, int patience=64, Data confirm=None):
-        cdef Py_ssize_t m = data.blocks.n_rows, room
+        cdef Py_ssize_t m = data.blocks.n_rows, workspace
         cdef double[::1] scratch
         self.view = self.other = data.view()
         if confirm is not None:
             self.other = confirm.view()
             self.confirm = &self.other
-        room = watch_room(m, count_islands(&self.view.p))
-        scratch = np.empty(room + 2 * m + scratch_of(&self.other) + 4)
+        workspace = watch_workspace_size(m, count_islands(&self.view.p))
+        scratch = np.empty(workspace + 2 * m + scratch_of(&self.other) + 4)
         self.keep = data, confirm, scratch
         begin_watch(&self.state, &self.view.p, data.reference_energy, data.reference_velocity, patience, &scratch[0])
-        self.state.w = &scratch[room]
-        self.state.e = &scratch[room + m]
-        self.state.v = &scratch[room + 2 * m]
+        self.state.w = &scratch[workspace]
+        self.state.e = &scratch[workspace + m]
+        self.state.v = &scratch[workspace + 2 * m]
 
     @property
     def total(self):

@@ -1,8 +1,8 @@
-"""What Newton's method over bodies factors, from a problem's own arrays: an order of elimination and a panel, in given room.
+"""What Newton's method over bodies factors, from a problem's own arrays: an order of elimination and a panel, in given workspace.
 
-First what the pattern needs (`index_room`, `lay_pattern`, `make_pattern`), then, with it, the numbers (`body_room`,
-`furnish_bodies`), six columns for a body. A host that allocates in between gives the factor's pattern its room after
-`order_bodies`, and its numbers theirs, of fewer columns, by `factor_room` and `furnish_factor`.
+First the memory of the pattern (`index_workspace_size`, `lay_pattern`, `make_pattern`), then the numbers (`body_workspace_size`,
+`furnish_bodies`), six columns for a body. A host that allocates in between gives the factor's pattern its workspace after
+`order_bodies`, and its numbers theirs, of fewer columns, by `factor_workspace_size` and `furnish_factor`.
 """
 from libc.math cimport sqrt
 from libc.stdint cimport int32_t, int64_t
@@ -11,21 +11,21 @@ from libc.string cimport memset
 from lavender_ext.core.parts cimport blocks_t
 from lavender_ext.core.view cimport bodies_of, generalized_t, rows_t, view_t
 from lavender_ext.factor.blocks cimport factor_t, sparse_t
-from lavender_ext.factor.graph cimport eliminate_bodies, pattern_room
+from lavender_ext.factor.graph cimport eliminate_bodies, pattern_workspace_size
 from lavender_ext.factor.symbolic cimport block_pattern, block_tree
 from lavender_ext.newton.elements cimport elements_t
 from lavender_ext.newton.panel cimport fill_panel, inertia_root
-from lavender_ext.newton.run cimport furnish, lay_index, newton_t, own_index, own_room
+from lavender_ext.newton.run cimport furnish, lay_index, newton_t, own_index, own_workspace_size
 from lavender_ext.newton.scaling cimport find_elements, is_known, scaled_t
 from lavender_ext.newton.system cimport BODIES
 
 
 cdef enum:
-    MOST_BODIES = 1500          # whose factor has room as if it were full
+    MOST_BODIES = 1500          # whose factor has workspace as if it were full
     PARTS = 8                   # arrays of numbers of a factor
 
 
-cdef inline int64_t index_room(const blocks_t* p, const rows_t* r) noexcept nogil:
+cdef inline int64_t index_workspace_size(const blocks_t* p, const rows_t* r) noexcept nogil:
     """Whole numbers that `lay_pattern` hands out, as if every row were an element; 0 where the method does not apply."""
     cdef int64_t k = p.n_rows, n = r.n_bodies
     if n == 0 or n > MOST_BODIES or k == 0 or not is_known(p):
@@ -36,13 +36,13 @@ cdef inline int64_t index_room(const blocks_t* p, const rows_t* r) noexcept nogi
 cdef inline int64_t order_index(int64_t n, int64_t k) noexcept nogil:
     """Of that what `order_bodies` takes for n bodies and k elements."""
     # scratch of an order, six vectors of bodies and their pivots, the pattern of N, elements
-    return pattern_room(n, k) + 12 * (n + 1) + (n + k + 1) + 9 * (k + 1)
+    return pattern_workspace_size(n, k) + 12 * (n + 1) + (n + k + 1) + 9 * (k + 1)
 
 
 cdef struct pattern_t:
     int32_t n                   # bodies
     int32_t k                   # elements
-    int32_t* scratch            # `pattern_room`
+    int32_t* scratch            # `pattern_workspace_size`
     int32_t* parent
     int32_t* mark
     int32_t* nptr
@@ -64,7 +64,7 @@ cdef inline int32_t* lay_pattern(pattern_t* a, int32_t* index, int64_t n, int64_
     """Places in index, a multiple of 8 bytes, for k elements, and for `most` blocks of L; where the next begins."""
     a.n, a.k = <int32_t>n, <int32_t>k
     a.scratch = index
-    a.parent = index + pattern_room(n, k)
+    a.parent = index + pattern_workspace_size(n, k)
     a.mark = a.parent + n + 1
     a.nptr = a.mark + n + 1
     a.lptr = a.nptr + n + 1
@@ -83,7 +83,7 @@ cdef inline int32_t* lay_pattern(pattern_t* a, int32_t* index, int64_t n, int64_
 
 
 cdef inline void lay_bodies(newton_t* s, pattern_t* a, int32_t* index, const blocks_t* p, const rows_t* r) noexcept nogil:
-    """Places in index (`index_room`) for s and a."""
+    """Places in index (`index_workspace_size`) for s and a."""
     cdef int64_t n = r.n_bodies
     lay_index(s, p.n_rows, lay_pattern(a, index, n, p.n_rows, n * (n - 1) // 2))
 
@@ -117,7 +117,7 @@ cdef inline void make_pattern(const scaled_t* s, pattern_t* a, const rows_t* r) 
     block_pattern(a.n, a.nptr, a.nind, a.parent, a.mark, a.lptr, a.rptr, a.scratch, a.lind, a.rind)
 
 
-cdef inline int64_t factor_room(const pattern_t* a, int32_t s, bint lu, bint panels, int64_t* size) noexcept nogil:
+cdef inline int64_t factor_workspace_size(const pattern_t* a, int32_t s, bint lu, bint panels, int64_t* size) noexcept nogil:
     """Doubles of the PARTS that `furnish_factor` takes, and of all; lu: L U may be asked for; panels: L stands in some."""
     cdef int64_t i, b = s * s, n = a.n, below = a.lptr[n] * b, all_ = 0
     size[0], size[1], size[2] = n * s, a.nptr[n] * b, a.nptr[n] * b * lu
@@ -128,11 +128,11 @@ cdef inline int64_t factor_room(const pattern_t* a, int32_t s, bint lu, bint pan
     return all_
 
 
-cdef inline int64_t body_room(const newton_t* s, const pattern_t* a, const blocks_t* p, const rows_t* r) noexcept nogil:
+cdef inline int64_t body_workspace_size(const newton_t* s, const pattern_t* a, const blocks_t* p, const rows_t* r) noexcept nogil:
     """Doubles that `furnish_bodies` hands out, after `make_pattern`."""
     cdef int64_t size[PARTS]
-    return (12 * <int64_t>p.n_rows + 10 * <int64_t>r.n_bodies + own_room(p.n_rows, s.sc.small)
-            + factor_room(a, 6, 1, 0, size))
+    return (12 * <int64_t>p.n_rows + 10 * <int64_t>r.n_bodies + own_workspace_size(p.n_rows, s.sc.small)
+            + factor_workspace_size(a, 6, 1, 0, size))
 
 
 cdef inline int32_t find_groups(elements_t* e, int32_t* group) noexcept nogil:
@@ -206,7 +206,7 @@ cdef inline void furnish_factor(newton_t* s, const pattern_t* a, double* panel, 
 
 
 cdef inline void furnish_bodies(newton_t* s, pattern_t* a, double* real, const view_t* v) noexcept nogil:
-    """Everything of s in real (`body_room`): what every form has, then panel and factor."""
+    """Everything of s in real (`body_workspace_size`): what every form has, then panel and factor."""
     cdef const blocks_t* p = &v.p
     cdef const rows_t* r = v.r
     cdef int32_t i
@@ -215,14 +215,14 @@ cdef inline void furnish_bodies(newton_t* s, pattern_t* a, double* real, const v
     cdef double* part[PARTS]
     cdef double* panel
     cdef double* x
-    memset(real, 0, own_room(p.n_rows, s.sc.small) * sizeof(double))
+    memset(real, 0, own_workspace_size(p.n_rows, s.sc.small) * sizeof(double))
     panel = furnish(s, v, real)
     x = panel + 12 * <int64_t>p.n_rows
     for i in range(6):
         column[i] = i
     panel_of(p, r, x, panel)
     x += 10 * <int64_t>r.n_bodies
-    memset(x, 0, factor_room(a, 6, 1, 0, size) * sizeof(double))
+    memset(x, 0, factor_workspace_size(a, 6, 1, 0, size) * sizeof(double))
     for i in range(PARTS):
         part[i] = x
         x += size[i]

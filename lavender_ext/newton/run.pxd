@@ -9,7 +9,7 @@ from libc.string cimport memcpy, memset
 from lavender_ext.core.parts cimport blocks_t
 from lavender_ext.core.view cimport csr_t, generalized_t, rows_t, view_t
 from lavender_ext.factor.blocks cimport factor_t
-from lavender_ext.judge.best cimport best_room, best_t, bind_best, note_score, relative_of_best, see_impulse
+from lavender_ext.judge.best cimport best_workspace_size, best_t, bind_best, note_score, relative_of_best, see_impulse
 from lavender_ext.judge.measure cimport above_floor_of, floor_of, judge_view, relative_of
 from lavender_ext.judge.score cimport new_score, relative, score_t, smallest_reference
 from lavender_ext.newton.natural_map cimport convex_error
@@ -238,7 +238,7 @@ cdef struct newton_t:           # may not move once it is furnished
     path_t path
 
 
-# -- places in the caller's room -----------------------------------------------------------------------------------
+# -- places in the caller's workspace -----------------------------------------------------------------------------------
 
 
 cdef inline void aim(newton_t* n, const blocks_t* p, const csr_t* a, const rows_t* r, const generalized_t* g) noexcept nogil:
@@ -246,21 +246,22 @@ cdef inline void aim(newton_t* n, const blocks_t* p, const csr_t* a, const rows_
     n.problem.p, n.problem.a, n.problem.r, n.problem.g = p[0], a, r, g
 
 
-cdef inline int64_t judge_room(const blocks_t* p, const rows_t* r, const generalized_t* g) noexcept nogil:
+cdef inline int64_t judge_workspace_size(const blocks_t* p, const rows_t* r, const generalized_t* g) noexcept nogil:
     """Doubles that `lay_judge` hands out."""
-    cdef int64_t m = p.n_rows, own = 4 * m + best_room(m, <int64_t>p.n_blocks + 1)
+    cdef int64_t m = p.n_rows, own = 4 * m + best_workspace_size(m, <int64_t>p.n_blocks + 1)
     if r != NULL:
         return own + 12 * <int64_t>r.n_bodies
     return own + (g.n + m if g != NULL else 0)
 
 
-cdef inline double* lay_judge(newton_t* n, double* room) noexcept nogil:
+cdef inline double* lay_judge(newton_t* n, double* workspace) noexcept nogil:
     """What the judge writes to, of `aim`; what is behind it."""
     cdef int64_t m = n.problem.p.n_rows
-    n.lam, n.proof = room, room + m
-    n.problem.w, n.problem.error, n.problem.x = room + 2 * m, room + 3 * m, room + 4 * m + best_room(m, n.problem.p.n_blocks + 1)
-    bind_best(&n.kept, &n.problem.p, room + 4 * m)
-    return room + judge_room(&n.problem.p, n.problem.r, n.problem.g)
+    n.lam, n.proof = workspace, workspace + m
+    n.problem.w, n.problem.error = workspace + 2 * m, workspace + 3 * m
+    n.problem.x = workspace + 4 * m + best_workspace_size(m, n.problem.p.n_blocks + 1)
+    bind_best(&n.kept, &n.problem.p, workspace + 4 * m)
+    return workspace + judge_workspace_size(&n.problem.p, n.problem.r, n.problem.g)
 
 
 cdef inline int64_t own_index(int64_t m) noexcept nogil:
@@ -274,13 +275,13 @@ cdef inline void lay_index(newton_t* n, int64_t m, int32_t* index) noexcept nogi
     n.exchange.side, n.s.swap, n.s.free = index, index + m, index + 2 * m
 
 
-cdef inline int64_t own_room(int64_t m, int64_t small) noexcept nogil:
+cdef inline int64_t own_workspace_size(int64_t m, int64_t small) noexcept nogil:
     """Doubles that `furnish` hands out, of m rows and so many entries of small matrices."""
     return scaled_real(m) + VECTORS * m + 5 * small
 
 
-cdef inline void lay_vectors(newton_t* n, double* room, int64_t m) noexcept nogil:
-    """Places in room (VECTORS m)."""
+cdef inline void lay_vectors(newton_t* n, double* workspace, int64_t m) noexcept nogil:
+    """Places in workspace (VECTORS m)."""
     cdef double** at[VECTORS]
     cdef int32_t i
     at[0], at[1], at[2], at[3] = &n.best_z, &n.aside_z, &n.before_z, &n.direction
@@ -292,17 +293,17 @@ cdef inline void lay_vectors(newton_t* n, double* room, int64_t m) noexcept nogi
     at[24], at[25], at[26], at[27] = &n.exchange.kept, &n.progress.kept, &n.polish.z, &n.rounds[0].z
     at[28], at[29], at[30] = &n.rounds[1].z, &n.s.t, &n.s.q
     for i in range(VECTORS):
-        at[i][0] = room + i * m
+        at[i][0] = workspace + i * m
 
 
-cdef inline double* furnish(newton_t* n, const view_t* v, double* room) noexcept nogil:
-    """Elements (`find_elements`) scaled, with vectors and small matrices, in room of zeros; what is behind.
+cdef inline double* furnish(newton_t* n, const view_t* v, double* workspace) noexcept nogil:
+    """Elements (`find_elements`) scaled, with vectors and small matrices, in workspace of zeros; what is behind.
 
     What factors is still to come: form, symmetric and what belongs to the form.
     """
     cdef int64_t rows = n.problem.p.n_rows, small = n.sc.small
-    cdef double* x = room + scaled_real(rows)
-    lay_numbers(&n.sc, rows, room)
+    cdef double* x = workspace + scaled_real(rows)
+    lay_numbers(&n.sc, rows, workspace)
     scale_elements(&n.sc, v, n.problem.w, n.problem.x)
     lay_vectors(n, x, rows)
     x += VECTORS * rows

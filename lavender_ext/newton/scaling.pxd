@@ -4,7 +4,7 @@
 
 An element is a bounded row, or a contact with the parts that move. Rows of equal bounds,
 parts without friction and empty rows of A stay where they are. Whole numbers come first (`find_elements`), since the
-room of a factor over bodies depends on them, then the numbers (`scale_elements`).
+workspace of a factor over bodies depends on them, then the numbers (`scale_elements`).
 """
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t, int64_t

@@ -1,4 +1,4 @@
-"""Newton's method over the rows of A, dense, or over up to 1,500 bodies, as room, start and step (`core/method.pxd`).
+"""Newton's method over the rows of A, dense, or over up to 1,500 bodies, as workspace, start and step (`core/method.pxd`).
 
 The unit of work is a factorisation; a step may do one or two more than it was asked for. After CERTIFICATE `options_t.proven`
 = 1 ends it; without, the next step goes on.
@@ -14,7 +14,7 @@ import numpy as np
 from lavender_ext.factor.symbolic import block_panels
 
 from lavender_ext.core.arrays cimport address, zeros
-from lavender_ext.core.method cimport CERTIFICATE, MORE, ROOM, Method, grant, method_t, options_t, room_t, said_t
+from lavender_ext.core.method cimport CERTIFICATE, MORE, NEEDS_WORKSPACE, Method, grant, method_t, options_t, workspace_t, said_t
 from lavender_ext.core.parts cimport COULOMB
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.view cimport rows_t, view_t
@@ -22,7 +22,8 @@ from lavender_ext.factor.blocks cimport sparse_t
 from lavender_ext.factor.sparse cimport SparsePanels
 from lavender_ext.factor.symbolic cimport block_pattern
 from lavender_ext.factor.tiles cimport has_wide
-from lavender_ext.newton.bodies cimport (PARTS, body_room, factor_room, furnish_bodies, furnish_factor, index_room,
+from lavender_ext.newton.bodies cimport (PARTS, body_workspace_size, factor_workspace_size, furnish_bodies, furnish_factor,
+                                         index_workspace_size,
                                          lay_bodies, lay_pattern, make_pattern, order_bodies, order_index, panel_of,
                                          panel_of_velocities, pattern_t)
 from lavender_ext.newton.elements cimport elements_t
@@ -31,11 +32,11 @@ from lavender_ext.newton.path cimport path_compliance, smooth
 from lavender_ext.newton.phases cimport begin_exchanges, exchange_once, sides
 from lavender_ext.newton.plan cimport newton_start, newton_step
 from lavender_ext.newton.run cimport (APPROACH, DE_SAXCE, EXCHANGES, INTERIOR, N_COUNTED, PATH, POLISH, PROXIMAL, PURSUIT,
-                                      RELAXED, aim, furnish, impulse_of, judge_room, lay_index, lay_judge, newton_t,
-                                      own_index, own_room, proof_of, relative_at, set_reference)
+                                      RELAXED, aim, furnish, impulse_of, judge_workspace_size, lay_index, lay_judge, newton_t,
+                                      own_index, own_workspace_size, proof_of, relative_at, set_reference)
 from lavender_ext.newton.scaling cimport dense_matrix, find_elements, is_known
 from lavender_ext.newton.steps cimport begin_interior, duals, interior_step, slips, turn
-from lavender_ext.newton.system cimport (DENSE, OF_BARRIER, OF_NATURAL, OF_PAIR, SPARSE, dense_room,
+from lavender_ext.newton.system cimport (DENSE, OF_BARRIER, OF_NATURAL, OF_PAIR, SPARSE, dense_workspace_size,
                                          natural_times, others_t, solve_natural, solve_refined, system_factor,
                                          system_natural, system_sign, system_solve, system_times)
 
@@ -72,7 +73,7 @@ COUNTED = (
 # -- the method on plain structs --------------------------------------------------------------------------------
 
 
-cdef struct state_t:            # at the beginning of the room's whole numbers
+cdef struct state_t:            # at the beginning of the workspace's whole numbers
     newton_t n
     pattern_t a
 
@@ -82,7 +83,7 @@ cdef inline int64_t head() noexcept nogil:
     return sizeof(state_t) // sizeof(int32_t)
 
 
-cdef inline newton_t* state_of(const room_t* r) noexcept nogil:
+cdef inline newton_t* state_of(const workspace_t* r) noexcept nogil:
     return &(<state_t*>r.index).n
 
 
@@ -94,7 +95,7 @@ cdef inline int32_t begin(newton_t* n, const options_t* o, const double* lam) no
     return MORE
 
 
-cdef int32_t system_step(const view_t* v, const options_t* o, const room_t* r, int32_t work, double* lam,
+cdef int32_t system_step(const view_t* v, const options_t* o, const workspace_t* r, int32_t work, double* lam,
                                 said_t* said) noexcept nogil:
     cdef newton_t* n = state_of(r)
     cdef int32_t how
@@ -110,28 +111,28 @@ cdef int32_t system_step(const view_t* v, const options_t* o, const room_t* r, i
     return how
 
 
-cdef int32_t rows_room(const view_t* v, const options_t* o, room_t* r) noexcept nogil:
+cdef int32_t rows_workspace_size(const view_t* v, const options_t* o, workspace_t* r) noexcept nogil:
     """More than enough, whatever the numbers: as if every row moved, in contacts of six rows that rub."""
     cdef int64_t m = v.p.n_rows
     r.n_index = head() + own_index(m)
-    r.n_real = judge_room(&v.p, NULL, NULL) + own_room(m, 6 * m) + 2 * m * m + dense_room(m, True) + 8
+    r.n_real = judge_workspace_size(&v.p, NULL, NULL) + own_workspace_size(m, 6 * m) + 2 * m * m + dense_workspace_size(m, True) + 8
     return is_known(&v.p)
 
 
-cdef int32_t rows_start(const view_t* v, const options_t* o, room_t* r, const double* lam) noexcept nogil:
+cdef int32_t rows_start(const view_t* v, const options_t* o, workspace_t* r, const double* lam) noexcept nogil:
     cdef newton_t* n = state_of(r)
     cdef int64_t m = v.p.n_rows
-    cdef room_t need
+    cdef workspace_t need
     cdef double* x
-    rows_room(v, o, &need)
+    rows_workspace_size(v, o, &need)
     if not grant(r, need.n_index, need.n_real):
-        return ROOM
+        return NEEDS_WORKSPACE
     memset(n, 0, sizeof(newton_t))
     aim(n, &v.p, v.a, NULL, NULL)
     x = lay_judge(n, r.real)
     lay_index(n, m, r.index + head())
     find_elements(&n.sc, v)
-    memset(x, 0, own_room(m, n.sc.small) * sizeof(double))
+    memset(x, 0, own_workspace_size(m, n.sc.small) * sizeof(double))
     x = furnish(n, v, x)
     n.s.form, n.s.wide = DENSE, o.wide
     n.s.h, n.s.whole, n.s.lower = x, x + m * m, x + 2 * m * m
@@ -139,26 +140,26 @@ cdef int32_t rows_start(const view_t* v, const options_t* o, room_t* r, const do
     return begin(n, o, lam)
 
 
-cdef int32_t bodies_room(const view_t* v, const options_t* o, room_t* r) noexcept nogil:
+cdef int32_t bodies_workspace_size(const view_t* v, const options_t* o, workspace_t* r) noexcept nogil:
     """Whole numbers; the others are known when the pattern of the factor is."""
-    cdef int64_t most = index_room(&v.p, v.r)
+    cdef int64_t most = index_workspace_size(&v.p, v.r)
     r.n_index, r.n_real = head() + most, 0
     return most > 0
 
 
-cdef int32_t bodies_start(const view_t* v, const options_t* o, room_t* r, const double* lam) noexcept nogil:
+cdef int32_t bodies_start(const view_t* v, const options_t* o, workspace_t* r, const double* lam) noexcept nogil:
     cdef newton_t* n = state_of(r)
     cdef pattern_t* a = &(<state_t*>r.index).a
     if not r.laid:
-        if not grant(r, head() + index_room(&v.p, v.r), 0):
-            return ROOM
+        if not grant(r, head() + index_workspace_size(&v.p, v.r), 0):
+            return NEEDS_WORKSPACE
         memset(n, 0, sizeof(newton_t))
         lay_bodies(n, a, r.index + head(), &v.p, v.r)
         find_elements(&n.sc, v)
         make_pattern(&n.sc, a, v.r)
         r.laid = 1
-    if not grant(r, r.n_index, judge_room(&v.p, v.r, NULL) + body_room(n, a, &v.p, v.r)):
-        return ROOM
+    if not grant(r, r.n_index, judge_workspace_size(&v.p, v.r, NULL) + body_workspace_size(n, a, &v.p, v.r)):
+        return NEEDS_WORKSPACE
     aim(n, &v.p, NULL, v.r, NULL)
     furnish_bodies(n, a, lay_judge(n, r.real), v)
     return begin(n, o, lam)
@@ -277,12 +278,12 @@ cdef class Solve(Method):
         n = self.n = state_of(&self.space)
         aim(n, &self.view.p, self.view.a, self.view.r, self.view.g)
         set_reference(&n.problem, data.reference_energy, data.reference_velocity)
-        judge = zeros(judge_room(&n.problem.p, n.problem.r, n.problem.g))
+        judge = zeros(judge_workspace_size(&n.problem.p, n.problem.r, n.problem.g))
         self.held = [matrix, judge]
         lay_judge(n, <double*>address(judge))
         lay_index(n, rows, self.space.index + head())
         find_elements(&n.sc, &v)
-        self.real = zeros(own_room(rows, n.sc.small))
+        self.real = zeros(own_workspace_size(rows, n.sc.small))
         furnish(n, &v, <double*>address(self.real))
         m = self.m = n.sc.e.m
         k = n.sc.e.n
@@ -316,7 +317,8 @@ cdef class Solve(Method):
 
     def over_rows(self, double[:, ::1] h, bint symmetric, bint wide):
         """H (m, m), dense."""
-        cdef double[::1] whole = np.empty(self.m * self.m + 1), lower = np.empty(dense_room(self.m, self.has_friction) + 1)
+        cdef double[::1] whole = np.empty(self.m * self.m + 1)
+        cdef double[::1] lower = np.empty(dense_workspace_size(self.m, self.has_friction) + 1)
         self.held += [h, whole, lower]
         self.n.s.form, self.n.s.symmetric, self.n.s.wide = DENSE, symmetric, wide and has_wide()
         self.n.s.h, self.n.s.whole, self.n.s.lower = &h[0, 0] if self.m else NULL, &whole[0], &lower[0]
@@ -373,7 +375,7 @@ cdef class Solve(Method):
             held = SparsePanels.of_blocks(layout.panels[1:], a.n * s, wide)
             super_, places = &held.f, &spot[0]
             self.held.append(held)
-        factor_room(&a, s, lu, super_ != NULL, size)
+        factor_workspace_size(&a, s, lu, super_ != NULL, size)
         values = [zeros(size[i]) for i in range(PARTS)]
         for i in range(PARTS):
             x[i] = <double*>address(values[i])

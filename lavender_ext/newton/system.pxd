@@ -19,7 +19,8 @@ from lavender_ext.core.parts cimport CONE
 from lavender_ext.core.view cimport csr_t
 from lavender_ext.factor.blocks cimport factor_t
 from lavender_ext.factor.cholesky cimport block_cholesky, block_solve
-from lavender_ext.factor.dense cimport PANEL, cholesky_room, dense_cholesky, dense_cholesky_solve, dense_lu, dense_lu_solve
+from lavender_ext.factor.dense cimport (PANEL, cholesky_workspace_size, dense_cholesky, dense_cholesky_solve, dense_lu,
+                                        dense_lu_solve)
 from lavender_ext.factor.lu cimport block_lu, block_lu_solve
 from lavender_ext.newton.cones cimport is_high, is_low
 from lavender_ext.newton.elements cimport element_times, elements_t, is_row
@@ -68,7 +69,7 @@ cdef struct system_t:
     csr_t a                     # H, SPARSE
     const others_t* others      # or NULL
     double* whole               # (m, m) DENSE: the matrix, or L U
-    double* lower               # (`dense_room`) L L^T, or scratch
+    double* lower               # (`dense_workspace_size`) L L^T, or scratch
     int32_t* swap               # (m)
     int32_t* free               # (m)
     double* v                   # small matrices
@@ -81,11 +82,11 @@ cdef struct system_t:
     double* y                   # (bodies s)
 
 
-cdef inline int64_t dense_room(int64_t m, int32_t cones) noexcept nogil:
+cdef inline int64_t dense_workspace_size(int64_t m, int32_t cones) noexcept nogil:
     """Values of `lower`; with cones it holds L H as well."""
-    cdef int64_t room = cholesky_room(<int32_t>m), other = PANEL * m
-    room = room if room > other else other
-    return m * m if cones and m * m > room else room
+    cdef int64_t workspace = cholesky_workspace_size(<int32_t>m), other = PANEL * m
+    workspace = workspace if workspace > other else other
+    return m * m if cones and m * m > workspace else workspace
 
 
 cdef inline void system_times(system_t* s, const double* x, double* out) noexcept nogil:

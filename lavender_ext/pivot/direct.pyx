@@ -429,7 +429,7 @@ cdef class Pivoting:
         `factor(place, n_free, shift)` of the rows with place >= 0, numbered as they stand: how many pivots are small, -1
         where it was not begun; `solve(rhs)` (n_free,).
     linear, symmetric : bool
-        Every row is free; A is symmetric. Without `outside`: else LU, in room for a band of m - 1, as rows stand.
+        Every row is free; A is symmetric. Without `outside`: else LU, in workspace for a band of m - 1, as rows stand.
     """
 
     def __init__(self, Data p, int band, order, double tiny, Data judged=None, outside=None, bint linear=False,
@@ -443,7 +443,7 @@ cdef class Pivoting:
         if p.factored or p.is_general:
             raise ValueError("Pivoting reads A in compressed rows")
         if outside is None and not symmetric and (band != m - 1 or order is not None):
-            raise ValueError("LU has room where the band is whole, and takes rows as they stand")
+            raise ValueError("LU has workspace where the band is whole, and takes rows as they stand")
         self.p, self.judged, self.order, self.outside = p, p if judged is None else judged, order, outside
         if order is not None:
             given = order

@@ -1,7 +1,7 @@
 """The call of few rows for other compiled loops: `lay_few` once, then `run_few` from any start, by any thread on its own copy."""
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.method cimport room_t
+from lavender_ext.core.method cimport workspace_t
 from lavender_ext.core.parts cimport blocks_t
 from lavender_ext.core.view cimport view_t
 from lavender_ext.judge.score cimport score_t
@@ -38,13 +38,13 @@ cdef struct few_t:
 
 
 cdef struct rooms_t:
-    room_t work
-    room_t more                 # of Newton's method, or of paths
+    workspace_t work
+    workspace_t more                 # of Newton's method, or of paths
 
 
 cdef bint has_call(const blocks_t* p) noexcept nogil
 cdef bint are_bounded(const blocks_t* p) noexcept nogil
-cdef bint lay_few(few_t* s, room_t* room) noexcept nogil
+cdef bint lay_few(few_t* s, workspace_t* workspace) noexcept nogil
 cdef void judge_few(few_t* s, const double* lam, double* both, double* scratch) noexcept nogil
 cdef int32_t run_few(few_t* s, const few_rules_t* rules, double* own, bint cold, double tol, double most, double* both,
                      rooms_t* rooms, int32_t* counts) noexcept nogil

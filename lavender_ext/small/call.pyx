@@ -20,13 +20,13 @@ from lavender_ext.core.csr cimport scan_entries
 from lavender_ext.core.order cimport sort_by_level
 from lavender_ext.core.parts cimport CONE, CONTACT_ROLLING, FRICTIONS, ROUND, blocks_t, frictions_of, is_rows, lay_frictions
 from lavender_ext.core.problem cimport Data
-from lavender_ext.core.method cimport room_t
+from lavender_ext.core.method cimport workspace_t
 from lavender_ext.core.view cimport bodies_of, csr_t, rows_t
 from lavender_ext.factor.tiles cimport has_wide
 from lavender_ext.small.call cimport COUNTS, ENDED, FAILED, KEPT, Rules, few_rules_t, few_t, rooms_t
 from lavender_ext.small.friction cimport ask_t, part_t, solve_part, work_of
 from lavender_ext.small.limits cimport is_linear
-from lavender_ext.small.room cimport has_room, leave
+from lavender_ext.small.workspace cimport has_workspace_size, leave
 from lavender_ext.judge.measure cimport set_zero_impulse, floor_of, judge_view, judged_from, relative_of, scratch_of
 from lavender_ext.judge.score cimport new_score
 from lavender_ext.local.gauss_seidel cimport prepare_blocks, prepared_sizes
@@ -56,25 +56,25 @@ cdef bint are_bounded(const blocks_t* p) noexcept nogil:
     return True
 
 
-cdef bint lay_few(few_t* s, room_t* room) noexcept nogil:
-    """What the call needs beside both views and the error of doing nothing; in `room`, where it stays."""
+cdef bint lay_few(few_t* s, workspace_t* workspace) noexcept nogil:
+    """What the call needs beside both views and the error of doing nothing; in `workspace`, where it stays."""
     cdef const blocks_t* p = &s.v.p
     cdef int32_t band[2]
     cdef int64_t n
     s.pivots, s.linear, s.at, s.prepared = are_bounded(p), is_linear(p), NULL, NULL
     s.split = s.v.r.n_joints if s.v.r != NULL else 0
-    if not has_room(room, p.n_blocks + 1 + p.n_rows, 0):
+    if not has_workspace_size(workspace, p.n_blocks + 1 + p.n_rows, 0):
         return False
     if s.pivots:
-        s.symmetric = scan_entries(s.over.a, s.over.p.d, p.n_rows, room.index, band) <= 1e-14
+        s.symmetric = scan_entries(s.over.a, s.over.p.d, p.n_rows, workspace.index, band) <= 1e-14
         s.band = max(band[0], band[1]) if s.symmetric else p.n_rows - 1
     elif p.law == CONE or s.v.a != NULL:                # within a contact of a matrix that was given, units may be unlike
-        n = <int64_t>prepared_sizes(p, room.index) + 1
-        if not has_room(room, 0, n):
+        n = <int64_t>prepared_sizes(p, workspace.index) + 1
+        if not has_workspace_size(workspace, 0, n):
             return False
-        memset(room.real, 0, n * sizeof(double))
-        prepare_blocks(&s.over, room.index, room.real)
-        s.at, s.prepared = room.index, room.real
+        memset(workspace.real, 0, n * sizeof(double))
+        prepare_blocks(&s.over, workspace.index, workspace.real)
+        s.at, s.prepared = workspace.index, workspace.real
     return True
 
 
@@ -151,7 +151,7 @@ cdef inline bint pivot(direct_t* t, const double* start, double tol, bint enough
     return met(t, tol, enough)
 
 
-cdef inline int32_t followed(direct_t* t, double tol, double* most, room_t* room) noexcept nogil:
+cdef inline int32_t followed(direct_t* t, double tol, double* most, workspace_t* workspace) noexcept nogil:
     """Where exchanges are stuck: Lemke's paths, and exchanges at their end.
 
     Pivots of the paths, -1 where they do not end below tol.
@@ -159,9 +159,9 @@ cdef inline int32_t followed(direct_t* t, double tol, double* most, room_t* room
     cdef lemke_t l
     cdef double each = 2.0 * <double>t.s.n ** 2
     cdef int32_t last = PATH * t.s.n if most[0] > PATH * t.s.n * each else <int32_t>(most[0] / each)
-    if not has_room(room, lemke_index(t.s.p), lemke_real(t.s.p)):
+    if not has_workspace_size(workspace, lemke_index(t.s.p), lemke_real(t.s.p)):
         return -1
-    lemke_lay(&l, t, room.real, room.index)
+    lemke_lay(&l, t, workspace.real, workspace.index)
     lemke_begin(&l)
     while lemke_run(&l, last - l.pivots) == RAY:
         pass
@@ -182,7 +182,7 @@ cdef bint pivot_few(const few_t* s, double* own, double tol, bint follows, doubl
     cdef int32_t path = 0, m = s.v.p.n_rows
     cdef double each = ROUND_ROW * m + 0.1 * m * (s.band + 1.0) ** 2
     cdef bint ended
-    if not has_room(&rooms.work, direct_index(&s.v), direct_real(&s.v, s.band)):
+    if not has_workspace_size(&rooms.work, direct_index(&s.v), direct_real(&s.v, s.band)):
         return False
     t.e0, t.v0, t.least = s.begin[0], s.begin[1], 1e-13
     t.linear, t.symmetric = s.linear, s.symmetric
@@ -214,7 +214,7 @@ cdef bint sweep_few(const few_t* s, double* own, double tol, int32_t swept, doub
     cdef part_t part
     cdef ask_t o = ask_t(tol, swept, swept, has_wide(), 0, 0, 0, 0.0, most[0], 0, 0)
     cdef bint good
-    if not has_room(&rooms.work, s.v.p.n_blocks, work_of(m, n) + m):
+    if not has_workspace_size(&rooms.work, s.v.p.n_blocks, work_of(m, n) + m):
         return False
     part.v, part.lam, part.answer, part.split = s.over, own, rooms.work.real, s.split
     part.at, part.prepared, part.nothing = s.at, s.prepared, s.begin[2]
@@ -231,14 +231,14 @@ cdef int32_t run_few(few_t* s, const few_rules_t* rules, double* own, bint cold,
     """From `own` (m) [N s], from doing nothing if `cold`, into it, judged: how it ended (`FAILED` ...)."""
     cdef int64_t m = s.v.p.n_rows, scratch = m + scratch_of(&s.v)
     memset(counts, 0, COUNTS * sizeof(int32_t))
-    if not has_room(&rooms.work, 0, scratch):
+    if not has_workspace_size(&rooms.work, 0, scratch):
         return FAILED
     if begin_few(s, rules, own, cold, tol, both, rooms.work.real):
         return KEPT
     if not (pivot_few(s, own, tol, rules.follows, &most, rooms, counts) if s.pivots
             else sweep_few(s, own, tol, rules.swept, &most, rooms, counts)):
         return FAILED
-    if not has_room(&rooms.work, 0, scratch):
+    if not has_workspace_size(&rooms.work, 0, scratch):
         return FAILED
     judge_few(s, own, both, rooms.work.real)
     return ENDED if s.pivots or s.relative <= tol or not most > 0.0 else FAILED
@@ -432,17 +432,17 @@ cdef class Small:
     cdef readonly int count                             # of islands
     cdef Data over
     cdef few_t at
-    cdef room_t room
+    cdef workspace_t workspace
 
     def __init__(self, Data data, Data over):
         self.data, self.over, self.count = data, over, 1
         self.at.v, self.at.over = data.view(), over.view()
         self.at.begin[0], self.at.begin[1], self.at.begin[2] = data.reference_energy, data.reference_velocity, data.relative_at_zero
-        if not lay_few(&self.at, &self.room):
+        if not lay_few(&self.at, &self.workspace):
             raise MemoryError(f"{data.blocks.n_rows} rows")
 
     def __dealloc__(self):
-        leave(&self.room)
+        leave(&self.workspace)
 
     def run(self, impulse, double tol, Rules rules, double most=INFINITY):
         """From `impulse` (m,) [N s], or from doing nothing where it is None: (what the judge finds, what was done).
@@ -511,7 +511,7 @@ cdef class Islands(Small):
         cdef int64_t m = s.v.p.n_rows, scratch = m + scratch_of(&s.v)
         cdef ask_t o = ask_t(tol, rules.swept, rules.swept, has_wide(), 0, 0, 0, 0.0, most, 0, 0)
         cdef bint good
-        if not has_room(&rooms.work, 0, scratch):
+        if not has_workspace_size(&rooms.work, 0, scratch):
             raise MemoryError(f"{m} rows")
         if begin_few(s, rules, own, cold, tol, both, rooms.work.real):
             return KEPT
@@ -523,7 +523,7 @@ cdef class Islands(Small):
         judge_few(s, own, both, rooms.work.real)
         return ENDED if s.relative <= tol or not o.left > 0.0 else FAILED
 
-    cdef bint islands(self, double* own, ask_t* o, room_t* r) except -1:
+    cdef bint islands(self, double* own, ask_t* o, workspace_t* r) except -1:
         """Each after the other from `own` (m) [N s], into it."""
         cdef const blocks_t* p = &self.over.blocks
         cdef const rows_t* rows = &self.over.rows

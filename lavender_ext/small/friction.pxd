@@ -1,17 +1,17 @@
 """A few contacts, or an island of them: accelerated sweeps, and where these are slow Newton's method, in turns.
 
-One call solves a part over A or over bodies, in room that the caller has. Factors go on where they stood; so do sweeps.
+One call solves a part over A or over bodies, in workspace that the caller has. Factors go on where they stood; so do sweeps.
 """
 from libc.stdint cimport int32_t, int64_t, uint64_t
 from libc.string cimport memcmp, memcpy, memset
 
 from lavender_ext.accelerate.accelerated cimport lav_anderson, sweep_data_t
 from lavender_ext.accelerate.mixing cimport CONTROL, MAX_MEMORY, UNDONE
-from lavender_ext.core.method cimport CERTIFICATE, MORE, ROOM, options_t, room_t, said_t
+from lavender_ext.core.method cimport CERTIFICATE, MORE, NEEDS_WORKSPACE, options_t, workspace_t, said_t
 from lavender_ext.core.parts cimport CONE, blocks_t
 from lavender_ext.core.view cimport csr_t, view_t
-from lavender_ext.driver.driver cimport NEWTON, lav_room, lav_start, lav_step
-from lavender_ext.small.room cimport has_room
+from lavender_ext.driver.driver cimport NEWTON, lav_workspace_size, lav_start, lav_step
+from lavender_ext.small.workspace cimport has_workspace_size
 from lavender_ext.judge.measure cimport set_zero_impulse, find_reference, judge_view, relative_of
 from lavender_ext.judge.score cimport new_score, score_t
 from lavender_ext.sweep.serial cimport context_t, form_velocity
@@ -59,7 +59,7 @@ cdef struct ask_t:
 cdef struct turns_t:            # of one part
     part_t* s
     ask_t* o
-    room_t* r                   # of Newton's method
+    workspace_t* r                   # of Newton's method
     double e0                   # the part's reference, sqrt J
     double v0                   # m/s
     double* swept               # (m) N s
@@ -69,7 +69,7 @@ cdef struct turns_t:            # of one part
     context_t sweeps
     sweep_data_t c
     options_t options
-    room_t room
+    workspace_t workspace
     said_t said
     int32_t how
     double sweep                # ns of one sweep and
@@ -142,18 +142,18 @@ cdef inline double sweep_on(turns_t* t, double now, int32_t most, bint hoping) n
 
 
 cdef inline bint begin_newton(turns_t* t) noexcept nogil:
-    """Newton's method from `answer`; is there room for it?"""
-    cdef room_t* r = t.r
+    """Newton's method from `answer`; is there workspace for it?"""
+    cdef workspace_t* r = t.r
     t.how = 0
-    if not lav_room(&t.s.v, &t.options, &t.room):
+    if not lav_workspace_size(&t.s.v, &t.options, &t.workspace):
         return False
     t.said.factorisations = 0
     while True:
-        if not has_room(r, t.room.n_index, t.room.n_real):
+        if not has_workspace_size(r, t.workspace.n_index, t.workspace.n_real):
             return False
-        t.room.index, t.room.real = r.index, r.real
-        t.how = lav_start(&t.s.v, &t.options, &t.room, t.s.answer)
-        if t.how != ROOM:
+        t.workspace.index, t.workspace.real = r.index, r.real
+        t.how = lav_start(&t.s.v, &t.options, &t.workspace, t.s.answer)
+        if t.how != NEEDS_WORKSPACE:
             return t.how == MORE
 
 
@@ -162,7 +162,7 @@ cdef inline double step_newton(turns_t* t, int32_t steps) noexcept nogil:
     cdef double fit = (t.o.left - spent(t)) / t.factor
     cdef int32_t last = t.said.factorisations + (steps if fit > steps else <int32_t>max(fit, 0.0))
     while t.said.factorisations < last and (t.how == MORE or t.how == CERTIFICATE):
-        t.how = lav_step(&t.s.v, &t.options, &t.room, last - t.said.factorisations, t.s.answer, &t.said)
+        t.how = lav_step(&t.s.v, &t.options, &t.workspace, last - t.said.factorisations, t.s.answer, &t.said)
     return found_at(t, t.s.answer)
 
 
@@ -180,7 +180,7 @@ cdef inline double factor_in_turns(turns_t* t) noexcept nogil:
     return now
 
 
-cdef inline bint solve_part(part_t* s, ask_t* o, room_t* r, double* work, int32_t* order) noexcept nogil:
+cdef inline bint solve_part(part_t* s, ask_t* o, workspace_t* r, double* work, int32_t* order) noexcept nogil:
     """From `lam` into `answer`; is its relative residual at most `tol`?"""
     cdef score_t nothing = new_score()
     cdef turns_t t

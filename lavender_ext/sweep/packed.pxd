@@ -24,7 +24,7 @@ from lavender_ext.sweep.lanes cimport (ALONE, BODY, HEADER, KINDS, MOST_ROWS, P_
 from lavender_ext.sweep.pair cimport LANES, pair_t
 
 
-cdef enum:                      # doubles of room: records, as every block may stand alone, and four int32
+cdef enum:                      # doubles of workspace: records, as every block may stand alone, and four int32
     ROOM_CONTACT = 27
     ROOM_CONTACT_ROW = 29
     ROOM_JOINT = 14
@@ -38,7 +38,7 @@ cdef enum:                      # doubles of room: records, as every block may s
     ROUNDS = 3                  # of moving late what begins too early
 
 
-cdef struct packed_t:           # the blocks of an order, packed; pointers into `room`
+cdef struct packed_t:           # the blocks of an order, packed; pointers into `workspace`
     int32_t pairs
     int32_t stages
     int32_t* lane               # (k) LANES * place of the record + lane of each block, in the order's order
@@ -61,7 +61,7 @@ cdef struct plan_t:             # bodies and blocks on the way to it
     int32_t single              # one sweep at a time
 
 
-cdef inline int64_t room_for(int64_t joints, int64_t joint_rows, int64_t contacts, int64_t contact_rows,
+cdef inline int64_t allocate_workspace(int64_t joints, int64_t joint_rows, int64_t contacts, int64_t contact_rows,
                              int64_t bodies) noexcept nogil:
     """Doubles that `pack_order` asks for."""
     return (ROOM_JOINT * joints + ROOM_JOINT_ROW * joint_rows + ROOM_CONTACT * contacts
@@ -70,7 +70,7 @@ cdef inline int64_t room_for(int64_t joints, int64_t joint_rows, int64_t contact
 
 cdef inline int64_t room_of(const blocks_t* p, const rows_t* r) noexcept nogil:
     cdef int32_t first = p.ptr[r.n_joints]
-    return room_for(r.n_joints, first, r.n_contacts, p.n_rows - first, r.n_bodies)
+    return allocate_workspace(r.n_joints, first, r.n_contacts, p.n_rows - first, r.n_bodies)
 
 
 cdef inline int32_t set_levels(const blocks_t* p, const rows_t* r, const int32_t* order, int32_t apart, plan_t* x,
@@ -234,28 +234,28 @@ cdef inline void put_slot(const blocks_t* p, const rows_t* r, const int32_t* ord
         put_record(p, r, order, lam, x, odd[i], k, out)
 
 
-cdef inline int32_t pack_order(const blocks_t* p, const rows_t* r, const int32_t* order, int32_t single, double* room,
+cdef inline int32_t pack_order(const blocks_t* p, const rows_t* r, const int32_t* order, int32_t single, double* workspace,
                                const double* lam, packed_t* out) noexcept nogil:
     """Records of the blocks order (k); 0, and none, where a slot has fewer than LEAST on average or most have no lanes.
 
     Any T from that of (1) on will do; a longer one, up to all levels, makes fewer stages, and slots of fewer blocks. T
     is as long as slots of WIDTH blocks on average allow; `single`: all levels, those of contacts behind those of joints.
 
-    room: `room_of` doubles.
+    workspace: `room_of` doubles.
     """
     cdef int32_t n = p.n_blocks, i, t, top = 0, begin = 0, end, next_end
     cdef plan_t x
     x.single = single
-    x.last = <int32_t*>room
+    x.last = <int32_t*>workspace
     x.first = x.last + r.n_bodies
     x.early = x.first + r.n_bodies
     x.count = x.early + r.n_bodies
-    room += 2 * r.n_bodies
-    x.level = <int32_t*>room
+    workspace += 2 * r.n_bodies
+    x.level = <int32_t*>workspace
     x.line = x.level + n
     x.kind = x.line + n
     x.slot = x.kind + n
-    room += 2 * n
+    workspace += 2 * n
     if not 0 < n <= MOST:
         return 0
     for i in range(r.n_bodies):
@@ -271,7 +271,7 @@ cdef inline int32_t pack_order(const blocks_t* p, const rows_t* r, const int32_t
     if n < LEAST * t or not set_slots(p, r, order, t, &x):
         return 0
     # records begin on a multiple of 16 bytes
-    out.record = <pair_t*>(room + ((<uintptr_t>room >> 3) & 1))
+    out.record = <pair_t*>(workspace + ((<uintptr_t>workspace >> 3) & 1))
     out.last = out.record
     out.behind = <double*>out.record
     out.lane = x.level
@@ -360,12 +360,12 @@ cdef inline void sweep_records(const blocks_t* p, const rows_t* r, const packed_
 
 
 cdef inline int32_t sweep_packed(const blocks_t* p, const rows_t* r, const int32_t* order, int32_t sweeps,
-                                 double* room, double* lam, double* v) noexcept nogil:
+                                 double* workspace, double* lam, double* v) noexcept nogil:
     """`sweeps` sweeps over the blocks order (k), or 0 and none, as `pack_order`; v (n_bodies, 6)."""
     cdef packed_t packed
     cdef double* body
     cdef int32_t i
-    if not pack_order(p, r, order, 0, room, lam, &packed):
+    if not pack_order(p, r, order, 0, workspace, lam, &packed):
         return 0
     body = packed.behind
     for i in range(6 * r.n_bodies):

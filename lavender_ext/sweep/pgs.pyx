@@ -1,6 +1,6 @@
 """One sweep over the blocks (n_blocks) of an order, each loop with the update of a block inlined whole.
 
-A module of their own, since that is what a compiler has room for: beside other loops it would call the updates.
+A module of their own, since that is what a compiler has workspace for: beside other loops it would call the updates.
 """
 from libc.stdint cimport int32_t
 

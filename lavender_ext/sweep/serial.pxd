@@ -1,8 +1,8 @@
-"""Methods of sweeps, accelerated or not, as room, start and step on plain structs, for any host.
+"""Methods of sweeps, accelerated or not, as workspace, start and step on plain structs, for any host.
 
     sweeping_t x                its order, how it sweeps, and `pack`: the host's
-    sweeps_room(&x, &v, place)  -> float64 of a run over v
-    sweeps_start(&x, &v, place, room)
+    sweeps_workspace_size(&x, &v, place)  -> float64 of a run over v
+    sweeps_start(&x, &v, place, workspace)
     sweeps_step(&x, &watch, &v, ...) -> how it stands after so many sweeps
 """
 from libc.math cimport fabs, sqrt
@@ -46,7 +46,7 @@ cdef enum:                      # of a packing
 
 cdef struct packing_t:          # blocks in pairs, made at the first run of sweeps that is long enough
     packed_t packed
-    double* room                # `room_of`, or NULL
+    double* workspace                # `room_of`, or NULL
     int32_t status
     int32_t first               # sweeps of a run that makes it
     int32_t single              # one sweep at a time, since something is done in between
@@ -58,7 +58,7 @@ cdef struct context_t:          # what a sweep needs besides lam
     const csr_t* csr            # NULL over bodies
     const rows_t* rows
     const generalized_t* general        # NULL but for J and M
-    double* v                   # M^-1 J^T lam (n_bodies, 6), then room for twelve; of J and M u = Y^T lam (nv)
+    double* v                   # M^-1 J^T lam (n_bodies, 6), then workspace for twelve; of J and M u = Y^T lam (nv)
     int32_t n_v                 # numbers of v; 0 over A
     int32_t split               # blocks before it are swept before the others: joints, contacts
     int32_t mode
@@ -89,9 +89,9 @@ cdef inline bint is_packed(context_t* c, const double* lam, int64_t sweeps) noex
     cdef packing_t* x = c.packing
     if not WHOLE or x == NULL:
         return False
-    if x.status == NOT_YET and x.room != NULL and sweeps >= x.first:
+    if x.status == NOT_YET and x.workspace != NULL and sweeps >= x.first:
         x.backwards = 0
-        x.status = READY if pack_order(c.blocks, c.rows, c.order, x.single, x.room, lam, &x.packed) else USELESS
+        x.status = READY if pack_order(c.blocks, c.rows, c.order, x.single, x.workspace, lam, &x.packed) else USELESS
     return x.status == READY
 
 
@@ -141,7 +141,7 @@ cdef inline int32_t velocities_of(const view_t* v) noexcept nogil:
     return v.g.n if v.g != NULL else 6 * v.r.n_bodies if v.r != NULL else 0
 
 
-cdef inline int64_t sweeps_room(sweeping_t* x, const view_t* v, int32_t* place) noexcept nogil:
+cdef inline int64_t sweeps_workspace_size(sweeping_t* x, const view_t* v, int32_t* place) noexcept nogil:
     """Numbers of a run over v, -1 where places do not reach; place (k): of what blocks have prepared, NULL: none is exact."""
     cdef context_t* c = &x.c
     cdef double n = prepared_sizes(&v.p, place) + 1 if WHOLE and place != NULL else 0.0
@@ -149,13 +149,13 @@ cdef inline int64_t sweeps_room(sweeping_t* x, const view_t* v, int32_t* place) 
     return c.n_v + 12 + <int64_t>n if n < 2147483647.0 else -1
 
 
-cdef inline void sweeps_start(sweeping_t* x, const view_t* v, const int32_t* place, double* room) noexcept nogil:
-    """In room (`sweeps_room`, zeroed)."""
+cdef inline void sweeps_start(sweeping_t* x, const view_t* v, const int32_t* place, double* workspace) noexcept nogil:
+    """In workspace (`sweeps_workspace_size`, zeroed)."""
     cdef context_t* c = &x.c
-    c.v = room
+    c.v = workspace
     if WHOLE and place != NULL:
-        c.start, c.g = place, room + c.n_v + 12
-        prepare_blocks(v, place, room + c.n_v + 12)
+        c.start, c.g = place, workspace + c.n_v + 12
+        prepare_blocks(v, place, workspace + c.n_v + 12)
     x.packing.first = FIRST_FAR if x.packing.single or v.p.n_blocks >= FAR else FIRST
     if x.of == NULL:
         x.of = c
@@ -184,7 +184,7 @@ cdef void sweep(context_t* c, const blocks_t* p, bint exact, double* lam, bint f
 cdef class Sweeps:
     cdef sweeping_t x
     cdef view_t view
-    cdef object keep, room, for_pairs
+    cdef object keep, workspace, for_pairs
     cdef double* lay(self, Data p, int32_t[::1] order, int split, int mode, uint64_t[::1] rng, bint exact, bint prepares,
                      int64_t more) except NULL
     cdef double undone(self) noexcept

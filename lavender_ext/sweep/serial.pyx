@@ -23,7 +23,7 @@ from lavender_ext.sweep.levels cimport sweep_levels
 from lavender_ext.sweep.packed cimport move_impulses, room_of, sweep_records
 from lavender_ext.sweep.pgs cimport relax_bodies, relax_general, relax_matrix
 from lavender_ext.sweep.serial cimport (NOT_YET, READY, USELESS, WHOLE, context_t, form_velocity, is_packed, may_pack,
-                                        next_order, packing_t, safe_damping, sweeps_room, sweeps_start, sweeps_step)
+                                        next_order, packing_t, safe_damping, sweeps_workspace_size, sweeps_start, sweeps_step)
 
 
 cdef void sweep(context_t* c, const blocks_t* p, bint exact, double* lam, bint first) noexcept nogil:
@@ -117,7 +117,7 @@ cdef class Sweeps:
     exact : bool
         Blocks are solved exactly.
     before : Sweeps, optional
-        Of another problem: hands over the room of its pairs, and packs no more.
+        Of another problem: hands over the workspace of its pairs, and packs no more.
     """
 
     def __init__(self, Data p, int32_t[::1] order, int split, int mode, uint64_t[::1] rng, int kind=SWEEPS, double omega=1.0,
@@ -131,24 +131,24 @@ cdef class Sweeps:
 
     cdef double* lay(self, Data p, int32_t[::1] order, int split, int mode, uint64_t[::1] rng, bint exact, bint prepares,
                      int64_t more) except NULL:
-        """Before the first sweep; room for so many numbers more. `prepares`: blocks, as some sweeps solve them exactly."""
+        """Before the first sweep; workspace for so many numbers more. `prepares`: blocks, as some sweeps solve them exactly."""
         cdef context_t* c = &self.x.c
         cdef int32_t[::1] place = np.empty(p.blocks.n_blocks + 1, np.int32) if prepares else None
         cdef int32_t* at = &place[0] if prepares else NULL
-        cdef double[::1] room
+        cdef double[::1] workspace
         cdef int64_t n
         self.view = p.view()
         c.order = &order[0] if order.shape[0] else NULL
         c.split, c.mode, c.rng, c.exact = split, mode, &rng[0], exact
-        n = sweeps_room(&self.x, &self.view, at)
+        n = sweeps_workspace_size(&self.x, &self.view, at)
         if n < 0:
             raise MemoryError("the prepared numbers of blocks do not fit 32-bit places")
-        self.room = room = np.zeros(n + more)
+        self.workspace = workspace = np.zeros(n + more)
         self.keep = p, order, rng, place
-        sweeps_start(&self.x, &self.view, at, &room[0])
+        sweeps_start(&self.x, &self.view, at, &workspace[0])
         if may_pack(&self.x, &self.view):
             c.packing = &self.x.packing
-        return &room[0] + n
+        return &workspace[0] + n
 
     cdef double undone(self) noexcept:
         """Blocks so far that fell back."""
@@ -158,17 +158,17 @@ cdef class Sweeps:
         """`n` sweeps in place, or fewer where `watch` ends them, GIL released: (status, sweeps done, `undone`)."""
         cdef int32_t status, done = 0
         cdef double before = self.undone()
-        cdef double[::1] room
+        cdef double[::1] workspace
         cdef packing_t* x = self.x.c.packing
         if lam.shape[0] == 0:
             if tol > 0.0:
                 return CONVERGED, 0, 0
             return RUNNING, n, 0
-        if x != NULL and x.status == NOT_YET and x.room == NULL and n + (watch.state.total if x.single else 0) >= x.first:
+        if x != NULL and x.status == NOT_YET and x.workspace == NULL and n + (watch.state.total if x.single else 0) >= x.first:
             if self.for_pairs is None or len(self.for_pairs) < room_of(&self.view.p, self.view.r):
                 self.for_pairs = np.empty(room_of(&self.view.p, self.view.r))
-            room = self.for_pairs
-            x.room = &room[0]
+            workspace = self.for_pairs
+            x.workspace = &workspace[0]
         with nogil:
             status = sweeps_step(&self.x, &watch.state, &watch.view, watch.confirm, &lam[0], n, tol, &done)
         return status, done, int(self.undone() - before)
@@ -185,7 +185,7 @@ cdef class Sweeps:
     @property
     def velocity(self):
         """(n + 2, 6) of bodies, then zeros."""
-        return self.room[:self.x.c.n_v + 12].reshape(-1, 6)
+        return self.workspace[:self.x.c.n_v + 12].reshape(-1, 6)
 
     @property
     def pairs(self):

@@ -1,4 +1,4 @@
-"""Where Newton's method over generalised velocities stands: islands of trees, and its arrays in room that the caller has.
+"""Where Newton's method over generalised velocities stands: islands of trees, and its arrays in workspace that the caller has.
 
 Panels that share a column, directly or through others, are an island: its velocities move no row of another.
 """
@@ -45,7 +45,7 @@ cdef inline int32_t find_islands(const blocks_t* p, const generalized_t* g, int3
     """Islands: panels that share no column, directly or through others, in the order of their first panel.
 
     up (n) and label (max(n, n_panels)) are scratch; what is found stands in arrays as `flow_t` has them (iptr and cptr
-    with room for n_panels + 1). most (4): columns of the largest island, of the widest panel, rows x columns of the
+    with workspace for n_panels + 1). most (4): columns of the largest island, of the widest panel, rows x columns of the
     largest panel, and its rows. A panel without columns is an island of its own.
     """
     cdef int32_t b, q, r, i, n = 0, size, nc, rows, end, panels = g.n_panels, at
@@ -149,7 +149,7 @@ cdef inline bint count_few(const flow_t* f, int32_t island, need_t* need) noexce
             added += ADDED * 0.5 * v * nc
             normal += nc * (28.0 + 2.0 * nc + 0.5 * v)
     formed = rows * (values / 6.0 + (rows + rows * rows / 24.0 if f.plain else 3.0 * rows + rows * rows / 6.0))
-    few = f.plain or (f.law != COULOMB and rows <= size)    # `swap` has room for these
+    few = f.plain or (f.law != COULOMB and rows <= size)    # `swap` has workspace for these
     if not few or formed > normal or rows * (rows + size) > 1e9:
         need.work += added
         return False
@@ -166,7 +166,7 @@ cdef inline bint count_few(const flow_t* f, int32_t island, need_t* need) noexce
 
 
 cdef inline ssize_t marks_of(const blocks_t* p, const generalized_t* g, int32_t per) noexcept nogil:
-    """int32 that `settle` needs, with room for `per` entries in a row of L."""
+    """int32 that `settle` needs, with workspace for `per` entries in a row of L."""
     cdef ssize_t n = g.n, panels = g.n_panels
     return (3 * n + (n if n > panels else panels) + 6 * panels + 5 * <ssize_t>p.n_rows + g.pcol[panels] + p.n_blocks + 8
             + pattern_marks(n, g.pcol[panels], per))

@@ -1,10 +1,10 @@
-"""Newton's method over generalised velocities as room, start and step (`core/method.pxd`).
+"""Newton's method over generalised velocities as workspace, start and step (`core/method.pxd`).
 
-The unit of work is a step of one island; 0 judges what is there. `room_t.work` has N of all islands and a factor of each.
+The unit of work is a step of one island; 0 judges what is there. `workspace_t.work` has N of all islands and a factor of each.
 """
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.method cimport MORE, ROOM, SPENT, UNFIT, grant, options_t, room_t, said_t
+from lavender_ext.core.method cimport MORE, NEEDS_WORKSPACE, SPENT, UNFIT, grant, options_t, workspace_t, said_t
 from lavender_ext.core.view cimport view_t
 from lavender_ext.velocity_newton.flow cimport flow_t
 from lavender_ext.velocity_newton.islands cimport aim_at, furnish, marks_of, need_t, numbers_of, settle
@@ -12,13 +12,13 @@ from lavender_ext.velocity_newton.newton cimport descend_all
 from lavender_ext.velocity_newton.sparse cimport per_column
 
 
-cdef struct state_t:            # at the beginning of the room's whole numbers
+cdef struct state_t:            # at the beginning of the workspace's whole numbers
     flow_t f
     need_t need
     int32_t done                # steps
 
 
-cdef inline int32_t general_room(const view_t* v, const options_t* o, room_t* r) noexcept nogil:
+cdef inline int32_t general_workspace_size(const view_t* v, const options_t* o, workspace_t* r) noexcept nogil:
     """Whole numbers for the least fill; the others are known when the fill is."""
     r.n_index = sizeof(state_t) // sizeof(int32_t) + marks_of(&v.p, v.g, per_column(v.g.n) << r.tries)
     r.n_real = 0
@@ -34,15 +34,15 @@ cdef inline bint is_past(const options_t* o, const need_t* need, double entries,
     return entries > o.most or 0.0 < o.work < 0.5 * factored * factored / n
 
 
-cdef inline int32_t general_start(const view_t* v, const options_t* o, room_t* r, const double* lam) noexcept nogil:
+cdef inline int32_t general_start(const view_t* v, const options_t* o, workspace_t* r, const double* lam) noexcept nogil:
     cdef state_t* s = <state_t*>r.index
     cdef need_t* need = &s.need
     cdef int32_t per
-    cdef room_t least = r[0]
+    cdef workspace_t least = r[0]
     while not r.laid:
-        general_room(v, o, &least)
+        general_workspace_size(v, o, &least)
         if not grant(r, least.n_index, 0):
-            return ROOM
+            return NEEDS_WORKSPACE
         per = per_column(v.g.n) << r.tries
         settle(&s.f, &v.p, v.g, per, r.index + sizeof(state_t) // sizeof(int32_t), need)
         r.laid = not need.crowded
@@ -51,7 +51,7 @@ cdef inline int32_t general_start(const view_t* v, const options_t* o, room_t* r
             return UNFIT
         least.tries = r.tries = r.tries + (1 - r.laid)  # L has more entries than that in a row
     if not grant(r, r.n_index, numbers_of(&s.f, need)):
-        return ROOM
+        return NEEDS_WORKSPACE
     furnish(&s.f, need, r.real)
     s.f.wide = o.wide
     aim_at(&s.f, o.tol, 0, o.e0, o.v0)
@@ -59,7 +59,7 @@ cdef inline int32_t general_start(const view_t* v, const options_t* o, room_t* r
     return MORE
 
 
-cdef inline int32_t general_step(const view_t* v, const options_t* o, const room_t* r, int32_t work, double* lam,
+cdef inline int32_t general_step(const view_t* v, const options_t* o, const workspace_t* r, int32_t work, double* lam,
                                  said_t* said) noexcept nogil:
     """All islands, the one that waits first."""
     cdef state_t* s = <state_t*>r.index

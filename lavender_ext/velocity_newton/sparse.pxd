@@ -14,13 +14,13 @@ from lavender_ext.core.view cimport generalized_t
 
 
 cdef enum:
-    PER_COLUMN = 24             # entries in a row of L for which there is room at first,
+    PER_COLUMN = 24             # entries in a row of L for which there is workspace at first,
     MANY = 200                  # of more columns than these: of fewer for all that there may be
     PASSED = 8                  # multiply-adds of a full factor that it costs to pass over a column
 
 
 cdef inline int32_t per_column(int32_t n) noexcept nogil:
-    """Entries in a row of L of n columns for which there is room at first."""
+    """Entries in a row of L of n columns for which there is workspace at first."""
     return PER_COLUMN if n > MANY else (n + 1) // 2
 
 
@@ -31,14 +31,14 @@ cdef inline ssize_t pattern_marks(ssize_t n, ssize_t reached, ssize_t per) noexc
 
 cdef inline int32_t find_pattern(const generalized_t* g, int32_t n_islands, const int32_t* iptr, const int32_t* run,
                                  const int32_t* cptr, const int32_t* local, int32_t per, int32_t* w) noexcept nogil:
-    """Rows of L of all islands, one after the other, columns as in their island: how many entries, -1 without room.
+    """Rows of L of all islands, one after the other, columns as in their island: how many entries, -1 without workspace.
 
     w (`pattern_marks`) begins with the pointers (n + 1) and the columns; the rest is scratch.
     """
-    cdef int32_t n = cptr[n_islands], room = per * g.n, i, a, b, q, k, base, first, end, most, count
+    cdef int32_t n = cptr[n_islands], workspace = per * g.n, i, a, b, q, k, base, first, end, most, count
     cdef int32_t* lptr = w
     cdef int32_t* lidx = w + n + 1
-    cdef int32_t* mptr = lidx + room
+    cdef int32_t* mptr = lidx + workspace
     cdef int32_t* parent = mptr + n + 1
     cdef int32_t* mark = parent + n
     cdef int32_t* sibling = mark + n
@@ -74,7 +74,7 @@ cdef inline int32_t find_pattern(const generalized_t* g, int32_t n_islands, cons
                     midx[count] = base + local[cols[q]]
                     count += 1
                 mark[most] = count
-    count = tree_pattern(n, mptr, midx, room, lptr, lidx, parent, mark, sibling, child)
+    count = tree_pattern(n, mptr, midx, workspace, lptr, lidx, parent, mark, sibling, child)
     if count < 0:
         return -1
     for i in range(1, n_islands):

@@ -88,18 +88,18 @@ class Library:
             setattr(made, key, None if values is None or not values.size else values.ctypes.data)
         return made
 
-    def room(self, problem, options):
+    def workspace(self, problem, options):
         """Bytes that a solver asks for."""
-        room = ct.c_uint64()
-        code = self.c.lav_room(ct.byref(problem), ct.byref(options), ct.byref(room))
+        workspace = ct.c_uint64()
+        code = self.c.lav_workspace_size(ct.byref(problem), ct.byref(options), ct.byref(workspace))
         if code:
             raise Refused(self, code)
-        return room
+        return workspace
 
     def open(self, problem, options, extra=0):
-        room = self.room(problem, options)
+        workspace = self.workspace(problem, options)
         while True:
-            memory = (ct.c_double * ((room.value + extra) // 8 + 2))()
+            memory = (ct.c_double * ((workspace.value + extra) // 8 + 2))()
             solver = ct.c_void_p()
             code = self.c.lav_open(
                 memory, ct.c_uint64(ct.sizeof(memory)), ct.byref(problem), ct.byref(options), ct.byref(solver)
@@ -109,7 +109,7 @@ class Library:
             code = self.c.lav_set(solver, ct.byref(problem))
             if code != -10:
                 break
-            room.value = self.c.lav_needed(solver)
+            workspace.value = self.c.lav_needed(solver)
         if code:
             raise Refused(self, code)
         return Solver(self, solver, memory, problem)

@@ -11,10 +11,10 @@ from lavender_ext.engine.arrays import views
 
 
 def opened(library, image):
-    c, room, at = library.c, ct.c_uint64(), ct.c_void_p()
-    assert c.lav_engine_room(image, ct.c_uint64(len(image)), ct.byref(room)) == 0
-    memory = (ct.c_double * (room.value // 8 + 2))()
-    assert c.lav_engine_open(memory, room, image, ct.c_uint64(len(image)), ct.byref(at)) == 0
+    c, workspace, at = library.c, ct.c_uint64(), ct.c_void_p()
+    assert c.lav_engine_workspace_size(image, ct.c_uint64(len(image)), ct.byref(workspace)) == 0
+    memory = (ct.c_double * (workspace.value // 8 + 2))()
+    assert c.lav_engine_open(memory, workspace, image, ct.c_uint64(len(image)), ct.byref(at)) == 0
     return at, memory
 
 
@@ -55,9 +55,9 @@ def test_steps_and_images_have_the_bits_of_the_package(library, name):
 
 def test_an_image_with_a_changed_bit_is_refused(library):
     image = bytearray(engine_image(lv.Simulation(lv.Scene("stack"))))
-    room = ct.c_uint64()
+    workspace = ct.c_uint64()
     image[len(image) // 2] ^= 4
-    assert library.c.lav_engine_room(bytes(image), ct.c_uint64(len(image)), ct.byref(room)) == -4
-    assert library.c.lav_engine_room(bytes(image), ct.c_uint64(len(image) - 8), ct.byref(room)) == -3
+    assert library.c.lav_engine_workspace_size(bytes(image), ct.c_uint64(len(image)), ct.byref(workspace)) == -4
+    assert library.c.lav_engine_workspace_size(bytes(image), ct.c_uint64(len(image) - 8), ct.byref(workspace)) == -3
     image[0] ^= 1
-    assert library.c.lav_engine_room(bytes(image), ct.c_uint64(len(image)), ct.byref(room)) == -2
+    assert library.c.lav_engine_workspace_size(bytes(image), ct.c_uint64(len(image)), ct.byref(workspace)) == -2

@@ -43,7 +43,7 @@ class Guarded:
 
 def open_solver(library, method="sequential_impulses"):
     problem, options = library.problem(self_test_problem()), library.options(method)
-    solver = Guarded(library, problem, options, library.room(problem, options).value)
+    solver = Guarded(library, problem, options, library.workspace(problem, options).value)
     assert solver.code == 0
     return solver, problem
 
@@ -149,7 +149,7 @@ def test_every_error_has_a_text_of_its_own(library):
 def test_null_and_memory_without_a_solver_have_different_errors(library):
     c, q, o, r = library.c, Problem(), Options(), Result()
     assert c.lav_set(None, ct.byref(q)) == c.lav_run(None, None, None) == c.lav_impulse(None, None, 0) == -1
-    assert c.lav_room(None, None, None) == c.lav_open(None, ct.c_uint64(8), None, None, None) == -1
+    assert c.lav_workspace_size(None, None, None) == c.lav_open(None, ct.c_uint64(8), None, None, None) == -1
     nobody = (ct.c_double * 400)()
     assert c.lav_set(nobody, ct.byref(q)) == -15
     assert c.lav_default_options(99, ct.byref(o)) == c.lav_default_problem(0, ct.byref(q)) == -12
@@ -173,8 +173,8 @@ def test_null_and_memory_without_a_solver_have_different_errors(library):
 )
 def test_too_little_memory_is_an_error_and_nothing_is_written_behind_it(library, method):
     problem, options = library.problem(self_test_problem()), library.options(method)
-    seen, room = set(), library.room(problem, options).value
-    for bytes_ in [*range(0, room, room // 40), room]:
+    seen, workspace = set(), library.workspace(problem, options).value
+    for bytes_ in [*range(0, workspace, workspace // 40), workspace]:
         solver = Guarded(library, problem, options, bytes_)
         if solver.code == 0:
             code = library.c.lav_set(solver.at, ct.byref(problem))
@@ -225,10 +225,10 @@ def test_a_solver_moved_to_the_memory_it_needs_takes_a_larger_problem(library, m
 
 
 def test_newton_rejects_more_bodies_than_its_factor_can_hold(library):
-    problem, options, room = library.problem(stack_of(1501)), library.options("newton"), ct.c_uint64()
+    problem, options, workspace = library.problem(stack_of(1501)), library.options("newton"), ct.c_uint64()
     assert ERRORS[library.c.lav_takes(ct.byref(problem), ct.byref(options))] == "LAV_ERROR_BODIES"
     assert (
-        ERRORS[library.c.lav_room(ct.byref(problem), ct.byref(options), ct.byref(room))] == "LAV_ERROR_BODIES"
+        ERRORS[library.c.lav_workspace_size(ct.byref(problem), ct.byref(options), ct.byref(workspace))] == "LAV_ERROR_BODIES"
     )
 
 
@@ -267,7 +267,7 @@ def test_counting_memory_reads_only_where_the_joints_end(library, form, method):
             setattr(problem, key, ptr.ctypes.data if (form, key) == (2, "block_ptr") else 8)
     problem.n_rows, problem.n_blocks, problem.n_bodies, problem.n_joints = 30, 12, 5, 2
     problem.n_velocities, problem.n_entries, problem.n_mass_entries = 30, 60, 40
-    assert Guarded(library, problem, options, library.room(problem, options).value).code == 0
+    assert Guarded(library, problem, options, library.workspace(problem, options).value).code == 0
 
 
 def stack_of(n):
@@ -307,14 +307,14 @@ def test_no_drawn_problem_makes_the_library_write_outside_its_memory(library, da
                 x[: len(values)] = np.abs(values) if key == "key" else values
             keep.append(x)
             setattr(problem, key, x.ctypes.data)
-    options, room = Options(), ct.c_uint64()
+    options, workspace = Options(), ct.c_uint64()
     library.c.lav_default_options(method, ct.byref(options))
-    code = library.c.lav_room(ct.byref(problem), ct.byref(options), ct.byref(room))
+    code = library.c.lav_workspace_size(ct.byref(problem), ct.byref(options), ct.byref(workspace))
     assert code == 0 or code in ERRORS
     if code:
         return
-    assert room.value < 10_000_000
-    solver = Guarded(library, problem, options, room.value)
+    assert workspace.value < 10_000_000
+    solver = Guarded(library, problem, options, workspace.value)
     assert solver.code == 0
     code = library.c.lav_set(solver.at, ct.byref(problem))
     assert code == 0 or code in ERRORS
@@ -342,11 +342,11 @@ def test_the_verdict_of_the_library_equals_that_of_the_package(library, seed, me
         problem, options = library.problem(source), library.options(method)
         if library.c.lav_takes(ct.byref(problem), ct.byref(options)):
             continue
-        room, code = library.room(problem, options), -10
+        workspace, code = library.workspace(problem, options), -10
         while code == -10:  # what a factor fills is known with the numbers
-            solver = Guarded(library, problem, options, room.value)
+            solver = Guarded(library, problem, options, workspace.value)
             code = library.c.lav_set(solver.at, ct.byref(problem))
-            room.value = library.c.lav_needed(solver.at)
+            workspace.value = library.c.lav_needed(solver.at)
         if code:
             assert (
                 ERRORS[code] == "LAV_ERROR_UNSUPPORTED"

@@ -231,9 +231,9 @@ def test_room_is_what_a_method_takes_where_nothing_is_guessed(library, method):
         problem, options = library.problem(given), library.options(method)
         if given.generalized is not None or library.c.lav_takes(ct.byref(problem), ct.byref(options)):
             continue
-        room, solver = library.room(problem, options).value, library.open(problem, options)
+        workspace, solver = library.workspace(problem, options).value, library.open(problem, options)
         needed = library.c.lav_needed(solver.at)
-        assert needed <= room <= 1.05 * needed + 8192, (given.m, given.n_blocks)
+        assert needed <= workspace <= 1.05 * needed + 8192, (given.m, given.n_blocks)
         looked += 1
     assert looked >= 3
 
@@ -247,7 +247,7 @@ def test_room_of_pivots_counts_the_bodies_that_no_row_moves(library, method, n_b
     )  # fmt: skip
     problem = library.problem(lv.Problem.from_rows(rows, target=2.0, lower=0.0))
     options = library.options(method)
-    assert library.c.lav_needed(library.open(problem, options).at) <= library.room(problem, options).value
+    assert library.c.lav_needed(library.open(problem, options).at) <= library.workspace(problem, options).value
 
 
 def test_impulses_are_carried_by_key(library):

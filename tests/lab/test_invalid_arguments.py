@@ -28,7 +28,7 @@ MOTIONS = lv.find_solutions(LCP, n=1)
 ANY_SEED = {"seed": ("very large",)}
 
 CALLS = {
-    "SolutionSet.__getitem__": Call(MOTIONS.__getitem__, {"i": 0}, {"i": "find_solutions?"}),
+    "SolutionSet.__getitem__": Call(MOTIONS.__getitem__, {"i": 0}, {"i": "motions?"}),
     "SolutionSet.nearest": Call(MOTIONS.nearest, {"impulse": B}, {"impulse": "x"}),
     "SolutionSet.picks": Call(MOTIONS.picks, {"solvers": ["pgs"], "tol": 1e-6, "max_iter": 100}),
     "SolutionSet.select": Call(MOTIONS.select, {"choice": "nearest", "impulse": B}),

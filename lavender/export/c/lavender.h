@@ -57,7 +57,7 @@ enum { /* what functions return; `lav_text` has these words */
   LAV_ERROR_BLOCKS = -7,      /* block_ptr or kind describe no blocks: sizes, kinds, or joints behind contacts */
   LAV_ERROR_INDEX = -8,       /* a column, body or place in the order is out of range, or columns do not ascend */
   LAV_ERROR_MASS = -9,        /* an inverse mass or a compliance is negative, an inertia is no positive semidefinite tensor, or M is not positive definite */
-  LAV_ERROR_ROOM = -10,       /* too little memory: give as many bytes as lav_needed or lav_room says */
+  LAV_ERROR_WORKSPACE = -10,       /* too little memory: give as many bytes as lav_needed or lav_workspace_size says */
   LAV_ERROR_UNSUPPORTED = -11, /* this method of this build does not take this form, law or kind of block: lav_takes asks beforehand */
   LAV_ERROR_OPTION = -12,     /* an option is out of its range */
   LAV_ERROR_BUSY = -13,       /* another thread is in this solver: one at a time */
@@ -67,7 +67,7 @@ enum { /* what functions return; `lav_text` has these words */
   LAV_ERROR_PAIR = -17,       /* a contact or joint of a body with itself, or a contact of the world with the world: leave it out */
   LAV_ERROR_FRAME = -18,      /* normal and tangent of a contact are no orthogonal unit vectors, to 1e-5: divide each by its length */
   LAV_ERROR_BODIES = -19,     /* newton takes 1,500 bodies at most: its factor may be full. Take sweeps or anderson, or solve islands apart */
-  LAV_ERROR_FILE = -20        /* a file cannot be written, by lav_dump alone: is there such a folder, and is there room? */
+  LAV_ERROR_FILE = -20        /* a file cannot be written, by lav_dump alone: is there such a folder, and is there workspace? */
 };
 
 enum { LAV_MATRIX = 1, LAV_BODIES = 2, LAV_VELOCITIES = 3 };      /* form: A; bodies, joints, contacts; J and M */
@@ -212,7 +212,7 @@ LAV_API int32_t lav_takes(const lav_problem *problem, const lav_options *options
 /* Bytes for a solver of problems with at most these counts (a hint: what binds later is memory alone). Arrays may be null; block_ptr alone is read, where there are
  * joints: it tells their rows from those of contacts. What a factor fills and which columns M's trees join is guessed:
  * `lav_set` tells when it is more. */
-LAV_API int32_t lav_room(const lav_problem *problem, const lav_options *options, uint64_t *bytes);
+LAV_API int32_t lav_workspace_size(const lav_problem *problem, const lav_options *options, uint64_t *bytes);
 LAV_API int32_t lav_open(void *memory, uint64_t bytes, const lav_problem *largest, const lav_options *options,
                          lav_solver **out);
 LAV_API uint64_t lav_needed(const lav_solver *solver); /* bytes that the last `lav_set` asked for */
@@ -246,10 +246,10 @@ LAV_API uint64_t lav_hash(const double *x, int32_t n, uint64_t seed);
 
 /* The engine of the package, stepped from a snapshot that it wrote: `lavender.export.engine_image(simulation)`. */
 typedef struct lav_engine lav_engine;
-LAV_API int32_t lav_engine_room(const void *image, uint64_t image_bytes, uint64_t *bytes);
+LAV_API int32_t lav_engine_workspace_size(const void *image, uint64_t image_bytes, uint64_t *bytes);
 LAV_API int32_t lav_engine_open(void *memory, uint64_t bytes, const void *image, uint64_t image_bytes, lav_engine **out);
-/* Whole substeps; the eight solver values of the last one into values (8) where not null. On LAV_ERROR_ROOM the contacts
- * have outgrown the memory: write an image, open it with lav_engine_room's new size, go on. */
+/* Whole substeps; the eight solver values of the last one into values (8) where not null. On LAV_ERROR_WORKSPACE the contacts
+ * have outgrown the memory: write an image, open it with lav_engine_workspace_size's new size, go on. */
 LAV_API int32_t lav_engine_step(lav_engine *engine, int32_t substeps, double *values);
 LAV_API int32_t lav_engine_image(lav_engine *engine, void *out, uint64_t out_bytes, uint64_t *bytes);
 LAV_API int32_t lav_engine_places(const lav_engine *engine, int32_t *n_bodies, double *out, int32_t n); /* (n_bodies, 7) */

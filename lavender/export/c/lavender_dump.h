@@ -130,7 +130,7 @@ static inline int32_t lav_dump(lav_solver *solver, const lav_problem *q, const c
   lav_dump_file d;
   lav_verdict verdict;
   verdict.size = (uint32_t)sizeof verdict;
-  code = b && whole ? lav_judge(solver, b + m, m, b, NULL, &verdict) : LAV_ERROR_ROOM; /* of no impulse: w = -b */
+  code = b && whole ? lav_judge(solver, b + m, m, b, NULL, &verdict) : LAV_ERROR_WORKSPACE; /* of no impulse: w = -b */
   memset(&d, 0, sizeof d);
   if (code == LAV_OK && !(d.file = fopen(path, "wb"))) code = LAV_ERROR_FILE;
   if (code != LAV_OK) {

@@ -39,7 +39,7 @@ int main(void) {
   q.n_blocks = CONTACTS, q.n_rows = 3 * CONTACTS, q.n_bodies = BOXES, q.block_ptr = ptr, q.kind = kind, q.key = key;
   q.mu = mu, q.target = target, q.velocity = v, q.inv_mass = inv_mass, q.inv_inertia = inv_inertia;
   q.contact_body = body, q.normal = normal, q.tangent = tangent, q.arm_a = arm_a, q.arm_b = arm_b;
-  CHECK(lav_room(&q, &options, &bytes));
+  CHECK(lav_workspace_size(&q, &options, &bytes));
   memory = malloc(bytes);
   CHECK(lav_open(memory, bytes, &q, &options, &solver));
   for (step = 0; step < 120; step++) {

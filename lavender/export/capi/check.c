@@ -63,9 +63,9 @@ static void read_problem(lav_problem *q) {
 /* A solver with a problem, in memory of its own that grows as it asks. */
 static int set(const lav_options *options, const lav_problem *q, void **memory, lav_solver **solver) {
   uint64_t bytes;
-  int32_t code = LAV_ERROR_ROOM;
-  CHECK(lav_room(q, options, &bytes));
-  while (code == LAV_ERROR_ROOM) {
+  int32_t code = LAV_ERROR_WORKSPACE;
+  CHECK(lav_workspace_size(q, options, &bytes));
+  while (code == LAV_ERROR_WORKSPACE) {
     free(*memory);
     *memory = malloc(bytes);
     CHECK(lav_open(*memory, bytes, q, options, solver));

@@ -40,7 +40,7 @@ struct lav_solver {
   rows_t r;
   general_t g;
   uint64_t *key;
-  double *impulse, *v_free, *score_room, *compare;
+  double *impulse, *v_free, *score_workspace, *compare;
   double start[3]; /* E0 [sqrt J], V0 [m/s], relative residual of the zero impulse */
   struct core_parts_islands_t islands;
   double *reference; /* E0, V0 of each island */
@@ -73,7 +73,7 @@ typedef struct method_t {
   int32_t forms, rolling, round; /* 1 << form of those it takes: at all, with parts that roll, with round cones */
   int32_t blocks, patience;      /* checks without a gain before it stalls */
   sweep_t sweep;                 /* where it is one after the other */
-  int64_t (*room)(const lav_problem *, const lav_options *, int32_t n_v); /* doubles beside the problem */
+  int64_t (*workspace)(const lav_problem *, const lav_options *, int32_t n_v); /* doubles beside the problem */
   int32_t (*start)(lav_solver *);                                         /* a problem is set */
   void (*step)(lav_solver *, const lav_budget *, lav_result *);           /* on from where it is */
 } method_t;

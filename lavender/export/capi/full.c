@@ -50,7 +50,7 @@ static int32_t read_image(const void *image, uint64_t bytes, int32_t *size, int3
   return hash_bytes(at + sizeof head, bytes - sizeof head, 0) == head.hash ? LAV_OK : LAV_ERROR_NUMBER;
 }
 
-int32_t lav_engine_room(const void *image, uint64_t image_bytes, uint64_t *bytes) {
+int32_t lav_engine_workspace_size(const void *image, uint64_t image_bytes, uint64_t *bytes) {
   int32_t size[10], count[3];
   if (!bytes) return LAV_ERROR_NULL;
   GIVE_BACK(read_image(image, image_bytes, size, count));
@@ -66,7 +66,7 @@ int32_t lav_engine_open(void *memory, uint64_t bytes, const void *image, uint64_
   if (!memory || !out) return LAV_ERROR_NULL;
   GIVE_BACK(read_image(image, image_bytes, size, count));
   skip = (16 - (uintptr_t)memory % 16) % 16;
-  if (bytes < skip + sizeof *e + image_bytes) return LAV_ERROR_ROOM;
+  if (bytes < skip + sizeof *e + image_bytes) return LAV_ERROR_WORKSPACE;
   e = (lav_engine *)(void *)((char *)memory + skip);
   e->magic = IMAGE;
   memcpy(e->size, size, sizeof size);
@@ -91,7 +91,7 @@ int32_t lav_engine_step(lav_engine *engine, int32_t substeps, double *values) {
   if (substeps < 0) return LAV_ERROR_COUNT;
   status = k_engine_substeps(engine->size, engine->real, engine->index, engine->keys, substeps, &done);
   if (values) k_engine_values(engine->size, engine->real, engine->index, engine->keys, values);
-  return status == 0 ? LAV_OK : status == 1 ? LAV_ERROR_ROOM : LAV_ERROR_NUMBER;
+  return status == 0 ? LAV_OK : status == 1 ? LAV_ERROR_WORKSPACE : LAV_ERROR_NUMBER;
 }
 
 int32_t lav_engine_image(lav_engine *engine, void *out, uint64_t out_bytes, uint64_t *bytes) {
@@ -101,12 +101,12 @@ int32_t lav_engine_image(lav_engine *engine, void *out, uint64_t out_bytes, uint
   image_t head;
   if (!e || !bytes) return LAV_ERROR_NULL;
   if ((uintptr_t)e % 8 != 0 || e->magic != IMAGE) return LAV_ERROR_SOLVER;
-  k_engine_more_room(e->size, e->real, e->index, e->keys, size);
+  k_engine_grow_workspace(e->size, e->real, e->index, e->keys, size);
   k_engine_lengths(size, count);
   if (count[0] < 0 || count[1] < 0 || count[2] < 0) return LAV_ERROR_COUNT;
   *bytes = image_bytes_of(count);
   if (!out) return LAV_OK; /* asks how many */
-  if ((uintptr_t)out % 8 != 0 || out_bytes < *bytes) return LAV_ERROR_ROOM;
+  if ((uintptr_t)out % 8 != 0 || out_bytes < *bytes) return LAV_ERROR_WORKSPACE;
   memset(out, 0, (size_t)*bytes);
   at = (unsigned char *)out + sizeof(image_t);
   memcpy(at, size, 40);
@@ -145,7 +145,7 @@ int32_t lav_engine_places(const lav_engine *engine, int32_t *n_bodies, double *o
 
 #else
 int32_t lav_islands(lav_solver *solver, int32_t *label, int32_t n) { return !solver || (!label && n > 0) ? LAV_ERROR_NULL : LAV_ERROR_UNSUPPORTED; }
-int32_t lav_engine_room(const void *image, uint64_t image_bytes, uint64_t *bytes) { return image && image_bytes && bytes ? LAV_ERROR_UNSUPPORTED : LAV_ERROR_NULL; }
+int32_t lav_engine_workspace_size(const void *image, uint64_t image_bytes, uint64_t *bytes) { return image && image_bytes && bytes ? LAV_ERROR_UNSUPPORTED : LAV_ERROR_NULL; }
 int32_t lav_engine_open(void *memory, uint64_t bytes, const void *image, uint64_t image_bytes, lav_engine **out) { return memory && bytes && image && image_bytes && out ? LAV_ERROR_UNSUPPORTED : LAV_ERROR_NULL; }
 int32_t lav_engine_step(lav_engine *engine, int32_t substeps, double *values) { return engine || values || substeps ? LAV_ERROR_UNSUPPORTED : LAV_ERROR_NULL; }
 int32_t lav_engine_image(lav_engine *engine, void *out, uint64_t out_bytes, uint64_t *bytes) { return engine || out || out_bytes || bytes ? LAV_ERROR_UNSUPPORTED : LAV_ERROR_NULL; }
@@ -161,7 +161,7 @@ int32_t lav_self_test(void) {
   static const double side[4][2] = {{-0.5, -0.5}, {0.5, -0.5}, {-0.5, 0.5}, {0.5, 0.5}};
   double inv_mass[TEST_BODIES], inv_inertia[9 * TEST_BODIES], velocity[6 * TEST_BODIES], normal[3 * TEST_CONTACTS],
       tangent[3 * TEST_CONTACTS], arm_a[3 * TEST_CONTACTS], arm_b[3 * TEST_CONTACTS], mu[TEST_CONTACTS],
-      impulse[3 * TEST_CONTACTS], room[5200];
+      impulse[3 * TEST_CONTACTS], workspace[5200];
   int32_t ptr[TEST_CONTACTS + 1], kind[TEST_CONTACTS], body[2 * TEST_CONTACTS], i, c, k;
   lav_problem q;
   lav_options options;
@@ -200,7 +200,7 @@ int32_t lav_self_test(void) {
   result.size = (uint32_t)sizeof result;
   budget.iterations = 40;
   budget.tol = 0.0;
-  GIVE_BACK(lav_open(room, sizeof room, &q, &options, &s));
+  GIVE_BACK(lav_open(workspace, sizeof workspace, &q, &options, &s));
   GIVE_BACK(lav_set(s, &q));
   GIVE_BACK(lav_run(s, &budget, &result));
   GIVE_BACK(lav_impulse(s, impulse, 3 * TEST_CONTACTS));

@@ -21,7 +21,7 @@ static int32_t start_sweeps(lav_solver *s) {
   struct sweep_serial_sweeping_t *x = &s->swept;
   int32_t *place = NULL;
   int64_t numbers, more = 0;
-  double *room;
+  double *workspace;
 #ifndef LAV_SWEEPS_ONLY
   const int32_t rubs = has_tangents(&s->p), is_cone = s->p.law == LAV_CONE && rubs;
   const int32_t memory = o->method == LAV_NNCG ? 0 : o->memory, convex = rubs && !is_cone ? o->convex : 0;
@@ -29,11 +29,11 @@ static int32_t start_sweeps(lav_solver *s) {
   x->c.exact = o->method == LAV_BLOCK_GAUSS_SEIDEL;
   if (x->packing.single) {
     x->c.exact = o->sweep == LAV_BLOCK_SWEEP || (o->sweep == LAV_DEFAULT_SWEEP && is_cone);
-    more = accelerate_accelerated_accelerated_room(s->p.n_rows, s->n_v, memory);
+    more = accelerate_accelerated_accelerated_workspace_size(s->p.n_rows, s->n_v, memory);
   }
   if (x->c.exact || (x->packing.single && convex > 0)) {
     place = TAKE(s, int32_t, s->p.n_blocks);
-    if (s->is_short) return LAV_ERROR_ROOM;
+    if (s->is_short) return LAV_ERROR_WORKSPACE;
   }
 #endif
   x->c.order = o->method == LAV_PGS && s->in_rows ? NULL : s->order;
@@ -42,20 +42,20 @@ static int32_t start_sweeps(lav_solver *s) {
   x->c.rng = &s->rng;
   x->c.omega = o->method == LAV_JACOBI && o->omega == 0.0 ? sweep_serial_safe_damping(&s->p, &s->a, s->watch.e) : o->omega;
   x->step = row_of(o->method)->sweep;
-  numbers = sweep_serial_sweeps_room(x, &s->read, place);
+  numbers = sweep_serial_sweeps_workspace_size(x, &s->read, place);
   if (numbers < 0) return LAV_ERROR_COUNT;
-  room = TAKE(s, double, numbers + more);
-  if (s->is_short) return LAV_ERROR_ROOM;
-  memset(room, 0, (size_t)(numbers + more) * sizeof(double));
-  sweep_serial_sweeps_start(x, &s->read, place, room);
+  workspace = TAKE(s, double, numbers + more);
+  if (s->is_short) return LAV_ERROR_WORKSPACE;
+  memset(workspace, 0, (size_t)(numbers + more) * sizeof(double));
+  sweep_serial_sweeps_start(x, &s->read, place, workspace);
 #ifndef LAV_SWEEPS_ONLY
-  if (x->packing.single) accelerate_accelerated_accelerate(x, &s->fast, memory, convex, o->keeps, room + numbers);
+  if (x->packing.single) accelerate_accelerated_accelerate(x, &s->fast, memory, convex, o->keeps, workspace + numbers);
   if (sweep_serial_may_pack(x, &s->read)) {
     x->c.packing = &x->packing;
-    x->packing.room = TAKE(s, double, sweep_packed_room_of(&s->p, &s->r));
+    x->packing.workspace = TAKE(s, double, sweep_packed_room_of(&s->p, &s->r));
   }
 #endif
-  return s->is_short ? LAV_ERROR_ROOM : LAV_OK;
+  return s->is_short ? LAV_ERROR_WORKSPACE : LAV_OK;
 }
 
 static int32_t is_timed(const lav_budget *budget) { return budget->seconds > 0.0; }
@@ -121,7 +121,7 @@ static int32_t form_matrix(lav_solver *s) {
   if (s->form == LAV_VELOCITIES) return LAV_ERROR_UNSUPPORTED;
   start = TAKE(s, int32_t, s->r.n_bodies + 1);
   blocks = TAKE(s, int32_t, 2 * k + 1);
-  if (s->is_short) return LAV_ERROR_ROOM;
+  if (s->is_short) return LAV_ERROR_WORKSPACE;
   k_body_blocks(&s->p, &s->r, start, blocks, &most);
   if (most >= 2147483647) return LAV_ERROR_COUNT;
   near = TAKE(s, int32_t, 4 * k + 2 + m);
@@ -132,7 +132,7 @@ static int32_t form_matrix(lav_solver *s) {
   s->q.d = TAKE(s, double, m);
   s->q.nu = TAKE(s, double, m);
   s->q.step = TAKE(s, double, m);
-  if (s->is_short) return LAV_ERROR_ROOM;
+  if (s->is_short) return LAV_ERROR_WORKSPACE;
   k_expand_rows(&s->p, &s->r, jac, jac + 12 * m);
   k_assemble(&s->p, &s->r, jac, jac + 12 * m, start, blocks, near, near + 2 * k + 1, near + 4 * k + 2, indptr, index, data);
   s->a.indptr = indptr;
@@ -159,25 +159,25 @@ static int32_t begin_newton(lav_solver *s, double tol, int32_t budget) {
 
 static int32_t start_newton(lav_solver *s) {
   uint64_t from = s->used;
-  int32_t how = core_method_ROOM;
+  int32_t how = core_method_NEEDS_WORKSPACE;
   s->newton_options.method = driver_driver_NEWTON;
   s->newton_options.wide = LAVENDER_HAS_WIDE();
   s->view = s->read;
   s->driven = 0;
   if (s->p.n_rows == 0) return LAV_OK;
-  if (!k_room(&s->view, &s->newton_options, &s->drive)) {
+  if (!k_workspace_size(&s->view, &s->newton_options, &s->drive)) {
     GIVE_BACK(form_matrix(s));
     s->view.r = NULL;
     s->view.a = &s->a;
-    if (!k_room(&s->view, &s->newton_options, &s->drive)) return LAV_ERROR_UNSUPPORTED;
+    if (!k_workspace_size(&s->view, &s->newton_options, &s->drive)) return LAV_ERROR_UNSUPPORTED;
     from = s->used;
   }
-  while (how == core_method_ROOM) {
+  while (how == core_method_NEEDS_WORKSPACE) {
     s->used = from;
     s->drive.index = TAKE(s, int32_t, s->drive.n_index);
     s->drive.real = TAKE(s, double, s->drive.n_real);
-    if (s->is_short) return LAV_ERROR_ROOM;
-    how = s->view.a ? core_method_MORE : begin_newton(s, s->newton_options.tol, s->newton_options.budget); /* as the last run: it tells the room */
+    if (s->is_short) return LAV_ERROR_WORKSPACE;
+    how = s->view.a ? core_method_MORE : begin_newton(s, s->newton_options.tol, s->newton_options.budget); /* as the last run: it tells the workspace */
   }
   s->driven = s->view.a == NULL;
   return LAV_OK;
@@ -186,7 +186,7 @@ static int32_t start_newton(lav_solver *s) {
 /* Of a run that its budget ended: in each island the better of its result, the start and the zero impulse. */
 static void keep_better(lav_solver *s, const double *begin, double tol) {
   struct judge_best_best_t best;
-  judge_best_bind_best(&best, &s->p, s->score_room);
+  judge_best_bind_best(&best, &s->p, s->score_workspace);
   double *zero = s->compare + s->p.n_rows; /* behind `begin` */
   judge_measure_do_nothing(&s->p, zero, s->watch.w);
   see(s, &best, begin, -1.0);
@@ -264,15 +264,15 @@ static void admm_step(void *context, double *lam, int32_t first, int32_t n) {
 }
 
 static int32_t start_admm(lav_solver *s) {
-  const int64_t m = s->p.n_rows, numbers = (int64_t)k_admm_room(s->p.n_rows, s->options.memory);
+  const int64_t m = s->p.n_rows, numbers = (int64_t)k_admm_workspace_size(s->p.n_rows, s->options.memory);
   double *x;
   int32_t bands[2];
   GIVE_BACK(form_matrix(s));
   if (m > 0 && s->a.indptr[m] > 0 && core_csr_scan_entries(&s->a, s->p.d, (int32_t)m, s->marks, bands) > 1e-14)
     return LAV_ERROR_UNSUPPORTED; /* L L^T alone: A is not symmetric */
-  s->table = TAKE(s, double, m * m + factor_dense_cholesky_room(s->p.n_rows));
+  s->table = TAKE(s, double, m * m + factor_dense_cholesky_workspace_size(s->p.n_rows));
   x = TAKE(s, double, numbers);
-  if (s->is_short) return LAV_ERROR_ROOM;
+  if (s->is_short) return LAV_ERROR_WORKSPACE;
   memset(x, 0, (size_t)numbers * sizeof(double));
   k_admm_lay(&s->splitting, &s->p, s->options.memory, FIRST_RHO, RELAXATION, x);
   memset(&s->factor, 0, sizeof s->factor);

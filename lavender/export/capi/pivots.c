@@ -25,7 +25,7 @@ static int32_t start_pivots(lav_solver *s) {
     s->table = TAKE(s, double, pivot_lemke_lemke_real(&s->p));
     whole = TAKE(s, int32_t, pivot_lemke_lemke_index(&s->p));
   }
-  if (s->is_short) return LAV_ERROR_ROOM;
+  if (s->is_short) return LAV_ERROR_WORKSPACE;
   t->e0 = s->start[0];
   t->v0 = s->start[1];
   t->least = 1e-13;

@@ -45,7 +45,7 @@ static void take_blocks(lav_solver *s, const lav_problem *q) {
   s->marks = TAKE(s, int32_t, 4 * ((int64_t)s->kept.most_blocks + k) + m + 2 * n + 4 * nv + 16); /* scratch */
   s->island_marks = TAKE(s, int32_t, 4 * k + 1 + (q->form == LAV_VELOCITIES ? 2 * nv : q->form == LAV_BODIES ? n : m));
   s->reference = TAKE(s, double, 2 * k);
-  s->score_room = TAKE(s, double, judge_watch_watch_room(m, k + 1));
+  s->score_workspace = TAKE(s, double, judge_watch_watch_workspace_size(m, k + 1));
   s->watch.w = TAKE(s, double, m);
   s->watch.e = TAKE(s, double, m);
   s->form = q->form;
@@ -233,20 +233,20 @@ static int32_t factor_mass(lav_solver *s, const lav_problem *q) {
   int32_t *mptr = TAKE(s, int32_t, n + 1), *midx = TAKE(s, int32_t, q->n_mass_entries), *columns = NULL, *lidx, count, i;
   double *mval = TAKE(s, double, q->n_mass_entries), *pivot = (double *)(uintptr_t)s->g.root, *values, *lval;
   const uint64_t from = s->used;
-  int64_t room = (int64_t)q->n_mass_entries + 1;
-  if (s->is_short) return LAV_ERROR_ROOM;
+  int64_t workspace = (int64_t)q->n_mass_entries + 1;
+  if (s->is_short) return LAV_ERROR_WORKSPACE;
   fill_matrix(mptr, midx, mval, q->mass_ptr, q->mass_index, q->mass_value, n, n, q->n_mass_entries, 1);
-  for (;; room = 2 * room < most ? 2 * room : most) {
+  for (;; workspace = 2 * workspace < most ? 2 * workspace : most) {
     s->used = from;
-    columns = TAKE(s, int32_t, room);
-    if (s->is_short) return LAV_ERROR_ROOM;
-    count = core_tree_tree_pattern(n, mptr, midx, (int32_t)room, (int32_t *)(uintptr_t)s->g.lptr, columns,
+    columns = TAKE(s, int32_t, workspace);
+    if (s->is_short) return LAV_ERROR_WORKSPACE;
+    count = core_tree_tree_pattern(n, mptr, midx, (int32_t)workspace, (int32_t *)(uintptr_t)s->g.lptr, columns,
                                           (int32_t *)(uintptr_t)s->g.parent, s->marks, s->marks + n, s->marks + 2 * n);
     if (count >= 0) break;
-    if (room >= most) return LAV_ERROR_MASS;
+    if (workspace >= most) return LAV_ERROR_MASS;
   }
   values = TAKE(s, double, count);
-  if (s->is_short) return LAV_ERROR_ROOM;
+  if (s->is_short) return LAV_ERROR_WORKSPACE;
   if (core_tree_tree_factor(n, mptr, midx, mval, s->g.lptr, columns, values, pivot,
                                    (double *)(uintptr_t)s->g.inv_pivot) >= 0)
     return LAV_ERROR_MASS;
@@ -266,7 +266,7 @@ static int32_t fill_velocities(lav_solver *s, const lav_problem *q) {
   const int32_t n = q->n_velocities, m = q->n_rows, k = q->n_blocks;
   int32_t *columns, *pcol, *pval, *home, n_columns = 0, i, j;
   double *b = (double *)(uintptr_t)s->p.b, values = 0.0;
-  int64_t room = (int64_t)q->n_entries + 64;
+  int64_t workspace = (int64_t)q->n_entries + 64;
   uint64_t from;
   fill_matrix(s->g.jptr, s->g.jidx, s->g.jval, q->index_ptr, q->index, q->value, m, n, q->n_entries, 0);
   GIVE_BACK(factor_mass(s, q));
@@ -278,21 +278,21 @@ static int32_t fill_velocities(lav_solver *s, const lav_problem *q) {
   s->g.pcol = pcol = TAKE(s, int32_t, k + 1);
   s->g.pval = pval = TAKE(s, int32_t, k + 1);
   s->g.home = home = TAKE(s, int32_t, k);
-  for (from = s->used;; room *= 2) {
+  for (from = s->used;; workspace *= 2) {
     s->used = from;
-    s->g.cols = columns = TAKE(s, int32_t, room);
-    if (s->is_short) return LAV_ERROR_ROOM;
+    s->g.cols = columns = TAKE(s, int32_t, workspace);
+    if (s->is_short) return LAV_ERROR_WORKSPACE;
     s->g.n_panels = core_generalized_panel_pattern(&s->g, k, s->p.ptr, s->marks, (int32_t *)(uintptr_t)s->g.prow, pcol, pval,
-                                                   columns, room < 2147483647 ? (int32_t)room : 2147483647, &n_columns,
+                                                   columns, workspace < 2147483647 ? (int32_t)workspace : 2147483647, &n_columns,
                                                    &values);
     if (s->g.n_panels >= 0) break;
-    if (room >= 2147483647) return LAV_ERROR_COUNT;
+    if (workspace >= 2147483647) return LAV_ERROR_COUNT;
   }
   if (values >= 2147483647.0) return LAV_ERROR_COUNT;
   s->used = from;
   s->g.cols = TAKE(s, int32_t, n_columns); /* where it is, no longer than it must be */
   s->g.y = TAKE(s, double, (int64_t)values);
-  if (s->is_short) return LAV_ERROR_ROOM;
+  if (s->is_short) return LAV_ERROR_WORKSPACE;
   for (i = j = 0; i < k; i++) {
     while (s->g.prow[j + 1] <= s->p.ptr[i]) j++;
     home[i] = j;

@@ -27,7 +27,7 @@ static int32_t grow_kept(lav_solver *s, const lav_problem *q) {
   if (s->is_short) {
     s->kept = old;
     s->used = used;
-    return LAV_ERROR_ROOM;
+    return LAV_ERROR_WORKSPACE;
   }
   s->begin = s->used;
   s->kept.n_blocks = old.n_blocks;
@@ -66,9 +66,9 @@ static void carry(lav_solver *s) {
   }
 }
 
-/* -- room: numbers that a method has beside the problem; what depends on arrays is guessed ----------------------------- */
+/* -- workspace: numbers that a method has beside the problem; what depends on arrays is guessed ----------------------------- */
 
-static int64_t sweeps_room(const lav_problem *q, const lav_options *o, int32_t n_v) {
+static int64_t sweeps_workspace_size(const lav_problem *q, const lav_options *o, int32_t n_v) {
   int64_t numbers = n_v + 76;
 #ifndef LAV_SWEEPS_ONLY
   const int32_t fast = is_accelerated(o), packs = q->form == LAV_BODIES && q->n_blocks >= sweep_serial_FEWEST;
@@ -76,7 +76,7 @@ static int64_t sweeps_room(const lav_problem *q, const lav_options *o, int32_t n
   if (!exact && packs)
     numbers += sweep_packed_room_for(q->n_joints, joint_rows(q), q->n_blocks - q->n_joints, contact_rows(q), q->n_bodies);
   if (exact || (fast && o->convex > 0)) numbers += 9 * (int64_t)q->n_rows + 26 * (int64_t)q->n_blocks;
-  if (fast) numbers += accelerate_accelerated_accelerated_room(q->n_rows, n_v, o->method == LAV_NNCG ? 0 : o->memory);
+  if (fast) numbers += accelerate_accelerated_accelerated_workspace_size(q->n_rows, n_v, o->method == LAV_NNCG ? 0 : o->memory);
 #else
   (void)q, (void)o;
 #endif
@@ -84,12 +84,12 @@ static int64_t sweeps_room(const lav_problem *q, const lav_options *o, int32_t n
 }
 
 #ifndef LAV_SWEEPS_ONLY
-static int64_t newton_room(const lav_problem *q, const lav_options *o, int32_t n_v) {
+static int64_t newton_workspace_size(const lav_problem *q, const lav_options *o, int32_t n_v) {
   const int64_t m = q->n_rows, k = q->n_blocks, nv = q->n_velocities;
   const int32_t one = LAV_CONTACT, ends[2] = {0, q->n_rows};
   struct core_view_view_t view;
   struct core_method_options_t newton;
-  struct core_method_room_t room;
+  struct core_method_room_t workspace;
   csr_t none = {NULL, NULL, NULL};
   (void)o, (void)n_v;
   if (q->form == LAV_VELOCITIES) return 60 * m + 18 * k + 2 * nv * (nv < 180 ? nv : 180) + 2048;
@@ -98,26 +98,26 @@ static int64_t newton_room(const lav_problem *q, const lav_options *o, int32_t n
   memset(&newton, 0, sizeof newton);
   view.p.n_blocks = m > 0, view.p.n_rows = q->n_rows, view.p.kind = &one, view.p.ptr = ends, view.a = &none;
   newton.method = driver_driver_NEWTON;
-  k_room(&view, &newton, &room);
-  return room.n_index / 2 + room.n_real + 16;
+  k_workspace_size(&view, &newton, &workspace);
+  return workspace.n_index / 2 + workspace.n_real + 16;
 }
 
 /* A of bodies, which is formed first. */
-static int64_t formed_room(const lav_problem *q) {
+static int64_t formed_workspace_size(const lav_problem *q) {
   return (q->form == LAV_BODIES ? 90 * (int64_t)q->n_rows + 6 * (int64_t)q->n_blocks + q->n_bodies : 0) + 64;
 }
 
-static int64_t pivots_room(const lav_problem *q, const lav_options *o, int32_t n_v) {
+static int64_t pivots_workspace_size(const lav_problem *q, const lav_options *o, int32_t n_v) {
   const int64_t m = q->n_rows, each = q->form == LAV_MATRIX && m > 0 ? q->n_entries / m : 0, band = each > 64 ? each : 64;
   const int64_t table = o->method == LAV_LEMKE ? 4 * m * m + 9 * m : 0; /* two places in the dictionary for each row */
   (void)n_v;
-  return 22 * m + (q->form == LAV_BODIES ? 12 * (int64_t)q->n_bodies : 0) + m * (m < band ? m : band) + table + formed_room(q);
+  return 22 * m + (q->form == LAV_BODIES ? 12 * (int64_t)q->n_bodies : 0) + m * (m < band ? m : band) + table + formed_workspace_size(q);
 }
 
-static int64_t admm_room(const lav_problem *q, const lav_options *o, int32_t n_v) {
+static int64_t admm_workspace_size(const lav_problem *q, const lav_options *o, int32_t n_v) {
   const int64_t m = q->n_rows;
   (void)n_v;
-  return m * m + factor_dense_cholesky_room(q->n_rows) + (int64_t)k_admm_room(q->n_rows, o->memory) + formed_room(q);
+  return m * m + factor_dense_cholesky_workspace_size(q->n_rows) + (int64_t)k_admm_workspace_size(q->n_rows, o->memory) + formed_workspace_size(q);
 }
 #endif
 
@@ -127,20 +127,20 @@ static const method_t *row_of(int32_t method) {
   enum { A = 1 << LAV_MATRIX, B = 1 << LAV_BODIES, V = 1 << LAV_VELOCITIES, ALL = A | B | V };
   static const method_t table[LAV_ADMM + 1] = {
     {0, 0, 0, 0, 0, NULL, NULL, NULL, NULL},
-    /* forms, where parts roll, with round cones; blocks, patience; a sweep; room, start, step */
-    {B, B, 0, COULOMB_ALONE, PATIENCE, sweep_serial_sweep_step, sweeps_room, start_sweeps, run_sweeps},
-    {A | V, A | V, 0, COULOMB_ALONE, PATIENCE, sweep_serial_sweep_step, sweeps_room, start_sweeps, run_sweeps},
-    {A, 0, 0, FREE_ROWS, PATIENCE, sweep_serial_sor_step, sweeps_room, start_sweeps, run_sweeps},
-    {A, 0, 0, FREE_ROWS, PATIENCE, sweep_serial_sor_step, sweeps_room, start_sweeps, run_sweeps},
-    {A, A, 0, COULOMB_ALONE, PATIENCE, sweep_serial_jacobi_step, sweeps_room, start_sweeps, run_sweeps},
+    /* forms, where parts roll, with round cones; blocks, patience; a sweep; workspace, start, step */
+    {B, B, 0, COULOMB_ALONE, PATIENCE, sweep_serial_sweep_step, sweeps_workspace_size, start_sweeps, run_sweeps},
+    {A | V, A | V, 0, COULOMB_ALONE, PATIENCE, sweep_serial_sweep_step, sweeps_workspace_size, start_sweeps, run_sweeps},
+    {A, 0, 0, FREE_ROWS, PATIENCE, sweep_serial_sor_step, sweeps_workspace_size, start_sweeps, run_sweeps},
+    {A, 0, 0, FREE_ROWS, PATIENCE, sweep_serial_sor_step, sweeps_workspace_size, start_sweeps, run_sweeps},
+    {A, A, 0, COULOMB_ALONE, PATIENCE, sweep_serial_jacobi_step, sweeps_workspace_size, start_sweeps, run_sweeps},
 #ifndef LAV_SWEEPS_ONLY
-    {ALL, ALL, A | V, EVERY_LAW, PATIENCE, sweep_serial_sweep_step, sweeps_room, start_sweeps, run_sweeps},
-    {ALL, ALL, 0, EVERY_LAW, LONG_PATIENCE, sweep_serial_sweep_step, sweeps_room, start_sweeps, run_sweeps},
-    {ALL, ALL, A | V, EVERY_LAW, LONG_PATIENCE, sweep_serial_sweep_step, sweeps_room, start_sweeps, run_sweeps},
-    {ALL, V, V, EVERY_LAW, PATIENCE, NULL, newton_room, start_newton, run_newton},
-    {A | B, 0, 0, ROWS_ALONE, PATIENCE, NULL, pivots_room, start_pivots, run_pivots},
-    {A | B, 0, 0, ROWS_ALONE, PATIENCE, NULL, pivots_room, start_pivots, run_pivots},
-    {A | B, A | B, A, EVERY_LAW, SPLIT_PATIENCE, NULL, admm_room, start_admm, run_sweeps},
+    {ALL, ALL, A | V, EVERY_LAW, PATIENCE, sweep_serial_sweep_step, sweeps_workspace_size, start_sweeps, run_sweeps},
+    {ALL, ALL, 0, EVERY_LAW, LONG_PATIENCE, sweep_serial_sweep_step, sweeps_workspace_size, start_sweeps, run_sweeps},
+    {ALL, ALL, A | V, EVERY_LAW, LONG_PATIENCE, sweep_serial_sweep_step, sweeps_workspace_size, start_sweeps, run_sweeps},
+    {ALL, V, V, EVERY_LAW, PATIENCE, NULL, newton_workspace_size, start_newton, run_newton},
+    {A | B, 0, 0, ROWS_ALONE, PATIENCE, NULL, pivots_workspace_size, start_pivots, run_pivots},
+    {A | B, 0, 0, ROWS_ALONE, PATIENCE, NULL, pivots_workspace_size, start_pivots, run_pivots},
+    {A | B, A | B, A, EVERY_LAW, SPLIT_PATIENCE, NULL, admm_workspace_size, start_admm, run_sweeps},
 #endif
   };
   return table + method;
@@ -148,7 +148,7 @@ static const method_t *row_of(int32_t method) {
 
 /* -- the calls -------------------------------------------------------------------------------------------------------- */
 
-int32_t lav_room(const lav_problem *problem, const lav_options *options, uint64_t *bytes) {
+int32_t lav_workspace_size(const lav_problem *problem, const lav_options *options, uint64_t *bytes) {
   lav_solver s; /* of no memory: it only counts */
   int64_t m, k, n, nv, numbers;
   if (!problem || !options || !bytes) return LAV_ERROR_NULL;
@@ -167,7 +167,7 @@ int32_t lav_room(const lav_problem *problem, const lav_options *options, uint64_
     const int64_t filled = (int64_t)problem->n_entries + problem->n_entries / 4 + 256;
     numbers += 2 * nv + 4 * (int64_t)problem->n_mass_entries + 2 * k + problem->n_entries / 4 + (m * nv < filled ? m * nv : filled);
   }
-  numbers += row_of(options->method)->room(problem, options, s.n_v);
+  numbers += row_of(options->method)->workspace(problem, options, s.n_v);
   *bytes = s.used + 8 * (uint64_t)numbers + 4096;
   return LAV_OK;
 }
@@ -183,7 +183,7 @@ int32_t lav_open(void *memory, uint64_t bytes, const lav_problem *largest, const
   memset(&probe, 0, sizeof probe);
   probe.used = sizeof(lav_solver);
   take_kept(&probe, largest);
-  if (bytes < skip + probe.used) return LAV_ERROR_ROOM;
+  if (bytes < skip + probe.used) return LAV_ERROR_WORKSPACE;
   s = (lav_solver *)(void *)((char *)memory + skip);
   memset(s, 0, sizeof *s);
   s->base = (char *)s;
@@ -208,7 +208,7 @@ int32_t lav_move(lav_solver *solver, void *memory, uint64_t bytes, lav_solver **
   const uint64_t skip = (16 - (uintptr_t)memory % 16) % 16;
   GIVE_BACK(enter(s));
   if (!memory || !out) return leave(s, LAV_ERROR_NULL);
-  if (bytes < skip + s->begin) return leave(s, LAV_ERROR_ROOM);
+  if (bytes < skip + s->begin) return leave(s, LAV_ERROR_WORKSPACE);
   keep_impulses(s);
   to = (lav_solver *)(void *)((char *)memory + skip);
   memcpy(to, s, s->begin); /* what is carried lies behind the struct */
@@ -242,7 +242,7 @@ static int32_t set_problem(lav_solver *s, const lav_problem *q) {
   s->is_short = 0;
   take_blocks(s, q);
   take_form(s, q);
-  if (s->is_short) return LAV_ERROR_ROOM;
+  if (s->is_short) return LAV_ERROR_WORKSPACE;
   GIVE_BACK(fill_blocks(s, q));
   if (q->form == LAV_MATRIX) {
     copy_or(s->p.b, q->b, q->n_rows, 0.0);
@@ -281,11 +281,11 @@ int32_t lav_set(lav_solver *solver, const lav_problem *problem) {
   GIVE_BACK(enter(solver));
   if (!problem) return leave(solver, LAV_ERROR_NULL);
   code = set_problem(solver, problem);
-  if (code == LAV_ERROR_ROOM) {
-    if (lav_room(problem, &solver->options, &wanted) != LAV_OK) wanted = 0;
+  if (code == LAV_ERROR_WORKSPACE) {
+    if (lav_workspace_size(problem, &solver->options, &wanted) != LAV_OK) wanted = 0;
     if (solver->used + solver->used / 2 > wanted) wanted = solver->used + solver->used / 2; /* what comes after is not known yet */
   }
-  solver->needed = code == LAV_ERROR_ROOM ? wanted + 32 : solver->peak + 32;
+  solver->needed = code == LAV_ERROR_WORKSPACE ? wanted + 32 : solver->peak + 32;
   return leave(solver, code);
 }
 
@@ -300,7 +300,7 @@ static int32_t run(lav_solver *s, const lav_budget *budget, lav_result *out) {
   out->outcome = LAV_MAX_ITERATIONS;
   out->iterations = out->sweeps = out->restarts = 0;
   s->deadline = is_timed(budget) ? budget->clock(budget->clock_data) + budget->seconds : 0.0;
-  if (!s->begun) judge_watch_begin_watch(&s->watch, &s->p, s->start[0], s->start[1], row->patience, s->score_room);
+  if (!s->begun) judge_watch_begin_watch(&s->watch, &s->p, s->start[0], s->start[1], row->patience, s->score_workspace);
   s->begun = 1;
   if (s->p.n_rows == 0) {
     if (budget->tol > 0.0) out->outcome = LAV_CONVERGED;

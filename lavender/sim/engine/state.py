@@ -66,7 +66,7 @@ class State:
         used = lengths(self.size)
         if min(used) < 0 or 8 * used[0] + 4 * used[1] + 8 * used[2] > MOST_BYTES:
             raise InputError(
-                f"{self.size[SIZE['bodies']]} bodies with room for {self.size[CAP_PAIR]} pairs and "
+                f"{self.size[SIZE['bodies']]} bodies with memory for {self.size[CAP_PAIR]} pairs and "
                 f"{self.size[CAP_CONTACT]} contacts need more than the {MOST_BYTES >> 30} GiB that a simulation "
                 "may take: move the bodies apart or take fewer"
             )
@@ -126,14 +126,14 @@ class State:
         self.keys[:] = other.keys
 
     def grown(self) -> State:
-        """A copy with room for what the last substep found missing."""
+        """Return a copy with the memory that the last substep lacked."""
         if self.head[HEAD["need_pairs"]] == TOO_MANY:
             raise InputError(
                 f"more than {MOST_PAIRS} pairs of bodies are close together ({self.size[SIZE['bodies']]} bodies): "
                 "move them apart"
             )
         own = (self.size, self.real, self.index, self.keys)
-        other = State(memory.more_room(*own))
+        other = State(memory.grow_workspace(*own))
         memory.move(*own, other.size, other.real, other.index, other.keys)
         return other
 

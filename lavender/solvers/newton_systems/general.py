@@ -26,7 +26,7 @@ TIME_SHARE = 0.5
 LOOKED_UP = 20.0
 FLOP = 1e-10  # s for each multiply-add of a dense factor
 CLOSEST = 1e-2  # of tol, up to which the kernel is asked again where the judge does not find what it found
-ROOM = 9e6  # values of one island's N: 3,000 velocities dense, 144 MB with its factor
+MAX_MATRIX_ENTRIES = 9e6  # values of one island's N: 3,000 velocities dense, 144 MB with its factor
 _STATUS = {
     OUTCOMES["reached"]: Status.CONVERGED,
     OUTCOMES["more"]: Status.MAX_ITERATIONS,
@@ -41,7 +41,7 @@ _WORDS = ("factorisations", "Coulomb rounds", "line evaluations")
 def prepare(problem: Problem, work: float = inf) -> Driver | None:
     """Islands and room for them; None where N of one is too large to be kept, or seen to need more multiply-adds."""
     reference(problem)
-    kernel = Driver(problem.metric, ROOM, work)
+    kernel = Driver(problem.metric, MAX_MATRIX_ENTRIES, work)
     return kernel if kernel.fits else None
 
 

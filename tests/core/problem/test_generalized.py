@@ -354,12 +354,12 @@ def test_room_for_a_pattern_grows():
 
 
 def test_an_island_too_large_for_a_dense_matrix_goes_over_the_rows(monkeypatch):
-    monkeypatch.setattr(general, "ROOM", 30.0)  # five velocities, dense
+    monkeypatch.setattr(general, "MAX_MATRIX_ENTRIES", 30.0)  # five velocities, dense
     problem = random_general(6, "cone")
     solver, impulse = Newton(), problem.start().copy()  # behind the small call, which has room of its own
     claim = solver.run(solver.prepare(problem), impulse, 100, 1e-8)
     assert claim.form == "impulse" and lv.residual(problem, impulse).relative <= 1e-8
-    with pytest.raises(lv.CapabilityError, match="room for a matrix of"):
+    with pytest.raises(lv.CapabilityError, match="accepts a matrix of"):
         lv.solve(random_general(6, "cone"), "newton", form="velocity")
     small = lv.Problem.from_jacobian([[1.0]], [[2.0]], [-1.0], cones=lv.Cones.contacts(0.0, 0))
     assert [s.success for s in lv.solve_many([random_general(6, "cone"), small])] == [True, True]

@@ -28,7 +28,7 @@ static int64_t whole(void) {
   return x;
 }
 
-static void *room(uint64_t bytes) {
+static void *workspace(uint64_t bytes) {
   void *at = calloc((size_t)bytes / 8 + 2, 8);
   if (!at) fail("no memory");
   return at;
@@ -36,7 +36,7 @@ static void *room(uint64_t bytes) {
 
 static void *array(uint64_t *bytes) {
   const uint64_t n = (uint64_t)whole(), padded = (n + 7) / 8 * 8;
-  void *at = room(n);
+  void *at = workspace(n);
   if (padded > 0 && fread(at, (size_t)padded, 1, file) != 1) fail("the data file ends early");
   *bytes = n;
   return at;
@@ -45,9 +45,9 @@ static void *array(uint64_t *bytes) {
 static lav_engine *opened(void *memory[1], const void *image, uint64_t bytes) {
   lav_engine *engine;
   uint64_t needed;
-  check(lav_engine_room(image, bytes, &needed));
+  check(lav_engine_workspace_size(image, bytes, &needed));
   free(memory[0]);
-  memory[0] = room(needed);
+  memory[0] = workspace(needed);
   check(lav_engine_open(memory[0], needed, image, bytes, &engine));
   return engine;
 }
@@ -55,11 +55,11 @@ static lav_engine *opened(void *memory[1], const void *image, uint64_t bytes) {
 /* One substep; where its contacts outgrow the memory, in a larger one. */
 static lav_engine *step(lav_engine *engine, void *memory[1], double *values) {
   int32_t code;
-  while ((code = lav_engine_step(engine, 1, values)) == LAV_ERROR_ROOM) {
+  while ((code = lav_engine_step(engine, 1, values)) == LAV_ERROR_WORKSPACE) {
     uint64_t bytes;
     void *image;
     check(lav_engine_image(engine, NULL, 0, &bytes));
-    image = room(bytes);
+    image = workspace(bytes);
     check(lav_engine_image(engine, image, bytes, &bytes));
     engine = opened(memory, image, bytes);
     free(image);
@@ -84,7 +84,7 @@ static void scene(void) {
     free(image);
     check(lav_engine_places(engine, &bodies, NULL, 0));
     n = 8 + 7 * bodies; /* numbers of a step */
-    own = (double *)room(8 * (uint64_t)n);
+    own = (double *)workspace(8 * (uint64_t)n);
     for (; (uint64_t)((char *)at - (char *)made) < end; at += n) {
       for (k = 0; k < substeps; k++) engine = step(engine, memory, own);
       check(lav_engine_places(engine, &bodies, own + 8, n - 8));

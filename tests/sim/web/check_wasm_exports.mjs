@@ -70,7 +70,7 @@ function checkModule() {
   const functions = exports.filter((e) => e.kind === "function").map((e) => e.name);
   for (const name of [
     "lav_engine_substeps", "lav_engine_prepare", "lav_engine_solve", "lav_engine_solve_watched", "lav_engine_finish",
-    "lav_engine_lengths", "lav_engine_offsets", "lav_engine_more_room", "lav_engine_move",
+    "lav_engine_lengths", "lav_engine_offsets", "lav_engine_grow_workspace", "lav_engine_move",
   ]) {
     assert.ok(functions.includes(name), `no function ${name}`);
   }

@@ -74,7 +74,7 @@ export class Newton {
     }
     this.said = this.k.alloc(32);
     this.trace = this.k.alloc(24 * MOST_TRACED);
-    this.room = [0, 0];
+    this.workspace = [0, 0];
     this.places = [0, 0];
   }
 
@@ -83,9 +83,9 @@ export class Newton {
     if (n < 0) {
       throw new Error("the substep needs more than 2^31 numbers of scratch");
     }
-    if (n > this.room[which]) {
-      this.room[which] = Math.ceil(1.25 * n) + 64;
-      this.places[which] = this.k.alloc((which === 0 ? 4 : 8) * this.room[which]);
+    if (n > this.workspace[which]) {
+      this.workspace[which] = Math.ceil(1.25 * n) + 64;
+      this.places[which] = this.k.alloc((which === 0 ? 4 : 8) * this.workspace[which]);
     }
     return this.places[which];
   }
@@ -93,7 +93,7 @@ export class Newton {
   // { met, sweeps, steps, relative, at, energy, normal }: whether the residual is within tol, the work, the relative
   // residual; and of each score on the way the work so far, E [sqrt J] and max |e_n| [N s].
   solve(buffers, tol) {
-    const whole = this.#scratch(0, this.f.lav_newton_index_room(...buffers, 1));
+    const whole = this.#scratch(0, this.f.lav_newton_index_workspace_size(...buffers, 1));
     const real = this.#scratch(1, this.f.lav_newton_plan(...buffers, 1, whole));
     const how = this.f.lav_newton_substep(...buffers, tol, 1, whole, real, this.trace, this.said);
     const [sweeps, steps, relative, n] = this.k.f64(this.said, 4);
@@ -222,9 +222,9 @@ export class Simulation {
 
   #grow() {
     const old = this.buffers;
-    const room = this.k.alloc(4 * SIZES);
-    this.k.functions.lav_engine_more_room(...old, room);
-    this.#allocate(Array.from(this.k.i32(room, SIZES)));
+    const workspace = this.k.alloc(4 * SIZES);
+    this.k.functions.lav_engine_grow_workspace(...old, workspace);
+    this.#allocate(Array.from(this.k.i32(workspace, SIZES)));
     this.k.functions.lav_engine_move(...old, ...this.buffers);
   }
 

@@ -1,12 +1,12 @@
-"""Room that grows, for one small problem after the other: fresh pages for each cost more than what is done in them."""
+"""Workspace that grows, for one small problem after the other: fresh pages for each cost more than what is done in them."""
 from libc.stdint cimport int32_t, int64_t
 from libc.stdlib cimport free, malloc
 
-from lavender_ext.core.method cimport room_t
+from lavender_ext.core.method cimport workspace_t
 
 
-cdef inline bint has_room(room_t* r, int64_t n_index, int64_t n_real) noexcept nogil:
-    """Is there room for so many, made where there was none? What grows is empty."""
+cdef inline bint has_workspace_size(workspace_t* r, int64_t n_index, int64_t n_real) noexcept nogil:
+    """Is there workspace for so many, made where there was none? What grows is empty."""
     if n_index > r.n_index:
         free(r.index)
         r.index = <int32_t*>malloc(2 * n_index * sizeof(int32_t))
@@ -18,6 +18,6 @@ cdef inline bint has_room(room_t* r, int64_t n_index, int64_t n_real) noexcept n
     return n_index <= r.n_index and n_real <= r.n_real
 
 
-cdef inline void leave(room_t* r) noexcept nogil:
+cdef inline void leave(workspace_t* r) noexcept nogil:
     free(r.index)
     free(r.real)
