@@ -166,7 +166,7 @@ class Newton(Solver):
             return NewtonState(problem, None, kernel)
         if bodies is None and over_velocities and self.form == "velocity":
             raise CapabilityError(
-                f"form='velocity' accepts a matrix of {general.MAX_MATRIX_ENTRIES:.1e} values over the velocities of an "
+                f"form='velocity' accepts a matrix of {general.MAX_MATRIX_ENTRIES:.1e} values over the velocities of "
                 "island (dense or with the factor's own fill); this problem has a larger one: use form='impulse' "
                 "or sweeps"
             )

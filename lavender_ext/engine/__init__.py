@@ -1,1 +1,1 @@
-"""LavenderSim's substep: its arrays, broad and narrow phase, contacts, joints, projection, integration; Newton."""
+"""LavenderSim's substep: arrays, collision detection, contact and joint rows, solves, position projection, integration."""

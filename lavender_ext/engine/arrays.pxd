@@ -1,31 +1,31 @@
 """The flat arrays of LavenderSim: three buffers, one layout.
 
-Everything the engine knows lies in a buffer of doubles, one of int32 and one of uint64, allocated by the
-caller. `bind` lays the arrays out one after the other, so that a host (Python, WebAssembly) needs the
+The complete engine state is stored in one buffer of doubles, one of int32 and one of uint64, allocated by
+the caller. `bind` places the arrays one after the other, so that a host (Python, WebAssembly) needs only the
 sizes and three pointers, and a snapshot is a copy of three buffers. An array that the scene does not
 need has length 0: no frames for spheres, no tangents without friction, no joint rows without joints.
 
-Bodies stand in the order of the scene, static ones among them; the velocity solve sees the dynamic ones
-only, by their number `dyn` (-1 = static), as core/rows.pxd asks.
+Bodies are in the order of the scene, static ones included. The velocity solve uses the dynamic bodies
+only, by their index `dyn` (-1 = static), as core/rows.pxd requires.
 """
 from libc.stdint cimport int32_t, int64_t, uint64_t
 
 
-# size[]: what `bind` needs to know
+# size[]: the array sizes that `bind` needs
 cpdef enum:
     N_BODY = 0
     N_DYNAMIC = 1
     N_JOINT = 2
     N_JOINT_ROW = 3
     N_EXCLUDED = 4
-    N_BUCKET = 5            # buckets of the hash grid, a power of two; 0: all pairs are tested
-    N_FRAME = 6             # rotation matrices: n_bodies where boxes, joints or uneven inertia are, else 0
+    N_BUCKET = 5            # buckets of the hash grid, a power of two; 0: every pair is tested
+    N_FRAME = 6             # rotation matrices: n_bodies if the scene has boxes, joints or anisotropic inertia, else 0
     ROWS_PER_CONTACT = 7    # 1 without friction, 3 with, 4 with patch friction, 2 more with rolling friction
     CAP_PAIR = 8
     CAP_CONTACT = 9
     N_SIZES = 10
 
-# head[]: integers that change
+# head[]: integer state and settings
 cpdef enum:
     H_CONTACTS = 0
     H_CONTACT_ROWS = 1
@@ -38,19 +38,19 @@ cpdef enum:
     H_POSITION_ITERATIONS = 8
     H_ORDER = 9
     H_SEED = 10
-    H_STEP = 11             # substeps done, wraps
+    H_STEP = 11             # completed substeps; wraps around to 0
     H_NEED_PAIRS = 12
     H_NEED_CONTACTS = 13
     H_REBUILDS = 14
     H_PROJECTED = 15        # position sweeps done in the last substep
-    H_LOST = 16             # first body whose state is not finite, or -1
+    H_LOST = 16             # first body with a state that is not finite, or -1
     H_SOLVED = 17           # 1: the arrays hold the last substep's problem and its impulses
-    H_STEPPER = 18          # what happens between collision and integration, see below
-    H_RELAXING = 19         # sweeps without bias after the others, of SOFT_STEP
-    H_FRICTION_SHAPE = 20   # 1: each tangent is bounded by itself, as a box
+    H_STEPPER = 18          # method between collision detection and integration, see below
+    H_RELAXING = 19         # relaxing sweeps of SOFT_STEP: without bias, after the biased ones
+    H_FRICTION_SHAPE = 20   # 1: each tangent is bounded separately (box friction)
     N_HEAD = 24
 
-# H_ORDER: how the blocks of a sweep are ordered, joints and contacts each among themselves
+# H_ORDER: sweep order of the blocks; joints and contacts are ordered separately
 cpdef enum:
     AS_GIVEN = 0
     REVERSED = 1
@@ -59,7 +59,7 @@ cpdef enum:
     BOTTOM_UP = 4
     TOP_DOWN = 5
     COLORED = 6
-    ALTERNATING = 7         # as given, and contacts are made from the last pair to the first in odd substeps
+    ALTERNATING = 7         # as given; in odd substeps contacts are built from the last pair to the first
 
 # H_STEPPER
 cpdef enum:
@@ -68,27 +68,27 @@ cpdef enum:
     XPBD = 2                # position corrections, velocities from positions: engine/xpbd.pxd
     AVBD = 3                # block descent over bodies, augmented Lagrangian: engine/avbd.pxd
 
-# setting[]: real numbers; those from S_OUT on are written by the engine
+# setting[]: real settings; the engine writes the entries from S_OUT to S_JOINT_ERROR
 cpdef enum:
     S_H = 0                 # s, substep
     S_GRAVITY = 1           # m/s^2, three
     S_SLOP = 4              # m
-    S_MARGIN = 5            # m, contacts are made below this gap
-    S_SKIN = 6              # m, by which the boxes of the pair list are larger
-    S_BETA = 7              # -, share of the position error removed per substep
-    S_MAX_PUSH = 8          # m, largest error corrected per substep
-    S_BOUNCE = 9            # m/s, closing speed below which restitution is 0
-    S_MATCH = 10            # m, a cached contact further away than this is stale
-    S_PUSH = 11             # m/s, largest speed at which SOFT_STEP pushes bodies apart
-    S_OUT = 12              # the eight solver values
+    S_MARGIN = 5            # m, a contact is built if its gap is below this
+    S_SKIN = 6              # m, additional size of the bounding boxes of the pair list
+    S_BETA = 7              # -, fraction of the position error removed per substep
+    S_MAX_PUSH = 8          # m, largest position error corrected per substep
+    S_BOUNCE = 9            # m/s, restitution is 0 at closing speeds below this
+    S_MATCH = 10            # m, a cached contact farther away than this is not reused
+    S_PUSH = 11             # m/s, maximum separation speed of penetrating bodies under SOFT_STEP
+    S_OUT = 12              # eight solver statistics, see engine/substep.pyx
     S_DEPTH = 20            # m, deepest penetration
     S_JOINT_ERROR = 21      # m or rad, largest joint error
-    S_HERTZ = 22            # 1/s, of the contacts of SOFT_STEP; stabilisation [-] of AVBD
-    S_RATIO = 23            # -, their damping ratio
+    S_HERTZ = 22            # 1/s, contact frequency of SOFT_STEP; stabilisation alpha [-] of AVBD
+    S_RATIO = 23            # -, damping ratio of SOFT_STEP; stiffness growth beta of AVBD
     S_ROLLING = 24          # m, mu_r of every contact with friction
     N_SETTINGS = 25
 
-# the pair list: what stops the broad phase, and what it then says is needed, which no capacity meets
+# The broad phase stops if more than MOST_PAIRS boxes overlap; it then reports TOO_MANY as the needed capacity.
 cpdef enum:
     MOST_PAIRS = 16777216
     TOO_MANY = 2147483647
@@ -96,8 +96,8 @@ cpdef enum:
 # status of a substep
 cpdef enum:
     OK = 0
-    NEED_ROOM = 1           # H_NEED_PAIRS, H_NEED_CONTACTS say how much; no state has changed
-    NOT_FINITE = 2          # H_LOST names the body
+    NEED_ROOM = 1           # H_NEED_PAIRS and H_NEED_CONTACTS hold the needed capacities; the state is unchanged
+    NOT_FINITE = 2          # H_LOST holds the body
 
 # shapes
 cpdef enum:
@@ -122,8 +122,8 @@ cpdef enum:
     J_LENGTH = 15           # m
     J_HERTZ = 16            # 1/s, 0 = rigid
     J_DAMPING = 17          # -, damping ratio
-    J_SPEED = 18            # rad/s, of b against a
-    J_TORQUE = 19           # N m, largest of the motor
+    J_SPEED = 18            # rad/s, motor speed of b relative to a
+    J_TORQUE = 19           # N m, maximum motor torque
     N_JOINT_REAL = 20
 
 # arrays in each buffer
@@ -132,14 +132,14 @@ cdef enum:
     N_INDEX_ARRAYS = 22
     N_KEY_ARRAYS = 3
 
-# how a cached contact stores its impulse: normal, friction as a world vector, spin
+# entries of a cached contact impulse: normal, friction as a world vector (3), spin
 cpdef enum:
     N_CACHE_IMPULSE = 5
 
 
 cdef struct engine_t:
     const int32_t* size
-    # the buffer of doubles, in its order: `lav_engine_offsets` walks over the fields
+    # The buffer of doubles, in order: `lav_engine_offsets` iterates over these fields.
     double* setting         # (N_SETTINGS)
     double* x               # (n, 3) m
     double* q               # (n, 4) unit quaternion w, x, y, z
@@ -152,7 +152,7 @@ cdef struct engine_t:
     double* restitution     # (n) -
     double* patch           # (n) m
     double* rot             # (N_FRAME, 9) body to world
-    double* fat             # (n, 6) m, box of the pair list: low, high
+    double* fat             # (n, 6) m, enlarged bounding box of the pair list: lower, upper corner
     double* joint           # (kj, N_JOINT_REAL)
     double* joint_error     # (mj) m or rad
     double* jac             # (mj, 12)
@@ -162,7 +162,7 @@ cdef struct engine_t:
     double* inv_inertia     # (nd, 9) 1/(kg m^2), world
     double* v_free          # (nd, 6) m/s, rad/s
     double* dv              # (nd, 6) m/s, rad/s
-    double* shift           # (nd, 6) m, rad: the position projection
+    double* shift           # (nd, 6) m, rad: displacement of the position projection
     double* point           # (c, 3) m
     double* gap             # (c) m, negative = penetration
     double* normal          # (c, 3)
@@ -176,7 +176,7 @@ cdef struct engine_t:
     double* cache_local     # (c, 6) m
     double* push            # (c + mj) N s / s: multipliers of the position projection
     double* target          # (m) m/s
-    double* lower           # (mj) N s, of the joint rows
+    double* lower           # (mj) N s, joint rows only
     double* upper           # (mj) N s
     double* b               # (m) m/s
     double* d               # (m) 1/kg
@@ -187,16 +187,16 @@ cdef struct engine_t:
     double* patch_radius    # (kj + c) m
     double* rolling         # (kj + c) m, absent without rolling friction
     double* cache_roll      # (c, 3) N m s, world; absent without rolling friction
-    # the buffer of int32, in its order: `lav_engine_offsets` walks over the fields
+    # The buffer of int32, in order: `lav_engine_offsets` iterates over these fields.
     int32_t* head           # (N_HEAD)
     int32_t* kind_of_shape  # (n)
-    int32_t* dyn            # (n) number among the dynamic bodies, -1 = static
-    int32_t* uneven         # (n) 1 where the inertia has a direction
-    int32_t* body_of        # (nd) body of a dynamic number
+    int32_t* dyn            # (n) index among the dynamic bodies, -1 = static
+    int32_t* uneven         # (n) 1 if the inertia is anisotropic
+    int32_t* body_of        # (nd) body index of each dynamic body
     int32_t* joint_kind     # (kj)
     int32_t* joint_motor    # (kj) 0 or 1
     int32_t* joint_bodies   # (kj, 2) bodies, -1 = the world
-    int32_t* excluded       # (N_EXCLUDED, 2) pairs that never collide, sorted
+    int32_t* excluded       # (N_EXCLUDED, 2) body pairs that never collide, sorted
     int32_t* pair           # (CAP_PAIR, 2) bodies a < b, sorted
     int32_t* pair_scratch   # (CAP_PAIR, 2)
     int32_t* count          # (n + 1)
@@ -204,25 +204,27 @@ cdef struct engine_t:
     int32_t* chain          # (n) next body of the chain
     int32_t* cell           # (n, 4) cell and level
     int32_t* contact_pair   # (c, 2) bodies
-    int32_t* joint_body     # (kj, 2) dynamic numbers, -1 = static; contact_body follows
-    int32_t* contact_body   # (c, 2) dynamic numbers; right after joint_body, so that all blocks follow
+    int32_t* joint_body     # (kj, 2) dynamic indices, -1 = static; contact_body follows
+    int32_t* contact_body   # (c, 2) dynamic indices; directly after joint_body, so that joint_body covers all blocks
     int32_t* ptr            # (kj + c + 1)
     int32_t* kind           # (kj + c)
     int32_t* order          # (kj + c) sweep order of the blocks
-    int32_t* order_scratch  # (2 (n + kj + c) + 8): level of each body, of each block, places
-    # the buffer of uint64, in its order: `lav_engine_offsets` walks over the fields
+    int32_t* order_scratch  # (2 (n + kj + c) + 8): level of each body, level of each block, sorting scratch
+    # The buffer of uint64, in order: `lav_engine_offsets` iterates over these fields.
     uint64_t* key           # (c)
     uint64_t* cache_key     # (c)
     uint64_t* color_scratch  # (nd)
 
 
 cdef inline double* reals(double* base, int64_t* at, int64_t count) noexcept nogil:
+    """Return the next `count` doubles of the buffer and advance the offset `at`."""
     cdef double* p = base + at[0]
     at[0] += count
     return p
 
 
 cdef inline int32_t* ints(int32_t* base, int64_t* at, int64_t count) noexcept nogil:
+    """Return the next `count` int32 of the buffer and advance the offset `at`."""
     cdef int32_t* p = base + at[0]
     at[0] += count
     return p
@@ -230,12 +232,12 @@ cdef inline int32_t* ints(int32_t* base, int64_t* at, int64_t count) noexcept no
 
 cdef inline void bind(const int32_t* size, double* real, int32_t* index, uint64_t* keys, engine_t* e,
                       int64_t* used) noexcept nogil:
-    """Point every array of `e` into the three buffers; used (3): entries that the buffers must hold."""
+    """Point every array of `e` into the three buffers; `used` (3) receives the number of entries of each buffer."""
     cdef int64_t n = size[N_BODY], nd = size[N_DYNAMIC], kj = size[N_JOINT], mj = size[N_JOINT_ROW]
     cdef int64_t c = size[CAP_CONTACT], p = size[CAP_PAIR], k = kj + c, m = mj + c * size[ROWS_PER_CONTACT]
     cdef int64_t frames = size[N_FRAME], nt = c if size[ROWS_PER_CONTACT] > 1 else 0
     cdef int64_t rolls = 1 if size[ROWS_PER_CONTACT] > 4 else 0
-    cdef int64_t grid = n if size[N_BUCKET] > 0 else 0, apart = size[N_EXCLUDED]
+    cdef int64_t grid = n if size[N_BUCKET] > 0 else 0, n_excluded = size[N_EXCLUDED]
     cdef int64_t i = 0, j = 0
     e.size = size
     e.setting = reals(real, &i, N_SETTINGS)
@@ -293,7 +295,7 @@ cdef inline void bind(const int32_t* size, double* real, int32_t* index, uint64_
     e.joint_kind = ints(index, &j, kj)
     e.joint_motor = ints(index, &j, kj)
     e.joint_bodies = ints(index, &j, 2 * kj)
-    e.excluded = ints(index, &j, 2 * apart)
+    e.excluded = ints(index, &j, 2 * n_excluded)
     e.pair = ints(index, &j, 2 * p)
     e.pair_scratch = ints(index, &j, 2 * p)
     e.count = ints(index, &j, n + 1)

@@ -1,4 +1,4 @@
-"""The engine's arrays by name: where they lie in the three buffers, their shapes, and the numbers of engine/arrays.pxd."""
+"""The engine's arrays by name: their offsets in the three buffers, their shapes, and the constants of engine/arrays.pxd."""
 from libc.stdint cimport int32_t, int64_t, uint64_t
 
 import numpy as np
@@ -8,7 +8,7 @@ from lavender_ext.engine.arrays cimport (N_CACHE_IMPULSE, N_INDEX_ARRAYS, N_JOIN
 
 
 cdef public void lav_engine_lengths(const int32_t* size, int32_t* used) noexcept nogil:
-    """Entries (3) of the buffers of doubles, int32 and uint64 for these sizes; -1 where beyond 2^31."""
+    """Compute the lengths (3) of the buffers of doubles, int32 and uint64 for these sizes; -1 if a length exceeds int32."""
     cdef engine_t e
     cdef int64_t n[3]
     cdef double real = 0.0
@@ -21,7 +21,7 @@ cdef public void lav_engine_lengths(const int32_t* size, int32_t* used) noexcept
 
 cdef public void lav_engine_offsets(const int32_t* size, double* real, int32_t* index, uint64_t* keys,
                                     int32_t* out) noexcept nogil:
-    """First entry of each array in its buffer; see SHAPES. The buffers are not read."""
+    """Compute the offset of each array in its buffer, in the order of SHAPES. The buffers are not read."""
     cdef engine_t e
     cdef int64_t n[3]
     cdef int32_t k
@@ -37,7 +37,7 @@ cdef public void lav_engine_offsets(const int32_t* size, double* real, int32_t* 
         out[N_REAL_ARRAYS + N_INDEX_ARRAYS + k] = <int32_t>(wide[k] - keys)
 
 
-#: Arrays by buffer, in the order of `bind`: the shape of one of their entries, or None for scratch of a substep.
+#: Arrays of each buffer, in the order of `bind`: the shape of one entry, or None for scratch arrays of a substep.
 SHAPES = {
     "real": {
         "setting": (), "x": (3,), "q": (4,), "v": (6,), "inv_mass_body": (), "inertia": (3, 3), "inv_inertia_body": (3, 3),
@@ -59,14 +59,14 @@ SHAPES = {
 
 
 def lengths(const int32_t[::1] size):
-    """Entries of the three buffers (doubles, int32, uint64) that these sizes (10,) need; -1: too many."""
+    """Return the lengths of the three buffers (doubles, int32, uint64) for these sizes (10,); -1 if a length exceeds int32."""
     cdef int32_t used[3]
     lav_engine_lengths(&size[0], used)
     return used[0], used[1], used[2]
 
 
 def offsets(const int32_t[::1] size):
-    """Array -> its first entry in its buffer, for these sizes (10,)."""
+    """Return {array name: offset in its buffer} for these sizes (10,)."""
     cdef double real = 0.0
     cdef int32_t index = 0
     cdef uint64_t key = 0
@@ -76,7 +76,7 @@ def offsets(const int32_t[::1] size):
 
 
 def views(const int32_t[::1] size, real, index, keys):
-    """Array -> writable view of one of the buffers, in its shape; without scratch."""
+    """Return {array name: writable view into its buffer, in its shape}, without scratch arrays."""
     first = offsets(size)
     out = {}
     for buffer, end, shapes in zip((real, index, keys), lengths(size), SHAPES.values(), strict=True):

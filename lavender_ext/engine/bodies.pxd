@@ -1,15 +1,15 @@
-"""Bodies in free flight: frames, quaternions, and a drift that keeps angular momentum.
+"""Bodies in free flight: frames, quaternions, and an integration step that conserves angular momentum.
 
     q <- q + 1/2 h (0, omega) q, normalised                                                    (1)
     I = R I_body R^T,   L = I omega                                                            (2)
 
-A body whose inertia has a direction drifts by the midpoint rule at constant L [N m s]:
+A body with anisotropic inertia is integrated by the midpoint rule at constant L [N m s]:
 
     q' = (1) over h/2 with omega,  omega' = I(q')^-1 L,                                        (3)
     q <- (1) over h with omega',   omega <- I(q)^-1 L
 
-so the gyroscopic term costs nothing in angular momentum (kept to rounding) and O(h^2) in energy. Even
-inertia (spheres, cubes) needs (1) alone.
+so the gyroscopic term conserves angular momentum to rounding and energy to O(h^2). Isotropic inertia
+(spheres, cubes) needs (1) alone.
 """
 from libc.math cimport sqrt
 from libc.stdint cimport int32_t
@@ -20,7 +20,7 @@ from lavender_ext.engine.vectors cimport copy3, plus3, times3
 
 
 cdef inline void rotation(const double* q, double* r) noexcept nogil:
-    # body to world, of a unit quaternion w, x, y, z
+    """Compute the rotation matrix r (3, 3), body to world, of a unit quaternion w, x, y, z."""
     cdef double w = q[0], x = q[1], y = q[2], z = q[3]
     r[0] = 1.0 - 2.0 * (y * y + z * z)
     r[1] = 2.0 * (x * y - w * z)
@@ -34,19 +34,19 @@ cdef inline void rotation(const double* q, double* r) noexcept nogil:
 
 
 cdef inline void to_world(const double* r, const double* a, double* out) noexcept nogil:
-    # R a
+    """Rotate a vector from the body's frame to the world: out = R a."""
     times3(r, a, out)
 
 
 cdef inline void to_body(const double* r, const double* a, double* out) noexcept nogil:
-    # R^T a
+    """Rotate a vector from the world to the body's frame: out = R^T a."""
     cdef int32_t k
     for k in range(3):
         out[k] = r[k] * a[0] + r[3 + k] * a[1] + r[6 + k] * a[2]
 
 
 cdef inline void turn(double* q, const double* omega, double h) noexcept nogil:
-    # (1)
+    """Rotate the quaternion q by omega [rad/s] over h [s], (1)."""
     cdef double w = q[0], x = q[1], y = q[2], z = q[3], s, f = 0.5 * h
     cdef double a = f * omega[0], b = f * omega[1], c = f * omega[2]
     q[0] = w - (a * x + b * y + c * z)
@@ -62,7 +62,7 @@ cdef inline void turn(double* q, const double* omega, double h) noexcept nogil:
 
 
 cdef inline void world_tensor(const double* r, const double* body, double* out) noexcept nogil:
-    # R T R^T, symmetric to the bit
+    """Transform a symmetric tensor to the world, out = R T R^T; out is exactly symmetric."""
     cdef double t[9]
     cdef int32_t i, j
     for i in range(3):
@@ -76,7 +76,7 @@ cdef inline void world_tensor(const double* r, const double* body, double* out) 
 
 cdef inline void world_times(const double* r, const double* body, const double* a,
                              double* out) noexcept nogil:
-    # R T R^T a
+    """Compute out = R T R^T a: a tensor in the body's frame times a world vector."""
     cdef double s[3]
     cdef double t[3]
     to_body(r, a, s)
@@ -86,7 +86,7 @@ cdef inline void world_times(const double* r, const double* body, const double* 
 
 cdef inline void drift_rotation(double* q, double* omega, const double* inertia, const double* inv_inertia,
                                 double h) noexcept nogil:
-    # (3)
+    """Advance q and omega over h at constant angular momentum, (3)."""
     cdef double r[9]
     cdef double half[4]
     cdef double momentum[3]
@@ -105,13 +105,13 @@ cdef inline void drift_rotation(double* q, double* omega, const double* inertia,
 
 
 cdef inline int32_t is_lost(const engine_t* e, int32_t body) noexcept nogil:
-    # Has its state left what core/door.pxd (1) allows?
+    """Return whether the body's state is outside the range that core/door.pxd (1) allows."""
     return (first_outside(e.v + 6 * body, 6) >= 0 or first_outside(e.x + 3 * body, 3) >= 0
             or first_outside(e.q + 4 * body, 4) >= 0)
 
 
 cdef inline void start_bodies(engine_t* e) noexcept nogil:
-    """Frames, world inverse inertia and v* = v + h g of the coming substep."""
+    """Compute frames, world inverse inertia and v* = v + h g of the coming substep."""
     cdef int32_t i, b
     cdef double h = e.setting[S_H]
     cdef const double* g = e.setting + S_GRAVITY
@@ -127,10 +127,13 @@ cdef inline void start_bodies(engine_t* e) noexcept nogil:
 
 
 cdef inline int32_t drift_bodies(engine_t* e, const double* by, int32_t shifted) noexcept nogil:
-    """v = v* + dv, then poses over h by v* + `by` (nd, 6), then the shift of the position projection.
+    """Set v = v* + dv, advance the poses over h by v* + `by`, and add the shift of the position projection.
 
-    Where `by` is not dv a turning body keeps the momentum of v; NULL: the poses are there already. Returns the first
-    body whose state is not finite, or -1.
+    by : (nd, 6) or NULL
+        Velocity change that moves the poses. If it is not dv, a rotating body keeps the angular momentum of v. NULL: the
+        poses are already up to date.
+
+    Returns the first body with a state out of range or not finite, or -1.
     """
     cdef int32_t i, k, b, lost = -1
     cdef double h = e.setting[S_H]

@@ -1,15 +1,15 @@
-"""The broad phase: a list of pairs of boxes, kept while every body stays in its box.
+"""The broad phase: a list of body pairs with overlapping boxes, reused while every body stays in its box.
 
-Each body has a box larger by margin + skin than its shape. The list holds every pair of boxes that
-meet, sorted by bodies; it is made anew when a shape with its margin leaves its box. The narrow phase
-drops pairs beyond the margin, so that the contacts depend on the poses alone, never on the age of the
+Each body has an axis-aligned box that is larger than its shape by margin + skin. The list holds every pair
+of overlapping boxes, sorted by bodies. It is rebuilt when a shape with its margin leaves its box. The narrow
+phase drops pairs beyond the margin, so that the contacts depend on the poses alone, never on the age of the
 list.
 
-Few bodies: every pair is tested. Many: a hash grid with one level for each power of two in size; a body
-lies in the cell of its centre, at the level whose cells are no smaller than its box, and looks into
-the neighbouring cells of coarser levels and, on its own, into those ahead. Cost is linear in bodies and
-pairs for any mix of sizes; counting sorts put the pairs in order. Where more than MOST_PAIRS boxes meet
-the search ends there.
+With few bodies, every pair is tested. With many bodies, a hash grid has one level for each power of two in
+size. A body is stored in the cell of its centre, at the finest level with cells at least as large as its box.
+It searches the neighbouring cells of coarser levels and, on its own level, the cells that follow its own. The
+cost is linear in bodies and pairs for any mix of sizes; counting sorts put the pairs in order. The search stops
+when more than MOST_PAIRS boxes overlap.
 """
 from libc.math cimport fabs, floor
 from libc.stdint cimport int32_t, uint32_t
@@ -20,7 +20,7 @@ from lavender_ext.engine.arrays cimport (BOX, CAP_PAIR, H_PAIRS, H_PAIRS_VALID, 
 
 
 cdef inline void half_box(const engine_t* e, int32_t i, double* half) noexcept nogil:
-    # half extents of the axis-aligned box of body i
+    """Compute the half extents of the axis-aligned bounding box of body i."""
     cdef const double* s = e.shape + 4 * i
     cdef const double* r
     cdef int32_t k
@@ -34,7 +34,7 @@ cdef inline void half_box(const engine_t* e, int32_t i, double* half) noexcept n
 
 
 cdef inline int32_t pairs_hold(engine_t* e) noexcept nogil:
-    # 1 where every shape with its margin is inside the box that the list was made of
+    """Return whether every moving shape with its margin is inside the box that the list was built from."""
     cdef int32_t i, k
     cdef double half[3]
     cdef double m = e.setting[S_MARGIN], x
@@ -54,13 +54,14 @@ cdef inline int32_t pairs_hold(engine_t* e) noexcept nogil:
 
 
 cdef inline int32_t may_meet(const engine_t* e, int32_t i, int32_t j) noexcept nogil:
+    """Return whether two bodies can collide: both have a shape and at least one is dynamic."""
     if e.kind_of_shape[i] == NO_SHAPE or e.kind_of_shape[j] == NO_SHAPE:
         return 0
     return e.dyn[i] >= 0 or e.dyn[j] >= 0
 
 
 cdef inline int32_t boxes_meet(const engine_t* e, int32_t i, int32_t j) noexcept nogil:
-    # two boxes, or a plane and a box: the lowest corner against the plane
+    """Return whether two bounding boxes overlap, or the lowest corner of a box is below a plane."""
     cdef const double* a = e.fat + 6 * i
     cdef const double* b = e.fat + 6 * j
     cdef const double* n
@@ -77,7 +78,7 @@ cdef inline int32_t boxes_meet(const engine_t* e, int32_t i, int32_t j) noexcept
 
 
 cdef inline void add_pair(engine_t* e, int32_t i, int32_t j, int32_t* n) noexcept nogil:
-    # counts beyond the capacity too, so that the caller learns what is needed
+    """Append a pair. Pairs beyond the capacity are only counted, so that the caller gets the needed capacity."""
     if n[0] < e.size[CAP_PAIR]:
         e.pair[2 * n[0]] = i if i < j else j
         e.pair[2 * n[0] + 1] = j if i < j else i
@@ -85,6 +86,7 @@ cdef inline void add_pair(engine_t* e, int32_t i, int32_t j, int32_t* n) noexcep
 
 
 cdef inline uint32_t cell_hash(const int32_t* c, int32_t mask) noexcept nogil:
+    """Return the bucket of a cell (x, y, z, level)."""
     cdef uint32_t h = (<uint32_t>c[0]) * <uint32_t>0x9E3779B1U
     h = (h ^ (h >> 15)) + (<uint32_t>c[1]) * <uint32_t>0x85EBCA77U
     h = (h ^ (h >> 13)) + (<uint32_t>c[2]) * <uint32_t>0xC2B2AE3DU
@@ -93,13 +95,13 @@ cdef inline uint32_t cell_hash(const int32_t* c, int32_t mask) noexcept nogil:
 
 
 cdef inline int32_t cell_of(double x, double size) noexcept nogil:
-    # far away all cells are one; neighbours stay neighbours
+    """Return the cell index of a coordinate, clamped to 1e9 so that far cells merge and neighbours stay neighbours."""
     cdef double c = floor(x / size)
     return <int32_t>(-1e9 if not c > -1e9 else (1e9 if c > 1e9 else c))
 
 
 cdef inline double extent_of(const engine_t* e, int32_t i) noexcept nogil:
-    # m, the longest side of a body's box
+    """Return the longest side [m] of a body's bounding box."""
     cdef const double* f = e.fat + 6 * i
     cdef double extent = 0.0
     cdef int32_t k
@@ -110,26 +112,28 @@ cdef inline double extent_of(const engine_t* e, int32_t i) noexcept nogil:
 
 
 cdef inline void grid_pairs(engine_t* e, int32_t* n_pairs) noexcept nogil:
+    """Find the overlapping boxes by the hash grid, then test planes against every body."""
     cdef int32_t n = e.size[N_BODY], mask = e.size[N_BUCKET] - 1, i, j, k, level, x, y, z
     cdef uint32_t used = 0, slot
-    cdef double extent, least = 0.0, most = 0.0, base, size, half
+    cdef double extent, min_extent = 0.0, max_extent = 0.0, base, size, half
     cdef int32_t c[4]
     cdef int32_t low[3]
     cdef int32_t high[3]
     cdef const double* f
     cdef const int32_t* own
+    # finest cell size: the smallest box; the hierarchy has at most 32 levels, smaller bodies share the finest level
     for i in range(n):
         if e.kind_of_shape[i] < SPHERE:
             continue
         extent = extent_of(e, i)
-        if extent > most:
-            most = extent
-        if least == 0.0 or extent < least:
-            least = extent
-    # 31 levels at most; whatever is smaller than the finest cell shares it
-    base = least if least > most * 1e-9 else most * 1e-9
+        if extent > max_extent:
+            max_extent = extent
+        if min_extent == 0.0 or extent < min_extent:
+            min_extent = extent
+    base = min_extent if min_extent > max_extent * 1e-9 else max_extent * 1e-9
     if not base > 0.0:
         base = 1.0
+    # insert every body into its cell, in reverse order, so that chains are in increasing order
     for i in range(mask + 1):
         e.bucket[i] = -1
     i = n - 1
@@ -150,6 +154,7 @@ cdef inline void grid_pairs(engine_t* e, int32_t* n_pairs) noexcept nogil:
             e.chain[i] = e.bucket[slot]
             e.bucket[slot] = i
         i -= 1
+    # search the cells around every body, on its own and all coarser levels in use
     for i in range(n):
         if e.kind_of_shape[i] < SPHERE:
             continue
@@ -162,7 +167,7 @@ cdef inline void grid_pairs(engine_t* e, int32_t* n_pairs) noexcept nogil:
                     low[k] = cell_of(f[k] - half, size)
                     high[k] = cell_of(f[3 + k] + half, size)
                 c[3] = level
-                # on its own level a body looks ahead only: cells before its own look at it
+                # on its own level a body searches only the following cells: bodies of preceding cells search its cell
                 own = e.cell + 4 * i if level == e.cell[4 * i + 3] else NULL
                 if own != NULL:
                     low[0] = own[0]
@@ -186,6 +191,7 @@ cdef inline void grid_pairs(engine_t* e, int32_t* n_pairs) noexcept nogil:
                                         return
                                 j = e.chain[j]
             size *= 2.0
+    # planes have no cell
     for i in range(n):
         if e.kind_of_shape[i] == PLANE:
             for j in range(n):
@@ -196,7 +202,7 @@ cdef inline void grid_pairs(engine_t* e, int32_t* n_pairs) noexcept nogil:
 
 
 cdef inline void sort_pairs(engine_t* e, int32_t n_pairs) noexcept nogil:
-    # two stable counting sorts, by the second body, then by the first
+    """Sort the pairs by two stable counting sorts, by the second body, then by the first."""
     cdef int32_t n = e.size[N_BODY], i, t, s, word
     cdef int32_t* source = e.pair
     cdef int32_t* goal = e.pair_scratch
@@ -220,8 +226,8 @@ cdef inline void sort_pairs(engine_t* e, int32_t n_pairs) noexcept nogil:
 
 
 cdef inline int32_t drop_excluded(engine_t* e, int32_t n_pairs) noexcept nogil:
-    # both lists are sorted
-    cdef int32_t i, j = 0, kept = 0, n = e.size[N_EXCLUDED], a, b
+    """Remove the excluded pairs by merging two sorted lists, and return the number of remaining pairs."""
+    cdef int32_t i, j = 0, n_kept = 0, n = e.size[N_EXCLUDED], a, b
     for i in range(n_pairs):
         a = e.pair[2 * i]
         b = e.pair[2 * i + 1]
@@ -229,17 +235,17 @@ cdef inline int32_t drop_excluded(engine_t* e, int32_t n_pairs) noexcept nogil:
             j += 1
         if j < n and e.excluded[2 * j] == a and e.excluded[2 * j + 1] == b:
             continue
-        e.pair[2 * kept] = a
-        e.pair[2 * kept + 1] = b
-        kept += 1
-    return kept
+        e.pair[2 * n_kept] = a
+        e.pair[2 * n_kept + 1] = b
+        n_kept += 1
+    return n_kept
 
 
 cdef inline int32_t update_pairs(engine_t* e) noexcept nogil:
-    """Make the pair list anew where it no longer holds; returns the number of pairs needed (see CAP_PAIR)."""
+    """Rebuild the pair list if a body has left its box, and return the needed capacity (see CAP_PAIR)."""
     cdef int32_t n = e.size[N_BODY], i, j, k, n_pairs = 0
     cdef double half[3]
-    cdef double reach = e.setting[S_MARGIN] + e.setting[S_SKIN]
+    cdef double enlargement = e.setting[S_MARGIN] + e.setting[S_SKIN]
     if pairs_hold(e):
         return e.head[H_PAIRS]
     e.head[H_PAIRS_VALID] = 0
@@ -248,8 +254,8 @@ cdef inline int32_t update_pairs(engine_t* e) noexcept nogil:
             continue
         half_box(e, i, half)
         for k in range(3):
-            e.fat[6 * i + k] = e.x[3 * i + k] - half[k] - reach
-            e.fat[6 * i + 3 + k] = e.x[3 * i + k] + half[k] + reach
+            e.fat[6 * i + k] = e.x[3 * i + k] - half[k] - enlargement
+            e.fat[6 * i + 3 + k] = e.x[3 * i + k] + half[k] + enlargement
     if e.size[N_BUCKET] > 0:
         grid_pairs(e, &n_pairs)
         if n_pairs > MOST_PAIRS:

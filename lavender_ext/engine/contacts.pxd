@@ -1,29 +1,29 @@
-"""Contacts of a substep: manifolds to rows, right-hand sides, and what the cache knows about them.
+"""Contacts of a substep: rows and right-hand sides from manifolds, and warm starts from the contact cache.
 
-A contact's rows are normal, two tangents where mu > 0, spin where mu and the patch radius are. With v the
-velocities before the substep and v* those after gravity, g the gap and e the restitution,
+A contact has a normal row, two tangent rows if mu > 0, and a spin row if mu and the patch radius are positive.
+With v the velocities before the substep and v* those after gravity, g the gap and e the restitution,
 
-    target_n = -g/h                     where g > 0: the gap may close, not more               (1)
-             = -beta max(0, g - slop)/h where g > 0 and the cache says that the contact bears  (2)
-             = -e v_n                   where v_n < -bounce and g + h v*_n <= 0, if more       (3)
-             = 0                        otherwise; penetration is left to the position projection
+    target_n = -g/h                     if g > 0: the gap may close, but not more              (1)
+             = -beta max(0, g - slop)/h if g > 0 and the cached normal impulse is positive     (2)
+             = -e v_n                   if v_n < -bounce, g + h v*_n <= 0, and if larger       (3)
+             = 0                        otherwise; the position projection removes penetration
     b = target - J v*                                                                          (4)
 
-(2) is what lets a tower stand on few sweeps. A warm-started sweep takes a share kappa of what is left of a
-slow mode in each substep; that mode rings like a spring with a damper of |z| = sqrt(1 - kappa). (1) closes
-the whole gap in one substep: feedback of gain 1 on the same mode, unstable where it exceeds kappa or so. A
-bearing contact is in place within a slop above as below, and comes back at the rate of the projection.
+(2) lets a tower stay upright with few sweeps. In each substep a warm-started sweep removes a fraction kappa of the
+error of a slow mode; that mode oscillates like a damped spring with |z| = sqrt(1 - kappa). (1) closes the whole gap
+in one substep: feedback of gain 1 on the same mode, which is unstable if the gain exceeds about kappa. With (2) a
+loaded contact has the same slop above the surface as below, and returns at the rate of the projection.
 
 Combined: mu = sqrt(mu_a mu_b), e = max, patch radius = min.
 
-Contacts are made pair by pair, and under the alternating order in every other substep from the last point of
-the last pair to the first: what one direction of sweeping leaves behind on one side of a face, the next
-leaves on the other.
+Contacts are built pair by pair. Under the alternating order, every second substep runs from the last point of the
+last pair to the first: a sweep in one direction leaves its error on one side of a face, and the next sweep on the
+other.
 
-The cache holds key, impulse and arms of the last substep's contacts, sorted by pair as the pair list is.
-A contact takes the impulse of the entry with its key, if its point is within the match distance in the
-frame of either body; where the key is new (a corner crossed an edge) the nearest entry of the pair that
-no key has claimed. A stale or false entry is left alone, or corrected by the sweeps.
+The cache holds key, impulse and arms of the last substep's contacts, sorted by pair like the pair list.
+A contact reuses the impulse of the entry with the same key if its point is within the match distance in the
+frame of either body. If the key is new (a corner crossed an edge), it reuses the nearest entry of the pair that
+no key has matched. A stale entry is not used; the sweeps correct a wrong match.
 """
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t, uint64_t
@@ -42,12 +42,12 @@ from lavender_ext.engine.vectors cimport both3, copy3, minus3
 
 
 cdef inline uint64_t contact_key(int32_t a, int32_t b, int32_t feature) noexcept nogil:
-    # 24 bits each for the bodies, 16 for the feature: sorted like the pair list
+    """Return a contact's cache key: 24 bits for each body and 16 for the feature, sorted like the pair list."""
     return ((<uint64_t>a) << 40) | ((<uint64_t>b) << 16) | (<uint64_t>feature)
 
 
 cdef inline void tangent_of(const double* n, double* t) noexcept nogil:
-    # a unit vector normal to n: the coordinate axis that n is furthest from, made orthogonal
+    """Compute a unit tangent: n x the coordinate axis with the smallest component of n, normalised."""
     cdef double x = fabs(n[0]), y = fabs(n[1]), z = fabs(n[2]), s
     if x <= y and x <= z:
         s = 1.0 / sqrt(n[1] * n[1] + n[2] * n[2])
@@ -67,12 +67,13 @@ cdef inline void tangent_of(const double* n, double* t) noexcept nogil:
 
 
 cdef inline double distance2(const double* a, const double* b) noexcept nogil:
+    """Return the squared distance of two points."""
     cdef double x = a[0] - b[0], y = a[1] - b[1], z = a[2] - b[2]
     return x * x + y * y + z * z
 
 
 cdef inline double apart2(const engine_t* e, int32_t c, int32_t entry) noexcept nogil:
-    # squared distance of a contact from a cached one, in the frame of the body where it moved less
+    """Return the squared distance [m^2] of a contact from a cached one, the smaller of the two body frames' values."""
     cdef double x = distance2(e.cache_local + 6 * entry, e.local + 6 * c)
     cdef double y = distance2(e.cache_local + 6 * entry + 3, e.local + 6 * c + 3)
     return x if x < y else y
@@ -80,35 +81,38 @@ cdef inline double apart2(const engine_t* e, int32_t c, int32_t entry) noexcept 
 
 cdef inline void match_pair(const engine_t* e, int32_t c, int32_t n, int32_t first,
                             int32_t* entry) noexcept nogil:
-    """Cached entries of contacts c .. c + n - 1 of one pair, whose entries begin at `first`; -1 for none.
+    """Find the cache entries of contacts c .. c + n - 1 of one pair; the pair's entries begin at `first`.
 
-    By key, then by place: a contact whose key is new takes the nearest entry that no key has claimed.
+    Contacts are matched by key, then by position: a contact with a new key gets the nearest entry that no key has
+    matched. entry (n) receives the indices, -1 for none.
     """
-    cdef double reach = e.setting[S_MATCH] * e.setting[S_MATCH], x, least
+    cdef double max_distance2 = e.setting[S_MATCH] * e.setting[S_MATCH], x, min_distance2
     cdef uint64_t pair = e.key[c] >> 16
     cdef int32_t i, j, end = first, used = 0, missing = 0
     while end < e.head[H_CACHED] and end < first + 4 and (e.cache_key[end] >> 16) == pair:
         end += 1
+    # match by key
     for j in range(n):
         entry[j] = -1
         for i in range(first, end):
             if (e.cache_key[i] == e.key[c + j] and not (used >> (i - first)) & 1
-                    and apart2(e, c + j, i) <= reach):
+                    and apart2(e, c + j, i) <= max_distance2):
                 entry[j] = i
                 used |= 1 << (i - first)
                 break
         missing += entry[j] < 0
     if missing == 0 or used == (1 << (end - first)) - 1:
         return
+    # match the remaining contacts by distance
     for j in range(n):
         if entry[j] >= 0:
             continue
-        least = reach
+        min_distance2 = max_distance2
         for i in range(first, end):
             if not (used >> (i - first)) & 1:
                 x = apart2(e, c + j, i)
-                if x <= least:
-                    least = x
+                if x <= min_distance2:
+                    min_distance2 = x
                     entry[j] = i
         if entry[j] >= 0:
             used |= 1 << (entry[j] - first)
@@ -116,7 +120,7 @@ cdef inline void match_pair(const engine_t* e, int32_t c, int32_t n, int32_t fir
 
 cdef inline void guess_contact(engine_t* e, int32_t c, int32_t entry, int32_t nt, int32_t turns,
                                double* lam) noexcept nogil:
-    # The cached impulse in this contact's frame: friction is kept as a world vector.
+    """Write the cached impulse to lam in this contact's frame; the cache stores friction as a world vector."""
     cdef double t2[3]
     cdef const double* p = e.cache_impulse + N_CACHE_IMPULSE * entry
     lam[0] = p[0]
@@ -134,11 +138,12 @@ cdef inline void guess_contact(engine_t* e, int32_t c, int32_t entry, int32_t nt
 
 
 cdef inline double restitution_of(const engine_t* e, int32_t a, int32_t b) noexcept nogil:
+    """Return the restitution of two bodies, the larger of their values."""
     return e.restitution[a] if e.restitution[a] > e.restitution[b] else e.restitution[b]
 
 
 cdef inline double normal_velocity(const engine_t* e, int32_t a, int32_t b, int32_t c) noexcept nogil:
-    # closing speed of a contact with the velocities before the substep, static bodies at rest
+    """Return a contact's relative normal velocity [m/s] before the substep; static bodies are at rest."""
     cdef double u[3]
     cdef double s[3]
     relative_velocity(e.v, a if e.dyn[a] >= 0 else -1, b if e.dyn[b] >= 0 else -1, e.arm_a + 3 * c,
@@ -147,7 +152,7 @@ cdef inline double normal_velocity(const engine_t* e, int32_t a, int32_t b, int3
 
 
 cdef inline void local_arm(const engine_t* e, int32_t body, const double* arm, double* out) noexcept nogil:
-    # a sphere's contact does not turn with it; a box's does
+    """Store an arm for cache matching: a box's contact rotates with the body, a sphere's does not."""
     if e.kind_of_shape[body] == BOX:
         to_body(e.rot + 9 * body, arm, out)
     else:
@@ -157,11 +162,12 @@ cdef inline void local_arm(const engine_t* e, int32_t body, const double* arm, d
 cdef inline void make_contact(engine_t* e, const rows_t* r, int32_t c, int32_t row, int32_t a, int32_t b,
                               const manifold_t* m, int32_t at, const double* tangent, int32_t nt,
                               int32_t turns) noexcept nogil:
-    """Row data of contact c, rows row .. row + nt + turns, of point `at` of the manifold, but for its target."""
+    """Fill rows row .. row + nt + turns of contact c from point `at` of the manifold, except for the target."""
     cdef double off[2]
     cdef double w[6]
     cdef int32_t k, roll = row + nt + turns - 1, da = e.dyn[a], db = e.dyn[b]
     cdef double* d = e.d + row
+    # bodies, key and geometry
     e.contact_pair[2 * c] = a
     e.contact_pair[2 * c + 1] = b
     e.contact_body[2 * c] = da
@@ -176,7 +182,7 @@ cdef inline void make_contact(engine_t* e, const rows_t* r, int32_t c, int32_t r
     local_arm(e, b, e.arm_b + 3 * c, e.local + 6 * c + 3)
     if nt > 0:
         copy3(tangent, e.tangent + 3 * c)
-    # the common kind with its size as constants, so that a compiler unrolls it
+    # diagonal of A and w* = J v*; the common kind has constant sizes, so that the compiler unrolls its loops
     if nt == 2 and not turns:
         contact_diagonal(e.normal + 3 * c, e.tangent + 3 * c, e.arm_a + 3 * c, e.arm_b + 3 * c, 2, 0, da, db,
                          e.inv_mass, e.inv_inertia, d, off, e.coupling + 5 * c,
@@ -189,6 +195,7 @@ cdef inline void make_contact(engine_t* e, const rows_t* r, int32_t c, int32_t r
         contact_slack(r, c, nt, turns, e.v_free, w)
     for k in range(1 + nt + turns):
         d[k] += e.compliance[row + k]
+    # step sizes: separate tangents for box friction, else one step from the tangents' largest eigenvalue
     e.step[row] = reciprocal(d[0])
     if nt > 0 and e.head[H_FRICTION_SHAPE]:
         e.coupling[5 * c + 2] = off[0]
@@ -204,33 +211,35 @@ cdef inline void make_contact(engine_t* e, const rows_t* r, int32_t c, int32_t r
     if turns & 2:
         e.step[roll] = e.step[roll + 1] = reciprocal(largest_eigenvalue(e.d[roll], off[1], e.d[roll + 1]))
         e.d[roll] = e.d[roll + 1] = 0.5 * (e.d[roll] + e.d[roll + 1])
+    # right-hand side with target 0
     for k in range(1 + nt + turns):
         e.target[row + k] = 0.0
         e.b[row + k] = 0.0 - w[k]
 
 
 cdef inline void aim_contact(engine_t* e, int32_t c, int32_t row, int32_t a, int32_t b, double bounce) noexcept nogil:
-    # Target of the normal row, once the guess is there: b = -J v* so far.
-    cdef double h = e.setting[S_H], gap = e.gap[c], target = 0.0, vn
+    """Set the normal row's target after the warm start; on entry b = -J v*."""
+    cdef double h = e.setting[S_H], gap = e.gap[c], target = 0.0, relative_normal_velocity
     if gap > 0.0:
         if e.impulse[row] > 0.0:                        # (2)
             gap = e.setting[S_BETA] * (gap - e.setting[S_SLOP])
         if gap > 0.0:
             target = -gap / h                           # (1)
     if bounce > 0.0 and e.gap[c] - h * e.b[row] <= 0.0:  # (3)
-        vn = normal_velocity(e, a, b, c)
-        if vn < -e.setting[S_BOUNCE] and -bounce * vn > target:
-            target = -bounce * vn
+        relative_normal_velocity = normal_velocity(e, a, b, c)
+        if relative_normal_velocity < -e.setting[S_BOUNCE] and -bounce * relative_normal_velocity > target:
+            target = -bounce * relative_normal_velocity
     e.target[row] = target
     e.b[row] = target + e.b[row]                        # (4)
 
 
 cdef inline int32_t backwards(const engine_t* e) noexcept nogil:
+    """Return whether this substep builds its contacts from the last pair to the first."""
     return e.head[H_ORDER] == ALTERNATING and e.head[H_STEP] & 1
 
 
 cdef inline int32_t make_contacts(engine_t* e, const rows_t* r) noexcept nogil:
-    """All contacts of the pair list, with guesses from the cache; returns how many there are."""
+    """Build all contacts of the pair list, warm-started from the cache, and return their number."""
     cdef manifold_t m
     cdef double tangent[3]
     cdef int32_t entry[4]
@@ -248,7 +257,7 @@ cdef inline int32_t make_contacts(engine_t* e, const rows_t* r) noexcept nogil:
         if m.n == 0:
             continue
         if c + m.n > e.size[CAP_CONTACT]:
-            c += m.n                                    # only counted from here on
+            c += m.n                                    # beyond the capacity contacts are only counted
             continue
         mu = sqrt(e.friction[a] * e.friction[b])
         bounce = restitution_of(e, a, b)
@@ -258,7 +267,7 @@ cdef inline int32_t make_contacts(engine_t* e, const rows_t* r) noexcept nogil:
         if nt > 0:
             tangent_of(m.normal, tangent)
         pair = contact_key(a, b, 0)
-        # the first entry of this pair, or where it would stand
+        # first cache entry of this pair, or its insertion position
         while first < cached and e.cache_key[first] < pair:
             first += 1
         while first > 0 and e.cache_key[first - 1] >= pair:
@@ -296,7 +305,7 @@ cdef inline int32_t make_contacts(engine_t* e, const rows_t* r) noexcept nogil:
 
 
 cdef inline void store_contacts(engine_t* e) noexcept nogil:
-    """The cache of the next substep; kept up to date whether warm starting is on or not."""
+    """Write the contact cache for the next substep, whether warm starting is on or not."""
     cdef int32_t c, k, row, nt, at, size, n = e.head[H_CONTACTS], last_first = backwards(e)
     cdef double t2[3]
     cdef double* p
@@ -319,7 +328,7 @@ cdef inline void store_contacts(engine_t* e) noexcept nogil:
         elif e.size[ROWS_PER_CONTACT] > 4:
             for k in range(3):
                 e.cache_roll[3 * at + k] = 0.0
-        if e.head[H_STEPPER] == AVBD:                   # which has no spin: the stiffness of the contact
+        if e.head[H_STEPPER] == AVBD:                   # AVBD has no spin row: the entry holds the contact's stiffness
             p[4] = e.push[e.size[N_JOINT_ROW] + c]
         for k in range(6):
             e.cache_local[6 * at + k] = e.local[6 * c + k]

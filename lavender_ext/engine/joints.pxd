@@ -6,12 +6,12 @@
                         axis.(omega_b - omega_a) = speed, |impulse| <= h torque
 
 With C the error of a row [m or rad] and f, zeta its frequency [Hz] and damping ratio, a soft row is a
-spring with a damper on the effective mass m = 1/A_ii, integrated implicitly (Catto 2011):
+damped spring on the effective mass m = 1/A_ii, integrated implicitly (Catto 2011):
 
     k = m (2 pi f)^2,  c = 2 m zeta (2 pi f),  compliance = 1/(h (c + h k)),
     target = -C k / (c + h k)                                                                  (1)
 
-A rigid row has target 0; its error is left to the position projection.
+A rigid row has target 0; the position projection removes its error.
 """
 from libc.math cimport sqrt
 from libc.stdint cimport int32_t
@@ -27,7 +27,7 @@ from lavender_ext.engine.vectors cimport copy3, minus3, plus3, scale3
 
 
 cdef inline void direction(const engine_t* e, int32_t body, const double* local, double* out) noexcept nogil:
-    # of a body's frame in the world; body -1 is the world
+    """Rotate a direction from a body's frame to the world; body -1 is the world."""
     if body < 0:
         copy3(local, out)
     else:
@@ -36,7 +36,7 @@ cdef inline void direction(const engine_t* e, int32_t body, const double* local,
 
 cdef inline void anchor(const engine_t* e, int32_t body, const double* local, double* arm,
                         double* point) noexcept nogil:
-    # arm from the centre and point, world
+    """Compute an anchor's arm from the body's centre and its point, both in the world frame."""
     direction(e, body, local, arm)
     if body < 0:
         copy3(arm, point)
@@ -46,7 +46,7 @@ cdef inline void anchor(const engine_t* e, int32_t body, const double* local, do
 
 cdef inline void point_row(double* jac, const double* axis, const double* arm_a,
                            const double* arm_b) noexcept nogil:
-    # axis.(v_b + omega_b x arm_b - v_a - omega_a x arm_a)
+    """Fill the Jacobian row (12) of axis.(v_b + omega_b x arm_b - v_a - omega_a x arm_a)."""
     scale3(-1.0, axis, jac)
     cross(arm_a, axis, jac + 3)
     scale3(-1.0, jac + 3, jac + 3)
@@ -55,7 +55,7 @@ cdef inline void point_row(double* jac, const double* axis, const double* arm_a,
 
 
 cdef inline void turn_row(double* jac, const double* axis) noexcept nogil:
-    # axis.(omega_b - omega_a)
+    """Fill the Jacobian row (12) of axis.(omega_b - omega_a)."""
     cdef int32_t k
     for k in range(3):
         jac[k] = 0.0
@@ -65,7 +65,7 @@ cdef inline void turn_row(double* jac, const double* axis) noexcept nogil:
 
 
 cdef inline void joint_geometry(engine_t* e, int32_t i) noexcept nogil:
-    """Jacobian rows and errors of joint i at the present poses."""
+    """Compute the Jacobian rows and errors of joint i at the current poses."""
     cdef const double* p = e.joint + N_JOINT_REAL * i
     cdef int32_t a = e.joint_bodies[2 * i], b = e.joint_bodies[2 * i + 1], row = e.ptr[i], k
     cdef double arm_a[3]
@@ -78,6 +78,7 @@ cdef inline void joint_geometry(engine_t* e, int32_t i) noexcept nogil:
     cdef double length
     anchor(e, a, p + J_ANCHOR_A, arm_a, pa)
     anchor(e, b, p + J_ANCHOR_B, arm_b, pb)
+    # distance: one row along the line between the anchors
     if e.joint_kind[i] == DISTANCE:
         minus3(pb, pa, axis)
         length = sqrt(dot3(axis, axis))
@@ -91,6 +92,7 @@ cdef inline void joint_geometry(engine_t* e, int32_t i) noexcept nogil:
         point_row(e.jac + 12 * row, axis, arm_a, arm_b)
         e.joint_error[row] = length - p[J_LENGTH]
         return
+    # ball: the three world axes
     for k in range(3):
         axis[0] = 0.0
         axis[1] = 0.0
@@ -100,22 +102,24 @@ cdef inline void joint_geometry(engine_t* e, int32_t i) noexcept nogil:
         e.joint_error[row + k] = pb[k] - pa[k]
     if e.joint_kind[i] == BALL:
         return
+    # hinge: two angular rows normal to the axis
     direction(e, a, p + J_AXIS_A, axis)
     direction(e, b, p + J_AXIS_B, other)
     direction(e, a, p + J_SIDE_A, side)
     turn_row(e.jac + 12 * (row + 3), side)
     cross(axis, side, pa)
     turn_row(e.jac + 12 * (row + 4), pa)
-    cross(axis, other, pb)                              # rotation that takes axis_a to axis_b
+    cross(axis, other, pb)                              # rotation vector from axis_a to axis_b
     e.joint_error[row + 3] = dot3(pb, side)
     e.joint_error[row + 4] = dot3(pb, pa)
+    # motor: relative angular velocity about the axis
     if e.joint_motor[i]:
         turn_row(e.jac + 12 * (row + 5), axis)
         e.joint_error[row + 5] = 0.0
 
 
 cdef inline void make_joints(engine_t* e) noexcept nogil:
-    """Rows, diagonal, compliance, right-hand sides and guesses of all joints."""
+    """Build rows, diagonal, compliance, right-hand side and warm start of all joints."""
     cdef int32_t i, row, a, b
     cdef double h = e.setting[S_H], omega, k, c, d, inf = 1.0 / 0.0
     cdef const double* p

@@ -1,4 +1,4 @@
-"""Vectors of three numbers, beside `dot3` and `cross` of core/rows.pxd; `out` may be an argument."""
+"""Arithmetic of 3-vectors, complementing `dot3` and `cross` of core/rows.pxd; `out` may alias an argument."""
 from libc.math cimport sqrt
 from libc.stdint cimport int32_t
 
@@ -6,55 +6,56 @@ from lavender_ext.core.rows cimport dot3
 
 
 cdef inline void copy3(const double* x, double* out) noexcept nogil:
+    """Copy x to out."""
     cdef int32_t k
     for k in range(3):
         out[k] = x[k]
 
 
 cdef inline void scale3(double s, const double* x, double* out) noexcept nogil:
-    # s x
+    """Compute out = s x."""
     cdef int32_t k
     for k in range(3):
         out[k] = s * x[k]
 
 
 cdef inline void minus3(const double* x, const double* y, double* out) noexcept nogil:
-    # x - y
+    """Compute out = x - y."""
     cdef int32_t k
     for k in range(3):
         out[k] = x[k] - y[k]
 
 
 cdef inline void plus3(const double* x, double s, const double* y, double* out) noexcept nogil:
-    # x + s y
+    """Compute out = x + s y."""
     cdef int32_t k
     for k in range(3):
         out[k] = x[k] + s * y[k]
 
 
 cdef inline void both3(double s, const double* x, double t, const double* y, double* out) noexcept nogil:
-    # s x + t y
+    """Compute out = s x + t y."""
     cdef int32_t k
     for k in range(3):
         out[k] = s * x[k] + t * y[k]
 
 
 cdef inline void column3(const double* matrix, int32_t j, double* out) noexcept nogil:
-    # column j of a matrix (3, 3): axis j of a body's frame
+    """Copy column j of a matrix (3, 3), axis j of a body's frame, to out."""
     cdef int32_t k
     for k in range(3):
         out[k] = matrix[3 * k + j]
 
 
 cdef inline void times3(const double* matrix, const double* x, double* out) noexcept nogil:
-    # matrix (3, 3) times x, into other numbers than x
+    """Compute out = matrix (3, 3) x; out must not alias x."""
     cdef int32_t k
     for k in range(3):
         out[k] = dot3(matrix + 3 * k, x)
 
 
 cdef inline double normalise3(double* x) noexcept nogil:
-    # x at length 1, where it has one; returns its length
+    """Scale x to unit length if it is not zero, and return its previous length."""
     cdef double size = sqrt(dot3(x, x))
     cdef int32_t k
     if size > 0.0:

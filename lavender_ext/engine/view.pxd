@@ -1,11 +1,14 @@
-"""The engine's velocity problem as the shared kernels see it."""
+"""The engine's velocity problem as the structs of the shared kernels."""
 from lavender_ext.core.parts cimport COULOMB, blocks_t
 from lavender_ext.core.view cimport rows_t
 from lavender_ext.engine.arrays cimport H_CONTACTS, H_CONTACT_ROWS, N_DYNAMIC, N_JOINT, N_JOINT_ROW, engine_t
 
 
 cdef inline void view(const engine_t* e, blocks_t* p, rows_t* r) noexcept nogil:
-    # nu = d: right for contacts without spin and for linear joint rows; whoever judges other rows sets it
+    """Fill p and r with pointers to the arrays of the prepared substep.
+
+    nu = d is correct for contacts without spin and for linear joint rows; a caller that judges other rows must set nu.
+    """
     p.n_blocks = e.size[N_JOINT] + e.head[H_CONTACTS]
     p.n_rows = e.size[N_JOINT_ROW] + e.head[H_CONTACT_ROWS]
     p.law = COULOMB
@@ -20,7 +23,7 @@ cdef inline void view(const engine_t* e, blocks_t* p, rows_t* r) noexcept nogil:
     p.d = e.d
     p.nu = e.d
     p.step = e.step
-    p.islands = NULL                                    # the engine measures all bodies together
+    p.islands = NULL                                    # the engine measures all bodies as one island
     r.n_bodies = e.size[N_DYNAMIC]
     r.n_joints = e.size[N_JOINT]
     r.n_contacts = e.head[H_CONTACTS]
