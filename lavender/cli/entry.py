@@ -17,7 +17,7 @@ import click
 from lavender._version import __version__
 from lavender.base import early_sigint as _early_sigint
 from lavender.base.errors import LavenderError, UnknownName
-from lavender.cli.options import EXIT_BAD_INPUT, EXIT_INTERRUPTED, say, unheard
+from lavender.cli.options import EXIT_BAD_INPUT, EXIT_INTERRUPTED, say, suggest_new_option, unheard
 
 #: Name -> the module that has the command.
 COMMANDS = {
@@ -126,6 +126,8 @@ def _code_of(args: Sequence[str] | None) -> int:
         say(f"lavender: {error}", err=True)
         code = EXIT_BAD_INPUT
     except click.exceptions.ClickException as error:
+        if isinstance(error, click.NoSuchOption):
+            suggest_new_option(error)
         error.show()
         code = error.exit_code
     except (click.exceptions.Abort, KeyboardInterrupt):

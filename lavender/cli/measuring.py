@@ -79,9 +79,9 @@ def plan_of(asked: Mapping[str, Any], kind: type[P], **more: Any) -> P:
     Raises
     ------
     InputError
-        A level, budget or limit that means nothing.
+        A tolerance, budget or limit that means nothing.
     """
-    names = ("levels", "budgets", "motion", "prove", "speed_levels", "orders")
+    names = ("tolerances", "budgets", "motion", "prove", "velocity_tolerances", "orders")
     return kind(**{name: asked[name] for name in names if asked[name] is not None}, **more)
 
 

@@ -36,6 +36,23 @@ Option = tuple[tuple[str, ...], dict[str, Any]]  # names, and what click is told
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
 
 
+#: Present name of each option that earlier versions had under another name.
+RENAMED_OPTIONS = {
+    "--campaign": "--workers",
+    "--levels": "--tolerances",
+    "--speed-levels": "--velocity-tolerances",
+}
+
+
+def suggest_new_option(error: click.NoSuchOption) -> None:
+    """Let the message of an unknown option suggest its present name, if the command has an option of that name."""
+    new_name = RENAMED_OPTIONS.get(error.option_name)
+    command = error.ctx.command if error.ctx is not None else None
+    if command is not None and any(new_name in option.opts for option in command.params):
+        error.message = f"{error.message} Did you mean {new_name!r}?"  # type: ignore[misc]
+        error.possibilities = None  # type: ignore[misc]
+
+
 def _is_number(word: str) -> bool:
     try:
         float(word)
@@ -62,11 +79,11 @@ def _is_solver(word: str) -> bool:
 
 
 class ManyValues(click.Command):
-    """`--levels 1e-3 1e-6` as well as `--levels 1e-3,1e-6`: what follows is taken while it fits the option."""
+    """`--tolerances 1e-3 1e-6` as well as `--tolerances 1e-3,1e-6`: what follows is taken while it fits the option."""
 
     FITS: dict[str, Callable[[str], bool]] = {  # noqa: RUF012 - a constant of the class
-        "--levels": _is_number,
-        "--speed-levels": _is_number,
+        "--tolerances": _is_number,
+        "--velocity-tolerances": _is_number,
         "--budgets": _is_number,
         "--time-budgets": _is_number,
         "--solvers": _is_solver,
@@ -259,13 +276,13 @@ recording_options = adding([THRESHOLD, *RECORDING_OPTIONS], show_default=True)
 #: Of what is measured.
 PLAN_OPTIONS: tuple[tuple[str, dict[str, Any]], ...] = (
     ("--solvers", {"type": Listed(str), "help": "Solvers by name; default: all that are installed."}),
-    ("--levels", {"type": Listed(float), "default": "1e-3,1e-6,1e-9", "show_default": True,
+    ("--tolerances", {"type": Listed(float), "default": "1e-3,1e-6,1e-9", "show_default": True,
                   "help": "Relative residuals to reach."}),
     ("--motion", {"is_flag": True, "help": "Also measure the motion error: how wrong the velocities of the bodies are, "
                   "relative to a reference that is solved once for each case."}),
     ("--prove", {"is_flag": True, "help": "Measure the motion error from an exact solution that is enclosed with "
                  "proof, where one is (extra `proof`); implies --motion."}),
-    ("--speed-levels", {"type": Listed(float), "default": (), "metavar": "M/S,M/S,...",
+    ("--velocity-tolerances", {"type": Listed(float), "default": (), "metavar": "M/S,M/S,...",
                         "help": "Motion errors to reach, in metres per second; implies --motion."}),
     ("--budgets", {"type": Listed(int), "default": "4,8,16,32,64", "show_default": True,
                    "help": "Numbers of iterations to run exactly."}),
@@ -276,7 +293,7 @@ PLAN_OPTIONS: tuple[tuple[str, dict[str, Any]], ...] = (
     ("--time-limit", {"type": float, "default": None, "metavar": "S",
                       "help": "Limit of one solve; default: 1 s, or 0.25 s for the built-in suite."}),
     ("--pass-limit", {"type": float, "default": None, "metavar": "S",
-                      "help": "Limit of a solver over all steps of a sequence, at one budget or level; default: 5 s."}),
+                      "help": "Time limit of a solver over all steps of a sequence with one setting; default: 5 s."}),
     ("--memory", {"type": float, "default": None, "metavar": "GB",
                   "help": "Memory limit of each process of another package's solver; default: half of the "
                   "machine's memory, shared by the workers (--workers)."}),

@@ -33,13 +33,6 @@ from lavender.cli.options import (
 from lavender.io.stored import lock_output, write_text
 
 
-def _reject_campaign(context: click.Context, option: click.Parameter, given: bool) -> None:
-    """Raise the usual error for the former name of --workers."""
-    if given:
-        message = "No such option '--campaign'. Did you mean '--workers'?"
-        raise click.NoSuchOption("--campaign", message, ctx=context)
-
-
 @click.command(cls=ManyValues)
 @click.argument("files", nargs=-1, metavar="[FILES | FOLDERS | NAMES]...")
 @plan_options
@@ -71,7 +64,6 @@ def _reject_campaign(context: click.Context, option: click.Parameter, given: boo
     metavar="N | A:B",
     help="With --workers: seeds 0 to N - 1, or A to B - 1, of cases that take one.",
 )
-@click.option("--campaign", is_flag=True, hidden=True, expose_value=False, callback=_reject_campaign)
 @click.option("--compare", type=PATH, help="Compare with earlier records (.jsonl, or their folder).")
 @click.option(
     "--time-budgets",
@@ -91,7 +83,7 @@ def _reject_campaign(context: click.Context, option: click.Parameter, given: boo
 @click.option("--no-figures", is_flag=True, help="Do not write SVG and PNG files.")
 @click.pass_context
 def report(context: click.Context, /, files: tuple[str, ...], out: Path, **asked: Any) -> None:
-    """Measure speed against error: every solver on every case, to each level of residual and with each budget.
+    """Measure speed against error: every solver on every case, to each tolerance and with each budget.
 
     FILES are problems (.npz, .hdf5), folders of them, folders of recorded steps, or cases of the built-in
     suite such as "stack(n=64)"; without any, the built-in suite runs. A MuJoCo model (.xml) is simulated first,

@@ -21,7 +21,7 @@ from lavender.cli import entry
 from lavender.lab.bench.record import Skip, to_json
 
 TOLD = {"capture_output": False, "stderr": subprocess.PIPE}  # where the output goes to a place of its own
-QUICK = ("--levels", "1e-3", "1e-6", "--budgets", "2", "4", "--repeats", "1", "--no-figures")
+QUICK = ("--tolerances", "1e-3", "1e-6", "--budgets", "2", "4", "--repeats", "1", "--no-figures")
 
 
 def test_a_contradicted_claim_is_marked(lavender, path, plug_in):
@@ -120,14 +120,14 @@ def test_solvers_lists_all_with_reasons(lavender):
         (("report", "--solvers", "pgz"), "did you mean 'pgs'"),
         (("report", "no/such.npz"), "no such file"),
         (("report", "stak(n=8)"), "did you mean"),
-        (("report", "--levels", "0"), "level is 0;"),
+        (("report", "--tolerances", "0"), "tolerance is 0;"),
         (("report", "a.jsonl", "b.npz"), "shown alone"),
         (("report", "missing.jsonl"), "cannot read"),
         (("solve", "stack(n=4)", "--solver", "nobody"), "unknown solver 'nobody'"),
         (("solve", "stack(n=4)", "--solver", "direct", "--order", "reverse"), "order"),
         (("solve", "stack(n=4)", "--solver", "pgs", "--output", "no/such/folder.npz"), "cannot write"),
         (("check", "nothing.npz"), "no such file"),
-        (("report", "--levels", "many"), "not a list of numbers"),
+        (("report", "--tolerances", "many"), "not a list of numbers"),
         (("report", "--workers", "1", "--seeds", "9:3"), "whole numbers with A < B"),
         (("report", "--time-budgets", "0"), "time budget 0.0 must be"),
         (("report", "stack(n=4)", "--seeds", "3"), "--seeds has no effect without --workers"),
@@ -141,7 +141,12 @@ def test_solvers_lists_all_with_reasons(lavender):
         (("report", "stack(n=4)", "--solvers", "direct", "--orders", "reverse"), "--orders has no effect"),
         (("report", "--workers", "1", "--time-limit", "3"), "--time-limit has no effect with --workers"),
         (("report", "--campaign"), "Did you mean '--workers'?"),
-        (("report", "a.jsonl", "--levels", "1e-3"), "--levels has no effect where records are shown again"),
+        (("report", "--levels", "1e-3"), "Did you mean '--tolerances'?"),
+        (("report", "--speed-levels=1e-3"), "Did you mean '--velocity-tolerances'?"),
+        (
+            ("report", "a.jsonl", "--tolerances", "1e-3"),
+            "--tolerances has no effect where records are shown again",
+        ),
         (("report", "stack(n=4)", "--solvers", "pgs", "--memory", "3"), "--memory has no effect"),
         (("run", "stack", "--replace"), "--replace has no effect without --record"),
         (("record", "a.xml", "--out", "o", "--seed", "3", "--controls", "zero"), "without --controls random"),

@@ -94,7 +94,7 @@ def test_references_are_written_beside_files_and_used(lavender, tmp_path, monkey
 
     load = runner.load_reference
     monkeypatch.setattr(runner, "load_reference", lambda p, path: used.append(load(p, path)))
-    plan = bench.Plan(levels=(1e-3,), budgets=(), repeats=1, orders=(), motion=True)
+    plan = bench.Plan(tolerances=(1e-3,), budgets=(), repeats=1, orders=(), motion=True)
     found = bench.run([tmp_path], ["pgs"], plan)  # the folder holds one problem: a reference is none
     assert len(found.cases) == 1
     assert used[0].accepted
@@ -108,7 +108,7 @@ def test_a_proven_reference_is_what_a_report_measures_motions_from(lavender, tmp
     assert code == 0 and "proof: an exact solution within" in out
     found = lv.motion.load_reference(lv.load(path), path)
     assert found.solver.startswith("proof") and found.residual.at_floor
-    plan = bench.Plan(levels=(1e-3, 1e-9), budgets=(), repeats=1, orders=(), motion=True)
+    plan = bench.Plan(tolerances=(1e-3, 1e-9), budgets=(), repeats=1, orders=(), motion=True)
     coarse, fine = (r.motion for r in bench.run([path], ["pgs"], plan))
     assert 0.0 < fine < 1e-3 * coarse
 
@@ -145,7 +145,9 @@ def test_vectors_are_of_the_problems_that_the_report_measured(lavender, tmp_path
     mine = lv.Problem.lcp(b @ b.T + np.eye(9), np.ones(9))
     mine.save(tmp_path / "ring.npz")  # the name of a case of the suite, too
     records, out = tmp_path / "records.jsonl", tmp_path / "library"
-    bench.run([tmp_path / "ring.npz"], ["direct"], bench.Plan(levels=(1e-6,), budgets=(), repeats=1), records)
+    bench.run(
+        [tmp_path / "ring.npz"], ["direct"], bench.Plan(tolerances=(1e-6,), budgets=(), repeats=1), records
+    )
     command = ("export", "c", out, "--for", records, "--solver", "direct")
     assert lavender(*command)[0] == 0
     assert vectors.pack_problem(mine) in (out / "vectors.bin").read_bytes()
@@ -192,17 +194,17 @@ def test_progress_is_told_in_lines_where_there_is_no_terminal(capsys, monkeypatc
     assert capsys.readouterr().err == ""
 
 
-QUICK = ("--levels", "1e-3", "1e-6", "--budgets", "2", "4", "--repeats", "1", "--no-figures")
+QUICK = ("--tolerances", "1e-3", "1e-6", "--budgets", "2", "4", "--repeats", "1", "--no-figures")
 
 
 def test_lists_take_commas_or_blanks_and_files_may_follow(lavender, path, tmp_path):
     code, *_ = lavender(
-        "report", "--levels=1e-2", "--solvers", "pgs,jacobi", "--budgets", "3", "5", path, "--orders", "reverse",
-        "--speed-levels", "1e-2,1e-3", "--repeats", 1, "--no-figures", "--out", tmp_path / "out",
+        "report", "--tolerances=1e-2", "--solvers", "pgs,jacobi", "--budgets", "3", "5", path, "--orders", "reverse",
+        "--velocity-tolerances", "1e-2,1e-3", "--repeats", 1, "--no-figures", "--out", tmp_path / "out",
     )  # fmt: skip
     assert code == 0
     records = bench.read(tmp_path / "out")
-    assert motion_tables.get_speed_levels(records) == (1e-2, 1e-3)
+    assert motion_tables.get_velocity_tolerances(records) == (1e-2, 1e-3)
     assert {r.solver for r in records} == {"pgs", "jacobi"}
     assert {r.max_iter for r in records if r.mode == "budget"} == {3, 5}
     assert {r.order for r in records} == {"given", "reverse"}
@@ -275,7 +277,7 @@ def test_one_reason_of_many_cases_is_said_once(lavender, tmp_path, monkeypatch):
 @pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
 @pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
 def test_what_stops_a_report_keeps_the_records_and_writes_the_page(stop, tmp_path):
-    # A problem that nothing solves in the time: every run to a level takes its limit.
+    # A problem that nothing solves in the time: every run to a tolerance takes its limit.
     out = tmp_path / "out"
     a = np.array([[1.0, -1.0], [-1.0, 1.0]])
     n = 300
@@ -302,7 +304,7 @@ def test_what_stops_a_report_keeps_the_records_and_writes_the_page(stop, tmp_pat
 
 
 def test_campaigns_over_parts_of_the_seeds_are_one_when_put_together(lavender, tmp_path):
-    more = ("--solvers", "pgs", "--levels", "1e-3", "--budgets", "4", "--workers", 1)
+    more = ("--solvers", "pgs", "--tolerances", "1e-3", "--budgets", "4", "--workers", 1)
     parts = []
     for name, seeds in (("a", "2"), ("b", "2:4")):
         code, *_ = lavender("report", "granular(n=2)", "--seeds", seeds, *more, "--out", tmp_path / name)
@@ -321,7 +323,7 @@ def test_a_recorded_scene_is_reported_as_a_sequence(lavender, tmp_path):
     assert code == 0
     assert "4 problems" in out
     assert len(list(folder.glob("*.npz"))) == 4
-    words = ("report", folder, "--solvers", "sequential_impulses", "--budgets", "4", "--levels", "1e-1")
+    words = ("report", folder, "--solvers", "sequential_impulses", "--budgets", "4", "--tolerances", "1e-1")
     code, out, _ = lavender(*words, "--no-figures", "--repeats", 1)
     assert code == 0
     assert "it solves the 4 steps of steps in" in out

@@ -16,16 +16,16 @@ from lavender.judge.solution import CLAIM_CHECKS, CONFIRMED, CONTRADICTED, NOT_P
 ERROR, KILLED, CRASHED = "ERROR", "KILLED", "CRASHED"
 
 
-def level_name(level: float) -> str:
-    """A level as people write it: 1e-3, not 1e-03."""
-    mantissa, _, exponent = f"{level:.3e}".partition("e")
+def format_tolerance(tolerance: float) -> str:
+    """Return a tolerance with the exponent's leading zeros removed: 1e-3, not 1e-03."""
+    mantissa, _, exponent = f"{tolerance:.3e}".partition("e")
     mantissa = mantissa.rstrip("0").rstrip(".")
     return f"{mantissa}e{int(exponent)}"
 
 
 def asked_of(mode: str, tol: float, max_iter: int) -> str:
     """What a run is asked for, in words: to 1e-6, or 16 iterations."""
-    return f"{max_iter} iterations" if mode == "budget" else f"to {level_name(tol)}"
+    return f"{max_iter} iterations" if mode == "budget" else f"to {format_tolerance(tol)}"
 
 
 LONGEST_NAME = 120  # characters of a file's name: file systems take 255 bytes, with a suffix
@@ -217,7 +217,7 @@ class Record(_Texts):
 
     @property
     def asked(self) -> str:
-        """The budget or the level, and the order of sweeps where it is another."""
+        """The budget or the tolerance, and the order of sweeps where it is another."""
         order = "" if self.order == "given" else f", order {self.order}"
         return asked_of(self.mode, self.tol, self.max_iter) + order
 
@@ -235,8 +235,14 @@ def measurement_key(what: Any) -> tuple[Any, ...]:
 
 
 Entry = Run | CaseInfo | Skip | Record
-#: Fields of records by the names that earlier versions wrote.
-RENAMED_FIELDS = {"floor": "roundoff_floor", "suspicions": "diagnostics", "contradicted": "status_conflict"}
+#: Names that earlier versions wrote for fields of entries, and of the plan of a run.
+RENAMED_FIELDS = {
+    "floor": "roundoff_floor",
+    "suspicions": "diagnostics",
+    "contradicted": "status_conflict",
+    "levels": "tolerances",
+    "speed_levels": "velocity_tolerances",
+}
 REMOVED_KINDS = ("done",)  # Earlier versions marked complete pairs of a campaign; such lines are ignored.
 RENAMED_STATUSES = {"FLOOR": "ROUNDOFF_LIMIT", "REFUSED": "INVALID_PROBLEM"}
 KINDS: dict[str, type] = {"run": Run, "case": CaseInfo, "skip": Skip, "record": Record}
@@ -276,6 +282,8 @@ def _with_new_names(line: Mapping[str, Any]) -> Mapping[str, Any]:
     status = renamed.get("status")
     if isinstance(status, str):
         renamed["status"] = RENAMED_STATUSES.get(status, status)
+    if isinstance(plan := renamed.get("plan"), Mapping):
+        renamed["plan"] = {RENAMED_FIELDS.get(name, name): value for name, value in plan.items()}
     conflict = line.get("contradicted")
     if not conflict or "claim_check" in line:
         return renamed
@@ -343,8 +351,8 @@ def _is_positive(value: Any) -> bool:
 
 
 def _is_plan(plan: Mapping[str, Any]) -> bool:
-    levels = plan.get("levels", [])
-    return _is_mapping(plan, _is_flat) and isinstance(levels, list) and all(map(_is_positive, levels))
+    tolerances = plan.get("tolerances", [])
+    return _is_mapping(plan, _is_flat) and isinstance(tolerances, list) and all(map(_is_positive, tolerances))
 
 
 _Rule = tuple[str, Callable[[Any], bool]]
@@ -373,7 +381,7 @@ _TYPES: dict[str, _Rule] = {
 #: What their values are limited to; "" is the rule of every other number with a fraction.
 _RANGES: dict[Any, _Rule] = {
     "": ("0 or more", lambda v: not v < 0.0),
-    ("Run", "plan"): ("a plan with positive levels", _is_plan),
+    ("Run", "plan"): ("a plan with positive tolerances", _is_plan),
     ("Record", "start"): ("cold, warm or carried", lambda v: v in ("cold", "warm", "carried")),
     ("Record", "mode"): ("tol, budget or time", lambda v: v in ("tol", "budget", "time")),
     ("Record", "way"): ("call, steps, batch or nothing", lambda v: v in ("", "call", "steps", "batch")),

@@ -26,7 +26,7 @@ from lavender.lab.bench.recommendation import (
     recommend_from_single_runs,
 )
 from lavender.lab.bench.record import Record
-from lavender.lab.bench.statistics import MEAN_TIME_SHIFT, levels_of, limit_of
+from lavender.lab.bench.statistics import MEAN_TIME_SHIFT, get_tolerances, limit_of
 from lavender.lab.bench.store import Records
 from lavender.lab.bench.timed_call import format_call
 
@@ -118,26 +118,32 @@ def select_calls(records: Records, way: str, in_turns: bool = True) -> list[Time
 STARTS = {"cold": "cold", "carried": "warm from the step before"}
 
 
-def _keep_best_of_each(calls: Sequence[TimedCall], level: float) -> list[TimedCall]:
-    """Keep one call of each solver: the start that brings more cases to the level, then the faster one."""
+def _keep_best_of_each(calls: Sequence[TimedCall], tolerance: float) -> list[TimedCall]:
+    """Keep one call of each solver: the start that brings more cases to the tolerance, then the faster one."""
     best: dict[str, TimedCall] = {}
-    for call in sorted(calls, key=lambda f: (sum(not r.relative <= level for r in f.runs.values()), f.time)):
+    for call in sorted(
+        calls, key=lambda f: (sum(not r.relative <= tolerance for r in f.runs.values()), f.time)
+    ):
         best.setdefault(call.line.solver, call)
     return list(best.values())
 
 
-def rank_calls_to_level(
-    records: Records, calls: Sequence[TimedCall], level: float, cases: int = 0
+def rank_calls_to_tolerance(
+    records: Records, calls: Sequence[TimedCall], tolerance: float, cases: int = 0
 ) -> ResampledRanking | None:
-    """Rank calls with a tolerance by the cases that they bring to the level, then by the geometric mean of times.
+    """Rank calls by the number of cases that they bring to the tolerance, then by the geometric mean of times.
 
     `cases` is the number of all cases, if calls were timed on fewer. Returns None without such a call.
     """
-    calls = _keep_best_of_each([f for f in calls if f.line.mode == "tol" and f.line.tol <= level], level)
+    calls = _keep_best_of_each(
+        [f for f in calls if f.line.mode == "tol" and f.line.tol <= tolerance], tolerance
+    )
     if not calls:
         return None
     limit, names = limit_of(records), _list_cases(calls)
-    missed = np.array([[c not in f.runs or not f.runs[c].relative <= level for c in names] for f in calls])
+    missed = np.array(
+        [[c not in f.runs or not f.runs[c].relative <= tolerance for c in names] for f in calls]
+    )
     times = _stack_repetitions(calls, names, lambda r: r.times or (r.time_min,))
     charged = np.where(missed[:, :, None] | ~np.isfinite(times), limit, times)
 
@@ -158,7 +164,7 @@ def rank_calls_to_level(
 
 
 def recommend_solvers(records: Records, times: Sequence[float] = ()) -> list[FamilyAdvice]:
-    """Rank solvers for each structure and sequence; to the middle level by the calls timed in turns, if there are any.
+    """Rank solvers for each structure and sequence; to the middle tolerance by interleaved calls, if there are any.
 
     Parameters
     ----------
@@ -166,27 +172,27 @@ def recommend_solvers(records: Records, times: Sequence[float] = ()) -> list[Fam
     times : s, optional
         Time budgets; three decades about the fastest times if none are given.
     """
-    levels = levels_of(records)
-    level = levels[len(levels) // 2]
+    tolerances = get_tolerances(records)
+    tolerance = tolerances[len(tolerances) // 2]
     in_turns = {way: select_calls(records, way) for way in ("call", "steps")}
     advice = []
     for family in recommend_from_single_runs(records, times):
         calls = in_turns["steps" if family.sequence else "call"]
-        first = recommend_for_cases(records, family.by_level[level], calls, family.cases)
-        advice.append(replace(family, by_level={**family.by_level, level: first}))
+        first = recommend_for_cases(records, family.by_tolerance[tolerance], calls, family.cases)
+        advice.append(replace(family, by_tolerance={**family.by_tolerance, tolerance: first}))
     return advice
 
 
 def recommend_for_cases(
     records: Records, alone: Advice, calls: Sequence[TimedCall], cases: Sequence[str]
 ) -> Advice:
-    """Rank solvers to a level on some cases by the rule and the times of the report's first sentence.
+    """Rank solvers to a tolerance on some cases by the rule and the times of the report's first sentence.
 
     Solvers of `calls`, which were timed in turns, come first, then the others of `alone`. Returns `alone` if no call
     was timed on these cases, or if the calls solve fewer of them.
     """
     parts = [replace(f, runs={c: f.runs[c] for c in cases if c in f.runs}) for f in calls]
-    resampled = rank_calls_to_level(records, [f for f in parts if f.runs], alone.target, len(cases))
+    resampled = rank_calls_to_tolerance(records, [f for f in parts if f.runs], alone.target, len(cases))
     best = alone.ranking[0].solved if alone.ranking else 0
     if resampled is None or resampled.ranking[0][1].solved < max(1, best):
         return alone

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from lavender.lab.bench.record import Record, level_name
+from lavender.lab.bench.record import Record, format_tolerance
 from lavender.solvers import registry
 
 COLD = "dataclasses.replace({}, guess=None)"  # removes the start that came with a problem
@@ -47,7 +47,7 @@ def format_call(record: Record, guessed: bool = False) -> tuple[str, ...]:
     """
     asked = make_call_arguments(record, record.iterations)
     text = {
-        name: str(x) if name == "max_iter" else _exact(x, level_name(x) if x else "0")
+        name: str(x) if name == "max_iter" else _exact(x, format_tolerance(x) if x else "0")
         for name, x in asked.items()
     }
     words = ", ".join(f"{name}={value}" for name, value in text.items())

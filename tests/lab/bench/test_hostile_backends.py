@@ -211,7 +211,7 @@ from lavender import bench
 def hard(i):
     chain = diags_array([2.0, -1.0, -1.0], offsets=[0, 1, -1], shape=(3000, 3000))  # condition 4e6
     return lv.Problem.lcp(chain.tocsr(), (1.0 + i) * np.eye(1, 3000)[0], name=f"hard {i}")
-plan = bench.CampaignPlan(levels=(1e-9,), budgets=(), cap=10_000_000)
+plan = bench.CampaignPlan(tolerances=(1e-9,), budgets=(), cap=10_000_000)
 bench.run([hard(i) for i in range(4)], ["pgs"], plan, workers=2)
 """
 
@@ -250,7 +250,9 @@ def test_workers_of_a_campaign_end_when_it_is_killed():
 
 def test_a_whole_run_survives_its_backends(hostile, watchdog, monkeypatch):
     monkeypatch.setattr("lavender.lab.bench.running.worker.GRACE", 0.5)
-    plan = bench.Plan(levels=(1e-3,), budgets=(), repeats=1, time_limit=1.0)  # a hundred times what they take
+    plan = bench.Plan(
+        tolerances=(1e-3,), budgets=(), repeats=1, time_limit=1.0
+    )  # a hundred times what they take
     records = bench.run([stack(4)], ["x_talk", "x_hang", "x_segfault", "x_leave", "pgs"], plan)
     said = [r.status for r in records]
     assert said == ["CONVERGED", "KILLED", "CRASHED (SIGSEGV)", "CRASHED (exit status 3)", "CONVERGED"]

@@ -9,7 +9,7 @@ import pytest
 from lavender import bench, report
 from lavender.lab.bench import statistics
 from lavender.lab.report import table_specs
-from tests.lab.report.synthetic import BUDGET, FALSE_CLAIM, LEVELS, info, record, records_of
+from tests.lab.report.synthetic import BUDGET, FALSE_CLAIM, TOLERANCES, info, record, records_of
 
 
 def test_time_to_a_level_is_that_of_the_cheapest_run_that_reached_it():
@@ -41,7 +41,7 @@ def test_a_claim_that_is_not_proven_is_neither_a_proof_nor_a_false_claim(check, 
     found = records_of(record("a", "x", 1.0, 0.5, **claim))
     assert len(report.failures(found)) == (0 if check == "confirmed" else 1)
     assert [c.wrong for c in report.claims(found)] == [wrong]
-    table = table_specs.tabulate_reaches(report.reaches(found), LEVELS)
+    table = table_specs.tabulate_reaches(report.reaches(found), TOLERANCES)
     assert str(table.rows[0][table.heads.index("claim")]) == mark
     assert table.marks == ["bad" if wrong else ""]
 
@@ -52,7 +52,7 @@ def test_profiles_count_misses_and_refusals_at_infinity():
         record("b", "fast", 2.0, 1e-1, success=False), record("b", "slow", 4.0, 1e-7),
         record("c", "slow", 1.0, 1e-7), record("d", "slow", 1.0, 1.0), record("d", "fast", 1.0, 1.0),
     )  # fmt: skip
-    profile = next(p for p in report.profiles(found) if p.level == 1e-6)
+    profile = next(p for p in report.profiles(found) if p.tolerance == 1e-6)
     assert profile.cases == 4
     assert dict(profile.curves) == {"fast": ((1.0, 0.25),), "slow": ((1.0, 0.5), (3.0, 0.75))}
 
@@ -115,7 +115,7 @@ def test_changes_beyond_noise_are_named():
         record("a", "x", 3.0, 1e-7), record("a", "y", 1.1, 1e-7), record("a", "z", 1.0, 1e-7),
         record("a", "w", 1.0, 1e-4, success=False), record("a", "v", 1.9, 1e-7),
     )  # fmt: skip
-    found = {c.solver: c for c in statistics.changes(old, new) if c.level == 1e-6}
+    found = {c.solver: c for c in statistics.changes(old, new) if c.tolerance == 1e-6}
     kinds = {"x": "slower", "y": "same", "z": "reached", "w": "lost", "v": "same"}
     assert {s: c.kind for s, c in found.items()} == kinds
     assert found["v"].noise == 2.0  # its repeats spread by half
@@ -136,7 +136,7 @@ def test_a_slower_machine_is_no_slower_code():
 
 @pytest.fixture(scope="module")
 def measured():
-    return bench.run(["stack(n=6)"], ["auto", "osqp"], bench.Plan(levels=(1e-6,), budgets=(), repeats=2))
+    return bench.run(["stack(n=6)"], ["auto", "osqp"], bench.Plan(tolerances=(1e-6,), budgets=(), repeats=2))
 
 
 def test_backends_have_the_time_of_their_own_interface_too(measured):

@@ -12,7 +12,7 @@ from lavender.lab.report.engine import read_engine_answers
 from lavender.lab.report.findings import Report
 from lavender.lab.report.terminal import print_report
 
-LEVELS = (1e-3, 1e-6)
+TOLERANCES = (1e-3, 1e-6)
 FALSE_CLAIM = {"claim_check": "contradicted", "status_conflict": "says CONVERGED"}
 BUDGET = {"mode": "budget", "tol": 0.0, "max_iter": 8, "status": "MAX_ITERATIONS", "claims": False,
           "work": {"sweeps": 8}, "iterations": 8}  # fmt: skip
@@ -38,7 +38,7 @@ def record(case, solver, time, relative, **more):
 
 def records_of(*made, structure=None, law=None):
     found = bench.Records()
-    versions, plan = {"numpy": "2"}, {"levels": list(LEVELS)}
+    versions, plan = {"numpy": "2"}, {"tolerances": list(TOLERANCES)}
     found.add(Run("run", "2026-01-01", "0.1", "3.11", "linux", "a cpu", 2, 1, versions, plan))
     for case in dict.fromkeys(r.case for r in made):
         found.add(info(case, (law or {}).get(case, "lcp"), (structure or {}).get(case, ("stack",))))

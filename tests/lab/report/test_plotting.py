@@ -81,7 +81,7 @@ def test_a_drawing_survives_what_has_no_place_on_its_axes():
     for drawn in (
         figures.Figure("f", "<t>&$x_", "x", "y", (odd,)),
         figures.Figure("f", "t", "x", "y", (), x_log=False, y_log=False),
-        figures.Figure("f", "t", "x [s]", "y", (noted,), levels=(0.0,)),
+        figures.Figure("f", "t", "x [s]", "y", (noted,), tolerances=(0.0,)),
         figures.Figure("f", "t", "x", "y", (flat,), False, False),
     ):
         assert plot_for_page(drawn, {}) == plot_for_page(drawn, {})

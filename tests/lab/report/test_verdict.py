@@ -171,7 +171,7 @@ def test_tables_stay_within_the_terminal_and_nothing_is_cut(tmp_path, width):
     assert "…" not in out
     for line in found.lines:
         assert line.name in out
-        for best in (a.best for a in (*line.by_level.values(), *line.by_time.values())):
+        for best in (a.best for a in (*line.by_tolerance.values(), *line.by_time.values())):
             assert best is None or best.solver in out
 
 

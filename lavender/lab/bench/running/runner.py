@@ -382,7 +382,7 @@ class Runner:
             self.done += 1
 
     def measure_sequence(self, items: list[Item]) -> None:
-        """Measure every solver on the steps of a sequence, in passes: each budget and level, cold and carried."""
+        """Measure every solver on the steps of a sequence, in passes: each budget and tolerance, cold and carried."""
         infos = [self.load_case(item) for item in items]
         identity = hashlib.sha256("".join(i.sha for i in infos if i is not None).encode()).hexdigest()[:16]
         steps = [
@@ -468,7 +468,7 @@ class Runner:
         return other
 
     def measure_solver(self, info: CaseInfo, problem: Problem, name: str) -> None:
-        """Measure one solver on one case, at every budget and level."""
+        """Measure one solver on one case, at every budget and tolerance."""
         spec = self.select_solver(info.case, name, [problem])
         if spec is None:
             return
