@@ -71,10 +71,10 @@ NEAR = 1.25  # times the fastest: differences below say nothing on a machine tha
 ADVICE = (
     "The first table has the solver that brings the most cases of a structure to each tolerance and, of those that\n"
     "bring as many, is the fastest. The number is the shifted geometric mean of its times; brackets show on how\n"
-    "many cases, if not on all. The second table has the solver that serves the most cases within each time (a case\n"
-    "is served if at most half of the start's residual is left); the number is the residual at the 90th percentile. Solvers\n"
-    f"after ≈ are as good within noise (a factor of {TIME_NOISE_FACTOR:g} in time, {RESIDUAL_NOISE_FACTOR:g} in "
-    "residual).\n"
+    "many cases, if not on all. The second table has the solver that serves the most cases within each time\n"
+    "(a case is served if at most half of the start's residual is left); the number is the residual at the 90th\n"
+    f"percentile. Solvers after ≈ are as good within noise (a factor of {TIME_NOISE_FACTOR:g} in time, "
+    f"{RESIDUAL_NOISE_FACTOR:g} in residual).\n"
     "[A report's page](REPORT) shows the same records."
 )
 LAW_NAMES = {

@@ -12,9 +12,9 @@ from lavender.cli.options import Reading, say
 @click.command()
 @click.argument("files", nargs=-1, required=True, metavar="FILE...")
 @click.option("--tol", type=float, default=1e-6, show_default=True, help="Relative residual to reach.")
-@click.option("--json", "as_data", is_flag=True, help="Print one way per line as JSON.")
+@click.option("--json", "as_data", is_flag=True, help="Print one decision trace per line as JSON.")
 def explain(files: tuple[str, ...], tol: float, as_data: bool) -> None:
-    """Print the way of `auto` through its tree with problems (files, folders or cases of the suite).
+    """Print the decision trace of `auto` on problems (files, folders or cases of the suite).
 
     Nothing is solved. Costs are counted from the structure of a problem, with the same rates on every machine.
 

@@ -64,7 +64,7 @@ def phenomena(
     A cell shows the worst distance from the exact motion and the number of cases within all bounds. A note says which
     engine is missing, crashed, or cannot build a scene.
     """
-    from lavender.lab.phenomena import WAYS, chosen, run
+    from lavender.lab.phenomena import ENGINE_VARIANTS, chosen, run
     from lavender.lab.phenomena import table as tables
 
     if listed:
@@ -98,7 +98,12 @@ def phenomena(
             click.echo(f"{heading}:\n" + "\n".join(f"- {x}" for x in lines) + "\n")
     click.echo(tables.table(found))
     ran = {r.engine for r in found}
-    click.echo("\n" + "\n".join(f"- {way.name}: {way.text}" for way in WAYS.values() if way.name in ran))
+    click.echo(
+        "\n"
+        + "\n".join(
+            f"- {variant.name}: {variant.text}" for variant in ENGINE_VARIANTS.values() if variant.name in ran
+        )
+    )
 
 
 def _told(found: list[Record]) -> dict[str, object]:

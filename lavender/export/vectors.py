@@ -150,7 +150,7 @@ def made(path: Path, solver: str | None, most: int) -> dict[str, str | bytes]:
 
 def _chosen(records: Records, solver: str | None) -> list[Record]:
     """Runs of the solver that is written, to the tolerance that the report recommends by, or else its tightest."""
-    solved = [r for r in records if r.success and r.mode == "tol" and r.way in ("call", "steps")]
+    solved = [r for r in records if r.success and r.mode == "tol" and r.timing_mode in ("call", "steps")]
     names = sorted({r.solver for r in solved if r.solver in METHODS or r.solver == "auto"})
     if solver is None:
         leaders = build_verdict(records).leaders

@@ -46,10 +46,12 @@ def list_candidates(records: Records, times: Sequence[float] = ()) -> list[Ask]:
         for solver in [c.solver for c in near[:MAX_CANDIDATES]]:
             max_iter = _required_max_iter(records, solver, tolerance)
             # Carrying impulses has its price: if steps are quick, a cold start may be faster.
-            for start in ("cold", "carried") if subject.way == "steps" else ("cold",):
-                asks.append(Ask(solver, "tol", tolerance, max_iter, way=subject.way, start=start))
-            asks.append(Ask(solver, "tol", tolerance, max_iter, way="batch"))
-        single = select_calls(records, subject.way, in_turns=False)
+            for start in ("cold", "carried") if subject.timing_mode == "steps" else ("cold",):
+                asks.append(
+                    Ask(solver, "tol", tolerance, max_iter, timing_mode=subject.timing_mode, start=start)
+                )
+            asks.append(Ask(solver, "tol", tolerance, max_iter, timing_mode="batch"))
+        single = select_calls(records, subject.timing_mode, in_turns=False)
         for advice in subject.quick:
             if times or advice.target <= SHORT_TIME_RATIO * best.score:
                 asks += _list_time_limited(records, subject, single, advice, tolerance)
@@ -66,12 +68,19 @@ def _list_time_limited(
     records: Records, subject: Subject, single: Sequence[TimedCall], advice: Advice, tolerance: float
 ) -> list[Ask]:
     """List time limits for the solvers that come closest, and the budgets of sweeps that stay within the time."""
-    start = "carried" if subject.way == "steps" else "cold"
+    start = "carried" if subject.timing_mode == "steps" else "cold"
     own = [
         c.solver for c in advice.ranking if not (s := specs().get(c.solver)) or not (s.external or s.requires)
     ]
     asks = [
-        Ask(solver, "time", tolerance, time_limit=fraction * advice.target, way=subject.way, start=start)
+        Ask(
+            solver,
+            "time",
+            tolerance,
+            time_limit=fraction * advice.target,
+            timing_mode=subject.timing_mode,
+            start=start,
+        )
         for solver in dict.fromkeys([*own[: MAX_CANDIDATES - 1], *(s for s in own if s == "auto")])
         for fraction in TIME_LIMIT_FRACTIONS
     ]
@@ -79,7 +88,16 @@ def _list_time_limited(
     for call, choice in () if ranking is None else ranking.ranking[:MAX_CANDIDATES]:
         if choice.solved:
             line = call.line
-            asks.append(Ask(line.solver, "budget", 0.0, line.max_iter, way=subject.way, start=line.start))
+            asks.append(
+                Ask(
+                    line.solver,
+                    "budget",
+                    0.0,
+                    line.max_iter,
+                    timing_mode=subject.timing_mode,
+                    start=line.start,
+                )
+            )
     return asks
 
 

@@ -336,7 +336,7 @@ class Subject:
 
     names: tuple[str, ...]  # cases, or sequences
     cases: tuple[str, ...]  # cases, or steps of the sequences
-    way: str  # "call" or "steps"
+    timing_mode: str  # "call" or "steps"
     best: Advice  # to the middle tolerance
     quick: tuple[Advice, ...]  # in each time
 
@@ -350,9 +350,9 @@ def list_subjects(records: Records, times: Sequence[float] = ()) -> list[Subject
     sequences = group_steps(records)
     steps = tuple(step for some in sequences.values() for step in some)
     subjects = []
-    for names, members, way in ((cases, cases, "call"), (tuple(sequences), steps, "steps")):
+    for names, members, timing_mode in ((cases, cases, "call"), (tuple(sequences), steps, "steps")):
         if members:
             quick = tuple(rank_in_time(records, "all", members, t) for t in times)
             best = rank_to_tolerance(records, "all", members, tolerance)
-            subjects.append(Subject(names, members, way, best, quick))
+            subjects.append(Subject(names, members, timing_mode, best, quick))
     return subjects

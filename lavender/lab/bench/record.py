@@ -193,14 +193,14 @@ class Record(_Texts):
     setup_median: float = math.nan
     solve_min: float = math.nan
     solve_median: float = math.nan
-    # of one repeat: of the line where `way` says one, else set-up and solve together
+    # of one repeat: of the line where `timing_mode` says one, else set-up and solve together
     time_min: float = math.nan
     time_median: float = math.nan
     threads: int = 1
     step: int = -1  # of a sequence
-    # What was timed: "call", one `lv.solve` on a problem just made; "steps", the same in a loop that carries impulses;
-    # "batch", a problem's share of one `lv.solve_many`; "" prepare and solve, without judge and front door.
-    way: str = ""
+    # "call": one `lv.solve` on a new problem. "steps": the same in a loop that carries impulses. "batch": the time of
+    # one `lv.solve_many`, divided by its problems. "": prepare and solve, without the judge and the input validation.
+    timing_mode: str = ""
     # which lines on which cases took turns with this one; "": repeats came one after the other
     turns: str = ""
     times: tuple[float, ...] = ()  # s, of each repeat
@@ -230,7 +230,7 @@ class Record(_Texts):
 def measurement_key(what: Any) -> tuple[Any, ...]:
     """The identity of a measurement, of its `Task` as of its `Record`."""
     options = repr(sorted(plain(what.options).items()))
-    asked = (what.start, what.mode, what.tol, what.max_iter, what.time_limit, what.way, what.turns)
+    asked = (what.start, what.mode, what.tol, what.max_iter, what.time_limit, what.timing_mode, what.turns)
     return (what.case, what.sha, what.solver, options, *asked)
 
 
@@ -240,6 +240,7 @@ RENAMED_FIELDS = {
     "floor": "roundoff_floor",
     "suspicions": "diagnostics",
     "contradicted": "status_conflict",
+    "way": "timing_mode",
     "levels": "tolerances",
     "speed_levels": "velocity_tolerances",
 }
@@ -384,7 +385,10 @@ _RANGES: dict[Any, _Rule] = {
     ("Run", "plan"): ("a plan with positive tolerances", _is_plan),
     ("Record", "start"): ("cold, warm or carried", lambda v: v in ("cold", "warm", "carried")),
     ("Record", "mode"): ("tol, budget or time", lambda v: v in ("tol", "budget", "time")),
-    ("Record", "way"): ("call, steps, batch or nothing", lambda v: v in ("", "call", "steps", "batch")),
+    ("Record", "timing_mode"): (
+        "call, steps, batch or nothing",
+        lambda v: v in ("", "call", "steps", "batch"),
+    ),
     ("Record", "claim_check"): ("confirmed, not proven or contradicted", lambda v: v in CLAIM_CHECKS),
     ("Record", "tol"): ("a finite number of 0 or more", lambda v: 0.0 <= v < math.inf),
     ("Record", "time_limit"): ("a positive number of seconds", _is_positive),

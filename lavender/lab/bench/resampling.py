@@ -87,17 +87,19 @@ class ResampledRanking:
         return tuple(dict.fromkeys([solvers[0], *others]))
 
 
-def select_calls(records: Records, way: str, in_turns: bool = True) -> list[TimedCall]:
-    """Select the calls of a way ("call", "steps", "batch") that ran on the largest number of cases.
+def select_calls(records: Records, timing_mode: str, in_turns: bool = True) -> list[TimedCall]:
+    """Select the calls of a timing mode ("call", "steps", "batch") that ran on the largest number of cases.
 
     With `in_turns` these are calls that were timed in turns with others. Without it they are runs that were measured
     one after the other; records of earlier versions have no others.
     """
     groups: dict[tuple[object, ...], dict[str, Record]] = {}
     for r in records:
-        same_way = r.way == way or (not r.way and not in_turns and (r.step >= 0) is (way == "steps"))
+        same_mode = r.timing_mode == timing_mode or (
+            not r.timing_mode and not in_turns and (r.step >= 0) is (timing_mode == "steps")
+        )
         compared = r.order == "given" and r.start != "warm" and (r.mode != "budget" or counts_sweeps(r))
-        if same_way and compared and bool(r.turns) is in_turns and r.case in records.cases:
+        if same_mode and compared and bool(r.turns) is in_turns and r.case in records.cases:
             key = (r.solver, r.mode, r.tol, r.max_iter, r.time_limit, r.start)
             groups.setdefault(key, {})[r.case] = r
     most = max((len(runs) for runs in groups.values()), default=0)
@@ -106,7 +108,7 @@ def select_calls(records: Records, way: str, in_turns: bool = True) -> list[Time
         for runs in groups.values()
         if len(runs) == most
     ]
-    if way != "batch":
+    if timing_mode != "batch":
         return calls
     # A batch of some of the cases cannot be compared with a call on all of them.
     complete = {
@@ -174,7 +176,7 @@ def recommend_solvers(records: Records, times: Sequence[float] = ()) -> list[Fam
     """
     tolerances = get_tolerances(records)
     tolerance = tolerances[len(tolerances) // 2]
-    in_turns = {way: select_calls(records, way) for way in ("call", "steps")}
+    in_turns = {timing_mode: select_calls(records, timing_mode) for timing_mode in ("call", "steps")}
     advice = []
     for family in recommend_from_single_runs(records, times):
         calls = in_turns["steps" if family.sequence else "call"]

@@ -51,7 +51,7 @@ def format_call(record: Record, guessed: bool = False) -> tuple[str, ...]:
         for name, x in asked.items()
     }
     words = ", ".join(f"{name}={value}" for name, value in text.items())
-    if record.way == "batch":
+    if record.timing_mode == "batch":
         cold = (f"problems = [{COLD.format('p')} for p in problems]",) if guessed else ()
         return (*cold, f'solutions = lv.solve_many(problems, "{record.solver}", {words})')
     if record.start != "carried":

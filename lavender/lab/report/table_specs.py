@@ -518,9 +518,11 @@ def _recommend_here(records: Records, cases: Sequence[str], tolerance: float) ->
     """Return the solver that is recommended for the cases of a folder, by the rule of the first sentence."""
     if not cases:
         return None
-    way = "steps" if records.cases[cases[0]].sequence else "call"
+    timing_mode = "steps" if records.cases[cases[0]].sequence else "call"
     alone = recommendation.rank_to_tolerance(records, "", cases, tolerance)
-    best = resampling.recommend_for_cases(records, alone, resampling.select_calls(records, way), cases).best
+    best = resampling.recommend_for_cases(
+        records, alone, resampling.select_calls(records, timing_mode), cases
+    ).best
     return best if best is not None and best.solved else None
 
 

@@ -108,7 +108,10 @@ def _recommend(
 ) -> Verdict:
     """Recommend a solver for one subject by the calls timed in turns, or by single runs if there are none."""
     tolerance, n = subject.best.target, subject.best.ranking[0].cases if subject.best.ranking else 0
-    in_turns, single = select_calls(records, subject.way), select_calls(records, subject.way, in_turns=False)
+    in_turns, single = (
+        select_calls(records, subject.timing_mode),
+        select_calls(records, subject.timing_mode, in_turns=False),
+    )
     resampled = rank_calls_to_tolerance(records, in_turns or single, tolerance, n)
     cases = _describe_subject(records, subject, n)
     reached = f"down to {format_tolerance(tolerance)} of the error of doing nothing"
@@ -154,7 +157,7 @@ def _recommend(
         elif swept is not None:
             statements.append(Statement(f"{asked} nothing serves nine cases of ten.", asked=True))
     faster = [f"{b.solver} on {b.wins} of {b.solved} cases" for b in statistics.backends(records) if b.wins]
-    if faster and subject.way == "call":
+    if faster and subject.timing_mode == "call":
         head = "By their own interface, on data given before, some are faster than all of ours"
         statements.append(Statement(f"{head}: {', '.join(faster)}."))
     return Verdict(tuple(statements), tuple(dict.fromkeys(leaders))[:3], resampled.ranking)
@@ -205,7 +208,7 @@ def _describe_speed(speed: float) -> str:
 def _describe_subject(records: Records, subject: Subject, n: int) -> str:
     """Return words for the cases of a subject, with the number of those that did not load."""
     names, lost = subject.names, records.left_out
-    if subject.way == "call":
+    if subject.timing_mode == "call":
         return _describe_cases(records, names) + format_left_out(len(lost.get("", ())))
     of = names[0] if len(names) == 1 else f"your {format_count(len(names), 'sequence')}"
     n_lost = sum(len(lost.get(name, ())) for name in names)
@@ -317,7 +320,13 @@ def _add_code(records: Records, call: TimedCall, text: str, asked: bool = False)
         text += " Records of an earlier version: the line itself was not timed."
     line, reason, in_c = call.line, _explain_missing_c(records, call), ""
     spec = specs().get(line.solver)
-    if spec is not None and spec.builtin and not spec.external and line.mode == "tol" and line.way != "batch":
+    if (
+        spec is not None
+        and spec.builtin
+        and not spec.external
+        and line.mode == "tol"
+        and line.timing_mode != "batch"
+    ):
         source = quote(records.source or "records.jsonl")
         command = f"lavender export c liblavender --solver {line.solver} --for {source}"
         in_c = f"not in C: {reason}" if reason else command

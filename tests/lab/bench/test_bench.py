@@ -108,12 +108,14 @@ def test_an_answer_is_no_start(tmp_path, early):
     records = bench.run([path], ["pgs"], QUICK)
     assert {r.start for r in records} == {"cold"}
     assert records.cases["step"].guess == "answer"
-    asks = [bench.Ask("pgs", "tol", 1e-6), bench.Ask("pgs", "tol", 1e-6, way="batch")]
+    asks = [bench.Ask("pgs", "tol", 1e-6), bench.Ask("pgs", "tol", 1e-6, timing_mode="batch")]
     made = bench.time_alternately([path], asks, records, QUICK).records
     assert all(r.iterations > 5 for r in made if r.mode == "tol" and r.tol <= 1e-6)
     steps = bench.sequence([p.updated(guess=answer), p.updated(guess=answer)], "steps")
     records = bench.run(steps, ["pgs"], QUICK)
-    made = bench.time_alternately(steps, [bench.Ask("pgs", "tol", 1e-6, way="steps")], records, QUICK).records
+    made = bench.time_alternately(
+        steps, [bench.Ask("pgs", "tol", 1e-6, timing_mode="steps")], records, QUICK
+    ).records
     assert all(r.iterations > 5 for r in made if r.start == "cold" and r.mode == "tol" and r.tol <= 1e-6)
     assert all(r.iterations > 5 for r in made if r.start == "carried" and r.step == 0 and r.tol == 1e-8)
     assert lv.cross_check(lv.load(path), ["pgs"])["pgs"].solution.iterations > 5
@@ -554,7 +556,7 @@ def test_what_is_timed_is_the_line_that_is_printed(timed):
     for r, (solver, asked, guess) in zip(records, timed, strict=True):
         assert (solver, asked, guess is None) == said(r, problem)
         assert (guess is None) == (r.start == "cold")
-        assert r.way == "call"
+        assert r.timing_mode == "call"
         assert len(r.times) == 1
         assert r.time_min >= 1.0 + r.setup_min + r.solve_min
     timed.clear()
@@ -594,7 +596,7 @@ def test_lines_are_timed_in_turns_and_kept(tmp_path):
         bench.Ask("pgs", "tol", 1e-6),
         bench.Ask("pgs", "budget", 0.0, 4),
         bench.Ask("pgs", "time", 1e-6, time_limit=1e-3),
-        bench.Ask("pgs", "tol", 1e-6, way="batch"),
+        bench.Ask("pgs", "tol", 1e-6, timing_mode="batch"),
     ]
     problems, plan = (
         [stack(6), stack(8, "other")],

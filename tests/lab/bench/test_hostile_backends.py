@@ -327,7 +327,7 @@ def test_time_that_a_line_took_before_its_process_was_asked_is_no_lie_of_its_pro
     p = stack()
     lead = 100.0  # s
     with Worker() as worker:
-        asked = task(p, "pgs", start="carried", way="call", repeats=2, lead=lead)
+        asked = task(p, "pgs", start="carried", timing_mode="call", repeats=2, lead=lead)
         record, impulse = worker.measure(p, asked, np.zeros(p.m))
         assert record.status == "CONVERGED" and impulse is not None
         assert len(record.times) == 1 and lead <= record.times[0] < lead + 60.0

@@ -201,7 +201,7 @@ def in_turns(speeds, seed, cases=CASES, noise=1.04, rerun=1.0, sizes=None, repea
         for solver, of_case in speeds.items():
             factor = of_case if isinstance(of_case, float) else of_case(i)
             times = tuple(size * factor * noise ** rng.gauss(0.0, 1.0) for _ in range(repeats))
-            more = {"way": "call", "times": times, "pace": 1e-4 * machine}
+            more = {"timing_mode": "call", "times": times, "pace": 1e-4 * machine}
             made.append(record(case, solver, min(times), 1e-7, turns="one", **more))
             made.append(record(case, solver, min(times), 1e-7, **more))
     return records_of(*made)
@@ -250,7 +250,7 @@ def test_who_misses_a_case_is_never_the_first_whatever_the_mean_says():
     for case in CASES:
         sure, quick = (1e-3, 1e-7), (1e-6, 1.0 if case == CASES[0] else 1e-12)
         for solver, (t, left) in (("sure", sure), ("quick", quick)):
-            made.append(record(case, solver, t, left, way="call", turns="one", times=(t,) * 3))
+            made.append(record(case, solver, t, left, timing_mode="call", turns="one", times=(t,) * 3))
     found = race(records_of(*made))
     assert [(c.solver, c.solved) for _, c in found.ranking] == [("sure", 6), ("quick", 5)]
 
@@ -258,7 +258,7 @@ def test_who_misses_a_case_is_never_the_first_whatever_the_mean_says():
 def test_lines_that_were_refused_different_cases_are_compared_on_all_of_them():
     size = {"easy": 1e-3, "both": 1e-2, "hard": 1e-1}
     made = [
-        record(case, solver, t, 1e-7, turns="one", way="call", times=(t,) * 7, **more)
+        record(case, solver, t, 1e-7, turns="one", timing_mode="call", times=(t,) * 7, **more)
         for case in size
         for solver, factor, refused in (("slow", 2.0, "hard"), ("quick", 1.0, "easy"))
         for t in (factor * size[case],)
@@ -281,7 +281,7 @@ def test_lines_that_were_refused_different_cases_are_compared_on_all_of_them():
 def test_what_comes_too_late_in_more_than_one_repetition_of_twenty_is_not_served():
     def line(solver, late):
         times = (2e-3,) * late + (0.5e-3,) * (20 - late)
-        more = {"mode": "time", "time_limit": 0.5e-3, "way": "call", "turns": "one", "times": times}
+        more = {"mode": "time", "time_limit": 0.5e-3, "timing_mode": "call", "turns": "one", "times": times}
         return record("a", solver, min(times), 1e-2, reached=(1e-2,) * 20, **more)
 
     found = records_of(line("punctual", 1), line("late", 2))
@@ -291,7 +291,7 @@ def test_what_comes_too_late_in_more_than_one_repetition_of_twenty_is_not_served
 
 def test_lines_that_took_turns_on_fewer_cases_do_not_replace_those_that_solved_more():
     made = [record(case, "x", 1e-3, 1e-9) for case in "abc"]
-    made.append(record("a", "x", 2e-3, 1e-9, way="call", turns="one", times=(2e-3,) * 5, pace=1e-4))
+    made.append(record("a", "x", 2e-3, 1e-9, timing_mode="call", turns="one", times=(2e-3,) * 5, pace=1e-4))
     (line,) = report.recommend_solvers(records_of(*made))
     assert (line.by_tolerance[1e-6].best.solved, line.by_tolerance[1e-6].best.score) == (
         3,
@@ -303,6 +303,6 @@ def test_lines_that_took_turns_on_fewer_cases_do_not_replace_those_that_solved_m
 def test_a_batch_of_some_of_the_cases_is_not_told_beside_a_call_on_all(n):
     made = in_turns({"auto": 1.0, "pgs": 2.0}, 0, cases=CASES[:3])
     for r in [r for r in made if r.turns and r.case in CASES[:n]]:
-        made.add(dataclasses.replace(r, way="batch"))
+        made.add(dataclasses.replace(r, timing_mode="batch"))
     code = [line for t in build_verdict(made).statements for line in t.code]
     assert any("solve_many" in line for line in code) == (n == 3)

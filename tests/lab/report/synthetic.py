@@ -51,7 +51,7 @@ def in_turns(made, case, solver, time, relative, **more):
     """Add a run alone and the same in turns with others, 1.25 times as long."""
     made.append(record(case, solver, time, relative, **more))
     slow = 1.25 * time
-    turns = {"way": "call", "turns": "one", "times": (slow,) * 5, "pace": 1e-4}
+    turns = {"timing_mode": "call", "turns": "one", "times": (slow,) * 5, "pace": 1e-4}
     made.append(record(case, solver, slow, relative, **(turns | more)))
 
 
@@ -83,7 +83,7 @@ def example(folder):
     made.append(record("idle", "pgs", 1e-5, 1.0, velocity=3e-12))
     for step in range(2):
         for start, left in (("cold", 1e-1), ("carried", 1e-2)):
-            steps = {"start": start, "step": step, "way": "steps"}
+            steps = {"start": start, "step": step, "timing_mode": "steps"}
             made.append(record(f"walk[{step}]", "pgs", 1e-3, left, **steps, **BUDGET))
             in_turns(made, f"walk[{step}]", "auto", 2e-3 if start == "cold" else 1e-3, 1e-8, **steps)
     found = records_of(*made, structure={EVIL: ("stack", "friction")}, law={EVIL: "coulomb"})

@@ -126,7 +126,7 @@ def test_the_picture_of_all_cases_is_the_median_of_what_was_reached_by_each_time
             assert (low, middle, high) == tuple(np.sort(reached)[[1, 3, 5]])
         assert list(curve.y) == sorted(curve.y, reverse=True)
     # Shares of a batch, and the least time of repetitions of which another left less, are no points of it.
-    more = [record("a", "pgs", 1e-9, 1e-12, turns="one", way=way, mode=mode) for way, mode in
+    more = [record("a", "pgs", 1e-9, 1e-12, turns="one", timing_mode=timing_mode, mode=mode) for timing_mode, mode in
             (("batch", "tol"), ("call", "time"))]  # fmt: skip
     assert repr(figures.build_overall_figure(records_of(*made, *more))) == repr(found)  # whose floor is NaN
 

@@ -53,7 +53,7 @@ def time_alternately(
     ----------
     cases, plan, store, watch, isolate, memory, fresh : as `lavender.lab.bench.run`
     asks : sequence of Ask
-        Of way "call" on single cases, "steps" over sequences, "batch" on either.
+        Of timing mode "call" on single cases, "steps" over sequences, "batch" on either.
     known : Records
 
     Returns
@@ -96,7 +96,7 @@ class _Alternation:
     def measure_part(self, part: Cases, limit: float, extra: float) -> None:
         """Repeat all lines on some cases or one sequence: at most `limit` [s], above the usual number `extra` [s]."""
         is_sequence = bool(part[0][0].sequence)
-        asks = [a for a in self.asks if a.way == "batch" or (a.way == "steps") == is_sequence]
+        asks = [a for a in self.asks if a.timing_mode == "batch" or (a.timing_mode == "steps") == is_sequence]
         accepted = {ask: [(i, info) for i, info in part if self.accepts(ask, i)] for ask in asks}
         records: RecordsByKey = {}
         begun = perf_counter()
@@ -113,17 +113,17 @@ class _Alternation:
             else:
                 for item, info in part:
                     for ask in order:
-                        if ask.way != "batch" and any(info is other for _, other in accepted[ask]):
+                        if ask.timing_mode != "batch" and any(info is other for _, other in accepted[ask]):
                             self.add(records, self.time_case(ask, item, info, None)[0])
             for ask in order:
-                if ask.way == "batch" and _is_batch(accepted[ask], is_sequence):
+                if ask.timing_mode == "batch" and _is_batch(accepted[ask], is_sequence):
                     self.time_batch(ask, accepted[ask], records)
         for repeated in records.values():
             self.runner.keep(_merge(repeated))
 
     def accepts(self, ask: Ask, item: Item) -> bool:
         spec = self.runner.specs[ask.solver]
-        if is_foreign(spec) and (ask.way == "batch" or ask.mode == "time"):
+        if is_foreign(spec) and (ask.timing_mode == "batch" or ask.mode == "time"):
             return False  # a process of its own adds its start, or takes no limit
         return spec.refuses(item.problem) is None
 
@@ -131,7 +131,7 @@ class _Alternation:
         """Return one repetition of a line on one case."""
         more = {
             "time_limit": ask.time_limit or self.runner.plan.time_limit,
-            "repeats": 1 if ask.way == "steps" else 2,
+            "repeats": 1 if ask.timing_mode == "steps" else 2,
             "turns": self.turns,
             "guarded": False,
         }
@@ -150,7 +150,9 @@ class _Alternation:
         return record, after
 
     def time_steps(self, ask: Ask, steps: Cases, records: RecordsByKey) -> None:
-        if ask.way == "batch" or all(self.make_task(ask, info).key in self.known for _, info in steps):
+        if ask.timing_mode == "batch" or all(
+            self.make_task(ask, info).key in self.known for _, info in steps
+        ):
             return
         before = None
         for item, info in steps:

@@ -110,7 +110,7 @@ class Plan:
         object.__setattr__(self, "orders", tuple(dict.fromkeys(self.orders)))
         object.__setattr__(self, "motion", self.motion or self.prove or bool(self.velocity_tolerances))
 
-    way = "call"  # what of a single problem is timed, as `Record.way`
+    timing_mode = "call"  # what of a single problem is timed, as `Record.timing_mode`
 
     def iteration_limit(self) -> int:
         """Return the maximum number of iterations of a run to a tolerance."""
@@ -131,7 +131,9 @@ class Plan:
         """
 
         def one(mode: str, tol: float, max_iter: int, start: str, **options: Any) -> Record:
-            ask = Ask(spec.name, mode, tol, max_iter, start=start, way="" if options else self.way)
+            ask = Ask(
+                spec.name, mode, tol, max_iter, start=start, timing_mode="" if options else self.timing_mode
+            )
             more = {"options": options, "repeats": self.repeats, "time_limit": self.time_limit}
             return make(Task.of(info, ask, **more))
 
@@ -193,7 +195,7 @@ class CampaignPlan(Plan):
     time_limit: float = HANG_LIMIT
     cap: int = 20_000
     campaign: bool = True
-    way = ""  # nothing is timed
+    timing_mode = ""  # nothing is timed
 
     def iteration_limit(self) -> int:
         """Return `cap`."""
@@ -209,7 +211,7 @@ def list_passes(plan: Plan, spec: SolverSpec) -> list[Ask]:
     if spec.resumable and not spec.exact:
         asked = [*(("budget", 0.0, n) for n in plan.budgets), *asked]
     starts = ("cold", "carried") if spec.impulse and not spec.exact else ("cold",)
-    return [Ask(spec.name, *what, way="steps", start=start) for start in starts for what in asked]
+    return [Ask(spec.name, *what, timing_mode="steps", start=start) for start in starts for what in asked]
 
 
 def _rules_out_tighter_tolerances(record: Record) -> bool:

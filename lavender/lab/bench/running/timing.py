@@ -2,9 +2,9 @@
 
 The timed call is the line that a report prints, `lv.solve(problem, "name", tol=...)`, with the judge. The arrays of its
 problem were written just before, as a simulator leaves them, and other work has used the caches since. A guarded solve
-under the time limit runs first; if it does not end, its own time is recorded. If `Task.way` is empty, only `prepare`
-and `solve` are timed, without the judge, on a problem of which nothing is computed yet. BLAS and OpenMP use one thread,
-and the garbage collector is off.
+under the time limit runs first; if it does not end, its own time is recorded. If `Task.timing_mode` is empty,
+only `prepare` and `solve` are timed, without the judge, on a problem of which nothing is computed yet. BLAS and OpenMP
+use one thread, and the garbage collector is off.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class Ask:
     tol: float
     max_iter: int = 0  # 0: the solver's own default
     time_limit: float = 0.0  # s, of one solve; 0: that of the plan
-    way: str = "call"  # as `Record.way`
+    timing_mode: str = "call"  # as `Record.timing_mode`
     start: str = "cold"
 
 
@@ -66,7 +66,7 @@ class Task:
     options: Mapping[str, Any] = field(default_factory=dict)
     repeats: int = 1
     step: int = -1
-    way: str = ""
+    timing_mode: str = ""
     turns: str = ""
     guarded: bool = True  # a solve under the time limit comes first
     lead: float = 0.0  # s, that the line takes before its call: carrying impulses
@@ -189,7 +189,7 @@ def attempt(problem: Problem, task: Task, impulse: Any = None) -> Outcome | str:
         _warm_up(task.solver)
         with _undisturbed(task.solver):
             begun = perf_counter()
-            if task.way and task.guarded:
+            if task.timing_mode and task.guarded:
                 # A plug-in may test nothing: then its own budget ends its line, and a larger one never would.
                 tests = registry.get(task.solver).builtin or task.mode != "tol"
                 guard = uninterrupted(
@@ -200,7 +200,7 @@ def attempt(problem: Problem, task: Task, impulse: Any = None) -> Outcome | str:
             left = max(1, task.repeats - (guard is not None))
             while left and (guard is None or guard.status is not Status.TIME_LIMIT):
                 paces.append(pace())
-                if not task.way:
+                if not task.timing_mode:
                     parts = uninterrupted(_prepare_and_solve(problem, task, impulse))
                     runs.append((parts, parts.setup_time + parts.solve_time))
                 else:
@@ -213,7 +213,7 @@ def attempt(problem: Problem, task: Task, impulse: Any = None) -> Outcome | str:
                 if runs[-1][0].status is Status.TIME_LIMIT or perf_counter() - begun > task.time_limit:
                     left = 0 if task.mode != "time" else left
             solution = runs[-1][0] if runs else guard
-            if guard is None and task.way and _ended_by_budget(solution, task):
+            if guard is None and task.timing_mode and _ended_by_budget(solution, task):
                 # More iterations than the solver's own limit: they are asked for, under the guard.
                 return attempt(problem, replace(task, guarded=True), impulse)
     except Exception as error:
@@ -370,7 +370,7 @@ def record_of(task: Task, s: Solution, found: Outcome) -> Record:
         solve_median=statistics.median(solves),
         time_min=min(both),
         time_median=statistics.median(both),
-        times=found.times if task.way else (),
+        times=found.times if task.timing_mode else (),
         reached=found.reached,
         pace=found.pace,
         load=machine.running(),
