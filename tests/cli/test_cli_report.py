@@ -109,7 +109,7 @@ def test_a_proven_reference_is_what_a_report_measures_motions_from(lavender, tmp
     found = lv.motion.load_reference(lv.load(path), path)
     assert found.solver.startswith("proof") and found.residual.at_floor
     plan = bench.Plan(tolerances=(1e-3, 1e-9), budgets=(), repeats=1, orders=(), motion=True)
-    coarse, fine = (r.motion for r in bench.run([path], ["pgs"], plan))
+    coarse, fine = (r.motion_error for r in bench.run([path], ["pgs"], plan))
     assert 0.0 < fine < 1e-3 * coarse
 
     # On the border of two states: a solution is found, but no proof by signs.
@@ -354,11 +354,11 @@ def test_a_second_report_takes_its_runs_from_the_first_unless_told_otherwise(lav
     code, out, _ = lavender(*words, "--tables")
     assert "By structure" in out
     n = len(bench.read(tmp_path / "out"))
-    plain = len([r for r in bench.read(tmp_path / "out") if not r.turns])
+    plain = len([r for r in bench.read(tmp_path / "out") if not r.interleave_group])
     assert f"{n} of {n} runs reused of 20" in out
     code, out, _ = lavender(*words, "--fresh")
     assert "reused" not in out
-    again = [r for r in bench.read(tmp_path / "out") if not r.turns]
+    again = [r for r in bench.read(tmp_path / "out") if not r.interleave_group]
     assert len(again) == plain  # made again, they stand for the earlier ones
 
 

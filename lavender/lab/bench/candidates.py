@@ -1,4 +1,4 @@
-"""Choose the calls that are worth timing in turns, and time them.
+"""Choose the calls that are worth timing alternately, and time them.
 
 A report prints calls of `lv.solve`. Those near the best of what `bench.run` measured are timed again, interleaved with
 each other (`lavender.lab.bench.time_alternately`), so that the printed times are times of exactly these calls.
@@ -31,7 +31,7 @@ TIME_LIMIT_FRACTIONS = (
 
 
 def list_candidates(records: Records, times: Sequence[float] = ()) -> list[Ask]:
-    """List the calls to time in turns.
+    """List the calls to time alternately.
 
     These are calls to the middle tolerance, the same as a batch, and calls with each time limit in `times` [s]. Without
     `times`, time limits are those of `choose_time_budgets` that are short enough to be reported.
@@ -51,7 +51,7 @@ def list_candidates(records: Records, times: Sequence[float] = ()) -> list[Ask]:
                     Ask(solver, "tol", tolerance, max_iter, timing_mode=subject.timing_mode, start=start)
                 )
             asks.append(Ask(solver, "tol", tolerance, max_iter, timing_mode="batch"))
-        single = select_calls(records, subject.timing_mode, in_turns=False)
+        single = select_calls(records, subject.timing_mode, interleaved=False)
         for advice in subject.quick:
             if times or advice.target <= SHORT_TIME_RATIO * best.score:
                 asks += _list_time_limited(records, subject, single, advice, tolerance)

@@ -185,7 +185,7 @@ def _group_runs(records: Records) -> RunGroups:
     """Group cold runs on single cases by solver, and runs over sequences by budget or tolerance and start, too."""
     groups: dict[tuple[str, str, str], _RunGroup] = {}
     for r in records:
-        if r.order != "given" or r.turns or (r.step < 0 and r.start != "cold"):
+        if r.order != "given" or r.interleave_group or (r.step < 0 and r.start != "cold"):
             continue
         if r.step < 0:
             group = groups.setdefault((r.solver, "", ""), _RunGroup(r.solver))
@@ -201,7 +201,9 @@ def _group_sweep_budgets(records: Records) -> dict[int, RunGroups]:
     """Group the runs of each budget whose iterations are sweeps."""
     groups: dict[int, dict[tuple[str, str, str], _RunGroup]] = defaultdict(dict)
     for r in records:
-        compared = r.order == "given" and not r.turns and r.start in ("cold", "carried") and r.usable
+        compared = (
+            r.order == "given" and not r.interleave_group and r.start in ("cold", "carried") and r.usable
+        )
         if compared and r.mode == "budget" and counts_sweeps(r):
             start = "" if r.step < 0 else r.start
             new = _RunGroup(r.solver, start, r.max_iter)

@@ -173,11 +173,11 @@ class Record(_Texts):
     energy: float = math.inf  # sqrt J
     velocity: float = math.inf  # m/s
     roundoff_floor: float = math.nan  # -
-    motion: float | None = None  # -, relative motion error; None if it was not requested, or if there is none
+    motion_error: float | None = None  # -, relative motion error; None if not requested or not available
     motion_speed: float | None = None  # m/s, of the body that is furthest off (row, without bodies)
     bound: float | None = None  # sqrt J, proved bound of the motion error
-    degenerate: float | None = None  # -, share of blocks at a boundary; None if no error has a bound
-    bits: str = ""  # hash of the answer: equal where two answers are, to the last bit
+    boundary_fraction: float | None = None  # -, share of blocks at a boundary; None if no error has a bound
+    solution_hash: str = ""  # hash of the impulses: equal if they are bit-identical
     worst_row: int = -1
     worst_name: str = ""
     success: bool = False  # the judge: relative <= tol (a budget: false)
@@ -201,14 +201,14 @@ class Record(_Texts):
     # "call": one `lv.solve` on a new problem. "steps": the same in a loop that carries impulses. "batch": the time of
     # one `lv.solve_many`, divided by its problems. "": prepare and solve, without the judge and the input validation.
     timing_mode: str = ""
-    # which lines on which cases took turns with this one; "": repeats came one after the other
-    turns: str = ""
+    # identifies the calls that were timed alternately with this one; "": its repeats came one after the other
+    interleave_group: str = ""
     times: tuple[float, ...] = ()  # s, of each repeat
-    reached: tuple[float, ...] = ()  # relative residual of each repeat, where they differ (mode "time")
-    pace: float | None = None  # s, of a loop of fixed work beside the repeats: what the machine was worth
+    residual_per_repeat: tuple[float, ...] = ()  # relative residual of each repeat, in mode "time"
+    calibration_time: float | None = None  # s, of a loop of fixed work that ran with the repeats
     load: float | None = None  # processes that wanted a processor when it was made, this one among them
-    # s, of a backend of others on data that it was given before, by its own interface
-    own_min: float | None = None
+    # s, in the own interface of a third-party backend, on converted data
+    backend_time_min: float | None = None
 
     @property
     def key(self) -> tuple[Any, ...]:
@@ -230,19 +230,34 @@ class Record(_Texts):
 def measurement_key(what: Any) -> tuple[Any, ...]:
     """The identity of a measurement, of its `Task` as of its `Record`."""
     options = repr(sorted(plain(what.options).items()))
-    asked = (what.start, what.mode, what.tol, what.max_iter, what.time_limit, what.timing_mode, what.turns)
+    asked = (
+        what.start,
+        what.mode,
+        what.tol,
+        what.max_iter,
+        what.time_limit,
+        what.timing_mode,
+        what.interleave_group,
+    )
     return (what.case, what.sha, what.solver, options, *asked)
 
 
 Entry = Run | CaseInfo | Skip | Record
-#: Names that earlier versions wrote for fields of entries, and of the plan of a run.
+#: Present name of each field that earlier versions wrote under another name; "plan." marks fields of a run's plan.
 RENAMED_FIELDS = {
     "floor": "roundoff_floor",
     "suspicions": "diagnostics",
     "contradicted": "status_conflict",
     "way": "timing_mode",
-    "levels": "tolerances",
-    "speed_levels": "velocity_tolerances",
+    "pace": "calibration_time",
+    "own_min": "backend_time_min",
+    "reached": "residual_per_repeat",
+    "motion": "motion_error",
+    "bits": "solution_hash",
+    "degenerate": "boundary_fraction",
+    "turns": "interleave_group",
+    "plan.levels": "tolerances",
+    "plan.speed_levels": "velocity_tolerances",
 }
 REMOVED_KINDS = ("done",)  # Earlier versions marked complete pairs of a campaign; such lines are ignored.
 RENAMED_STATUSES = {"FLOOR": "ROUNDOFF_LIMIT", "REFUSED": "INVALID_PROBLEM"}
@@ -284,7 +299,7 @@ def _with_new_names(line: Mapping[str, Any]) -> Mapping[str, Any]:
     if isinstance(status, str):
         renamed["status"] = RENAMED_STATUSES.get(status, status)
     if isinstance(plan := renamed.get("plan"), Mapping):
-        renamed["plan"] = {RENAMED_FIELDS.get(name, name): value for name, value in plan.items()}
+        renamed["plan"] = {RENAMED_FIELDS.get(f"plan.{name}", name): value for name, value in plan.items()}
     conflict = line.get("contradicted")
     if not conflict or "claim_check" in line:
         return renamed

@@ -1,4 +1,4 @@
-"""Rank calls that were timed in turns, and measure by resampling how sure the ranking is.
+"""Rank calls that were timed alternately, and measure by resampling how sure the ranking is.
 
 A resampling draws the cases and the repetitions with replacement (the steps of a sequence in blocks of consecutive
 ones, since neighbours are alike). In each resampling the calls are ranked by the rule of `recommendation`; every call
@@ -87,19 +87,19 @@ class ResampledRanking:
         return tuple(dict.fromkeys([solvers[0], *others]))
 
 
-def select_calls(records: Records, timing_mode: str, in_turns: bool = True) -> list[TimedCall]:
+def select_calls(records: Records, timing_mode: str, interleaved: bool = True) -> list[TimedCall]:
     """Select the calls of a timing mode ("call", "steps", "batch") that ran on the largest number of cases.
 
-    With `in_turns` these are calls that were timed in turns with others. Without it they are runs that were measured
+    With `interleaved` these are calls that were timed alternately. Without it they are runs that were measured
     one after the other; records of earlier versions have no others.
     """
     groups: dict[tuple[object, ...], dict[str, Record]] = {}
     for r in records:
         same_mode = r.timing_mode == timing_mode or (
-            not r.timing_mode and not in_turns and (r.step >= 0) is (timing_mode == "steps")
+            not r.timing_mode and not interleaved and (r.step >= 0) is (timing_mode == "steps")
         )
         compared = r.order == "given" and r.start != "warm" and (r.mode != "budget" or counts_sweeps(r))
-        if same_mode and compared and bool(r.turns) is in_turns and r.case in records.cases:
+        if same_mode and compared and bool(r.interleave_group) is interleaved and r.case in records.cases:
             key = (r.solver, r.mode, r.tol, r.max_iter, r.time_limit, r.start)
             groups.setdefault(key, {})[r.case] = r
     most = max((len(runs) for runs in groups.values()), default=0)
@@ -176,10 +176,10 @@ def recommend_solvers(records: Records, times: Sequence[float] = ()) -> list[Fam
     """
     tolerances = get_tolerances(records)
     tolerance = tolerances[len(tolerances) // 2]
-    in_turns = {timing_mode: select_calls(records, timing_mode) for timing_mode in ("call", "steps")}
+    interleaved = {timing_mode: select_calls(records, timing_mode) for timing_mode in ("call", "steps")}
     advice = []
     for family in recommend_from_single_runs(records, times):
-        calls = in_turns["steps" if family.sequence else "call"]
+        calls = interleaved["steps" if family.sequence else "call"]
         first = recommend_for_cases(records, family.by_tolerance[tolerance], calls, family.cases)
         advice.append(replace(family, by_tolerance={**family.by_tolerance, tolerance: first}))
     return advice
@@ -190,7 +190,7 @@ def recommend_for_cases(
 ) -> Advice:
     """Rank solvers to a tolerance on some cases by the rule and the times of the report's first sentence.
 
-    Solvers of `calls`, which were timed in turns, come first, then the others of `alone`. Returns `alone` if no call
+    Solvers of `calls`, which were timed alternately, come first, then the others of `alone`. Returns `alone` if no call
     was timed on these cases, or if the calls solve fewer of them.
     """
     parts = [replace(f, runs={c: f.runs[c] for c in cases if c in f.runs}) for f in calls]
@@ -199,15 +199,15 @@ def recommend_for_cases(
     if resampled is None or resampled.ranking[0][1].solved < max(1, best):
         return alone
     hows = {c.solver: c.how for c in alone.ranking}
-    in_turns = [
+    interleaved = [
         replace(c, how=f"{f.line.asked}, {f.line.start}" if f.line.step >= 0 else hows.get(c.solver, ""))
         for f, c in resampled.ranking
     ]
     named = resampled.named
-    in_turns.sort(key=lambda c: named.index(c.solver) if c.solver in named else len(in_turns))
-    known = {c.solver for c in in_turns}
+    interleaved.sort(key=lambda c: named.index(c.solver) if c.solver in named else len(interleaved))
+    known = {c.solver for c in interleaved}
     rest = [c for c in alone.ranking if c.solver not in known]
-    return replace(alone, ranking=(*in_turns, *rest), equal=len(named))
+    return replace(alone, ranking=(*interleaved, *rest), equal=len(named))
 
 
 def rank_calls_in_time(
@@ -225,7 +225,9 @@ def rank_calls_in_time(
         return None
     names = _list_cases(calls)
     times = _stack_repetitions(calls, names, lambda r: r.times or (r.time_min,))
-    residuals = np.minimum(_stack_repetitions(calls, names, lambda r: r.reached or (r.relative,)), 1.0)
+    residuals = np.minimum(
+        _stack_repetitions(calls, names, lambda r: r.residual_per_repeat or (r.relative,)), 1.0
+    )
     in_time = np.where(times <= limit, np.nan_to_num(residuals, nan=1.0), 1.0)
     served = np.quantile(in_time, IN_TIME_SHARE, axis=2, method="lower") <= SERVED_RESIDUAL
 

@@ -41,7 +41,7 @@ def pairs(records: Iterable[Record]) -> dict[tuple[str, str, str], list[Record]]
     """Group runs in the given order of blocks by (case, solver, start)."""
     groups: dict[tuple[str, str, str], list[Record]] = defaultdict(list)
     for r in records:
-        if r.order == "given" and r.step < 0 and not r.turns:
+        if r.order == "given" and r.step < 0 and not r.interleave_group:
             groups[r.case, r.solver, r.start].append(r)
     return dict(groups)
 
@@ -98,7 +98,7 @@ class Reach:
     claim_check: str  # the worst of all runs
     status_conflict: str
     form: str
-    motion: float  # -, relative motion error of the best run; nan where there is none
+    motion_error: float  # -, relative motion error of the best run; nan where there is none
     bound: float  # sqrt J, proved bound of it; nan where nothing is proved
 
     @property
@@ -115,7 +115,7 @@ class Difficulty:
     rows: int
     sweeps: int | None  # of `pgs` to EASY_RESIDUAL; None where it did not get there, or was not asked
     condition: float | None  # of A, as `CaseInfo.condition`
-    degenerate: (
+    boundary_fraction: (
         float | None
     )  # share of blocks at a boundary at the best answer, of those whose error has a bound
     proof: str
@@ -178,7 +178,7 @@ def reaches(records: Records, tolerances: Sequence[float] | None = None) -> list
                 claim_check=max((r.claim_check for r in group), key=CLAIM_CHECKS.index),
                 status_conflict=next((r.status_conflict for r in group if r.status_conflict), ""),
                 form=last.form,
-                motion=math.nan if best is None or best.motion is None else best.motion,
+                motion_error=math.nan if best is None or best.motion_error is None else best.motion_error,
                 bound=math.nan if best is None or best.bound is None else best.bound,
             )
         )
@@ -186,8 +186,8 @@ def reaches(records: Records, tolerances: Sequence[float] | None = None) -> list
 
 
 def _is_again(r: Record) -> bool:
-    """Return whether a run repeats an earlier one in turns; runs with a time limit exist only in turns."""
-    return bool(r.turns) and r.mode != "time"
+    """Return whether an interleaved run repeats an earlier one; runs with a time limit have no earlier one."""
+    return bool(r.interleave_group) and r.mode != "time"
 
 
 def failures(records: Records) -> list[Record]:
@@ -214,11 +214,11 @@ def difficulties(records: Records) -> list[Difficulty]:
             for r in runs
             if r.solver == "pgs" and r.mode == "tol" and r.relative <= EASY_RESIDUAL
         ]
-        judged = [r for r in runs if r.degenerate is not None]
-        idle = [r for r in runs if r.bits and r.iterations == 0 and r.claims]
+        judged = [r for r in runs if r.boundary_fraction is not None]
+        idle = [r for r in runs if r.solution_hash and r.iterations == 0 and r.claims]
         groups = defaultdict(set)
         for r in idle:
-            groups[r.bits].add(r.solver)
+            groups[r.solution_hash].add(r.solver)
         same = max(groups.values(), key=len, default=set())
         out.append(
             Difficulty(
@@ -226,7 +226,7 @@ def difficulties(records: Records) -> list[Difficulty]:
                 rows=info.rows,
                 sweeps=min(swept, default=None),
                 condition=info.condition,
-                degenerate=min(judged, key=lambda r: r.relative).degenerate if judged else None,
+                boundary_fraction=min(judged, key=lambda r: r.relative).boundary_fraction if judged else None,
                 proof=info.proof,
                 same=tuple(sorted(same)) if len(same) > 1 and not info.nothing_to_do else (),
             )
@@ -258,7 +258,7 @@ def spreads(records: Records) -> list[Spread]:
     """Return the residual of each sweep order for budgets that were run in several orders."""
     groups: dict[tuple[str, str, int], dict[str, Record]] = defaultdict(dict)
     for r in records:
-        if r.mode == "budget" and r.start == "cold" and r.step < 0 and not r.turns:
+        if r.mode == "budget" and r.start == "cold" and r.step < 0 and not r.interleave_group:
             name = f"{r.order} {r.seed}" if r.order == "random" else r.order
             groups[r.case, r.solver, r.max_iter][name] = r
     return [
@@ -272,7 +272,7 @@ def budgets(records: Records) -> dict[tuple[str, str, str], list[tuple[int, floa
     """Return (iterations, residual) of the exact budgets in the given order, by (case, solver, start)."""
     groups: dict[tuple[str, str, str], list[tuple[int, float]]] = defaultdict(list)
     for r in records:
-        if r.mode != "budget" or r.turns:
+        if r.mode != "budget" or r.interleave_group:
             continue
         if r.order == "given" and r.step < 0 and r.status == "MAX_ITERATIONS":
             groups[r.case, r.solver, r.start].append((r.iterations, r.relative))
@@ -334,7 +334,7 @@ def drift(old: Records, new: Records, case: str = "") -> float:
     """Return the ratio of new to old time of the calibration loop, medians over runs of a case or of all; else 1."""
     medians = []
     for records in (old, new):
-        some = [r.pace for r in records if r.pace and (not case or r.case == case)]
+        some = [r.calibration_time for r in records if r.calibration_time and (not case or r.case == case)]
         medians.append(median(some) if some else math.nan)
     return medians[1] / medians[0] if all(map(math.isfinite, medians)) else 1.0
 
@@ -407,7 +407,7 @@ class Backend:
     solver: str
     solved: int
     whole: float  # s, geometric mean of the whole way from a problem
-    own: float  # s, of its own solve, on data that it was given before
+    backend_time: float  # s, of its own solve, on data that it was given before
     wins: int  # cases on which that is less than the fastest of ours takes
 
 
@@ -418,23 +418,25 @@ def backends(records: Records) -> list[Backend]:
     best: dict[tuple[str, str], Record] = {}
     for r in records:
         key = (r.solver, r.case)
-        reached = r.usable and r.relative <= tolerance and r.start == "cold" and not r.turns
+        reached = r.usable and r.relative <= tolerance and r.start == "cold" and not r.interleave_group
         if reached and (key not in best or r.time_min < best[key].time_min):
             best[key] = r
     ours: dict[str, float] = {}
     for (_, case), r in best.items():
-        if r.own_min is None:
+        if r.backend_time_min is None:
             ours[case] = min(r.time_min, ours.get(case, math.inf))
     out = []
-    for solver in sorted({r.solver for r in best.values() if r.own_min is not None}):
-        mine = {c: r for (s, c), r in best.items() if s == solver and r.own_min is not None}
-        owns = {c: r.own_min or 0.0 for c, r in mine.items()}
+    for solver in sorted({r.solver for r in best.values() if r.backend_time_min is not None}):
+        mine = {c: r for (s, c), r in best.items() if s == solver and r.backend_time_min is not None}
+        backend_times = {c: r.backend_time_min or 0.0 for c, r in mine.items()}
         whole = geometric_mean([r.time_min for r in mine.values()], MEAN_TIME_SHIFT)
-        wins = sum(t < ours.get(c, math.inf) for c, t in owns.items())
+        wins = sum(t < ours.get(c, math.inf) for c, t in backend_times.items())
         out.append(
-            Backend(solver, len(mine), whole, geometric_mean(list(owns.values()), MEAN_TIME_SHIFT), wins)
+            Backend(
+                solver, len(mine), whole, geometric_mean(list(backend_times.values()), MEAN_TIME_SHIFT), wins
+            )
         )
-    return sorted(out, key=lambda b: b.own)
+    return sorted(out, key=lambda b: b.backend_time)
 
 
 def _laws(records: Records) -> dict[str, list[str]]:
@@ -576,7 +578,7 @@ def passes(records: Records) -> list[Pass]:
         lambda: defaultdict(list)
     )
     for r in records:
-        if r.step >= 0 and not r.turns and r.case in records.cases:
+        if r.step >= 0 and not r.interleave_group and r.case in records.cases:
             name = records.cases[r.case].sequence
             groups[name, r.solver, r.mode, r.tol, r.max_iter][r.start].append(r)
     steps = Counter(info.sequence for info in records.cases.values())

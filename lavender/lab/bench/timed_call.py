@@ -27,7 +27,9 @@ def make_call_arguments(what: Any, iterations: int) -> dict[str, Any]:
     `iterations` is the number that a solve took.
     """
     asked: dict[str, Any] = {"tol": what.tol}
-    given = what.turns and what.max_iter  # timed alternately with others: the number that all cases need
+    given = (
+        what.interleave_group and what.max_iter
+    )  # timed alternately with others: the number that all cases need
     if what.mode == "budget" or given or exceeds_default_budget(what.solver, iterations):
         asked["max_iter"] = what.max_iter
     if what.mode == "time":

@@ -121,7 +121,7 @@ def build_overall_figure(records: Records) -> Figure:
     start = "cold" if single or all(r.start == "cold" for r in records) else "carried"
     runs = [
         r for r in records
-        if (r.step < 0) == single and r.start == start and r.order == "given" and not r.turns
+        if (r.step < 0) == single and r.start == start and r.order == "given" and not r.interleave_group
     ]  # fmt: skip
     cases = sorted({r.case for r in runs})
     by: dict[str, dict[str, list[tuple[float, float]]]] = {}

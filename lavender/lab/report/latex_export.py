@@ -59,7 +59,9 @@ def write_paper(report: Report, folder: str | Path) -> Path:
     records = report.records
     if not len(records) or report.is_campaign:
         raise InputError("a paper's figures need runs with times; these records have none")
-    own = records.having(r if r.own_min is None else replace(r, time_min=r.own_min) for r in records)
+    own = records.having(
+        r if r.backend_time_min is None else replace(r, time_min=r.backend_time_min) for r in records
+    )
     drawn = build_figures(own)
     groups = (drawn.over, _build_folder_figures(own), drawn.profiles, drawn.sequences)
     some = [
@@ -139,7 +141,7 @@ def _name_file(figure: Figure) -> str:
 
 def _state_own_times(records: Records, solvers: Iterable[str]) -> str:
     """Return a sentence on the timing of solvers of other packages among these; empty if there are none."""
-    names = sorted({r.solver for r in records if r.own_min is not None}.intersection(solvers))
+    names = sorted({r.solver for r in records if r.backend_time_min is not None}.intersection(solvers))
     if not names:
         return ""
     return f" Time of its own interface, on data given before, without conversion: {', '.join(names)}."

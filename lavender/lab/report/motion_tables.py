@@ -45,7 +45,7 @@ def convert_to_motion_errors(records: Records) -> Records:
     converted = records.having(
         replace(r, relative=math.inf if r.motion_speed is None else r.motion_speed, roundoff_floor=0.0)
         for r in records
-        if not r.turns
+        if not r.interleave_group
     )
     for run in records.runs.values():
         converted.add(replace(run, plan={**run.plan, "tolerances": tolerances}))

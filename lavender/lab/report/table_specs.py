@@ -41,7 +41,10 @@ DIFFICULTY = (
     "boundary of two states, among those whose error has a bound; "
     "solvers with the same bits and no iteration, whose times are of one shortcut"
 )
-IN_TURNS, ALONE = "in turns", "alone"  # lines of a recommendation, timed again; runs one after the other
+INTERLEAVED, ALONE = (
+    "interleaved",
+    "alone",
+)  # lines of a recommendation, timed again; runs one after the other
 ENGINES_OWN = "engine's own"  # column of the solver of the engine that recorded the cases
 NOT_COMPARED = "no case has the same numbers in both (steps of sequences are not compared)"
 
@@ -71,8 +74,8 @@ def list_sections(report: Report) -> list[Section]:
         ]
     else:
         timed = (
-            f"{IN_TURNS} to {format_tolerance(tolerances[len(tolerances) // 2])}, else {ALONE}"
-            if has_turns(report)
+            f"{INTERLEAVED} to {format_tolerance(tolerances[len(tolerances) // 2])}, else {ALONE}"
+            if has_interleaved_calls(report)
             else ALONE
         )
         by_structure = (
@@ -124,7 +127,7 @@ def build_short_table(report: Report) -> Table:
     table = tabulate_speeds(report) if by_motion else tabulate_advice(report)
     column = 1 + (len(report.speeds) // 2 if by_motion else middle)
     rows: Rows = [[str(row[0]), replace(row[column], after="")] for row in table.rows]  # type: ignore[type-var]
-    head = f"{table.heads[column]}, timed {IN_TURNS if has_turns(report) and not by_motion else ALONE}"
+    head = f"{table.heads[column]}, timed {INTERLEAVED if has_interleaved_calls(report) and not by_motion else ALONE}"
     heads = ["structure", head]
     if ENGINES_OWN in table.heads:
         heads.append(ENGINES_OWN)
@@ -132,9 +135,9 @@ def build_short_table(report: Report) -> Table:
     return Table(heads, rows, words=WORDS | set(heads))
 
 
-def has_turns(report: Report) -> bool:
-    """Return whether calls of the recommendation were timed in turns."""
-    return any(r.turns for r in report.records)
+def has_interleaved_calls(report: Report) -> bool:
+    """Return whether calls of the recommendation were timed alternately."""
+    return any(r.interleave_group for r in report.records)
 
 
 def _tabulate_solvers(report: Report, tolerance: float) -> Table:
@@ -146,7 +149,7 @@ def _tabulate_solvers(report: Report, tolerance: float) -> Table:
             c.solver,
             seconds(c.score) + format_share(c.solved, c.cases),
             f"{line.asked}, {line.start}",
-            IN_TURNS if line.turns else ALONE,
+            INTERLEAVED if line.interleave_group else ALONE,
         ]
         for line, c in raced.values()
     ]
@@ -309,7 +312,7 @@ def tabulate_difficulties(difficulties: Sequence[statistics.Difficulty]) -> Tabl
             str(d.rows),
             NONE if d.sweeps is None else str(d.sweeps),
             NONE if d.condition is None else f"{d.condition:.1e}",
-            NONE if d.degenerate is None else format_percent(round(1e6 * d.degenerate), 10**6),
+            NONE if d.boundary_fraction is None else format_percent(round(1e6 * d.boundary_fraction), 10**6),
             ", ".join(d.same),
             d.proof,
         ]
@@ -326,7 +329,7 @@ def tabulate_motion_errors(report: Report) -> Table:
     for m in statistics.reaches(report.by_speed, tolerances):
         known = [
             f"{format_residual(x)}{unit}" if math.isfinite(x) else NONE
-            for x, unit in ((m.best, " m/s"), (m.motion, ""), (m.bound, " √J"))
+            for x, unit in ((m.best, " m/s"), (m.motion_error, ""), (m.bound, " √J"))
         ]
         rows.append([m.case, name_run(m.solver, m.start), *(seconds(m.times[x]) for x in tolerances), *known])
     heads = [f"to {format_speed(x)}" for x in tolerances]
@@ -450,7 +453,12 @@ def tabulate_means(by_tolerance: Mapping[float, Mapping[str, tuple[float, int, i
 def tabulate_backends(records: Records) -> Table:
     """Tabulate total time, its two parts, and wins against the built-in solvers, of solvers of other packages."""
     rows: Rows = [
-        [b.solver, str(b.solved), *map(seconds, (b.whole, b.whole - b.own, b.own)), str(b.wins)]
+        [
+            b.solver,
+            str(b.solved),
+            *map(seconds, (b.whole, b.whole - b.backend_time, b.backend_time)),
+            str(b.wins),
+        ]
         for b in statistics.backends(records)
     ]
     return Table(["solver", "cases", "whole way", "conversion", "own interface", "less than ours"], rows)

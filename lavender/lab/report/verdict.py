@@ -106,13 +106,13 @@ def _recommend(
     sweeps: Sequence[int],
     engines: Sequence[EngineAnswers],
 ) -> Verdict:
-    """Recommend a solver for one subject by the calls timed in turns, or by single runs if there are none."""
+    """Recommend a solver for one subject by the interleaved calls, or by single runs if there are none."""
     tolerance, n = subject.best.target, subject.best.ranking[0].cases if subject.best.ranking else 0
-    in_turns, single = (
+    interleaved, single = (
         select_calls(records, subject.timing_mode),
-        select_calls(records, subject.timing_mode, in_turns=False),
+        select_calls(records, subject.timing_mode, interleaved=False),
     )
-    resampled = rank_calls_to_tolerance(records, in_turns or single, tolerance, n)
+    resampled = rank_calls_to_tolerance(records, interleaved or single, tolerance, n)
     cases = _describe_subject(records, subject, n)
     reached = f"down to {format_tolerance(tolerance)} of the error of doing nothing"
     engine = rank_engine(engines, records, subject.cases, tolerance)
@@ -138,7 +138,7 @@ def _recommend(
     for t in times or [a.target for a in subject.quick if a.target <= SHORT_TIME_RATIO * first.score][-1:]:
         if first.worst <= t and first.solved == first.cases:
             continue  # the recommended call ends in this time
-        rankings = (rank_calls_in_time(records, calls, t, n) for calls in (in_turns, single))
+        rankings = (rank_calls_in_time(records, calls, t, n) for calls in (interleaved, single))
         quick = next((r for r in rankings if r is not None and r.ranking[0][1].is_for(SERVED_QUANTILE)), None)
         if quick is None:
             statements.append(Statement(_state_serving_time(single, t), asked=bool(times)))
@@ -164,7 +164,7 @@ def _recommend(
 
 
 def _recommend_by_speed(records: Records) -> Verdict:
-    """Recommend a solver by motion error. Calls are not timed in turns for it."""
+    """Recommend a solver by motion error. It uses no interleaved calls."""
     subject = list_subjects(records)[0]
     best, n = subject.best, subject.best.ranking[0].cases if subject.best.ranking else 0
     cases, reached = _describe_subject(records, subject, n), _describe_speed(subject.best.target)

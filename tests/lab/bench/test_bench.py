@@ -357,11 +357,12 @@ def test_records_of_earlier_versions_keep_their_verdict(status, conflict, check,
 
 def _former_names(content):
     """Return the content of a line, and of its plan, under the names that earlier versions wrote."""
-    former = {new: old for old, new in RENAMED_FIELDS.items()}
-    return {
-        former.get(name, name): _former_names(value) if name == "plan" else value
-        for name, value in content.items()
-    }
+    former = {new: old for old, new in RENAMED_FIELDS.items() if not old.startswith("plan.")}
+    of_plan = {new: old[5:] for old, new in RENAMED_FIELDS.items() if old.startswith("plan.")}
+    line = {former.get(name, name): value for name, value in content.items()}
+    if "plan" in line:
+        line["plan"] = {of_plan.get(name, name): value for name, value in line["plan"].items()}
+    return line
 
 
 def test_files_of_earlier_versions_load_with_their_values(tmp_path):
@@ -370,7 +371,7 @@ def test_files_of_earlier_versions_load_with_their_values(tmp_path):
     bench.run([stack(2)], ["pgs"], plan, path)
     content = [json.loads(line) for line in path.read_text().splitlines()]
     lines = [_former_names(line) for line in content]
-    names = {name for line in lines for name in (*line, *line.get("plan", ()))}
+    names = {name for line in lines for name in (*line, *(f"plan.{name}" for name in line.get("plan", ())))}
     assert names >= RENAMED_FIELDS.keys() - UNWRITTEN
     assert [to_json(from_json(line)) for line in lines] == content
 
@@ -611,7 +612,7 @@ def test_lines_are_timed_in_turns_and_kept(tmp_path):
         assert len(r.times) == r.repeats >= 3
         assert r.time_min == min(r.times)
         assert r.success == (r.mode == "tol")
-        assert len(r.reached) == (r.repeats if r.mode == "time" else 0)
+        assert len(r.residual_per_repeat) == (r.repeats if r.mode == "time" else 0)
     assert bench.read(path).records == known.records
     again = bench.time_alternately(problems, asks, bench.run(problems, ["pgs"], plan, path), plan, path)
     assert again.records == known.records

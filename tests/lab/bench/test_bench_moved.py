@@ -23,7 +23,7 @@ def test_a_record_has_the_motion_error_of_its_run():
     for r in records:
         again = lv.solve(problem, "pgs", tol=r.tol, max_iter=r.max_iter or None)
         error = again.motion_error()
-        assert (r.motion, r.motion_speed, r.bound) == (error.relative, error.speed, error.bound)
+        assert (r.motion_error, r.motion_speed, r.bound) == (error.relative, error.speed, error.bound)
         assert r.motion_speed > 0.0
         assert from_json(to_json(r)) == r
 
@@ -87,9 +87,13 @@ def test_a_case_has_its_difficulty_and_who_gave_the_same_answer_without_an_itera
     plan = bench.Plan(tolerances=(1e-3, 1e-6), **SHORT)
     records = bench.run(["stack(n=8)", "threshold"], ["pgs", "newton", "lemke", "direct"], plan)
     stack, border = statistics.difficulties(records)
-    assert stack.sweeps > 10 and stack.condition > 10.0 and stack.degenerate == 0.0 and stack.same == ()
-    assert border.degenerate == 1.0
-    told = [replace(r, iterations=0, bits="x") if r.solver in ("lemke", "direct") else r for r in records]
+    assert (
+        stack.sweeps > 10 and stack.condition > 10.0 and stack.boundary_fraction == 0.0 and stack.same == ()
+    )
+    assert border.boundary_fraction == 1.0
+    told = [
+        replace(r, iterations=0, solution_hash="x") if r.solver in ("lemke", "direct") else r for r in records
+    ]
     shared = replace(records, records=told)
     assert statistics.difficulties(shared)[0].same == ("direct", "lemke")
     page = write(shared, tmp_path, figures=False).read_text(encoding="utf-8")

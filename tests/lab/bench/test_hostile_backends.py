@@ -317,7 +317,9 @@ def test_a_worker_says_what_this_process_says_and_judges_a_problem_that_no_backe
             near, here = timing.measure(p, asked, start)
             np.testing.assert_array_equal(here, there)
             times = {
-                n: 0.0 for n in vars(near) if n.startswith(("time_m", "setup_", "solve_", "pace", "load"))
+                n: 0.0
+                for n in vars(near)
+                if n.startswith(("time_m", "setup_", "solve_", "calibration_time", "load"))
             }
             assert dataclasses.replace(far, **times) == dataclasses.replace(near, **times)
 
@@ -349,7 +351,7 @@ def test_time_that_a_line_took_before_its_process_was_asked_is_no_lie_of_its_pro
         {"times": [1e9]},
         {"times": [float("nan")]},
         {"times": None},
-        {"pace": "fast"},
+        {"calibration_time": "fast"},
         {"sizes": [4, 4]},
         {"sizes": [2, 2]},
         {"sizes": [None, 4]},
@@ -360,7 +362,7 @@ def test_time_that_a_line_took_before_its_process_was_asked_is_no_lie_of_its_pro
 def test_an_answer_that_is_none_is_refused(said):
     good = {
         "status": "CONVERGED", "iterations": 3, "work": {"sweeps": 3}, "message": "", "form": "",
-        "setups": [0.01], "solves": [0.02], "times": [0.04], "pace": 1e-4, "sizes": [4, None],
+        "setups": [0.01], "solves": [0.02], "times": [0.04], "calibration_time": 1e-4, "sizes": [4, None],
     }  # fmt: skip
     numbers = np.ones(4).tobytes()
     assert parse_outcome(*unpack_answer(json.dumps(good).encode(), numbers), 4, 1.0).iterations == 3

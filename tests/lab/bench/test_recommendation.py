@@ -188,11 +188,11 @@ def test_misses_in_a_time_count():
     assert build_verdict(rest, [1e-3]).text.endswith("Nothing serves in 1.00 ms.")
 
 
-# -- lines that were timed in turns ---------------------------------------------------------------------------
+# -- lines that were timed alternately ---------------------------------------------------------------------------
 
 
-def in_turns(speeds, seed, cases=CASES, noise=1.04, rerun=1.0, sizes=None, repeats=7):
-    """Records of lines that took turns: each case has its size, each repetition its noise, a rerun its own machine."""
+def interleaved(speeds, seed, cases=CASES, noise=1.04, rerun=1.0, sizes=None, repeats=7):
+    """Records of interleaved lines: each case has its size, each repetition its noise, a rerun its own machine."""
     rng = random.Random(seed)
     machine = rerun ** rng.uniform(-1.0, 1.0)
     made = []
@@ -201,8 +201,8 @@ def in_turns(speeds, seed, cases=CASES, noise=1.04, rerun=1.0, sizes=None, repea
         for solver, of_case in speeds.items():
             factor = of_case if isinstance(of_case, float) else of_case(i)
             times = tuple(size * factor * noise ** rng.gauss(0.0, 1.0) for _ in range(repeats))
-            more = {"timing_mode": "call", "times": times, "pace": 1e-4 * machine}
-            made.append(record(case, solver, min(times), 1e-7, turns="one", **more))
+            more = {"timing_mode": "call", "times": times, "calibration_time": 1e-4 * machine}
+            made.append(record(case, solver, min(times), 1e-7, interleave_group="one", **more))
             made.append(record(case, solver, min(times), 1e-7, **more))
     return records_of(*made)
 
@@ -212,17 +212,17 @@ def race(records, tolerance=1e-6):
 
 
 def test_a_clear_winner_is_named_alone_and_wins_every_resampling():
-    found = race(in_turns({"auto": 1.5, "fast": 1.0, "slow": 2.0}, 0))
+    found = race(interleaved({"auto": 1.5, "fast": 1.0, "slow": 2.0}, 0))
     assert (found.named, found.shares[0], found.loss) == (("fast",), 1.0, 1.0)
 
 
 def test_cases_that_disagree_make_it_unsure_and_both_are_named():
     speeds = {"even": 1.0, "odd": lambda i: (0.5, 2.0)[i % 2]}
-    found = race(in_turns(speeds, 0))
+    found = race(interleaved(speeds, 0))
     assert set(found.named) == {"even", "odd"}
     assert found.shares[0] < 0.9
     assert found.loss > 1.05
-    text = build_verdict(in_turns(speeds, 0)).statements[1].text
+    text = build_verdict(interleaved(speeds, 0)).statements[1].text
     assert all(re.search(rf"{name} \([\d.]* ms\) in \d* %", text) for name in speeds)
     assert "it takes" in text  # and what the choice loses where the other is faster
 
@@ -237,7 +237,7 @@ def test_three_reports_of_a_near_tie_name_the_same_set(speeds, noise):
     agreed = []
     for first in range(0, 18, 3):
         found = [
-            race(in_turns(speeds, seed, tuple(ROBOTS), noise, rerun=1.6, sizes=ROBOTS, repeats=21))
+            race(interleaved(speeds, seed, tuple(ROBOTS), noise, rerun=1.6, sizes=ROBOTS, repeats=21))
             for seed in range(first, first + 3)
         ]
         assert all(fastest in f.named for f in found)
@@ -250,7 +250,9 @@ def test_who_misses_a_case_is_never_the_first_whatever_the_mean_says():
     for case in CASES:
         sure, quick = (1e-3, 1e-7), (1e-6, 1.0 if case == CASES[0] else 1e-12)
         for solver, (t, left) in (("sure", sure), ("quick", quick)):
-            made.append(record(case, solver, t, left, timing_mode="call", turns="one", times=(t,) * 3))
+            made.append(
+                record(case, solver, t, left, timing_mode="call", interleave_group="one", times=(t,) * 3)
+            )
     found = race(records_of(*made))
     assert [(c.solver, c.solved) for _, c in found.ranking] == [("sure", 6), ("quick", 5)]
 
@@ -258,7 +260,7 @@ def test_who_misses_a_case_is_never_the_first_whatever_the_mean_says():
 def test_lines_that_were_refused_different_cases_are_compared_on_all_of_them():
     size = {"easy": 1e-3, "both": 1e-2, "hard": 1e-1}
     made = [
-        record(case, solver, t, 1e-7, turns="one", timing_mode="call", times=(t,) * 7, **more)
+        record(case, solver, t, 1e-7, interleave_group="one", timing_mode="call", times=(t,) * 7, **more)
         for case in size
         for solver, factor, refused in (("slow", 2.0, "hard"), ("quick", 1.0, "easy"))
         for t in (factor * size[case],)
@@ -281,8 +283,14 @@ def test_lines_that_were_refused_different_cases_are_compared_on_all_of_them():
 def test_what_comes_too_late_in_more_than_one_repetition_of_twenty_is_not_served():
     def line(solver, late):
         times = (2e-3,) * late + (0.5e-3,) * (20 - late)
-        more = {"mode": "time", "time_limit": 0.5e-3, "timing_mode": "call", "turns": "one", "times": times}
-        return record("a", solver, min(times), 1e-2, reached=(1e-2,) * 20, **more)
+        more = {
+            "mode": "time",
+            "time_limit": 0.5e-3,
+            "timing_mode": "call",
+            "interleave_group": "one",
+            "times": times,
+        }
+        return record("a", solver, min(times), 1e-2, residual_per_repeat=(1e-2,) * 20, **more)
 
     found = records_of(line("punctual", 1), line("late", 2))
     ranking = rank_calls_in_time(found, select_calls(found, "call"), 1e-3).ranking
@@ -291,7 +299,18 @@ def test_what_comes_too_late_in_more_than_one_repetition_of_twenty_is_not_served
 
 def test_lines_that_took_turns_on_fewer_cases_do_not_replace_those_that_solved_more():
     made = [record(case, "x", 1e-3, 1e-9) for case in "abc"]
-    made.append(record("a", "x", 2e-3, 1e-9, timing_mode="call", turns="one", times=(2e-3,) * 5, pace=1e-4))
+    made.append(
+        record(
+            "a",
+            "x",
+            2e-3,
+            1e-9,
+            timing_mode="call",
+            interleave_group="one",
+            times=(2e-3,) * 5,
+            calibration_time=1e-4,
+        )
+    )
     (line,) = report.recommend_solvers(records_of(*made))
     assert (line.by_tolerance[1e-6].best.solved, line.by_tolerance[1e-6].best.score) == (
         3,
@@ -301,8 +320,8 @@ def test_lines_that_took_turns_on_fewer_cases_do_not_replace_those_that_solved_m
 
 @pytest.mark.parametrize("n", [2, 3])
 def test_a_batch_of_some_of_the_cases_is_not_told_beside_a_call_on_all(n):
-    made = in_turns({"auto": 1.0, "pgs": 2.0}, 0, cases=CASES[:3])
-    for r in [r for r in made if r.turns and r.case in CASES[:n]]:
+    made = interleaved({"auto": 1.0, "pgs": 2.0}, 0, cases=CASES[:3])
+    for r in [r for r in made if r.interleave_group and r.case in CASES[:n]]:
         made.add(dataclasses.replace(r, timing_mode="batch"))
     code = [line for t in build_verdict(made).statements for line in t.code]
     assert any("solve_many" in line for line in code) == (n == 3)

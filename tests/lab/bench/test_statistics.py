@@ -92,9 +92,11 @@ def test_claims_failures_and_spreads():
     by = {c.solver: c for c in report.claims(found)}
     assert (by["x"].claims, by["x"].wrong) == (2, 1)
     assert (by["y"].crashed, by["y"].asked, by["y"].reached) == (1, 1, 0)
-    # Of what was run again in turns the first run counts; a run to a limit of time is in turns alone.
+    # If a run was repeated alternately, the first run counts; a run with a time limit is always interleaved.
     for mode, wrong in (("tol", 1), ("time", 2)):
-        more = records_of(*found, record("a", "x", 1.0, 1e-2, mode=mode, turns="one", **FALSE_CLAIM))
+        more = records_of(
+            *found, record("a", "x", 1.0, 1e-2, mode=mode, interleave_group="one", **FALSE_CLAIM)
+        )
         assert next(c.wrong for c in report.claims(more) if c.solver == "x") == wrong
         assert sum(bool(f.status_conflict) for f in report.failures(more)) == wrong
     failed = [(f.solver, f.status) for f in report.failures(found)]
@@ -126,9 +128,9 @@ def test_changes_beyond_noise_are_named():
 
 
 def test_a_slower_machine_is_no_slower_code():
-    old = records_of(*(record("a", solver, 1e-3, 1e-7, pace=1e-4) for solver in ("pgs", "auto")))
+    old = records_of(*(record("a", solver, 1e-3, 1e-7, calibration_time=1e-4) for solver in ("pgs", "auto")))
     slower = [dataclasses.replace(r, time_min=1.6 * r.time_min) for r in old]
-    by = [dataclasses.replace(r, pace=1.6 * r.pace) for r in slower]
+    by = [dataclasses.replace(r, calibration_time=1.6 * r.calibration_time) for r in slower]
     assert {c.kind for c in statistics.changes(old, records_of(*by))} == {"same"}
     assert {c.kind for c in statistics.changes(old, records_of(*slower))} == {"slower"}
     assert statistics.drift(old, records_of(*by)) == pytest.approx(1.6)
@@ -142,9 +144,9 @@ def measured():
 def test_backends_have_the_time_of_their_own_interface_too(measured):
     (osqp,) = statistics.backends(measured)
     (r,) = (r for r in measured if r.solver == "osqp")
-    assert 0.0 < r.own_min < r.time_min
+    assert 0.0 < r.backend_time_min < r.time_min
     assert (osqp.solver, osqp.solved) == ("osqp", 1)
-    assert (osqp.own, osqp.whole) == (pytest.approx(r.own_min), pytest.approx(r.time_min))
+    assert (osqp.backend_time, osqp.whole) == (pytest.approx(r.backend_time_min), pytest.approx(r.time_min))
 
 
 def test_each_run_has_the_load_of_the_machine_and_a_row_of_the_frame(measured):

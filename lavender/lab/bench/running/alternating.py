@@ -18,7 +18,14 @@ from lavender.lab.bench.cases import Item, Source, resolve
 from lavender.lab.bench.record import CaseInfo, Record
 from lavender.lab.bench.running.plan import Plan
 from lavender.lab.bench.running.runner import Runner, Watch, is_foreign, open_runner
-from lavender.lab.bench.running.timing import Ask, Task, just_written, outcome_of, pace, record_of
+from lavender.lab.bench.running.timing import (
+    Ask,
+    Task,
+    just_written,
+    measure_calibration_time,
+    outcome_of,
+    record_of,
+)
 from lavender.lab.bench.store import Records, Store
 
 USUAL_REPETITIONS, MIN_REPETITIONS, MAX_REPETITIONS = 7, 3, 41
@@ -83,11 +90,11 @@ def time_alternately(
 
 
 class _Alternation:
-    """Repeats all lines on the cases of a part; `stages` identifies the lines and cases that are timed together."""
+    """Repeats all lines on the cases of a part; `interleave_group` identifies lines and cases timed together."""
 
-    def __init__(self, runner: Runner, asks: Sequence[Ask], turns: str) -> None:
-        self.runner, self.asks, self.turns = runner, asks, turns
-        self.known = {r.key for r in runner.known.values() if r.turns == turns}
+    def __init__(self, runner: Runner, asks: Sequence[Ask], interleave_group: str) -> None:
+        self.runner, self.asks, self.interleave_group = runner, asks, interleave_group
+        self.known = {r.key for r in runner.known.values() if r.interleave_group == interleave_group}
         for record in runner.known.values():
             if record.key in self.known:
                 runner.out.add(record)
@@ -132,7 +139,7 @@ class _Alternation:
         more = {
             "time_limit": ask.time_limit or self.runner.plan.time_limit,
             "repeats": 1 if ask.timing_mode == "steps" else 2,
-            "turns": self.turns,
+            "interleave_group": self.interleave_group,
             "guarded": False,
         }
         return Task.of(info, ask, **more)
@@ -165,7 +172,7 @@ class _Alternation:
         if all(task.key in self.known for task in tasks):
             return
         problems = [just_written(item.problem, ask.start) for item, _ in cases]
-        calibration_time = pace()
+        calibration_time = measure_calibration_time()
         begun = perf_counter()
         try:
             solutions = solve_many(problems, ask.solver, tol=ask.tol, max_iter=ask.max_iter or None)
@@ -188,13 +195,13 @@ def _is_batch(cases: Cases, is_sequence: bool) -> bool:
 def _merge(records: Sequence[Record]) -> Record:
     """Return the last record, with the times of all repetitions."""
     times = [t for r in records for t in r.times]
-    paces = [r.pace for r in records if r.pace is not None]
+    calibration_times = [r.calibration_time for r in records if r.calibration_time is not None]
     return replace(
         records[-1],
         repeats=len(records),
         times=tuple(times),
-        reached=tuple(x for r in records for x in r.reached),
+        residual_per_repeat=tuple(x for r in records for x in r.residual_per_repeat),
         time_min=min(times, default=records[-1].time_min),
         time_median=median(times) if times else records[-1].time_median,
-        pace=min(paces, default=None),
+        calibration_time=min(calibration_times, default=None),
     )

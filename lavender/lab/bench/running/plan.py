@@ -10,7 +10,7 @@ from typing import Any
 
 from lavender.base.arrays import flag, number, several, whole_number
 from lavender.base.errors import InputError, UnknownName, reject_former_names
-from lavender.lab.bench.record import CaseInfo, Record
+from lavender.lab.bench.record import RENAMED_FIELDS, CaseInfo, Record
 from lavender.lab.bench.running.timing import Ask, Task
 from lavender.problem import Problem
 from lavender.problem.ordering import ORDERS
@@ -24,7 +24,9 @@ HANG_LIMIT = (
     60.0  # s, after which a campaign kills the process of another package's solver and records KILLED
 )
 
-FORMER_PLAN_FIELDS = {"levels": "tolerances", "speed_levels": "velocity_tolerances"}
+FORMER_PLAN_FIELDS = {
+    name.removeprefix("plan."): new for name, new in RENAMED_FIELDS.items() if name.startswith("plan.")
+}
 
 
 @reject_former_names(**FORMER_PLAN_FIELDS)

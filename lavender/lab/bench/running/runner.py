@@ -68,7 +68,7 @@ def carry(before: Problem, impulse: FloatArray, problem: Problem) -> FloatArray:
 
 
 def add_motion_error(record: Record, problem: Problem, impulse: Any) -> Record:
-    """Return the record with `motion`, `motion_speed` and `bound` of its impulses (m,) [N s], None if there are none.
+    """Return the record with `motion_error`, `motion_speed` and `bound` of its impulses (m,) [N s].
 
     No clock runs. The reference, and under Coulomb's law the motions that are found, are cached in `problem`.
     """
@@ -80,7 +80,7 @@ def add_motion_error(record: Record, problem: Problem, impulse: Any) -> Record:
         motion.motion_error(problem, impulse) if found is None else motion.nearest(problem, impulse, found)
     )
     speed = error.rows if error.speed is None else error.speed
-    told = replace(record, motion=error.relative, motion_speed=speed, bound=error.bound)
+    told = replace(record, motion_error=error.relative, motion_speed=speed, bound=error.bound)
     reference = error.reference
     if (
         record.claims
@@ -101,8 +101,8 @@ def add_motion_error(record: Record, problem: Problem, impulse: Any) -> Record:
 def add_solution_hash(record: Record, problem: Problem, impulse: FloatArray) -> Record:
     """Return the record with the hash of its impulses (m,) [N s] and the fraction of blocks at a boundary."""
     fraction = states_of(problem, impulse).boundary_fraction
-    bits = hashlib.sha256(impulse.tobytes()).hexdigest()[:16]
-    return replace(record, bits=bits, degenerate=fraction)
+    solution_hash = hashlib.sha256(impulse.tobytes()).hexdigest()[:16]
+    return replace(record, solution_hash=solution_hash, boundary_fraction=fraction)
 
 
 def without_times(record: Record, time_limit: float) -> Record:
@@ -110,7 +110,7 @@ def without_times(record: Record, time_limit: float) -> Record:
     nan = math.nan
     return replace(
         record, setup_min=nan, setup_median=nan, solve_min=nan, solve_median=nan, time_min=nan, time_median=nan,
-        pace=None, load=None, own_min=None, time_limit=time_limit,
+        calibration_time=None, load=None, backend_time_min=None, time_limit=time_limit,
     )  # fmt: skip
 
 
