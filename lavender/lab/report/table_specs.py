@@ -363,7 +363,7 @@ def tabulate_failures(failures: Sequence[Record], campaign: bool) -> Table:
     ]  # fmt: skip
     marks = ["bad" if f.status_conflict else "" for f in failures]
     return Table(
-        ["case", "solver", "asked", "status", "residual", "roundoff_floor", "worst row", "message"],
+        ["case", "solver", "asked", "status", "residual", "floor", "worst row", "message"],
         rows,
         marks,
     )
