@@ -24,7 +24,8 @@ def bench() -> None:
     "--steps", type=click.IntRange(0), default=10, show_default=True, help="Problems of each model."
 )
 @click.option(
-    "--every",
+    "--record-every",
+    "every",
     type=click.IntRange(1),
     default=20,
     show_default=True,

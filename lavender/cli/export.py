@@ -16,10 +16,10 @@ VECTORS = 4  # problems in the test vectors, at most
 @click.argument("kind", type=click.Choice(["c"]))
 @click.argument("folder", type=FOLDER)
 @click.option(
-    "--for", "records", type=click.Path(exists=True, path_type=Path), metavar="RECORDS",
+    "--records", "records", type=click.Path(exists=True, path_type=Path), metavar="RECORDS",
     help="records.jsonl of a report or its folder: add the recommended solver, settings and test vectors.",
 )  # fmt: skip
-@click.option("--solver", help="With --for: use this solver of the records, not the recommended one.")
+@click.option("--solver", help="With --records: use this solver of the records, not the recommended one.")
 @click.option("--replace", is_flag=True, help="Overwrite files of an earlier export that differ.")
 @click.pass_context
 def export(
@@ -34,7 +34,7 @@ def export(
     from lavender.export import library, vectors
 
     if records is None:
-        refuse_unused(context, ["solver"], "without --for")
+        refuse_unused(context, ["solver"], "without --records")
     context.with_resource(lock_output(folder, folder=True))  # before the vectors are solved for
     more = vectors.made(records, solver, VECTORS) if records is not None else {}
     written = library.write(folder, more=more, replace=replace)

@@ -46,7 +46,7 @@ class Measured:
         """What was not measured now, in words; empty where everything was."""
         if not self.reused:
             return ""
-        return f"{self.reused} of {len(self.records)} runs reused of {self.since}; --fresh measures again"
+        return f"{self.reused} of {len(self.records)} runs reused of {self.since}; --no-reuse measures again"
 
     @property
     def lost(self) -> int:
@@ -119,8 +119,8 @@ def measure(context: click.Context, files: Sequence[str], path: Path, sweeps: Se
     reused = 0
     with bench.Store(path) as store:
         items = bench.resolve(words, asked["sequence"])
-        if was_given(context, "pass_limit") and not any(item.sequence for item in items):
-            raise InputError("--pass-limit has no effect without a sequence: leave it out")
+        if was_given(context, "sequence_time_limit") and not any(item.sequence for item in items):
+            raise InputError("--sequence-time-limit has no effect without a sequence: leave it out")
         check_named(items)
         before = {name: run.started for name, run in store.records.runs.items()}
         found: list[Records] = []
@@ -133,7 +133,11 @@ def measure(context: click.Context, files: Sequence[str], path: Path, sweeps: Se
 
             stopped = False
             try:
-                common = {"watch": watch, "fresh": asked["fresh"], "memory": bytes_of(asked["memory"])}
+                common: dict[str, Any] = {
+                    "watch": watch,
+                    "reuse": not asked["no_reuse"],
+                    "memory": bytes_of(asked["memory"]),
+                }
                 bench.run(items, asked["solvers"], plan, store, into=found, **common, **more)
                 if not campaign:
                     time_candidates(items, found[0], plan, store, **common)
@@ -151,7 +155,11 @@ def _timed_plan(asked: Mapping[str, Any], files: Sequence[str], sweeps: Sequence
 
     if asked["sequence"] and not files:
         raise InputError("--sequence needs a folder of problem files, one for each step")
-    limits = {"pass_limit": asked["pass_limit"]} if asked["pass_limit"] is not None else {}
+    limits = (
+        {"sequence_time_limit": asked["sequence_time_limit"]}
+        if asked["sequence_time_limit"] is not None
+        else {}
+    )
     # without files: all of the suite in a minute
     limits["time_limit"] = (1.0 if files else 0.25) if asked["time_limit"] is None else asked["time_limit"]
     more: dict[str, Any] = {"repeats": asked["repeats"], "times": asked["time_budgets"], "sweeps": sweeps}

@@ -38,8 +38,15 @@ THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXP
 
 #: Present name of each option that earlier versions had under another name.
 RENAMED_OPTIONS = {
+    "--accept": "--max-velocity-error",
+    "--ahead": "--horizon",
     "--campaign": "--workers",
+    "--every": "--record-every",
+    "--for": "--records",
+    "--fresh": "--no-reuse",
     "--levels": "--tolerances",
+    "--pass-limit": "--sequence-time-limit",
+    "--rounds": "--repeats",
     "--speed-levels": "--velocity-tolerances",
 }
 
@@ -261,7 +268,7 @@ threshold_option = adding([THRESHOLD], show_default=True)
 #: How a MuJoCo model is simulated and recorded: the same options of every command that does so.
 RECORDING_OPTIONS: tuple[Option, ...] = (
     (("--steps",), {"default": 500, "help": "MODEL.xml: number of simulation steps."}),
-    (("--every",), {"default": 5, "help": "MODEL.xml: record every n-th step."}),
+    (("--record-every", "every"), {"default": 5, "help": "MODEL.xml: record every n-th step."}),
     (("--controls", "control"), {"default": "random", "metavar": "zero|random|FILE",
                                  "help": "MODEL.xml: its controls. FILE: an .npy array of shape (any, nu)."}),
     (("--seed",), {"default": 0, "help": "MODEL.xml: seed of random controls."}),
@@ -292,7 +299,7 @@ PLAN_OPTIONS: tuple[tuple[str, dict[str, Any]], ...] = (
                    "help": "Repetitions of each solve; minimum and median are kept."}),
     ("--time-limit", {"type": float, "default": None, "metavar": "S",
                       "help": "Limit of one solve; default: 1 s, or 0.25 s for the built-in suite."}),
-    ("--pass-limit", {"type": float, "default": None, "metavar": "S",
+    ("--sequence-time-limit", {"type": float, "default": None, "metavar": "S",
                       "help": "Time limit of a solver over all steps of a sequence with one setting; default: 5 s."}),
     ("--memory", {"type": float, "default": None, "metavar": "GB",
                   "help": "Memory limit of each process of another package's solver; default: half of the "

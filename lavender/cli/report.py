@@ -74,7 +74,7 @@ from lavender.io.stored import lock_output, write_text
 )
 @recording_options
 @click.option("--tables", is_flag=True, help="Print every table, warning and line of code.")
-@click.option("--fresh", is_flag=True, help="Repeat runs that the folder already holds.")
+@click.option("--no-reuse", is_flag=True, help="Repeat runs that the folder already holds.")
 @click.option(
     "--paper",
     is_flag=True,
@@ -107,7 +107,7 @@ def report(context: click.Context, /, files: tuple[str, ...], out: Path, **asked
     context.with_resource(lock_output(out, folder=True))
     taken: set[Path] = set()
     how = {name: asked[name] for name in RECORDING}
-    files = tuple(_recorded(f, out, taken, asked["fresh"], how) for f in files)
+    files = tuple(_recorded(f, out, taken, not asked["no_reuse"], how) for f in files)
     old = None if asked["compare"] is None else bench.read(asked["compare"])
     sweeps = asked["budgets"] if was_given(context, "budgets") else ()
     path = out / "records.jsonl"
@@ -153,7 +153,7 @@ def _refuse_unused(context: click.Context, files: tuple[str, ...], solvers: tupl
         rest = [p.name for p in context.command.params if p.name and p.name not in kept]
         refuse_unused(context, rest, "where records are shown again and nothing is solved")
     elif is_campaign(context):
-        of_times = ["repeats", "time_limit", "pass_limit", "time_budgets", "sequence"]
+        of_times = ["repeats", "time_limit", "sequence_time_limit", "time_budgets", "sequence"]
         refuse_unused(context, of_times, "with --workers, which measures no times and ends by iterations")
         refuse_unused(context, ["prove"], "with --workers, which measures too many problems")
     else:
@@ -162,7 +162,7 @@ def _refuse_unused(context: click.Context, files: tuple[str, ...], solvers: tupl
     refuse_idle(context, solvers)
 
 
-def _recorded(word: str, out: Path, taken: set[Path], fresh: bool, how: Mapping[str, Any]) -> str:
+def _recorded(word: str, out: Path, taken: set[Path], reuse: bool, how: Mapping[str, Any]) -> str:
     """A model's file as the folder of its recorded steps, recorded now unless that was done in the same way, `how`.
 
     The folder is named by the model's own folder and file: many are called scene.xml. `taken` are those of the models
@@ -183,7 +183,7 @@ def _recorded(word: str, out: Path, taken: set[Path], fresh: bool, how: Mapping[
     taken.add(folder)
     kept = folder / "how.json"
     asked = json.dumps({"model": model, "changed": _ages(path, how["control"], how["states"]), **how})
-    if fresh or not kept.is_file() or kept.read_text(encoding="utf-8") != asked:
+    if not reuse or not kept.is_file() or kept.read_text(encoding="utf-8") != asked:
         kept.unlink(missing_ok=True)  # a recording that is stopped on the way is none
         say(str(record_file(path, folder, **how, replace=True)))
         write_text(kept, asked)

@@ -15,8 +15,8 @@ from lavender.io.stored import lock_output
 @click.command()
 @click.argument("model", metavar="MODEL.xml", type=FILE)
 @worlds_options(worlds=16, steps=200)
-@click.option("--ahead", default=10, show_default=True, help="Steps after which the motion is compared.")
-@click.option("--rounds", default=5, show_default=True, help="In which the settings are timed in turns.")
+@click.option("--horizon", default=10, show_default=True, help="Steps after which the motion is compared.")
+@click.option("--repeats", default=5, show_default=True, help="Times that each setting is timed.")
 @threshold_option
 @click.option("--out", type=FOLDER, default=Path("lavender-tune"),
               show_default=True, help="Folder of the page.")  # fmt: skip

@@ -53,7 +53,7 @@ def test_without_a_problem_nothing_is_printed_but_why(boxes):
     words = [str(boxes()), "--steps", "0"]
     done = CliRunner().invoke(mujoco, words)
     assert isinstance(done.exception, InputError) and "no step of these models" in str(done.exception)
-    for bad in (["--every", "0"], ["--warm", "-1"], ["--steps", "-1"]):
+    for bad in (["--record-every", "0"], ["--warm", "-1"], ["--steps", "-1"]):
         assert CliRunner().invoke(mujoco, [*words, *bad]).exit_code == 2
     warm = CliRunner().invoke(mujoco, [*words, "--warm", "40"])
     assert warm.exit_code == 0 and "ours, median" in warm.output and "Cold" not in warm.output
@@ -148,7 +148,7 @@ def test_vectors_are_of_the_problems_that_the_report_measured(lavender, tmp_path
     bench.run(
         [tmp_path / "ring.npz"], ["direct"], bench.Plan(tolerances=(1e-6,), budgets=(), repeats=1), records
     )
-    command = ("export", "c", out, "--for", records, "--solver", "direct")
+    command = ("export", "c", out, "--records", records, "--solver", "direct")
     assert lavender(*command)[0] == 0
     assert vectors.pack_problem(mine) in (out / "vectors.bin").read_bytes()
     before = {path.name: path.read_bytes() for path in out.iterdir()}
@@ -172,7 +172,7 @@ def test_what_a_report_chose_on_the_steps_of_an_engine_is_exported(lavender, tmp
     words = ("--solvers", "newton", "anderson", *QUICK, "--out", out)
     code, _, err = lavender("report", steps, *words)
     assert code == 0, err
-    code, _, err = lavender("export", "c", tmp_path / "c", "--for", out)
+    code, _, err = lavender("export", "c", tmp_path / "c", "--records", out)
     assert code == 0, err
     assert (tmp_path / "c" / "chosen.h").read_text().count("LAV_") >= 1
     assert (
@@ -356,7 +356,7 @@ def test_a_second_report_takes_its_runs_from_the_first_unless_told_otherwise(lav
     n = len(bench.read(tmp_path / "out"))
     plain = len([r for r in bench.read(tmp_path / "out") if not r.interleave_group])
     assert f"{n} of {n} runs reused of 20" in out
-    code, out, _ = lavender(*words, "--fresh")
+    code, out, _ = lavender(*words, "--no-reuse")
     assert "reused" not in out
     again = [r for r in bench.read(tmp_path / "out") if not r.interleave_group]
     assert len(again) == plain  # made again, they stand for the earlier ones
@@ -395,7 +395,7 @@ def test_models_of_one_file_name_are_kept_apart(lavender, tmp_path):
         (tmp_path / name).mkdir()
         (tmp_path / name / "scene.xml").write_text(ARM.format(height=0.1, kind=kind))
     quick = ("--solvers", "auto", "--repeats", 1, "--no-figures")
-    words = ("--steps", 20, "--every", 5, *quick, "--out", tmp_path / "o")
+    words = ("--steps", 20, "--record-every", 5, *quick, "--out", tmp_path / "o")
     models = [tmp_path / name / "scene.xml" for name in ("h1", "g1")]
     assert lavender("report", *models, *words)[0] == 0
     found = bench.read(tmp_path / "o")
@@ -436,7 +436,7 @@ def test_steps_that_could_not_be_recorded_are_counted(lavender, tmp_path, monkey
     assert code == cli.EXIT_UNMET and "left out, the first of 3: " in out
     assert lavender("check", folder, "--solvers", "pgs")[0] == cli.EXIT_UNMET
     monkeypatch.setattr(recording.adapter, "from_mujoco", true)
-    code, out, _ = lavender("report", *model, *more, *shown, "--fresh")
+    code, out, _ = lavender("report", *model, *more, *shown, "--no-reuse")
     assert (code, "left out" in out) == (0, False)
 
 
@@ -452,7 +452,7 @@ def test_a_model_is_recorded_again_when_what_it_is_made_of_has_changed(lavender,
     model.write_text('<mujoco><include file="part.xml"/></mujoco>')
     np.save(played, np.zeros((1, 0)))
     calls, kept = [], recording.record_file
-    words = ["report", model, "--controls", played, "--steps", 10, "--every", 5, "--solvers", "auto"]
+    words = ["report", model, "--controls", played, "--steps", 10, "--record-every", 5, "--solvers", "auto"]
     words.append("--no-figures")
 
     def recorded(*given, **more):
@@ -469,6 +469,6 @@ def test_a_model_is_recorded_again_when_what_it_is_made_of_has_changed(lavender,
         os.utime(changed, (1e9, 1e9 + count))
         assert (lavender(*words)[0], len(calls)) == (0, count)
     monkeypatch.setattr(recording, "record_file", stopped)  # on the way, for all that anybody knows
-    assert lavender(*words, "--fresh")[0] == cli.EXIT_INTERRUPTED
+    assert lavender(*words, "--no-reuse")[0] == cli.EXIT_INTERRUPTED
     monkeypatch.setattr(recording, "record_file", recorded)
     assert (lavender(*words)[0], len(calls)) == (0, 5)

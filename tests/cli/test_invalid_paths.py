@@ -440,7 +440,7 @@ COMMANDS = [
     ("run", "stack", "--steps", "3", "--record", "steps", "--trace", "t.csv", "--plot", "t.svg", "--film", "t.gif"),
     ("solve", "stack(n=2)", "--output", "solution.npz"),
     ("phenomena", "slide", "--steppers", "impulses", "--engines", "none", "--out", "phenomena.json"),
-    ("export", "c", "c", "--for", "report"),
+    ("export", "c", "c", "--records", "report"),
     ("web", "page", "page"),
     ("problems", "@hard", "--page", "set.md"),
 ]  # fmt: skip
@@ -522,7 +522,7 @@ def test_commands_print_paths_as_text(lavender, tmp_path):
     to = "to\x1b[31m"
     for line in (
         ["bench", "mujoco", path, "--steps", "1"],
-        ["record", path, "--steps", "15", "--every", "15", "--out", to],
+        ["record", path, "--steps", "15", "--record-every", "15", "--out", to],
         ["problems", "@walking", "--out", f"{to}1"],
         ["run", "stack", "--set", "n=1", "--steps", "2", "--trace", f"{to}.csv", "--record", f"{to}2"],
         ["solve", "stack(n=2)", "--output", f"{to}.npz"],

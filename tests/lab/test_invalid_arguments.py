@@ -50,7 +50,7 @@ CALLS = {
     "redundancy": Call(lv.redundancy, {"problem": LCP, "tol": 1e-12}),
     "bench.Plan": Call(
         bench.Plan,
-        {"tolerances": (1e-3,), "budgets": (4,), "repeats": 1, "time_limit": 1.0, "pass_limit": 1.0,
+        {"tolerances": (1e-3,), "budgets": (4,), "repeats": 1, "time_limit": 1.0, "sequence_time_limit": 1.0,
          "orders": ("given",), "times": (), "motion": False, "warm": True, "campaign": True},
     ),
     "bench.Plan, a tolerance": Call(lambda tolerance: bench.Plan(tolerances=[tolerance]), {"tolerance": 1e-3}),

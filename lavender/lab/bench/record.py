@@ -258,6 +258,7 @@ RENAMED_FIELDS = {
     "turns": "interleave_group",
     "plan.levels": "tolerances",
     "plan.speed_levels": "velocity_tolerances",
+    "plan.pass_limit": "sequence_time_limit",
 }
 REMOVED_KINDS = ("done",)  # Earlier versions marked complete pairs of a campaign; such lines are ignored.
 RENAMED_STATUSES = {"FLOOR": "ROUNDOFF_LIMIT", "REFUSED": "INVALID_PROBLEM"}

@@ -80,7 +80,7 @@ class Report:
             return ""
         return (
             f"The machine was busy: load {fmean(loads):.1f} on {format_count(run.cores, 'core')} while this was timed. "
-            "These times are void; measure again with --fresh."
+            "These times are void; measure again with --no-reuse."
         )
 
     @cached_property

@@ -328,6 +328,6 @@ def _add_code(records: Records, call: TimedCall, text: str, asked: bool = False)
         and line.timing_mode != "batch"
     ):
         source = quote(records.source or "records.jsonl")
-        command = f"lavender export c liblavender --solver {line.solver} --for {source}"
+        command = f"lavender export c liblavender --solver {line.solver} --records {source}"
         in_c = f"not in C: {reason}" if reason else command
     return Statement(text, call.code, in_c, asked)

@@ -376,10 +376,12 @@ def test_files_of_earlier_versions_load_with_their_values(tmp_path):
     assert [to_json(from_json(line)) for line in lines] == content
 
 
-def test_former_names_of_a_plan_are_named_with_the_present_ones():
+def test_former_names_of_arguments_are_answered_with_the_present_ones():
     for kind in (bench.Plan, bench.CampaignPlan):
         with pytest.raises(lv.UnknownName, match=r"unknown argument 'levels' of .*did you mean 'tolerances'"):
             kind(levels=(1e-3,))
+    with pytest.raises(lv.UnknownName, match=r"unknown argument 'fresh' of run; did you mean 'reuse'"):
+        bench.run([stack(2)], ["pgs"], fresh=True)
 
 
 def test_infinite_and_undefined_numbers_survive_json():
@@ -401,7 +403,7 @@ def test_infinite_and_undefined_numbers_survive_json():
         ({"tolerances": (), "budgets": ()}, "nothing to run"),
         ({"repeats": 0}, "repeats is 0"),
         ({"time_limit": 0.0}, "time_limit is 0"),
-        ({"pass_limit": 0.0}, "pass_limit is 0"),
+        ({"sequence_time_limit": 0.0}, "sequence_time_limit is 0"),
         *(
             ({"velocity_tolerances": (tolerance,)}, "velocity tolerance")
             for tolerance in (0.0, -1.0, math.nan)

@@ -31,7 +31,7 @@ def test_a_sequence_carries_each_solvers_own_impulses():
 def test_a_pass_that_takes_too_long_ends_and_says_so(tmp_path, monkeypatch):
     items = bench.sequence(moving_stack(5), "load")
     # No solve takes less than a picosecond: each pass ends after its first step.
-    plan = bench.Plan(tolerances=(), budgets=(6,), repeats=1, pass_limit=1e-12)
+    plan = bench.Plan(tolerances=(), budgets=(6,), repeats=1, sequence_time_limit=1e-12)
     path = tmp_path / "records.jsonl"
     records = bench.run(items, ["pgs"], plan, path)
     assert [(r.step, r.start) for r in records] == [(0, "cold"), (0, "carried")]

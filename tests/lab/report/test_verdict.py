@@ -38,7 +38,7 @@ def test_the_sentence_has_the_worst_case_and_the_line_its_command_in_c():
     assert said.text.startswith(
         "Use auto: it solves your 2 stacks in 12.7 ms on average (40.0 ms at worst, b), cold, down to 1e-6 of the error"
     )
-    assert said.in_c == "lavender export c liblavender --solver auto --for 'my report/records.jsonl'"
+    assert said.in_c == "lavender export c liblavender --solver auto --records 'my report/records.jsonl'"
     # Of two runs put together: x never ran on b, which is no miss of its own.
     parts = build_verdict(records_of(record("a", "x", 0.004, 1e-9), record("b", "y", 9.0, 0.5)))
     assert "(a miss counted as 2.00 s; on 1 it has no run)" in parts.text

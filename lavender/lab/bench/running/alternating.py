@@ -13,6 +13,7 @@ from statistics import median
 from time import perf_counter
 from typing import Any
 
+from lavender.base.errors import reject_former_names
 from lavender.batch.solve import solve_many
 from lavender.lab.bench.cases import Item, Source, resolve
 from lavender.lab.bench.record import CaseInfo, Record
@@ -40,6 +41,7 @@ RecordsByKey = dict[tuple[Any, ...], list[Record]]  # records of one measurement
 Cases = Sequence[tuple[Item, CaseInfo]]
 
 
+@reject_former_names(fresh="reuse")
 def time_alternately(
     cases: Iterable[Source],
     asks: Sequence[Ask],
@@ -50,7 +52,7 @@ def time_alternately(
     watch: Watch | None = None,
     isolate: bool = True,
     memory: int | None = None,
-    fresh: bool = False,
+    reuse: bool = True,
 ) -> Records:
     """Time lines alternately on cases that `lavender.lab.bench.run` has described in `known`.
 
@@ -58,7 +60,7 @@ def time_alternately(
 
     Parameters
     ----------
-    cases, plan, store, watch, isolate, memory, fresh : as `lavender.lab.bench.run`
+    cases, plan, store, watch, isolate, memory, reuse : as `lavender.lab.bench.run`
     asks : sequence of Ask
         Of timing mode "call" on single cases, "steps" over sequences, "batch" on either.
     known : Records
@@ -70,7 +72,7 @@ def time_alternately(
     """
     this = list(known.runs.values())[-1]
     names = list(dict.fromkeys(ask.solver for ask in asks))
-    with open_runner(this, plan, names, store, watch, isolate, memory, fresh) as runner:
+    with open_runner(this, plan, names, store, watch, isolate, memory, reuse) as runner:
         runner.out = known
         described = [(i, known.cases[i.name]) for i in resolve(cases) if i.name in known.cases]
         identity = repr([asks, [info.sha for _, info in described]])

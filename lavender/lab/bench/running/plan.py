@@ -18,7 +18,7 @@ from lavender.solvers.registry import SolverSpec
 
 # A motion error is reached by solves to tighter and tighter residuals: the first, the last, and their maximum number.
 FIRST_TOL, LAST_TOL, MAX_SPEED_TRIES = 1e-2, 1e-13, 6
-PASS_LIMIT = 5.0  # s, of one pass over a sequence.
+SEQUENCE_TIME_LIMIT = 5.0  # s, of one pass over a sequence.
 UNLIMITED = 10_000_000  # Iterations of a run to a tolerance: the time limit ends it first.
 HANG_LIMIT = (
     60.0  # s, after which a campaign kills the process of another package's solver and records KILLED
@@ -41,7 +41,7 @@ class Plan:
     repeats : solves of each kind; minimum and median are recorded. Repeats end early once they have
         taken `time_limit` together. Steps of a sequence of more than twenty are solved once.
     time_limit : s, of one solve
-    pass_limit : s, of one solver over all steps of a sequence with one budget or tolerance. The remaining
+    sequence_time_limit : s, of one solver over all steps of a sequence with one budget or tolerance. The remaining
         steps are not solved, and a note says so.
     warm : also start from the problem's guess, where it has one that is no answer already
     orders : sweep orders beside "given", each at the middle budget, for solvers that take an order;
@@ -66,7 +66,7 @@ class Plan:
     budgets: Sequence[int] = (4, 8, 16, 32, 64)
     repeats: int = 3
     time_limit: float = 1.0
-    pass_limit: float = PASS_LIMIT
+    sequence_time_limit: float = SEQUENCE_TIME_LIMIT
     warm: bool = True
     orders: Sequence[str] = ("reverse", "symmetric", "random:0", "random:1", "random:2")
     campaign: bool = False
@@ -91,7 +91,7 @@ class Plan:
             raise InputError("nothing to run: give tolerances, budgets or both")
         whole_number("repeats", self.repeats, 1)
         number("time_limit", self.time_limit, above=0.0)
-        number("pass_limit", self.pass_limit, above=0.0)
+        number("sequence_time_limit", self.sequence_time_limit, above=0.0)
         for name in ("warm", "campaign", "motion", "prove"):
             flag(name, getattr(self, name))
         for word in self.orders:

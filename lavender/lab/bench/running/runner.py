@@ -19,7 +19,7 @@ from time import perf_counter
 from typing import Any
 
 from lavender.base.arrays import FloatArray, several
-from lavender.base.errors import InputError, LavenderError
+from lavender.base.errors import InputError, LavenderError, reject_former_names
 from lavender.judge.solution import CONTRADICTED
 from lavender.judge.states import states_of
 from lavender.lab import motion
@@ -136,6 +136,7 @@ def solver_names(names: str | Sequence[str] | None) -> list[str]:
     return [name for name, spec in sorted(registry.specs().items()) if spec.missing() is None]
 
 
+@reject_former_names(fresh="reuse")
 def run(
     cases: Source | Iterable[Source] = (),
     solvers: str | Sequence[str] | None = None,
@@ -148,7 +149,7 @@ def run(
     isolate: bool = True,
     memory: int | None = None,
     into: list[Records] | None = None,
-    fresh: bool = False,
+    reuse: bool = True,
 ) -> Records:
     """Measure every solver that takes a case, on every case.
 
@@ -172,7 +173,7 @@ def run(
         machine of a cluster.
     into : list, optional
         Receives the records before the first is made, for those who stop the run and want what there is.
-    fresh : measure again what `store` holds already
+    reuse : do not repeat measurements that `store` holds
 
     Returns
     -------
@@ -197,7 +198,7 @@ def run(
     packages = {module for name in names for module in registry.specs()[name].requires}
     this = machine.describe(plan.as_dict(), packages)
     backend, cluster = connect_backend(backend) if spread else ("", contextlib.nullcontext())
-    with cluster, open_runner(this, plan, names, store, watch, isolate, memory, fresh) as runner:
+    with cluster, open_runner(this, plan, names, store, watch, isolate, memory, reuse) as runner:
         if into is not None:
             into.append(runner.out)
         return runner.run(items, workers, backend, memory)
@@ -212,11 +213,11 @@ def open_runner(
     watch: Watch | None = None,
     isolate: bool = True,
     memory: int | None = None,
-    fresh: bool = False,
+    reuse: bool = True,
 ) -> Iterator[Runner]:
     """Open the store and a process for other packages' solvers, and limit BLAS to one thread; see `run`."""
     with opened(store) as kept, Worker(memory) as worker, one_thread():  # describing a case computes too
-        yield Runner(this, plan, names, kept, watch, worker if isolate else None, fresh)
+        yield Runner(this, plan, names, kept, watch, worker if isolate else None, reuse)
 
 
 class Runner:
@@ -230,7 +231,7 @@ class Runner:
         store: Store | None = None,
         watch: Watch | None = None,
         worker: Worker | None = None,
-        fresh: bool = False,
+        reuse: bool = True,
     ) -> None:
         self.this, self.plan, self.names = this, plan, names
         self.store, self.watch, self.worker = store, watch, worker
@@ -238,7 +239,7 @@ class Runner:
         self.out = Records(source=str(store.path) if store else "")
         self.done = 0
         self.total = 0
-        stored = Records() if store is None or fresh else store.records
+        stored = Records() if store is None or not reuse else store.records
         self.known: dict[Any, Record] = {r.key: r for r in stored if r.run == this.run}
         # Descriptions of a campaign are reused: many cases take longer to describe than to load.
         self.described = {n: i for n, i in stored.cases.items() if plan.campaign and i.run == this.run}
@@ -401,11 +402,11 @@ class Runner:
             self.done += len(items)
 
     def measure_pass(self, steps: list[tuple[Item, CaseInfo]], spec: SolverSpec, ask: Ask) -> None:
-        """Measure one pass. It ends, with a note, when its steps have taken `Plan.pass_limit` together."""
+        """Measure one pass. It ends, with a note, when its steps have taken `Plan.sequence_time_limit` together."""
         repeats = self.plan.repeats if len(steps) <= MAX_REPEATED_STEPS else 1
         tasks = [Task.of(info, ask, repeats=repeats, time_limit=self.plan.time_limit) for _, info in steps]
         problems = [item for item, _ in steps]
-        limit, spent, made = self.plan.pass_limit, 0.0, 0
+        limit, spent, made = self.plan.sequence_time_limit, 0.0, 0
         for task in tasks:
             record = self.known.get(task.key)
             if record is None or spent > limit:
@@ -435,7 +436,7 @@ class Runner:
             asked = asked_of(ask.mode, ask.tol, ask.max_iter)
             reason = (
                 f"stopped after {made} of {len(tasks)} steps, which took more than the pass limit of {limit:.3g} s "
-                "together (--pass-limit)"
+                "together (--sequence-time-limit)"
             )
             self.keep(Skip(self.this.run, f"{problems[0].sequence}, {asked}, {ask.start}", spec.name, reason))
 
