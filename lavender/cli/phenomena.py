@@ -91,7 +91,7 @@ def phenomena(
         show=show,
     )
     for heading, lines in (
-        ("Ours out of their bounds", tables.losses(found)),
+        ("Steppers of lavender out of bounds", tables.out_of_bound_cases(found)),
         ("Without values", tables.notes(found)),
     ):
         if lines:

@@ -61,8 +61,8 @@ def notes(records: Sequence[Record]) -> list[str]:
     return [f"{engine}: {', '.join(which)}: {note}" for (engine, note), which in found.items()]
 
 
-def losses(records: Sequence[Record]) -> list[str]:
-    """Cases in which a stepper of ours is out of its bound, one line for each stepper and phenomenon."""
+def out_of_bound_cases(records: Sequence[Record]) -> list[str]:
+    """Return a line for each of our steppers and phenomenon with cases out of their bounds."""
     found = []
     for (variant, name), some in _groups(records).items():
         bad = [r for r in some if not r.passed and not r.note]
@@ -79,7 +79,7 @@ def losses(records: Sequence[Record]) -> list[str]:
             {r.engine for r in records if r.phenomenon == name and r.case in cases}
             - {r.engine for r in records if r.phenomenon == name and r.case in cases and not r.passed}
         )
-        within = f"; within it: {', '.join(others)}" if others else "; nobody is within it"
+        within = f"; within it: {', '.join(others)}" if others else "; no engine is within it"
         found.append(f"{name}, {variant}: {len(bad)} of {len(some)} cases out, {words}{within}")
     return found
 

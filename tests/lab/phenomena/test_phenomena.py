@@ -428,7 +428,7 @@ def test_names_of_engine_variants():
 # -- the table and the command --------------------------------------------------------------------
 
 
-def test_the_table_tells_worst_values_losses_and_reasons():
+def test_the_table_has_worst_values_cases_out_of_bounds_and_reasons():
     case = {"mu": 0.5, "slope": 0.9}
     found = [
         Record("stick", "impulses", case, {"creep": 0.02}),
@@ -439,7 +439,7 @@ def test_the_table_tells_worst_values_losses_and_reasons():
     assert "| impulses | **0.02 m/s, 0/1** |" in text
     assert "| soft_step | 1.0e-09 m/s, 1/1 |" in text
     assert "| drake | – |" in text
-    assert tables.losses(found) == [
+    assert tables.out_of_bound_cases(found) == [
         "stick, impulses: 1 of 1 cases out, creep 0.02 m/s (bound 1.0e-06 m/s); within it: soft_step"
     ]
     assert tables.notes(found) == ["drake: stick: it has no cause"]
