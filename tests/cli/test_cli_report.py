@@ -181,14 +181,14 @@ def test_what_a_report_chose_on_the_steps_of_an_engine_is_exported(lavender, tmp
 
 
 def test_progress_is_told_in_lines_where_there_is_no_terminal(capsys, monkeypatch):
-    monkeypatch.setattr(measuring, "EVERY", 0.0)  # s between two lines
+    monkeypatch.setattr(measuring, "PROGRESS_INTERVAL", 0.0)  # s between two lines
     with measuring.progress() as watch:
         for done in range(3):
             watch(Event(done, 3, "stack", "newton"))
     assert capsys.readouterr().err.splitlines() == [
         f"{done} of 3, 0 s: stack newton" for done in range(3)
     ]  # and no control codes or empty lines
-    monkeypatch.setattr(measuring, "EVERY", 1e9)
+    monkeypatch.setattr(measuring, "PROGRESS_INTERVAL", 1e9)
     with measuring.progress() as watch:
         watch(Event(0, 3, "stack", "newton"))
     assert capsys.readouterr().err == ""
@@ -248,7 +248,7 @@ def test_a_file_without_a_record_is_refused(lavender, path, tmp_path):
     for left in (b"", b"\n", head):
         (tmp_path / "r.jsonl").write_bytes(left)
         code, _, said = lavender("report", tmp_path / "r.jsonl", "--out", tmp_path / "again")
-        assert (code, "holds no records" in said) == (2, True)
+        assert (code, "has no records" in said) == (2, True)
         assert not (tmp_path / "again").exists()
 
 
@@ -355,7 +355,7 @@ def test_a_second_report_takes_its_runs_from_the_first_unless_told_otherwise(lav
     assert "By structure" in out
     n = len(bench.read(tmp_path / "out"))
     plain = len([r for r in bench.read(tmp_path / "out") if not r.interleave_group])
-    assert f"{n} of {n} runs reused of 20" in out
+    assert f"{n} of {n} runs of 20" in out
     code, out, _ = lavender(*words, "--no-reuse")
     assert "reused" not in out
     again = [r for r in bench.read(tmp_path / "out") if not r.interleave_group]
