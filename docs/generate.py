@@ -35,7 +35,7 @@ from benchmarks import stability
 from benchmarks.output import markdown as table
 from lavender import bench, registry, suite
 from lavender.base.deadline import seconds
-from lavender.lab.bench import level_name
+from lavender.lab.bench import format_tolerance
 from lavender.lab.bench.statistics import RESIDUAL_NOISE_FACTOR, TIME_NOISE_FACTOR
 from lavender.lab.report import geometric_means, reaches, table_specs
 from lavender.lab.report.figures import build_figures, build_work_precision
@@ -47,7 +47,7 @@ from lavender.problem import LAWS
 from lavender.sim.scene.gallery import SCENES
 
 ROOT = Path(__file__).resolve().parent.parent
-LEVELS = (1e-3, 1e-6, 1e-9)
+TOLERANCES = (1e-3, 1e-6, 1e-9)
 CASES = (
     "random_spd(n=100, condition=1e4)",
     "chain(n=33, tip_mass=1e4)",
@@ -64,17 +64,17 @@ CASES = (
     "pyramid(k=6, friction=cone)",
     "granular(n=4, friction=cone)",
 )
-PLAN = bench.Plan(LEVELS, budgets=(4, 16, 64), repeats=2, time_limit=0.1, warm=False, orders=())
+PLAN = bench.Plan(TOLERANCES, budgets=(4, 16, 64), repeats=2, time_limit=0.1, warm=False, orders=())
 # Beside the solvers of lavender: one backend of each kind (splitting, interior point, cones).
 BACKENDS = ("osqp", "scs", "piqp", "clarabel", "clarabel_cone")
 NEAR = 1.25  # times the fastest: differences below say nothing on a machine that does other work
 ADVICE = (
-    "The first table has the solver that brings the most cases of a structure to each level and, of those that bring\n"
-    "as many, is the fastest. The number is the shifted geometric mean of its times; brackets show on how many cases,\n"
-    "if not on all. The second table has the solver that serves the most cases within each time (a case is served if\n"
-    "at most half of the start's residual is left); the number is the residual at the 90th percentile. Solvers\n"
-    f"after ≈ are as good within noise (a factor of {TIME_NOISE_FACTOR:g} in time, {RESIDUAL_NOISE_FACTOR:g} in "
-    "residual).\n"
+    "The first table has the solver that brings the most cases of a structure to each tolerance and, of those that\n"
+    "bring as many, is the fastest. The number is the shifted geometric mean of its times; brackets show on how\n"
+    "many cases, if not on all. The second table has the solver that serves the most cases within each time\n"
+    "(a case is served if at most half of the start's residual is left); the number is the residual at the 90th\n"
+    f"percentile. Solvers after ≈ are as good within noise (a factor of {TIME_NOISE_FACTOR:g} in time, "
+    f"{RESIDUAL_NOISE_FACTOR:g} in residual).\n"
     "[A report's page](REPORT) shows the same records."
 )
 LAW_NAMES = {
@@ -234,23 +234,23 @@ def _times(ratio):
 def standing(records, solver):
     """Where a solver is the fastest, and where it does not arrive, in this build's measurements."""
     by_case = {}
-    for reach in reaches(records, LEVELS):
+    for reach in reaches(records, TOLERANCES):
         by_case.setdefault(reach.case, []).append(reach)
-    rows, best = [], {level: [] for level in LEVELS}
+    rows, best = [], {tolerance: [] for tolerance in TOLERANCES}
     for case, all_reaches in by_case.items():
         mine = next((r for r in all_reaches if r.solver == solver), None)
         if mine is None:
             continue
         cells = [f"`{case}`"]
-        for level in LEVELS:
-            others = [r.times[level] for r in all_reaches if r.solver not in (solver, "auto")]
+        for tolerance in TOLERANCES:
+            others = [r.times[tolerance] for r in all_reaches if r.solver not in (solver, "auto")]
             fastest = min(others, default=float("inf"))
-            t = mine.times[level]
+            t = mine.times[tolerance]
             if t == float("inf"):
                 cells.append("–")
                 continue
             if t <= NEAR * fastest:
-                best[level].append(case)
+                best[tolerance].append(case)
             ratio = "" if fastest == float("inf") else f" ({_times(t / fastest)} ×)"
             cells.append(f"{seconds(t)}{ratio}")
         cells.append(format_residual(mine.best) + (" (floor)" if mine.at_floor else ""))
@@ -258,18 +258,20 @@ def standing(records, solver):
     if not rows:
         return "Not measured here: it is not installed, or accepts none of the cases."
     lines = []
-    for level, cases in best.items():
+    for tolerance, cases in best.items():
         if cases:
             shown = ", ".join(f"`{c}`" for c in cases)
             lines.append(
-                f"- to {level_name(level)} it is the fastest, or within a quarter of it, on {shown};"
+                f"- to {format_tolerance(tolerance)} it is the fastest, or within a quarter of it, on {shown};"
             )
     if lines:
         lines[-1] = lines[-1].rstrip(";") + "."
         said = "In the measurements of this build:\n\n" + "\n".join(lines)
     else:
-        said = "In the measurements of this build another solver was faster on every case, to every level."
-    head = ("case", *(f"to {level_name(x)}" for x in LEVELS), "best residual")
+        said = (
+            "In the measurements of this build another solver was faster on every case, to every tolerance."
+        )
+    head = ("case", *(f"to {format_tolerance(x)}" for x in TOLERANCES), "best residual")
     note = (
         "Times include set-up and solve; brackets: relative to the fastest *other* solver (`auto` excluded); "
         "–: not reached."
@@ -357,7 +359,7 @@ def solver_pages(site, records, figures):
 
 
 def by_structure(records):
-    """The table of the report's page as markdown: what to take for each structure, to a level and in a time."""
+    """The table of the report's page as markdown: what to take for each structure, to a tolerance and in a time."""
 
     def cell(c):
         words = (f"**{c.lead}** {c.text}" if c.lead else c.text.replace(" / ", "<br>"), c.after.lstrip(", "))
@@ -366,10 +368,10 @@ def by_structure(records):
     report = Report(records)
     found = table_specs.tabulate_advice(report)
     rows = [(f"{cell(name)}<br>{name.more}", *map(cell, cells)) for name, *cells in found.rows]
-    first = 1 + len(report.levels)
-    to_level = table(found.heads[:first], [row[:first] for row in rows])
+    first = 1 + len(report.tolerances)
+    to_tolerance = table(found.heads[:first], [row[:first] for row in rows])
     in_time = table(("structure", *found.heads[first:]), [(row[0], *row[first:]) for row in rows])
-    return f"{ADVICE}\n\n:::{{container}} wide\n{to_level}\n\n{in_time}\n:::"
+    return f"{ADVICE}\n\n:::{{container}} wide\n{to_tolerance}\n\n{in_time}\n:::"
 
 
 def measured_page(site, records, figures):
@@ -383,11 +385,13 @@ def measured_page(site, records, figures):
     shown = ", ".join(f"{n} {v}" for n, v in run.versions.items())
     site.write("parts/advice.md", structures.replace("REPORT", "generated/report.html"))
     rows, drawn = [], []
-    for law, by_level in geometric_means(records).items():
+    for law, by_tolerance in geometric_means(records).items():
         cells = []
-        for level in LEVELS:
-            most = max(solved for _, solved, _ in by_level[level].values())
-            names = sorted((t, name) for name, (t, solved, _) in by_level[level].items() if solved == most)
+        for tolerance in TOLERANCES:
+            most = max(solved for _, solved, _ in by_tolerance[tolerance].values())
+            names = sorted(
+                (t, name) for name, (t, solved, _) in by_tolerance[tolerance].items() if solved == most
+            )
             cells.append(
                 "<br>".join(f"**{name}** {seconds(t)}" for t, name in names[:3]) if most else "nobody"
             )
@@ -410,7 +414,7 @@ def measured_page(site, records, figures):
         *drawn,
     ]
     site.write("measured.md", "\n\n".join(parts))
-    by_law = table(("", *(f"to {level_name(x)}" for x in LEVELS)), rows)
+    by_law = table(("", *(f"to {format_tolerance(x)}" for x in TOLERANCES)), rows)
     site.write("parts/advice_by_law.md", f":::{{container}} wide\n{by_law}\n:::")
 
 

@@ -6,7 +6,8 @@
 
 Problems   `Problem`, `Cones` (bounds and friction), `Rows` (bodies), `Generalized` (J and M), `load`
 Worlds     `Batch` (many problems in arrays), `solve_many`, `residual_many`
-Solving    `solve`, `solve_qp`, `prepare` (for repeated steps), `available`, `known`, `explain` (the way of `auto`)
+Solving    `solve`, `solve_qp`, `prepare` (for repeated steps), `available`, `known`, `explain` (decision trace
+           of `auto`)
 Results    `Solution`, `residual` (judge any impulse), `prove` (an exact solution near by), `diagnose` (mistakes in the
            data), `motion_error`, `redundancy`
 Engine     `Scene`, `Simulation`

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
-from typing import Any
+from collections.abc import Callable, Collection, Iterable
+from functools import wraps
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -19,6 +20,7 @@ __all__ = [
     "UnknownName",
     "check_name",
     "last_words",
+    "reject_former_names",
 ]
 
 
@@ -35,14 +37,23 @@ class TooLarge(InputError):
 
 
 class UnknownName(LavenderError, KeyError):
-    """A solver, option, order, scene or case that does not exist; the message names the nearest."""
+    """A solver, option, order, scene or case that does not exist; the message names the nearest.
 
-    def __init__(self, kind: str, name: object, known: Iterable[str]) -> None:
+    Parameters
+    ----------
+    kind : word for the thing, such as "option of solver 'pgs'"
+    name : the unknown name
+    known : names that exist
+    successor : the present name, if `name` is a former one; the message suggests it
+    """
+
+    def __init__(self, kind: str, name: object, known: Iterable[str], successor: str = "") -> None:
         import difflib  # needed only where something went wrong
 
         known = sorted(set(known))
         plain = {word.lower(): word for word in reversed(known)}
         near = [plain[w] for w in difflib.get_close_matches(str(name).lower(), plain, n=3, cutoff=0.5)]
+        near = [successor] if successor else near
         hint = (
             f"did you mean {' or '.join(map(repr, near))}?"
             if near
@@ -66,6 +77,36 @@ def check_name(kind: str, name: object, known: Collection[str]) -> str:
     if not isinstance(name, str) or name not in known:
         raise UnknownName(kind, name, known)
     return name
+
+
+_Callable = TypeVar("_Callable", bound=Callable[..., Any])
+
+
+def reject_former_names(**successors: str) -> Callable[[_Callable], _Callable]:
+    """Decorate a function or class with renamed keyword arguments: a former name raises `UnknownName`.
+
+    Parameters
+    ----------
+    **successors : present name by former name
+    """
+
+    def decorate(function: Any) -> Any:
+        is_class = isinstance(function, type)
+        inner = function.__init__ if is_class else function
+
+        @wraps(inner)
+        def call(*args: Any, **arguments: Any) -> Any:
+            for name in successors.keys() & arguments.keys():
+                kind = f"argument of {function.__name__}"
+                raise UnknownName(kind, name, (), successor=successors[name])
+            return inner(*args, **arguments)
+
+        if not is_class:
+            return call
+        function.__init__ = call
+        return function
+
+    return decorate
 
 
 def _restored(message: str) -> UnknownName:

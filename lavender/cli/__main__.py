@@ -1,4 +1,4 @@
-"""`python -m lavender.cli`: the same as the command `lavender`."""
+"""Run the command line: `python -m lavender.cli`."""
 
 from lavender.cli.entry import main
 

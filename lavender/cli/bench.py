@@ -1,4 +1,4 @@
-"""`lavender bench mujoco MODEL.xml ...`."""
+"""Define `lavender bench mujoco MODEL.xml ...`."""
 
 from __future__ import annotations
 
@@ -9,13 +9,16 @@ from pathlib import Path
 import click
 
 from lavender.base.errors import InputError, LavenderError
-from lavender.cli.options import EXIT_UNMET, PATH, one_thread, say
+from lavender.cli.options import EXIT_UNMET, PATH, echo, one_thread
 from lavender.io.stored import writable, write_text
 
 
 @click.group()
 def bench() -> None:
-    """Measure lavender's solvers inside the steps of your own simulator (`lavender report` measures files)."""
+    """Measure solvers inside the steps of your own simulator.
+
+    `lavender report` measures solvers on files.
+    """
 
 
 @bench.command("mujoco")
@@ -24,7 +27,8 @@ def bench() -> None:
     "--steps", type=click.IntRange(0), default=10, show_default=True, help="Problems of each model."
 )
 @click.option(
-    "--every",
+    "--record-every",
+    "every",
     type=click.IntRange(1),
     default=20,
     show_default=True,
@@ -39,9 +43,9 @@ def bench() -> None:
 )
 @click.option("--out", type=PATH, help="Write the numbers of every problem as JSON lines.")
 def mujoco(models: tuple[Path, ...], steps: int, every: int, warm: int, out: Path | None) -> None:
-    """Measure lavender's `newton` beside MuJoCo's Newton solver on steps of your own models (MJCF files).
+    """Compare `newton` with MuJoCo's Newton solver on your models.
 
-    Exit code 1: a model is left out, of every number.
+    The problems are steps of your own models (MJCF files). Exit code 1: a model is left out of all numbers.
     """
     one_thread()
     if out is not None:
@@ -52,31 +56,31 @@ def mujoco(models: tuple[Path, ...], steps: int, every: int, warm: int, out: Pat
     from lavender.lab.report.simulators import table, warm_table
 
     mj = package()
-    found: list[Step] = []
+    measured: list[Step] = []
     consecutive: list[WarmStep] = []
-    lost: list[str] = []
+    left_out: list[str] = []
     for path in models:
         try:
             new = measure(mj, path, steps, every)
             after = measure_warm(mj, path, warm)
-        except (ValueError, LavenderError) as error:  # MuJoCo's own word about a file is a ValueError
-            lost.append(f"{path.name}: left out: {str(error).splitlines()[0][:140]}")
-            say(lost[-1], err=True)
+        except (ValueError, LavenderError) as error:  # MuJoCo reports an invalid file as ValueError.
+            left_out.append(f"{path.name}: left out: {str(error).splitlines()[0][:140]}")
+            echo(left_out[-1], err=True)
             continue
-        found += new
+        measured += new
         consecutive += after
-        say(f"{path.name}: {len(new)} problems", err=True)
+        echo(f"{path.name}: {len(new)} problems", err=True)
     if out is not None:
         lines = [json.dumps({"cpu": cpu_name(), **versions(("mujoco", "numpy"))})]
-        lines += [json.dumps(asdict(s)) for s in found]
+        lines += [json.dumps(asdict(s)) for s in measured]
         lines += [json.dumps(asdict(w)) for w in consecutive]
         write_text(out, "\n".join(lines) + "\n")
-    if not found and not consecutive:
+    if not measured and not consecutive:
         raise InputError("no step of these models had a problem to solve: more steps, or other models")
-    if found:
-        say(table(found))
+    if measured:
+        echo(table(measured))
     if consecutive:
-        say(f"\n{warm_table(consecutive)}")
-    if lost:
-        say("\n".join(lost))
+        echo(f"\n{warm_table(consecutive)}")
+    if left_out:
+        echo("\n".join(left_out))
         raise click.exceptions.Exit(EXIT_UNMET)

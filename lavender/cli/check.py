@@ -1,4 +1,4 @@
-"""`lavender check`."""
+"""Define `lavender check`."""
 
 from __future__ import annotations
 
@@ -8,27 +8,25 @@ import click
 
 from lavender.base.errors import InputError
 from lavender.cli.options import (
-    Listed,
-    ManyValues,
-    Reading,
+    ErrorReporter,
+    ListType,
+    MultiValueCommand,
+    echo,
     one_thread,
     precision_option,
-    say,
     threshold_option,
     was_given,
 )
 
 
-@click.command(cls=ManyValues)
+@click.command(cls=MultiValueCommand)
 @click.argument("files", nargs=-1, metavar="[FILES | FOLDERS | NAMES]...")
-@click.option("--solvers", type=Listed(str), help="Solvers by name; default: all that accept the problem.")
+@click.option("--solvers", type=ListType(str), help="Solvers by name; default: all that accept the problem.")
 @click.option(
-    "--reference", default="osqp", show_default=True, help="Solver whose answer the others are compared with."
+    "--reference", default="osqp", show_default=True, help="Solver with whose result the others are compared."
 )
 @click.option("--tol", type=float, default=1e-6, show_default=True, help="Relative residual to reach.")
-@click.option(
-    "--time-limit", type=float, metavar="S", help="Limit of the time of each solver, as of `solve`."
-)
+@click.option("--time-limit", type=float, metavar="S", help="Time limit of each solve.")
 @precision_option
 @threshold_option
 @click.pass_context
@@ -42,14 +40,14 @@ def check(
     precision: str | None,
     threshold: float,
 ) -> None:
-    """Compare solvers with a reference solver, and their claims with the judge.
+    """Compare solvers with a reference solver and with the judge.
 
-    A solution stored in a file is judged too: is it at the floor of its precision, close enough (--threshold), or did
-    its solver stop early?
+    The judge checks the claim of each solver. A solution stored in a file is judged, too: it is at the floor of its
+    precision, close enough (--threshold), or its solver stopped early.
 
-    Exit code 1: a claim is contradicted; none of the solvers takes a problem; a file in a folder cannot be read; or,
+    Exit code 1: a claim is contradicted; none of the solvers accepts a problem; a file in a folder cannot be read; or,
     with --precision or --threshold, a stored solution is neither at its floor nor close enough.
-    Exit code 2: a named file cannot be read, or these options find no stored solution.
+    Exit code 2: a named file cannot be read, or no file has a stored solution for these options.
     """
     from lavender.base.arrays import number
     from lavender.judge.residuals import AT_FLOOR, CLOSE
@@ -63,35 +61,35 @@ def check(
             raise InputError(
                 f"{name}: problems are checked, not records; `lavender report {name}` shows them again"
             )
-    contradicted = untaken = answers = above = unmet = 0
-    reading = Reading(partial(say, style="yellow"))
-    asked = precision is not None or was_given(context, "threshold")
+    contradicted = unaccepted = solutions = above = unmet = 0
+    errors = ErrorReporter(partial(echo, style="yellow"))
+    judges_stored = precision is not None or was_given(context, "threshold")
     bench.solver_names([*(solvers or ()), reference])
     number("tol", tol, low=0.0)
     number("threshold", threshold, low=0.0)
     seconds_of(time_limit)
     for item in bench.resolve(files):
-        with reading(item):
-            found = cross_check(
+        with errors(item):
+            comparison = cross_check(
                 item.problem, solvers=solvers, reference=reference, tol=tol, time_limit=time_limit
             )
             stored = item.judged(precision, threshold)
-            say(item.name, style="bold")
-            say(str(found))
+            echo(item.name, style="bold")
+            echo(str(comparison))
             if stored is not None:
-                answers += 1
+                solutions += 1
                 above += stored.verdict != AT_FLOOR
                 unmet += stored.verdict not in (AT_FLOOR, CLOSE)
-                say(f"stored answer: {stored.verdict_in_words} of {stored.precision}; {stored}")
-            contradicted += len(found.contradicted)
-            untaken += len(found.refused) == len(found.rows)
+                echo(f"stored solution: {stored.verdict_in_words} of {stored.precision}; {stored}")
+            contradicted += len(comparison.contradicted)
+            unaccepted += len(comparison.refused) == len(comparison.rows)
     if contradicted:
-        say(f"{contradicted} claims are contradicted", style="bold red")
-    if untaken:
-        say(f"{untaken} problems are taken by none of these solvers", style="bold red")
-    if asked and not answers:
-        raise InputError("--precision, --threshold: no file holds an answer to judge (an entry `impulse`)")
-    if answers:
-        shares = f"{above} of {answers} above their floor, {unmet} also more than {threshold:g} m/s off"
-        say(f"stored answers: {shares}")
-    reading.end(contradicted or untaken or (asked and unmet))
+        echo(f"{contradicted} claims are contradicted", style="bold red")
+    if unaccepted:
+        echo(f"{unaccepted} problems are accepted by none of these solvers", style="bold red")
+    if judges_stored and not solutions:
+        raise InputError("--precision, --threshold: no file has a solution to judge (an entry `impulse`)")
+    if solutions:
+        shares = f"{above} of {solutions} above their floor, {unmet} also more than {threshold:g} m/s off"
+        echo(f"stored solutions: {shares}")
+    errors.exit(contradicted or unaccepted or (judges_stored and unmet))

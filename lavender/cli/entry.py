@@ -1,4 +1,4 @@
-"""The group of all commands, and the entry point that turns what they raise into an exit code."""
+"""Define the group of all commands, and the entry point, which turns exceptions into exit codes."""
 
 from __future__ import annotations
 
@@ -17,33 +17,53 @@ import click
 from lavender._version import __version__
 from lavender.base import early_sigint as _early_sigint
 from lavender.base.errors import LavenderError, UnknownName
-from lavender.cli.options import EXIT_BAD_INPUT, EXIT_INTERRUPTED, say, unheard
+from lavender.cli.options import EXIT_BAD_INPUT, EXIT_INTERRUPTED, discard_output, echo, suggest_new_option
 
-#: Name -> the module that has the command.
+#: Names of the commands by the heading under which `lavender --help` lists them.
+COMMAND_GROUPS = {
+    "Solve and judge": ("solve", "check", "prove", "reference", "explain"),
+    "Measure": ("report", "phenomena"),
+    "MuJoCo": ("record", "audit", "tune", "bench"),
+    "Engine": ("run", "view", "web"),
+    "Tools": ("solvers", "cases", "problems", "doctor", "export"),
+}
+_WEB_COMMANDS = ("view", "web")
+#: Module of each command.
 COMMANDS = {
-    name: f"lavender.cli.{name}"
-    for name in ("audit", "bench", "cases", "check", "doctor", "explain", "export", "phenomena", "problems", "prove",
-                 "record", "reference", "report", "run", "solve", "solvers", "tune")
-} | dict.fromkeys(("view", "web"), "lavender.sim.web.command")  # fmt: skip
+    name: "lavender.sim.web.command" if name in _WEB_COMMANDS else f"lavender.cli.{name}"
+    for names in COMMAND_GROUPS.values()
+    for name in names
+}
 
 
 class Commands(click.Group):
-    """Commands by name, each imported when it is asked for."""
+    """Group of commands, each of which is imported when it is used."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """An empty word would be read as the present folder."""
+        """Reject an empty argument, which would mean the current folder, then parse as click does."""
         if any(word == "" or (word.startswith("--") and word.endswith("=")) for word in args):
             raise click.UsageError("an empty argument: is a variable of the shell not set?", ctx)
         return super().parse_args(ctx, args)
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        """Every name."""
+        """Return the names of all commands."""
         return sorted(COMMANDS)
 
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the commands under the headings of `COMMAND_GROUPS`."""
+        width = max(map(len, COMMANDS))
+        limit = formatter.width - 6 - width
+        for heading, names in COMMAND_GROUPS.items():
+            commands = [(name, self.get_command(ctx, name)) for name in names]
+            with formatter.section(heading):
+                formatter.write_dl(
+                    [(name.ljust(width), c.get_short_help_str(limit)) for name, c in commands if c]
+                )
+
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        """The command of that name in its module."""
+        """Import and return a command; an unknown name raises UnknownName."""
         if cmd_name not in COMMANDS:
-            if not ctx.resilient_parsing:  # of a shell that completes words
+            if not ctx.resilient_parsing:  # True while a shell completes words.
                 raise UnknownName("command", cmd_name, COMMANDS)
             return None
         command: click.Command = getattr(importlib.import_module(COMMANDS[cmd_name]), cmd_name)
@@ -53,101 +73,107 @@ class Commands(click.Group):
 @click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
 @click.version_option(__version__, prog_name="lavender")
 def cli() -> None:
-    """Solve and compare constraint problems of rigid-body simulation: any solver by name, its error, its cost.
+    """Solve constraint problems of rigid-body simulation, and compare the error and the cost of solvers.
 
     Problems are files (.npz, .hdf5), folders of them, or cases of the built-in suite such as "stack(n=64)".
     """
 
 
 def main(args: Sequence[str] | None = None) -> None:
-    """Entry point: what lavender raises on purpose becomes one line and status 2, whatever Ctrl-C ends 130.
+    """Run the command line. An error of lavender is printed as one line and exits with 2, Ctrl-C exits with 130.
 
-    SIGTERM, of a queue whose time is over or of `timeout`, is as Ctrl-C, with 143; a second one ends it at once.
+    SIGTERM, which `timeout` and batch queues send, stops a command as Ctrl-C does and exits with 143; a second SIGTERM
+    ends the process at once.
     """
     _early_sigint.restore_handler()
-    with _interruptions() as came:
+    with _note_signals() as received:
         try:
-            code = _code_of(args)
+            code = _run_command(args)
         except Exception as error:
-            if not came:
+            if not received:
                 raise
-            say(f"lavender: {type(error).__name__}: {error}", err=True)
+            echo(f"lavender: {type(error).__name__}: {error}", err=True)
             code = EXIT_BAD_INPUT
-    if came and code not in (0, EXIT_INTERRUPTED):
+    if received and code not in (0, EXIT_INTERRUPTED):
         click.echo("lavender: stopped", err=True)
         code = EXIT_INTERRUPTED
-    if code == EXIT_INTERRUPTED and signal.SIGTERM in came:
+    if code == EXIT_INTERRUPTED and signal.SIGTERM in received:
         code = 128 + signal.SIGTERM
     raise SystemExit(code)
 
 
-#: What stops a command -> what Python does with it by itself.
-STOPS: dict[int, Any] = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}
+#: Signals that stop a command, with the handlers that Python installs for them.
+DEFAULT_SIGNAL_HANDLERS: dict[int, Any] = {
+    signal.SIGINT: signal.default_int_handler,
+    signal.SIGTERM: signal.SIG_DFL,
+}
 
 
 @contextlib.contextmanager
-def _interruptions() -> Iterator[list[int]]:
-    """Those that came: libraries in C make an error of their own of the exception that one raises in them."""
-    came: list[int] = []
+def _note_signals() -> Iterator[list[int]]:
+    """Note the signals that arrive; C libraries replace the exception of a signal by an error of their own."""
+    received: list[int] = []
 
     def note(number: int, frame: FrameType | None) -> None:
-        came.append(number)
+        received.append(number)
         if number == signal.SIGTERM:
             signal.signal(number, signal.SIG_DFL)
         signal.default_int_handler(number, frame)
 
-    for number, usual in STOPS.items():
-        with contextlib.suppress(ValueError):  # of another thread than the first
-            if signal.getsignal(number) is usual:
+    for number, handler in DEFAULT_SIGNAL_HANDLERS.items():
+        with contextlib.suppress(ValueError):  # Raised outside the main thread.
+            if signal.getsignal(number) is handler:
                 signal.signal(number, note)
     try:
-        yield came
+        yield received
     finally:
-        for number, usual in STOPS.items():
+        for number, handler in DEFAULT_SIGNAL_HANDLERS.items():
             if signal.getsignal(number) is note:
-                signal.signal(number, usual)
+                signal.signal(number, handler)
 
 
-def _code_of(args: Sequence[str] | None) -> int:
-    """The exit code of a command, told what ended it."""
+def _run_command(args: Sequence[str] | None) -> int:
+    """Run a command, print the error that ended it, and return the exit code."""
     for name in ("stdout", "stderr"):
-        if getattr(sys, name) is None:  # it was closed: a file that is opened next would stand in its place
-            nowhere = os.open(os.devnull, os.O_WRONLY)
-            setattr(sys, name, open(nowhere, "w", encoding="utf-8", closefd=False))  # noqa: SIM115 - to the end
+        if getattr(sys, name) is None:  # Closed by the caller: the next file would get its descriptor.
+            null_device = os.open(os.devnull, os.O_WRONLY)
+            setattr(sys, name, open(null_device, "w", encoding="utf-8", closefd=False))  # noqa: SIM115 - never closed
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")  # names of files may be of bytes that are no text
+            stream.reconfigure(errors="backslashreplace")  # File names may not be valid UTF-8.
     try:
         code = cli.main(
             args=None if args is None else list(args), prog_name="lavender", standalone_mode=False
         )
         sys.stdout.flush()
     except LavenderError as error:
-        say(f"lavender: {error}", err=True)
+        echo(f"lavender: {error}", err=True)
         code = EXIT_BAD_INPUT
     except click.exceptions.ClickException as error:
+        if isinstance(error, click.NoSuchOption):
+            suggest_new_option(error)
         error.show()
         code = error.exit_code
     except (click.exceptions.Abort, KeyboardInterrupt):
         click.echo("lavender: stopped", err=True)
         code = EXIT_INTERRUPTED
     except (BrokenPipeError, SystemExit):
-        # `lavender solvers | head`: nobody reads any more, which click and rich turn into an exit of their own.
-        unheard()
+        # The reader has closed the pipe (`lavender solvers | head`); click and rich raise SystemExit then.
+        discard_output()
         code = 0
     except MemoryError as error:
         click.echo(
             f"lavender: not enough memory ({str(error) or 'none left'}): give a smaller problem", err=True
         )
         code = EXIT_BAD_INPUT
-    except OSError as error:  # a full disk behind stdout, for one
-        click.echo(f"lavender: {error}{_where()}", err=True)
+    except OSError as error:  # For example a full disk behind stdout.
+        click.echo(f"lavender: {error}{_explain_os_error()}", err=True)
         code = EXIT_BAD_INPUT
     return code if isinstance(code, int) else 0
 
 
-def _where() -> str:
-    """What explains an error of the system."""
+def _explain_os_error() -> str:
+    """Return a hint to the cause of an OSError, or an empty text."""
     try:
         os.getcwd()
     except OSError:

@@ -1,4 +1,4 @@
-"""`lavender explain`."""
+"""Define `lavender explain`."""
 
 from __future__ import annotations
 
@@ -6,31 +6,32 @@ import json
 
 import click
 
-from lavender.cli.options import Reading, say
+from lavender.cli.options import ErrorReporter, echo
 
 
 @click.command()
-@click.argument("files", nargs=-1, required=True, metavar="FILE...")
+@click.argument("files", nargs=-1, required=True, metavar="FILES...")
 @click.option("--tol", type=float, default=1e-6, show_default=True, help="Relative residual to reach.")
-@click.option("--json", "as_data", is_flag=True, help="Print one way per line as JSON.")
+@click.option("--json", "as_data", is_flag=True, help="Print one decision trace per line as JSON.")
 def explain(files: tuple[str, ...], tol: float, as_data: bool) -> None:
-    """Print the way of `auto` through its tree with problems (files, folders or cases of the suite).
+    """Print the decision trace of `auto` on problems.
 
-    Nothing is solved. Costs are counted from the structure of a problem, with the same rates on every machine.
+    FILES are files, folders or cases of the suite. Nothing is solved. Costs are counted from the structure of a
+    problem, with the same rates on every machine.
 
     Exit code 1: a file in a folder cannot be read; the others are explained. Exit code 2: a named file cannot be read.
     """
     from lavender.base.arrays import number
     from lavender.lab.bench.cases import resolve
-    from lavender.solving.plan import explain as plan_of
+    from lavender.solving.plan import explain as explain_problem
 
     number("tol", tol, above=0.0)
-    reading = Reading()
+    errors = ErrorReporter()
     for item in resolve(list(files)):
-        with reading(item):
-            plan = plan_of(item.problem, tol)
+        with errors(item):
+            plan = explain_problem(item.problem, tol)
             if as_data:
                 click.echo(json.dumps(plan.data()))
             else:
-                say(f"{item.name}: {plan}\n")
-    reading.end()
+                echo(f"{item.name}: {plan}\n")
+    errors.exit()

@@ -13,13 +13,13 @@ import click
 
 from lavender.base.errors import InputError
 from lavender.cli.options import (
-    bytes_of,
     console,
-    end_stopped,
-    going_on,
+    convert_to_bytes,
+    echo,
+    exit_stopped,
+    ignore_closed_output,
     one_thread,
-    refuse_unused,
-    say,
+    reject_unused_options,
     was_given,
 )
 
@@ -29,38 +29,46 @@ if TYPE_CHECKING:
 
     P = TypeVar("P", bound=Plan)
 
-EVERY = 10.0  # s between two lines of progress where there is no terminal
+PROGRESS_INTERVAL = 10.0  # [s] Time between two lines of progress if the output is not a terminal.
 
 
 @dataclass(frozen=True)
 class Measured:
-    """What a command measured, or found measured."""
+    """Records of a command, measured now or read from its output folder.
+
+    Parameters
+    ----------
+    records : Records
+    stopped : whether Ctrl-C ended the measurement
+    reused : number of records that were not measured again
+    since : date of the first reused record
+    """
 
     records: Records
-    stopped: bool  # by Ctrl-C
-    reused: int = 0  # of the records
-    since: str = ""  # when those were measured first
+    stopped: bool
+    reused: int = 0
+    since: str = ""
 
     @property
     def note(self) -> str:
-        """What was not measured now, in words; empty where everything was."""
+        """Sentence on reused records; empty if all were measured now."""
         if not self.reused:
             return ""
-        return f"{self.reused} of {len(self.records)} runs reused of {self.since}; --fresh measures again"
+        return f"{self.reused} of {len(self.records)} runs of {self.since} reused; --no-reuse measures again"
 
     @property
     def lost(self) -> int:
-        """Cases of folders that did not load."""
+        """Number of cases in folders that did not load."""
         return sum(not skip.solver for skip in self.records.skips)
 
 
-def check_named(items: Sequence[Item]) -> None:
-    """Load what was asked for by name, and let go of it.
+def check_named_problems(items: Sequence[Item]) -> None:
+    """Load each named problem and release its memory.
 
     Raises
     ------
     InputError
-        One of them does not load: nothing is measured, and no page touched.
+        A problem does not load. Nothing has been measured and no page changed.
     """
     from lavender.lab.bench.running.runner import describe_load_error
 
@@ -73,89 +81,102 @@ def check_named(items: Sequence[Item]) -> None:
             item.forget()
 
 
-def plan_of(asked: Mapping[str, Any], kind: type[P], **more: Any) -> P:
-    """The plan that the options of `plan_options` mean; those without a default leave the plan's.
+def make_plan(options: Mapping[str, Any], kind: type[P], **more: Any) -> P:
+    """Make a plan of the options of `plan_options`; options that are None keep the default of the plan.
 
     Raises
     ------
     InputError
-        A level, budget or limit that means nothing.
+        A tolerance, budget or limit is invalid.
     """
-    names = ("levels", "budgets", "motion", "prove", "speed_levels", "orders")
-    return kind(**{name: asked[name] for name in names if asked[name] is not None}, **more)
+    names = ("tolerances", "budgets", "motion", "prove", "velocity_tolerances", "orders")
+    return kind(**{name: options[name] for name in names if options[name] is not None}, **more)
 
 
 def is_campaign(context: click.Context) -> bool:
-    """Whether workers measure: error and robustness without times."""
+    """Return whether workers measure error and robustness without times."""
     return was_given(context, "workers") or was_given(context, "backend")
 
 
 def measure(context: click.Context, files: Sequence[str], path: Path, sweeps: Sequence[int]) -> Measured:
-    """Run with a progress bar; without workers, then time the lines that a report would print. `path` has the records.
+    """Measure solvers on files with a progress bar, and time the calls that a report would print.
+
+    With workers nothing is timed. `path` is the records file.
 
     Raises
     ------
     InputError
-        A file that was named and does not load; a folder that cannot be written or that another process writes.
+        A named file does not load, or the folder cannot be written or is in use by another process.
     """
     from lavender.lab import bench
     from lavender.lab.bench.candidates import time_candidates
 
     one_thread()
-    asked = context.params
-    bench.solver_names(asked["solvers"])  # before anything is loaded: names first
-    campaign, words = is_campaign(context), list(files)
+    options = context.params
+    bench.solver_names(options["solvers"])  # An unknown name is an error before a problem is loaded.
+    campaign, names = is_campaign(context), list(files)
     more: dict[str, Any] = {}
     plan: Plan
     if campaign:
-        workers = asked["workers"] if was_given(context, "workers") else -1
-        more = {"workers": workers, "backend": asked["backend"]}
-        words = bench.expand_seeds(files, len(asked["seeds"]), asked["seeds"].start)
-        if words == list(files):
-            refuse_unused(context, ["seeds"], "where no case takes one")
-        plan = plan_of({**asked, "orders": asked["orders"] or ()}, bench.CampaignPlan)
+        workers = options["workers"] if was_given(context, "workers") else -1
+        more = {"workers": workers, "backend": options["backend"]}
+        names = bench.expand_seeds(files, len(options["seeds"]), options["seeds"].start)
+        if names == list(files):
+            reject_unused_options(context, ["seeds"], "if no case takes one")
+        plan = make_plan({**options, "orders": options["orders"] or ()}, bench.CampaignPlan)
     else:
-        plan = _timed_plan(asked, files, sweeps)
+        plan = _make_timed_plan(options, files, sweeps)
     reused = 0
     with bench.Store(path) as store:
-        items = bench.resolve(words, asked["sequence"])
-        if was_given(context, "pass_limit") and not any(item.sequence for item in items):
-            raise InputError("--pass-limit has no effect without a sequence: leave it out")
-        check_named(items)
+        items = bench.resolve(names, options["sequence"])
+        if was_given(context, "sequence_time_limit") and not any(item.sequence for item in items):
+            raise InputError("--sequence-time-limit has no effect without a sequence: leave it out")
+        check_named_problems(items)
         before = {name: run.started for name, run in store.records.runs.items()}
-        found: list[Records] = []
+        measured: list[Records] = []
         with progress() as bar:
 
-            def watch(event: Event) -> None:
+            def show_event(event: Event) -> None:
                 nonlocal reused
                 reused += event.reused
                 bar(event)
 
             stopped = False
             try:
-                common = {"watch": watch, "fresh": asked["fresh"], "memory": bytes_of(asked["memory"])}
-                bench.run(items, asked["solvers"], plan, store, into=found, **common, **more)
+                common: dict[str, Any] = {
+                    "watch": show_event,
+                    "reuse": not options["no_reuse"],
+                    "memory": convert_to_bytes(options["memory"]),
+                }
+                bench.run(items, options["solvers"], plan, store, into=measured, **common, **more)
                 if not campaign:
-                    time_candidates(items, found[0], plan, store, **common)
+                    time_candidates(items, measured[0], plan, store, **common)
             except KeyboardInterrupt:
-                if not found:
+                if not measured:
                     raise
                 stopped = True
-    since = before.get(next(iter(found[0].runs)), "") if reused else ""
-    return Measured(found[0], stopped, reused, since.replace("T", " ")[:16])
+    since = before.get(next(iter(measured[0].runs)), "") if reused else ""
+    return Measured(measured[0], stopped, reused, since.replace("T", " ")[:16])
 
 
-def _timed_plan(asked: Mapping[str, Any], files: Sequence[str], sweeps: Sequence[int]) -> Plan:
+def _make_timed_plan(options: Mapping[str, Any], files: Sequence[str], sweeps: Sequence[int]) -> Plan:
+    """Make the plan of a report that measures times."""
     from lavender.lab.bench import Plan
     from lavender.lab.proof import require
 
-    if asked["sequence"] and not files:
+    if options["sequence"] and not files:
         raise InputError("--sequence needs a folder of problem files, one for each step")
-    limits = {"pass_limit": asked["pass_limit"]} if asked["pass_limit"] is not None else {}
-    # without files: all of the suite in a minute
-    limits["time_limit"] = (1.0 if files else 0.25) if asked["time_limit"] is None else asked["time_limit"]
-    more: dict[str, Any] = {"repeats": asked["repeats"], "times": asked["time_budgets"], "sweeps": sweeps}
-    plan = plan_of(asked, Plan, **limits, **more)
+    limits = (
+        {"sequence_time_limit": options["sequence_time_limit"]}
+        if options["sequence_time_limit"] is not None
+        else {}
+    )
+    # Without files, the short limit measures the whole suite in a minute.
+    limits["time_limit"] = (
+        (1.0 if files else 0.25) if options["time_limit"] is None else options["time_limit"]
+    )
+    more: dict[str, Any] = {"repeats": options["repeats"], "times": options["time_budgets"], "sweeps": sweeps}
+    plan = make_plan(options, Plan, **limits, **more)
     if plan.prove:
         require()
     return plan
@@ -164,19 +185,19 @@ def _timed_plan(asked: Mapping[str, Any], files: Sequence[str], sweeps: Sequence
 def show_page(page: SummaryPage, folder: Path) -> None:
     """Write a page and print its short form; exit if Ctrl-C ended the measurement."""
     path = page.write(folder)
-    with going_on():
+    with ignore_closed_output():
         page.print_short(console())
-        say(f"\npage: {path}")
+        echo(f"\npage: {path}")
     if page.stopped:
-        end_stopped()
+        exit_stopped()
 
 
 @contextlib.contextmanager
 def progress() -> Iterator[Callable[[Event], None]]:
-    """What is being measured: a bar on a terminal, elsewhere a line of stderr every EVERY seconds."""
+    """Yield a callback that shows progress: a bar on a terminal, otherwise a line of stderr now and then."""
     to = console(stderr=True)
     if not to.is_terminal:
-        yield _lines()
+        yield _print_progress_lines()
         return
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
@@ -187,27 +208,28 @@ def progress() -> Iterator[Callable[[Event], None]]:
         TextColumn("{task.fields[what]}", markup=False),
         console=to,
         transient=True,
-        refresh_per_second=4,  # drawing takes time from what is being timed
+        refresh_per_second=4,  # Drawing takes processor time from the measurement.
     ) as bar:
         task = bar.add_task("", total=None, what="")
         yield lambda event: bar.update(
-            task, completed=event.done, total=event.total or None, what=_words(event)
+            task, completed=event.done, total=event.total or None, what=_format_event(event)
         )
 
 
-def _lines() -> Callable[[Event], None]:
-    began = told = time.monotonic()
+def _print_progress_lines() -> Callable[[Event], None]:
+    """Return a callback that prints a line of progress every `PROGRESS_INTERVAL` seconds."""
+    began = printed = time.monotonic()
 
-    def watch(event: Event) -> None:
-        nonlocal told
+    def show_event(event: Event) -> None:
+        nonlocal printed
         now = time.monotonic()
-        if now - told >= EVERY:
-            told = now
+        if now - printed >= PROGRESS_INTERVAL:
+            printed = now
             count = f"{event.done} of {event.total}, " if event.total else ""
-            click.echo(f"{count}{now - began:.0f} s: {_words(event)}", err=True)
+            click.echo(f"{count}{now - began:.0f} s: {_format_event(event)}", err=True)
 
-    return watch
+    return show_event
 
 
-def _words(event: Event) -> str:
+def _format_event(event: Event) -> str:
     return f"{event.case} {event.solver}".strip()

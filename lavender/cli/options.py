@@ -1,4 +1,4 @@
-"""What commands share: kinds of values, options of a plan, the console, exit codes."""
+"""Common parts of the commands: option types, options of a plan, console output, exit codes."""
 
 from __future__ import annotations
 
@@ -24,16 +24,40 @@ if TYPE_CHECKING:
 else:
     _ParamType = click.ParamType
 
-EXIT_UNMET = 1  # a claim not met: unsolved, a failed check, an unreadable file met in a folder
-EXIT_BAD_INPUT = 2  # or a folder that another process writes
-EXIT_INFEASIBLE = 3  # with a certificate that the judge confirms
+EXIT_UNMET = 1  # The problem is not solved, a check failed, or a file in a folder cannot be read.
+EXIT_BAD_INPUT = 2  # An argument is invalid, or another process writes to the output folder.
+EXIT_INFEASIBLE = 3  # The problem is infeasible, with a certificate that the judge confirms.
 EXIT_INTERRUPTED = 130
-LEAST_WIDTH = 60  # columns of a terminal
+MIN_TERMINAL_WIDTH = 60  # [columns] Tables are formatted for at least this width.
 PATH = click.Path(path_type=Path)
 FILE = click.Path(dir_okay=False, path_type=Path)
 FOLDER = click.Path(file_okay=False, path_type=Path)
-Option = tuple[tuple[str, ...], dict[str, Any]]  # names, and what click is told of it
-THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
+Option = tuple[tuple[str, ...], dict[str, Any]]  # Names of an option, and its arguments of `click.option`.
+THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
+
+
+#: Present name of each option that earlier versions had under another name.
+RENAMED_OPTIONS = {
+    "--accept": "--max-velocity-error",
+    "--ahead": "--horizon",
+    "--campaign": "--workers",
+    "--every": "--record-every",
+    "--for": "--records",
+    "--fresh": "--no-reuse",
+    "--levels": "--tolerances",
+    "--pass-limit": "--sequence-time-limit",
+    "--rounds": "--repeats",
+    "--speed-levels": "--velocity-tolerances",
+}
+
+
+def suggest_new_option(error: click.NoSuchOption) -> None:
+    """Let the message of an unknown option suggest its present name, if the command has an option of that name."""
+    new_name = RENAMED_OPTIONS.get(error.option_name)
+    command = error.ctx.command if error.ctx is not None else None
+    if command is not None and any(new_name in option.opts for option in command.params):
+        error.message = f"{error.message} Did you mean {new_name!r}?"  # type: ignore[misc]
+        error.possibilities = None  # type: ignore[misc]
 
 
 def _is_number(word: str) -> bool:
@@ -57,16 +81,16 @@ def _is_solver(word: str) -> bool:
     if Path(word).exists():
         return False
     names = {family.partition("(")[0] for family in suite.families()}
-    # What is no case and no path either is a solver's name with a mistake in it, and is refused as such.
+    # A word that is neither a case nor a path is a misspelt solver name; it is rejected as such later.
     return word in registry.specs() or not (word in names or set(word) & set("(*?[/\\."))
 
 
-class ManyValues(click.Command):
-    """`--levels 1e-3 1e-6` as well as `--levels 1e-3,1e-6`: what follows is taken while it fits the option."""
+class MultiValueCommand(click.Command):
+    """Command that accepts `--tolerances 1e-3 1e-6` as well as `--tolerances 1e-3,1e-6`."""
 
-    FITS: dict[str, Callable[[str], bool]] = {  # noqa: RUF012 - a constant of the class
-        "--levels": _is_number,
-        "--speed-levels": _is_number,
+    VALUE_TESTS: dict[str, Callable[[str], bool]] = {  # noqa: RUF012 - a constant of the class
+        "--tolerances": _is_number,
+        "--velocity-tolerances": _is_number,
         "--budgets": _is_number,
         "--time-budgets": _is_number,
         "--solvers": _is_solver,
@@ -74,25 +98,25 @@ class ManyValues(click.Command):
     }
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Fold the values of such an option into one word, then parse as click does."""
+        """Join the values that follow an option of `VALUE_TESTS` into one word, then parse as click does."""
         folded: list[str] = []
         i = 0
         while i < len(args):
             word = args[i]
             folded.append(word)
             i += 1
-            if word in self.FITS and i < len(args):
+            if word in self.VALUE_TESTS and i < len(args):
                 values = [args[i]]
                 i += 1
-                while i < len(args) and not args[i].startswith("-") and self.FITS[word](args[i]):
+                while i < len(args) and not args[i].startswith("-") and self.VALUE_TESTS[word](args[i]):
                     values.append(args[i])
                     i += 1
                 folded.append(",".join(values))
         return super().parse_args(ctx, folded)
 
 
-class Listed(_ParamType):
-    """Numbers, or words, with commas or blanks between them."""
+class ListType(_ParamType):
+    """Option type: numbers or words, separated by commas or blanks."""
 
     def __init__(self, kind: type) -> None:
         self.kind = kind
@@ -101,7 +125,7 @@ class Listed(_ParamType):
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> tuple[Any, ...]:
-        """A tuple of them."""
+        """Return the values as a tuple."""
         if not isinstance(value, str):
             return tuple(value)
         try:
@@ -112,13 +136,13 @@ class Listed(_ParamType):
             )
 
 
-class Seeds(_ParamType):
-    """N or A:B, whole numbers."""
+class SeedRange(_ParamType):
+    """Option type: seeds as N (0 to N - 1) or A:B (A to B - 1)."""
 
     name = "n"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> range:
-        """The seeds."""
+        """Return the range of seeds."""
         if isinstance(value, range):
             return value
         first, colon, last = str(value).partition(":")
@@ -130,93 +154,98 @@ class Seeds(_ParamType):
 
 
 def one_thread() -> None:
-    """One thread for libraries that are loaded later; those that are loaded are limited while timing."""
-    for name in THREADS:
+    """Limit libraries that are loaded later to one thread; loaded ones are limited during timing."""
+    for name in THREAD_VARIABLES:
         os.environ.setdefault(name, "1")
 
 
 def console(stderr: bool = False) -> Console:
-    """A terminal to print on, never so narrow that names are cut; into a file or a pipe as wide as tables need."""
+    """Return a console that never cuts names; in a file or pipe, lines are as long as the tables need."""
     from rich.console import Console
 
-    known = Console(stderr=stderr).is_terminal or os.environ.get("COLUMNS", "0").strip("0").isdigit()
-    # nothing is folded or cut
-    width = max(shutil.get_terminal_size().columns, LEAST_WIDTH) if known else 10_000
+    has_width = Console(stderr=stderr).is_terminal or os.environ.get("COLUMNS", "0").strip("0").isdigit()
+    width = max(shutil.get_terminal_size().columns, MIN_TERMINAL_WIDTH) if has_width else 10_000
     return Console(stderr=stderr, width=width)
 
 
-def unheard() -> None:
-    """Nobody reads what is printed (`| head`): from here on it goes nowhere."""
+def discard_output() -> None:
+    """Redirect standard output to the null device after its reader has closed the pipe (`| head`)."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 @contextlib.contextmanager
-def going_on() -> Iterator[None]:
-    """Around what a command prints before it has written its last file: written it is, whoever reads."""
+def ignore_closed_output() -> Iterator[None]:
+    """Discard output if its reader has closed the pipe, so that the command still writes its files."""
     try:
         yield
-    except (BrokenPipeError, SystemExit):  # rich makes an exit of it
-        unheard()
+    except (BrokenPipeError, SystemExit):  # rich turns BrokenPipeError into SystemExit.
+        discard_output()
 
 
 def was_given(context: click.Context, name: str) -> bool:
-    """An option stands on the command line (or in the environment), whatever its value."""
+    """Return whether an option is set on the command line or in the environment, with any value."""
     return context.get_parameter_source(name) not in (None, click.core.ParameterSource.DEFAULT)
 
 
-def adding(options: Sequence[Option], **same: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """A decorator that gives a command these options in their order, and all of them what is the `same`."""
+def add_options(
+    options: Sequence[Option], **common: Any
+) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Return a decorator that adds options to a command in this order, all with the settings `common`."""
 
     def decorate(command: Callable[..., Any]) -> Callable[..., Any]:
-        for names, more in reversed(options):
-            command = click.option(*names, **same, **more)(command)
+        for names, settings in reversed(options):
+            command = click.option(*names, **common, **settings)(command)
         return command
 
     return decorate
 
 
 def worlds_options(worlds: int, steps: int) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Which worlds of a MuJoCo model are simulated, with these numbers as the defaults."""
+    """Return a decorator with the options for simulating worlds of a MuJoCo model; the arguments are defaults."""
     options: list[Option] = [
-        (("--worlds",), {"default": worlds, "help": "How many; the first is that of `lavender record`."}),
-        (("--steps",), {"default": steps, "help": "Of each world."}),
+        (("--worlds",), {"default": worlds, "help": "Number of worlds; the first is the one of `lavender record`."}),
+        (("--steps",), {"default": steps, "help": "Steps of each world."}),
         (("--spread",), {"default": 0.1, "metavar": "M/S",
-                         "help": "Standard deviation of what the others' first velocities differ by."}),
+                         "help": "Standard deviation by which the initial velocities of the other worlds differ."}),
     ]  # fmt: skip
     options += [
         (names, more) for names, more in RECORDING_OPTIONS if names[0] in ("--controls", "--seed", "--states")
     ]
-    return adding(options, show_default=True)
+    return add_options(options, show_default=True)
 
 
-def refuse_unused_recording(context: click.Context, recorded: bool) -> None:
-    """Refuse those that would be ignored."""
+def reject_unused_recording_options(context: click.Context, recorded: bool) -> None:
+    """Raise InputError for options of a recording that would be ignored."""
     if not recorded:
-        refuse_unused(context, RECORDING, "without a MODEL.xml")
+        reject_unused_options(context, RECORDING_NAMES, "without a MODEL.xml")
     elif context.params["control"] != "random":
-        refuse_unused(context, ["seed"], "without --controls random")
+        reject_unused_options(context, ["seed"], "without --controls random")
 
 
-def refuse_unused(context: click.Context, names: Sequence[str], where: str) -> None:
-    """Refuse options that would be ignored.
+def reject_unused_options(context: click.Context, names: Sequence[str], condition: str) -> None:
+    """Raise InputError if one of these options is set, which would be ignored.
 
-    Raises
-    ------
-    InputError
-        One of them was given.
+    Parameters
+    ----------
+    context : context of the command
+    names : names of the options' parameters
+    condition : why the options have no effect, such as "without --records"
     """
     options = {p.name: p.opts[0] for p in context.command.params}
     for name in names:
         if was_given(context, name):
-            raise InputError(f"{options[name]} has no effect {where}: leave it out")
+            raise InputError(f"{options[name]} has no effect {condition}: leave it out")
 
 
-def refuse_idle(context: click.Context, solvers: Sequence[str] | None) -> None:
-    """Refuse options of a plan that none of the named solvers heeds.
+def reject_options_without_effect(context: click.Context, solvers: Sequence[str] | None) -> None:
+    """Raise InputError for options of a plan that none of the named solvers uses.
 
     Raises
     ------
-    InputError, UnknownName
+    InputError
+        An option has no effect.
+    UnknownName
+        A solver does not exist.
     """
     from lavender.lab.bench.running.runner import is_foreign
     from lavender.solvers import registry
@@ -225,14 +254,14 @@ def refuse_idle(context: click.Context, solvers: Sequence[str] | None) -> None:
         return
     specs = [registry.get(name) for name in solvers]
     if not any(s.resumable and not s.exact for s in specs):
-        refuse_unused(context, ["budgets"], "on solvers that cannot stop after any iteration")
+        reject_unused_options(context, ["budgets"], "on solvers that cannot stop after any iteration")
     if not any(s.order and not s.exact for s in specs):
-        refuse_unused(context, ["orders"], "on solvers that take no order")
+        reject_unused_options(context, ["orders"], "on solvers that take no order")
     if not any(map(is_foreign, specs)):
-        refuse_unused(context, ["memory"], "where no solver of another package runs")
+        reject_unused_options(context, ["memory"], "if no solver of another package runs")
 
 
-#: Of answers that an engine made.
+#: Option of commands that judge solutions of an engine.
 precision_option = click.option(
     "--precision", type=click.Choice(["float64", "float32"]),
     help="Precision in which the engine computed its solutions; default: that of the problem, or float64.",
@@ -240,11 +269,11 @@ precision_option = click.option(
 THRESHOLD: Option = (("--threshold",), {
     "type": float, "default": 1e-6, "help": "Velocity error [m/s] up to which an engine's solution is close enough.",
 })  # fmt: skip
-threshold_option = adding([THRESHOLD], show_default=True)
-#: How a MuJoCo model is simulated and recorded: the same options of every command that does so.
+threshold_option = add_options([THRESHOLD], show_default=True)
+#: Options of all commands that simulate and record a MuJoCo model.
 RECORDING_OPTIONS: tuple[Option, ...] = (
     (("--steps",), {"default": 500, "help": "MODEL.xml: number of simulation steps."}),
-    (("--every",), {"default": 5, "help": "MODEL.xml: record every n-th step."}),
+    (("--record-every", "every"), {"default": 5, "help": "MODEL.xml: record every n-th step."}),
     (("--controls", "control"), {"default": "random", "metavar": "zero|random|FILE",
                                  "help": "MODEL.xml: its controls. FILE: an .npy array of shape (any, nu)."}),
     (("--seed",), {"default": 0, "help": "MODEL.xml: seed of random controls."}),
@@ -253,44 +282,44 @@ RECORDING_OPTIONS: tuple[Option, ...] = (
                      "mjSTATE_INTEGRATION (with warm start and controls) in its rows; else qpos and qvel, and other "
                      "arrays of MjData, such as `lavender audit` writes. keyframes: those of the model."}),
 )  # fmt: skip
-RECORDING = ("steps", "every", "control", "seed", "states", "threshold")  # their names
-recording_options = adding([THRESHOLD, *RECORDING_OPTIONS], show_default=True)
+RECORDING_NAMES = ("steps", "every", "control", "seed", "states", "threshold")  # Parameter names.
+recording_options = add_options([THRESHOLD, *RECORDING_OPTIONS], show_default=True)
 
-#: Of what is measured.
+#: Options of the commands that measure, as fields of `lavender.lab.bench.Plan`.
 PLAN_OPTIONS: tuple[tuple[str, dict[str, Any]], ...] = (
-    ("--solvers", {"type": Listed(str), "help": "Solvers by name; default: all that are installed."}),
-    ("--levels", {"type": Listed(float), "default": "1e-3,1e-6,1e-9", "show_default": True,
+    ("--solvers", {"type": ListType(str), "help": "Solvers by name; default: all that are installed."}),
+    ("--tolerances", {"type": ListType(float), "default": "1e-3,1e-6,1e-9", "show_default": True,
                   "help": "Relative residuals to reach."}),
     ("--motion", {"is_flag": True, "help": "Also measure the motion error: how wrong the velocities of the bodies are, "
                   "relative to a reference that is solved once for each case."}),
-    ("--prove", {"is_flag": True, "help": "Measure the motion error from an exact solution that is enclosed with "
-                 "proof, where one is (extra `proof`); implies --motion."}),
-    ("--speed-levels", {"type": Listed(float), "default": (), "metavar": "M/S,M/S,...",
+    ("--prove", {"is_flag": True, "help": "Measure the motion error from an enclosed exact solution, if one is proven "
+                 "(extra `proof`); implies --motion."}),
+    ("--velocity-tolerances", {"type": ListType(float), "default": (), "metavar": "M/S,M/S,...",
                         "help": "Motion errors to reach, in metres per second; implies --motion."}),
-    ("--budgets", {"type": Listed(int), "default": "4,8,16,32,64", "show_default": True,
+    ("--budgets", {"type": ListType(int), "default": "4,8,16,32,64", "show_default": True,
                    "help": "Numbers of iterations to run exactly."}),
-    ("--orders", {"type": Listed(str), "default": None,
+    ("--orders", {"type": ListType(str), "default": None,
                   "help": "Sweep orders to compare with 'given', at the middle budget; random:3 uses seed 3."}),
     ("--repeats", {"type": int, "default": 3, "show_default": True,
-                   "help": "Repetitions of each solve; minimum and median are kept."}),
+                   "help": "Repetitions of each solve; minimum and median are recorded."}),
     ("--time-limit", {"type": float, "default": None, "metavar": "S",
                       "help": "Limit of one solve; default: 1 s, or 0.25 s for the built-in suite."}),
-    ("--pass-limit", {"type": float, "default": None, "metavar": "S",
-                      "help": "Limit of a solver over all steps of a sequence, at one budget or level; default: 5 s."}),
+    ("--sequence-time-limit", {"type": float, "default": None, "metavar": "S",
+                      "help": "Time limit of a solver over all steps of a sequence with one setting; default: 5 s."}),
     ("--memory", {"type": float, "default": None, "metavar": "GB",
                   "help": "Memory limit of each process of another package's solver; default: half of the "
                   "machine's memory, shared by the workers (--workers)."}),
 )  # fmt: skip
-plan_options = adding([((name,), more) for name, more in PLAN_OPTIONS])
+plan_options = add_options([((name,), more) for name, more in PLAN_OPTIONS])
 
 
-def bytes_of(gigabytes: float | None) -> int | None:
-    """Bytes of an option in GB.
+def convert_to_bytes(gigabytes: float | None) -> int | None:
+    """Return the bytes of an option in GB.
 
     Raises
     ------
     InputError
-        Not a positive number.
+        The number is not positive.
     """
     if gigabytes is None:
         return None
@@ -299,8 +328,8 @@ def bytes_of(gigabytes: float | None) -> int | None:
     return int(gigabytes * 2**30)
 
 
-def plain(text: str) -> str:
-    """Text with what rich would take for markup escaped, and what a terminal would obey written as its code."""
+def escape_markup(text: str) -> str:
+    """Return text with rich's markup escaped and control characters written as their codes."""
     from rich.markup import escape
 
     from lavender.lab.bench.record import printable
@@ -308,60 +337,60 @@ def plain(text: str) -> str:
     return escape(printable(text, lines=True))
 
 
-def say(text: str, err: bool = False, style: str = "") -> None:
-    """Print what names of files and problems are part of: what a terminal would obey is written as its code."""
+def echo(text: str, err: bool = False, style: str = "") -> None:
+    """Print text that may contain names of files and problems; control characters are written as their codes."""
     from lavender.lab.bench.record import printable
 
     if style:
-        console(err).print(plain(text), style=style, highlight=False, soft_wrap=True)
+        console(err).print(escape_markup(text), style=style, highlight=False, soft_wrap=True)
     else:
         click.echo(printable(text, lines=True), err=err)
 
 
-def end_stopped() -> NoReturn:
-    """The end of a command that Ctrl-C ended early, once what was done is written."""
-    say("Stopped: of what was done until then.", style="yellow")
+def exit_stopped() -> NoReturn:
+    """Exit a command after Ctrl-C, once the completed part is written."""
+    echo("Stopped: the results are those of the completed part.", style="yellow")
     raise click.exceptions.Exit(EXIT_INTERRUPTED)
 
 
-class Reading:
-    """Around what is done with each problem of a command: what a file makes raise is told, and costs the exit code."""
+class ErrorReporter:
+    """Context manager of each problem of a command: it prints the errors of a problem and sets the exit code."""
 
-    def __init__(self, tell: Callable[[str], Any] | None = None) -> None:
-        self.tell = tell or partial(say, err=True)
+    def __init__(self, report: Callable[[str], Any] | None = None) -> None:
+        self.report = report or partial(echo, err=True)
         self.code = 0
 
     @contextlib.contextmanager
     def __call__(self, item: Item) -> Iterator[None]:
-        """One problem, whose memory is let go of at the end."""
+        """Run the block for one problem and release its memory at the end."""
         try:
             yield
         except LavenderError as error:
-            self.tell(f"{item.name}: {error}")
-            named = isinstance(error, InputError) and item.named
-            self.code = max(self.code, EXIT_BAD_INPUT if named else EXIT_UNMET)
+            self.report(f"{item.name}: {error}")
+            is_bad_argument = isinstance(error, InputError) and item.named
+            self.code = max(self.code, EXIT_BAD_INPUT if is_bad_argument else EXIT_UNMET)
         finally:
             item.forget()
 
-    def end(self, unmet: Any = False) -> None:
-        """The exit of the command: 2 where a named problem could not be read, 1 for another, or where `unmet`."""
+    def exit(self, unmet: Any = False) -> None:
+        """Exit with 2 if a named problem could not be read, with 1 after another error or if `unmet`."""
         if code := self.code or (EXIT_UNMET if unmet else 0):
             raise click.exceptions.Exit(code)
 
 
-def parameters_of(words: tuple[str, ...]) -> dict[str, Any]:
-    """`n=20` as {"n": 20}: numbers, true and false, none; else a word."""
-    found: dict[str, Any] = {}
+def parse_parameters(words: tuple[str, ...]) -> dict[str, Any]:
+    """Return {"n": 20} for `n=20`. Values are numbers, true, false, none, or else texts."""
+    parameters: dict[str, Any] = {}
     for word in words:
         name, equals, value = word.partition("=")
         if not equals or not name:
             raise InputError(f"--set {word!r}; NAME=VALUE is needed")
-        known = {"true": True, "false": False, "none": None}
-        if value.lower() in known:
-            found[name] = known[value.lower()]
+        constants = {"true": True, "false": False, "none": None}
+        if value.lower() in constants:
+            parameters[name] = constants[value.lower()]
             continue
         try:
-            found[name] = float(value) if not value.lstrip("+-").isdigit() else int(value)
+            parameters[name] = float(value) if not value.lstrip("+-").isdigit() else int(value)
         except ValueError:
-            found[name] = value
-    return found
+            parameters[name] = value
+    return parameters

@@ -1,4 +1,4 @@
-"""`lavender phenomena`."""
+"""Define `lavender phenomena`."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from typing import TYPE_CHECKING
 
 import click
 
-from lavender.cli.options import PATH, parameters_of, refuse_unused
+from lavender.cli.options import PATH, parse_parameters, reject_unused_options
 from lavender.io.stored import writable, write_text
 
 if TYPE_CHECKING:
     from lavender.lab.phenomena import Record
 
-PACKAGES = ("mujoco", "pybullet", "drake", "lavendersim", "newton", "numpy")
+ENGINE_PACKAGES = ("mujoco", "pybullet", "drake", "lavendersim", "newton", "numpy")
 
 
-def _names(text: str | None) -> list[str] | None:
+def _split_names(text: str | None) -> list[str] | None:
     if text is None or text == "all":
         return None
     return [] if text == "none" else [w.strip() for w in text.split(",") if w.strip()]
@@ -59,54 +59,60 @@ def phenomena(
     out: Path | None,
     listed: bool,
 ) -> None:
-    """Measure every stepper, and other engines, on scenes whose exact motion is known.
+    """Measure steppers and engines on scenes with a known motion.
 
     A cell shows the worst distance from the exact motion and the number of cases within all bounds. A note says which
     engine is missing, crashed, or cannot build a scene.
     """
-    from lavender.lab.phenomena import WAYS, chosen, run
+    from lavender.lab.phenomena import ENGINE_VARIANTS, chosen, run
     from lavender.lab.phenomena import table as tables
 
     if listed:
-        refuse_unused(context, ["steppers", "engines", "parameters", "limit", "out"], "with --list")
+        reject_unused_options(context, ["steppers", "engines", "parameters", "limit", "out"], "with --list")
         click.echo(tables.described(chosen(names)))
         return
     if out is not None:
         writable(out)
-    case = parameters_of(parameters) if parameters else None
-    found: list[Record] = []
+    case = parse_parameters(parameters) if parameters else None
+    records: list[Record] = []
 
     def show(record: Record) -> None:
-        found.append(record)
+        records.append(record)
         click.echo(tables.line(record), err=True)
         if out is not None:
-            write_text(out, json.dumps(_told(found), indent=1) + "\n")
+            write_text(out, json.dumps(_collect_results(records), indent=1) + "\n")
 
     run(
         names,
-        steppers=_names(steppers),
-        engines=_names(engines),
+        steppers=_split_names(steppers),
+        engines=_split_names(engines),
         parameters=case,
         limit=limit,
         show=show,
     )
     for heading, lines in (
-        ("Ours out of their bounds", tables.losses(found)),
-        ("Without values", tables.notes(found)),
+        ("Steppers of lavender out of bounds", tables.out_of_bound_cases(records)),
+        ("Without values", tables.notes(records)),
     ):
         if lines:
             click.echo(f"{heading}:\n" + "\n".join(f"- {x}" for x in lines) + "\n")
-    click.echo(tables.table(found))
-    ran = {r.engine for r in found}
-    click.echo("\n" + "\n".join(f"- {way.name}: {way.text}" for way in WAYS.values() if way.name in ran))
+    click.echo(tables.table(records))
+    ran = {r.engine for r in records}
+    click.echo(
+        "\n"
+        + "\n".join(
+            f"- {variant.name}: {variant.text}" for variant in ENGINE_VARIANTS.values() if variant.name in ran
+        )
+    )
 
 
-def _told(found: list[Record]) -> dict[str, object]:
+def _collect_results(records: list[Record]) -> dict[str, object]:
+    """Return the content of the file of --out: processor, versions and records."""
     from lavender.lab.bench.machine import cpu_name, versions
     from lavender.lab.phenomena.engines import versions_of_node
 
     return {
         "cpu": cpu_name(),
-        "versions": versions(PACKAGES) | versions_of_node(),
-        "records": [asdict(r) for r in found],
+        "versions": versions(ENGINE_PACKAGES) | versions_of_node(),
+        "records": [asdict(r) for r in records],
     }

@@ -1,4 +1,4 @@
-"""`lavender problems`."""
+"""Define `lavender problems`."""
 
 from __future__ import annotations
 
@@ -7,20 +7,18 @@ from pathlib import Path
 import click
 
 from lavender.base.errors import InputError
-from lavender.cli.options import EXIT_UNMET, FILE, FOLDER, one_thread, refuse_unused, say
+from lavender.cli.options import EXIT_UNMET, FILE, FOLDER, echo, one_thread, reject_unused_options
 from lavender.io.stored import lock_output, writable, write_text
 
 
 @click.command()
 @click.argument("groups", nargs=-1, metavar="[@SET | FILE | FOLDER]...")
 @click.option("--out", type=FOLDER, help="Write every problem as a file here.")
-@click.option(
-    "--check", is_flag=True, help="Make every problem again and compare its numbers with the manifest."
-)
+@click.option("--check", is_flag=True, help="Build every problem and compare its numbers with the manifest.")
 @click.option(
     "--certify",
     type=FILE,
-    help="Prove what can be proved of each and write this manifest: minutes, with the extra `proof`.",
+    help="Prove properties of each solution and write this manifest; takes minutes and needs the extra `proof`.",
 )
 @click.option("--page", type=FILE, help="Write the catalogue as markdown.")
 @click.pass_context
@@ -32,12 +30,13 @@ def problems(
     certify: Path | None,
     page: Path | None,
 ) -> None:
-    """List, make or check the problem set: names, numbers, and what is proved of each solution.
+    """List, build or check the problem set.
 
-    Without an option, a line for each problem of the named sets; all sets if none is named. Files and folders of your
-    own are taken by --certify alone. What needs a package that is not installed is left out, and named.
+    Without an option, print a line for each problem of the named sets, or of all sets: name, size, and the proven
+    properties of its solution. Only --certify accepts files and folders of your own. Problems that need a package that
+    is not installed are left out, with a message.
 
-    Exit code 1: a problem has other numbers than the manifest says.
+    Exit code 1: the numbers of a problem differ from the manifest.
     """
     from lavender.lab import collection, suite
     from lavender.lab.bench.cases import is_path
@@ -45,9 +44,9 @@ def problems(
 
     one_thread()
     if certify is not None:
-        refuse_unused(context, ["out", "check", "page"], "with --certify")
+        reject_unused_options(context, ["out", "check", "page"], "with --certify")
     elif check:
-        refuse_unused(context, ["out"], "with --check")
+        reject_unused_options(context, ["out"], "with --check")
     if out is not None:
         context.with_resource(lock_output(out, folder=True))
     for path in (certify, page):
@@ -56,22 +55,22 @@ def problems(
     names = [group.removeprefix("@") for group in groups]
     for name in names:
         if not is_path(name):
-            suite.names(f"@{name}")  # an unknown set is refused first
+            suite.names(f"@{name}")  # An unknown set is an error before any work starts.
         elif certify is None:
             raise InputError(
-                f"{name} is a file or folder, which --certify alone takes; give sets, such as @hard"
+                f"{name} is a file or folder, which only --certify accepts; give sets, such as @hard"
             )
     if certify is not None:
-        made = []
+        certified = []
         for entry in collection.entries(names):
             click.echo(f"{entry.name}: {entry.known}{'; ' if entry.reason else ''}{entry.reason}")
-            made.append(entry)
-        collection.save(made, certify)
+            certified.append(entry)
+        collection.save(certified, certify)
         return
-    found = [e for e in collection.load() if not names or e.group in names]
+    entries = [e for e in collection.load() if not names or e.group in names]
     if page is not None:
-        write_text(page, collection.page(found, collection.load(collection.RECORDED)))
-    here, missing = collection.makeable(found)
+        write_text(page, collection.page(entries, collection.load(collection.RECORDED)))
+    here, missing = collection.makeable(entries)
     for line in missing if check or out is not None else ():
         click.echo(f"left out: {line}", err=True)
     if check:
@@ -86,7 +85,7 @@ def problems(
         for entry in here:
             (case,) = suite.cases(entry.name)
             case.problem.save(out / f"{file_name(entry.name)}.npz")
-        say(f"{len(here)} problems in {out}")
+        echo(f"{len(here)} problems in {out}")
     elif page is None:
-        for e in found:
-            say(f"@{e.group} {e.name}: {e.rows} rows, {e.law}, {collection.told(e)}")
+        for e in entries:
+            echo(f"@{e.group} {e.name}: {e.rows} rows, {e.law}, {collection.told(e)}")

@@ -1,25 +1,28 @@
-"""`lavender prove`."""
+"""Define `lavender prove`."""
 
 from __future__ import annotations
 
 import click
 
-from lavender.cli.options import Reading, one_thread, say
+from lavender.cli.options import ErrorReporter, echo, one_thread
 
 
 @click.command()
-@click.argument("files", nargs=-1, required=True, metavar="FILE...")
+@click.argument("files", nargs=-1, required=True, metavar="FILES...")
 @click.option(
-    "--solver", default="auto", show_default=True, help="Whose answer is held to the exact solution."
+    "--solver",
+    default="auto",
+    show_default=True,
+    help="Solver whose result is compared with the exact solution.",
 )
-@click.option("--tol", type=float, default=1e-12, show_default=True, help="Relative residual asked of it.")
+@click.option("--tol", type=float, default=1e-12, show_default=True, help="Relative residual to reach.")
 def prove(files: tuple[str, ...], solver: str, tol: float) -> None:
-    """Solve problems (files, folders or cases of the suite) and prove an exact solution near each answer.
+    """Solve problems and enclose an exact solution near each result.
 
-    Needs the extra `proof`. Each line says how far the exact solution is at most, that there is none, or what could not
-    be decided.
+    FILES are files, folders or cases of the suite; the extra `proof` is needed. Each line states the largest distance
+    of the exact solution, that there is no solution, or why neither could be proven.
 
-    Exit code 1: an answer without a proof, or a file in a folder that cannot be read. Exit code 2: a named file cannot
+    Exit code 1: a result has no proof, or a file in a folder cannot be read. Exit code 2: a named file cannot
     be read.
     """
     from lavender.base.arrays import number
@@ -30,17 +33,16 @@ def prove(files: tuple[str, ...], solver: str, tol: float) -> None:
     from lavender.solvers.registry import get
 
     one_thread()
-    number(
-        "tol", tol, low=0.0
-    )  # refused before anything is read, as are an unknown solver and a missing package
+    # Check the arguments before any file is read.
+    number("tol", tol, low=0.0)
     get(solver)
     require()
-    unmet, reading = False, Reading()
+    unmet, errors = False, ErrorReporter()
     for item in resolve(list(files)):
-        with reading(item), Worker() as worker:
+        with errors(item), Worker() as worker:
             solution = solve_isolated(worker, item.problem, solver, tol=tol)
-            found = enclose(item.problem, solution)
-            short = "" if solution.success else f"; {solver}: {solution.status.name}"
-            say(f"{item.name}: {found}{short}")
-            unmet |= not (found.proven or found.infeasible)
-    reading.end(unmet)
+            proof = enclose(item.problem, solution)
+            failure = "" if solution.success else f"; {solver}: {solution.status.name}"
+            echo(f"{item.name}: {proof}{failure}")
+            unmet |= not (proof.proven or proof.infeasible)
+    errors.exit(unmet)

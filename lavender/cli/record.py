@@ -1,4 +1,4 @@
-"""`lavender record`."""
+"""Define `lavender record`."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ import click
 from lavender.cli.options import (
     FILE,
     FOLDER,
+    echo,
     precision_option,
     recording_options,
-    refuse_unused_recording,
-    say,
+    reject_unused_recording_options,
 )
 
 
@@ -27,10 +27,13 @@ from lavender.cli.options import (
 @precision_option
 @click.pass_context
 def record(
-    context: click.Context, /, model: Path, out: Path, steps: int, precision: str | None, **asked: Any
+    context: click.Context, /, model: Path, out: Path, steps: int, precision: str | None, **options: Any
 ) -> None:
-    """Simulate a MuJoCo model (MJCF) and write its constraint problems, for `lavender report OUT`."""
+    """Simulate a MuJoCo model and write its constraint problems.
+
+    MODEL.xml is an MJCF file. `lavender report OUT` measures solvers on the problems.
+    """
     from lavender.io.recording import record_file
 
-    refuse_unused_recording(context, True)
-    say(str(record_file(model, out, steps, precision=precision or "float64", **asked)))
+    reject_unused_recording_options(context, True)
+    echo(str(record_file(model, out, steps, precision=precision or "float64", **options)))

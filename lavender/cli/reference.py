@@ -1,4 +1,4 @@
-"""`lavender reference`."""
+"""Define `lavender reference`."""
 
 from __future__ import annotations
 
@@ -8,23 +8,23 @@ from pathlib import Path
 import click
 
 from lavender.base.errors import InputError
-from lavender.cli.options import Reading, going_on, one_thread, say
+from lavender.cli.options import ErrorReporter, echo, ignore_closed_output, one_thread
 
 
 @click.command()
 @click.argument("files", nargs=-1, required=True, metavar="FILES | FOLDERS...")
 @click.option(
-    "--prove", "proven", is_flag=True, help="Only exact solutions that are enclosed with proof, rounded."
+    "--prove", "proven", is_flag=True, help="Write only proven exact solutions, rounded to float64."
 )
 def reference(files: tuple[str, ...], proven: bool) -> None:
-    """Solve each problem to the floor and write the solution beside its file.
+    """Solve problems to the floor and write reference solutions.
 
-    `lavender report --motion` then uses pile.npz.reference instead of solving pile.npz again. The content of such a
-    file is judged before it is used. With `--prove` (extra `proof`) motion errors are then those to an exact solution,
-    which owes nothing to any solver.
+    The solution of pile.npz is written to pile.npz.reference, which `lavender report --motion` uses instead of solving
+    pile.npz again. The content of such a file is judged before it is used. With `--prove` (extra `proof`), motion
+    errors are relative to an exact solution, which does not depend on a solver.
 
-    Exit code 1: nothing solves a problem or proves a solution, or a file in a folder cannot be read. Exit code 2: a
-    named file cannot be read.
+    Exit code 1: a problem was not solved to the floor, or its solution was not proven; or a file in a folder
+    cannot be read. Exit code 2: a named file cannot be read.
     """
     from lavender.lab import bench, motion
     from lavender.lab.proof import enclosed, require
@@ -33,25 +33,27 @@ def reference(files: tuple[str, ...], proven: bool) -> None:
     if proven:
         require()
 
-    def tell(text: str, style: str = "") -> None:
-        with going_on():
-            say(text, style=style)
+    def print_line(text: str, style: str = "") -> None:
+        with ignore_closed_output():
+            echo(text, style=style)
 
-    unmet, reading = False, Reading(partial(tell, style="yellow"))
+    unmet, errors = False, ErrorReporter(partial(print_line, style="yellow"))
     for item in bench.resolve(files):
-        with reading(item):
+        with errors(item):
             if not Path(item.source).is_file():
-                raise InputError(f"{item.source} is no file; a reference is written beside one")
+                raise InputError(f"{item.source} is not a file; a reference is written next to a file")
             proof = enclosed(item.problem) if proven else None
-            found = motion.reference(item.problem.disk)
+            reference = motion.reference(item.problem.disk)
             if proof is not None and not proof.proven:
-                reading.tell(f"{item.name}: {proof}")
+                errors.report(f"{item.name}: {proof}")
                 unmet = True
-            elif not found.accepted:
-                reading.tell(
-                    f"{item.name}: nothing reached the floor ({found}); there is no reference to write"
+            elif not reference.accepted:
+                errors.report(
+                    f"{item.name}: no solver reached the floor ({reference}); no reference is written"
                 )
                 unmet = True
             else:
-                tell(f"{item.name}: {found}, written: {motion.save_reference(item.problem, item.source)}")
-    reading.end(unmet)
+                print_line(
+                    f"{item.name}: {reference}, written: {motion.save_reference(item.problem, item.source)}"
+                )
+    errors.exit(unmet)

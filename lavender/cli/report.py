@@ -1,4 +1,4 @@
-"""`lavender report`."""
+"""Define `lavender report`."""
 
 from __future__ import annotations
 
@@ -17,30 +17,23 @@ from lavender.cli.options import (
     EXIT_INTERRUPTED,
     EXIT_UNMET,
     PATH,
-    RECORDING,
-    Listed,
-    ManyValues,
-    Seeds,
+    RECORDING_NAMES,
+    ListType,
+    MultiValueCommand,
+    SeedRange,
     console,
+    echo,
     plan_options,
     recording_options,
-    refuse_idle,
-    refuse_unused,
-    refuse_unused_recording,
-    say,
+    reject_options_without_effect,
+    reject_unused_options,
+    reject_unused_recording_options,
     was_given,
 )
 from lavender.io.stored import lock_output, write_text
 
 
-def _reject_campaign(context: click.Context, option: click.Parameter, given: bool) -> None:
-    """Raise the usual error for the former name of --workers."""
-    if given:
-        message = "No such option '--campaign'. Did you mean '--workers'?"
-        raise click.NoSuchOption("--campaign", message, ctx=context)
-
-
-@click.command(cls=ManyValues)
+@click.command(cls=MultiValueCommand)
 @click.argument("files", nargs=-1, metavar="[FILES | FOLDERS | NAMES]...")
 @plan_options
 @click.option(
@@ -66,23 +59,22 @@ def _reject_campaign(context: click.Context, option: click.Parameter, given: boo
 )
 @click.option(
     "--seeds",
-    type=Seeds(),
+    type=SeedRange(),
     default="1",
     metavar="N | A:B",
     help="With --workers: seeds 0 to N - 1, or A to B - 1, of cases that take one.",
 )
-@click.option("--campaign", is_flag=True, hidden=True, expose_value=False, callback=_reject_campaign)
 @click.option("--compare", type=PATH, help="Compare with earlier records (.jsonl, or their folder).")
 @click.option(
     "--time-budgets",
-    type=Listed(float),
+    type=ListType(float),
     default=(),
     metavar="S,S,...",
     help="Time budgets in seconds, each with a recommended solver; default: three decades around the fastest times.",
 )
 @recording_options
 @click.option("--tables", is_flag=True, help="Print every table, warning and line of code.")
-@click.option("--fresh", is_flag=True, help="Repeat runs that the folder already holds.")
+@click.option("--no-reuse", is_flag=True, help="Repeat runs that the folder already holds.")
 @click.option(
     "--paper",
     is_flag=True,
@@ -90,13 +82,15 @@ def _reject_campaign(context: click.Context, option: click.Parameter, given: boo
 )
 @click.option("--no-figures", is_flag=True, help="Do not write SVG and PNG files.")
 @click.pass_context
-def report(context: click.Context, /, files: tuple[str, ...], out: Path, **asked: Any) -> None:
-    """Measure speed against error: every solver on every case, to each level of residual and with each budget.
+def report(context: click.Context, /, files: tuple[str, ...], out: Path, **options: Any) -> None:
+    """Measure the time and the error of solvers on problems.
+
+    Every solver runs on every case, to each tolerance and with each budget.
 
     FILES are problems (.npz, .hdf5), folders of them, folders of recorded steps, or cases of the built-in
     suite such as "stack(n=64)"; without any, the built-in suite runs. A MuJoCo model (.xml) is simulated first,
-    and its steps are recorded in the folder of the report. A records.jsonl is shown again
-    without solving. After an interruption, the same command continues where it stopped.
+    and its steps are recorded in the folder of the report. For a records.jsonl, the report is
+    written again without solving. After an interruption, the same command continues where it stopped.
 
     Exit code 1: a file in a folder cannot be read, a step could not be recorded, or nothing was measured. Exit code 2:
     a named file cannot be read, or another report is writing to the folder.
@@ -108,73 +102,88 @@ def report(context: click.Context, /, files: tuple[str, ...], out: Path, **asked
     from lavender.lab.report.text import format_count, list_reasons
     from lavender.lab.report.write import write
 
-    for limit in asked["time_budgets"]:
+    for limit in options["time_budgets"]:
         if not (math.isfinite(limit) and limit > 0.0):
             raise InputError(f"time budget {limit} must be a positive number of seconds")
-    _refuse_unused(context, files, asked["solvers"])
+    _reject_unused_options(context, files, options["solvers"])
     context.with_resource(lock_output(out, folder=True))
-    taken: set[Path] = set()
-    how = {name: asked[name] for name in RECORDING}
-    files = tuple(_recorded(f, out, taken, asked["fresh"], how) for f in files)
-    old = None if asked["compare"] is None else bench.read(asked["compare"])
-    sweeps = asked["budgets"] if was_given(context, "budgets") else ()
+    used_folders: set[Path] = set()
+    recording = {name: options[name] for name in RECORDING_NAMES}
+    files = tuple(_record_model(f, out, used_folders, not options["no_reuse"], recording) for f in files)
+    old = None if options["compare"] is None else bench.read(options["compare"])
+    sweeps = options["budgets"] if was_given(context, "budgets") else ()
     path = out / "records.jsonl"
-    again = [f for f in files if f.endswith(".jsonl")]
-    if again:
+    records_files = [f for f in files if f.endswith(".jsonl")]
+    if records_files:
         if len(files) > 1:
-            raise InputError("a records.jsonl is shown alone: give one, and no problems")
-        done = Measured(bench.read(again[0]), False)
-        if not (done.records.records or done.records.skips):
-            raise InputError(f"{again[0]} holds no records: there is nothing to show")
+            raise InputError("a records.jsonl is shown alone: give one file, without problems")
+        measured = Measured(bench.read(records_files[0]), False)
+        if not (measured.records.records or measured.records.skips):
+            raise InputError(f"{records_files[0]} has no records")
     else:
-        done = measure(context, files, path, sweeps)
-    engines = [] if is_campaign(context) else read_engine_answers(files, done.records.latest())
-    shown = Report(done.records, old, asked["time_budgets"], sweeps, engines)
-    # before a pipe that nobody reads ends the command
-    index = write(shown, out, figures=not asked["no_figures"])
+        measured = measure(context, files, path, sweeps)
+    engines = [] if is_campaign(context) else read_engine_answers(files, measured.records.latest())
+    shown = Report(measured.records, old, options["time_budgets"], sweeps, engines)
+    # The files are written first: a closed pipe can end the command while it prints.
+    index = write(shown, out, figures=not options["no_figures"])
     paper = None
-    if asked["paper"]:
+    if options["paper"]:
         from lavender.lab.report.latex_export import write_paper
 
         paper = write_paper(shown, out / "paper")
-    print_report(shown, console(), complete=asked["tables"])
+    print_report(shown, console(), complete=options["tables"])
     if paper is not None:
-        say(f"figures, tables and method of a paper: {paper}")
-    say(f"\n{format_count(len(done.records), 'run')}; page: {index}")
-    if done.note:
-        say(done.note)
-    if done.stopped:
-        say("Stopped; the same command continues from here.", style="yellow")
+        echo(f"figures, tables and method of a paper: {paper}")
+    echo(f"\n{format_count(len(measured.records), 'run')}; page: {index}")
+    if measured.note:
+        echo(measured.note)
+    if measured.stopped:
+        echo("Stopped; the same command continues from here.", style="yellow")
         raise click.exceptions.Exit(EXIT_INTERRUPTED)
-    if not (again or done.records.records):
-        say(f"nothing was measured: {'; '.join(list_reasons(done.records.skips))}", style="yellow")
+    if not (records_files or measured.records.records):
+        echo(f"nothing was measured: {'; '.join(list_reasons(measured.records.skips))}", style="yellow")
         raise click.exceptions.Exit(EXIT_UNMET)
-    if done.lost and not again:
-        say(f"{format_count(done.lost, 'case')} of a folder left out of every number", style="yellow")
+    if measured.lost and not records_files:
+        echo(f"{format_count(measured.lost, 'case')} of a folder left out of all numbers", style="yellow")
         raise click.exceptions.Exit(EXIT_UNMET)
 
 
-def _refuse_unused(context: click.Context, files: tuple[str, ...], solvers: tuple[str, ...] | None) -> None:
-    """Every option that would be ignored is an error."""
+def _reject_unused_options(
+    context: click.Context, files: tuple[str, ...], solvers: tuple[str, ...] | None
+) -> None:
+    """Raise InputError for each option that would be ignored."""
     if any(f.endswith(".jsonl") for f in files):
-        kept = {"files", "out", "compare", "time_budgets", "budgets", "tables", "paper", "no_figures"}
-        rest = [p.name for p in context.command.params if p.name and p.name not in kept]
-        refuse_unused(context, rest, "where records are shown again and nothing is solved")
+        used = {"files", "out", "compare", "time_budgets", "budgets", "tables", "paper", "no_figures"}
+        unused = [p.name for p in context.command.params if p.name and p.name not in used]
+        reject_unused_options(context, unused, "if records are shown again, since nothing is solved")
     elif is_campaign(context):
-        of_times = ["repeats", "time_limit", "pass_limit", "time_budgets", "sequence"]
-        refuse_unused(context, of_times, "with --workers, which measures no times and ends by iterations")
-        refuse_unused(context, ["prove"], "with --workers, which measures too many problems")
+        timing_options = ["repeats", "time_limit", "sequence_time_limit", "time_budgets", "sequence"]
+        reject_unused_options(
+            context, timing_options, "with --workers, which measures no times and ends by iterations"
+        )
+        reject_unused_options(context, ["prove"], "with --workers, which measures too many problems")
     else:
-        refuse_unused(context, ["seeds"], "without --workers")
-    refuse_unused_recording(context, any(Path(f).suffix.lower() == ".xml" for f in files))
-    refuse_idle(context, solvers)
+        reject_unused_options(context, ["seeds"], "without --workers")
+    reject_unused_recording_options(context, any(Path(f).suffix.lower() == ".xml" for f in files))
+    reject_options_without_effect(context, solvers)
 
 
-def _recorded(word: str, out: Path, taken: set[Path], fresh: bool, how: Mapping[str, Any]) -> str:
-    """A model's file as the folder of its recorded steps, recorded now unless that was done in the same way, `how`.
+def _record_model(
+    word: str, out: Path, used_folders: set[Path], reuse: bool, recording: Mapping[str, Any]
+) -> str:
+    """Record the steps of a model and return their folder; return any other word unchanged.
 
-    The folder is named by the model's own folder and file: many are called scene.xml. `taken` are those of the models
-    before it.
+    Steps that were recorded with the same settings are reused.
+
+    Parameters
+    ----------
+    word : argument of the command; a model is a file *.xml
+    out : folder of the report
+    used_folders : folders of the models before this one; the new folder is added
+    reuse : reuse recorded steps
+    recording : options of the recording
+
+    The name of the folder contains the folder and the file of the model, since many files are called scene.xml.
     """
     path = Path(word)
     if path.suffix.lower() != ".xml":
@@ -185,38 +194,46 @@ def _recorded(word: str, out: Path, taken: set[Path], fresh: bool, how: Mapping[
     model, n = str(path.resolve()), 1
     first = out / "recorded" / file_name(f"{path.resolve().parent.name}-{path.stem}")
     folder = first
-    while folder in taken or _model_of(folder) not in ("", model):
+    while folder in used_folders or _read_recorded_model(folder) not in ("", model):
         n += 1
         folder = first.with_name(f"{first.name}-{n}")
-    taken.add(folder)
-    kept = folder / "how.json"
-    asked = json.dumps({"model": model, "changed": _ages(path, how["control"], how["states"]), **how})
-    if fresh or not kept.is_file() or kept.read_text(encoding="utf-8") != asked:
-        kept.unlink(missing_ok=True)  # a recording that is stopped on the way is none
-        say(str(record_file(path, folder, **how, replace=True)))
-        write_text(kept, asked)
+    used_folders.add(folder)
+    settings_file = folder / "how.json"
+    settings = json.dumps(
+        {
+            "model": model,
+            "changed": _list_modification_times(path, recording["control"], recording["states"]),
+            **recording,
+        }
+    )
+    if not reuse or not settings_file.is_file() or settings_file.read_text(encoding="utf-8") != settings:
+        settings_file.unlink(missing_ok=True)  # An interrupted recording is not reused.
+        echo(str(record_file(path, folder, **recording, replace=True)))
+        write_text(settings_file, settings)
     return str(folder)
 
 
-def _model_of(folder: Path) -> str:
-    """The model whose steps a folder holds; empty where there are none."""
+def _read_recorded_model(folder: Path) -> str:
+    """Return the model whose steps a folder contains; empty if it contains none."""
     try:
         return str(json.loads((folder / "how.json").read_text(encoding="utf-8"))["model"])
     except (OSError, ValueError, KeyError, TypeError):
         return ""
 
 
-def _ages(path: Path, controls: str, states: str | None) -> list[float]:
-    """When the model, the files that it includes, its controls and its start states were changed."""
+def _list_modification_times(path: Path, controls: str, states: str | None) -> list[float]:
+    """Return the modification times of the model, its included files, its controls and its start states."""
     try:
-        found = [path.stat().st_mtime]
+        times = [path.stat().st_mtime]
     except OSError as error:
         raise InputError(f"{path}: {error.strerror or error}") from None
     try:
         from mujoco import FatalError, mju_getXMLDependencies
-    except ImportError:  # none, or an earlier one
-        return found
-    with contextlib.suppress(ValueError, RuntimeError, FatalError):  # no model: said where it is read
+    except ImportError:  # MuJoCo is missing, or has no such function.
+        return times
+    with contextlib.suppress(
+        ValueError, RuntimeError, FatalError
+    ):  # An invalid model is reported when it is read.
         others = (*sorted(mju_getXMLDependencies(str(path))), controls, states or "")
-        found += [p.stat().st_mtime for p in map(Path, others) if p.is_file()]
-    return found
+        times += [p.stat().st_mtime for p in map(Path, others) if p.is_file()]
+    return times

@@ -1,4 +1,4 @@
-"""`lavender run`."""
+"""Define `lavender run`."""
 
 from __future__ import annotations
 
@@ -11,7 +11,14 @@ from typing import Any
 import click
 
 from lavender.base.errors import InputError
-from lavender.cli.options import PATH, end_stopped, going_on, parameters_of, refuse_unused, say
+from lavender.cli.options import (
+    PATH,
+    echo,
+    exit_stopped,
+    ignore_closed_output,
+    parse_parameters,
+    reject_unused_options,
+)
 from lavender.io.stored import check_figure, destination, writable
 
 
@@ -67,30 +74,32 @@ def run(
     replace: bool,
     view: bool,
     film: Path | None,
-    **of_the_scene: Any,
+    **scene_options: Any,
 ) -> None:
-    """Simulate a scene of the gallery; optionally record its steps as a sequence for `lavender report`.
+    """Simulate a scene of the gallery.
 
-    SCENE is stack, pyramid, card_house, pile, chain, bridge, heavy_on_light, table, ramp, spinner,
-    newtons_cradle or four_bar.
+    With --record, its steps are written as a sequence for `lavender report`.
 
-    Exit code 130: stopped by Ctrl-C; what was asked for holds the steps until then.
+    SCENE is stack, pyramid, card_house, pile, chain, bridge, heavy_on_light, table, ramp, spinner, newtons_cradle or
+    four_bar.
+
+    Exit code 130: stopped by Ctrl-C; the files contain the completed steps.
     """
     from lavender.sim.engine import Simulation
-    from lavender.sim.engine import run as stepped
+    from lavender.sim.engine import run as run_simulation
     from lavender.sim.engine.picture import PICTURES, picture_suffix, save_picture
     from lavender.sim.engine.run import line
     from lavender.sim.scene import Scene
 
     if record is None:
-        refuse_unused(context, ["replace"], "without --record")
+        reject_unused_options(context, ["replace"], "without --record")
     if plot is not None:
         plot = check_figure(plot)
     files = {
         name: path for name, path in (("trace", trace), ("figure", plot), ("film", film)) if path is not None
     }
     if len({destination(path) for path in files.values()}) < len(files):
-        raise InputError(f"{', '.join(map(str, files.values()))}: a file can hold one of these; name several")
+        raise InputError(f"{', '.join(map(str, files.values()))}: each needs a file of its own")
     for path in files.values():
         writable(path)
     drawn = film is not None and film.suffix.lower() in PICTURES
@@ -99,64 +108,66 @@ def run(
     live, writes = sys.stdout.isatty(), bool(files) or record is not None
 
     def show(text: str) -> None:
-        # on a terminal each line takes the place of the one before
-        with going_on() if writes else contextlib.nullcontext():
+        # On a terminal each line replaces the previous one.
+        with ignore_closed_output() if writes else contextlib.nullcontext():
             click.echo(f"\r{text}\x1b[K" if live else text, nl=not live)
 
-    simulation = Simulation(Scene(scene, **_parameters(parameters, of_the_scene)), report_residual=residual)
+    simulation = Simulation(
+        Scene(scene, **_collect_parameters(parameters, scene_options)), report_residual=residual
+    )
     every = 1 if live else max(1, steps // 20)
     with simulation.view() if view else contextlib.nullcontext() as viewer:
-        taken = viewer.film if viewer is not None else simulation.start_film() if film is not None else None
+        frames = viewer.film if viewer is not None else simulation.start_film() if film is not None else None
         if viewer is not None:
             show(f"{viewer.address}   Ctrl-C ends")
         begun = perf_counter()
 
-        def watch(step: int, observation: dict[str, Any], info: dict[str, Any]) -> None:
+        def show_step(step: int, observation: dict[str, Any], info: dict[str, Any]) -> None:
             if step % every == 0 or step == steps or "lost_body" in info:
                 show(line(step, observation, info))
-            if viewer is not None:  # no faster than it would go
+            if viewer is not None:  # Not faster than real time.
                 sleep(max(0.0, info["time"] - (perf_counter() - begun)))
 
-        found = stepped(simulation, steps, record=record, replace=replace, watch=watch)
-        if found.lost_body:
-            show(f"stopped: the state of {found.lost_body!r} is not finite")
+        result = run_simulation(simulation, steps, record=record, replace=replace, watch=show_step)
+        if result.lost_body:
+            show(f"stopped: the state of {result.lost_body!r} is not finite")
         if trace is not None:
-            found.save(trace)
+            result.save(trace)
         if plot is not None:
-            found.plot(plot)
-        if film is not None and taken is not None:
+            result.plot(plot)
+        if film is not None and frames is not None:
             if drawn:
-                save_picture(taken, film)
+                save_picture(frames, film)
             else:
-                taken.save(film)
-        if viewer is not None and not found.stopped:
+                frames.save(film)
+        if viewer is not None and not result.stopped:
             viewer.wait()
     if live:
         click.echo()
     for name, path in files.items():
         shown_by = f": lavender view {path}" if name == "film" and not drawn else ""
-        say(f"{name}: {path}{shown_by}")
+        echo(f"{name}: {path}{shown_by}")
     if record is not None:
-        say(f"{found.recorded} problems in {record}: lavender report {record}")
-    best = 1e3 * found.cost.min()
+        echo(f"{result.recorded} problems in {record}: lavender report {record}")
+    best = 1e3 * result.cost.min()
     click.echo(
-        f"{found.scene}: {len(found)} steps, {found.time[-1]:.3f} s, {found.method}, {best:.3g} ms a step at best"
+        f"{result.scene}: {len(result)} steps, {result.time[-1]:.3f} s, {result.method}, {best:.3g} ms per step at best"
     )
-    if found.stopped:
-        end_stopped()
+    if result.stopped:
+        exit_stopped()
 
 
-def _parameters(words: tuple[str, ...], options: dict[str, Any]) -> dict[str, Any]:
-    """Parameters of the scene from `--set` and from the options that mean one of them."""
-    found = parameters_of(words)
+def _collect_parameters(assignments: tuple[str, ...], options: dict[str, Any]) -> dict[str, Any]:
+    """Return the parameters of the scene from `--set` and from the options for single parameters."""
+    values = parse_parameters(assignments)
     for name, value in options.items():
         if value is None:
             continue
-        if name in found:
+        if name in values:
             raise InputError(
-                f"--set {name}={found[name]} and an option ({value}) both say {name}: leave one out"
+                f"--set {name}={values[name]} and an option ({value}) both set {name}: leave one out"
             )
-        found[name] = value
-    if found.get("solver", "sequential_impulses") != "sequential_impulses" and "order" in found:
-        found["solver_options"] = {"order": found.pop("order")}  # a solver that takes none refuses it
-    return found
+        values[name] = value
+    if values.get("solver", "sequential_impulses") != "sequential_impulses" and "order" in values:
+        values["solver_options"] = {"order": values.pop("order")}  # A solver without sweep orders rejects it.
+    return values

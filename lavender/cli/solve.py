@@ -1,4 +1,4 @@
-"""`lavender solve`."""
+"""Define `lavender solve`."""
 
 from __future__ import annotations
 
@@ -8,10 +8,11 @@ from typing import Any
 import click
 
 from lavender.base.errors import InputError
-from lavender.cli.options import EXIT_INFEASIBLE, EXIT_INTERRUPTED, EXIT_UNMET, PATH, one_thread, say
+from lavender.cli.options import EXIT_INFEASIBLE, EXIT_INTERRUPTED, EXIT_UNMET, PATH, echo, one_thread
 from lavender.io.stored import writable, write_atomically
 
-RESIDUAL = ("error", "relative", "energy", "velocity", "roundoff_floor")  # what is written of it
+#: Fields of the residual that --output writes.
+SAVED_RESIDUAL_FIELDS = ("error", "relative", "energy", "velocity", "roundoff_floor")
 
 
 @click.command()
@@ -26,7 +27,7 @@ RESIDUAL = ("error", "relative", "energy", "velocity", "roundoff_floor")  # what
     show_default=True,
     help="Relative residual to reach; 0 runs exactly --max-iter iterations.",
 )
-@click.option("--max-iter", type=int, help="The most iterations; default: the solver's.")
+@click.option("--max-iter", type=int, help="Largest number of iterations; default: the solver's.")
 @click.option("--time-limit", type=float, metavar="S", help="Limit of the solve time.")
 @click.option("--order", help="Sweep order, for solvers that take one.")
 @click.option("--seed", type=int, help="Seed of a random order.")
@@ -41,10 +42,11 @@ def solve(
     seed: int | None,
     output: Path | None,
 ) -> None:
-    """Solve one problem (a file, or a case of the suite) and print its error.
+    """Solve one problem and print the judged result.
 
-    Exit code 0: the judge accepts the answer (within tol, or at the floor of float64; with --tol 0 always).
-    1: it does not. 3: the problem is infeasible, with a certificate that the judge confirms.
+    FILE is a file or a case of the suite. Exit code 0: the judge accepts the result (within tol, or at the floor of
+    float64; with --tol 0 always). 1: the judge rejects it. 3: the problem is infeasible, with a certificate that the
+    judge confirms.
     """
     from lavender.judge.residuals import WRONG
     from lavender.lab import bench
@@ -57,7 +59,7 @@ def solve(
     if more:
         raise InputError(f"{file} holds {len(more) + 1} problems; give one file")
     if output is not None and output.exists() and Path(item.source).exists() and output.samefile(item.source):
-        raise InputError(f"--output {output} is the problem itself, which would be lost: give another file")
+        raise InputError(f"--output {output} would overwrite the problem: give another file")
     options: dict[str, Any] = {k: v for k, v in (("order", order), ("seed", seed)) if v is not None}
     with Worker() as worker:
         solution = solve_isolated(
@@ -72,7 +74,7 @@ def solve(
                     f,
                     impulse=solution.impulse,
                     slack=solution.slack,
-                    **{name: getattr(solution.residual, name) for name in RESIDUAL},
+                    **{name: getattr(solution.residual, name) for name in SAVED_RESIDUAL_FIELDS},
                     status=solution.status.name,
                     solver=solution.solver.name,
                     iterations=solution.iterations,
@@ -81,17 +83,19 @@ def solve(
                 )
 
         write_atomically(output, write)
-    say(f"{item.name}: {item.problem.law}, {item.problem.m} rows")
-    say(str(solution))
+    echo(f"{item.name}: {item.problem.law}, {item.problem.m} rows")
+    echo(str(solution))
     if output is not None:
-        say(f"written: {output}")
+        echo(f"written: {output}")
     if solution.status.name == "INTERRUPTED":
         raise click.exceptions.Exit(EXIT_INTERRUPTED)
     if solution.status.name == "INFEASIBLE" and solution.claim_check == "confirmed":
         raise click.exceptions.Exit(EXIT_INFEASIBLE)
     judged = solution.residual
     if judged.nothing_to_do and judged.verdict != WRONG:
-        click.echo(f"nothing to do: doing nothing is right; this moves by {judged.velocity:.1e} m/s")
+        click.echo(
+            f"nothing to do: the zero impulse is a solution; this result differs by {judged.velocity:.1e} m/s"
+        )
         return
     if tol > 0.0 and not (solution.success or judged.at_floor):
         raise click.exceptions.Exit(EXIT_UNMET)

@@ -1,25 +1,28 @@
-"""`lavender solvers`."""
+"""Define `lavender solvers`."""
 
 from __future__ import annotations
 
 import click
 
-from lavender.cli.options import console, plain
+from lavender.cli.options import console, escape_markup
 
 
 @click.command()
 def solvers() -> None:
-    """List the solvers: what each can do, and what to install for those that are missing."""
+    """List the solvers and their capabilities.
+
+    Solvers that are not installed show the package to install.
+    """
     from rich.table import Table
 
     from lavender.problem import LAWS, OPERATORS
     from lavender.solvers import registry
 
     table = Table(box=None, pad_edge=False, header_style="bold")
-    for name in ("solver", "laws", "reads", "can", "what it is"):
+    for name in ("solver", "laws", "reads", "capabilities", "description"):
         table.add_column(name, no_wrap=name == "solver", overflow="fold")
     reasons = registry.known()
-    # What is here first.
+    # Installed solvers come first.
     order = sorted(registry.specs().items(), key=lambda pair: (reasons[pair[0]] is not None, pair[0]))
     for name, spec in order:
         abilities = [
@@ -36,14 +39,14 @@ def solvers() -> None:
             if has
         ]
         reason = reasons[name]
-        what = plain(spec.summary) if reason is None else f"[yellow]{plain(reason)}[/]"
+        description = escape_markup(spec.summary) if reason is None else f"[yellow]{escape_markup(reason)}[/]"
         laws = [law for law in LAWS if law in spec.laws]
         table.add_row(
-            plain(name),
+            escape_markup(name),
             " ".join(laws),
             " ".join(o for o in OPERATORS if o in spec.operators),
             ", ".join(abilities),
-            what,
+            description,
             style="" if reason is None else "dim",
         )
     console().print(table)

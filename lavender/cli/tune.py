@@ -1,4 +1,4 @@
-"""`lavender tune`."""
+"""Define `lavender tune`."""
 
 from __future__ import annotations
 
@@ -15,25 +15,26 @@ from lavender.io.stored import lock_output
 @click.command()
 @click.argument("model", metavar="MODEL.xml", type=FILE)
 @worlds_options(worlds=16, steps=200)
-@click.option("--ahead", default=10, show_default=True, help="Steps after which the motion is compared.")
-@click.option("--rounds", default=5, show_default=True, help="In which the settings are timed in turns.")
+@click.option("--horizon", default=10, show_default=True, help="Steps after which the motion is compared.")
+@click.option("--repeats", default=5, show_default=True, help="Times that each setting is timed.")
 @threshold_option
 @click.option("--out", type=FOLDER, default=Path("lavender-tune"),
               show_default=True, help="Folder of the page.")  # fmt: skip
 @click.pass_context
-def tune(context: click.Context, /, model: Path, out: Path, **asked: Any) -> None:
-    """Measure MuJoCo's settings on worlds of a model (MJCF): time of a step beside error.
+def tune(context: click.Context, /, model: Path, out: Path, **options: Any) -> None:
+    """Find faster or more accurate MuJoCo settings for a model.
 
-    Prints the <option> line that is as accurate as now and faster, and the one that is as fast as now and more
-    accurate. Both are chosen on half of the worlds and tried on the other half. No line is printed if fewer than 20 %
-    of the steps have contact: give states that have, with --states.
+    MODEL.xml is an MJCF file. The time and the error of a step are measured with many settings on worlds of the model.
+    Two <option> lines are printed: one that is faster and as accurate as the present setting, and one that is more
+    accurate and as fast. Both are chosen on half of the worlds and validated on the other half. No line is printed if
+    fewer than 20 % of the steps have contact: then start from states with contact (--states).
 
-    Exit code 130: stopped by Ctrl-C; the page tells of what was done.
+    Exit code 130: stopped by Ctrl-C; the page shows the completed part.
     """
     from lavender.lab.tune import tune as run
 
     context.with_resource(lock_output(out, folder=True))
     one_thread()
     with progress() as watch:
-        found = run(model, watch=watch, **asked)
-    show_page(found.summary_page, out)
+        tuning = run(model, watch=watch, **options)
+    show_page(tuning.summary_page, out)

@@ -149,8 +149,8 @@ def made(path: Path, solver: str | None, most: int) -> dict[str, str | bytes]:
 
 
 def _chosen(records: Records, solver: str | None) -> list[Record]:
-    """Runs of the solver that is written, to the level that the report recommends by, or else its tightest."""
-    solved = [r for r in records if r.success and r.mode == "tol" and r.way in ("call", "steps")]
+    """Runs of the solver that is written, to the tolerance that the report recommends by, or else its tightest."""
+    solved = [r for r in records if r.success and r.mode == "tol" and r.timing_mode in ("call", "steps")]
     names = sorted({r.solver for r in solved if r.solver in METHODS or r.solver == "auto"})
     if solver is None:
         leaders = build_verdict(records).leaders
@@ -158,12 +158,12 @@ def _chosen(records: Records, solver: str | None) -> list[Record]:
     if solver not in names:
         have = ", ".join(names) or "none"
         raise InputError(
-            f"{solver or 'what is recommended'} is not in the C library or reached no level in these records; of both "
-            f"are: {have} (--solver)"
+            f"{solver or 'what is recommended'} is not in the C library or reached no tolerance in these records; "
+            f"of both are: {have} (--solver)"
         )
-    mine, levels = [r for r in solved if r.solver == solver], statistics.levels_of(records)
-    level = levels[len(levels) // 2]
-    tol = level if any(r.tol == level for r in mine) else min(r.tol for r in mine)
+    mine, tolerances = [r for r in solved if r.solver == solver], statistics.get_tolerances(records)
+    tolerance = tolerances[len(tolerances) // 2]
+    tol = tolerance if any(r.tol == tolerance for r in mine) else min(r.tol for r in mine)
     return [r for r in mine if r.tol == tol and r.options == mine[0].options]
 
 

@@ -3,12 +3,12 @@
     found = tune("ant.xml", worlds=16, steps=200)
     found.faster, found.closer; found.summary_page.write("lavender-tune")
 
-Even worlds are chosen on, odd ones held back. Each world is cut into stretches of `ahead` steps of a run with the
+Even worlds are chosen on, odd ones held back. Each world is cut into stretches of `horizon` steps of a run with the
 settings that the model has. From the start of each, a setting makes its own steps, warm from its own answers:
 
-    time    of mj_step, the mean of all steps [s], of each the least of several rounds, in which settings take turns
+    time    of mj_step, the mean of all steps [s], of each the least of several repetitions, in which settings alternate
     error   of the engine's answer to the problem of each step, by the judge [m/s]
-    motion  how far the body that is furthest off is, after `ahead` steps, from where the converged run has it [m]
+    motion  how far the body that is furthest off is, after `horizon` steps, from where the converged run has it [m]
 
 If fewer than `MIN_CONTACT_SHARE` of the steps have contact, only the model's own setting is measured and no line is
 recommended.
@@ -31,7 +31,7 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray, number, whole_number
 from lavender.base.deadline import seconds
-from lavender.base.errors import InputError
+from lavender.base.errors import InputError, reject_former_names
 from lavender.batch.residuals import residual_many
 from lavender.io.efc import from_mujoco_many
 from lavender.io.recording import Control
@@ -48,7 +48,7 @@ from lavender.problem.derived import cached_property
 WORST = 0.99  # quantile of the error by which settings are compared
 EQUAL = 0.05  # share of a time by which two may differ and be called equal: noise is a few per cent
 SLOW = 2.0  # times the time now, above which a setting is timed no more
-TRIAL = 2  # rounds after which settings near the front are varied
+TRIAL = 2  # repetitions after which settings near the front are varied
 NEAR = 1.5  # times the time now, up to which settings of the front are varied
 TOLERANCES = (1e-3, 1e-4, 1e-6, 1e-8, 1e-10, 1e-12, 1e-15)
 ITERATIONS = {"Newton": (1, 2, 3, 5, 10), "CG": (3, 6, 12, 25, 50), "PGS": (3, 6, 12, 25, 50, 100)}
@@ -122,7 +122,7 @@ class Measured:
     solver: str
     error: FloatArray = field(repr=False)  # (steps,) m/s
     motion: FloatArray = field(repr=False)  # (stretches,) m
-    # (steps,) s, each the least of all rounds: what interrupts one is no part of it
+    # (steps,) s, each the least of all repetitions: what interrupts one is no part of it
     times: FloatArray = field(repr=False)
     rows: Any = field(default=(), repr=False)  # (steps,) int
     contacts: Any = field(default=(), repr=False)
@@ -145,7 +145,7 @@ class Measured:
 
 @dataclass(eq=False)
 class Stage:
-    """Worlds on which settings are measured: starts (n, size), controls (n, ahead, nu), where bodies converge to."""
+    """Worlds on which settings are measured: starts (n, size), controls (n, horizon, nu), where bodies converge to."""
 
     mj: Any
     model: Any
@@ -154,14 +154,14 @@ class Stage:
     ends: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     @classmethod
-    def of(cls, mj: Any, model: Any, runs: Runs, worlds: Iterable[int], ahead: int) -> Stage:
+    def of(cls, mj: Any, model: Any, runs: Runs, worlds: Iterable[int], horizon: int) -> Stage:
         """Stretches of worlds that run with the model's own setting."""
         starts, controls = [], []
         for world in worlds:
             drive = runs.drive(model, world)
             each = np.array([drive(None, step) for step in range(runs.steps)])
-            ctrl = each.reshape(runs.steps // ahead, ahead, model.nu)
-            starts.append(simulate_world(mj, model, runs, world)[0][::ahead])
+            ctrl = each.reshape(runs.steps // horizon, horizon, model.nu)
+            starts.append(simulate_world(mj, model, runs, world)[0][::horizon])
             controls.append(ctrl)
         made = cls(mj, model, np.concatenate(starts), np.concatenate(controls))
         try:
@@ -174,18 +174,18 @@ class Stage:
         """Seconds of each step, and places of bodies after each stretch (n, bodies, 3) [m]; states before each step."""
         mj, kind = self.mj, self.mj.mjtState.mjSTATE_INTEGRATION
         data = mj.MjData(model)
-        n, ahead, _ = self.controls.shape
-        spent = np.empty(n * ahead)
+        n, horizon, _ = self.controls.shape
+        spent = np.empty(n * horizon)
         ends = np.empty((n, model.nbody, 3))
         for i in range(n):
             mj.mj_setState(model, data, self.starts[i], kind)
-            for k in range(ahead):
+            for k in range(horizon):
                 data.ctrl[:] = self.controls[i, k]
                 if states is not None:
-                    mj.mj_getState(model, data, states[ahead * i + k], kind)
+                    mj.mj_getState(model, data, states[horizon * i + k], kind)
                 begin = perf_counter()
                 mj.mj_step(model, data)
-                spent[ahead * i + k] = perf_counter() - begin
+                spent[horizon * i + k] = perf_counter() - begin
             mj.mj_kinematics(model, data)
             ends[i] = np.nan if has_diverged(mj, data) else data.xpos
         return spent, ends
@@ -216,14 +216,14 @@ class Stage:
         sizes: dict[str, Any] = {"rows": np.concatenate(rows), "contacts": np.concatenate(contacts)}
         return replace(apart, error=np.nan_to_num(np.concatenate(errors), nan=np.inf), motion=off, **sizes)
 
-    def time(self, some: list[Measured], rounds: int, tell: Callable[[str], None]) -> None:
-        """Steps of several rounds in which all take turns, the first of them the model's own setting.
+    def time(self, some: list[Measured], repeats: int, tell: Callable[[str], None]) -> None:
+        """Time the steps of several repetitions in which all alternate, the first of them the model's own setting.
 
         A setting with which a world diverges is not timed.
         """
         some = [m for m in some if np.isfinite(m.error).all()]
         models = [m.setting.on(self.mj, self.model) for m in some]
-        for turn in range(rounds):
+        for turn in range(repeats):
             for m, model in zip(some, models, strict=True):
                 # Medians: one step that was interrupted in the first round says nothing of a setting.
                 if turn == 0 or np.median(m.times) <= SLOW * np.median(some[0].times):
@@ -238,7 +238,7 @@ class Tuning:
     Parameters
     ----------
     runs : Runs
-    ahead : int
+    horizon : int
         Steps of a stretch.
     measured : list of Measured
         On the even worlds.
@@ -252,7 +252,7 @@ class Tuning:
     """
 
     runs: Runs
-    ahead: int
+    horizon: int
     measured: list[Measured]
     held: list[Measured]
     threshold: float
@@ -344,7 +344,14 @@ class Tuning:
             ]
             for m in some
         ]  # fmt: skip
-        heads = ["setting", "a step", "of now", "error 99 % [m/s]", "worst", f"motion after {self.ahead} [m]"]
+        heads = [
+            "setting",
+            "a step",
+            "of now",
+            "error 99 % [m/s]",
+            "worst",
+            f"motion after {self.horizon} [m]",
+        ]
         return Table(heads, rows, words=frozenset({"setting"}))
 
     @property
@@ -430,6 +437,7 @@ def around(mj: Any, model: Any, setting: Setting) -> list[Setting]:
     return [Setting.of(mj, model, **whole | x) for x in tried]
 
 
+@reject_former_names(ahead="horizon", rounds="repeats")
 def tune(
     model: str | os.PathLike[str],
     *,
@@ -439,8 +447,8 @@ def tune(
     seed: int = 0,
     spread: float = 0.1,
     states: Any = None,
-    ahead: int = 10,
-    rounds: int = 5,
+    horizon: int = 10,
+    repeats: int = 5,
     threshold: float = ENOUGH,
     watch: Callable[[Event], None] | None = None,
 ) -> Tuning:
@@ -450,13 +458,13 @@ def tune(
     ----------
     model : path (MJCF)
     worlds, steps, control, seed, spread : as `Runs`
-        Half of the worlds are held back; `steps` is a multiple of `ahead`.
+        Half of the worlds are held back; `steps` is a multiple of `horizon`.
     states : path of an .npz, "keyframes", or arrays, optional
         As of `audit`.
-    ahead : int
+    horizon : int
         Steps of a stretch.
-    rounds : int
-        In which settings are timed in turns.
+    repeats : int
+        Repetitions of the timing, in which settings alternate.
     threshold : float, m/s, m
         Error, and distance, below which nobody asks for less.
     watch : callable, optional
@@ -470,16 +478,17 @@ def tune(
     Raises
     ------
     InputError
-        A model that cannot be read, fewer than two worlds, or steps that `ahead` does not divide.
+        A model that cannot be read, fewer than two worlds, or steps that `horizon` does not divide.
     CapabilityError
         An integrator whose problem is not of M.
     """
     own: dict[str, Any] = {"worlds": whole_number("worlds", worlds, 2, None), "steps": steps}
     runs = Runs(os.fspath(model), **own, control=control, seed=seed, spread=spread).start_from(states)
-    ahead, rounds = whole_number("ahead", ahead, 1, None), whole_number("rounds", rounds, 1, None)
+    horizon = whole_number("horizon", horizon, 1, None)
+    repeats = whole_number("repeats", repeats, 1, None)
     threshold = number("threshold", threshold, low=0.0)
-    if steps % ahead:
-        raise InputError(f"steps is {steps} and ahead {ahead}; a multiple of it is needed")
+    if steps % horizon:
+        raise InputError(f"steps is {steps} and horizon {horizon}; a multiple of it is needed")
     mj, made = runs.load()
     from_mujoco_many(made, np.zeros((0, made.nq + made.nv)))  # what it refuses is refused here
     done = 0
@@ -496,7 +505,7 @@ def tune(
 
     def found(stopped: bool) -> Tuning:
         timed = [m for m in measured if np.isfinite(m.time)]
-        return Tuning(runs, ahead, timed, held, threshold=threshold, stopped=stopped, sizes=sizes)
+        return Tuning(runs, horizon, timed, held, threshold=threshold, stopped=stopped, sizes=sizes)
 
     def judge(stage: Stage, settings: list[Setting]) -> list[Measured]:
         out = []
@@ -506,7 +515,7 @@ def tune(
         return out
 
     try:
-        stage, held_back = (Stage.of(mj, made, runs, range(i, worlds, 2), ahead) for i in (0, 1))
+        stage, held_back = (Stage.of(mj, made, runs, range(i, worlds, 2), horizon) for i in (0, 1))
         measured += judge(stage, [Setting()])
         if not np.isfinite(measured[0].error).all():
             raise InputError(f"{runs.model}: these worlds diverge with the model's own setting")
@@ -515,19 +524,19 @@ def tune(
         rows, contacts = (np.concatenate([getattr(m, name) for m in both]) for name in ("rows", "contacts"))
         sizes = StepSizes(rows, contacts, can_touch(mj, made))
         if not sizes.is_enough:
-            stage.time(measured, rounds, tell)
+            stage.time(measured, repeats, tell)
             return found(False)
         measured += judge(stage, grid(mj, made)[1:])
-        stage.time(measured, min(TRIAL, rounds), tell)
+        stage.time(measured, min(TRIAL, repeats), tell)
         near = [m.setting for m in found(False).front if m.time <= NEAR * measured[0].time]
         known = {m.setting for m in measured}
         more = dict.fromkeys(x for s in [Setting(), *near] for x in around(mj, made, s) if x not in known)
         measured += judge(stage, list(more))
-        stage.time(measured, rounds, tell)
+        stage.time(measured, repeats, tell)
         chosen = found(False)
         other = dict.fromkeys(m.setting for m in (chosen.faster, chosen.closer) if m is not None)
         last += judge(held_back, list(other))
-        held_back.time(last, 2 * rounds, tell)
+        held_back.time(last, 2 * repeats, tell)
         held += last if np.isfinite(last[0].time) else []
     except KeyboardInterrupt:
         if not measured or not np.isfinite(measured[0].time):

@@ -1,4 +1,4 @@
-"""The way of `auto` through its tree with a problem, and the counted costs that decide it; nothing is run."""
+"""The decision trace of `auto` on a problem: its tree of solvers and the counted costs that decide; nothing is run."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def _plain(value: Any) -> Any:
 
 
 def explain(problem: Problem, tol: float = 1e-6) -> Plan:
-    """The way of `auto` through its tree: who runs, for how many iterations, and why. Nothing is solved.
+    """Return the decision trace of `auto`: solvers, iteration limits and reasons. Nothing is solved.
 
     Parameters
     ----------

@@ -21,7 +21,7 @@ from lavender.cli import entry
 from lavender.lab.bench.record import Skip, to_json
 
 TOLD = {"capture_output": False, "stderr": subprocess.PIPE}  # where the output goes to a place of its own
-QUICK = ("--levels", "1e-3", "1e-6", "--budgets", "2", "4", "--repeats", "1", "--no-figures")
+QUICK = ("--tolerances", "1e-3", "1e-6", "--budgets", "2", "4", "--repeats", "1", "--no-figures")
 
 
 def test_a_contradicted_claim_is_marked(lavender, path, plug_in):
@@ -43,7 +43,7 @@ def test_check_ends_each_solver_at_its_time_limit(lavender):
 
 def test_a_problem_that_none_of_the_solvers_takes_is_not_checked(lavender):
     code, out, _ = lavender("check", "granularF(n=3)", "--solvers", "sor")
-    assert code == cli.EXIT_UNMET and "1 problems are taken by none of these solvers" in out
+    assert code == cli.EXIT_UNMET and "1 problems are accepted by none of these solvers" in out
     assert lavender("check", "granularF(n=3)", "--solvers", "sor", "pgs")[0] == 0
 
 
@@ -120,28 +120,43 @@ def test_solvers_lists_all_with_reasons(lavender):
         (("report", "--solvers", "pgz"), "did you mean 'pgs'"),
         (("report", "no/such.npz"), "no such file"),
         (("report", "stak(n=8)"), "did you mean"),
-        (("report", "--levels", "0"), "level is 0;"),
+        (("report", "--tolerances", "0"), "tolerance is 0;"),
         (("report", "a.jsonl", "b.npz"), "shown alone"),
         (("report", "missing.jsonl"), "cannot read"),
         (("solve", "stack(n=4)", "--solver", "nobody"), "unknown solver 'nobody'"),
         (("solve", "stack(n=4)", "--solver", "direct", "--order", "reverse"), "order"),
         (("solve", "stack(n=4)", "--solver", "pgs", "--output", "no/such/folder.npz"), "cannot write"),
         (("check", "nothing.npz"), "no such file"),
-        (("report", "--levels", "many"), "not a list of numbers"),
+        (("report", "--tolerances", "many"), "not a list of numbers"),
         (("report", "--workers", "1", "--seeds", "9:3"), "whole numbers with A < B"),
         (("report", "--time-budgets", "0"), "time budget 0.0 must be"),
         (("report", "stack(n=4)", "--seeds", "3"), "--seeds has no effect without --workers"),
         (
             ("report", "stack(n=4)", "--workers", "1", "--seeds", "3"),
-            "--seeds has no effect where no case takes one",
+            "--seeds has no effect if no case takes one",
         ),
         (("report", "stack(n=4)", "--steps", "3"), "--steps has no effect without a MODEL.xml"),
-        (("report", "stack(n=4)", "--pass-limit", "3"), "--pass-limit has no effect without a sequence"),
+        (
+            ("report", "stack(n=4)", "--sequence-time-limit", "3"),
+            "--sequence-time-limit has no effect without a sequence",
+        ),
         (("report", "stack(n=4)", "--solvers", "direct", "--budgets", "3"), "--budgets has no effect"),
         (("report", "stack(n=4)", "--solvers", "direct", "--orders", "reverse"), "--orders has no effect"),
         (("report", "--workers", "1", "--time-limit", "3"), "--time-limit has no effect with --workers"),
         (("report", "--campaign"), "Did you mean '--workers'?"),
-        (("report", "a.jsonl", "--levels", "1e-3"), "--levels has no effect where records are shown again"),
+        (("report", "--levels", "1e-3"), "Did you mean '--tolerances'?"),
+        (("report", "--speed-levels=1e-3"), "Did you mean '--velocity-tolerances'?"),
+        (("report", "--fresh"), "Did you mean '--no-reuse'?"),
+        (("report", "--pass-limit=3"), "Did you mean '--sequence-time-limit'?"),
+        (("record", "a.xml", "--every", "5"), "Did you mean '--record-every'?"),
+        (("audit", "a.xml", "--accept", "1e-3"), "Did you mean '--max-velocity-error'?"),
+        (("tune", "a.xml", "--ahead", "5"), "Did you mean '--horizon'?"),
+        (("tune", "a.xml", "--rounds", "5"), "Did you mean '--repeats'?"),
+        (("export", "c", "lib", "--for", "records.jsonl"), "Did you mean '--records'?"),
+        (
+            ("report", "a.jsonl", "--tolerances", "1e-3"),
+            "--tolerances has no effect if records are shown again",
+        ),
         (("report", "stack(n=4)", "--solvers", "pgs", "--memory", "3"), "--memory has no effect"),
         (("run", "stack", "--replace"), "--replace has no effect without --record"),
         (("record", "a.xml", "--out", "o", "--seed", "3", "--controls", "zero"), "without --controls random"),
@@ -154,9 +169,9 @@ def test_solvers_lists_all_with_reasons(lavender):
         (("run", "stac"), "did you mean 'stack'"),
         (("run", "stack", "--set", "n"), "NAME=VALUE"),
         (("run", "stack", "--iterations", "3"), "solver_iterations"),
-        (("run", "stack", "--order", "given", "--set", "order=reverse"), "both say order"),
-        (("run", "stack", "--iterations", "8", "--set", "solver_iterations=4"), "both say solver_iterations"),
-        (("run", "stack", "--warm-start", "--set", "warm_start=false"), "both say warm_start"),
+        (("run", "stack", "--order", "given", "--set", "order=reverse"), "both set order"),
+        (("run", "stack", "--iterations", "8", "--set", "solver_iterations=4"), "both set solver_iterations"),
+        (("run", "stack", "--warm-start", "--set", "warm_start=false"), "both set warm_start"),
         (("phenomena", "nothing"), "unknown phenomenon"),
         (("phenomena", "stick", "--set", "slope=3"), "0 to 0.99 is needed"),
         (("phenomena", "stick", "--set", "slope"), "NAME=VALUE"),
@@ -347,9 +362,9 @@ def test_another_program_keeps_its_own_ctrl_c():
 
 
 def test_doctor_tells_what_looks_wrong_in_a_problem(lavender, path, tmp_path):
-    assert lavender("doctor", path)[:2] == (0, "1 looked at, none suspicious\n")
+    assert lavender("doctor", path)[:2] == (0, "1 problems checked, none with diagnostics\n")
     code, out, _ = lavender("doctor", path, "duplicated(k=3)")
-    assert (code, out.splitlines()[-1]) == (1, "2 looked at, 1 suspicious")
+    assert (code, out.splitlines()[-1]) == (1, "2 problems checked, 1 with diagnostics")
     assert out.startswith("duplicated(k=3): duplicate rows: 2 contacts")
     assert json.loads(lavender("doctor", "duplicated(k=3)", "--json")[1])["duplicated(k=3)"][0]["blocks"] == [
         1,
@@ -447,12 +462,12 @@ def test_check_judges_a_stored_answer_for_the_precision_it_was_made_in(lavender,
     told = ("--solvers", "pgs", "--precision", "float32")
     code, out, err = lavender("check", tmp_path / "done.npz", *told)
     assert code == 0, out + err
-    assert "stored answer: at its floor of float32" in " ".join(out.split())
+    assert "stored solution: at its floor of float32" in " ".join(out.split())
     code, out, _ = lavender("check", tmp_path / "early.npz", *told)
-    assert code == 1 and "stored answer: stopped before convergence, " in out
+    assert code == 1 and "stored solution: stopped before convergence, " in out
     # Without the option the precision is the problem's, and the exit code that of the claims.
     assert lavender("check", tmp_path / "early.npz", *told[:2])[0] == 0
     code, _, err = lavender("check", tmp_path / "none.npz", *told)
-    assert code == cli.EXIT_BAD_INPUT and "no file holds an answer" in err
+    assert code == cli.EXIT_BAD_INPUT and "no file has a solution" in err
     code, _, err = lavender("check", tmp_path / "done.npz", "--precision", "half")
     assert code == cli.EXIT_BAD_INPUT and "'half' is not one of 'float64', 'float32'" in err

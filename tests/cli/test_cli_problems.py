@@ -30,7 +30,7 @@ def test_options_that_have_no_effect_are_refused(lavender, tmp_path):
     assert lavender("problems", "@nobody")[0] == 2
     lv.Problem.lcp([[1.0]], [1.0]).save(tmp_path / "a.npz")
     code, _, err = lavender("problems", tmp_path / "a.npz")
-    assert code == 2 and "--certify alone" in err
+    assert code == 2 and "only --certify accepts" in err
     for words, sign in (
         (("@walking", "--check", "--out", tmp_path / "b"), "--out has no effect with --check"),
         (("--certify", tmp_path / "m.json", "--check"), "--check has no effect with --certify"),

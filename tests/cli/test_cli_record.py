@@ -53,7 +53,7 @@ def test_record_and_report_take_the_same_options_with_the_same_defaults():
 def test_record_then_report_from_the_command_line(lavender, tmp_path):
     model, out, page = (tmp_path / name for name in ("scene.xml", "steps", "report"))
     model.write_text(scene())
-    code, told, _ = lavender("record", model, "--steps", 30, "--every", 15, "--out", out)
+    code, told, _ = lavender("record", model, "--steps", 30, "--record-every", 15, "--out", out)
     assert code == 0 and "2 problems" in told
     assert len(list(out.glob("*.npz"))) == 2
     assert lavender("record", model, "--controls", "no.npy", "--out", tmp_path / "o")[0] == EXIT_BAD_INPUT
@@ -62,7 +62,18 @@ def test_record_then_report_from_the_command_line(lavender, tmp_path):
         (tmp_path / "torn.xml").write_text(text)
         code, _, said = lavender("report", tmp_path / "torn.xml", "--out", page)
         assert code == EXIT_BAD_INPUT and "torn.xml: " in said
-    words = ("report", model, "--steps", 30, "--every", 10, "--controls", "zero", "--solvers", "auto,newton")
+    words = (
+        "report",
+        model,
+        "--steps",
+        30,
+        "--record-every",
+        10,
+        "--controls",
+        "zero",
+        "--solvers",
+        "auto,newton",
+    )
     for again in range(2):  # the second time nothing is recorded anew
         code, told, _ = lavender(*words, "--no-figures", "--tables", "--out", page)
         assert code == 0 and ("3 problems" in told) == (again == 0)

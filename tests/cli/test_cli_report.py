@@ -53,7 +53,7 @@ def test_without_a_problem_nothing_is_printed_but_why(boxes):
     words = [str(boxes()), "--steps", "0"]
     done = CliRunner().invoke(mujoco, words)
     assert isinstance(done.exception, InputError) and "no step of these models" in str(done.exception)
-    for bad in (["--every", "0"], ["--warm", "-1"], ["--steps", "-1"]):
+    for bad in (["--record-every", "0"], ["--warm", "-1"], ["--steps", "-1"]):
         assert CliRunner().invoke(mujoco, [*words, *bad]).exit_code == 2
     warm = CliRunner().invoke(mujoco, [*words, "--warm", "40"])
     assert warm.exit_code == 0 and "ours, median" in warm.output and "Cold" not in warm.output
@@ -94,7 +94,7 @@ def test_references_are_written_beside_files_and_used(lavender, tmp_path, monkey
 
     load = runner.load_reference
     monkeypatch.setattr(runner, "load_reference", lambda p, path: used.append(load(p, path)))
-    plan = bench.Plan(levels=(1e-3,), budgets=(), repeats=1, orders=(), motion=True)
+    plan = bench.Plan(tolerances=(1e-3,), budgets=(), repeats=1, orders=(), motion=True)
     found = bench.run([tmp_path], ["pgs"], plan)  # the folder holds one problem: a reference is none
     assert len(found.cases) == 1
     assert used[0].accepted
@@ -108,8 +108,8 @@ def test_a_proven_reference_is_what_a_report_measures_motions_from(lavender, tmp
     assert code == 0 and "proof: an exact solution within" in out
     found = lv.motion.load_reference(lv.load(path), path)
     assert found.solver.startswith("proof") and found.residual.at_floor
-    plan = bench.Plan(levels=(1e-3, 1e-9), budgets=(), repeats=1, orders=(), motion=True)
-    coarse, fine = (r.motion for r in bench.run([path], ["pgs"], plan))
+    plan = bench.Plan(tolerances=(1e-3, 1e-9), budgets=(), repeats=1, orders=(), motion=True)
+    coarse, fine = (r.motion_error for r in bench.run([path], ["pgs"], plan))
     assert 0.0 < fine < 1e-3 * coarse
 
     # On the border of two states: a solution is found, but no proof by signs.
@@ -145,8 +145,10 @@ def test_vectors_are_of_the_problems_that_the_report_measured(lavender, tmp_path
     mine = lv.Problem.lcp(b @ b.T + np.eye(9), np.ones(9))
     mine.save(tmp_path / "ring.npz")  # the name of a case of the suite, too
     records, out = tmp_path / "records.jsonl", tmp_path / "library"
-    bench.run([tmp_path / "ring.npz"], ["direct"], bench.Plan(levels=(1e-6,), budgets=(), repeats=1), records)
-    command = ("export", "c", out, "--for", records, "--solver", "direct")
+    bench.run(
+        [tmp_path / "ring.npz"], ["direct"], bench.Plan(tolerances=(1e-6,), budgets=(), repeats=1), records
+    )
+    command = ("export", "c", out, "--records", records, "--solver", "direct")
     assert lavender(*command)[0] == 0
     assert vectors.pack_problem(mine) in (out / "vectors.bin").read_bytes()
     before = {path.name: path.read_bytes() for path in out.iterdir()}
@@ -170,7 +172,7 @@ def test_what_a_report_chose_on_the_steps_of_an_engine_is_exported(lavender, tmp
     words = ("--solvers", "newton", "anderson", *QUICK, "--out", out)
     code, _, err = lavender("report", steps, *words)
     assert code == 0, err
-    code, _, err = lavender("export", "c", tmp_path / "c", "--for", out)
+    code, _, err = lavender("export", "c", tmp_path / "c", "--records", out)
     assert code == 0, err
     assert (tmp_path / "c" / "chosen.h").read_text().count("LAV_") >= 1
     assert (
@@ -179,30 +181,30 @@ def test_what_a_report_chose_on_the_steps_of_an_engine_is_exported(lavender, tmp
 
 
 def test_progress_is_told_in_lines_where_there_is_no_terminal(capsys, monkeypatch):
-    monkeypatch.setattr(measuring, "EVERY", 0.0)  # s between two lines
+    monkeypatch.setattr(measuring, "PROGRESS_INTERVAL", 0.0)  # s between two lines
     with measuring.progress() as watch:
         for done in range(3):
             watch(Event(done, 3, "stack", "newton"))
     assert capsys.readouterr().err.splitlines() == [
         f"{done} of 3, 0 s: stack newton" for done in range(3)
     ]  # and no control codes or empty lines
-    monkeypatch.setattr(measuring, "EVERY", 1e9)
+    monkeypatch.setattr(measuring, "PROGRESS_INTERVAL", 1e9)
     with measuring.progress() as watch:
         watch(Event(0, 3, "stack", "newton"))
     assert capsys.readouterr().err == ""
 
 
-QUICK = ("--levels", "1e-3", "1e-6", "--budgets", "2", "4", "--repeats", "1", "--no-figures")
+QUICK = ("--tolerances", "1e-3", "1e-6", "--budgets", "2", "4", "--repeats", "1", "--no-figures")
 
 
 def test_lists_take_commas_or_blanks_and_files_may_follow(lavender, path, tmp_path):
     code, *_ = lavender(
-        "report", "--levels=1e-2", "--solvers", "pgs,jacobi", "--budgets", "3", "5", path, "--orders", "reverse",
-        "--speed-levels", "1e-2,1e-3", "--repeats", 1, "--no-figures", "--out", tmp_path / "out",
+        "report", "--tolerances=1e-2", "--solvers", "pgs,jacobi", "--budgets", "3", "5", path, "--orders", "reverse",
+        "--velocity-tolerances", "1e-2,1e-3", "--repeats", 1, "--no-figures", "--out", tmp_path / "out",
     )  # fmt: skip
     assert code == 0
     records = bench.read(tmp_path / "out")
-    assert motion_tables.get_speed_levels(records) == (1e-2, 1e-3)
+    assert motion_tables.get_velocity_tolerances(records) == (1e-2, 1e-3)
     assert {r.solver for r in records} == {"pgs", "jacobi"}
     assert {r.max_iter for r in records if r.mode == "budget"} == {3, 5}
     assert {r.order for r in records} == {"given", "reverse"}
@@ -246,7 +248,7 @@ def test_a_file_without_a_record_is_refused(lavender, path, tmp_path):
     for left in (b"", b"\n", head):
         (tmp_path / "r.jsonl").write_bytes(left)
         code, _, said = lavender("report", tmp_path / "r.jsonl", "--out", tmp_path / "again")
-        assert (code, "holds no records" in said) == (2, True)
+        assert (code, "has no records" in said) == (2, True)
         assert not (tmp_path / "again").exists()
 
 
@@ -275,7 +277,7 @@ def test_one_reason_of_many_cases_is_said_once(lavender, tmp_path, monkeypatch):
 @pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
 @pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
 def test_what_stops_a_report_keeps_the_records_and_writes_the_page(stop, tmp_path):
-    # A problem that nothing solves in the time: every run to a level takes its limit.
+    # A problem that nothing solves in the time: every run to a tolerance takes its limit.
     out = tmp_path / "out"
     a = np.array([[1.0, -1.0], [-1.0, 1.0]])
     n = 300
@@ -302,7 +304,7 @@ def test_what_stops_a_report_keeps_the_records_and_writes_the_page(stop, tmp_pat
 
 
 def test_campaigns_over_parts_of_the_seeds_are_one_when_put_together(lavender, tmp_path):
-    more = ("--solvers", "pgs", "--levels", "1e-3", "--budgets", "4", "--workers", 1)
+    more = ("--solvers", "pgs", "--tolerances", "1e-3", "--budgets", "4", "--workers", 1)
     parts = []
     for name, seeds in (("a", "2"), ("b", "2:4")):
         code, *_ = lavender("report", "granular(n=2)", "--seeds", seeds, *more, "--out", tmp_path / name)
@@ -321,7 +323,7 @@ def test_a_recorded_scene_is_reported_as_a_sequence(lavender, tmp_path):
     assert code == 0
     assert "4 problems" in out
     assert len(list(folder.glob("*.npz"))) == 4
-    words = ("report", folder, "--solvers", "sequential_impulses", "--budgets", "4", "--levels", "1e-1")
+    words = ("report", folder, "--solvers", "sequential_impulses", "--budgets", "4", "--tolerances", "1e-1")
     code, out, _ = lavender(*words, "--no-figures", "--repeats", 1)
     assert code == 0
     assert "it solves the 4 steps of steps in" in out
@@ -352,11 +354,11 @@ def test_a_second_report_takes_its_runs_from_the_first_unless_told_otherwise(lav
     code, out, _ = lavender(*words, "--tables")
     assert "By structure" in out
     n = len(bench.read(tmp_path / "out"))
-    plain = len([r for r in bench.read(tmp_path / "out") if not r.turns])
-    assert f"{n} of {n} runs reused of 20" in out
-    code, out, _ = lavender(*words, "--fresh")
+    plain = len([r for r in bench.read(tmp_path / "out") if not r.interleave_group])
+    assert f"{n} of {n} runs of 20" in out
+    code, out, _ = lavender(*words, "--no-reuse")
     assert "reused" not in out
-    again = [r for r in bench.read(tmp_path / "out") if not r.turns]
+    again = [r for r in bench.read(tmp_path / "out") if not r.interleave_group]
     assert len(again) == plain  # made again, they stand for the earlier ones
 
 
@@ -393,7 +395,7 @@ def test_models_of_one_file_name_are_kept_apart(lavender, tmp_path):
         (tmp_path / name).mkdir()
         (tmp_path / name / "scene.xml").write_text(ARM.format(height=0.1, kind=kind))
     quick = ("--solvers", "auto", "--repeats", 1, "--no-figures")
-    words = ("--steps", 20, "--every", 5, *quick, "--out", tmp_path / "o")
+    words = ("--steps", 20, "--record-every", 5, *quick, "--out", tmp_path / "o")
     models = [tmp_path / name / "scene.xml" for name in ("h1", "g1")]
     assert lavender("report", *models, *words)[0] == 0
     found = bench.read(tmp_path / "o")
@@ -434,7 +436,7 @@ def test_steps_that_could_not_be_recorded_are_counted(lavender, tmp_path, monkey
     assert code == cli.EXIT_UNMET and "left out, the first of 3: " in out
     assert lavender("check", folder, "--solvers", "pgs")[0] == cli.EXIT_UNMET
     monkeypatch.setattr(recording.adapter, "from_mujoco", true)
-    code, out, _ = lavender("report", *model, *more, *shown, "--fresh")
+    code, out, _ = lavender("report", *model, *more, *shown, "--no-reuse")
     assert (code, "left out" in out) == (0, False)
 
 
@@ -450,7 +452,7 @@ def test_a_model_is_recorded_again_when_what_it_is_made_of_has_changed(lavender,
     model.write_text('<mujoco><include file="part.xml"/></mujoco>')
     np.save(played, np.zeros((1, 0)))
     calls, kept = [], recording.record_file
-    words = ["report", model, "--controls", played, "--steps", 10, "--every", 5, "--solvers", "auto"]
+    words = ["report", model, "--controls", played, "--steps", 10, "--record-every", 5, "--solvers", "auto"]
     words.append("--no-figures")
 
     def recorded(*given, **more):
@@ -467,6 +469,6 @@ def test_a_model_is_recorded_again_when_what_it_is_made_of_has_changed(lavender,
         os.utime(changed, (1e9, 1e9 + count))
         assert (lavender(*words)[0], len(calls)) == (0, count)
     monkeypatch.setattr(recording, "record_file", stopped)  # on the way, for all that anybody knows
-    assert lavender(*words, "--fresh")[0] == cli.EXIT_INTERRUPTED
+    assert lavender(*words, "--no-reuse")[0] == cli.EXIT_INTERRUPTED
     monkeypatch.setattr(recording, "record_file", recorded)
     assert (lavender(*words)[0], len(calls)) == (0, 5)

@@ -12,7 +12,18 @@ pytest.importorskip("mujoco", reason="needs MuJoCo: pip install 'lavender-contac
 
 
 def test_an_audit_accepts_or_does_not(lavender, boxes, tmp_path):
-    words = ("--worlds", 2, "--steps", 20, "--workers", 1, "--out", tmp_path / "out", "--accept", "1e-3")
+    words = (
+        "--worlds",
+        2,
+        "--steps",
+        20,
+        "--workers",
+        1,
+        "--out",
+        tmp_path / "out",
+        "--max-velocity-error",
+        "1e-3",
+    )
     code, out, _ = lavender("audit", boxes(EARLY), *words)
     assert code == 1 and "stopped before convergence" in out
     assert len(out.splitlines()) <= 25
@@ -30,7 +41,7 @@ def test_tuning_prints_a_page_and_few_lines(lavender, boxes, tmp_path, monkeypat
     monkeypatch.setattr(tuning, "TOLERANCES", (1e-6, 1e-12))
     monkeypatch.setattr(tuning, "ITERATIONS", {"Newton": (2,), "CG": (3, 25)})
     code, out, _ = lavender(
-        "tune", boxes(EARLY), "--worlds", 2, "--steps", 20, "--rounds", 1, "--out", tmp_path / "out"
+        "tune", boxes(EARLY), "--worlds", 2, "--steps", 20, "--repeats", 1, "--out", tmp_path / "out"
     )
     assert code == 0 and "held back" in out
     assert len(out.splitlines()) <= 25
@@ -54,7 +65,7 @@ def test_no_line_is_printed_of_states_without_contact(lavender, boxes, tmp_path,
     monkeypatch.setattr(tuning, "ITERATIONS", {"Newton": (2,)})
     high = boxes(EARLY)
     high.write_text(high.read_text().replace("0 0 0.099", "0 0 9").replace("0.32", "20"))
-    words = ("tune", high, "--worlds", 2, "--steps", 10, "--rounds", 1, "--out", tmp_path / "out")
+    words = ("tune", high, "--worlds", 2, "--steps", 10, "--repeats", 1, "--out", tmp_path / "out")
     code, out, _ = lavender(*words)
     assert code == 0 and "<option" not in out
     assert "No setting is recommended: 0 of 20 steps judged have contact (0 %), fewer than 20 %" in " ".join(
@@ -83,7 +94,7 @@ def test_recordings_start_from_states(lavender, tmp_path, boxes):
         "ctrl": np.array([[1.0], [-1.0]]),
     }
     np.savez(tmp_path / "two.npz", **states)
-    words = (path, "--steps", 10, "--every", 5, "--states", tmp_path / "two.npz", "--controls", "zero")
+    words = (path, "--steps", 10, "--record-every", 5, "--states", tmp_path / "two.npz", "--controls", "zero")
     assert lavender("record", *words, "--out", tmp_path / "steps")[0] == 0
     rows = [
         json.loads(line)["rows"] for line in (tmp_path / "steps" / "engine.jsonl").read_text().splitlines()

@@ -360,7 +360,18 @@ def test_a_new_recording_removes_the_description_of_the_old_one(tmp_path):
 
 # -- commands that write -----------------------------------------------------------------------------------------
 
-QUICK = ("--solvers", "pgs", "--levels", "1e-3", "--budgets", "4", "--repeats", "1", "--orders", "reverse")
+QUICK = (
+    "--solvers",
+    "pgs",
+    "--tolerances",
+    "1e-3",
+    "--budgets",
+    "4",
+    "--repeats",
+    "1",
+    "--orders",
+    "reverse",
+)
 
 
 @pytest.fixture
@@ -424,12 +435,12 @@ def test_a_folder_that_cannot_be_made_is_named(name, lavender, tmp_path, monkeyp
 
 
 COMMANDS = [
-    ("report", "stack(n=2)", "--solvers", "sequential_impulses", "--levels", "1e-3", "--budgets", "4", "--repeats", "1",
-     "--out", "report", "--paper"),
+    ("report", "stack(n=2)", "--solvers", "sequential_impulses", "--tolerances", "1e-3", "--budgets", "4",
+     "--repeats", "1", "--out", "report", "--paper"),
     ("run", "stack", "--steps", "3", "--record", "steps", "--trace", "t.csv", "--plot", "t.svg", "--film", "t.gif"),
     ("solve", "stack(n=2)", "--output", "solution.npz"),
     ("phenomena", "slide", "--steppers", "impulses", "--engines", "none", "--out", "phenomena.json"),
-    ("export", "c", "c", "--for", "report"),
+    ("export", "c", "c", "--records", "report"),
     ("web", "page", "page"),
     ("problems", "@hard", "--page", "set.md"),
 ]  # fmt: skip
@@ -511,7 +522,7 @@ def test_commands_print_paths_as_text(lavender, tmp_path):
     to = "to\x1b[31m"
     for line in (
         ["bench", "mujoco", path, "--steps", "1"],
-        ["record", path, "--steps", "15", "--every", "15", "--out", to],
+        ["record", path, "--steps", "15", "--record-every", "15", "--out", to],
         ["problems", "@walking", "--out", f"{to}1"],
         ["run", "stack", "--set", "n=1", "--steps", "2", "--trace", f"{to}.csv", "--record", f"{to}2"],
         ["solve", "stack(n=2)", "--output", f"{to}.npz"],
@@ -585,7 +596,7 @@ def check_folder(lavender, folder, entries, command, with_figures=False, again=F
     problems.mkdir(parents=True)
     for name, content in entries:
         write_entry(problems, name, content)
-    plan = ("--solvers", "pgs,nncg", "--levels", "1e-3", "--budgets", "4", "--repeats", "1", "--out", out)
+    plan = ("--solvers", "pgs,nncg", "--tolerances", "1e-3", "--budgets", "4", "--repeats", "1", "--out", out)
     words = {
         "report": ("report", problems, *plan),
         "files": ("report", *sorted(problems.iterdir()), *plan),
@@ -656,7 +667,7 @@ def test_a_reader_that_raises_costs_its_own_case(tmp_path, monkeypatch):
         return load(path, **more)
 
     monkeypatch.setattr(io, "load", load_or_raise)
-    records = bench.run([tmp_path], ["pgs"], bench.Plan(levels=(1e-3,), budgets=(), repeats=1))
+    records = bench.run([tmp_path], ["pgs"], bench.Plan(tolerances=(1e-3,), budgets=(), repeats=1))
     assert {r.case for r in records} == {"good"}
     assert ["RecursionError: [/x]" in s.reason for s in records.skips] == [True]
 
@@ -707,14 +718,14 @@ def test_a_description_of_a_recording_by_anybody_is_harmless(lavender, tmp_path,
 
 HOSTILE = [
     None, True, -1, 2**70, 1e400, float("nan"), "", "[/x]", "\ud800", "a$\\frac$b", "<b>", [], [[]], ["a", 2],
-    ["\x1b"], {}, {"levels": ["x"]}, {"a": {"b": 1}}, {"x": 1.5},
+    ["\x1b"], {}, {"tolerances": ["x"]}, {"a": {"b": 1}}, {"x": 1.5},
 ]  # fmt: skip
 
 
 @pytest.fixture(scope="module")
 def entries():
     """The entries of a small report with a sequence and a skip."""
-    plan = bench.Plan(levels=(1e-3,), budgets=(2, 4), repeats=1, orders=("reverse",))
+    plan = bench.Plan(tolerances=(1e-3,), budgets=(2, 4), repeats=1, orders=("reverse",))
     cases = [stack(name="one"), *bench.sequence([stack(), stack()], "walk")]
     records = bench.run(cases, ["pgs", "direct", "gauss_seidel"], plan)
     kinds = [*records.runs.values(), *records.cases.values(), *records.skips, *records.records]
@@ -800,7 +811,7 @@ def test_a_record_of_an_undescribed_case_is_rejected(tmp_path, entries):
 
 
 def test_the_newest_run_shows_its_own_cases_and_only_as_they_are_now(tmp_path, monkeypatch):
-    plan = bench.Plan(levels=(1e-3,), budgets=(), repeats=1)
+    plan = bench.Plan(tolerances=(1e-3,), budgets=(), repeats=1)
     path = tmp_path / "records.jsonl"
     bench.run([stack(name="a"), stack(name="b")], ["pgs"], plan, path)
     monkeypatch.setattr(machine, "cpu_name", lambda: "another")

@@ -178,9 +178,9 @@ def test_vectors_are_of_what_the_report_of_these_records_recommends(tmp_path):
     records, problem = tmp_path / "records.jsonl", tmp_path / "mine.npz"
     lv.Problem.lcp(np.array([[2.0, 0.5], [0.5, 1.0]]), np.ones(2)).save(problem)
     for repeats, solver in ((1, "direct"), (2, "nncg")):  # two runs: the page is of the newest
-        bench.run([problem], [solver], bench.Plan(levels=(1e-6,), budgets=(), repeats=repeats), records)
+        bench.run([problem], [solver], bench.Plan(tolerances=(1e-6,), budgets=(), repeats=repeats), records)
     assert "LAV_NNCG" in vectors.made(records, None, 1)["chosen.h"]
-    with pytest.raises(lv.InputError, match="reached no level in these records; of both are: nncg"):
+    with pytest.raises(lv.InputError, match="reached no tolerance in these records; of both are: nncg"):
         vectors.made(records, "direct", 1)
 
 
@@ -189,7 +189,7 @@ def test_the_programs_of_the_page_run_verbatim(folder, shared, compiler, tmp_pat
     program, steps = re.findall(r"^```c\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)
     (python,) = re.findall(r"^```py\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)
     records = tmp_path / "records.jsonl"
-    bench.run(["granularF(n=3)"], ["auto"], bench.Plan(levels=(1e-6,), budgets=(), repeats=1), records)
+    bench.run(["granularF(n=3)"], ["auto"], bench.Plan(tolerances=(1e-6,), budgets=(), repeats=1), records)
     (tmp_path / "chosen.h").write_text(vectors.made(records, None, 1)["chosen.h"])
     (tmp_path / "drop.c").write_text(program)
     call = "  if (solve(chosen, q, impulse, &result) || !(result.verdict.relative < 1e-6)) return 2;\n"
@@ -223,7 +223,7 @@ def test_the_programs_of_the_page_run_verbatim(folder, shared, compiler, tmp_pat
 
 def test_what_auto_did_is_steps_with_their_work_that_c_runs(folder, shared, compiler, tmp_path):
     records = tmp_path / "records.jsonl"
-    plan = bench.Plan(levels=(1e-3, 1e-6, 1e-9), budgets=(), repeats=1)
+    plan = bench.Plan(tolerances=(1e-3, 1e-6, 1e-9), budgets=(), repeats=1)
     sizes = ("granularF(n=3)", "granular(n=3)", "granularF(n=6)")  # the last under the cone law first
     bench.run(sizes, ["auto"], plan, records)
     made = vectors.made(records, None, 2)

@@ -247,7 +247,9 @@ def test_room_of_pivots_counts_the_bodies_that_no_row_moves(library, method, n_b
     )  # fmt: skip
     problem = library.problem(lv.Problem.from_rows(rows, target=2.0, lower=0.0))
     options = library.options(method)
-    assert library.c.lav_needed(library.open(problem, options).at) <= library.workspace(problem, options).value
+    assert (
+        library.c.lav_needed(library.open(problem, options).at) <= library.workspace(problem, options).value
+    )
 
 
 def test_impulses_are_carried_by_key(library):

@@ -86,7 +86,9 @@ def test_a_set_is_named_by_its_sign_wherever_cases_are():
 def test_robots_whose_package_is_absent_are_left_out_with_what_to_install(monkeypatch):
     monkeypatch.setattr("lavender.lab.suite.steps.find_spec", lambda name: None)
     names = [n for n in suite.SETS["robots"] if "dm_control" in n][:2]
-    records = bench.run(["two_particles", *names], ["pgs"], bench.Plan(levels=(1e-3,), budgets=(), orders=()))
+    records = bench.run(
+        ["two_particles", *names], ["pgs"], bench.Plan(tolerances=(1e-3,), budgets=(), orders=())
+    )
     assert [s.case for s in records.skips] == names and len(records) == 1
     assert all("lavender-contact[robots]" in s.reason for s in records.skips)
     here, missing = collection.makeable(ENTRIES)

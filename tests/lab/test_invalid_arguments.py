@@ -50,10 +50,10 @@ CALLS = {
     "redundancy": Call(lv.redundancy, {"problem": LCP, "tol": 1e-12}),
     "bench.Plan": Call(
         bench.Plan,
-        {"levels": (1e-3,), "budgets": (4,), "repeats": 1, "time_limit": 1.0, "pass_limit": 1.0, "orders": ("given",),
-         "times": (), "motion": False, "warm": True, "campaign": True},
+        {"tolerances": (1e-3,), "budgets": (4,), "repeats": 1, "time_limit": 1.0, "sequence_time_limit": 1.0,
+         "orders": ("given",), "times": (), "motion": False, "warm": True, "campaign": True},
     ),
-    "bench.Plan, a level": Call(lambda level: bench.Plan(levels=[level]), {"level": 1e-3}),
+    "bench.Plan, a tolerance": Call(lambda tolerance: bench.Plan(tolerances=[tolerance]), {"tolerance": 1e-3}),
     "bench.Plan, a budget": Call(lambda budget: bench.Plan(budgets=[budget]), {"budget": 3}),
     "bench.resolve": Call(
         bench.resolve, {"words": ["stack(n=2)"], "sequences": False}, {"words": "cases"},

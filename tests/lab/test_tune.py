@@ -24,7 +24,7 @@ def fewer(monkeypatch):
 def test_the_own_setting_is_measured_as_it_ran_and_worlds_are_held_back(boxes, monkeypatch):
     fewer(monkeypatch)
     path = boxes(EARLY)
-    found = tune(path, worlds=4, steps=30, rounds=1)
+    found = tune(path, worlds=4, steps=30, repeats=1)
     whole = audit(path, worlds=4, steps=30, workers=1).numbers[0]
     assert found.measured[0].setting == Setting()
     np.testing.assert_allclose(found.measured[0].error, whole[0::2].ravel(), rtol=1e-6, atol=1e-12)
@@ -39,7 +39,7 @@ def test_a_model_without_actuators_has_settings_too(tmp_path, monkeypatch):
     fewer(monkeypatch)
     path = tmp_path / "passive.xml"
     path.write_text(BOXES.format(options="").partition("<actuator>")[0] + "</mujoco>")
-    assert len(tune(path, worlds=2, steps=20, rounds=1).measured) > 1
+    assert len(tune(path, worlds=2, steps=20, repeats=1).measured) > 1
 
 
 def test_the_converged_run_does_not_move_away_from_itself(boxes):
@@ -163,14 +163,14 @@ def test_ctrl_c_keeps_what_there_is(boxes, monkeypatch):
                 raise KeyboardInterrupt
 
     seen = []
-    found = tune(boxes(EARLY), worlds=2, steps=10, rounds=1, watch=watch)
+    found = tune(boxes(EARLY), worlds=2, steps=10, repeats=1, watch=watch)
     assert found.stopped and len(found.measured) == 5 and not found.held
     assert "Stopped before the end" in found.summary_page.render_html()
     assert "not measured" in "".join(found.lines) or found.faster is found.closer is None
 
 
 @pytest.mark.parametrize(
-    ("given", "words"), [({"worlds": 1}, "worlds"), ({"steps": 15}, "ahead"), ({"rounds": 0}, "rounds")]
+    ("given", "words"), [({"worlds": 1}, "worlds"), ({"steps": 15}, "horizon"), ({"repeats": 0}, "repeats")]
 )
 def test_bad_words_are_told(boxes, given, words):
     with pytest.raises(lv.InputError, match=words):
@@ -187,8 +187,8 @@ def test_a_setting_with_which_mujoco_ends_in_an_error_is_left_out(boxes, monkeyp
         return run(self, model, states)
 
     monkeypatch.setattr(Stage, "run", dies)
-    found = tune(boxes(), worlds=2, steps=10, rounds=1)
+    found = tune(boxes(), worlds=2, steps=10, repeats=1)
     assert not any(dict(m.setting.options).get("iterations") == 25 for m in found.measured)
     monkeypatch.setattr(Stage, "measured", lambda self, setting: measured(np.inf, np.inf))
     with pytest.raises(lv.InputError, match="diverge"):
-        tune(boxes(), worlds=2, steps=10, rounds=1)
+        tune(boxes(), worlds=2, steps=10, repeats=1)

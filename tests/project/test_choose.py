@@ -9,7 +9,7 @@ import pytest
 from lavender import bench
 
 DOCS = Path(__file__).resolve().parent.parent.parent / "docs"
-LEVELS = (1e-3, 1e-6)
+TOLERANCES = (1e-3, 1e-6)
 
 
 @pytest.fixture(scope="module")
@@ -21,16 +21,16 @@ def pages(tmp_path_factory):
     finally:
         sys.path.remove(str(DOCS))
     folder = tmp_path_factory.mktemp("pages")
-    plan = bench.Plan(LEVELS, budgets=(4,), repeats=1, time_limit=0.2, warm=False, orders=())
+    plan = bench.Plan(TOLERANCES, budgets=(4,), repeats=1, time_limit=0.2, warm=False, orders=())
     cases = ("stack(n=8)", "box_stackF(n=2)", "chain(n=5)")
     records = bench.run(
         cases, ("auto", "direct", "newton", "sequential_impulses"), plan, folder / "r.jsonl"
     ).latest()
-    generate.LEVELS, kept = LEVELS, generate.LEVELS
+    generate.TOLERANCES, kept = TOLERANCES, generate.TOLERANCES
     try:
         generate.measured_page(generate.Site(folder), records, {})
     finally:
-        generate.LEVELS = kept
+        generate.TOLERANCES = kept
     return folder
 
 
@@ -44,8 +44,8 @@ def plain(cell):
 def test_every_cell_is_that_of_the_report(pages):
     lines = (pages / "parts" / "advice.md").read_text(encoding="utf-8").splitlines()
     cells = [[plain(c) for c in line.strip("| ").split(" | ")] for line in lines if line.startswith("| ")]
-    to_level, in_time = cells[: len(cells) // 2], cells[len(cells) // 2 :]  # two tables there, one here
-    shown = [[*a, *b[1:]] for a, b in zip(to_level, in_time, strict=True)]
+    to_tolerance, in_time = cells[: len(cells) // 2], cells[len(cells) // 2 :]  # two tables there, one here
+    shown = [[*a, *b[1:]] for a, b in zip(to_tolerance, in_time, strict=True)]
     html = (pages / "report.html").read_text(encoding="utf-8")
     body = re.search(r'<table class="advice">(.*?)</table>', html, re.DOTALL)[1]
     rows = [

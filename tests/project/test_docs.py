@@ -208,6 +208,6 @@ def test_every_column_of_records_is_told():
     page = (ROOT / "docs" / "report.md").read_text(encoding="utf-8")
     table = page.partition("## The columns of records")[2].partition("\n## ")[0]
     records = lv.bench.run(
-        ["toy_stack"], ["pgs"], lv.bench.Plan(levels=(1e-3,), budgets=(), orders=(), repeats=1)
+        ["toy_stack"], ["pgs"], lv.bench.Plan(tolerances=(1e-3,), budgets=(), orders=(), repeats=1)
     )
     assert set(re.findall(r"`(\w+)`", table)) >= set(records.rows()[0])

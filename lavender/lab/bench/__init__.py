@@ -8,7 +8,7 @@ Nothing here draws or prints; `lavender.lab.report` reads the records.
 
 from lavender.lab.bench.cases import Item, expand_seeds, resolve, sequence, steps_in, structure_of
 from lavender.lab.bench.machine import cpu_name
-from lavender.lab.bench.record import CaseInfo, Record, Run, Skip, level_name
+from lavender.lab.bench.record import CaseInfo, Record, Run, Skip, format_tolerance
 from lavender.lab.bench.running.alternating import time_alternately
 from lavender.lab.bench.running.plan import CampaignPlan, Plan
 from lavender.lab.bench.running.runner import Event, carry, run, solver_names
@@ -31,7 +31,7 @@ __all__ = [
     "carry",
     "cpu_name",
     "expand_seeds",
-    "level_name",
+    "format_tolerance",
     "measure",
     "one_thread",
     "read",

@@ -1,4 +1,4 @@
-"""Choose the calls that are worth timing in turns, and time them.
+"""Choose the calls that are worth timing alternately, and time them.
 
 A report prints calls of `lv.solve`. Those near the best of what `bench.run` measured are timed again, interleaved with
 each other (`lavender.lab.bench.time_alternately`), so that the printed times are times of exactly these calls.
@@ -23,7 +23,7 @@ from lavender.solvers.registry import specs
 CANDIDATE_TIME_RATIO = (
     1.6  # A rerun may rank a solver first if its time is below this multiple of the best's.
 )
-MAX_CANDIDATES = 4  # Solvers timed for a level and for each time limit, at most.
+MAX_CANDIDATES = 4  # Solvers timed for a tolerance and for each time limit, at most.
 TIME_LIMIT_FRACTIONS = (
     0.5,
     0.8,
@@ -31,47 +31,56 @@ TIME_LIMIT_FRACTIONS = (
 
 
 def list_candidates(records: Records, times: Sequence[float] = ()) -> list[Ask]:
-    """List the calls to time in turns.
+    """List the calls to time alternately.
 
-    These are calls to the middle level, the same as a batch, and calls with each time limit in `times` [s]. Without
+    These are calls to the middle tolerance, the same as a batch, and calls with each time limit in `times` [s]. Without
     `times`, time limits are those of `choose_time_budgets` that are short enough to be reported.
     """
     asks: list[Ask] = []
     for subject in list_subjects(records, times):
-        level, best = subject.best.target, subject.best.best
+        tolerance, best = subject.best.target, subject.best.best
         if best is None:
             continue
         equal = [c for c in subject.best.ranking if c.solved == best.solved]
         near = [c for i, c in enumerate(equal) if i < 2 or c.score <= CANDIDATE_TIME_RATIO * best.score]
         for solver in [c.solver for c in near[:MAX_CANDIDATES]]:
-            max_iter = _required_max_iter(records, solver, level)
+            max_iter = _required_max_iter(records, solver, tolerance)
             # Carrying impulses has its price: if steps are quick, a cold start may be faster.
-            for start in ("cold", "carried") if subject.way == "steps" else ("cold",):
-                asks.append(Ask(solver, "tol", level, max_iter, way=subject.way, start=start))
-            asks.append(Ask(solver, "tol", level, max_iter, way="batch"))
-        single = select_calls(records, subject.way, in_turns=False)
+            for start in ("cold", "carried") if subject.timing_mode == "steps" else ("cold",):
+                asks.append(
+                    Ask(solver, "tol", tolerance, max_iter, timing_mode=subject.timing_mode, start=start)
+                )
+            asks.append(Ask(solver, "tol", tolerance, max_iter, timing_mode="batch"))
+        single = select_calls(records, subject.timing_mode, interleaved=False)
         for advice in subject.quick:
             if times or advice.target <= SHORT_TIME_RATIO * best.score:
-                asks += _list_time_limited(records, subject, single, advice, level)
+                asks += _list_time_limited(records, subject, single, advice, tolerance)
     return list(dict.fromkeys(asks))
 
 
-def _required_max_iter(records: Records, solver: str, level: float) -> int:
-    """Return `max_iter` of a call to a level: 0 (the default), or unlimited if a case needs more than the default."""
-    runs = (r for r in records if r.solver == solver and r.mode == "tol" and r.tol == level)
+def _required_max_iter(records: Records, solver: str, tolerance: float) -> int:
+    """Return `max_iter` of a call: 0 (the default), or unlimited if a case needs more than the default."""
+    runs = (r for r in records if r.solver == solver and r.mode == "tol" and r.tol == tolerance)
     return UNLIMITED if any(exceeds_default_budget(solver, r.iterations) for r in runs) else 0
 
 
 def _list_time_limited(
-    records: Records, subject: Subject, single: Sequence[TimedCall], advice: Advice, level: float
+    records: Records, subject: Subject, single: Sequence[TimedCall], advice: Advice, tolerance: float
 ) -> list[Ask]:
     """List time limits for the solvers that come closest, and the budgets of sweeps that stay within the time."""
-    start = "carried" if subject.way == "steps" else "cold"
+    start = "carried" if subject.timing_mode == "steps" else "cold"
     own = [
         c.solver for c in advice.ranking if not (s := specs().get(c.solver)) or not (s.external or s.requires)
     ]
     asks = [
-        Ask(solver, "time", level, time_limit=fraction * advice.target, way=subject.way, start=start)
+        Ask(
+            solver,
+            "time",
+            tolerance,
+            time_limit=fraction * advice.target,
+            timing_mode=subject.timing_mode,
+            start=start,
+        )
         for solver in dict.fromkeys([*own[: MAX_CANDIDATES - 1], *(s for s in own if s == "auto")])
         for fraction in TIME_LIMIT_FRACTIONS
     ]
@@ -79,7 +88,16 @@ def _list_time_limited(
     for call, choice in () if ranking is None else ranking.ranking[:MAX_CANDIDATES]:
         if choice.solved:
             line = call.line
-            asks.append(Ask(line.solver, "budget", 0.0, line.max_iter, way=subject.way, start=line.start))
+            asks.append(
+                Ask(
+                    line.solver,
+                    "budget",
+                    0.0,
+                    line.max_iter,
+                    timing_mode=subject.timing_mode,
+                    start=line.start,
+                )
+            )
     return asks
 
 
@@ -88,6 +106,6 @@ def time_candidates(
 ) -> Records:
     """Choose the candidates among what `bench.run` measured, and time them by `bench.time_alternately`."""
     remaining = drop_idle_cases(records)
-    if not len(remaining) or plan.speed_levels:
+    if not len(remaining) or plan.velocity_tolerances:
         return records
     return time_alternately(cases, list_candidates(remaining, plan.times), records, plan, store, **more)

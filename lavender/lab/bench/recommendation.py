@@ -1,6 +1,6 @@
-"""Rank solvers: for each structure and sequence, to each accuracy level and within each time.
+"""Rank solvers: for each structure and sequence, to each tolerance and within each time.
 
-To a level, solvers rank by the number of cases that they bring there, then by the shifted geometric mean of their
+To a tolerance, solvers rank by the number of cases that they bring there, then by the shifted geometric mean of their
 times. Within a time, and with a budget of sweeps, they rank by the number of cases served (at most half of the start's
 residual is left), then by the 90th percentile of the residual; a solver is recommended only if it serves nine cases of
 ten. A case without a result in the time counts with residual 1, that of the zero impulse. A solver with a false claim
@@ -23,8 +23,8 @@ from lavender.lab.bench.statistics import (
     TIME_NOISE_FACTOR,
     families,
     geometric_mean,
+    get_tolerances,
     group_passes,
-    levels_of,
     limit_of,
     quantile,
     times_to,
@@ -37,7 +37,7 @@ SERVED_QUANTILE = (
 )
 PREFERRED_SOLVER = "auto"  # It comes first among equals: the only name that needs no choice.
 SHORT_TIME_RATIO = (
-    0.5  # A time is worth a sentence of its own if it is below this part of the time to the level.
+    0.5  # A time is worth a sentence of its own if it is below this part of the time to the tolerance.
 )
 
 
@@ -80,17 +80,17 @@ class Choice:
 
 @dataclass(frozen=True)
 class Advice:
-    """Ranking of solvers in a family for one accuracy level or time budget."""
+    """Ranking of solvers in a family for one tolerance or time budget."""
 
     family: str
-    target: float  # level [-] or time [s]
+    target: float  # tolerance [-] or time [s]
     ranking: tuple[Choice, ...]
     equal: int = 1  # number of solvers at the head that are the best within noise; their order is fixed
     least: float = 0.0  # share of the cases below which no solver is recommended
 
     @property
     def best(self) -> Choice | None:
-        """The recommended solver; None if no solver reached the level, or none serves enough cases in the time."""
+        """The recommended solver; None if no solver reached the tolerance, or none serves enough cases in the time."""
         return self.ranking[0] if self.ranking and self.ranking[0].is_for(self.least) else None
 
     @property
@@ -122,7 +122,7 @@ class FamilyAdvice:
     cases: tuple[str, ...]
     sequence: bool
     left_out: int  # steps that did not load
-    by_level: Mapping[float, Advice]
+    by_tolerance: Mapping[float, Advice]
     by_time: Mapping[float, Advice]
     by_sweeps: Mapping[float, Advice]
 
@@ -145,7 +145,9 @@ def recommend_from_single_runs(records: Records, times: Sequence[float] = ()) ->
             cases=tuple(cases),
             sequence=is_sequence,
             left_out=len(lost.get(name, ())) if is_sequence else 0,
-            by_level={x: rank_to_level(records, name, cases, x, groups) for x in levels_of(records)},
+            by_tolerance={
+                x: rank_to_tolerance(records, name, cases, x, groups) for x in get_tolerances(records)
+            },
             by_time={t: rank_in_time(records, name, cases, t, groups) for t in times},
             by_sweeps={
                 float(n): replace(rank_in_time(records, name, cases, math.inf, some), target=float(n))
@@ -180,10 +182,10 @@ RunGroups = Mapping[tuple[str, str, str], _RunGroup]  # by solver, call and star
 
 
 def _group_runs(records: Records) -> RunGroups:
-    """Group cold runs on single cases by solver, and runs over sequences by budget or level and start, too."""
+    """Group cold runs on single cases by solver, and runs over sequences by budget or tolerance and start, too."""
     groups: dict[tuple[str, str, str], _RunGroup] = {}
     for r in records:
-        if r.order != "given" or r.turns or (r.step < 0 and r.start != "cold"):
+        if r.order != "given" or r.interleave_group or (r.step < 0 and r.start != "cold"):
             continue
         if r.step < 0:
             group = groups.setdefault((r.solver, "", ""), _RunGroup(r.solver))
@@ -199,7 +201,9 @@ def _group_sweep_budgets(records: Records) -> dict[int, RunGroups]:
     """Group the runs of each budget whose iterations are sweeps."""
     groups: dict[int, dict[tuple[str, str, str], _RunGroup]] = defaultdict(dict)
     for r in records:
-        compared = r.order == "given" and not r.turns and r.start in ("cold", "carried") and r.usable
+        compared = (
+            r.order == "given" and not r.interleave_group and r.start in ("cold", "carried") and r.usable
+        )
         if compared and r.mode == "budget" and counts_sweeps(r):
             start = "" if r.step < 0 else r.start
             new = _RunGroup(r.solver, start, r.max_iter)
@@ -217,10 +221,10 @@ def group_steps(records: Records) -> dict[str, list[str]]:
     return {name: steps for name, steps in steps_of.items() if not ran.isdisjoint(steps)}
 
 
-def rank_to_level(
-    records: Records, family: str, cases: Sequence[str], level: float, groups: RunGroups | None = None
+def rank_to_tolerance(
+    records: Records, family: str, cases: Sequence[str], tolerance: float, groups: RunGroups | None = None
 ) -> Advice:
-    """Rank the solvers that bring these cases, or steps, to a level.
+    """Rank the solvers that bring these cases, or steps, to a tolerance.
 
     Steps of several sequences count together, by calls with at most this tolerance or with a budget. `groups` spares a
     pass over the records.
@@ -228,15 +232,15 @@ def rank_to_level(
     limit, liars = limit_of(records), _list_false_claims(records, cases)
     choices: list[RankedChoice] = []
     for group in _select_groups(cases, _group_runs(records) if groups is None else groups):
-        if group.tol > level:
+        if group.tol > tolerance:
             continue
-        runs = {c: _select_fastest(group.runs.get(c, ()), level) for c in cases}
+        runs = {c: _select_fastest(group.runs.get(c, ()), tolerance) for c in cases}
         solved = [r for r in runs.values() if r is not None]
         times = {c: math.inf if r is None else r.time_min for c, r in runs.items()}
         score = geometric_mean([t if math.isfinite(t) else limit for t in times.values()], MEAN_TIME_SHIFT)
         choice = Choice.of(group.solver, times, len(solved), score, **group.describe_budget(solved))
         choices.append(((group.solver in liars, -len(solved)), choice))
-    return rank_choices(family, level, _keep_best_of_each(choices), TIME_NOISE_FACTOR)
+    return rank_choices(family, tolerance, _keep_best_of_each(choices), TIME_NOISE_FACTOR)
 
 
 def rank_in_time(
@@ -289,8 +293,8 @@ def _select_groups(cases: Sequence[str], groups: RunGroups) -> list[_RunGroup]:
     return [group for _, group in sorted(groups.items()) if not names.isdisjoint(group.runs)]
 
 
-def _select_fastest(runs: Iterable[Record], level: float) -> Record | None:
-    return min((r for r in runs if r.relative <= level), key=lambda r: r.time_min, default=None)
+def _select_fastest(runs: Iterable[Record], tolerance: float) -> Record | None:
+    return min((r for r in runs if r.relative <= tolerance), key=lambda r: r.time_min, default=None)
 
 
 def _select_most_accurate(runs: Iterable[Record], limit: float) -> Record | None:
@@ -298,16 +302,16 @@ def _select_most_accurate(runs: Iterable[Record], limit: float) -> Record | None
 
 
 def choose_time_budgets(records: Records) -> tuple[float, ...]:
-    """Return three decades of time [s] about the median of the fastest times to the middle level."""
-    levels = levels_of(records)
-    level = levels[len(levels) // 2]
-    fastest = [min(by.values()) for by in times_to(records, level).values() if by]
+    """Return three decades of time [s] about the median of the fastest times to the middle tolerance."""
+    tolerances = get_tolerances(records)
+    tolerance = tolerances[len(tolerances) // 2]
+    fastest = [min(by.values()) for by in times_to(records, tolerance).values() if by]
     for passes in group_passes(records).values():
         reached = [
             median(w.times[start])
             for w in passes
             for start, residuals in w.residuals.items()
-            if len(residuals) == w.steps and max(residuals) <= level
+            if len(residuals) == w.steps and max(residuals) <= tolerance
         ]
         fastest.append(min(reached, default=math.inf))
     fastest = [t for t in fastest if 0.0 < t < math.inf]
@@ -334,23 +338,23 @@ class Subject:
 
     names: tuple[str, ...]  # cases, or sequences
     cases: tuple[str, ...]  # cases, or steps of the sequences
-    way: str  # "call" or "steps"
-    best: Advice  # to the middle level
+    timing_mode: str  # "call" or "steps"
+    best: Advice  # to the middle tolerance
     quick: tuple[Advice, ...]  # in each time
 
 
 def list_subjects(records: Records, times: Sequence[float] = ()) -> list[Subject]:
     """Return the subject of single cases, then that of sequences, each only if there are any."""
-    levels = levels_of(records)
-    level = levels[len(levels) // 2]
+    tolerances = get_tolerances(records)
+    tolerance = tolerances[len(tolerances) // 2]
     times = tuple(times) or choose_time_budgets(records)
     cases = tuple(dict.fromkeys(r.case for r in records if r.step < 0))
     sequences = group_steps(records)
     steps = tuple(step for some in sequences.values() for step in some)
     subjects = []
-    for names, members, way in ((cases, cases, "call"), (tuple(sequences), steps, "steps")):
+    for names, members, timing_mode in ((cases, cases, "call"), (tuple(sequences), steps, "steps")):
         if members:
             quick = tuple(rank_in_time(records, "all", members, t) for t in times)
-            best = rank_to_level(records, "all", members, level)
-            subjects.append(Subject(names, members, way, best, quick))
+            best = rank_to_tolerance(records, "all", members, tolerance)
+            subjects.append(Subject(names, members, timing_mode, best, quick))
     return subjects

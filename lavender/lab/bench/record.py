@@ -16,16 +16,16 @@ from lavender.judge.solution import CLAIM_CHECKS, CONFIRMED, CONTRADICTED, NOT_P
 ERROR, KILLED, CRASHED = "ERROR", "KILLED", "CRASHED"
 
 
-def level_name(level: float) -> str:
-    """A level as people write it: 1e-3, not 1e-03."""
-    mantissa, _, exponent = f"{level:.3e}".partition("e")
+def format_tolerance(tolerance: float) -> str:
+    """Return a tolerance with the exponent's leading zeros removed: 1e-3, not 1e-03."""
+    mantissa, _, exponent = f"{tolerance:.3e}".partition("e")
     mantissa = mantissa.rstrip("0").rstrip(".")
     return f"{mantissa}e{int(exponent)}"
 
 
 def asked_of(mode: str, tol: float, max_iter: int) -> str:
     """What a run is asked for, in words: to 1e-6, or 16 iterations."""
-    return f"{max_iter} iterations" if mode == "budget" else f"to {level_name(tol)}"
+    return f"{max_iter} iterations" if mode == "budget" else f"to {format_tolerance(tol)}"
 
 
 LONGEST_NAME = 120  # characters of a file's name: file systems take 255 bytes, with a suffix
@@ -173,11 +173,11 @@ class Record(_Texts):
     energy: float = math.inf  # sqrt J
     velocity: float = math.inf  # m/s
     roundoff_floor: float = math.nan  # -
-    motion: float | None = None  # -, relative motion error; None if it was not requested, or if there is none
+    motion_error: float | None = None  # -, relative motion error; None if not requested or not available
     motion_speed: float | None = None  # m/s, of the body that is furthest off (row, without bodies)
     bound: float | None = None  # sqrt J, proved bound of the motion error
-    degenerate: float | None = None  # -, share of blocks at a boundary; None if no error has a bound
-    bits: str = ""  # hash of the answer: equal where two answers are, to the last bit
+    boundary_fraction: float | None = None  # -, share of blocks at a boundary; None if no error has a bound
+    solution_hash: str = ""  # hash of the impulses: equal if they are bit-identical
     worst_row: int = -1
     worst_name: str = ""
     success: bool = False  # the judge: relative <= tol (a budget: false)
@@ -193,22 +193,22 @@ class Record(_Texts):
     setup_median: float = math.nan
     solve_min: float = math.nan
     solve_median: float = math.nan
-    # of one repeat: of the line where `way` says one, else set-up and solve together
+    # of one repeat: of the line where `timing_mode` says one, else set-up and solve together
     time_min: float = math.nan
     time_median: float = math.nan
     threads: int = 1
     step: int = -1  # of a sequence
-    # What was timed: "call", one `lv.solve` on a problem just made; "steps", the same in a loop that carries impulses;
-    # "batch", a problem's share of one `lv.solve_many`; "" prepare and solve, without judge and front door.
-    way: str = ""
-    # which lines on which cases took turns with this one; "": repeats came one after the other
-    turns: str = ""
+    # "call": one `lv.solve` on a new problem. "steps": the same in a loop that carries impulses. "batch": the time of
+    # one `lv.solve_many`, divided by its problems. "": prepare and solve, without the judge and the input validation.
+    timing_mode: str = ""
+    # identifies the calls that were timed alternately with this one; "": its repeats came one after the other
+    interleave_group: str = ""
     times: tuple[float, ...] = ()  # s, of each repeat
-    reached: tuple[float, ...] = ()  # relative residual of each repeat, where they differ (mode "time")
-    pace: float | None = None  # s, of a loop of fixed work beside the repeats: what the machine was worth
+    residual_per_repeat: tuple[float, ...] = ()  # relative residual of each repeat, in mode "time"
+    calibration_time: float | None = None  # s, of a loop of fixed work that ran with the repeats
     load: float | None = None  # processes that wanted a processor when it was made, this one among them
-    # s, of a backend of others on data that it was given before, by its own interface
-    own_min: float | None = None
+    # s, in the own interface of a third-party backend, on converted data
+    backend_time_min: float | None = None
 
     @property
     def key(self) -> tuple[Any, ...]:
@@ -217,7 +217,7 @@ class Record(_Texts):
 
     @property
     def asked(self) -> str:
-        """The budget or the level, and the order of sweeps where it is another."""
+        """The budget or the tolerance, and the order of sweeps where it is another."""
         order = "" if self.order == "given" else f", order {self.order}"
         return asked_of(self.mode, self.tol, self.max_iter) + order
 
@@ -230,13 +230,36 @@ class Record(_Texts):
 def measurement_key(what: Any) -> tuple[Any, ...]:
     """The identity of a measurement, of its `Task` as of its `Record`."""
     options = repr(sorted(plain(what.options).items()))
-    asked = (what.start, what.mode, what.tol, what.max_iter, what.time_limit, what.way, what.turns)
+    asked = (
+        what.start,
+        what.mode,
+        what.tol,
+        what.max_iter,
+        what.time_limit,
+        what.timing_mode,
+        what.interleave_group,
+    )
     return (what.case, what.sha, what.solver, options, *asked)
 
 
 Entry = Run | CaseInfo | Skip | Record
-#: Fields of records by the names that earlier versions wrote.
-RENAMED_FIELDS = {"floor": "roundoff_floor", "suspicions": "diagnostics", "contradicted": "status_conflict"}
+#: Present name of each field that earlier versions wrote under another name; "plan." marks fields of a run's plan.
+RENAMED_FIELDS = {
+    "floor": "roundoff_floor",
+    "suspicions": "diagnostics",
+    "contradicted": "status_conflict",
+    "way": "timing_mode",
+    "pace": "calibration_time",
+    "own_min": "backend_time_min",
+    "reached": "residual_per_repeat",
+    "motion": "motion_error",
+    "bits": "solution_hash",
+    "degenerate": "boundary_fraction",
+    "turns": "interleave_group",
+    "plan.levels": "tolerances",
+    "plan.speed_levels": "velocity_tolerances",
+    "plan.pass_limit": "sequence_time_limit",
+}
 REMOVED_KINDS = ("done",)  # Earlier versions marked complete pairs of a campaign; such lines are ignored.
 RENAMED_STATUSES = {"FLOOR": "ROUNDOFF_LIMIT", "REFUSED": "INVALID_PROBLEM"}
 KINDS: dict[str, type] = {"run": Run, "case": CaseInfo, "skip": Skip, "record": Record}
@@ -276,6 +299,8 @@ def _with_new_names(line: Mapping[str, Any]) -> Mapping[str, Any]:
     status = renamed.get("status")
     if isinstance(status, str):
         renamed["status"] = RENAMED_STATUSES.get(status, status)
+    if isinstance(plan := renamed.get("plan"), Mapping):
+        renamed["plan"] = {RENAMED_FIELDS.get(f"plan.{name}", name): value for name, value in plan.items()}
     conflict = line.get("contradicted")
     if not conflict or "claim_check" in line:
         return renamed
@@ -343,8 +368,8 @@ def _is_positive(value: Any) -> bool:
 
 
 def _is_plan(plan: Mapping[str, Any]) -> bool:
-    levels = plan.get("levels", [])
-    return _is_mapping(plan, _is_flat) and isinstance(levels, list) and all(map(_is_positive, levels))
+    tolerances = plan.get("tolerances", [])
+    return _is_mapping(plan, _is_flat) and isinstance(tolerances, list) and all(map(_is_positive, tolerances))
 
 
 _Rule = tuple[str, Callable[[Any], bool]]
@@ -373,10 +398,13 @@ _TYPES: dict[str, _Rule] = {
 #: What their values are limited to; "" is the rule of every other number with a fraction.
 _RANGES: dict[Any, _Rule] = {
     "": ("0 or more", lambda v: not v < 0.0),
-    ("Run", "plan"): ("a plan with positive levels", _is_plan),
+    ("Run", "plan"): ("a plan with positive tolerances", _is_plan),
     ("Record", "start"): ("cold, warm or carried", lambda v: v in ("cold", "warm", "carried")),
     ("Record", "mode"): ("tol, budget or time", lambda v: v in ("tol", "budget", "time")),
-    ("Record", "way"): ("call, steps, batch or nothing", lambda v: v in ("", "call", "steps", "batch")),
+    ("Record", "timing_mode"): (
+        "call, steps, batch or nothing",
+        lambda v: v in ("", "call", "steps", "batch"),
+    ),
     ("Record", "claim_check"): ("confirmed, not proven or contradicted", lambda v: v in CLAIM_CHECKS),
     ("Record", "tol"): ("a finite number of 0 or more", lambda v: 0.0 <= v < math.inf),
     ("Record", "time_limit"): ("a positive number of seconds", _is_positive),

@@ -1,4 +1,4 @@
-"""Rank calls that were timed in turns, and measure by resampling how sure the ranking is.
+"""Rank calls that were timed alternately, and measure by resampling how sure the ranking is.
 
 A resampling draws the cases and the repetitions with replacement (the steps of a sequence in blocks of consecutive
 ones, since neighbours are alike). In each resampling the calls are ranked by the rule of `recommendation`; every call
@@ -26,7 +26,7 @@ from lavender.lab.bench.recommendation import (
     recommend_from_single_runs,
 )
 from lavender.lab.bench.record import Record
-from lavender.lab.bench.statistics import MEAN_TIME_SHIFT, levels_of, limit_of
+from lavender.lab.bench.statistics import MEAN_TIME_SHIFT, get_tolerances, limit_of
 from lavender.lab.bench.store import Records
 from lavender.lab.bench.timed_call import format_call
 
@@ -87,17 +87,19 @@ class ResampledRanking:
         return tuple(dict.fromkeys([solvers[0], *others]))
 
 
-def select_calls(records: Records, way: str, in_turns: bool = True) -> list[TimedCall]:
-    """Select the calls of a way ("call", "steps", "batch") that ran on the largest number of cases.
+def select_calls(records: Records, timing_mode: str, interleaved: bool = True) -> list[TimedCall]:
+    """Select the calls of a timing mode ("call", "steps", "batch") that ran on the largest number of cases.
 
-    With `in_turns` these are calls that were timed in turns with others. Without it they are runs that were measured
+    With `interleaved` these are calls that were timed alternately. Without it they are runs that were measured
     one after the other; records of earlier versions have no others.
     """
     groups: dict[tuple[object, ...], dict[str, Record]] = {}
     for r in records:
-        same_way = r.way == way or (not r.way and not in_turns and (r.step >= 0) is (way == "steps"))
+        same_mode = r.timing_mode == timing_mode or (
+            not r.timing_mode and not interleaved and (r.step >= 0) is (timing_mode == "steps")
+        )
         compared = r.order == "given" and r.start != "warm" and (r.mode != "budget" or counts_sweeps(r))
-        if same_way and compared and bool(r.turns) is in_turns and r.case in records.cases:
+        if same_mode and compared and bool(r.interleave_group) is interleaved and r.case in records.cases:
             key = (r.solver, r.mode, r.tol, r.max_iter, r.time_limit, r.start)
             groups.setdefault(key, {})[r.case] = r
     most = max((len(runs) for runs in groups.values()), default=0)
@@ -106,7 +108,7 @@ def select_calls(records: Records, way: str, in_turns: bool = True) -> list[Time
         for runs in groups.values()
         if len(runs) == most
     ]
-    if way != "batch":
+    if timing_mode != "batch":
         return calls
     # A batch of some of the cases cannot be compared with a call on all of them.
     complete = {
@@ -118,26 +120,32 @@ def select_calls(records: Records, way: str, in_turns: bool = True) -> list[Time
 STARTS = {"cold": "cold", "carried": "warm from the step before"}
 
 
-def _keep_best_of_each(calls: Sequence[TimedCall], level: float) -> list[TimedCall]:
-    """Keep one call of each solver: the start that brings more cases to the level, then the faster one."""
+def _keep_best_of_each(calls: Sequence[TimedCall], tolerance: float) -> list[TimedCall]:
+    """Keep one call of each solver: the start that brings more cases to the tolerance, then the faster one."""
     best: dict[str, TimedCall] = {}
-    for call in sorted(calls, key=lambda f: (sum(not r.relative <= level for r in f.runs.values()), f.time)):
+    for call in sorted(
+        calls, key=lambda f: (sum(not r.relative <= tolerance for r in f.runs.values()), f.time)
+    ):
         best.setdefault(call.line.solver, call)
     return list(best.values())
 
 
-def rank_calls_to_level(
-    records: Records, calls: Sequence[TimedCall], level: float, cases: int = 0
+def rank_calls_to_tolerance(
+    records: Records, calls: Sequence[TimedCall], tolerance: float, cases: int = 0
 ) -> ResampledRanking | None:
-    """Rank calls with a tolerance by the cases that they bring to the level, then by the geometric mean of times.
+    """Rank calls by the number of cases that they bring to the tolerance, then by the geometric mean of times.
 
     `cases` is the number of all cases, if calls were timed on fewer. Returns None without such a call.
     """
-    calls = _keep_best_of_each([f for f in calls if f.line.mode == "tol" and f.line.tol <= level], level)
+    calls = _keep_best_of_each(
+        [f for f in calls if f.line.mode == "tol" and f.line.tol <= tolerance], tolerance
+    )
     if not calls:
         return None
     limit, names = limit_of(records), _list_cases(calls)
-    missed = np.array([[c not in f.runs or not f.runs[c].relative <= level for c in names] for f in calls])
+    missed = np.array(
+        [[c not in f.runs or not f.runs[c].relative <= tolerance for c in names] for f in calls]
+    )
     times = _stack_repetitions(calls, names, lambda r: r.times or (r.time_min,))
     charged = np.where(missed[:, :, None] | ~np.isfinite(times), limit, times)
 
@@ -158,7 +166,7 @@ def rank_calls_to_level(
 
 
 def recommend_solvers(records: Records, times: Sequence[float] = ()) -> list[FamilyAdvice]:
-    """Rank solvers for each structure and sequence; to the middle level by the calls timed in turns, if there are any.
+    """Rank solvers for each structure and sequence; to the middle tolerance by interleaved calls, if there are any.
 
     Parameters
     ----------
@@ -166,40 +174,40 @@ def recommend_solvers(records: Records, times: Sequence[float] = ()) -> list[Fam
     times : s, optional
         Time budgets; three decades about the fastest times if none are given.
     """
-    levels = levels_of(records)
-    level = levels[len(levels) // 2]
-    in_turns = {way: select_calls(records, way) for way in ("call", "steps")}
+    tolerances = get_tolerances(records)
+    tolerance = tolerances[len(tolerances) // 2]
+    interleaved = {timing_mode: select_calls(records, timing_mode) for timing_mode in ("call", "steps")}
     advice = []
     for family in recommend_from_single_runs(records, times):
-        calls = in_turns["steps" if family.sequence else "call"]
-        first = recommend_for_cases(records, family.by_level[level], calls, family.cases)
-        advice.append(replace(family, by_level={**family.by_level, level: first}))
+        calls = interleaved["steps" if family.sequence else "call"]
+        first = recommend_for_cases(records, family.by_tolerance[tolerance], calls, family.cases)
+        advice.append(replace(family, by_tolerance={**family.by_tolerance, tolerance: first}))
     return advice
 
 
 def recommend_for_cases(
     records: Records, alone: Advice, calls: Sequence[TimedCall], cases: Sequence[str]
 ) -> Advice:
-    """Rank solvers to a level on some cases by the rule and the times of the report's first sentence.
+    """Rank solvers to a tolerance on some cases by the rule and the times of the report's first sentence.
 
-    Solvers of `calls`, which were timed in turns, come first, then the others of `alone`. Returns `alone` if no call
+    Solvers of `calls`, which were timed alternately, come first, then the others of `alone`. Returns `alone` if no call
     was timed on these cases, or if the calls solve fewer of them.
     """
     parts = [replace(f, runs={c: f.runs[c] for c in cases if c in f.runs}) for f in calls]
-    resampled = rank_calls_to_level(records, [f for f in parts if f.runs], alone.target, len(cases))
+    resampled = rank_calls_to_tolerance(records, [f for f in parts if f.runs], alone.target, len(cases))
     best = alone.ranking[0].solved if alone.ranking else 0
     if resampled is None or resampled.ranking[0][1].solved < max(1, best):
         return alone
     hows = {c.solver: c.how for c in alone.ranking}
-    in_turns = [
+    interleaved = [
         replace(c, how=f"{f.line.asked}, {f.line.start}" if f.line.step >= 0 else hows.get(c.solver, ""))
         for f, c in resampled.ranking
     ]
     named = resampled.named
-    in_turns.sort(key=lambda c: named.index(c.solver) if c.solver in named else len(in_turns))
-    known = {c.solver for c in in_turns}
+    interleaved.sort(key=lambda c: named.index(c.solver) if c.solver in named else len(interleaved))
+    known = {c.solver for c in interleaved}
     rest = [c for c in alone.ranking if c.solver not in known]
-    return replace(alone, ranking=(*in_turns, *rest), equal=len(named))
+    return replace(alone, ranking=(*interleaved, *rest), equal=len(named))
 
 
 def rank_calls_in_time(
@@ -217,7 +225,9 @@ def rank_calls_in_time(
         return None
     names = _list_cases(calls)
     times = _stack_repetitions(calls, names, lambda r: r.times or (r.time_min,))
-    residuals = np.minimum(_stack_repetitions(calls, names, lambda r: r.reached or (r.relative,)), 1.0)
+    residuals = np.minimum(
+        _stack_repetitions(calls, names, lambda r: r.residual_per_repeat or (r.relative,)), 1.0
+    )
     in_time = np.where(times <= limit, np.nan_to_num(residuals, nan=1.0), 1.0)
     served = np.quantile(in_time, IN_TIME_SHARE, axis=2, method="lower") <= SERVED_RESIDUAL
 

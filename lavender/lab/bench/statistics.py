@@ -1,6 +1,6 @@
 """Compute statistics of records, of each case and over many cases, as lists of small frozen rows.
 
-Time to a level: the smallest time of any run whose judged residual is at or below it, whatever was asked
+Time to a tolerance: the smallest time of any run whose judged residual is at or below it, whatever was asked
 for: runs are matched by the accuracy they reached, never by the one they were asked for.
 """
 
@@ -29,11 +29,11 @@ RESIDUAL_NOISE_FACTOR = (
 MEAN_TIME_SHIFT = 1e-5  # s, added to times in geometric means: below it, Python's share of a call decides.
 
 
-def levels_of(records: Records) -> tuple[float, ...]:
-    """Return the levels of the newest run's plan, loosest first; without a plan the tolerances of the runs."""
+def get_tolerances(records: Records) -> tuple[float, ...]:
+    """Return the tolerances of the newest run's plan, loosest first; without a plan the tolerances of the runs."""
     for run in reversed(list(records.runs.values())):
-        if run.plan.get("levels"):
-            return tuple(sorted(map(float, run.plan["levels"]), reverse=True))
+        if run.plan.get("tolerances"):
+            return tuple(sorted(map(float, run.plan["tolerances"]), reverse=True))
     return tuple(sorted({r.tol for r in records if r.mode == "tol"}, reverse=True)) or (1e-3, 1e-6, 1e-9)
 
 
@@ -41,7 +41,7 @@ def pairs(records: Iterable[Record]) -> dict[tuple[str, str, str], list[Record]]
     """Group runs in the given order of blocks by (case, solver, start)."""
     groups: dict[tuple[str, str, str], list[Record]] = defaultdict(list)
     for r in records:
-        if r.order == "given" and r.step < 0 and not r.turns:
+        if r.order == "given" and r.step < 0 and not r.interleave_group:
             groups[r.case, r.solver, r.start].append(r)
     return dict(groups)
 
@@ -91,14 +91,14 @@ class Reach:
     case: str
     solver: str
     start: str
-    times: Mapping[float, float]  # s to each level, inf where it was not reached
+    times: Mapping[float, float]  # s to each tolerance, inf where it was not reached
     best: float  # smallest relative residual of any run
     roundoff_floor: float  # of that run
-    status: str  # of the run to the tightest level asked for
+    status: str  # of the run to the tightest tolerance asked for
     claim_check: str  # the worst of all runs
     status_conflict: str
     form: str
-    motion: float  # -, relative motion error of the best run; nan where there is none
+    motion_error: float  # -, relative motion error of the best run; nan where there is none
     bound: float  # sqrt J, proved bound of it; nan where nothing is proved
 
     @property
@@ -115,7 +115,7 @@ class Difficulty:
     rows: int
     sweeps: int | None  # of `pgs` to EASY_RESIDUAL; None where it did not get there, or was not asked
     condition: float | None  # of A, as `CaseInfo.condition`
-    degenerate: (
+    boundary_fraction: (
         float | None
     )  # share of blocks at a boundary at the best answer, of those whose error has a bound
     proof: str
@@ -130,7 +130,7 @@ class Claims:
     runs: int
     claims: int  # says CONVERGED, ROUNDOFF_LIMIT or INFEASIBLE
     wrong: int
-    reached: int  # runs to a level that the judge confirms
+    reached: int  # runs to a tolerance that the judge confirms
     asked: int
     crashed: int  # ERROR, KILLED, CRASHED
 
@@ -154,9 +154,9 @@ class Spread:
         return max(values) / min(values) if values else 1.0
 
 
-def reaches(records: Records, levels: Sequence[float] | None = None) -> list[Reach]:
+def reaches(records: Records, tolerances: Sequence[float] | None = None) -> list[Reach]:
     """Return one row for each case, solver and start, in the order of the records."""
-    levels = levels_of(records) if levels is None else tuple(levels)
+    tolerances = get_tolerances(records) if tolerances is None else tuple(tolerances)
     out = []
     for (case, solver, start), group in pairs(records).items():
         good = [r for r in group if r.usable]
@@ -169,8 +169,8 @@ def reaches(records: Records, levels: Sequence[float] | None = None) -> list[Rea
                 solver=solver,
                 start=start,
                 times={
-                    level: min((r.time_min for r in good if r.relative <= level), default=math.inf)
-                    for level in levels
+                    tolerance: min((r.time_min for r in good if r.relative <= tolerance), default=math.inf)
+                    for tolerance in tolerances
                 },
                 best=best.relative if best else math.inf,
                 roundoff_floor=best.roundoff_floor if best else math.nan,
@@ -178,7 +178,7 @@ def reaches(records: Records, levels: Sequence[float] | None = None) -> list[Rea
                 claim_check=max((r.claim_check for r in group), key=CLAIM_CHECKS.index),
                 status_conflict=next((r.status_conflict for r in group if r.status_conflict), ""),
                 form=last.form,
-                motion=math.nan if best is None or best.motion is None else best.motion,
+                motion_error=math.nan if best is None or best.motion_error is None else best.motion_error,
                 bound=math.nan if best is None or best.bound is None else best.bound,
             )
         )
@@ -186,12 +186,12 @@ def reaches(records: Records, levels: Sequence[float] | None = None) -> list[Rea
 
 
 def _is_again(r: Record) -> bool:
-    """Return whether a run repeats an earlier one in turns; runs with a time limit exist only in turns."""
-    return bool(r.turns) and r.mode != "time"
+    """Return whether an interleaved run repeats an earlier one; runs with a time limit have no earlier one."""
+    return bool(r.interleave_group) and r.mode != "time"
 
 
 def failures(records: Records) -> list[Record]:
-    """Return runs that missed their level above the round-off floor, crashes, and false claims."""
+    """Return runs that missed their tolerance above the round-off floor, crashes, and false claims."""
     out = []
     for r in records:
         if _is_again(r):
@@ -214,11 +214,11 @@ def difficulties(records: Records) -> list[Difficulty]:
             for r in runs
             if r.solver == "pgs" and r.mode == "tol" and r.relative <= EASY_RESIDUAL
         ]
-        judged = [r for r in runs if r.degenerate is not None]
-        idle = [r for r in runs if r.bits and r.iterations == 0 and r.claims]
+        judged = [r for r in runs if r.boundary_fraction is not None]
+        idle = [r for r in runs if r.solution_hash and r.iterations == 0 and r.claims]
         groups = defaultdict(set)
         for r in idle:
-            groups[r.bits].add(r.solver)
+            groups[r.solution_hash].add(r.solver)
         same = max(groups.values(), key=len, default=set())
         out.append(
             Difficulty(
@@ -226,7 +226,7 @@ def difficulties(records: Records) -> list[Difficulty]:
                 rows=info.rows,
                 sweeps=min(swept, default=None),
                 condition=info.condition,
-                degenerate=min(judged, key=lambda r: r.relative).degenerate if judged else None,
+                boundary_fraction=min(judged, key=lambda r: r.relative).boundary_fraction if judged else None,
                 proof=info.proof,
                 same=tuple(sorted(same)) if len(same) > 1 and not info.nothing_to_do else (),
             )
@@ -239,15 +239,15 @@ def claims(records: Records) -> list[Claims]:
     out = []
     for solver in sorted({r.solver for r in records}):
         runs = [r for r in records if r.solver == solver and not _is_again(r)]
-        to_level = [r for r in runs if r.mode == "tol"]
+        to_tolerance = [r for r in runs if r.mode == "tol"]
         out.append(
             Claims(
                 solver=solver,
                 runs=len(runs),
                 claims=sum(r.claims for r in runs),
                 wrong=sum(r.claims and bool(r.status_conflict) for r in runs),
-                reached=sum(r.success for r in to_level),
-                asked=len(to_level),
+                reached=sum(r.success for r in to_tolerance),
+                asked=len(to_tolerance),
                 crashed=sum(r.status.startswith(DEATH_STATUSES) for r in runs),
             )
         )
@@ -258,7 +258,7 @@ def spreads(records: Records) -> list[Spread]:
     """Return the residual of each sweep order for budgets that were run in several orders."""
     groups: dict[tuple[str, str, int], dict[str, Record]] = defaultdict(dict)
     for r in records:
-        if r.mode == "budget" and r.start == "cold" and r.step < 0 and not r.turns:
+        if r.mode == "budget" and r.start == "cold" and r.step < 0 and not r.interleave_group:
             name = f"{r.order} {r.seed}" if r.order == "random" else r.order
             groups[r.case, r.solver, r.max_iter][name] = r
     return [
@@ -272,7 +272,7 @@ def budgets(records: Records) -> dict[tuple[str, str, str], list[tuple[int, floa
     """Return (iterations, residual) of the exact budgets in the given order, by (case, solver, start)."""
     groups: dict[tuple[str, str, str], list[tuple[int, float]]] = defaultdict(list)
     for r in records:
-        if r.mode != "budget" or r.turns:
+        if r.mode != "budget" or r.interleave_group:
             continue
         if r.order == "given" and r.step < 0 and r.status == "MAX_ITERATIONS":
             groups[r.case, r.solver, r.start].append((r.iterations, r.relative))
@@ -289,8 +289,8 @@ class Change:
     case: str
     solver: str
     start: str
-    level: float
-    old: float  # s, inf where the level was missed
+    tolerance: float
+    old: float  # s, inf where the tolerance was missed
     new: float
     noise: float  # what counts as noise: a factor above 1
 
@@ -305,14 +305,14 @@ class Change:
 
 
 def changes(old: Records, new: Records) -> list[Change]:
-    """Compare times to each level of two runs, on the cases whose numbers are the same in both.
+    """Compare times to each tolerance of two runs, on the cases whose numbers are the same in both.
 
     Noise is at least `TIME_NOISE_FACTOR`, and at least twice the ratio between minimum and median of either run.
     Earlier times are multiplied by the drift of the case, if both runs have measured it.
     """
-    levels = levels_of(new)
+    tolerances = get_tolerances(new)
     same = {name for name, info in new.cases.items() if name in old.cases and old.cases[name].sha == info.sha}
-    before = {(r.case, r.solver, r.start): r for r in reaches(old, levels)}
+    before = {(r.case, r.solver, r.start): r for r in reaches(old, tolerances)}
     jitter: dict[tuple[str, str, str], float] = defaultdict(lambda: 1.0)
     for records in (old, new):
         for key, group in pairs(records).items():
@@ -320,13 +320,13 @@ def changes(old: Records, new: Records) -> list[Change]:
                 if r.usable and r.time_min > 0.0:
                     jitter[key] = max(jitter[key], r.time_median / r.time_min)
     out = []
-    for row in reaches(new, levels):
+    for row in reaches(new, tolerances):
         key = (row.case, row.solver, row.start)
         if row.case not in same or key not in before:
             continue
         worth = drift(old, new, row.case)
         noise = max(TIME_NOISE_FACTOR, 1.0 + 2.0 * (jitter[key] - 1.0))
-        out += [Change(*key, x, worth * before[key].times[x], row.times[x], noise) for x in levels]
+        out += [Change(*key, x, worth * before[key].times[x], row.times[x], noise) for x in tolerances]
     return out
 
 
@@ -334,17 +334,17 @@ def drift(old: Records, new: Records, case: str = "") -> float:
     """Return the ratio of new to old time of the calibration loop, medians over runs of a case or of all; else 1."""
     medians = []
     for records in (old, new):
-        some = [r.pace for r in records if r.pace and (not case or r.case == case)]
+        some = [r.calibration_time for r in records if r.calibration_time and (not case or r.case == case)]
         medians.append(median(some) if some else math.nan)
     return medians[1] / medians[0] if all(map(math.isfinite, medians)) else 1.0
 
 
 @dataclass(frozen=True)
 class Profile:
-    """Dolan-More performance profile of one level over the cases of one law."""
+    """Dolan-More performance profile of one tolerance over the cases of one law."""
 
     law: str
-    level: float
+    tolerance: float
     cases: int
     curves: Mapping[str, tuple[tuple[float, float], ...]]  # solver -> (ratio, share) steps
 
@@ -362,22 +362,22 @@ def quantile(values: Sequence[float], q: float) -> float:
     return ordered[min(len(ordered) - 1, math.ceil(q * len(ordered)) - 1)]
 
 
-def times_to(records: Records, level: float) -> dict[str, dict[str, float]]:
-    """Return time [s] to a level from a cold start by case and solver: inf if missed, absent if the solver refused."""
+def times_to(records: Records, tolerance: float) -> dict[str, dict[str, float]]:
+    """Return the time [s] to a tolerance from a cold start by case and solver, inf if missed, without refused cases."""
     out: dict[str, dict[str, float]] = defaultdict(dict)
-    for reach in reaches(records, [level]):
+    for reach in reaches(records, [tolerance]):
         if reach.start == "cold":
-            out[reach.case][reach.solver] = reach.times[level]
+            out[reach.case][reach.solver] = reach.times[tolerance]
     return out
 
 
 def limit_of(records: Records) -> float:
-    """Return the time [s] that a missed level counts with: the time limit."""
+    """Return the time [s] that a missed tolerance counts with: the time limit."""
     return max((r.time_limit for r in records), default=1.0)
 
 
 def geometric_means(records: Records) -> dict[str, dict[float, dict[str, tuple[float, int, int]]]]:
-    """Return (shifted geometric mean [s], solved, cases) by law, level and solver; a miss counts with the time limit.
+    """Return (shifted geometric mean [s], solved, cases) by law, tolerance and solver; a miss takes the time limit.
 
     A law's table has the solvers that accept every case of it.
     """
@@ -385,8 +385,8 @@ def geometric_means(records: Records) -> dict[str, dict[float, dict[str, tuple[f
     out: dict[str, dict[float, dict[str, tuple[float, int, int]]]] = {}
     for law, cases in _laws(records).items():
         out[law] = {}
-        for level in levels_of(records):
-            times = times_to(records, level)
+        for tolerance in get_tolerances(records):
+            times = times_to(records, tolerance)
             by: dict[str, tuple[float, int, int]] = {}
             for solver in _whole(times, cases):
                 t = [times[c][solver] for c in cases]
@@ -396,45 +396,47 @@ def geometric_means(records: Records) -> dict[str, dict[float, dict[str, tuple[f
                     solved,
                     len(cases),
                 )
-            out[law][level] = dict(sorted(by.items(), key=lambda kv: kv[1][0]))
+            out[law][tolerance] = dict(sorted(by.items(), key=lambda kv: kv[1][0]))
     return out
 
 
 @dataclass(frozen=True)
 class Backend:
-    """A solver of another package to the middle level, on the cases that it brings there."""
+    """A solver of another package to the middle tolerance, on the cases that it brings there."""
 
     solver: str
     solved: int
     whole: float  # s, geometric mean of the whole way from a problem
-    own: float  # s, of its own solve, on data that it was given before
+    backend_time: float  # s, of its own solve, on data that it was given before
     wins: int  # cases on which that is less than the fastest of ours takes
 
 
 def backends(records: Records) -> list[Backend]:
     """Return solvers with both times, sorted by the time of their own interface."""
-    levels = levels_of(records)
-    level = levels[len(levels) // 2]
+    tolerances = get_tolerances(records)
+    tolerance = tolerances[len(tolerances) // 2]
     best: dict[tuple[str, str], Record] = {}
     for r in records:
         key = (r.solver, r.case)
-        reached = r.usable and r.relative <= level and r.start == "cold" and not r.turns
+        reached = r.usable and r.relative <= tolerance and r.start == "cold" and not r.interleave_group
         if reached and (key not in best or r.time_min < best[key].time_min):
             best[key] = r
     ours: dict[str, float] = {}
     for (_, case), r in best.items():
-        if r.own_min is None:
+        if r.backend_time_min is None:
             ours[case] = min(r.time_min, ours.get(case, math.inf))
     out = []
-    for solver in sorted({r.solver for r in best.values() if r.own_min is not None}):
-        mine = {c: r for (s, c), r in best.items() if s == solver and r.own_min is not None}
-        owns = {c: r.own_min or 0.0 for c, r in mine.items()}
+    for solver in sorted({r.solver for r in best.values() if r.backend_time_min is not None}):
+        mine = {c: r for (s, c), r in best.items() if s == solver and r.backend_time_min is not None}
+        backend_times = {c: r.backend_time_min or 0.0 for c, r in mine.items()}
         whole = geometric_mean([r.time_min for r in mine.values()], MEAN_TIME_SHIFT)
-        wins = sum(t < ours.get(c, math.inf) for c, t in owns.items())
+        wins = sum(t < ours.get(c, math.inf) for c, t in backend_times.items())
         out.append(
-            Backend(solver, len(mine), whole, geometric_mean(list(owns.values()), MEAN_TIME_SHIFT), wins)
+            Backend(
+                solver, len(mine), whole, geometric_mean(list(backend_times.values()), MEAN_TIME_SHIFT), wins
+            )
         )
-    return sorted(out, key=lambda b: b.own)
+    return sorted(out, key=lambda b: b.backend_time)
 
 
 def _laws(records: Records) -> dict[str, list[str]]:
@@ -452,15 +454,15 @@ def _whole(times: Mapping[str, Mapping[str, float]], cases: Sequence[str]) -> li
 
 
 def profiles(records: Records) -> list[Profile]:
-    """Compute the share of cases that a solver brings to a level within `ratio` times the fastest; a miss is infinite.
+    """Compute the share of cases that a solver solves within `ratio` times the fastest; a miss is infinite.
 
     Over the cases of one law, and within one run (`Records.latest`); a case that no solver brought to
-    the level counts as a miss of all.
+    the tolerance counts as a miss of all.
     """
     out = []
     for law, cases in _laws(records).items():
-        for level in levels_of(records):
-            times = times_to(records, level)
+        for tolerance in get_tolerances(records):
+            times = times_to(records, tolerance)
             curves: dict[str, tuple[tuple[float, float], ...]] = {}
             for solver in sorted({s for c in cases for s in times.get(c, {})}):
                 ratios = []
@@ -473,7 +475,7 @@ def profiles(records: Records) -> list[Profile]:
                     (r, sum(q <= r for q in ratios) / len(cases)) for r in sorted(set(ratios)) if r > 1.0
                 ]
                 curves[solver] = tuple(steps)
-            out.append(Profile(law, level, len(cases), curves))
+            out.append(Profile(law, tolerance, len(cases), curves))
     return out
 
 
@@ -487,7 +489,7 @@ class Robustness:
     family: str
     solver: str
     cases: int
-    reached: Mapping[float, int]  # level -> cases that the judge confirms
+    reached: Mapping[float, int]  # tolerance -> cases that the judge confirms
     wrong: int  # claims that do not hold
     died: int
     budgets: Mapping[int, tuple[float, float]]  # iterations -> median and 95th percentile of the residual
@@ -495,8 +497,8 @@ class Robustness:
 
 
 def robustness(records: Records) -> list[Robustness]:
-    """Count cases that reach each level, false claims and deaths by structure and solver, with residuals by budget."""
-    levels = levels_of(records)
+    """Count solved cases, false claims and crashes by structure and solver, with residuals by budget."""
+    tolerances = get_tolerances(records)
     groups = {k[:2]: g for k, g in pairs(records).items() if k[2] == "cold"}
     solvers = sorted({solver for _, solver in groups})
     out = []
@@ -517,7 +519,7 @@ def robustness(records: Records) -> list[Robustness]:
                     family=family,
                     solver=solver,
                     cases=len(groups_of_case),
-                    reached={x: sum(v <= x for v in best.values()) for x in levels},
+                    reached={x: sum(v <= x for v in best.values()) for x in tolerances},
                     wrong=sum(bool(r.status_conflict) for r in runs),
                     died=sum(r.status.startswith(DEATH_STATUSES) for r in runs),
                     budgets={n: (median(v), quantile(v, 0.95)) for n, v in sorted(by_budget.items())},
@@ -532,7 +534,7 @@ def robustness(records: Records) -> list[Robustness]:
 
 @dataclass(frozen=True)
 class Pass:
-    """Results of one solver over one sequence at one budget or level, cold and with carried impulses."""
+    """Results of one solver over one sequence at one budget or tolerance, cold and with carried impulses."""
 
     sequence: str
     solver: str
@@ -547,7 +549,7 @@ class Pass:
 
     @property
     def asked(self) -> str:
-        """The budget or the level."""
+        """The budget or the tolerance."""
         return asked_of(self.mode, self.tol, self.max_iter)
 
     @property
@@ -576,7 +578,7 @@ def passes(records: Records) -> list[Pass]:
         lambda: defaultdict(list)
     )
     for r in records:
-        if r.step >= 0 and not r.turns and r.case in records.cases:
+        if r.step >= 0 and not r.interleave_group and r.case in records.cases:
             name = records.cases[r.case].sequence
             groups[name, r.solver, r.mode, r.tol, r.max_iter][r.start].append(r)
     steps = Counter(info.sequence for info in records.cases.values())

@@ -108,8 +108,8 @@ class Records:
             r for r in self.records if r.run == run and r.sha == now.get(r.case, "" if r.step >= 0 else r.sha)
         ]
         # lines that were timed alternately
-        newest = next((r.turns for r in reversed(mine) if r.turns), "")
-        mine = [r for r in mine if r.turns in ("", newest)]
+        newest = next((r.interleave_group for r in reversed(mine) if r.interleave_group), "")
+        mine = [r for r in mine if r.interleave_group in ("", newest)]
         cases = {r.case for r in mine}
         return self.having(mine, lambda e: e.run == run or (isinstance(e, CaseInfo) and e.case in cases))
 
@@ -321,7 +321,7 @@ def _lines(path: Path) -> Iterator[str]:
 
 
 def write_csv(records: Records, path: str | Path) -> None:
-    """Write one row for each record; cells of `work`, `options`, `versions`, `times` and `reached` are JSON."""
+    """Write one row for each record. Cells that hold mappings and lists (`work`, `options`, `times`, ...) are JSON."""
     rows = records.rows()
     columns = list(rows[0]) if rows else [f.name for f in fields(Record)]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from lavender.lab.bench.record import Record, level_name
+from lavender.lab.bench.record import Record, format_tolerance
 from lavender.solvers import registry
 
 COLD = "dataclasses.replace({}, guess=None)"  # removes the start that came with a problem
@@ -27,7 +27,9 @@ def make_call_arguments(what: Any, iterations: int) -> dict[str, Any]:
     `iterations` is the number that a solve took.
     """
     asked: dict[str, Any] = {"tol": what.tol}
-    given = what.turns and what.max_iter  # timed alternately with others: the number that all cases need
+    given = (
+        what.interleave_group and what.max_iter
+    )  # timed alternately with others: the number that all cases need
     if what.mode == "budget" or given or exceeds_default_budget(what.solver, iterations):
         asked["max_iter"] = what.max_iter
     if what.mode == "time":
@@ -47,11 +49,11 @@ def format_call(record: Record, guessed: bool = False) -> tuple[str, ...]:
     """
     asked = make_call_arguments(record, record.iterations)
     text = {
-        name: str(x) if name == "max_iter" else _exact(x, level_name(x) if x else "0")
+        name: str(x) if name == "max_iter" else _exact(x, format_tolerance(x) if x else "0")
         for name, x in asked.items()
     }
     words = ", ".join(f"{name}={value}" for name, value in text.items())
-    if record.way == "batch":
+    if record.timing_mode == "batch":
         cold = (f"problems = [{COLD.format('p')} for p in problems]",) if guessed else ()
         return (*cold, f'solutions = lv.solve_many(problems, "{record.solver}", {words})')
     if record.start != "carried":

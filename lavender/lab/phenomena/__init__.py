@@ -4,20 +4,20 @@ Each phenomenon is data: parameters with ranges, a truth with its derivation, qu
 poses over time, and the measure is taken of them, the same for all.
 """
 
-from lavender.lab.phenomena.engines import WAYS, Way
+from lavender.lab.phenomena.engines import ENGINE_VARIANTS, EngineVariant
 from lavender.lab.phenomena.parts import Parameter, Phenomenon, Quantity, Record, Track
-from lavender.lab.phenomena.running import PHENOMENA, chosen, run, ways
+from lavender.lab.phenomena.running import PHENOMENA, chosen, run, select_variants
 
 __all__ = [
+    "ENGINE_VARIANTS",
     "PHENOMENA",
-    "WAYS",
+    "EngineVariant",
     "Parameter",
     "Phenomenon",
     "Quantity",
     "Record",
     "Track",
-    "Way",
     "chosen",
     "run",
-    "ways",
+    "select_variants",
 ]

@@ -10,7 +10,7 @@ from lavender.base import subprocesses
 from lavender.base.arrays import number, several
 from lavender.base.errors import CapabilityError, InputError, UnknownName, check_name
 from lavender.base.subprocesses import ProcessBackend, ProcessEnded, RemoteError
-from lavender.lab.phenomena.engines import WAYS, Way, follow, make
+from lavender.lab.phenomena.engines import ENGINE_VARIANTS, EngineVariant, follow, make
 from lavender.lab.phenomena.friction import FRICTION
 from lavender.lab.phenomena.joints import JOINTS
 from lavender.lab.phenomena.parts import Phenomenon, Record, Track, judged
@@ -30,7 +30,7 @@ class EngineProcess(ProcessBackend):
         super().__init__(simulate)
         self.limit = limit
 
-    def track(self, way: Way, scene: Scene, seconds: float, interval: float) -> Track | str:
+    def track(self, variant: EngineVariant, scene: Scene, seconds: float, interval: float) -> Track | str:
         """Return the motion that the engine computes, or why there is none."""
         try:
             self.start()
@@ -38,7 +38,7 @@ class EngineProcess(ProcessBackend):
             return f"its process does not start: {error}"
         try:
             answer, (time, place, turn, speed) = self.call(
-                way.name, scene, seconds, interval, timeout=self.limit, max_bytes=MAX_TRACK_SIZE
+                variant.name, scene, seconds, interval, timeout=self.limit, max_bytes=MAX_TRACK_SIZE
             )
             k, n = len(time), len(scene.bodies)
             return Track(
@@ -64,7 +64,7 @@ class EngineProcess(ProcessBackend):
 
 def simulate(name: str, scene: Scene, seconds: float, interval: float) -> subprocesses.Answer:
     """Step a scene with the engine of that name, in the process of `EngineProcess`."""
-    engine = make(WAYS[name], scene)
+    engine = make(ENGINE_VARIANTS[name], scene)
     try:
         track = follow(engine, seconds, interval)
     finally:
@@ -87,17 +87,19 @@ def chosen(names: Sequence[str] = ()) -> list[Phenomenon]:
     return [PHENOMENA[name] for name in dict.fromkeys(names or PHENOMENA)]
 
 
-def ways(steppers: Sequence[str] | None = None, engines: Sequence[str] | None = None) -> list[Way]:
-    """Return ways by the names of steppers and engines, or of one setting of them; None selects all.
+def select_variants(
+    steppers: Sequence[str] | None = None, engines: Sequence[str] | None = None
+) -> list[EngineVariant]:
+    """Return variants by the names of steppers and engines, or of one setting of them; None selects all.
 
     Raises
     ------
     UnknownName
         There is no such stepper or engine.
     """
-    found: list[Way] = []
+    found: list[EngineVariant] = []
     for what, given, own in (("stepper", steppers, True), ("engine", engines, False)):
-        some = [w for w in WAYS.values() if (w.module == "own") == own]
+        some = [w for w in ENGINE_VARIANTS.values() if (w.module == "own") == own]
         names = {n for w in some for n in (w.name, w.name.split()[0])}
         for name in given if given is not None else ():
             if name not in names:
@@ -123,8 +125,8 @@ def run(
     names : sequence of str
         Keys of `PHENOMENA`; all of them if empty.
     steppers, engines : sequence of str, optional
-        Names in `WAYS`; None: all. If an engine is missing, crashes, cannot build the scene or does not answer, its
-        record has a note.
+        Names in `ENGINE_VARIANTS`; None: all. If an engine is missing, crashes, cannot build the scene or does not
+        answer, its record has a note.
     parameters : mapping, optional
         One case that replaces the cases of each phenomenon.
     limit : float
@@ -152,14 +154,14 @@ def run(
         for p in chosen(names)
         for case in map(p.values, p.cases if parameters is None else (parameters,))
     ]
-    chosen_ways = ways(steppers, engines)
-    if not chosen_ways:
+    variants = select_variants(steppers, engines)
+    if not variants:
         raise InputError("no stepper and no engine to measure; name one, or leave steppers to its default")
     found = []
     process = EngineProcess(limit)
     try:
-        for way in chosen_ways:
-            for record in _measure(way, plan, process, keep):
+        for variant in variants:
+            for record in _measure(variant, plan, process, keep):
                 found.append(record)
                 show(record)
     finally:
@@ -168,30 +170,32 @@ def run(
 
 
 def _measure(
-    way: Way,
+    variant: EngineVariant,
     plan: list[tuple[Phenomenon, dict[str, float]]],
     process: EngineProcess,
     keep: Callable[[Record, Track], None],
 ) -> Iterator[Record]:
-    lack = way.missing()
+    lack = variant.missing()
     for phenomenon, case in plan:
-        note = lack or next((way.cannot[x] for x in sorted(phenomenon.needs) if x in way.cannot), "")
-        found = note or _one(way, phenomenon, case, process)
+        note = lack or next((variant.cannot[x] for x in sorted(phenomenon.needs) if x in variant.cannot), "")
+        found = note or _one(variant, phenomenon, case, process)
         if isinstance(found, str):
-            yield Record(phenomenon.name, way.name, case, note=found)
+            yield Record(phenomenon.name, variant.name, case, note=found)
         else:
-            record = judged(phenomenon, way.name, case, found)
+            record = judged(phenomenon, variant.name, case, found)
             if not record.note:
                 keep(record, found)
             yield record
 
 
-def _one(way: Way, phenomenon: Phenomenon, case: dict[str, float], process: EngineProcess) -> Track | str:
+def _one(
+    variant: EngineVariant, phenomenon: Phenomenon, case: dict[str, float], process: EngineProcess
+) -> Track | str:
     seconds = phenomenon.seconds(case)
     try:
-        scene = phenomenon.scene(case, **way.scene)
-        if way.module != "own":
-            return process.track(way, scene, seconds, phenomenon.interval)
-        return follow(make(way, scene), seconds, phenomenon.interval)
+        scene = phenomenon.scene(case, **variant.scene)
+        if variant.module != "own":
+            return process.track(variant, scene, seconds, phenomenon.interval)
+        return follow(make(variant, scene), seconds, phenomenon.interval)
     except (InputError, CapabilityError) as error:  # The stepper does not support the scene.
         return str(error)

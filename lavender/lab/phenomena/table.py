@@ -1,11 +1,11 @@
-"""Records as a table: a row for each way, a column for each phenomenon, and where ours lose."""
+"""Records as a table: a row for each variant, a column for each phenomenon, and where ours lose."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 
-from lavender.lab.phenomena.engines import WAYS
+from lavender.lab.phenomena.engines import ENGINE_VARIANTS
 from lavender.lab.phenomena.parts import Phenomenon, Record
 from lavender.lab.phenomena.running import PHENOMENA
 
@@ -45,15 +45,15 @@ def table(records: Sequence[Record]) -> str:
     groups = _groups(records)
     names = [n for n in PHENOMENA if any(key[1] == n for key in groups)]
     lines = [f"| | {' | '.join(names)} |", "|---" * (len(names) + 1) + "|"]
-    for way in WAYS:
-        if any(key[0] == way for key in groups):
-            cells = [_cell(groups[way, n], PHENOMENA[n]) if (way, n) in groups else "" for n in names]
-            lines.append(f"| {way} | {' | '.join(cells)} |")
+    for variant in ENGINE_VARIANTS:
+        if any(key[0] == variant for key in groups):
+            cells = [_cell(groups[variant, n], PHENOMENA[n]) if (variant, n) in groups else "" for n in names]
+            lines.append(f"| {variant} | {' | '.join(cells)} |")
     return "\n".join(lines)
 
 
 def notes(records: Sequence[Record]) -> list[str]:
-    """Why cells are empty or cases have no values, one line for each way and reason."""
+    """Why cells are empty or cases have no values, one line for each variant and reason."""
     found: dict[tuple[str, str], list[str]] = {}
     for r in records:
         if r.note and r.phenomenon not in found.setdefault((r.engine, r.note), []):
@@ -61,12 +61,12 @@ def notes(records: Sequence[Record]) -> list[str]:
     return [f"{engine}: {', '.join(which)}: {note}" for (engine, note), which in found.items()]
 
 
-def losses(records: Sequence[Record]) -> list[str]:
-    """Cases in which a stepper of ours is out of its bound, one line for each stepper and phenomenon."""
+def out_of_bound_cases(records: Sequence[Record]) -> list[str]:
+    """Return a line for each of our steppers and phenomenon with cases out of their bounds."""
     found = []
-    for (way, name), some in _groups(records).items():
+    for (variant, name), some in _groups(records).items():
         bad = [r for r in some if not r.passed and not r.note]
-        if WAYS[way].module != "own" or not bad:
+        if ENGINE_VARIANTS[variant].module != "own" or not bad:
             continue
         phenomenon = PHENOMENA[name]
         out = [q for q in phenomenon.quantities if any(r.value(q.name) > q.bound for r in bad)]
@@ -79,8 +79,8 @@ def losses(records: Sequence[Record]) -> list[str]:
             {r.engine for r in records if r.phenomenon == name and r.case in cases}
             - {r.engine for r in records if r.phenomenon == name and r.case in cases and not r.passed}
         )
-        within = f"; within it: {', '.join(others)}" if others else "; nobody is within it"
-        found.append(f"{name}, {way}: {len(bad)} of {len(some)} cases out, {words}{within}")
+        within = f"; within it: {', '.join(others)}" if others else "; no engine is within it"
+        found.append(f"{name}, {variant}: {len(bad)} of {len(some)} cases out, {words}{within}")
     return found
 
 

@@ -2,7 +2,7 @@
 
 The judge scores them like all answers. Their time is measured inside the engine: it includes neither a copy of the
 problem nor the judge, and the engine starts from the step before.
-`engine_choice` ranks it by the rule of the solvers: cases brought to a level, then the shifted geometric mean of times.
+`engine_choice` ranks it as solvers are ranked: by cases brought to a tolerance, then by the mean time.
 """
 
 from __future__ import annotations
@@ -104,9 +104,9 @@ def list_cases_of(engine: EngineAnswers, records: Records) -> tuple[str, ...]:
 
 
 def rank_engine(
-    engines: Sequence[EngineAnswers], records: Records, cases: Sequence[str], level: float
+    engines: Sequence[EngineAnswers], records: Records, cases: Sequence[str], tolerance: float
 ) -> Choice | None:
-    """Rank the engines' own answers to these cases to a level as lines of solvers are ranked.
+    """Rank the engines' own answers to these cases to a tolerance as lines of solvers are ranked.
 
     None unless an engine answered every case.
     """
@@ -120,7 +120,7 @@ def rank_engine(
                 solvers[engine.solver] = None
     if not cases or len(answers) < len(cases):
         return None
-    times = {name: time if relative <= level else math.inf for name, (time, relative) in answers.items()}
+    times = {name: time if relative <= tolerance else math.inf for name, (time, relative) in answers.items()}
     limit = limit_of(records)
     score = geometric_mean([t if math.isfinite(t) else limit for t in times.values()], MEAN_TIME_SHIFT)
     solved = sum(map(math.isfinite, times.values()))

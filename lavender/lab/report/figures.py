@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from lavender.lab.bench import statistics
-from lavender.lab.bench.record import Record, level_name
+from lavender.lab.bench.record import Record, format_tolerance
 from lavender.lab.bench.store import Records
-from lavender.lab.report.motion_tables import convert_to_motion_errors, get_speed_levels
+from lavender.lab.report.motion_tables import convert_to_motion_errors, get_velocity_tolerances
 from lavender.lab.report.text import format_count, name_run
 
 MIN_RESIDUAL = 1e-17  # A residual of exactly zero is drawn here.
@@ -63,7 +63,7 @@ class Figure:
     curves: tuple[Curve, ...]
     x_log: bool = True
     y_log: bool = True
-    levels: tuple[float, ...] = ()
+    tolerances: tuple[float, ...] = ()
     roundoff_floor: float = math.nan
     left_out: tuple[str, ...] = ()  # solvers without a curve, so that the others can be distinguished
 
@@ -103,7 +103,7 @@ def _build_case_figure(name: str, x_title: str, records: Records, case: str, cur
     )
     return Figure(
         f"{name} {case}", case, x_title, "relative residual [-]", tuple(curves),
-        levels=statistics.levels_of(records), roundoff_floor=best[1],
+        tolerances=statistics.get_tolerances(records), roundoff_floor=best[1],
     )  # fmt: skip
 
 
@@ -121,7 +121,7 @@ def build_overall_figure(records: Records) -> Figure:
     start = "cold" if single or all(r.start == "cold" for r in records) else "carried"
     runs = [
         r for r in records
-        if (r.step < 0) == single and r.start == start and r.order == "given" and not r.turns
+        if (r.step < 0) == single and r.start == start and r.order == "given" and not r.interleave_group
     ]  # fmt: skip
     cases = sorted({r.case for r in runs})
     by: dict[str, dict[str, list[tuple[float, float]]]] = {}
@@ -150,7 +150,8 @@ def build_overall_figure(records: Records) -> Figure:
         over += "; no result: 1"
     return Figure(
         "over all", f"Error against time{over if len(cases) > 1 else ''}",
-        "time: set-up and solve [s]", "relative residual [-]", tuple(curves), levels=statistics.levels_of(records),
+        "time: set-up and solve [s]", "relative residual [-]", tuple(curves),
+        tolerances=statistics.get_tolerances(records),
     )  # fmt: skip
 
 
@@ -164,7 +165,7 @@ def build_budget_figure(records: Records, case: str) -> Figure:
 
 
 def build_pass_figure(sequence: str, passes: list[statistics.Pass]) -> Figure:
-    """Plot each step of a sequence, carried and cold (thin): the residual at one budget, or the time to one level."""
+    """Plot each step of a sequence, carried and cold (thin): its residual at a budget, or its time to a tolerance."""
     timed = passes[0].mode == "tol"
     curves = []
     for w in passes:
@@ -201,8 +202,8 @@ def build_profile_figure(profile: statistics.Profile) -> Figure:
     ]
     left_out = tuple(sorted(set(profile.curves) - set(shown)))
     return Figure(
-        f"profile {profile.law} {level_name(profile.level)}",
-        f"{profile.law}, to {level_name(profile.level)} ({format_count(profile.cases, 'case')})",
+        f"profile {profile.law} {format_tolerance(profile.tolerance)}",
+        f"{profile.law}, to {format_tolerance(profile.tolerance)} ({format_count(profile.cases, 'case')})",
         "time / fastest time", "cases solved [%]", tuple(curves), y_log=False, left_out=left_out,
     )  # fmt: skip
 
@@ -215,7 +216,7 @@ class Figures:
     """Every figure of a report that has a curve, by its place on the page."""
 
     over: Group = field(default_factory=dict)  # "all": the one over all cases
-    profiles: Group = field(default_factory=dict)  # by law, one for each level
+    profiles: Group = field(default_factory=dict)  # by law, one for each tolerance
     sequences: Group = field(default_factory=dict)
     cases: Group = field(default_factory=dict)  # error against time, residual against iterations
     moved: Figures | None = None  # the same with motion errors [m/s] in place of residuals, where known
@@ -239,7 +240,7 @@ def build_figures(records: Records) -> Figures:
     by_residual = _build_figures(records)
     return (
         replace(by_residual, moved=_relabel_for_motion(_build_figures(convert_to_motion_errors(records))))
-        if get_speed_levels(records)
+        if get_velocity_tolerances(records)
         else by_residual
     )
 
@@ -294,5 +295,5 @@ def _build_pass_figures(name: str, passes: list[statistics.Pass]) -> tuple[Figur
     # The middle budget, and the solvers that have none.
     budgets = sorted({w.max_iter for w in passes if w.mode == "budget"})
     middle = [w for w in passes if w.mode == "budget" and w.max_iter == budgets[len(budgets) // 2]]
-    levels = [w for w in passes if w.mode == "tol"]
-    return tuple(build_pass_figure(name, some) for some in (middle, levels) if some)
+    to_tolerance = [w for w in passes if w.mode == "tol"]
+    return tuple(build_pass_figure(name, some) for some in (middle, to_tolerance) if some)

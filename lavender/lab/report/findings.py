@@ -11,7 +11,7 @@ from lavender.lab.bench.recommendation import FamilyAdvice, choose_time_budgets
 from lavender.lab.bench.resampling import recommend_solvers
 from lavender.lab.bench.store import Records
 from lavender.lab.report.engine import EngineAnswers
-from lavender.lab.report.motion_tables import convert_to_motion_errors, get_speed_levels
+from lavender.lab.report.motion_tables import convert_to_motion_errors, get_velocity_tolerances
 from lavender.lab.report.text import format_count
 from lavender.lab.report.verdict import Verdict, build_verdict
 from lavender.problem.derived import cached_property
@@ -80,18 +80,18 @@ class Report:
             return ""
         return (
             f"The machine was busy: load {fmean(loads):.1f} on {format_count(run.cores, 'core')} while this was timed. "
-            "These times are void; measure again with --fresh."
+            "These times are void; measure again with --no-reuse."
         )
 
     @cached_property
-    def levels(self) -> tuple[float, ...]:
+    def tolerances(self) -> tuple[float, ...]:
         """Levels of the residual, loosest first."""
-        return statistics.levels_of(self.records)
+        return statistics.get_tolerances(self.records)
 
     @cached_property
     def speeds(self) -> tuple[float, ...]:
         """Levels of the motion error [m/s]; empty without motion errors."""
-        return get_speed_levels(self.records)
+        return get_velocity_tolerances(self.records)
 
     @cached_property
     def by_speed(self) -> Records:

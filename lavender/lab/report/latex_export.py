@@ -4,7 +4,7 @@ Figures and mean times show the time of its own interface for a solver of anothe
 
 paper/over-all.pdf          error against time over all cases: medians, and bands of the middle half
 paper/class-FOLDER.pdf      the same for each folder that the cases came from, if there are several
-paper/profile-LAW-X.pdf     performance profiles, for each problem class and level
+paper/profile-LAW-X.pdf     performance profiles, for each problem class and tolerance
 paper/sequence-....pdf      each step of a sequence
 paper/figures.tex           these figures with their captions
 paper/tables.tex            recommendations, mean times by law, claims against the judge (booktabs)
@@ -23,7 +23,7 @@ from lavender.base.deadline import seconds
 from lavender.base.errors import InputError
 from lavender.io.stored import SUFFIXES, make_folder, write_figure, write_text
 from lavender.lab.bench import statistics
-from lavender.lab.bench.record import file_name, level_name
+from lavender.lab.bench.record import file_name, format_tolerance
 from lavender.lab.bench.statistics import TIME_NOISE_FACTOR
 from lavender.lab.bench.store import Records
 from lavender.lab.report import table_specs
@@ -59,7 +59,9 @@ def write_paper(report: Report, folder: str | Path) -> Path:
     records = report.records
     if not len(records) or report.is_campaign:
         raise InputError("a paper's figures need runs with times; these records have none")
-    own = records.having(r if r.own_min is None else replace(r, time_min=r.own_min) for r in records)
+    own = records.having(
+        r if r.backend_time_min is None else replace(r, time_min=r.backend_time_min) for r in records
+    )
     drawn = build_figures(own)
     groups = (drawn.over, _build_folder_figures(own), drawn.profiles, drawn.sequences)
     some = [
@@ -139,7 +141,7 @@ def _name_file(figure: Figure) -> str:
 
 def _state_own_times(records: Records, solvers: Iterable[str]) -> str:
     """Return a sentence on the timing of solvers of other packages among these; empty if there are none."""
-    names = sorted({r.solver for r in records if r.own_min is not None}.intersection(solvers))
+    names = sorted({r.solver for r in records if r.backend_time_min is not None}.intersection(solvers))
     if not names:
         return ""
     return f" Time of its own interface, on data given before, without conversion: {', '.join(names)}."
@@ -169,10 +171,10 @@ def _write_tables(report: Report, own: Records) -> str:
     records, shift = report.records, seconds(statistics.MEAN_TIME_SHIFT)
     caption = (
         "Recommended solver, its mean time (of other packages with conversion), and the cases that it brings to the "
-        f"level where that is not all. Within {TIME_NOISE_FACTOR:g} times of each other solvers count as equal."
+        f"tolerance where that is not all. Within {TIME_NOISE_FACTOR:g} times of each other solvers count as equal."
     )
     caption += _state_lost_cases(records)
-    advice, last = table_specs.tabulate_advice(report), 1 + len(report.levels)
+    advice, last = table_specs.tabulate_advice(report), 1 + len(report.tolerances)
     rows: list[list[str | Cell]] = [
         [
             str(row[0]),
@@ -182,16 +184,16 @@ def _write_tables(report: Report, own: Records) -> str:
         for row, line in zip(advice.rows, report.lines, strict=True)
     ]
     parts = [format_latex(Table(["structure", "cases", *advice.heads[1:last]], rows), caption, "recommended")]
-    for law, by_level in statistics.geometric_means(own).items():
-        solvers = set(next(iter(by_level.values())))
+    for law, by_tolerance in statistics.geometric_means(own).items():
+        solvers = set(next(iter(by_tolerance.values())))
         rest = sorted({r.solver for r in own if r.step < 0 and own.cases[r.case].law == law} - solvers)
         others = f" (not {', '.join(rest)})" if rest else ""
         caption = (
-            f"Law {law}: geometric mean of times with {shift} added, and cases brought to the level; a miss costs "
+            f"Law {law}: geometric mean of times with {shift} added, and cases brought to the tolerance; a miss costs "
             f"{seconds(statistics.limit_of(records))}. Solvers that take every case{others}."
         )
         caption += _state_own_times(own, solvers) + _state_lost_cases(records)
-        parts.append(format_latex(table_specs.tabulate_means(by_level), caption, f"means-{law}"))
+        parts.append(format_latex(table_specs.tabulate_means(by_tolerance), caption, f"means-{law}"))
     caption = "Claims of solvers against the judge, who recomputes every residual from the problem's data."
     caption += _state_lost_cases(records)
     parts.append(format_latex(table_specs.tabulate_claims(records), caption, "claims"))
@@ -211,7 +213,7 @@ def _describe_method(report: Report) -> str:
         for law in sorted({i.law for i in infos})
     ]
     repeats = sorted({r.repeats for r in own if r.usable})
-    levels = ", ".join(map(level_name, statistics.levels_of(records)))
+    tolerances = ", ".join(map(format_tolerance, statistics.get_tolerances(records)))
     budgets = sorted({r.max_iter for r in own if r.mode == "budget"})
     swept = f" and with exact budgets of {', '.join(map(str, budgets))} iterations" if budgets else ""
     versions = ", ".join(f"{name} {version}" for name, version in run.versions.items())
@@ -224,7 +226,7 @@ def _describe_method(report: Report) -> str:
     own_times = _state_own_times(records, {r.solver for r in own})
     parts = (
         f"We ran {solvers} on {problems}{lost} ({', '.join(laws)}; {rows[0]} to {rows[-1]} rows),",
-        f"{runs} in all, to relative residuals of {levels}{swept}. The residual of an impulse is",
+        f"{runs} in all, to relative residuals of {tolerances}{swept}. The residual of an impulse is",
         "computed from the problem's data, whatever the solver reports: the larger of its errors in energy norm and",
         "in velocity, each over that of doing nothing, so that 1 is doing nothing and 0 a solution. Times are those",
         f"of set-up and solve, {least}, within a limit of {limit}; BLAS and OpenMP had {threads}.",

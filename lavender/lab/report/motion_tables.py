@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
-from lavender.lab.bench.record import level_name
+from lavender.lab.bench.record import format_tolerance
 from lavender.lab.bench.store import Records
 
-DEFAULT_SPEED_LEVELS = (1e-2, 1e-3)  # m/s, if the plan has none
+DEFAULT_VELOCITY_TOLERANCES = (1e-2, 1e-3)  # m/s, if the plan has none
 
 
 @dataclass(frozen=True)
@@ -22,33 +22,33 @@ class IdleCase:
     energy: float  # sqrt J
 
 
-def format_speed(level: float) -> str:
+def format_speed(tolerance: float) -> str:
     """Return a speed in words: 1e-3 m/s."""
-    return f"{level_name(level)} m/s"
+    return f"{format_tolerance(tolerance)} m/s"
 
 
-def get_speed_levels(records: Records) -> tuple[float, ...]:
-    """Return the speed levels [m/s] of the newest run's plan, or the default ones; empty without motion errors."""
+def get_velocity_tolerances(records: Records) -> tuple[float, ...]:
+    """Return the velocity tolerances [m/s] of the newest run's plan, or the defaults; empty without motion errors."""
     if all(r.motion_speed is None for r in records):
         return ()
     for run in reversed(list(records.runs.values())):
-        if run.plan.get("speed_levels"):
-            return tuple(sorted(map(float, run.plan["speed_levels"]), reverse=True))
-    return DEFAULT_SPEED_LEVELS
+        if run.plan.get("velocity_tolerances"):
+            return tuple(sorted(map(float, run.plan["velocity_tolerances"]), reverse=True))
+    return DEFAULT_VELOCITY_TOLERANCES
 
 
 def convert_to_motion_errors(records: Records) -> Records:
     """Return the records with the motion error [m/s] as residual, inf for runs without one; empty if all have none."""
-    levels = get_speed_levels(records)
-    if not levels:
+    tolerances = get_velocity_tolerances(records)
+    if not tolerances:
         return Records()
     converted = records.having(
         replace(r, relative=math.inf if r.motion_speed is None else r.motion_speed, roundoff_floor=0.0)
         for r in records
-        if not r.turns
+        if not r.interleave_group
     )
     for run in records.runs.values():
-        converted.add(replace(run, plan={**run.plan, "levels": levels}))
+        converted.add(replace(run, plan={**run.plan, "tolerances": tolerances}))
     return converted
 
 

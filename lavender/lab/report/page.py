@@ -9,7 +9,7 @@ from typing import Any
 
 from lavender.base.deadline import seconds
 from lavender.lab.bench import recommendation, statistics
-from lavender.lab.bench.record import file_name, level_name
+from lavender.lab.bench.record import file_name, format_tolerance
 from lavender.lab.bench.statistics import RESIDUAL_NOISE_FACTOR, TIME_NOISE_FACTOR
 from lavender.lab.bench.store import Records
 from lavender.lab.report import table_specs
@@ -41,7 +41,9 @@ def create_environment() -> Any:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters.update(seconds=seconds, residual=format_residual, level=level_name, anchor=file_name)
+    environment.filters.update(
+        seconds=seconds, residual=format_residual, tolerance=format_tolerance, anchor=file_name
+    )
     environment.globals.update(
         table_specs=table_specs,
         statistics=statistics,
@@ -65,8 +67,9 @@ def render_page(report: Report, figures: Figures, saved: bool = True) -> str:
     """
     records = report.records
     return create_environment().get_template("index.html.j2").render(
-        report=report, records=records, verdict=report.verdict, levels=report.levels, saved=saved,
-        level=report.levels[len(report.levels) // 2], links=_list_links(report.lines), left_out=list_left_out(records),
+        report=report, records=records, verdict=report.verdict, tolerances=report.tolerances, saved=saved,
+        tolerance=report.tolerances[len(report.tolerances) // 2],
+        links=_list_links(report.lines), left_out=list_left_out(records),
         diagnostics=list_diagnostics(records), **_render_drawings(records, figures, report.verdict),
         **_describe_cases(report),
     )  # fmt: skip
@@ -102,21 +105,24 @@ def _list_keys(figures: Figures) -> dict[str, dict[str, list[str]]]:
 
 def _describe_cases(report: Report) -> dict[str, Any]:
     """Return the tables of each case; none for a campaign, which has thousands of cases."""
-    records, levels = report.records, report.levels
+    records, tolerances = report.records, report.tolerances
     by_case: dict[str, list[statistics.Reach]] = {}
     if not report.is_campaign:
-        for reach in statistics.reaches(records, levels):
+        for reach in statistics.reaches(records, tolerances):
             by_case.setdefault(reach.case, []).append(reach)
-    level = levels[len(levels) // 2]
-    fastest = {name: _select_fastest(rows, level) for name, rows in by_case.items()}
+    tolerance = tolerances[len(tolerances) // 2]
+    fastest = {name: _select_fastest(rows, tolerance) for name, rows in by_case.items()}
     stored = any(math.isfinite(x.stored) for x in records.cases.values())
     cases = [
-        {"info": records.cases[name], "reaches": table_specs.tabulate_reaches(rows, levels).without("case")}
+        {
+            "info": records.cases[name],
+            "reaches": table_specs.tabulate_reaches(rows, tolerances).without("case"),
+        }
         for name, rows in by_case.items()
     ]
     return {
         "cases": cases,
-        "case_list": table_specs.tabulate_cases(records, fastest, level, stored),
+        "case_list": table_specs.tabulate_cases(records, fastest, tolerance, stored),
         "difficulty": table_specs.tabulate_difficulties(statistics.difficulties(records) if cases else []),
     }
 
@@ -127,9 +133,9 @@ def _list_links(lines: Sequence[recommendation.FamilyAdvice]) -> dict[str, str]:
     return {name: f"{part}-{file_name(name)}" for name, part in parts.items()}
 
 
-def _select_fastest(rows: Sequence[statistics.Reach], level: float) -> statistics.Reach | None:
-    """Return the fastest solver to the level from a cold start, without a false claim."""
+def _select_fastest(rows: Sequence[statistics.Reach], tolerance: float) -> statistics.Reach | None:
+    """Return the fastest solver to the tolerance from a cold start, without a false claim."""
     candidates = [
-        r for r in rows if r.start == "cold" and not r.status_conflict and math.isfinite(r.times[level])
+        r for r in rows if r.start == "cold" and not r.status_conflict and math.isfinite(r.times[tolerance])
     ]
-    return min(candidates, key=lambda r: r.times[level], default=None)
+    return min(candidates, key=lambda r: r.times[tolerance], default=None)

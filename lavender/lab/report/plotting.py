@@ -22,7 +22,7 @@ from typing import Any
 from xml.etree import ElementTree
 
 from lavender.io.stored import make_folder, write_figure
-from lavender.lab.bench.record import file_name, level_name
+from lavender.lab.bench.record import file_name, format_tolerance
 from lavender.lab.report.figures import Curve, Figure
 
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#8C6D31", "#7F7F7F")
@@ -74,7 +74,7 @@ def label_axis(
     smallest = 9e-4 if is_time else 0.09  # smaller numbers of a logarithmic axis are written as powers of ten
 
     def write(value: float) -> str:
-        return f"{value:.6g}" if not log or smallest < value < 1e4 else level_name(value)
+        return f"{value:.6g}" if not log or smallest < value < 1e4 else format_tolerance(value)
 
     return title.replace("[s]", f"[{unit}]"), [write(tick / scale) for tick in ticks]
 
@@ -91,7 +91,7 @@ def _select_points(curve: Curve, figure: Figure) -> list[tuple[float, float]]:
 
 
 def _draw(axes: Any, figure: Figure) -> list[tuple[Curve, list[tuple[float, float]], Any, Any]]:
-    """Draw curves, levels, floor and axes of a figure without colours.
+    """Draw curves, tolerances, floor and axes of a figure without colours.
 
     Returns each curve that has a point with its points, its line and its band (None without one).
     """
@@ -121,10 +121,10 @@ def _draw(axes: Any, figure: Figure) -> list[tuple[Curve, list[tuple[float, floa
         band = axes.fill_between(c.x, c.low, c.high) if c.low else None
         artists.append((c, points, line, band))
     axes.set(xlim=x_limits, ylim=y_limits)
-    levels = [level for level in figure.levels if y_limits[0] <= level <= y_limits[1]]
+    tolerances = [tolerance for tolerance in figure.tolerances if y_limits[0] <= tolerance <= y_limits[1]]
     has_floor = figure.roundoff_floor > 0.0 and y_limits[0] <= figure.roundoff_floor <= y_limits[1]
-    for level in levels:
-        axes.axhline(level, color="0.8", linewidth=0.6, zorder=0, gid="@ l")
+    for tolerance in tolerances:
+        axes.axhline(tolerance, color="0.8", linewidth=0.6, zorder=0, gid="@ l")
     if has_floor:
         style: dict[str, Any] = {"color": "0.35", "linewidth": 1.0, "linestyle": (0, (1, 1))}
         axes.axhline(figure.roundoff_floor, label="floor of float64", zorder=0, gid="@ f", **style)

@@ -15,7 +15,7 @@ from lavender.judge.residuals import UNCONVERGED
 from lavender.judge.solution import CONFIRMED, CONTRADICTED, NOT_PROVEN
 from lavender.lab.bench import recommendation, resampling, statistics
 from lavender.lab.bench.recommendation import Advice, Choice, FamilyAdvice
-from lavender.lab.bench.record import Record, Skip, file_name, level_name, printable
+from lavender.lab.bench.record import Record, Skip, file_name, format_tolerance, printable
 from lavender.lab.bench.store import Records
 from lavender.lab.report.engine import INSIDE, list_cases_of, rank_engine, ranks_before
 from lavender.lab.report.findings import Report
@@ -41,7 +41,10 @@ DIFFICULTY = (
     "boundary of two states, among those whose error has a bound; "
     "solvers with the same bits and no iteration, whose times are of one shortcut"
 )
-IN_TURNS, ALONE = "in turns", "alone"  # lines of a recommendation, timed again; runs one after the other
+INTERLEAVED, ALONE = (
+    "interleaved",
+    "alone",
+)  # lines of a recommendation, timed again; runs one after the other
 ENGINES_OWN = "engine's own"  # column of the solver of the engine that recorded the cases
 NOT_COMPARED = "no case has the same numbers in both (steps of sequences are not compared)"
 
@@ -59,26 +62,26 @@ class Section:
 
 def list_sections(report: Report) -> list[Section]:
     """List the tables of a report with their headings, from the recommendations to changes since an earlier report."""
-    records, levels = report.records, report.levels
+    records, tolerances = report.records, report.tolerances
     moved = "how wrong the body moves that is furthest off"
     if report.is_campaign:
-        shares = tabulate_robustness(statistics.robustness(records), levels)
+        shares = tabulate_robustness(statistics.robustness(records), tolerances)
         by_speed = tabulate_robustness(statistics.robustness(report.by_speed), report.speeds, " m/s")
-        note = "no times; share of cases brought to a level, residual at each budget"
+        note = "no times; share of cases brought to a tolerance, residual at each budget"
         sections = [
             Section("Campaign", note, shares, grouped=True),
             Section("By motion error", moved, by_speed, grouped=True),
         ]
     else:
         timed = (
-            f"{IN_TURNS} to {level_name(levels[len(levels) // 2])}, else {ALONE}"
-            if has_turns(report)
+            f"{INTERLEAVED} to {format_tolerance(tolerances[len(tolerances) // 2])}, else {ALONE}"
+            if has_interleaved_calls(report)
             else ALONE
         )
         by_structure = (
-            f"to a level: mean time, {timed} (cold, if not carried), share of cases that get there, budget; in a time "
-            "or with sweeps: share of cases served, nine of ten at least, residual at the 90th percentile; ≈ as good "
-            "within noise"
+            f"to a tolerance: mean time, {timed} (cold, if not carried), share of cases that get there, budget; "
+            "in a time or with sweeps: share of cases served, nine of ten at least, residual at the 90th percentile; "
+            "≈ as good within noise"
         )
         by_sweeps = "share of cases served, residual at the 90th percentile"
         inside = (
@@ -87,7 +90,7 @@ def list_sections(report: Report) -> list[Section]:
         )
         every = "floor: rounding to float64 allows no better"
         carried = "median residual, time of all steps; carried from step to step, or cold"
-        cases = tabulate_reaches(statistics.reaches(records, levels), levels).without("form")
+        cases = tabulate_reaches(statistics.reaches(records, tolerances), tolerances).without("form")
         sections = [
             Section("By structure", by_structure, tabulate_advice(report)),
             Section("By sweeps", by_sweeps, tabulate_sweeps(report.lines)),
@@ -102,27 +105,29 @@ def list_sections(report: Report) -> list[Section]:
         changed = tabulate_changes(report.earlier_run, records)
         title = f"Against {printable(report.earlier_run.source)}"
         empty = "nothing beyond noise" if statistics.changes(report.earlier_run, records) else NOT_COMPARED
-        sections.append(Section(title, "times to a level", changed, empty=empty))
+        sections.append(Section(title, "times to a tolerance", changed, empty=empty))
     return [s for s in sections if s.table.rows or s.empty]
 
 
 def build_short_table(report: Report) -> Table:
-    """Build the table of a short report, to the middle level alone.
+    """Build the table of a short report, to the middle tolerance alone.
 
     Its rows are structures with the first solver of each, or the solvers of the only structure; for a campaign shares
     of cases.
     """
-    middle = len(report.levels) // 2
+    middle = len(report.tolerances) // 2
     if report.is_campaign:
-        table = tabulate_robustness(statistics.robustness(report.records), report.levels[middle : middle + 1])
+        table = tabulate_robustness(
+            statistics.robustness(report.records), report.tolerances[middle : middle + 1]
+        )
         return table.without(*(head for head in table.heads if "iterations" in head), "hardest")
-    by_motion = any(run.plan.get("speed_levels") for run in report.newest.runs.values())
+    by_motion = any(run.plan.get("velocity_tolerances") for run in report.newest.runs.values())
     if len(report.lines) == 1 and not by_motion:
-        return _tabulate_solvers(report, report.levels[middle])
+        return _tabulate_solvers(report, report.tolerances[middle])
     table = tabulate_speeds(report) if by_motion else tabulate_advice(report)
     column = 1 + (len(report.speeds) // 2 if by_motion else middle)
     rows: Rows = [[str(row[0]), replace(row[column], after="")] for row in table.rows]  # type: ignore[type-var]
-    head = f"{table.heads[column]}, timed {IN_TURNS if has_turns(report) and not by_motion else ALONE}"
+    head = f"{table.heads[column]}, timed {INTERLEAVED if has_interleaved_calls(report) and not by_motion else ALONE}"
     heads = ["structure", head]
     if ENGINES_OWN in table.heads:
         heads.append(ENGINES_OWN)
@@ -130,32 +135,32 @@ def build_short_table(report: Report) -> Table:
     return Table(heads, rows, words=WORDS | set(heads))
 
 
-def has_turns(report: Report) -> bool:
-    """Return whether calls of the recommendation were timed in turns."""
-    return any(r.turns for r in report.records)
+def has_interleaved_calls(report: Report) -> bool:
+    """Return whether calls of the recommendation were timed alternately."""
+    return any(r.interleave_group for r in report.records)
 
 
-def _tabulate_solvers(report: Report, level: float) -> Table:
-    """Tabulate the solvers of the only structure to a level: first those of the first sentence, with its times."""
+def _tabulate_solvers(report: Report, tolerance: float) -> Table:
+    """Tabulate the solvers of the only structure to a tolerance: first those of the first sentence, with its times."""
     raced = {choice.solver: (final.line, choice) for final, choice in report.verdict.ranking if choice.solved}
-    alone = [c for c in report.lines[0].by_level[level].ranking if c.solved and c.solver not in raced]
+    alone = [c for c in report.lines[0].by_tolerance[tolerance].ranking if c.solved and c.solver not in raced]
     rows: Rows = [
         [
             c.solver,
             seconds(c.score) + format_share(c.solved, c.cases),
             f"{line.asked}, {line.start}",
-            IN_TURNS if line.turns else ALONE,
+            INTERLEAVED if line.interleave_group else ALONE,
         ]
         for line, c in raced.values()
     ]
     rows += [[c.solver, seconds(c.score) + format_share(c.solved, c.cases), c.how, ALONE] for c in alone]
-    engine = rank_engine(report.engines, report.records, report.lines[0].cases, level)
+    engine = rank_engine(report.engines, report.records, report.lines[0].cases, tolerance)
     if engine is not None and engine.solved:
         ranked = [*(choice for _, choice in raced.values()), *alone]
         before = sum(not ranks_before(engine, choice) for choice in ranked)
         time = seconds(engine.score) + format_share(engine.solved, engine.cases)
         rows.insert(before, [f"engine's {engine.solver}", time, "own, warm", "inside the engine"])
-    return Table(["solver", f"to {level_name(level)}", "asked", "timed"], rows)
+    return Table(["solver", f"to {format_tolerance(tolerance)}", "asked", "timed"], rows)
 
 
 # -- recommendations ---------------------------------------------------------------------------------------
@@ -185,13 +190,16 @@ def format_advice(advice: Advice, in_time: bool) -> Cell:
 
 
 def tabulate_advice(report: Report, links: Mapping[str, str] | None = None) -> Table:
-    """Tabulate the first solver to each level and within each time [s], for each structure and sequence.
+    """Tabulate the first solver to each tolerance and within each time [s], for each structure and sequence.
 
     `links` are the parts of the page that a name leads to.
     """
-    heads = [*(f"to {level_name(x)}" for x in report.levels), *(f"in {seconds(t)}" for t in report.times)]
-    level = report.levels[len(report.levels) // 2]
-    engines = [rank_engine(report.engines, report.records, line.cases, level) for line in report.lines]
+    heads = [
+        *(f"to {format_tolerance(x)}" for x in report.tolerances),
+        *(f"in {seconds(t)}" for t in report.times),
+    ]
+    tolerance = report.tolerances[len(report.tolerances) // 2]
+    engines = [rank_engine(report.engines, report.records, line.cases, tolerance) for line in report.lines]
     rows: Rows = [
         [
             Cell(
@@ -200,9 +208,9 @@ def tabulate_advice(report: Report, links: Mapping[str, str] | None = None) -> T
                 more=format_count(line.size, "step" if line.sequence else "case"),
                 link=(links or {}).get(line.name, ""),
             ),
-            *(format_advice(a, False) for a in line.by_level.values()),
+            *(format_advice(a, False) for a in line.by_tolerance.values()),
             *(format_advice(a, True) for a in line.by_time.values()),
-            _format_engine(engine, level),
+            _format_engine(engine, tolerance),
         ]
         for line, engine in zip(report.lines, engines, strict=True)
     ]
@@ -210,12 +218,12 @@ def tabulate_advice(report: Report, links: Mapping[str, str] | None = None) -> T
     return table if any(engines) else table.without(ENGINES_OWN)
 
 
-def _format_engine(engine: Choice | None, level: float) -> Cell:
-    """Return the engine's own solver to the level of the first sentence."""
+def _format_engine(engine: Choice | None, tolerance: float) -> Cell:
+    """Return the engine's own solver to the tolerance of the first sentence."""
     if engine is None or not engine.solved:
-        return Cell(NONE if engine is None else f"nothing to {level_name(level)}")
+        return Cell(NONE if engine is None else f"nothing to {format_tolerance(tolerance)}")
     text = seconds(engine.score) + format_share(engine.solved, engine.cases)
-    return Cell(text, engine.solver, f", to {level_name(level)}", title=INSIDE)
+    return Cell(text, engine.solver, f", to {format_tolerance(tolerance)}", title=INSIDE)
 
 
 def tabulate_sweeps(lines: Sequence[FamilyAdvice]) -> Table:
@@ -237,7 +245,7 @@ def tabulate_speeds(report: Report) -> Table:
     """Tabulate the first solver to each motion error [m/s], for each structure."""
     heads = [f"to {format_speed(x)}" for x in report.speeds]
     rows: Rows = [
-        [line.name, *(format_advice(a, False) for a in line.by_level.values())]
+        [line.name, *(format_advice(a, False) for a in line.by_tolerance.values())]
         for line in recommendation.recommend_from_single_runs(report.by_speed)
         if not line.sequence
     ]
@@ -248,13 +256,13 @@ def tabulate_speeds(report: Report) -> Table:
 
 
 def tabulate_cases(
-    records: Records, fastest: Mapping[str, statistics.Reach | None], level: float, stored: bool
+    records: Records, fastest: Mapping[str, statistics.Reach | None], tolerance: float, stored: bool
 ) -> Table:
-    """Tabulate each case with its size, the first solver to the level, and the residual of its stored answer."""
+    """Tabulate each case with its size, the first solver to the tolerance, and the residual of its stored answer."""
     rows: Rows = []
     for name, best in fastest.items():
         info = records.cases[name]
-        time = math.inf if best is None else best.times[level]
+        time = math.inf if best is None else best.times[tolerance]
         answer = format_residual(info.stored) if math.isfinite(info.stored) else NONE
         rows.append(
             [
@@ -263,19 +271,19 @@ def tabulate_cases(
                 Cell(answer, value=info.stored),
             ]
         )  # fmt: skip
-    head = f"fastest to {level_name(level)}"
+    head = f"fastest to {format_tolerance(tolerance)}"
     heads = ["case", "law", "rows", "contacts", "structure", head, "time", "stored answer"]
     table = Table(heads, rows, words=WORDS | {head})
     return table if stored else table.without("stored answer")
 
 
-def tabulate_reaches(reaches: Sequence[statistics.Reach], levels: Sequence[float]) -> Table:
-    """Tabulate time to each level, smallest residual, status and claim of each case and solver."""
+def tabulate_reaches(reaches: Sequence[statistics.Reach], tolerances: Sequence[float]) -> Table:
+    """Tabulate time to each tolerance, smallest residual, status and claim of each case and solver."""
     rows: Rows = [
         [
             r.case,
             name_run(r.solver, r.start),
-            *(seconds(r.times[x]) for x in levels),
+            *(seconds(r.times[x]) for x in tolerances),
             Cell(format_residual(r.best), after=" floor" if r.at_floor else ""),
             Cell(r.status, mark="good" if r.status in GOOD else "warn"),
             Cell(CLAIM_MARKS[r.claim_check], more=r.status_conflict),
@@ -284,7 +292,15 @@ def tabulate_reaches(reaches: Sequence[statistics.Reach], levels: Sequence[float
         for r in reaches
     ]
     marks = ["bad" if r.status_conflict else "" for r in reaches]
-    heads = ["case", "solver", *(f"to {level_name(x)}" for x in levels), "best", "status", "claim", "form"]
+    heads = [
+        "case",
+        "solver",
+        *(f"to {format_tolerance(x)}" for x in tolerances),
+        "best",
+        "status",
+        "claim",
+        "form",
+    ]
     return Table(heads, rows, marks)
 
 
@@ -296,7 +312,7 @@ def tabulate_difficulties(difficulties: Sequence[statistics.Difficulty]) -> Tabl
             str(d.rows),
             NONE if d.sweeps is None else str(d.sweeps),
             NONE if d.condition is None else f"{d.condition:.1e}",
-            NONE if d.degenerate is None else format_percent(round(1e6 * d.degenerate), 10**6),
+            NONE if d.boundary_fraction is None else format_percent(round(1e6 * d.boundary_fraction), 10**6),
             ", ".join(d.same),
             d.proof,
         ]
@@ -308,15 +324,15 @@ def tabulate_difficulties(difficulties: Sequence[statistics.Difficulty]) -> Tabl
 
 def tabulate_motion_errors(report: Report) -> Table:
     """Tabulate time to each motion error, the smallest, relative, and its bound, of each case and solver."""
-    levels = report.speeds
+    tolerances = report.speeds
     rows: Rows = []
-    for m in statistics.reaches(report.by_speed, levels):
+    for m in statistics.reaches(report.by_speed, tolerances):
         known = [
             f"{format_residual(x)}{unit}" if math.isfinite(x) else NONE
-            for x, unit in ((m.best, " m/s"), (m.motion, ""), (m.bound, " √J"))
+            for x, unit in ((m.best, " m/s"), (m.motion_error, ""), (m.bound, " √J"))
         ]
-        rows.append([m.case, name_run(m.solver, m.start), *(seconds(m.times[x]) for x in levels), *known])
-    heads = [f"to {format_speed(x)}" for x in levels]
+        rows.append([m.case, name_run(m.solver, m.start), *(seconds(m.times[x]) for x in tolerances), *known])
+    heads = [f"to {format_speed(x)}" for x in tolerances]
     return Table(["case", "solver", *heads, "best", "relative", "bound"], rows)
 
 
@@ -336,7 +352,7 @@ def tabulate_idle_cases(records: Records) -> Table:
 
 
 def tabulate_failures(failures: Sequence[Record], campaign: bool) -> Table:
-    """Tabulate runs that missed their level or made a false claim. Cases of a campaign have no section to link to."""
+    """Tabulate runs that missed their tolerance or made a false claim. Cases of a campaign are not linked."""
     rows: Rows = [
         [
             Cell(f.case, link="" if campaign else f"case-{file_name(f.case)}"), name_run(f.solver, f.start), f.asked,
@@ -347,7 +363,7 @@ def tabulate_failures(failures: Sequence[Record], campaign: bool) -> Table:
     ]  # fmt: skip
     marks = ["bad" if f.status_conflict else "" for f in failures]
     return Table(
-        ["case", "solver", "asked", "status", "residual", "roundoff_floor", "worst row", "message"],
+        ["case", "solver", "asked", "status", "residual", "floor", "worst row", "message"],
         rows,
         marks,
     )
@@ -359,31 +375,34 @@ def tabulate_skips(skips: Sequence[Skip]) -> Table:
 
 
 def tabulate_changes(old: Records, new: Records) -> Table:
-    """Tabulate times to a level that differ from an earlier run beyond noise."""
+    """Tabulate times to a tolerance that differ from an earlier run beyond noise."""
     changes = [c for c in statistics.changes(old, new) if c.kind != "same"]
     rows: Rows = []
     for c in changes:
         factor = f" {c.new / c.old:.3g} times" if c.kind in ("faster", "slower") else ""
-        times_of = (level_name(c.level), seconds(c.old), seconds(c.new))
+        times_of = (format_tolerance(c.tolerance), seconds(c.old), seconds(c.new))
         rows.append([c.case, name_run(c.solver, c.start), *times_of, c.kind + factor])
     marks = ["bad" if c.kind in ("lost", "slower") else "good" for c in changes]
-    return Table(["case", "solver", "level", "before", "now", "change"], rows, marks)
+    return Table(["case", "solver", "tolerance", "before", "now", "change"], rows, marks)
 
 
 # -- over many cases ---------------------------------------------------------------------------------------
 
 
 def tabulate_robustness(
-    rows: Sequence[statistics.Robustness], levels: Sequence[float], unit: str = ""
+    rows: Sequence[statistics.Robustness], tolerances: Sequence[float], unit: str = ""
 ) -> Table:
-    """Tabulate shares of cases brought to each level, false claims, and residual (or motion error) by budget."""
+    """Tabulate shares of cases brought to each tolerance, false claims, and residual (or motion error) by budget."""
     budgets = sorted({n for row in rows for n in row.budgets})
     cells = [
         {
             "structure": r.family,
             "solver": r.solver,
             "cases": str(r.cases),
-            **{f"to {level_name(x)}{unit}": format_percent(r.reached[x], r.cases, 1) for x in levels},
+            **{
+                f"to {format_tolerance(x)}{unit}": format_percent(r.reached[x], r.cases, 1)
+                for x in tolerances
+            },
             "false claims": str(r.wrong),
             "died": str(r.died),
             **{
@@ -410,26 +429,36 @@ def tabulate_claims(records: Records) -> Table:
         for c in claims
     ]  # fmt: skip
     marks = ["bad" if c.wrong or c.crashed else "" for c in claims]
-    return Table(["solver", "runs", "correct rate", "claims", "wrong", "levels reached", "died"], rows, marks)
+    return Table(
+        ["solver", "runs", "correct rate", "claims", "wrong", "tolerances reached", "died"], rows, marks
+    )
 
 
-def tabulate_means(by_level: Mapping[float, Mapping[str, tuple[float, int, int]]]) -> Table:
-    """Tabulate `statistics.geometric_means` of one law: mean time to each level, and number of cases that reach it."""
-    levels = list(by_level)
+def tabulate_means(by_tolerance: Mapping[float, Mapping[str, tuple[float, int, int]]]) -> Table:
+    """Tabulate `statistics.geometric_means` of one law: mean time to each tolerance, and cases that reach it."""
+    tolerances = list(by_tolerance)
     rows: Rows = [
         [
             solver,
-            *(Cell(seconds(t), after=f" {n}/{of}") for t, n, of in (by_level[x][solver] for x in levels)),
+            *(
+                Cell(seconds(t), after=f" {n}/{of}")
+                for t, n, of in (by_tolerance[x][solver] for x in tolerances)
+            ),
         ]
-        for solver in by_level[levels[0]]
+        for solver in by_tolerance[tolerances[0]]
     ]
-    return Table(["solver", *(f"to {level_name(x)}" for x in levels)], rows)
+    return Table(["solver", *(f"to {format_tolerance(x)}" for x in tolerances)], rows)
 
 
 def tabulate_backends(records: Records) -> Table:
     """Tabulate total time, its two parts, and wins against the built-in solvers, of solvers of other packages."""
     rows: Rows = [
-        [b.solver, str(b.solved), *map(seconds, (b.whole, b.whole - b.own, b.own)), str(b.wins)]
+        [
+            b.solver,
+            str(b.solved),
+            *map(seconds, (b.whole, b.whole - b.backend_time, b.backend_time)),
+            str(b.wins),
+        ]
         for b in statistics.backends(records)
     ]
     return Table(["solver", "cases", "whole way", "conversion", "own interface", "less than ours"], rows)
@@ -466,13 +495,13 @@ def tabulate_passes(passes: Sequence[statistics.Pass]) -> Table:
 
 
 def tabulate_engines(report: Report) -> Table:
-    """Tabulate engines' own answers, and the first solver here on the same cases, to the middle level."""
-    records, level = report.records, report.levels[len(report.levels) // 2]
+    """Tabulate engines' own answers, and the first solver here on the same cases, to the middle tolerance."""
+    records, tolerance = report.records, report.tolerances[len(report.tolerances) // 2]
     rows = []
     for c in report.engines:
         cases = list_cases_of(c, records)
-        engine = rank_engine([c], records, cases, level)
-        first = _recommend_here(records, cases, level)
+        engine = rank_engine([c], records, cases, tolerance)
+        first = _recommend_here(records, cases, tolerance)
         far = c.unconverged and c.where
         rows.append(
             {
@@ -480,26 +509,28 @@ def tabulate_engines(report: Report) -> Table:
                 "steps": f"{c.steps}{format_left_out(c.left_out)}",
                 "rows": f"{c.rows:g}",
                 "engine's own": f"{c.solver} (inside the engine)",
-                f"to {level_name(level)}": _format_time(engine),
+                f"to {format_tolerance(tolerance)}": _format_time(engine),
                 "residual, median": format_residual(c.relative),
                 "worst": format_residual(c.worst),
                 "above floor": str(c.above_floor),
                 UNCONVERGED: str(c.unconverged),
                 "furthest off": f"{c.velocity:.2g} m/s, {c.where}" if far else NONE,
                 "first here": NONE if first is None else first.solver,
-                f"to {level_name(level)}, here": _format_time(first),
+                f"to {format_tolerance(tolerance)}, here": _format_time(first),
             }
         )
     return Table.of(rows)
 
 
-def _recommend_here(records: Records, cases: Sequence[str], level: float) -> Choice | None:
+def _recommend_here(records: Records, cases: Sequence[str], tolerance: float) -> Choice | None:
     """Return the solver that is recommended for the cases of a folder, by the rule of the first sentence."""
     if not cases:
         return None
-    way = "steps" if records.cases[cases[0]].sequence else "call"
-    alone = recommendation.rank_to_level(records, "", cases, level)
-    best = resampling.recommend_for_cases(records, alone, resampling.select_calls(records, way), cases).best
+    timing_mode = "steps" if records.cases[cases[0]].sequence else "call"
+    alone = recommendation.rank_to_tolerance(records, "", cases, tolerance)
+    best = resampling.recommend_for_cases(
+        records, alone, resampling.select_calls(records, timing_mode), cases
+    ).best
     return best if best is not None and best.solved else None
 
 

@@ -68,7 +68,7 @@ def print_table(console: Console, table: Table, grouped: bool = False, cut: bool
 
 
 def print_report(report: Report, console: Console, complete: bool = False) -> None:
-    """Print the recommendation, a table to the middle level, and notes.
+    """Print the recommendation, a table to the middle tolerance, and notes.
 
     A short report has at most `MAX_LINES` lines, none wider than the terminal. `complete` prints every sentence, table
     and warning.

@@ -17,20 +17,20 @@ from lavender.lab.bench.recommendation import (
     Subject,
     list_subjects,
 )
-from lavender.lab.bench.record import Record, level_name
+from lavender.lab.bench.record import Record, format_tolerance
 from lavender.lab.bench.resampling import (
     STARTS,
     ResampledRanking,
     TimedCall,
     compute_serving_time,
     rank_calls_in_time,
-    rank_calls_to_level,
+    rank_calls_to_tolerance,
     select_calls,
 )
 from lavender.lab.bench.statistics import STRUCTURE_ORDER
 from lavender.lab.bench.store import Records
 from lavender.lab.report.engine import INSIDE, EngineAnswers, rank_engine, ranks_before
-from lavender.lab.report.motion_tables import convert_to_motion_errors, format_speed, get_speed_levels
+from lavender.lab.report.motion_tables import convert_to_motion_errors, format_speed, get_velocity_tolerances
 from lavender.lab.report.text import format_count, format_left_out, format_ratio, format_residual
 from lavender.lab.suite import FAMILIES
 from lavender.solvers.registry import specs
@@ -74,7 +74,7 @@ def build_verdict(
 ) -> Verdict:
     """Build the recommendation for all that was measured together: single cases, then sequences.
 
-    The recommendation is by motion error if the plan has speed levels. If motion errors were measured besides
+    The recommendation is by motion error if the plan has velocity tolerances. If motion errors were measured besides
     residuals, a sentence names the first solver by them. Each of `times` [s] and `sweeps` gets a sentence; those of the
     newest plan if none are given. The first sentence also ranks the solver of the engine that recorded the cases, by
     its answers in `engines`.
@@ -82,8 +82,8 @@ def build_verdict(
     if statistics.is_campaign(records) or not len(records):
         return Verdict((), ())
     plan = next((run.plan for run in reversed(list(records.runs.values()))), {})
-    speeds = get_speed_levels(records)
-    if speeds and plan.get("speed_levels"):
+    speeds = get_velocity_tolerances(records)
+    if speeds and plan.get("velocity_tolerances"):
         return _recommend_by_speed(convert_to_motion_errors(records))
     times = tuple(times) or tuple(plan.get("times", ()))
     sweeps = tuple(sweeps) or tuple(plan.get("sweeps", ()))
@@ -106,13 +106,16 @@ def _recommend(
     sweeps: Sequence[int],
     engines: Sequence[EngineAnswers],
 ) -> Verdict:
-    """Recommend a solver for one subject by the calls timed in turns, or by single runs if there are none."""
-    level, n = subject.best.target, subject.best.ranking[0].cases if subject.best.ranking else 0
-    in_turns, single = select_calls(records, subject.way), select_calls(records, subject.way, in_turns=False)
-    resampled = rank_calls_to_level(records, in_turns or single, level, n)
+    """Recommend a solver for one subject by the interleaved calls, or by single runs if there are none."""
+    tolerance, n = subject.best.target, subject.best.ranking[0].cases if subject.best.ranking else 0
+    interleaved, single = (
+        select_calls(records, subject.timing_mode),
+        select_calls(records, subject.timing_mode, interleaved=False),
+    )
+    resampled = rank_calls_to_tolerance(records, interleaved or single, tolerance, n)
     cases = _describe_subject(records, subject, n)
-    reached = f"down to {level_name(level)} of the error of doing nothing"
-    engine = rank_engine(engines, records, subject.cases, level)
+    reached = f"down to {format_tolerance(tolerance)} of the error of doing nothing"
+    engine = rank_engine(engines, records, subject.cases, tolerance)
     if resampled is None or not resampled.ranking[0][1].solved:
         near = tuple(c.solver for c in subject.best.ranking[:3] if c.solved)
         text = f"No solver brings {cases} {reached}."
@@ -135,7 +138,7 @@ def _recommend(
     for t in times or [a.target for a in subject.quick if a.target <= SHORT_TIME_RATIO * first.score][-1:]:
         if first.worst <= t and first.solved == first.cases:
             continue  # the recommended call ends in this time
-        rankings = (rank_calls_in_time(records, calls, t, n) for calls in (in_turns, single))
+        rankings = (rank_calls_in_time(records, calls, t, n) for calls in (interleaved, single))
         quick = next((r for r in rankings if r is not None and r.ranking[0][1].is_for(SERVED_QUANTILE)), None)
         if quick is None:
             statements.append(Statement(_state_serving_time(single, t), asked=bool(times)))
@@ -154,14 +157,14 @@ def _recommend(
         elif swept is not None:
             statements.append(Statement(f"{asked} nothing serves nine cases of ten.", asked=True))
     faster = [f"{b.solver} on {b.wins} of {b.solved} cases" for b in statistics.backends(records) if b.wins]
-    if faster and subject.way == "call":
+    if faster and subject.timing_mode == "call":
         head = "By their own interface, on data given before, some are faster than all of ours"
         statements.append(Statement(f"{head}: {', '.join(faster)}."))
     return Verdict(tuple(statements), tuple(dict.fromkeys(leaders))[:3], resampled.ranking)
 
 
 def _recommend_by_speed(records: Records) -> Verdict:
-    """Recommend a solver by motion error. Calls are not timed in turns for it."""
+    """Recommend a solver by motion error. It uses no interleaved calls."""
     subject = list_subjects(records)[0]
     best, n = subject.best, subject.best.ranking[0].cases if subject.best.ranking else 0
     cases, reached = _describe_subject(records, subject, n), _describe_speed(subject.best.target)
@@ -171,18 +174,20 @@ def _recommend_by_speed(records: Records) -> Verdict:
         return Verdict((Statement(f"No solver brings {cases} so far {reached}."),), leaders)
     ties = (Statement(f"As good within noise: {', '.join(best.ties)}."),) if best.ties else ()
     tol = _find_tolerance(records, first.solver, best.target)
-    arguments = f"tol={level_name(tol)}" if math.isfinite(tol) else f"tol=0, max_iter={first.iterations}"
+    arguments = (
+        f"tol={format_tolerance(tol)}" if math.isfinite(tol) else f"tol=0, max_iter={first.iterations}"
+    )
     code = f'lv.solve(problem, "{first.solver}", {arguments})'
     start = STARTS["carried" if "carried" in first.how else "cold"]
     text = _state_choice(records, first, f"{start}, {reached}", cases)
     return Verdict((Statement(text, (code,)), *ties), leaders)
 
 
-def _find_tolerance(records: Records, solver: str, level: float) -> float:
+def _find_tolerance(records: Records, solver: str, tolerance: float) -> float:
     """Return the smallest tolerance of the fastest runs to this speed, over the cases; nan if they had none."""
     fastest: dict[str, Record] = {}
     for r in records:
-        if r.solver != solver or r.mode != "tol" or r.relative > level:
+        if r.solver != solver or r.mode != "tol" or r.relative > tolerance:
             continue
         if r.case not in fastest or r.time_min < fastest[r.case].time_min:
             fastest[r.case] = r
@@ -203,7 +208,7 @@ def _describe_speed(speed: float) -> str:
 def _describe_subject(records: Records, subject: Subject, n: int) -> str:
     """Return words for the cases of a subject, with the number of those that did not load."""
     names, lost = subject.names, records.left_out
-    if subject.way == "call":
+    if subject.timing_mode == "call":
         return _describe_cases(records, names) + format_left_out(len(lost.get("", ())))
     of = names[0] if len(names) == 1 else f"your {format_count(len(names), 'sequence')}"
     n_lost = sum(len(lost.get(name, ())) for name in names)
@@ -251,7 +256,7 @@ def _add_engine(records: Records, head: str, first: Choice | None, engine: Choic
         here = head if first is None else f"Of the solvers here, u{head[1:]}"
         return f"First is the engine's own {engine.solver}: it solves {of}{cases} in {time}, {INSIDE}. {here}"
     if not engine.solved:
-        return f"{head} The engine's own {engine.solver} solves none of them to that level."
+        return f"{head} The engine's own {engine.solver} solves none of them to that tolerance."
     of = f"solves {engine.solved} of them in" if has_misses else "takes"
     return f"{head} The engine's own {engine.solver} {of} {time}, {INSIDE}."
 
@@ -315,8 +320,14 @@ def _add_code(records: Records, call: TimedCall, text: str, asked: bool = False)
         text += " Records of an earlier version: the line itself was not timed."
     line, reason, in_c = call.line, _explain_missing_c(records, call), ""
     spec = specs().get(line.solver)
-    if spec is not None and spec.builtin and not spec.external and line.mode == "tol" and line.way != "batch":
+    if (
+        spec is not None
+        and spec.builtin
+        and not spec.external
+        and line.mode == "tol"
+        and line.timing_mode != "batch"
+    ):
         source = quote(records.source or "records.jsonl")
-        command = f"lavender export c liblavender --solver {line.solver} --for {source}"
+        command = f"lavender export c liblavender --solver {line.solver} --records {source}"
         in_c = f"not in C: {reason}" if reason else command
     return Statement(text, call.code, in_c, asked)

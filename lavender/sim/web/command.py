@@ -17,7 +17,10 @@ NO_BROWSER = click.option("--no-browser", is_flag=True, help="Only say where the
 @NO_BROWSER
 @click.pass_context
 def web(context: click.Context, port: int, no_browser: bool) -> None:
-    """Open a page that runs the kernels (WebAssembly) in a browser, or build the module or the page."""
+    """Open a page that runs the kernels in a browser.
+
+    The kernels are compiled to WebAssembly. The commands build the module and the page.
+    """
     if context.invoked_subcommand is None:
         _show(port, no_browser)
 
@@ -92,7 +95,7 @@ def check() -> None:
 @PORT
 @NO_BROWSER
 def view(film: Path, port: int, no_browser: bool) -> None:
-    """Show a film that `lavender run NAME --film FILM` has written, in a page on this machine."""
+    """Show a film of `lavender run --film` in a browser."""
     from lavender.sim.engine import Film
     from lavender.sim.web.view import Viewer
 

@@ -19,7 +19,7 @@ import lavender as lv
 from lavender import bench
 from lavender.lab.bench import cases as bench_cases
 from lavender.lab.bench import machine, store
-from lavender.lab.bench.record import Record, from_json, to_json
+from lavender.lab.bench.record import RENAMED_FIELDS, Record, from_json, to_json
 from lavender.lab.bench.running import timing
 from lavender.lab.bench.timed_call import format_call
 from lavender.lab.report.findings import Report
@@ -27,7 +27,8 @@ from lavender.lab.report.latex_export import write_paper
 from lavender.lab.report.terminal import print_report
 from lavender.lab.report.write import write
 
-QUICK = bench.Plan(levels=(1e-3, 1e-8), budgets=(2, 5), repeats=2, time_limit=60.0, orders=("reverse",))
+QUICK = bench.Plan(tolerances=(1e-3, 1e-8), budgets=(2, 5), repeats=2, time_limit=60.0, orders=("reverse",))
+UNWRITTEN = {"contradicted"}  # Its meaning was divided between two fields, see below.
 
 
 def broken(problem, impulse):
@@ -74,7 +75,7 @@ def test_a_record_holds_what_the_judge_says_and_what_it_cost():
 
 
 def test_one_case_and_one_solver_need_no_list():
-    plan = bench.Plan(levels=(1e-3,), budgets=(), repeats=1, orders=())
+    plan = bench.Plan(tolerances=(1e-3,), budgets=(), repeats=1, orders=())
     one = bench.run("stack(n=3)", "pgs", plan)
     assert {(r.case, r.solver) for r in one} == {("stack(n=3)", "pgs")}
     case = lv.suite.case("stack(n=3)")
@@ -107,12 +108,14 @@ def test_an_answer_is_no_start(tmp_path, early):
     records = bench.run([path], ["pgs"], QUICK)
     assert {r.start for r in records} == {"cold"}
     assert records.cases["step"].guess == "answer"
-    asks = [bench.Ask("pgs", "tol", 1e-6), bench.Ask("pgs", "tol", 1e-6, way="batch")]
+    asks = [bench.Ask("pgs", "tol", 1e-6), bench.Ask("pgs", "tol", 1e-6, timing_mode="batch")]
     made = bench.time_alternately([path], asks, records, QUICK).records
     assert all(r.iterations > 5 for r in made if r.mode == "tol" and r.tol <= 1e-6)
     steps = bench.sequence([p.updated(guess=answer), p.updated(guess=answer)], "steps")
     records = bench.run(steps, ["pgs"], QUICK)
-    made = bench.time_alternately(steps, [bench.Ask("pgs", "tol", 1e-6, way="steps")], records, QUICK).records
+    made = bench.time_alternately(
+        steps, [bench.Ask("pgs", "tol", 1e-6, timing_mode="steps")], records, QUICK
+    ).records
     assert all(r.iterations > 5 for r in made if r.start == "cold" and r.mode == "tol" and r.tol <= 1e-6)
     assert all(r.iterations > 5 for r in made if r.start == "carried" and r.step == 0 and r.tol == 1e-8)
     assert lv.cross_check(lv.load(path), ["pgs"])["pgs"].solution.iterations > 5
@@ -121,7 +124,7 @@ def test_an_answer_is_no_start(tmp_path, early):
 def test_exact_solvers_run_once_and_hopeless_levels_are_left_out():
     records = bench.run([stack(8)], ["direct"], QUICK)
     assert [(r.tol, r.success) for r in records] == [(1e-8, True)]
-    # A row that nothing can meet: projected Gauss-Seidel misses the loosest level, so tighter ones are not tried.
+    # A row that nothing can meet: projected Gauss-Seidel misses the loosest tolerance, so tighter ones are not tried.
     impossible = lv.Problem.lcp(np.array([[1.0, -1.0], [-1.0, 1.0]]), np.array([1.0, 1.0]), name="impossible")
     records = bench.run([impossible], ["pgs"], QUICK)
     assert [r.tol for r in records if r.mode == "tol"] == [1e-3]
@@ -142,7 +145,9 @@ def test_a_solver_that_raises_costs_its_own_record(plug_in):
         assert by[case, "fake_lie"].claim_check == "contradicted"
         assert not by[case, "fake_exit"].success
         assert by[case, "pgs"].status == "MAX_ITERATIONS"  # the last: a budget
-    assert sum(r.solver == "fake_raise" for r in records) == 2  # one each: no level after it can be better
+    assert (
+        sum(r.solver == "fake_raise" for r in records) == 2
+    )  # one each: no tolerance after it can be better
 
 
 def test_a_solver_that_is_registered_here_alone_is_measured_here_whatever_it_requires(plug_in):
@@ -162,7 +167,9 @@ def test_a_plug_in_that_tests_nothing_is_timed_with_its_own_budget(register):
 
     laws = {"coulomb", "lcp", "linear", "cone"}
     register(lv.SolverSpec("untested", Untested, laws=laws, summary="of a test", max_iter=200))
-    (record,) = bench.run([stack(2)], ["untested"], dataclasses.replace(QUICK, levels=(1e-3,), budgets=()))
+    (record,) = bench.run(
+        [stack(2)], ["untested"], dataclasses.replace(QUICK, tolerances=(1e-3,), budgets=())
+    )
     assert (record.status, record.iterations) == ("CONVERGED", 200) and record.times
     assert format_call(record) == ('lv.solve(problem, "untested", tol=1e-3)',)
 
@@ -205,7 +212,7 @@ def test_each_record_is_on_disk_when_it_is_made(tmp_path):
 CAMPAIGN = (
     bench.expand_seeds(["granular(n=2)", "toy_stack"], 3),
     ["pgs", "gauss_seidel"],
-    bench.CampaignPlan(levels=(1e-3,), budgets=(4,), orders=()),
+    bench.CampaignPlan(tolerances=(1e-3,), budgets=(4,), orders=()),
 )
 COMMANDS = {
     "problems": (([stack(6), chain(7)], ["pgs", "direct"], QUICK), 1, 1),
@@ -348,6 +355,35 @@ def test_records_of_earlier_versions_keep_their_verdict(status, conflict, check,
     assert (again.claim_check, again.status_conflict) == (check, kept)
 
 
+def _former_names(content):
+    """Return the content of a line, and of its plan, under the names that earlier versions wrote."""
+    former = {new: old for old, new in RENAMED_FIELDS.items() if not old.startswith("plan.")}
+    of_plan = {new: old[5:] for old, new in RENAMED_FIELDS.items() if old.startswith("plan.")}
+    line = {former.get(name, name): value for name, value in content.items()}
+    if "plan" in line:
+        line["plan"] = {of_plan.get(name, name): value for name, value in line["plan"].items()}
+    return line
+
+
+def test_files_of_earlier_versions_load_with_their_values(tmp_path):
+    path = tmp_path / "records.jsonl"
+    plan = dataclasses.replace(QUICK, velocity_tolerances=(1e-1,))
+    bench.run([stack(2)], ["pgs"], plan, path)
+    content = [json.loads(line) for line in path.read_text().splitlines()]
+    lines = [_former_names(line) for line in content]
+    names = {name for line in lines for name in (*line, *(f"plan.{name}" for name in line.get("plan", ())))}
+    assert names >= RENAMED_FIELDS.keys() - UNWRITTEN
+    assert [to_json(from_json(line)) for line in lines] == content
+
+
+def test_former_names_of_arguments_are_answered_with_the_present_ones():
+    for kind in (bench.Plan, bench.CampaignPlan):
+        with pytest.raises(lv.UnknownName, match=r"unknown argument 'levels' of .*did you mean 'tolerances'"):
+            kind(levels=(1e-3,))
+    with pytest.raises(lv.UnknownName, match=r"unknown argument 'fresh' of run; did you mean 'reuse'"):
+        bench.run([stack(2)], ["pgs"], fresh=True)
+
+
 def test_infinite_and_undefined_numbers_survive_json():
     r = Record(
         run="r", case="c", sha="s", solver="x", options={"seed": np.int64(3)}, start="cold", mode="tol", tol=1e-3,
@@ -364,11 +400,14 @@ def test_infinite_and_undefined_numbers_survive_json():
 @pytest.mark.parametrize(
     ("change", "sign"),
     [
-        ({"levels": (), "budgets": ()}, "nothing to run"),
+        ({"tolerances": (), "budgets": ()}, "nothing to run"),
         ({"repeats": 0}, "repeats is 0"),
         ({"time_limit": 0.0}, "time_limit is 0"),
-        ({"pass_limit": 0.0}, "pass_limit is 0"),
-        *(({"speed_levels": (level,)}, "speed level") for level in (0.0, -1.0, math.nan)),
+        ({"sequence_time_limit": 0.0}, "sequence_time_limit is 0"),
+        *(
+            ({"velocity_tolerances": (tolerance,)}, "velocity tolerance")
+            for tolerance in (0.0, -1.0, math.nan)
+        ),
     ],
 )
 def test_a_senseless_plan_is_refused(change, sign):
@@ -378,9 +417,9 @@ def test_a_senseless_plan_is_refused(change, sign):
 
 def test_what_a_plan_names_twice_is_run_once_and_moves_no_middle():
     plan = bench.Plan(
-        levels=(1e-3, 1e-9, 1e-3, 1e-6), budgets=(8, 4, 4), sweeps=(4, 4), orders=("reverse",) * 2
+        tolerances=(1e-3, 1e-9, 1e-3, 1e-6), budgets=(8, 4, 4), sweeps=(4, 4), orders=("reverse",) * 2
     )
-    assert plan.levels == (1e-3, 1e-6, 1e-9)
+    assert plan.tolerances == (1e-3, 1e-6, 1e-9)
     assert (plan.budgets, plan.sweeps, plan.orders) == ((4, 8), (4,), ("reverse",))
 
 
@@ -394,10 +433,10 @@ def test_unknown_and_missing_names_are_refused_before_loading(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("level", "name"), [(1e-3, "1e-3"), (1e-10, "1e-10"), (2.5e-6, "2.5e-6"), (0.5, "5e-1"), (1.0, "1e0")]
+    ("tolerance", "name"), [(1e-3, "1e-3"), (1e-10, "1e-10"), (2.5e-6, "2.5e-6"), (0.5, "5e-1"), (1.0, "1e0")]
 )
-def test_levels_are_written_as_people_do(level, name):
-    assert bench.level_name(level) == name
+def test_levels_are_written_as_people_do(tolerance, name):
+    assert bench.format_tolerance(tolerance) == name
 
 
 def two_bodies(copies, ratio=1.0):
@@ -508,19 +547,19 @@ def plainly(solver, asked, unguessed):
     return solver, {name: x.tolist() if name == "impulse" else x for name, x in asked.items()}, unguessed
 
 
-LEVEL = 1.23456e-6  # whose short form is another number
+TOLERANCE = 1.23456e-6  # whose short form is another number
 
 
 def test_what_is_timed_is_the_line_that_is_printed(timed):
     """Whatever the front door of `lv.solve` costs is in the time, and nothing but the line is asked for."""
-    plan = bench.Plan(levels=(LEVEL,), budgets=(4,), repeats=2, orders=())
+    plan = bench.Plan(tolerances=(TOLERANCE,), budgets=(4,), repeats=2, orders=())
     problem = stack(6, guess=np.ones(6))
     records = bench.run([problem], ["pgs"], plan)
     assert len(timed) == len(records) == 4
     for r, (solver, asked, guess) in zip(records, timed, strict=True):
         assert (solver, asked, guess is None) == said(r, problem)
         assert (guess is None) == (r.start == "cold")
-        assert r.way == "call"
+        assert r.timing_mode == "call"
         assert len(r.times) == 1
         assert r.time_min >= 1.0 + r.setup_min + r.solve_min
     timed.clear()
@@ -536,12 +575,15 @@ def test_what_is_timed_is_the_line_that_is_printed(timed):
 
 def test_lines_in_turns_are_those_that_are_printed_and_c_asks_for_the_same(timed):
     asks = [
-        bench.Ask("pgs", "tol", LEVEL),
-        bench.Ask("pgs", "tol", LEVEL, 20_000),
+        bench.Ask("pgs", "tol", TOLERANCE),
+        bench.Ask("pgs", "tol", TOLERANCE, 20_000),
         bench.Ask("pgs", "budget", 0.0, 4),
-        bench.Ask("pgs", "time", LEVEL, time_limit=1.23456e-3),
+        bench.Ask("pgs", "time", TOLERANCE, time_limit=1.23456e-3),
     ]
-    problem, plan = stack(6, guess=np.ones(6)), bench.Plan(levels=(1e-3,), budgets=(), repeats=1, orders=())
+    problem, plan = (
+        stack(6, guess=np.ones(6)),
+        bench.Plan(tolerances=(1e-3,), budgets=(), repeats=1, orders=()),
+    )
     known = bench.run([problem], ["pgs"], plan)
     n = len(known)
     timed.clear()
@@ -557,11 +599,11 @@ def test_lines_are_timed_in_turns_and_kept(tmp_path):
         bench.Ask("pgs", "tol", 1e-6),
         bench.Ask("pgs", "budget", 0.0, 4),
         bench.Ask("pgs", "time", 1e-6, time_limit=1e-3),
-        bench.Ask("pgs", "tol", 1e-6, way="batch"),
+        bench.Ask("pgs", "tol", 1e-6, timing_mode="batch"),
     ]
     problems, plan = (
         [stack(6), stack(8, "other")],
-        bench.Plan(levels=(1e-6,), budgets=(), repeats=1, orders=()),
+        bench.Plan(tolerances=(1e-6,), budgets=(), repeats=1, orders=()),
     )
     path = tmp_path / "records.jsonl"
     known = bench.run(problems, ["pgs"], plan, path)
@@ -572,7 +614,7 @@ def test_lines_are_timed_in_turns_and_kept(tmp_path):
         assert len(r.times) == r.repeats >= 3
         assert r.time_min == min(r.times)
         assert r.success == (r.mode == "tol")
-        assert len(r.reached) == (r.repeats if r.mode == "time" else 0)
+        assert len(r.residual_per_repeat) == (r.repeats if r.mode == "time" else 0)
     assert bench.read(path).records == known.records
     again = bench.time_alternately(problems, asks, bench.run(problems, ["pgs"], plan, path), plan, path)
     assert again.records == known.records
@@ -594,7 +636,7 @@ def test_things_show_themselves_shortly_and_in_notebooks():
     problem = lv.Problem.lcp(np.eye(1), np.ones(1), name="<b>")
     assert repr(problem) == "<Problem '<b>', lcp, 1 row in 1 block, dense>"
     solution = lv.solve(problem, "pgs", history=True)
-    records = bench.run([problem], ["pgs"], bench.Plan(levels=(1e-3,), budgets=(2, 4), repeats=1))
+    records = bench.run([problem], ["pgs"], bench.Plan(tolerances=(1e-3,), budgets=(2, 4), repeats=1))
     for thing in (problem, solution, records):
         assert len(repr(thing)) < 400
         html = thing._repr_html_()

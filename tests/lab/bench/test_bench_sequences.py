@@ -13,7 +13,7 @@ from lavender.lab.report import table_specs
 
 def test_a_sequence_carries_each_solvers_own_impulses():
     problems = moving_stack(5)
-    plan = bench.Plan(levels=(1e-6,), budgets=(6,), repeats=1)
+    plan = bench.Plan(tolerances=(1e-6,), budgets=(6,), repeats=1)
     records = bench.run(bench.sequence(problems, "load"), ["pgs"], plan)
     impulse = problems[0].start()
     by = {(r.start, r.mode, r.step): r for r in records}
@@ -31,7 +31,7 @@ def test_a_sequence_carries_each_solvers_own_impulses():
 def test_a_pass_that_takes_too_long_ends_and_says_so(tmp_path, monkeypatch):
     items = bench.sequence(moving_stack(5), "load")
     # No solve takes less than a picosecond: each pass ends after its first step.
-    plan = bench.Plan(levels=(), budgets=(6,), repeats=1, pass_limit=1e-12)
+    plan = bench.Plan(tolerances=(), budgets=(6,), repeats=1, sequence_time_limit=1e-12)
     path = tmp_path / "records.jsonl"
     records = bench.run(items, ["pgs"], plan, path)
     assert [(r.step, r.start) for r in records] == [(0, "cold"), (0, "carried")]
@@ -108,7 +108,7 @@ def test_a_folder_is_a_sequence_in_numeric_order(tmp_path):
 
 
 def test_steps_of_two_sequences_are_never_one(tmp_path):
-    path, plan = tmp_path / "records.jsonl", bench.Plan(levels=(), budgets=(6,), repeats=1)
+    path, plan = tmp_path / "records.jsonl", bench.Plan(tolerances=(), budgets=(6,), repeats=1)
     bench.run(bench.sequence(moving_stack(5), "load"), ["pgs"], plan, path)
     bench.run(bench.sequence(moving_stack(2, n=11), "load"), ["pgs"], plan, path)
     (one,) = bench.statistics.passes(bench.read(path).latest())
@@ -124,11 +124,11 @@ def test_a_folder_with_two_recordings_is_refused(tmp_path, names):
 
 
 def test_a_level_of_a_sequence_is_solved_to_that_level():
-    plan = bench.Plan(levels=(1e-3, 1e-6, 1e-9), budgets=(), repeats=1)
+    plan = bench.Plan(tolerances=(1e-3, 1e-6, 1e-9), budgets=(), repeats=1)
     records = bench.run(bench.sequence(moving_stack(3), "load"), ["pgs", "direct"], plan)
-    assert {r.tol for r in records if r.solver == "pgs"} == set(plan.levels)
+    assert {r.tol for r in records if r.solver == "pgs"} == set(plan.tolerances)
     (line,) = lv.report.recommend_solvers(records)
-    for advice in line.by_level.values():
+    for advice in line.by_tolerance.values():
         assert all(
             float(c.how.removeprefix("to ").partition(",")[0]) <= advice.target for c in advice.ranking
         )

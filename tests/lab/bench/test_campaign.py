@@ -20,8 +20,8 @@ from lavender.lab.bench.running import workers as workers_module
 from lavender.lab.report.findings import Report
 
 NAMES = bench.expand_seeds(["random_spd(n=12, condition=100)", "granular(n=2)", "toy_stack"], 4)
-PLAN = bench.CampaignPlan(levels=(1e-3, 1e-6), budgets=(4, 8), orders=("random:1",))
-SHORT = bench.CampaignPlan(levels=(1e-6,), budgets=(), orders=())
+PLAN = bench.CampaignPlan(tolerances=(1e-3, 1e-6), budgets=(4, 8), orders=("random:1",))
+SHORT = bench.CampaignPlan(tolerances=(1e-6,), budgets=(), orders=())
 
 
 def lines(records):
@@ -93,7 +93,7 @@ def test_a_file_that_has_changed_and_a_plan_that_asks_for_more_are_run_again(tmp
     lv.Problem.lcp(2.0 * np.eye(2), np.ones(2)).save(file)
     second = shas()
     assert len(second[0] - first[0]) == 2 == len(second[0]) and not second[1]
-    more = bench.CampaignPlan(levels=(1e-3, 1e-6), budgets=(), orders=())
+    more = bench.CampaignPlan(tolerances=(1e-3, 1e-6), budgets=(), orders=())
     assert {r.tol for r in run(more) if r.solver == "pgs"} == {1e-3, 1e-6}
     with (tmp_path / "records.jsonl").open("a") as f:  # the mark of a complete pair, of an earlier version
         f.write('{"kind": "done", "run": "r", "case": "file", "solver": "pgs", "sha": ""}\n')
@@ -169,7 +169,7 @@ def test_a_cluster_that_loses_a_worker_midway_loses_no_record():
         "distributed", reason="a cluster needs dask.distributed (extra: cluster)"
     )
     names = bench.expand_seeds(["granular(n=2)"], 16)
-    plan = bench.CampaignPlan(levels=(1e-6,), budgets=(8, 64), orders=())
+    plan = bench.CampaignPlan(tolerances=(1e-6,), budgets=(8, 64), orders=())
     expected = bench.run(names, ["pgs", "jacobi"], plan)
     with (
         distributed.LocalCluster(
@@ -197,7 +197,7 @@ def test_a_cluster_that_loses_a_worker_midway_loses_no_record():
 def test_after_a_cluster_that_goes_midway_the_next_run_goes_on(tmp_path, monkeypatch):
     pytest.importorskip("distributed", reason="a cluster needs dask.distributed (extra: cluster)")
     names, path = bench.expand_seeds(["granular(n=2)"], 40), tmp_path / "records.jsonl"
-    plan = bench.CampaignPlan(levels=(1e-6,), budgets=(8, 64), orders=())
+    plan = bench.CampaignPlan(tolerances=(1e-6,), budgets=(8, 64), orders=())
     code = (
         "import sys, distributed\n"
         "if __name__ == '__main__':\n"

@@ -211,7 +211,7 @@ from lavender import bench
 def hard(i):
     chain = diags_array([2.0, -1.0, -1.0], offsets=[0, 1, -1], shape=(3000, 3000))  # condition 4e6
     return lv.Problem.lcp(chain.tocsr(), (1.0 + i) * np.eye(1, 3000)[0], name=f"hard {i}")
-plan = bench.CampaignPlan(levels=(1e-9,), budgets=(), cap=10_000_000)
+plan = bench.CampaignPlan(tolerances=(1e-9,), budgets=(), cap=10_000_000)
 bench.run([hard(i) for i in range(4)], ["pgs"], plan, workers=2)
 """
 
@@ -250,7 +250,9 @@ def test_workers_of_a_campaign_end_when_it_is_killed():
 
 def test_a_whole_run_survives_its_backends(hostile, watchdog, monkeypatch):
     monkeypatch.setattr("lavender.lab.bench.running.worker.GRACE", 0.5)
-    plan = bench.Plan(levels=(1e-3,), budgets=(), repeats=1, time_limit=1.0)  # a hundred times what they take
+    plan = bench.Plan(
+        tolerances=(1e-3,), budgets=(), repeats=1, time_limit=1.0
+    )  # a hundred times what they take
     records = bench.run([stack(4)], ["x_talk", "x_hang", "x_segfault", "x_leave", "pgs"], plan)
     said = [r.status for r in records]
     assert said == ["CONVERGED", "KILLED", "CRASHED (SIGSEGV)", "CRASHED (exit status 3)", "CONVERGED"]
@@ -315,7 +317,9 @@ def test_a_worker_says_what_this_process_says_and_judges_a_problem_that_no_backe
             near, here = timing.measure(p, asked, start)
             np.testing.assert_array_equal(here, there)
             times = {
-                n: 0.0 for n in vars(near) if n.startswith(("time_m", "setup_", "solve_", "pace", "load"))
+                n: 0.0
+                for n in vars(near)
+                if n.startswith(("time_m", "setup_", "solve_", "calibration_time", "load"))
             }
             assert dataclasses.replace(far, **times) == dataclasses.replace(near, **times)
 
@@ -325,7 +329,7 @@ def test_time_that_a_line_took_before_its_process_was_asked_is_no_lie_of_its_pro
     p = stack()
     lead = 100.0  # s
     with Worker() as worker:
-        asked = task(p, "pgs", start="carried", way="call", repeats=2, lead=lead)
+        asked = task(p, "pgs", start="carried", timing_mode="call", repeats=2, lead=lead)
         record, impulse = worker.measure(p, asked, np.zeros(p.m))
         assert record.status == "CONVERGED" and impulse is not None
         assert len(record.times) == 1 and lead <= record.times[0] < lead + 60.0
@@ -347,7 +351,7 @@ def test_time_that_a_line_took_before_its_process_was_asked_is_no_lie_of_its_pro
         {"times": [1e9]},
         {"times": [float("nan")]},
         {"times": None},
-        {"pace": "fast"},
+        {"calibration_time": "fast"},
         {"sizes": [4, 4]},
         {"sizes": [2, 2]},
         {"sizes": [None, 4]},
@@ -358,7 +362,7 @@ def test_time_that_a_line_took_before_its_process_was_asked_is_no_lie_of_its_pro
 def test_an_answer_that_is_none_is_refused(said):
     good = {
         "status": "CONVERGED", "iterations": 3, "work": {"sweeps": 3}, "message": "", "form": "",
-        "setups": [0.01], "solves": [0.02], "times": [0.04], "pace": 1e-4, "sizes": [4, None],
+        "setups": [0.01], "solves": [0.02], "times": [0.04], "calibration_time": 1e-4, "sizes": [4, None],
     }  # fmt: skip
     numbers = np.ones(4).tobytes()
     assert parse_outcome(*unpack_answer(json.dumps(good).encode(), numbers), 4, 1.0).iterations == 3

@@ -12,7 +12,7 @@ from stacks import chain
 import lavender as lv
 from lavender import bench, report
 from lavender.lab.bench import recommendation, statistics
-from lavender.lab.bench.resampling import rank_calls_in_time, rank_calls_to_level, select_calls
+from lavender.lab.bench.resampling import rank_calls_in_time, rank_calls_to_tolerance, select_calls
 from lavender.lab.report.figures import build_figures
 from lavender.lab.report.verdict import build_verdict
 from tests.lab.report.synthetic import BUDGET, FALSE_CLAIM, info, record, records_of
@@ -21,8 +21,8 @@ CASES = [f"case {i}" for i in range(6)]
 ROBOTS = {"ant": 1.0, "cheetah": 3.0, "hopper": 0.7, "humanoid": 5.0, "walker": 1.5, "reacher": 0.4}
 
 
-def by_level(records):
-    return [a for line in report.recommend_solvers(records) for a in line.by_level.values()]
+def by_tolerance(records):
+    return [a for line in report.recommend_solvers(records) for a in line.by_tolerance.values()]
 
 
 def by_time(records, times=()):
@@ -39,7 +39,7 @@ def test_who_solves_most_is_first_and_false_claims_are_last():
         record("a", "liar", 0.1, 1e-7), record("b", "liar", 0.1, 1e-7, **FALSE_CLAIM),
         structure={"a": ("stack",), "b": ("stack", "redundant")},
     )  # fmt: skip
-    by = {(a.family, a.target): a for a in by_level(found)}
+    by = {(a.family, a.target): a for a in by_tolerance(found)}
     assert [c.solver for c in by["stack", 1e-6].ranking] == ["sure", "quick", "liar"]
     assert by["stack", 1e-6].best.solved == 2
     assert by["redundant", 1e-6].best.solver == "sure"
@@ -69,17 +69,17 @@ def close_race():
 
 def test_those_within_noise_are_ties_and_a_rerun_keeps_the_recommendation():
     first = close_race()
-    by = {a.target: a for a in by_level(first)}
+    by = {a.target: a for a in by_tolerance(first)}
     assert {by[1e-6].best.solver, *by[1e-6].ties} == {"edge"}
     others = records_of(*(r for r in first if r.solver != "edge"))
-    level = recommendation.rank_to_level(others, "all", CASES[:4], 1e-6)
-    assert (level.best.solver, level.ties) == ("auto", ("beta", "zeta"))
+    tolerance = recommendation.rank_to_tolerance(others, "all", CASES[:4], 1e-6)
+    assert (tolerance.best.solver, tolerance.ties) == ("auto", ("beta", "zeta"))
     times = (1e-3, 2e-3, 5e-3)
     for seed in range(40):
         again = jittered(first, seed)
         pairs = zip(
-            [*by_level(first), *by_time(first, times)],
-            [*by_level(again), *by_time(again, times)],
+            [*by_tolerance(first), *by_time(first, times)],
+            [*by_tolerance(again), *by_time(again, times)],
             strict=True,
         )
         for old, new in pairs:
@@ -91,19 +91,19 @@ def test_those_within_noise_are_ties_and_a_rerun_keeps_the_recommendation():
 def test_another_solver_changes_nobodys_score():
     first = close_race()
     more = records_of(*first, *(record(f"case {i}", "new", 1e-7, 1e-9) for i in range(4)))
-    for how in (by_level, lambda r: by_time(r, [1e-3, 1e-2])):
+    for how in (by_tolerance, lambda r: by_time(r, [1e-3, 1e-2])):
         for old, new in zip(how(first), how(more), strict=True):
             scores = {c.solver: c.score for c in new.ranking}
             assert {c.solver: scores[c.solver] for c in old.ranking} == {
                 c.solver: c.score for c in old.ranking
             }
-    assert "new" in {c.solver for c in by_level(more)[0].ranking}
+    assert "new" in {c.solver for c in by_tolerance(more)[0].ranking}
 
 
 def test_the_mean_ranks_and_the_worst_case_is_named():
     times = {"even": (3e-3, 3e-3, 3e-3), "odd": (1e-3, 1e-3, 60e-3)}  # a median would say odd
     made = [record(c, s, t, 1e-7) for s, ts in times.items() for c, t in zip("abc", ts, strict=True)]
-    (advice,) = (a for a in by_level(records_of(*made)) if a.target == 1e-6)
+    (advice,) = (a for a in by_tolerance(records_of(*made)) if a.target == 1e-6)
     assert advice.best.solver == "even"
     assert (advice.ranking[1].worst, advice.ranking[1].hardest) == (60e-3, "c")
 
@@ -116,7 +116,7 @@ def test_time_budgets_are_those_given_and_the_sweeps_are_named():
     )
     (line,) = report.recommend_solvers(found, [0.5, 5.0])
     assert (line.name, line.size, line.sequence) == ("stack", 1, False)
-    best = {x: (a.best.solver, a.best.how) for x, a in line.by_level.items()}
+    best = {x: (a.best.solver, a.best.how) for x, a in line.by_tolerance.items()}
     assert best == {1e-3: ("pgs", "8 sweeps"), 1e-6: ("pgs", "90 sweeps")}
     assert {t: a.best.solver for t, a in line.by_time.items()} == {0.5: "pgs", 5.0: "direct"}
 
@@ -129,43 +129,43 @@ def test_a_step_that_nobody_was_asked_for_is_missed_and_a_folder_may_have_the_na
     lines = report.recommend_solvers(found, [1.0])
     assert [(x.name, x.size, x.sequence) for x in lines] == [("stack", 1, False), ("stack", 3, True)]
     for line, solved in zip(lines, (1, 2), strict=True):
-        for best in (line.by_level[1e-6].best, line.by_time[1.0].ranking[0]):
+        for best in (line.by_tolerance[1e-6].best, line.by_time[1.0].ranking[0]):
             assert (best.solved, best.cases) == (solved, line.size)
     # charged the time limit of 2 s, as a case is
-    score = lines[1].by_level[1e-6].best.score
+    score = lines[1].by_tolerance[1e-6].best.score
     assert score == pytest.approx((1e-3**2 * 2.0) ** (1 / 3), rel=0.05)
 
 
 def test_sequences_are_compared_carried_against_cold():
     problems = [lv.Problem.lcp(chain(6).matrix, np.ones(6) * (1 + 0.001 * i)) for i in range(4)]
-    plan = bench.Plan(levels=(1e-6,), budgets=(5,), repeats=1)
+    plan = bench.Plan(tolerances=(1e-6,), budgets=(5,), repeats=1)
     records = bench.run(bench.sequence(problems, "load"), ["pgs", "direct"], plan)
-    budget, level, exact = statistics.passes(records)
+    budget, tolerance, exact = statistics.passes(records)
     assert (budget.solver, budget.max_iter, budget.steps) == ("pgs", 5, 4)
     cold = [r for r in records if r.solver == "pgs" and r.mode == "budget" and r.start == "cold"]
     assert budget.time["cold"] == sum(r.time_min for r in cold)
     assert budget.residuals["cold"] == tuple(r.relative for r in cold)
     assert budget.gain > 1.0
-    assert level.iterations["carried"] < level.iterations["cold"]
+    assert tolerance.iterations["carried"] < tolerance.iterations["cold"]
     assert set(exact.residuals) == {"cold"}
     (line,) = report.recommend_solvers(records, [1e-9, 10.0])
     assert (line.name, line.size, line.sequence) == ("load", 4, True)
-    # Only an exact solver, or a run to the level, brings all four steps there; nothing is done in a nanosecond.
-    best = line.by_level[1e-6].best
+    # Only an exact solver, or a run to the tolerance, brings all four steps there; nothing is done in a nanosecond.
+    best = line.by_tolerance[1e-6].best
     assert (best.solved, best.cases, best.how in ("to 1e-6, cold", "to 1e-6, carried")) == (4, 4, True)
     assert line.by_time[1e-9].best is None
     reached = {c.solver: c for c in line.by_time[10.0].ranking}
     means = {
         f"{w.asked}, {start}": math.exp(np.mean(np.log(np.clip(w.residuals[start], 1e-17, 1.0))))
-        for w in (budget, level)
+        for w in (budget, tolerance)
         for start in ("cold", "carried")
     }
     assert reached["pgs"].how == min(means, key=lambda how: means[how])
     assert reached["pgs"].score == pytest.approx(min(means.values()))
-    at_budget, to_level = build_figures(records).sequences["load"]
+    at_budget, to_tolerance = build_figures(records).sequences["load"]
     curves = [(c.label, c.y) for c in at_budget.curves]
     assert curves == [("pgs", budget.residuals["carried"]), ("pgs (cold)", budget.residuals["cold"])]
-    assert [c.y for c in to_level.curves if c.solver == "direct"] == [exact.times["cold"]]
+    assert [c.y for c in to_tolerance.curves if c.solver == "direct"] == [exact.times["cold"]]
     assert report.reaches(records) == []  # steps are no cases of their own
 
 
@@ -188,11 +188,11 @@ def test_misses_in_a_time_count():
     assert build_verdict(rest, [1e-3]).text.endswith("Nothing serves in 1.00 ms.")
 
 
-# -- lines that were timed in turns ---------------------------------------------------------------------------
+# -- lines that were timed alternately ---------------------------------------------------------------------------
 
 
-def in_turns(speeds, seed, cases=CASES, noise=1.04, rerun=1.0, sizes=None, repeats=7):
-    """Records of lines that took turns: each case has its size, each repetition its noise, a rerun its own machine."""
+def interleaved(speeds, seed, cases=CASES, noise=1.04, rerun=1.0, sizes=None, repeats=7):
+    """Records of interleaved lines: each case has its size, each repetition its noise, a rerun its own machine."""
     rng = random.Random(seed)
     machine = rerun ** rng.uniform(-1.0, 1.0)
     made = []
@@ -201,28 +201,28 @@ def in_turns(speeds, seed, cases=CASES, noise=1.04, rerun=1.0, sizes=None, repea
         for solver, of_case in speeds.items():
             factor = of_case if isinstance(of_case, float) else of_case(i)
             times = tuple(size * factor * noise ** rng.gauss(0.0, 1.0) for _ in range(repeats))
-            more = {"way": "call", "times": times, "pace": 1e-4 * machine}
-            made.append(record(case, solver, min(times), 1e-7, turns="one", **more))
+            more = {"timing_mode": "call", "times": times, "calibration_time": 1e-4 * machine}
+            made.append(record(case, solver, min(times), 1e-7, interleave_group="one", **more))
             made.append(record(case, solver, min(times), 1e-7, **more))
     return records_of(*made)
 
 
-def race(records, level=1e-6):
-    return rank_calls_to_level(records, select_calls(records, "call"), level)
+def race(records, tolerance=1e-6):
+    return rank_calls_to_tolerance(records, select_calls(records, "call"), tolerance)
 
 
 def test_a_clear_winner_is_named_alone_and_wins_every_resampling():
-    found = race(in_turns({"auto": 1.5, "fast": 1.0, "slow": 2.0}, 0))
+    found = race(interleaved({"auto": 1.5, "fast": 1.0, "slow": 2.0}, 0))
     assert (found.named, found.shares[0], found.loss) == (("fast",), 1.0, 1.0)
 
 
 def test_cases_that_disagree_make_it_unsure_and_both_are_named():
     speeds = {"even": 1.0, "odd": lambda i: (0.5, 2.0)[i % 2]}
-    found = race(in_turns(speeds, 0))
+    found = race(interleaved(speeds, 0))
     assert set(found.named) == {"even", "odd"}
     assert found.shares[0] < 0.9
     assert found.loss > 1.05
-    text = build_verdict(in_turns(speeds, 0)).statements[1].text
+    text = build_verdict(interleaved(speeds, 0)).statements[1].text
     assert all(re.search(rf"{name} \([\d.]* ms\) in \d* %", text) for name in speeds)
     assert "it takes" in text  # and what the choice loses where the other is faster
 
@@ -237,7 +237,7 @@ def test_three_reports_of_a_near_tie_name_the_same_set(speeds, noise):
     agreed = []
     for first in range(0, 18, 3):
         found = [
-            race(in_turns(speeds, seed, tuple(ROBOTS), noise, rerun=1.6, sizes=ROBOTS, repeats=21))
+            race(interleaved(speeds, seed, tuple(ROBOTS), noise, rerun=1.6, sizes=ROBOTS, repeats=21))
             for seed in range(first, first + 3)
         ]
         assert all(fastest in f.named for f in found)
@@ -250,7 +250,9 @@ def test_who_misses_a_case_is_never_the_first_whatever_the_mean_says():
     for case in CASES:
         sure, quick = (1e-3, 1e-7), (1e-6, 1.0 if case == CASES[0] else 1e-12)
         for solver, (t, left) in (("sure", sure), ("quick", quick)):
-            made.append(record(case, solver, t, left, way="call", turns="one", times=(t,) * 3))
+            made.append(
+                record(case, solver, t, left, timing_mode="call", interleave_group="one", times=(t,) * 3)
+            )
     found = race(records_of(*made))
     assert [(c.solver, c.solved) for _, c in found.ranking] == [("sure", 6), ("quick", 5)]
 
@@ -258,7 +260,7 @@ def test_who_misses_a_case_is_never_the_first_whatever_the_mean_says():
 def test_lines_that_were_refused_different_cases_are_compared_on_all_of_them():
     size = {"easy": 1e-3, "both": 1e-2, "hard": 1e-1}
     made = [
-        record(case, solver, t, 1e-7, turns="one", way="call", times=(t,) * 7, **more)
+        record(case, solver, t, 1e-7, interleave_group="one", timing_mode="call", times=(t,) * 7, **more)
         for case in size
         for solver, factor, refused in (("slow", 2.0, "hard"), ("quick", 1.0, "easy"))
         for t in (factor * size[case],)
@@ -281,8 +283,14 @@ def test_lines_that_were_refused_different_cases_are_compared_on_all_of_them():
 def test_what_comes_too_late_in_more_than_one_repetition_of_twenty_is_not_served():
     def line(solver, late):
         times = (2e-3,) * late + (0.5e-3,) * (20 - late)
-        more = {"mode": "time", "time_limit": 0.5e-3, "way": "call", "turns": "one", "times": times}
-        return record("a", solver, min(times), 1e-2, reached=(1e-2,) * 20, **more)
+        more = {
+            "mode": "time",
+            "time_limit": 0.5e-3,
+            "timing_mode": "call",
+            "interleave_group": "one",
+            "times": times,
+        }
+        return record("a", solver, min(times), 1e-2, residual_per_repeat=(1e-2,) * 20, **more)
 
     found = records_of(line("punctual", 1), line("late", 2))
     ranking = rank_calls_in_time(found, select_calls(found, "call"), 1e-3).ranking
@@ -291,15 +299,29 @@ def test_what_comes_too_late_in_more_than_one_repetition_of_twenty_is_not_served
 
 def test_lines_that_took_turns_on_fewer_cases_do_not_replace_those_that_solved_more():
     made = [record(case, "x", 1e-3, 1e-9) for case in "abc"]
-    made.append(record("a", "x", 2e-3, 1e-9, way="call", turns="one", times=(2e-3,) * 5, pace=1e-4))
+    made.append(
+        record(
+            "a",
+            "x",
+            2e-3,
+            1e-9,
+            timing_mode="call",
+            interleave_group="one",
+            times=(2e-3,) * 5,
+            calibration_time=1e-4,
+        )
+    )
     (line,) = report.recommend_solvers(records_of(*made))
-    assert (line.by_level[1e-6].best.solved, line.by_level[1e-6].best.score) == (3, pytest.approx(1e-3))
+    assert (line.by_tolerance[1e-6].best.solved, line.by_tolerance[1e-6].best.score) == (
+        3,
+        pytest.approx(1e-3),
+    )
 
 
 @pytest.mark.parametrize("n", [2, 3])
 def test_a_batch_of_some_of_the_cases_is_not_told_beside_a_call_on_all(n):
-    made = in_turns({"auto": 1.0, "pgs": 2.0}, 0, cases=CASES[:3])
-    for r in [r for r in made if r.turns and r.case in CASES[:n]]:
-        made.add(dataclasses.replace(r, way="batch"))
+    made = interleaved({"auto": 1.0, "pgs": 2.0}, 0, cases=CASES[:3])
+    for r in [r for r in made if r.interleave_group and r.case in CASES[:n]]:
+        made.add(dataclasses.replace(r, timing_mode="batch"))
     code = [line for t in build_verdict(made).statements for line in t.code]
     assert any("solve_many" in line for line in code) == (n == 3)

@@ -9,7 +9,7 @@ import pytest
 from lavender import bench, report
 from lavender.lab.bench import statistics
 from lavender.lab.report import table_specs
-from tests.lab.report.synthetic import BUDGET, FALSE_CLAIM, LEVELS, info, record, records_of
+from tests.lab.report.synthetic import BUDGET, FALSE_CLAIM, TOLERANCES, info, record, records_of
 
 
 def test_time_to_a_level_is_that_of_the_cheapest_run_that_reached_it():
@@ -41,7 +41,7 @@ def test_a_claim_that_is_not_proven_is_neither_a_proof_nor_a_false_claim(check, 
     found = records_of(record("a", "x", 1.0, 0.5, **claim))
     assert len(report.failures(found)) == (0 if check == "confirmed" else 1)
     assert [c.wrong for c in report.claims(found)] == [wrong]
-    table = table_specs.tabulate_reaches(report.reaches(found), LEVELS)
+    table = table_specs.tabulate_reaches(report.reaches(found), TOLERANCES)
     assert str(table.rows[0][table.heads.index("claim")]) == mark
     assert table.marks == ["bad" if wrong else ""]
 
@@ -52,7 +52,7 @@ def test_profiles_count_misses_and_refusals_at_infinity():
         record("b", "fast", 2.0, 1e-1, success=False), record("b", "slow", 4.0, 1e-7),
         record("c", "slow", 1.0, 1e-7), record("d", "slow", 1.0, 1.0), record("d", "fast", 1.0, 1.0),
     )  # fmt: skip
-    profile = next(p for p in report.profiles(found) if p.level == 1e-6)
+    profile = next(p for p in report.profiles(found) if p.tolerance == 1e-6)
     assert profile.cases == 4
     assert dict(profile.curves) == {"fast": ((1.0, 0.25),), "slow": ((1.0, 0.5), (3.0, 0.75))}
 
@@ -92,9 +92,11 @@ def test_claims_failures_and_spreads():
     by = {c.solver: c for c in report.claims(found)}
     assert (by["x"].claims, by["x"].wrong) == (2, 1)
     assert (by["y"].crashed, by["y"].asked, by["y"].reached) == (1, 1, 0)
-    # Of what was run again in turns the first run counts; a run to a limit of time is in turns alone.
+    # If a run was repeated alternately, the first run counts; a run with a time limit is always interleaved.
     for mode, wrong in (("tol", 1), ("time", 2)):
-        more = records_of(*found, record("a", "x", 1.0, 1e-2, mode=mode, turns="one", **FALSE_CLAIM))
+        more = records_of(
+            *found, record("a", "x", 1.0, 1e-2, mode=mode, interleave_group="one", **FALSE_CLAIM)
+        )
         assert next(c.wrong for c in report.claims(more) if c.solver == "x") == wrong
         assert sum(bool(f.status_conflict) for f in report.failures(more)) == wrong
     failed = [(f.solver, f.status) for f in report.failures(found)]
@@ -115,7 +117,7 @@ def test_changes_beyond_noise_are_named():
         record("a", "x", 3.0, 1e-7), record("a", "y", 1.1, 1e-7), record("a", "z", 1.0, 1e-7),
         record("a", "w", 1.0, 1e-4, success=False), record("a", "v", 1.9, 1e-7),
     )  # fmt: skip
-    found = {c.solver: c for c in statistics.changes(old, new) if c.level == 1e-6}
+    found = {c.solver: c for c in statistics.changes(old, new) if c.tolerance == 1e-6}
     kinds = {"x": "slower", "y": "same", "z": "reached", "w": "lost", "v": "same"}
     assert {s: c.kind for s, c in found.items()} == kinds
     assert found["v"].noise == 2.0  # its repeats spread by half
@@ -126,9 +128,9 @@ def test_changes_beyond_noise_are_named():
 
 
 def test_a_slower_machine_is_no_slower_code():
-    old = records_of(*(record("a", solver, 1e-3, 1e-7, pace=1e-4) for solver in ("pgs", "auto")))
+    old = records_of(*(record("a", solver, 1e-3, 1e-7, calibration_time=1e-4) for solver in ("pgs", "auto")))
     slower = [dataclasses.replace(r, time_min=1.6 * r.time_min) for r in old]
-    by = [dataclasses.replace(r, pace=1.6 * r.pace) for r in slower]
+    by = [dataclasses.replace(r, calibration_time=1.6 * r.calibration_time) for r in slower]
     assert {c.kind for c in statistics.changes(old, records_of(*by))} == {"same"}
     assert {c.kind for c in statistics.changes(old, records_of(*slower))} == {"slower"}
     assert statistics.drift(old, records_of(*by)) == pytest.approx(1.6)
@@ -136,15 +138,15 @@ def test_a_slower_machine_is_no_slower_code():
 
 @pytest.fixture(scope="module")
 def measured():
-    return bench.run(["stack(n=6)"], ["auto", "osqp"], bench.Plan(levels=(1e-6,), budgets=(), repeats=2))
+    return bench.run(["stack(n=6)"], ["auto", "osqp"], bench.Plan(tolerances=(1e-6,), budgets=(), repeats=2))
 
 
 def test_backends_have_the_time_of_their_own_interface_too(measured):
     (osqp,) = statistics.backends(measured)
     (r,) = (r for r in measured if r.solver == "osqp")
-    assert 0.0 < r.own_min < r.time_min
+    assert 0.0 < r.backend_time_min < r.time_min
     assert (osqp.solver, osqp.solved) == ("osqp", 1)
-    assert (osqp.own, osqp.whole) == (pytest.approx(r.own_min), pytest.approx(r.time_min))
+    assert (osqp.backend_time, osqp.whole) == (pytest.approx(r.backend_time_min), pytest.approx(r.time_min))
 
 
 def test_each_run_has_the_load_of_the_machine_and_a_row_of_the_frame(measured):

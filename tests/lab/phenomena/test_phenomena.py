@@ -15,7 +15,7 @@ from broken_engines import simulate as simulate_broken
 
 import lavender as lv
 from lavender.base.errors import LavenderError
-from lavender.lab.phenomena import PHENOMENA, WAYS, Record, Track, chosen, run, ways
+from lavender.lab.phenomena import ENGINE_VARIANTS, PHENOMENA, Record, Track, chosen, run, select_variants
 from lavender.lab.phenomena import table as tables
 from lavender.lab.phenomena.engines import PACKAGES_OF_NODE, follow, make, versions_of_node
 from lavender.lab.phenomena.engines.node import JsonLines
@@ -28,7 +28,7 @@ NAMES = tuple(PHENOMENA)
 QUICK = (
     "stick", "slide", "stop", "lift", "roll", "roll_to_rest", "spin_down", "free_rotation", "chain_load", "tipping",
 )  # fmt: skip
-OTHERS = [w for w in WAYS.values() if w.module != "own"]
+OTHERS = [w for w in ENGINE_VARIANTS.values() if w.module != "own"]
 
 
 def first(name):
@@ -101,8 +101,8 @@ def cells(text):
 def test_what_the_page_says_of_a_stepper_is_what_it_does(stepper):
     page = cells((Path(__file__).resolve().parents[3] / "docs" / "phenomena.md").read_text(encoding="utf-8"))
     found = cells(tables.table(run(QUICK, steppers=[stepper])))
-    for way in ways([stepper], []):
-        for key in ((way.name, name) for name in QUICK):
+    for variant in select_variants([stepper], []):
+        for key in ((variant.name, name) for name in QUICK):
             (value, *passed), (told, *counted) = found[key], page[key]
             assert passed == counted, key
             if passed:
@@ -125,7 +125,7 @@ def test_friction_of_four_fifths_is_out_of_a_bound(name, of):
     p, values = PHENOMENA[name], PHENOMENA[name].values()
     weak = {of: 0.8 * values[of]} | ({"slope": values["slope"] / 0.8} if name == "slide" else {})  # of mu
     scene = p.scene(values | weak, stepper="impulses")
-    track = follow(make(WAYS["impulses newton"], scene), p.seconds(values), p.interval)
+    track = follow(make(ENGINE_VARIANTS["impulses newton"], scene), p.seconds(values), p.interval)
     assert not judged(p, "weak", values, track).passed
 
 
@@ -137,7 +137,9 @@ def test_a_pendulum_loses_less_in_shorter_steps(stepper):
     for substeps in (4, 16):
         scene = p.scene(case, stepper=stepper, dt=1 / 60, substeps=substeps)
         left.append(
-            p.measure(case, follow(make(WAYS[stepper], scene), p.seconds(case), p.interval))["energy"]
+            p.measure(case, follow(make(ENGINE_VARIANTS[stepper], scene), p.seconds(case), p.interval))[
+                "energy"
+            ]
         )
     assert left[1] < 0.5 * left[0]
 
@@ -177,9 +179,9 @@ def test_crossings():
 # -- engines --------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("way", [w.name for w in OTHERS if not w.missing()])
-def test_every_engine_starts_as_the_scene_says_and_falls_as_it_should(way):
-    one = WAYS[way]
+@pytest.mark.parametrize("variant", [w.name for w in OTHERS if not w.missing()])
+def test_every_engine_starts_as_the_scene_says_and_falls_as_it_should(variant):
+    one = ENGINE_VARIANTS[variant]
     for name, p in PHENOMENA.items():
         if any(x in one.cannot for x in p.needs):
             continue
@@ -209,8 +211,8 @@ def test_every_engine_starts_as_the_scene_says_and_falls_as_it_should(way):
     np.testing.assert_allclose(fall, [0, 0, -0.5 * 9.81 * track.time[-1] ** 2], atol=0.06)
 
 
-@pytest.mark.parametrize("way", [w.name for w in OTHERS if not w.missing()])
-def test_what_an_engine_cannot_build_is_said(way):
+@pytest.mark.parametrize("variant", [w.name for w in OTHERS if not w.missing()])
+def test_what_an_engine_cannot_build_is_said(variant):
     soft = lv.Scene()
     body = soft.add_sphere()
     soft.add_joint("ball", -1, body, anchor=(0, 0, 1), hertz=2.0)
@@ -218,7 +220,7 @@ def test_what_an_engine_cannot_build_is_said(way):
     rough.add_box(friction=0.3)
     for scene, word in ((lv.Scene("four_bar"), "loop"), (soft, "rigid"), (rough, "one friction")):
         with pytest.raises(lv.CapabilityError, match=word):
-            make(WAYS[way], scene)
+            make(ENGINE_VARIANTS[variant], scene)
 
 
 def test_a_static_box_is_refused_where_an_engines_file_makes_none():
@@ -258,21 +260,21 @@ def test_mujoco_creeps_and_lifts_as_it_is_known_to():
 def test_an_engine_that_fails_is_a_note_and_the_next_has_a_process(name, words, broken):
     broken.limit = 2.0 if name == "sleeps" else 600.0
     scene = PHENOMENA["stick"].scene()
-    way = dataclasses.replace(OTHERS[0], name=name)
-    found = broken.track(way, scene, 1.0, 0.1)
+    variant = dataclasses.replace(OTHERS[0], name=name)
+    found = broken.track(variant, scene, 1.0, 0.1)
     assert isinstance(found, str)
     assert words in found
     if name != "babbles":  # it sleeps on
         broken.limit = 600.0
-        again = broken.track(dataclasses.replace(way, name="leaves"), scene, 1.0, 0.1)
+        again = broken.track(dataclasses.replace(variant, name="leaves"), scene, 1.0, 0.1)
         assert again == "its process ended: exit status 0"
 
 
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="reads /proc")
 def test_a_program_that_an_engine_waits_for_ends_with_it(broken, tmp_path):
     broken.limit = 6.0
-    way = dataclasses.replace(OTHERS[0], name=f"waits {tmp_path / 'number'}")
-    assert broken.track(way, PHENOMENA["stick"].scene(), 1.0, 0.1) == "no answer within 6 s"
+    variant = dataclasses.replace(OTHERS[0], name=f"waits {tmp_path / 'number'}")
+    assert broken.track(variant, PHENOMENA["stick"].scene(), 1.0, 0.1) == "no answer within 6 s"
     number = int((tmp_path / "number").read_text())
     state = Path(f"/proc/{number}/stat")
     for _ in range(12_000):  # the system takes a moment
@@ -301,7 +303,7 @@ def test_what_an_engine_raises_is_told_and_its_process_stays(process):
 
 def test_an_engine_that_is_missing_is_a_note(monkeypatch):
     gone = dataclasses.replace(OTHERS[0], package="no_such_package")
-    monkeypatch.setitem(WAYS, gone.name, gone)
+    monkeypatch.setitem(ENGINE_VARIANTS, gone.name, gone)
     (record,) = run(["lift"], steppers=[], engines=[gone.name], parameters={})
     assert record.note == "not installed: pip install no_such_package"
     assert not record.passed
@@ -309,7 +311,7 @@ def test_an_engine_that_is_missing_is_a_note(monkeypatch):
 
 def test_an_engine_without_what_a_scene_needs_is_a_note_and_starts_no_process(monkeypatch):
     bare = dataclasses.replace(OTHERS[0], package="", cannot={"hinge": "it has no hinges"})
-    monkeypatch.setitem(WAYS, bare.name, bare)
+    monkeypatch.setitem(ENGINE_VARIANTS, bare.name, bare)
     monkeypatch.setattr("lavender.lab.phenomena.running.ProcessBackend.start", None)  # a start would fail
     (record,) = run(["pendulum"], steppers=[], engines=[bare.name], parameters={})
     assert (record.note, record.values, record.passed) == ("it has no hinges", {}, False)
@@ -346,7 +348,7 @@ def under_node(monkeypatch, tmp_path):
 
     def made(*said):
         monkeypatch.setattr(Answers, "said", said)
-        return make(WAYS["rapier"], PHENOMENA["stick"].scene())
+        return make(ENGINE_VARIANTS["rapier"], PHENOMENA["stick"].scene())
 
     return made
 
@@ -371,15 +373,15 @@ def test_what_an_engine_under_node_says_is_told(under_node):
 
 def test_packages_of_node_are_found_or_what_to_install_is_said(under_node, monkeypatch, tmp_path):
     monkeypatch.setattr("lavender.lab.phenomena.engines.shutil.which", lambda name: name)
-    assert WAYS["rapier"].missing() == ""
+    assert ENGINE_VARIANTS["rapier"].missing() == ""
     assert versions_of_node() == dict.fromkeys(PACKAGES_OF_NODE.values(), "1.2.3")
     monkeypatch.delenv("NODE_PATH")
     monkeypatch.chdir(tmp_path)
-    assert "not installed: npm install jolt-physics" in WAYS["jolt"].missing()
+    assert "not installed: npm install jolt-physics" in ENGINE_VARIANTS["jolt"].missing()
     with pytest.raises(LavenderError, match="npm install @dimforge/rapier3d-compat"):
         under_node()
     monkeypatch.setattr("lavender.lab.phenomena.engines.shutil.which", lambda name: None)
-    assert "under Node" in WAYS["jolt"].missing()
+    assert "under Node" in ENGINE_VARIANTS["jolt"].missing()
 
 
 def test_a_program_is_asked_by_lines_and_its_end_is_told():
@@ -412,21 +414,21 @@ def test_a_limit_that_is_none_is_refused(limit):
         run(["stick"], steppers=["impulses"], limit=limit)
 
 
-def test_names_of_ways():
+def test_names_of_engine_variants():
     assert [p.name for p in chosen(["stick", "stop", "stick"])] == ["stick", "stop"]
-    assert {w.name for w in ways(["soft_step"], [])} == {"soft_step", "soft_step 16x4"}
-    assert [w.name for w in ways([], ["pybullet 4x100"])] == ["pybullet 4x100"]
-    assert len(ways()) == len(WAYS)
+    assert {w.name for w in select_variants(["soft_step"], [])} == {"soft_step", "soft_step 16x4"}
+    assert [w.name for w in select_variants([], ["pybullet 4x100"])] == ["pybullet 4x100"]
+    assert len(select_variants()) == len(ENGINE_VARIANTS)
     with pytest.raises(lv.UnknownName, match="soft_step"):
-        ways(["softstep"])
+        select_variants(["softstep"])
     with pytest.raises(lv.UnknownName, match="engine"):
-        ways([], ["impulses"])
+        select_variants([], ["impulses"])
 
 
 # -- the table and the command --------------------------------------------------------------------
 
 
-def test_the_table_tells_worst_values_losses_and_reasons():
+def test_the_table_has_worst_values_cases_out_of_bounds_and_reasons():
     case = {"mu": 0.5, "slope": 0.9}
     found = [
         Record("stick", "impulses", case, {"creep": 0.02}),
@@ -437,7 +439,7 @@ def test_the_table_tells_worst_values_losses_and_reasons():
     assert "| impulses | **0.02 m/s, 0/1** |" in text
     assert "| soft_step | 1.0e-09 m/s, 1/1 |" in text
     assert "| drake | – |" in text
-    assert tables.losses(found) == [
+    assert tables.out_of_bound_cases(found) == [
         "stick, impulses: 1 of 1 cases out, creep 0.02 m/s (bound 1.0e-06 m/s); within it: soft_step"
     ]
     assert tables.notes(found) == ["drake: stick: it has no cause"]

@@ -12,7 +12,7 @@ from lavender.lab.report.engine import read_engine_answers
 from lavender.lab.report.findings import Report
 from lavender.lab.report.terminal import print_report
 
-LEVELS = (1e-3, 1e-6)
+TOLERANCES = (1e-3, 1e-6)
 FALSE_CLAIM = {"claim_check": "contradicted", "status_conflict": "says CONVERGED"}
 BUDGET = {"mode": "budget", "tol": 0.0, "max_iter": 8, "status": "MAX_ITERATIONS", "claims": False,
           "work": {"sweeps": 8}, "iterations": 8}  # fmt: skip
@@ -38,7 +38,7 @@ def record(case, solver, time, relative, **more):
 
 def records_of(*made, structure=None, law=None):
     found = bench.Records()
-    versions, plan = {"numpy": "2"}, {"levels": list(LEVELS)}
+    versions, plan = {"numpy": "2"}, {"tolerances": list(TOLERANCES)}
     found.add(Run("run", "2026-01-01", "0.1", "3.11", "linux", "a cpu", 2, 1, versions, plan))
     for case in dict.fromkeys(r.case for r in made):
         found.add(info(case, (law or {}).get(case, "lcp"), (structure or {}).get(case, ("stack",))))
@@ -47,12 +47,12 @@ def records_of(*made, structure=None, law=None):
     return found
 
 
-def in_turns(made, case, solver, time, relative, **more):
-    """Add a run alone and the same in turns with others, 1.25 times as long."""
+def interleaved(made, case, solver, time, relative, **more):
+    """Add a run alone and the same interleaved with others, 1.25 times as long."""
     made.append(record(case, solver, time, relative, **more))
     slow = 1.25 * time
-    turns = {"way": "call", "turns": "one", "times": (slow,) * 5, "pace": 1e-4}
-    made.append(record(case, solver, slow, relative, **(turns | more)))
+    run = {"timing_mode": "call", "interleave_group": "one", "times": (slow,) * 5, "calibration_time": 1e-4}
+    made.append(record(case, solver, slow, relative, **(run | more)))
 
 
 def shown(found, width=200, **more):
@@ -68,10 +68,29 @@ def example(folder):
     crashed = {"status": "CRASHED (SIGSEGV)", "claims": False}
     for i, case in enumerate(("pile", EVIL)):
         size = 1e-3 * (1 + i)
-        in_turns(made, case, "auto", size, 1e-9, motion_speed=1e-4, motion=1e-3, bound=1e-5, bits="a")
-        in_turns(made, case, "direct", 2.0 * size, 1e-13, motion_speed=1e-8, bits="b", degenerate=0.25)
-        in_turns(made, case, "nncg", 9.0 * size, 1e-7)
-        made.append(record(case, "osqp", 3.0 * size, 1e-8, own_min=0.5 * size))
+        interleaved(
+            made,
+            case,
+            "auto",
+            size,
+            1e-9,
+            motion_speed=1e-4,
+            motion_error=1e-3,
+            bound=1e-5,
+            solution_hash="a",
+        )
+        interleaved(
+            made,
+            case,
+            "direct",
+            2.0 * size,
+            1e-13,
+            motion_speed=1e-8,
+            solution_hash="b",
+            boundary_fraction=0.25,
+        )
+        interleaved(made, case, "nncg", 9.0 * size, 1e-7)
+        made.append(record(case, "osqp", 3.0 * size, 1e-8, backend_time_min=0.5 * size))
         made.append(record(case, "pgs", size, 9e-4, tol=1e-3, iterations=40))
         made += [record(case, "pgs", 1e-4, (1 + 3 * k) * 1e-2, order=order, **BUDGET) for k, order in
                  enumerate(("given", "reverse"))]  # fmt: skip
@@ -83,9 +102,9 @@ def example(folder):
     made.append(record("idle", "pgs", 1e-5, 1.0, velocity=3e-12))
     for step in range(2):
         for start, left in (("cold", 1e-1), ("carried", 1e-2)):
-            steps = {"start": start, "step": step, "way": "steps"}
+            steps = {"start": start, "step": step, "timing_mode": "steps"}
             made.append(record(f"walk[{step}]", "pgs", 1e-3, left, **steps, **BUDGET))
-            in_turns(made, f"walk[{step}]", "auto", 2e-3 if start == "cold" else 1e-3, 1e-8, **steps)
+            interleaved(made, f"walk[{step}]", "auto", 2e-3 if start == "cold" else 1e-3, 1e-8, **steps)
     found = records_of(*made, structure={EVIL: ("stack", "friction")}, law={EVIL: "coulomb"})
     change = {
         "pile": {

@@ -20,7 +20,7 @@ from lavender.lab.report.verdict import build_verdict
 from lavender.lab.report.write import write
 
 PLAN = bench.Plan(
-    levels=(1e-3,), speed_levels=(1e-2, 1e-4), budgets=(8,), repeats=1, orders=(), time_limit=60.0
+    tolerances=(1e-3,), velocity_tolerances=(1e-2, 1e-4), budgets=(8,), repeats=1, orders=(), time_limit=60.0
 )
 
 
@@ -32,31 +32,33 @@ def records():
 def test_times_to_a_speed_are_those_of_runs_that_reached_it(records):
     for row in statistics.reaches(motion_tables.convert_to_motion_errors(records)):
         runs = [r for r in records if (r.case, r.solver, r.start) == (row.case, row.solver, row.start)]
-        for level, time in row.times.items():
-            assert time == min((r.time_min for r in runs if r.motion_speed <= level), default=math.inf)
+        for tolerance, time in row.times.items():
+            assert time == min((r.time_min for r in runs if r.motion_speed <= tolerance), default=math.inf)
         assert row.best == min(r.motion_speed for r in runs)
         assert row.bound >= 0.0
-    assert motion_tables.get_speed_levels(records) == (1e-2, 1e-4)
+    assert motion_tables.get_velocity_tolerances(records) == (1e-2, 1e-4)
 
 
 def test_the_first_sentence_is_by_motion_error_if_that_was_asked_for(records):
     found = Report(records)
     line, *_ = recommendation.recommend_from_single_runs(found.by_speed)
     said = found.verdict.statements[0]
-    assert said.text.startswith(f"Use {line.by_level[1e-4].best.solver}: it solves stack(n=16) in ")
+    assert said.text.startswith(f"Use {line.by_tolerance[1e-4].best.solver}: it solves stack(n=16) in ")
     assert "until no body is wrong by more than 1e-4 m/s." in said.text
     # the line to copy does what the sentence says
     problem = lv.suite.case("stack(n=16)").problem
     assert eval(said.line, {"lv": lv, "problem": problem}).motion_error().speed <= 1e-4
     (run,) = found.records.runs.values()
-    found.records.add(dataclasses.replace(run, plan={**run.plan, "speed_levels": ()}))
+    found.records.add(dataclasses.replace(run, plan={**run.plan, "velocity_tolerances": ()}))
     first, *_, last = build_verdict(found.records).statements
     assert "down to 1e-3 of the error of doing nothing" in first.text
     assert last.text.startswith("By motion error ") and "1e-3 m/s" in last.text
 
 
 def test_without_motion_errors_there_is_nothing_to_show(tmp_path):
-    plain = bench.run(["stack(n=4)"], ["pgs"], bench.Plan(levels=(1e-3,), budgets=(), repeats=1, orders=()))
+    plain = bench.run(
+        ["stack(n=4)"], ["pgs"], bench.Plan(tolerances=(1e-3,), budgets=(), repeats=1, orders=())
+    )
     found = Report(plain)
     assert len(found.by_speed) == 0 and found.speeds == ()
     assert table_specs.tabulate_motion_errors(found).rows == table_specs.tabulate_speeds(found).rows == []
@@ -88,14 +90,14 @@ def test_what_has_nothing_to_do_is_in_no_ranking(records, tmp_path):
 
 def test_a_campaign_counts_cases_by_motion_error_too(tmp_path):
     lv.io.save(idle_problem(), tmp_path / "idle.npz")
-    plan = bench.CampaignPlan(levels=(1e-3,), budgets=(1, 64), orders=(), motion=True)
+    plan = bench.CampaignPlan(tolerances=(1e-3,), budgets=(1, 64), orders=(), motion=True)
     found = bench.run(["stack(n=4)", "stack(n=32)", str(tmp_path / "idle.npz")], ["pgs"], plan, workers=1)
     made = Report(found)
     best = [min(r.motion_speed for r in made.records if r.case == case) for case in made.records.cases]
     rows = statistics.robustness(made.by_speed)
     for row in rows:
         assert row.cases == len(best) == 2
-        assert row.reached == {level: sum(v <= level for v in best) for level in row.reached}
+        assert row.reached == {tolerance: sum(v <= tolerance for v in best) for tolerance in row.reached}
     assert sum(row.reached[1e-2] for row in rows) > 0
     assert "to 1e-3 m/s" in write(made, tmp_path, figures=False).read_text(encoding="utf-8")
 

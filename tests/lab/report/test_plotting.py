@@ -47,7 +47,9 @@ def test_a_drawing_holds_the_runs_of_its_solvers(tmp_path):
         assert drawn["pgs"].get("class") == "c s1"
         for c in figure.curves:
             runs = [
-                r for r in records if (r.case, r.solver, r.order, r.turns) == (case, c.solver, "given", "")
+                r
+                for r in records
+                if (r.case, r.solver, r.order, r.interleave_group) == (case, c.solver, "given", "")
             ]
             points = sorted((r.time_min, r.relative) for r in runs if r.usable)
             assert sorted(zip(c.x, c.y, strict=True)) == points and len(c.notes) == len(points)
@@ -81,7 +83,7 @@ def test_a_drawing_survives_what_has_no_place_on_its_axes():
     for drawn in (
         figures.Figure("f", "<t>&$x_", "x", "y", (odd,)),
         figures.Figure("f", "t", "x", "y", (), x_log=False, y_log=False),
-        figures.Figure("f", "t", "x [s]", "y", (noted,), levels=(0.0,)),
+        figures.Figure("f", "t", "x [s]", "y", (noted,), tolerances=(0.0,)),
         figures.Figure("f", "t", "x", "y", (flat,), False, False),
     ):
         assert plot_for_page(drawn, {}) == plot_for_page(drawn, {})
@@ -126,7 +128,7 @@ def test_the_picture_of_all_cases_is_the_median_of_what_was_reached_by_each_time
             assert (low, middle, high) == tuple(np.sort(reached)[[1, 3, 5]])
         assert list(curve.y) == sorted(curve.y, reverse=True)
     # Shares of a batch, and the least time of repetitions of which another left less, are no points of it.
-    more = [record("a", "pgs", 1e-9, 1e-12, turns="one", way=way, mode=mode) for way, mode in
+    more = [record("a", "pgs", 1e-9, 1e-12, interleave_group="one", timing_mode=timed, mode=mode) for timed, mode in
             (("batch", "tol"), ("call", "time"))]  # fmt: skip
     assert repr(figures.build_overall_figure(records_of(*made, *more))) == repr(found)  # whose floor is NaN
 
@@ -137,7 +139,7 @@ def test_a_paper_has_a_figure_for_each_folder_and_backends_by_their_own_interfac
     made, places = [], {"a": "piles", "b": "piles", "c": "chains", "d": "chains"}
     for case in places:
         made += [record(case, f"solver_{i}", 1e-3 * (1 + i), 10.0 ** (i - 9)) for i in range(6)]
-        made.append(record(case, "osqp", 12.7e-3, 1e-12, own_min=1.1e-3))
+        made.append(record(case, "osqp", 12.7e-3, 1e-12, backend_time_min=1.1e-3))
     found = records_of(*made)
     for case, folder in places.items():
         found.add(dataclasses.replace(found.cases[case], source=f"mine/{folder}/{case}.npz"))

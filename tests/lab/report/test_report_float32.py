@@ -42,7 +42,7 @@ def test_a_recording_of_a_float32_engine_counts_its_early_answers(tmp_path):
     assert lv.load(tmp_path / found.files[0]).precision == "float32"
     lines = [json.loads(line) for line in (tmp_path / "engine.jsonl").read_text().splitlines()]
     early = sum(line["verdict"] != "at its floor" for line in lines)
-    assert all(line["precision"] == "float32" and line["roundoff_floor"] > 1e-9 for line in lines)
+    assert all(line["precision"] == "float32" and line["floor"] > 1e-9 for line in lines)
     assert early > 0  # at its tolerance, far above the floor
     (engine,) = read_engine_answers([str(tmp_path)], Records())
     assert engine.unconverged == early

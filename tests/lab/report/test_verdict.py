@@ -15,7 +15,7 @@ from lavender.lab.report.findings import Report
 from lavender.lab.report.terminal import COMMAND_LINES, MAX_LINES
 from lavender.lab.report.text import format_percent, format_ratio, format_residual
 from lavender.lab.report.verdict import build_verdict
-from tests.lab.report.synthetic import BUDGET, example, in_turns, record, records_of, shown
+from tests.lab.report.synthetic import BUDGET, example, interleaved, record, records_of, shown
 
 
 def test_numbers_are_written_with_what_they_know():
@@ -38,7 +38,7 @@ def test_the_sentence_has_the_worst_case_and_the_line_its_command_in_c():
     assert said.text.startswith(
         "Use auto: it solves your 2 stacks in 12.7 ms on average (40.0 ms at worst, b), cold, down to 1e-6 of the error"
     )
-    assert said.in_c == "lavender export c liblavender --solver auto --for 'my report/records.jsonl'"
+    assert said.in_c == "lavender export c liblavender --solver auto --records 'my report/records.jsonl'"
     # Of two runs put together: x never ran on b, which is no miss of its own.
     parts = build_verdict(records_of(record("a", "x", 0.004, 1e-9), record("b", "y", 9.0, 0.5)))
     assert "(a miss counted as 2.00 s; on 1 it has no run)" in parts.text
@@ -95,8 +95,8 @@ def recorded(folder, answers):
     (folder / "engine.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
     made = []
     for i in range(len(answers)):
-        in_turns(made, f"{folder.name} {i}", "auto", 32e-6 * (1 + i), 1e-8)
-        in_turns(made, f"{folder.name} {i}", "newton", 48e-6 * (1 + i), 1e-8)
+        interleaved(made, f"{folder.name} {i}", "auto", 32e-6 * (1 + i), 1e-8)
+        interleaved(made, f"{folder.name} {i}", "newton", 48e-6 * (1 + i), 1e-8)
         made.append(record(f"{folder.name} {i}", "pgs", 450e-6 * (1 + i), 1e-8))
     found = records_of(*made)
     for i in range(len(answers)):
@@ -136,7 +136,7 @@ def test_the_first_sentence_the_structures_and_the_engine_have_one_set_of_number
     own = dict(zip(table.heads, table.rows[0], strict=True))
     assert (own["first here"], own["to 1e-6, here"]) == ("auto", ours)
     assert own["to 1e-6"].startswith(seconds(score) if solved else "–")
-    ends = ("in turns", "inside the engine", "alone")
+    ends = ("interleaved", "inside the engine", "alone")
     rows = [line.split()[0] for line in shown(made).splitlines() if line.endswith(ends)]
     wanted = ["auto", "newton", "pgs"]
     if solved:
@@ -171,7 +171,7 @@ def test_tables_stay_within_the_terminal_and_nothing_is_cut(tmp_path, width):
     assert "…" not in out
     for line in found.lines:
         assert line.name in out
-        for best in (a.best for a in (*line.by_level.values(), *line.by_time.values())):
+        for best in (a.best for a in (*line.by_tolerance.values(), *line.by_time.values())):
             assert best is None or best.solver in out
 
 

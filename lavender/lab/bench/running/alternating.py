@@ -13,12 +13,20 @@ from statistics import median
 from time import perf_counter
 from typing import Any
 
+from lavender.base.errors import reject_former_names
 from lavender.batch.solve import solve_many
 from lavender.lab.bench.cases import Item, Source, resolve
 from lavender.lab.bench.record import CaseInfo, Record
 from lavender.lab.bench.running.plan import Plan
 from lavender.lab.bench.running.runner import Runner, Watch, is_foreign, open_runner
-from lavender.lab.bench.running.timing import Ask, Task, just_written, outcome_of, pace, record_of
+from lavender.lab.bench.running.timing import (
+    Ask,
+    Task,
+    just_written,
+    measure_calibration_time,
+    outcome_of,
+    record_of,
+)
 from lavender.lab.bench.store import Records, Store
 
 USUAL_REPETITIONS, MIN_REPETITIONS, MAX_REPETITIONS = 7, 3, 41
@@ -33,6 +41,7 @@ RecordsByKey = dict[tuple[Any, ...], list[Record]]  # records of one measurement
 Cases = Sequence[tuple[Item, CaseInfo]]
 
 
+@reject_former_names(fresh="reuse")
 def time_alternately(
     cases: Iterable[Source],
     asks: Sequence[Ask],
@@ -43,7 +52,7 @@ def time_alternately(
     watch: Watch | None = None,
     isolate: bool = True,
     memory: int | None = None,
-    fresh: bool = False,
+    reuse: bool = True,
 ) -> Records:
     """Time lines alternately on cases that `lavender.lab.bench.run` has described in `known`.
 
@@ -51,9 +60,9 @@ def time_alternately(
 
     Parameters
     ----------
-    cases, plan, store, watch, isolate, memory, fresh : as `lavender.lab.bench.run`
+    cases, plan, store, watch, isolate, memory, reuse : as `lavender.lab.bench.run`
     asks : sequence of Ask
-        Of way "call" on single cases, "steps" over sequences, "batch" on either.
+        Of timing mode "call" on single cases, "steps" over sequences, "batch" on either.
     known : Records
 
     Returns
@@ -63,7 +72,7 @@ def time_alternately(
     """
     this = list(known.runs.values())[-1]
     names = list(dict.fromkeys(ask.solver for ask in asks))
-    with open_runner(this, plan, names, store, watch, isolate, memory, fresh) as runner:
+    with open_runner(this, plan, names, store, watch, isolate, memory, reuse) as runner:
         runner.out = known
         described = [(i, known.cases[i.name]) for i in resolve(cases) if i.name in known.cases]
         identity = repr([asks, [info.sha for _, info in described]])
@@ -83,11 +92,11 @@ def time_alternately(
 
 
 class _Alternation:
-    """Repeats all lines on the cases of a part; `stages` identifies the lines and cases that are timed together."""
+    """Repeats all lines on the cases of a part; `interleave_group` identifies lines and cases timed together."""
 
-    def __init__(self, runner: Runner, asks: Sequence[Ask], turns: str) -> None:
-        self.runner, self.asks, self.turns = runner, asks, turns
-        self.known = {r.key for r in runner.known.values() if r.turns == turns}
+    def __init__(self, runner: Runner, asks: Sequence[Ask], interleave_group: str) -> None:
+        self.runner, self.asks, self.interleave_group = runner, asks, interleave_group
+        self.known = {r.key for r in runner.known.values() if r.interleave_group == interleave_group}
         for record in runner.known.values():
             if record.key in self.known:
                 runner.out.add(record)
@@ -96,7 +105,7 @@ class _Alternation:
     def measure_part(self, part: Cases, limit: float, extra: float) -> None:
         """Repeat all lines on some cases or one sequence: at most `limit` [s], above the usual number `extra` [s]."""
         is_sequence = bool(part[0][0].sequence)
-        asks = [a for a in self.asks if a.way == "batch" or (a.way == "steps") == is_sequence]
+        asks = [a for a in self.asks if a.timing_mode == "batch" or (a.timing_mode == "steps") == is_sequence]
         accepted = {ask: [(i, info) for i, info in part if self.accepts(ask, i)] for ask in asks}
         records: RecordsByKey = {}
         begun = perf_counter()
@@ -113,17 +122,17 @@ class _Alternation:
             else:
                 for item, info in part:
                     for ask in order:
-                        if ask.way != "batch" and any(info is other for _, other in accepted[ask]):
+                        if ask.timing_mode != "batch" and any(info is other for _, other in accepted[ask]):
                             self.add(records, self.time_case(ask, item, info, None)[0])
             for ask in order:
-                if ask.way == "batch" and _is_batch(accepted[ask], is_sequence):
+                if ask.timing_mode == "batch" and _is_batch(accepted[ask], is_sequence):
                     self.time_batch(ask, accepted[ask], records)
         for repeated in records.values():
             self.runner.keep(_merge(repeated))
 
     def accepts(self, ask: Ask, item: Item) -> bool:
         spec = self.runner.specs[ask.solver]
-        if is_foreign(spec) and (ask.way == "batch" or ask.mode == "time"):
+        if is_foreign(spec) and (ask.timing_mode == "batch" or ask.mode == "time"):
             return False  # a process of its own adds its start, or takes no limit
         return spec.refuses(item.problem) is None
 
@@ -131,8 +140,8 @@ class _Alternation:
         """Return one repetition of a line on one case."""
         more = {
             "time_limit": ask.time_limit or self.runner.plan.time_limit,
-            "repeats": 1 if ask.way == "steps" else 2,
-            "turns": self.turns,
+            "repeats": 1 if ask.timing_mode == "steps" else 2,
+            "interleave_group": self.interleave_group,
             "guarded": False,
         }
         return Task.of(info, ask, **more)
@@ -150,7 +159,9 @@ class _Alternation:
         return record, after
 
     def time_steps(self, ask: Ask, steps: Cases, records: RecordsByKey) -> None:
-        if ask.way == "batch" or all(self.make_task(ask, info).key in self.known for _, info in steps):
+        if ask.timing_mode == "batch" or all(
+            self.make_task(ask, info).key in self.known for _, info in steps
+        ):
             return
         before = None
         for item, info in steps:
@@ -163,7 +174,7 @@ class _Alternation:
         if all(task.key in self.known for task in tasks):
             return
         problems = [just_written(item.problem, ask.start) for item, _ in cases]
-        calibration_time = pace()
+        calibration_time = measure_calibration_time()
         begun = perf_counter()
         try:
             solutions = solve_many(problems, ask.solver, tol=ask.tol, max_iter=ask.max_iter or None)
@@ -186,13 +197,13 @@ def _is_batch(cases: Cases, is_sequence: bool) -> bool:
 def _merge(records: Sequence[Record]) -> Record:
     """Return the last record, with the times of all repetitions."""
     times = [t for r in records for t in r.times]
-    paces = [r.pace for r in records if r.pace is not None]
+    calibration_times = [r.calibration_time for r in records if r.calibration_time is not None]
     return replace(
         records[-1],
         repeats=len(records),
         times=tuple(times),
-        reached=tuple(x for r in records for x in r.reached),
+        residual_per_repeat=tuple(x for r in records for x in r.residual_per_repeat),
         time_min=min(times, default=records[-1].time_min),
         time_median=median(times) if times else records[-1].time_median,
-        pace=min(paces, default=None),
+        calibration_time=min(calibration_times, default=None),
     )

@@ -19,7 +19,7 @@ from time import perf_counter
 from typing import Any
 
 from lavender.base.arrays import FloatArray, several
-from lavender.base.errors import InputError, LavenderError
+from lavender.base.errors import InputError, LavenderError, reject_former_names
 from lavender.judge.solution import CONTRADICTED
 from lavender.judge.states import states_of
 from lavender.lab import motion
@@ -68,7 +68,7 @@ def carry(before: Problem, impulse: FloatArray, problem: Problem) -> FloatArray:
 
 
 def add_motion_error(record: Record, problem: Problem, impulse: Any) -> Record:
-    """Return the record with `motion`, `motion_speed` and `bound` of its impulses (m,) [N s], None if there are none.
+    """Return the record with `motion_error`, `motion_speed` and `bound` of its impulses (m,) [N s].
 
     No clock runs. The reference, and under Coulomb's law the motions that are found, are cached in `problem`.
     """
@@ -80,7 +80,7 @@ def add_motion_error(record: Record, problem: Problem, impulse: Any) -> Record:
         motion.motion_error(problem, impulse) if found is None else motion.nearest(problem, impulse, found)
     )
     speed = error.rows if error.speed is None else error.speed
-    told = replace(record, motion=error.relative, motion_speed=speed, bound=error.bound)
+    told = replace(record, motion_error=error.relative, motion_speed=speed, bound=error.bound)
     reference = error.reference
     if (
         record.claims
@@ -101,8 +101,8 @@ def add_motion_error(record: Record, problem: Problem, impulse: Any) -> Record:
 def add_solution_hash(record: Record, problem: Problem, impulse: FloatArray) -> Record:
     """Return the record with the hash of its impulses (m,) [N s] and the fraction of blocks at a boundary."""
     fraction = states_of(problem, impulse).boundary_fraction
-    bits = hashlib.sha256(impulse.tobytes()).hexdigest()[:16]
-    return replace(record, bits=bits, degenerate=fraction)
+    solution_hash = hashlib.sha256(impulse.tobytes()).hexdigest()[:16]
+    return replace(record, solution_hash=solution_hash, boundary_fraction=fraction)
 
 
 def without_times(record: Record, time_limit: float) -> Record:
@@ -110,7 +110,7 @@ def without_times(record: Record, time_limit: float) -> Record:
     nan = math.nan
     return replace(
         record, setup_min=nan, setup_median=nan, solve_min=nan, solve_median=nan, time_min=nan, time_median=nan,
-        pace=None, load=None, own_min=None, time_limit=time_limit,
+        calibration_time=None, load=None, backend_time_min=None, time_limit=time_limit,
     )  # fmt: skip
 
 
@@ -136,6 +136,7 @@ def solver_names(names: str | Sequence[str] | None) -> list[str]:
     return [name for name, spec in sorted(registry.specs().items()) if spec.missing() is None]
 
 
+@reject_former_names(fresh="reuse")
 def run(
     cases: Source | Iterable[Source] = (),
     solvers: str | Sequence[str] | None = None,
@@ -148,7 +149,7 @@ def run(
     isolate: bool = True,
     memory: int | None = None,
     into: list[Records] | None = None,
-    fresh: bool = False,
+    reuse: bool = True,
 ) -> Records:
     """Measure every solver that takes a case, on every case.
 
@@ -172,7 +173,7 @@ def run(
         machine of a cluster.
     into : list, optional
         Receives the records before the first is made, for those who stop the run and want what there is.
-    fresh : measure again what `store` holds already
+    reuse : do not repeat measurements that `store` holds
 
     Returns
     -------
@@ -197,7 +198,7 @@ def run(
     packages = {module for name in names for module in registry.specs()[name].requires}
     this = machine.describe(plan.as_dict(), packages)
     backend, cluster = connect_backend(backend) if spread else ("", contextlib.nullcontext())
-    with cluster, open_runner(this, plan, names, store, watch, isolate, memory, fresh) as runner:
+    with cluster, open_runner(this, plan, names, store, watch, isolate, memory, reuse) as runner:
         if into is not None:
             into.append(runner.out)
         return runner.run(items, workers, backend, memory)
@@ -212,11 +213,11 @@ def open_runner(
     watch: Watch | None = None,
     isolate: bool = True,
     memory: int | None = None,
-    fresh: bool = False,
+    reuse: bool = True,
 ) -> Iterator[Runner]:
     """Open the store and a process for other packages' solvers, and limit BLAS to one thread; see `run`."""
     with opened(store) as kept, Worker(memory) as worker, one_thread():  # describing a case computes too
-        yield Runner(this, plan, names, kept, watch, worker if isolate else None, fresh)
+        yield Runner(this, plan, names, kept, watch, worker if isolate else None, reuse)
 
 
 class Runner:
@@ -230,7 +231,7 @@ class Runner:
         store: Store | None = None,
         watch: Watch | None = None,
         worker: Worker | None = None,
-        fresh: bool = False,
+        reuse: bool = True,
     ) -> None:
         self.this, self.plan, self.names = this, plan, names
         self.store, self.watch, self.worker = store, watch, worker
@@ -238,7 +239,7 @@ class Runner:
         self.out = Records(source=str(store.path) if store else "")
         self.done = 0
         self.total = 0
-        stored = Records() if store is None or fresh else store.records
+        stored = Records() if store is None or not reuse else store.records
         self.known: dict[Any, Record] = {r.key: r for r in stored if r.run == this.run}
         # Descriptions of a campaign are reused: many cases take longer to describe than to load.
         self.described = {n: i for n, i in stored.cases.items() if plan.campaign and i.run == this.run}
@@ -382,7 +383,7 @@ class Runner:
             self.done += 1
 
     def measure_sequence(self, items: list[Item]) -> None:
-        """Measure every solver on the steps of a sequence, in passes: each budget and level, cold and carried."""
+        """Measure every solver on the steps of a sequence, in passes: each budget and tolerance, cold and carried."""
         infos = [self.load_case(item) for item in items]
         identity = hashlib.sha256("".join(i.sha for i in infos if i is not None).encode()).hexdigest()[:16]
         steps = [
@@ -401,11 +402,11 @@ class Runner:
             self.done += len(items)
 
     def measure_pass(self, steps: list[tuple[Item, CaseInfo]], spec: SolverSpec, ask: Ask) -> None:
-        """Measure one pass. It ends, with a note, when its steps have taken `Plan.pass_limit` together."""
+        """Measure one pass. It ends, with a note, when its steps have taken `Plan.sequence_time_limit` together."""
         repeats = self.plan.repeats if len(steps) <= MAX_REPEATED_STEPS else 1
         tasks = [Task.of(info, ask, repeats=repeats, time_limit=self.plan.time_limit) for _, info in steps]
         problems = [item for item, _ in steps]
-        limit, spent, made = self.plan.pass_limit, 0.0, 0
+        limit, spent, made = self.plan.sequence_time_limit, 0.0, 0
         for task in tasks:
             record = self.known.get(task.key)
             if record is None or spent > limit:
@@ -435,7 +436,7 @@ class Runner:
             asked = asked_of(ask.mode, ask.tol, ask.max_iter)
             reason = (
                 f"stopped after {made} of {len(tasks)} steps, which took more than the pass limit of {limit:.3g} s "
-                "together (--pass-limit)"
+                "together (--sequence-time-limit)"
             )
             self.keep(Skip(self.this.run, f"{problems[0].sequence}, {asked}, {ask.start}", spec.name, reason))
 
@@ -468,7 +469,7 @@ class Runner:
         return other
 
     def measure_solver(self, info: CaseInfo, problem: Problem, name: str) -> None:
-        """Measure one solver on one case, at every budget and level."""
+        """Measure one solver on one case, at every budget and tolerance."""
         spec = self.select_solver(info.case, name, [problem])
         if spec is None:
             return

@@ -2,9 +2,9 @@
 
 The timed call is the line that a report prints, `lv.solve(problem, "name", tol=...)`, with the judge. The arrays of its
 problem were written just before, as a simulator leaves them, and other work has used the caches since. A guarded solve
-under the time limit runs first; if it does not end, its own time is recorded. If `Task.way` is empty, only `prepare`
-and `solve` are timed, without the judge, on a problem of which nothing is computed yet. BLAS and OpenMP use one thread,
-and the garbage collector is off.
+under the time limit runs first; if it does not end, its own time is recorded. If `Task.timing_mode` is empty,
+only `prepare` and `solve` are timed, without the judge, on a problem of which nothing is computed yet. BLAS and OpenMP
+use one thread, and the garbage collector is off.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class Ask:
     tol: float
     max_iter: int = 0  # 0: the solver's own default
     time_limit: float = 0.0  # s, of one solve; 0: that of the plan
-    way: str = "call"  # as `Record.way`
+    timing_mode: str = "call"  # as `Record.timing_mode`
     start: str = "cold"
 
 
@@ -66,8 +66,8 @@ class Task:
     options: Mapping[str, Any] = field(default_factory=dict)
     repeats: int = 1
     step: int = -1
-    way: str = ""
-    turns: str = ""
+    timing_mode: str = ""
+    interleave_group: str = ""
     guarded: bool = True  # a solve under the time limit comes first
     lead: float = 0.0  # s, that the line takes before its call: carrying impulses
 
@@ -151,9 +151,9 @@ class Outcome:
     setups: tuple[float, ...]  # s, of each repeat
     solves: tuple[float, ...]  # s
     times: tuple[float, ...]  # s, of the line of each repeat; none where the guard did not end
-    pace: float | None  # s
-    own: float | None = None  # s, in the backend's own solve
-    reached: tuple[float, ...] = ()  # relative residual of each repeat, in mode "time"
+    calibration_time: float | None  # s
+    backend_time: float | None = None  # s, in the backend's own solve
+    residual_per_repeat: tuple[float, ...] = ()  # relative residual of each repeat, in mode "time"
     status_conflict: str = ""  # as in a Solution
 
 
@@ -182,14 +182,14 @@ def measure(problem: Problem, task: Task, impulse: Any = None) -> tuple[Record, 
 def attempt(problem: Problem, task: Task, impulse: Any = None) -> Outcome | str:
     """Run the solver of a task in this process. Return an exception as text."""
     runs: list[tuple[Solution, float]] = []  # with the time of the line
-    paces: list[float] = []
-    owns: list[float] = []
+    calibration_times: list[float] = []
+    backend_times: list[float] = []
     guard: Solution | None = None
     try:
         _warm_up(task.solver)
         with _undisturbed(task.solver):
             begun = perf_counter()
-            if task.way and task.guarded:
+            if task.timing_mode and task.guarded:
                 # A plug-in may test nothing: then its own budget ends its line, and a larger one never would.
                 tests = registry.get(task.solver).builtin or task.mode != "tol"
                 guard = uninterrupted(
@@ -199,21 +199,21 @@ def attempt(problem: Problem, task: Task, impulse: Any = None) -> Outcome | str:
                     guard = uninterrupted(_prepare_and_solve(problem, task, impulse))
             left = max(1, task.repeats - (guard is not None))
             while left and (guard is None or guard.status is not Status.TIME_LIMIT):
-                paces.append(pace())
-                if not task.way:
+                calibration_times.append(measure_calibration_time())
+                if not task.timing_mode:
                     parts = uninterrupted(_prepare_and_solve(problem, task, impulse))
                     runs.append((parts, parts.setup_time + parts.solve_time))
                 else:
                     with measure_backend_time(task.solver) as spent:
                         runs.append(_time_call(problem, task, impulse, guard))
-                    owns += [sum(spent)] if spent else []
-                if task.turns:  # in turns with others: as a simulator that calls the same line at every step
+                    backend_times += [sum(spent)] if spent else []
+                if task.interleave_group:  # Keep the last call only: a simulator also repeats one call.
                     left, runs = left if perf_counter() - begun < MAX_WARM_UP_TIME else 1, runs[-1:]
                 left -= 1
                 if runs[-1][0].status is Status.TIME_LIMIT or perf_counter() - begun > task.time_limit:
                     left = 0 if task.mode != "time" else left
             solution = runs[-1][0] if runs else guard
-            if guard is None and task.way and _ended_by_budget(solution, task):
+            if guard is None and task.timing_mode and _ended_by_budget(solution, task):
                 # More iterations than the solver's own limit: they are asked for, under the guard.
                 return attempt(problem, replace(task, guarded=True), impulse)
     except Exception as error:
@@ -221,12 +221,18 @@ def attempt(problem: Problem, task: Task, impulse: Any = None) -> Outcome | str:
         return f"{type(error).__name__}: {error}".strip()
     assert solution is not None  # there is at least one repeat
     made = [s for s, _ in runs] or [solution]
-    found = outcome_of(solution, made, [t for _, t in runs], min(paces, default=None), task.mode == "time")
-    return replace(found, own=min(owns, default=None))
+    found = outcome_of(
+        solution, made, [t for _, t in runs], min(calibration_times, default=None), task.mode == "time"
+    )
+    return replace(found, backend_time=min(backend_times, default=None))
 
 
 def outcome_of(
-    solution: Solution, made: list[Solution], times: list[float], paced: float | None, reached: bool = False
+    solution: Solution,
+    made: list[Solution],
+    times: list[float],
+    calibration_time: float | None,
+    keeps_residuals: bool = False,
 ) -> Outcome:
     """Return the outcome of the repeats `made`, the last of which is `solution`."""
     return Outcome(
@@ -241,8 +247,8 @@ def outcome_of(
         setups=tuple(s.setup_time for s in made),
         solves=tuple(s.solve_time for s in made),
         times=tuple(times),
-        pace=paced,
-        reached=tuple(float(s.residual.relative) for s in made) if reached else (),
+        calibration_time=calibration_time,
+        residual_per_repeat=tuple(float(s.residual.relative) for s in made) if keeps_residuals else (),
     )
 
 
@@ -250,7 +256,7 @@ def _ended_by_budget(solution: Solution | None, task: Task) -> bool:
     assert solution is not None
     return (
         task.mode == "tol"
-        and not task.turns
+        and not task.interleave_group
         and task.max_iter > 0
         and solution.status is Status.MAX_ITERATIONS
     )
@@ -259,7 +265,7 @@ def _ended_by_budget(solution: Solution | None, task: Task) -> bool:
 _NUMBERS = np.arange(2.0**15)  # 256 KiB: more than a first cache holds
 
 
-def pace() -> float:
+def measure_calibration_time() -> float:
     """Return the time [s] of a loop of fixed work, which measures the machine's current speed and uses the caches."""
     begun = perf_counter()
     total = 0.0
@@ -370,9 +376,9 @@ def record_of(task: Task, s: Solution, found: Outcome) -> Record:
         solve_median=statistics.median(solves),
         time_min=min(both),
         time_median=statistics.median(both),
-        times=found.times if task.way else (),
-        reached=found.reached,
-        pace=found.pace,
+        times=found.times if task.timing_mode else (),
+        residual_per_repeat=found.residual_per_repeat,
+        calibration_time=found.calibration_time,
         load=machine.running(),
-        own_min=found.own,
+        backend_time_min=found.backend_time,
     )

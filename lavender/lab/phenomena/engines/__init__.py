@@ -1,4 +1,4 @@
-"""One file for each engine: `Engine(scene, **options)` steps a scene; a way is an engine with its setting."""
+"""One file for each engine: `Engine(scene, **options)` steps a scene; a variant is an engine with a setting."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ class Stepping:
 
 
 @dataclass(frozen=True)
-class Way:
+class EngineVariant:
     """An engine with a setting: its own defaults, or one that is recommended."""
 
     name: str
@@ -125,7 +125,7 @@ def missing_in_node(package: str) -> str:
 FINE = {"substeps": 16, "solver_iterations": 4}
 
 
-def _own() -> list[Way]:
+def _own() -> list[EngineVariant]:
     found = []
     for name, spec in STEPPERS.items():
         cannot = {} if spec.spin else {"spin": "the stepper has no spin friction"}
@@ -138,7 +138,7 @@ def _own() -> list[Way]:
             settings.append((f"{name} newton", newton, "4 substeps, Newton to 1e-6"))
         for full, more, words in settings:
             asked = {"stepper": name, "dt": 1 / 60, **more}
-            found.append(Way(full, "own", "", {}, f"1/60 s, {words}", scene=asked, cannot=cannot))
+            found.append(EngineVariant(full, "own", "", {}, f"1/60 s, {words}", scene=asked, cannot=cannot))
     return found
 
 
@@ -147,38 +147,39 @@ _JOLT, _RAPIER = PACKAGES_OF_NODE["jolt"], PACKAGES_OF_NODE["rapier"]
 #: Engines of others.
 _OTHERS = (
     *(
-        Way(
+        EngineVariant(
             f"mujoco {cone}{' noslip' if noslip else ''}", "mujoco", "mujoco", {"cone": cone, "noslip": noslip},
             "2 ms, Newton to 1e-8" + (f", {noslip} iterations of noslip" if noslip else ""),
         )
         for cone in ("pyramidal", "elliptic") for noslip in (0, 10)
     ),
-    Way("pybullet", "bullet", "pybullet", {"sweeps": 50, "substeps": 1}, "1/240 s, 50 sweeps"),
-    Way("pybullet 4x100", "bullet", "pybullet", {"sweeps": 100, "substeps": 4}, "1/240 s in 4 of 100 sweeps"),
-    Way("drake", "drake", "pydrake", {"approximation": "lagged", "hydroelastic": False},
+    EngineVariant("pybullet", "bullet", "pybullet", {"sweeps": 50, "substeps": 1}, "1/240 s, 50 sweeps"),
+    EngineVariant("pybullet 4x100", "bullet", "pybullet", {"sweeps": 100, "substeps": 4}, "1/240 s in 4 of 100 sweeps"),
+    EngineVariant("drake", "drake", "pydrake", {"approximation": "lagged", "hydroelastic": False},
         "1 ms, point contacts: its defaults", cannot=_PATCHES),
-    Way("drake lagged", "drake", "pydrake", {"approximation": "lagged", "hydroelastic": True},
+    EngineVariant("drake lagged", "drake", "pydrake", {"approximation": "lagged", "hydroelastic": True},
         "1 ms, hydroelastic bodies of 1e8 Pa", cannot=_PATCHES),
-    Way("drake sap", "drake", "pydrake", {"approximation": "sap", "hydroelastic": True},
+    EngineVariant("drake sap", "drake", "pydrake", {"approximation": "sap", "hydroelastic": True},
         "1 ms, SAP, hydroelastic bodies of 1e8 Pa", cannot=_PATCHES),
-    Way("lavendersim", "lavender_sim", "lavendersim", {"sweeps": 22}, "1/60 s in 4 of 22 sweeps"),
-    Way("lavendersim 64", "lavender_sim", "lavendersim", {"sweeps": 64}, "1/60 s in 4 of 64 sweeps"),
-    Way("rapier", "node", _RAPIER, {"engine": "rapier", "iterations": 4}, "1/60 s, 4 iterations: its defaults",
+    EngineVariant("lavendersim", "lavender_sim", "lavendersim", {"sweeps": 22}, "1/60 s in 4 of 22 sweeps"),
+    EngineVariant("lavendersim 64", "lavender_sim", "lavendersim", {"sweeps": 64}, "1/60 s in 4 of 64 sweeps"),
+    EngineVariant("rapier", "node", _RAPIER, {"engine": "rapier", "iterations": 4},
+        "1/60 s, 4 iterations: its defaults", cannot=NO_TORSION),
+    EngineVariant("rapier 16", "node", _RAPIER, {"engine": "rapier", "iterations": 16}, "1/60 s, 16 iterations",
         cannot=NO_TORSION),
-    Way("rapier 16", "node", _RAPIER, {"engine": "rapier", "iterations": 16}, "1/60 s, 16 iterations",
-        cannot=NO_TORSION),
-    Way("jolt", "node", _JOLT, {"engine": "jolt", "sweeps": 10, "substeps": 1, "gyroscopic": False},
+    EngineVariant("jolt", "node", _JOLT, {"engine": "jolt", "sweeps": 10, "substeps": 1, "gyroscopic": False},
         "1/60 s, 10 sweeps: its defaults", cannot=NO_TORSION),
-    Way("jolt 4", "node", _JOLT, {"engine": "jolt", "sweeps": 10, "substeps": 4, "gyroscopic": True},
+    EngineVariant("jolt 4", "node", _JOLT, {"engine": "jolt", "sweeps": 10, "substeps": 4, "gyroscopic": True},
         "1/60 s in 4 of 10 sweeps, gyroscopic torques", cannot=NO_TORSION),
-    Way("newton xpbd", "newton", "newton", {"solver": "XPBD", "iterations": 2},
+    EngineVariant("newton xpbd", "newton", "newton", {"solver": "XPBD", "iterations": 2},
         "1/60 s in 4 of 2 iterations, its default"),
-    Way("newton xpbd 20", "newton", "newton", {"solver": "XPBD", "iterations": 20}, "1/60 s in 4 of 20 iterations"),
-    Way("newton vbd", "newton", "newton", {"solver": "VBD", "iterations": 10},
+    EngineVariant("newton xpbd 20", "newton", "newton", {"solver": "XPBD", "iterations": 20},
+        "1/60 s in 4 of 20 iterations"),
+    EngineVariant("newton vbd", "newton", "newton", {"solver": "VBD", "iterations": 10},
         "1/60 s in 4 of 10 iterations, its default", cannot=NO_TORSION),
 )  # fmt: skip
-#: Name -> way; ours first.
-WAYS: dict[str, Way] = {way.name: way for way in (*_own(), *_OTHERS)}
+#: Variants of engines by name; lavender's own steppers come first.
+ENGINE_VARIANTS: dict[str, EngineVariant] = {variant.name: variant for variant in (*_own(), *_OTHERS)}
 
 
 def engine(module: str, scene: Scene, **options: Any) -> Stepping:
@@ -189,9 +190,9 @@ def engine(module: str, scene: Scene, **options: Any) -> Stepping:
     return made
 
 
-def make(way: Way, scene: Scene) -> Stepping:
-    """The engine of a way with a scene."""
-    return engine(way.module, scene, **way.options)
+def make(variant: EngineVariant, scene: Scene) -> Stepping:
+    """Create the engine of a variant for a scene."""
+    return engine(variant.module, scene, **variant.options)
 
 
 def follow(engine: Stepping, seconds: float, interval: float) -> Track:
