@@ -25,7 +25,7 @@ from lavender.base.arrays import FloatArray, IntArray
 from lavender.base.deadline import Deadline
 from lavender.base.errors import InputError
 from lavender.base.lazy_import import sparse as sp
-from lavender.judge.certificates import Proof, fighting, prove
+from lavender.judge.certificates import Proof, list_conflicting_blocks, prove
 from lavender.judge.residuals import residual
 from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
@@ -80,10 +80,10 @@ def conflict_of(problem: Problem, tol: float, deadline: Deadline | None = None) 
     proof = prove(inner, claim.certificate, tol, deadline)
     if proof.reason:
         return None
-    joints, contacts = fighting(problem, proof.y)
+    joints, contacts = list_conflicting_blocks(problem, proof.y)
     soft, first, last = joints or contacts, problem.cones.ptr[:-1], problem.cones.ptr[1:]
     tries = [
-        (np.concatenate([np.arange(first[i], last[i]) for i in soft]), proof.fighting.split(" against ")[0])
+        (np.concatenate([np.arange(first[i], last[i]) for i in soft]), proof.conflict.split(" against ")[0])
     ]
     if contacts:  # others may fight as well, of which this proof says nothing
         tries.append((np.flatnonzero(problem.cones.contact_rows), "all contacts"))

@@ -28,7 +28,7 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray
 from lavender.base.deadline import Deadline
-from lavender.judge.certificates import NEAR, check_certificate
+from lavender.judge.certificates import MAX_POLISHED_SLACK, check_certificate
 from lavender.judge.residuals import FLOOR_MOST, judged, remember
 from lavender.judge.solution import Claim, Status, summed
 from lavender.problem import Problem
@@ -358,7 +358,7 @@ class _Run:
         y[np.abs(y) < 1e-13] = 0.0
         length = np.sqrt(self.problem.d)
         pull = self.problem.csr @ y if self.problem.is_symmetric else np.zeros(1)
-        if np.any(np.sign(y) * pull > NEAR * (length @ np.abs(y)) * length):
+        if np.any(np.sign(y) * pull > MAX_POLISHED_SLACK * (length @ np.abs(y)) * length):
             return None  # an impulse without an end meets b.y there, beyond what a solver rounds
         if check_certificate(self.problem, y, self.tol, self.deadline) is not None:
             return None

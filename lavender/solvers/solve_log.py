@@ -128,6 +128,6 @@ class SolveLog:
         if self.conflict is None or self.best <= self.tol:
             return []
         told = (
-            [] if self.certificate is not None else ["of the convex relaxation, " + self.conflict.proof.words]
+            [] if self.certificate is not None else ["of the convex relaxation, " + self.conflict.proof.message]
         )
         return [*told, self.conflict.advice]

@@ -11,7 +11,7 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import InputError
-from lavender.judge.certificates import prove, rounded_down
+from lavender.judge.certificates import prove, format_lower_bound
 from lavender.judge.residuals import Residual, best_of_islands, reference, relative_of, residual
 from lavender.judge.solution import (
     CONFIRMED,
@@ -109,13 +109,15 @@ def finish(
         proof = prove(problem, certificate, tol)
         certificate, bound = proof.y, proof.impulse_bound or None
         if status is INFEASIBLE and not proof.reason:
-            message = _joined(message, proof.words)
+            message = _joined(message, proof.message)
         elif bound == math.inf:
             status, message = STALLED, _joined(message, proof.reason)
         elif status is INFEASIBLE:
             unproven = proof.reason
         elif bound is not None and bound > max(np.abs(impulse).sum(), _contradicting_impulse(problem)):
-            message = _joined(message, f"every solution has an impulse of at least {rounded_down(bound)} N s")
+            message = _joined(
+                message, f"every solution has an impulse of at least {format_lower_bound(bound)} N s"
+            )
     if unproven:
         message = _joined(message, f"not proven: {unproven}")
         status_conflict = f"says INFEASIBLE, {refutation}" if refutation else ""
