@@ -59,7 +59,7 @@ class RemoteError(Exception):
 
 
 class ProcessBackend:
-    """Calls one function in a process that is started by `start` and kept between calls.
+    """Calls one function in another process, which `start` starts and later calls reuse.
 
     When this process ends, the system kills the other one.
 
@@ -160,7 +160,7 @@ class ProcessBackend:
         assert process is not None
         received: list[tuple[bytes, bytes] | BaseException] = []
 
-        # If a process that left the group holds a pipe, this thread waits alone.
+        # If a process that left the group still holds a pipe, only this thread waits for it.
         def exchange() -> None:
             try:
                 assert process.stdin is not None and process.stdout is not None
@@ -255,7 +255,7 @@ def unpack_answer(text: bytes, numbers: bytes) -> tuple[dict[str, Any], list[Any
     ------
     RemoteError
     InvalidAnswer
-        The text is not a JSON object, or the arrays have other sizes than it says.
+        The text is not a JSON object, or the arrays do not have the sizes in it.
     """
     try:
         fields = json.loads(text)

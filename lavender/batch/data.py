@@ -13,7 +13,7 @@ from typing import Any, overload
 import numpy as np
 
 from lavender.base.arrays import (
-    FLOATS,
+    FLOAT_DTYPES,
     ArrayLike,
     FloatArray,
     as_array,
@@ -441,7 +441,7 @@ class Batch(Sequence[Problem]):
             if np.ndim(x) <= own.ndim:
                 found[name] = np.ascontiguousarray(own), 0
             elif x.shape == (n, *own.shape) and (
-                x.dtype in FLOATS if kind is np.float64 else _are_indices(x)
+                x.dtype in FLOAT_DTYPES if kind is np.float64 else _are_indices(x)
             ):
                 found[name] = np.ascontiguousarray(x, kind), own.size
             else:

@@ -24,7 +24,7 @@ from lavender.base.arrays import (
     whole_number,
 )
 from lavender.base.errors import InputError, LavenderError
-from lavender.base.threads import together
+from lavender.base.threads import run_on_threads
 from lavender.batch.data import ERRORS, Batch
 from lavender.judge.residuals import AT_REST, ENOUGH, TOL, VERDICTS, Residual, residual, verdict_of
 from lavender.problem import PRECISIONS, Problem, check_problem
@@ -150,7 +150,7 @@ class Many:
                 if i >= 0:
                     single(i, stop)
 
-        together(work, min(threads, len(self)))
+        run_on_threads(work, min(threads, len(self)))
         for i in np.flatnonzero(self._worlds.code[:-1] == CODE["bad"]).tolist():
             single(i, bytearray(1))  # which finds the words
         if self.faults and errors == "raise":

@@ -317,7 +317,7 @@ def solve_many(
     made._unusable = unusable
     # What the results of those to come take is kept free.
     if deadline.is_set:
-        deadline.keep(made._reading())
+        deadline.reserve(made._reading())
     more = {"tol": tol, "max_iter": max_iter, **options}
     # What `solve` would ask of one compiled call.
     together = (
@@ -331,7 +331,7 @@ def solve_many(
             return int(hand.solve(tol, *asked))
         if deadline.passed(0.0):
             return int(hand.judge(tol, False, True))
-        return int(hand.solve(tol, *asked, COUNTED * (deadline.left(LEAST) or LEAST)))
+        return int(hand.solve(tol, *asked, COUNTED * (deadline.remaining(LEAST) or LEAST)))
 
     def alone(i: int) -> None:
         # The first late world of a batch is made, so that a solver that refuses its kind says so; the others are not.
@@ -344,12 +344,12 @@ def solve_many(
             small.in_vain(problem, start, tol, made._counts(problem, i))
         if deadline.is_set:
             if not isinstance(given, Batch):
-                deadline.keep(-UNREAD)
+                deadline.reserve(-UNREAD)
             if deadline.passed():
                 check_taken(problem, spec, deadline)
                 made.late(i, unjudged(problem, spec, options, start, tol, f"{NO_TURN}, unjudged"))
                 return
-        found = solve(problem, solver, impulse=start, time_limit=deadline.left(LEAST), **more)
+        found = solve(problem, solver, impulse=start, time_limit=deadline.remaining(LEAST), **more)
         is_judged = found.status is not Status.TIME_LIMIT or "residual" in vars(found)
         keep = made.keep if is_judged else made.late
         keep(i, found if "callback" in options else uninterrupted(found))

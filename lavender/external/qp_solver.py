@@ -107,7 +107,7 @@ class QPSolver(Solver):
             left = max(1, max_iter - before.iterations)
             qp = self._form(qp.problem, False)
             call = isolated or b.run
-            claim = ask(qp, impulse, call, left, tol, deadline.left(), self.settings, b.noisy)
+            claim = ask(qp, impulse, call, left, tol, deadline.remaining(), self.settings, b.noisy)
             work = summed((before.work, claim.work))
             claim = replace(claim, work=work, iterations=before.iterations + claim.iterations)
         if time_limit is None or b.stoppable:

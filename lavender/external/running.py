@@ -134,7 +134,7 @@ def ask(
         ):
             break
         limits = [
-            replace(level, max_iter=left, time_limit=deadline.left(), repeated=True) for level in limits
+            replace(level, max_iter=left, time_limit=deadline.remaining(), repeated=True) for level in limits
         ]
         if limits:
             impulse[:] = start

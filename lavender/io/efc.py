@@ -29,7 +29,7 @@ from lavender.base.arrays import (
     whole_number,
 )
 from lavender.base.errors import CapabilityError, InputError
-from lavender.base.threads import together
+from lavender.base.threads import run_on_threads
 from lavender.batch.data import ERRORS, Batch, check_counts, check_triangle
 from lavender.io import mujoco as single
 from lavender.problem.cones import Cones, kinds_of
@@ -238,7 +238,7 @@ def from_mujoco_many(model: Any, states: Any, *, threads: int = 1, errors: str =
         mj.mju_sparse2dense(jac, data.efc_J, data.efc_J_rownnz, data.efc_J_rowadr, data.efc_J_colind)
         return jac
 
-    parts = together(work, threads)
+    parts = run_on_threads(work, threads)
     rows, ptr = _in_order([of_rows for of_rows, _ in parts], n)
     contacts, contact_ptr = _in_order([of_contacts for _, of_contacts in parts], n)
     made = _gathered(model, rows, ptr, contacts, contact_ptr, mass, free, smooth)

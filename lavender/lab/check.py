@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from lavender.base.arrays import several
-from lavender.base.errors import InputError, LavenderError, last_words
+from lavender.base.errors import InputError, LavenderError, format_error
 from lavender.judge.residuals import FLOOR_MOST, WRONG
 from lavender.judge.solution import CONTRADICTED, NOT_PROVEN, Solution, Status, uninterrupted
 from lavender.lab.bench.running.worker import TaskFailed, Worker, solve_isolated
@@ -223,7 +223,7 @@ def _row(
         if get(run).builtin:
             raise
         # a plug-in may raise anything: it costs its own row
-        return CrossCheckRow(name, NOT_SOLVED, note=last_words(error))
+        return CrossCheckRow(name, NOT_SOLVED, note=format_error(error))
     return replace(compare(problem, name, solution, optimum), ran="" if other is None else run)
 
 
@@ -252,7 +252,7 @@ def _reference(
         except Exception as error:
             if spec.builtin and not isinstance(error, LavenderError):
                 raise
-            failed.append(f"{name}: {last_words(error)}")
+            failed.append(f"{name}: {format_error(error)}")
             continue
         r = solution.residual
         needed = max(REFERENCE_TOL, min(10.0 * r.roundoff_floor, FLOOR_MOST))

@@ -13,6 +13,7 @@ from lavender.base.arrays import (
     FloatArray,
     as_array,
     as_csr,
+    as_names,
     check_finite,
     check_sizes,
     check_unmasked,
@@ -22,7 +23,6 @@ from lavender.base.arrays import (
     shape_of,
     table_of,
     whole_number,
-    words_for,
 )
 from lavender.base.errors import InputError
 from lavender.base.lazy_import import issparse
@@ -148,7 +148,7 @@ class ProblemData:
                 )
             put(self, "key", read_only(key.astype(np.uint64)))
         if self.names is not None and not (isinstance(self.names, Names) and len(self.names) == k):
-            put(self, "names", words_for("blocks", self.names, k))
+            put(self, "names", as_names("blocks", self.names, k))
         put(self, "name", str(self.name))
         put(self, "copy", True)  # of what was given here: another problem made of this one says so itself
 

@@ -19,12 +19,12 @@ from lavender.base.arrays import (
     IntArray,
     as_array,
     as_csr,
+    as_names,
     borrowed,
     equal,
     precision_of,
     read_only,
     whole_number,
-    words_for,
 )
 from lavender.base.errors import InputError
 from lavender.base.lazy_import import issparse
@@ -167,7 +167,7 @@ class Generalized:
     ) -> None:
         n = len(v_free)
         self.__dict__["v_free"] = v_free
-        self.__dict__["names"] = None if names is None else words_for("velocities", names, n)
+        self.__dict__["names"] = None if names is None else as_names("velocities", names, n)
         self._lay_out(jac, mass, n, like)
         self._factor()
 

@@ -112,7 +112,7 @@ def _newton(
     problem: Problem, steps: int, tol: float, deadline: Deadline | None
 ) -> tuple[float, Claim | None]:
     """Relative residual and claim of Newton's method from nothing; inf, None where it does not take the problem."""
-    spec, left = get("newton"), None if deadline is None else deadline.left()
+    spec, left = get("newton"), None if deadline is None else deadline.remaining()
     if spec.refuses(problem) is not None or (left is not None and left <= 0.0):
         return np.inf, None
     solver, impulse = spec.load()(), problem.start()
@@ -275,7 +275,7 @@ def find_direction(problem: Problem, deadline: Deadline) -> FloatArray | None:
     gain = np.concatenate([scale * problem.b, np.zeros(rim.shape[1])])
     options: dict[str, Any] = {"maxiter": CERTIFICATE_STEPS * problem.m}
     if deadline.is_set:
-        options["time_limit"] = deadline.left(1e-3)
+        options["time_limit"] = deadline.remaining(1e-3)
     found = linprog(
         -gain, A_ub=above, b_ub=np.zeros(above.shape[0]), A_eq=level, b_eq=np.zeros(level.shape[0]),
         bounds=np.stack([low, high], 1), method="highs", options=options,
@@ -305,7 +305,7 @@ def check_infeasible(
     """
     if claim.certificate is not None and not prove(problem, claim.certificate, tol, deadline).reason:
         return claim, True, ""
-    spec, left = get("auto"), deadline.left()
+    spec, left = get("auto"), deadline.remaining()
     if problem.m > CERTIFICATE_ROWS or (left is not None and left <= 0.0):
         return claim, False, ""
     solver, impulse = spec.load()(), problem.start()

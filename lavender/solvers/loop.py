@@ -15,7 +15,7 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray
 from lavender.base.deadline import CHUNK_TIME, Deadline, Stopwatch
-from lavender.base.errors import BREAKDOWN, last_words
+from lavender.base.errors import BREAKDOWN, format_error
 from lavender.judge.residuals import Residual, best_of_islands, judged, remember, remembered, residual
 from lavender.judge.solution import (
     INTERRUPTED,
@@ -69,7 +69,7 @@ class Loop:
         watch = Stopwatch()
         try:
             try:
-                claim = self.call(max_iter, self.deadline.left(LEAST))
+                claim = self.call(max_iter, self.deadline.remaining(LEAST))
             finally:
                 self.time = watch.seconds
             if not self.broken:
@@ -86,7 +86,7 @@ class Loop:
             return self.solver.run(self.state, self.impulse, max_iter, self.tol, time_limit)
         except BREAKDOWN as error:
             self.broken = True
-            return Claim(NUMERICAL_ERROR, 0, {}, last_words(error))
+            return Claim(NUMERICAL_ERROR, 0, {}, format_error(error))
 
     def run(self, max_iter: int) -> Claim:
         """In chunks; the result is the best of what was checked."""
@@ -142,7 +142,7 @@ class Loop:
         return max(1, min(8 * n, int(n * self._aim() / max(elapsed, 1e-7))))
 
     def _aim(self) -> float:
-        left = self.deadline.left()
+        left = self.deadline.remaining()
         return CHUNK_TIME if left is None else min(CHUNK_TIME, SHARE * left)
 
     def not_worse(self, start: FloatArray, or_zero: bool = True) -> None:

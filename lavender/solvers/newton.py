@@ -243,7 +243,7 @@ class Newton(Solver):
             impulse[:] = problem.start()
         system = make_system(problem, "impulse" if bodies is None else "velocity", bodies=bodies)
         more = self._run_system(
-            problem, system if system.solve.m else None, impulse, left, tol, deadline.left(1e-3)
+            problem, system if system.solve.m else None, impulse, left, tol, deadline.remaining(1e-3)
         )
         if not quick(problem, impulse, w, e)[0] <= best:
             impulse[:] = before
@@ -321,7 +321,7 @@ def _stages(
         while True:
             before = solve.done
             most = WATCHED / max(system.seconds, 1e-6)
-            left, watch = deadline.left(), Stopwatch()
+            left, watch = deadline.remaining(), Stopwatch()
             if left is not None:
                 # Of the first the pace is only counted.
                 most = min(most, TIME_SHARE * left / max(system.seconds, 1e-9)) if solve.done else 1.0

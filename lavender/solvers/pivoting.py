@@ -116,7 +116,7 @@ class PivotState:
         (int, bool)
             Code of `Pivoting.advance`, and whether no round fits.
         """
-        left, before, watch = deadline.left(), self.rows.n_rounds, Stopwatch()
+        left, before, watch = deadline.remaining(), self.rows.n_rounds, Stopwatch()
         if left is None or self.outside is not None:  # which asks the clock itself
             return self.rows.advance(most), most == 0
         n = int(left / self.seconds)

@@ -206,7 +206,11 @@ class ThroughRows(Solver):
             return claim
         z = form.start(impulse)
         more = self._judged(
-            form, path.run(path.prepare(form.rows), z, max_iter, tol, deadline.left(1e-3)), z, impulse, tol
+            form,
+            path.run(path.prepare(form.rows), z, max_iter, tol, deadline.remaining(1e-3)),
+            z,
+            impulse,
+            tol,
         )
         work = summed((claim.work, more.work))
         words = f"{claim.message or 'no exchange helped'}, then complementary pivots"

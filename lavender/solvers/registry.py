@@ -16,7 +16,7 @@ from typing import Any, Protocol
 
 from lavender.base.arrays import FloatArray, flag, whole_number
 from lavender.base.deadline import Deadline
-from lavender.base.errors import InputError, SolverUnavailable, UnknownName, check_name, last_words
+from lavender.base.errors import InputError, SolverUnavailable, UnknownName, check_name, format_error
 from lavender.base.lazy_import import import_lock, import_locked
 from lavender.judge.solution import Claim, Status
 from lavender.problem import LAWS, OPERATORS, Problem, check_problem
@@ -352,7 +352,7 @@ class SolverSpec:
         except Exception as error:
             if self.builtin:
                 raise
-            return f"cannot say whether it takes the problem: {last_words(error)}"
+            return f"cannot say whether it takes the problem: {format_error(error)}"
 
     def standing_in(self, problem: Problem) -> SolverSpec | None:
         """Return the variant of this method with bounds if this one refuses the problem only for its bounds."""
@@ -376,7 +376,7 @@ class SolverSpec:
             return getattr(import_locked(module), attribute)
         except Exception as error:
             raise SolverUnavailable(
-                f"solver {self.name!r} cannot be imported from {self.factory!r}: {last_words(error)}"
+                f"solver {self.name!r} cannot be imported from {self.factory!r}: {format_error(error)}"
             ) from error
 
 

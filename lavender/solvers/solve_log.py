@@ -74,7 +74,7 @@ class SolveLog:
     @property
     def time_left(self) -> float | None:
         """s until the time limit, for a solver's `time_limit`."""
-        return self.deadline.left(1e-5)
+        return self.deadline.remaining(1e-5)
 
     def ends_late(self, cost: float) -> bool:
         """Whether a step of this counted cost [ns] would end after the deadline."""
@@ -128,6 +128,8 @@ class SolveLog:
         if self.conflict is None or self.best <= self.tol:
             return []
         told = (
-            [] if self.certificate is not None else ["of the convex relaxation, " + self.conflict.proof.message]
+            []
+            if self.certificate is not None
+            else ["of the convex relaxation, " + self.conflict.proof.message]
         )
         return [*told, self.conflict.advice]

@@ -11,7 +11,7 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import InputError
-from lavender.judge.certificates import prove, format_lower_bound
+from lavender.judge.certificates import format_lower_bound, prove
 from lavender.judge.residuals import Residual, best_of_islands, reference, relative_of, residual
 from lavender.judge.solution import (
     CONFIRMED,

@@ -14,7 +14,7 @@ import numpy as np
 
 from lavender.base.arrays import ArrayLike, FloatArray, equal, flag, number, read_only, whole_number
 from lavender.base.deadline import NEVER, Deadline, Stopwatch
-from lavender.base.errors import BREAKDOWN, CapabilityError, InputError, InUse, UnknownName, last_words
+from lavender.base.errors import BREAKDOWN, CapabilityError, InputError, InUse, UnknownName, format_error
 from lavender.base.lazy_import import import_numerics
 from lavender.external.foreign import Foreign
 from lavender.judge.certificates import prove
@@ -273,7 +273,7 @@ class Prepared:
             given = self._given if problem is None else problem
             plain = max_iter is None and callback is None and history is False
             if plain and self.spec.delegates and not self.options:
-                made = solve_small(given, self.spec, impulse, tol, deadline.left(LEAST) or math.inf)
+                made = solve_small(given, self.spec, impulse, tol, deadline.remaining(LEAST) or math.inf)
                 if made is not None:
                     self._take(problem)
                     return made
@@ -292,7 +292,7 @@ class Prepared:
                 if deadline.passed(setup_time(asked) + last) and not self.spec.external:
                     self._take(problem)
                     return unjudged(given, self.spec, self.options, impulse, tol, JUDGE_LATE)
-                deadline.keep(last)
+                deadline.reserve(last)
             if self.solver is None:
                 self._take(problem)
                 self._begin(deadline)
@@ -317,11 +317,11 @@ class Prepared:
             callback = _in_rows_of(given, given.cones.stretch, callback)
         if lam is None:
             lam = problem.start() if problem.guess is None else problem.guess.copy()
-        left = deadline.left()
+        left = deadline.remaining()
         if left is not None and not self._late and not self._broken:
             watch = Stopwatch()
             self.solver.start_workers(self.state, left)
-            deadline.keep(-watch.seconds)
+            deadline.reserve(-watch.seconds)
             self.setup_time += watch.seconds
         records: list[Record] | None = [] if history else None
         return Loop(
@@ -396,7 +396,7 @@ class Prepared:
         except InputError:  # All other numbers of b are below the smallest that a problem may have.
             return claim
         found = others.solve(
-            impulse=start, tol=loop.tol, max_iter=max_iter, time_limit=loop.deadline.left(LEAST)
+            impulse=start, tol=loop.tol, max_iter=max_iter, time_limit=loop.deadline.remaining(LEAST)
         )
         loop.impulse[:] = best_of_islands(self.problem, (loop.impulse,), (found.impulse,), loop.tol)
         loop.time += found.setup_time + found.solve_time
@@ -432,7 +432,7 @@ class Prepared:
                 # As processes are started: else no call within the limit would ever have what it needs.
                 watch = Stopwatch()
                 import_numerics()
-                deadline.keep(-watch.seconds)
+                deadline.reserve(-watch.seconds)
                 self._late = deadline.passed(self.solver.setup_time(problem))
             if self._late:
                 self.state = None
@@ -445,7 +445,7 @@ class Prepared:
         except InputError:
             raise  # before the start
         except BREAKDOWN as error:
-            self.state, self._broken = None, last_words(error)
+            self.state, self._broken = None, format_error(error)
 
 
 def unjudged(
@@ -632,7 +632,7 @@ def comes_too_late(problem: Problem, spec: SolverSpec, deadline: Deadline) -> bo
     if needed > 0.0 and problem.generalized is None and deadline.passed(needed) and loading("scipy.sparse"):
         watch = Stopwatch()
         import_numerics()
-        deadline.keep(
+        deadline.reserve(
             -watch.seconds
         )  # as processes are started: else no call within the limit would ever have it
         needed = estimate_disk_time(problem) + estimate_refusal_time(problem, spec)

@@ -90,7 +90,7 @@ def run(
         if status is not Status.MAX_ITERATIONS:
             break
         last, now = now, watch.seconds
-        left = deadline.left()
+        left = deadline.remaining()
         if left is not None and left <= 0.0:
             status = Status.TIME_LIMIT
             break
