@@ -29,7 +29,7 @@ from lavender.base.arrays import (
 from lavender.base.errors import InputError
 from lavender.problem import FRICTION, Problem
 from lavender.problem.cones import Cones
-from lavender.problem.generalized import ASYMMETRY, ASYMMETRY32
+from lavender.problem.generalized import MAX_ASYMMETRY, MAX_ASYMMETRY_FLOAT32
 from lavender.problem.rows import Rows
 from lavender_ext.batch.many import PLACE, Worlds
 from lavender_ext.core.problem import LAWS, zero_impulse
@@ -405,7 +405,9 @@ class Batch(Sequence[Problem]):
             made.of_objects([], [None] * len(self), [])
         else:
             mass = self._arrays[1]
-            allowed = ASYMMETRY32 if mass is not None and mass.dtype == np.float32 else ASYMMETRY
+            allowed = (
+                MAX_ASYMMETRY_FLOAT32 if mass is not None and mass.dtype == np.float32 else MAX_ASYMMETRY
+            )
             made.of_arrays(
                 self._arrays,
                 (self._jac_row, self._mass_row),
@@ -573,4 +575,4 @@ def _joined(cones: Any, n: int) -> Cones:
     each = several("cones", cones, f"Cones, one for each of {n} worlds,")
     if len(each) != n or not all(isinstance(c, Cones) for c in each):
         raise InputError(f"cones is a Cones, or one for each of {n} worlds; {len(each)} things came")
-    return Cones._joined(each)
+    return Cones._concatenate(each)

@@ -52,7 +52,7 @@ class QPSolver(Solver):
     def setup_time(self, problem: Problem) -> float:
         """Estimate the time [s] to form the program, and to send it if the backend runs in another process."""
         entry = FORM_TIME_PER_ENTRY + (ENTRY_SIZE / TRANSFER_RATE if self.isolate else 0.0)
-        return FORM_TIME + entry * problem.most_entries
+        return FORM_TIME + entry * problem.max_entries
 
     @np.errstate(all="ignore")  # The judge finds overflows.
     def prepare(self, problem: Problem) -> QP:

@@ -47,7 +47,7 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray, IntArray
 from lavender.problem import Problem
-from lavender.problem.ordering import rows_of_each
+from lavender.problem.ordering import rows_by_island
 from lavender_ext.derivative.linear import CASES, Linear
 
 UNIT_ROUNDOFF = 2.0**-53
@@ -128,11 +128,11 @@ def bound_errors(problem: Problem, impulse: FloatArray, linear: Linear) -> tuple
     """
     disk, m = problem.disk, problem.m
     impulse_error, margin_error = np.full(m, np.inf), np.full(m, np.inf)
-    if m == 0 or disk.most_entries > MAX_MATRIX_ENTRIES or not np.isfinite(linear.residual).all():
+    if m == 0 or disk.max_entries > MAX_MATRIX_ENTRIES or not np.isfinite(linear.residual).all():
         return impulse_error, margin_error
     with np.errstate(all="ignore"):  # An island with an overflow has no bound.
         scaled = _Scaled(problem, impulse, linear)
-        for rows in rows_of_each(disk, disk.cones.ptr):
+        for rows in rows_by_island(disk, disk.cones.ptr):
             if len(rows) > MAX_ISLAND_ROWS:
                 continue
             errors = _Island(scaled, rows).bound()

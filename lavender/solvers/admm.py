@@ -191,7 +191,7 @@ def _scaling(problem: Problem) -> float:
     """What scaling is expected to take [s]."""
     if _is_over_bodies(problem):
         return 3.0 * CALLS + LAID_OUT * _JACOBIAN * problem.m  # J, the root of M^-1, and their product
-    entries, formed = problem.most_entries, forming(problem)
+    entries, formed = problem.max_entries, forming(problem)
     if problem.generalized is not None and entries == float(problem.m) ** 2:  # one product of dense matrices
         formed = min(formed, START + WHOLE * entries + DENSE * float(problem.metric.products_of_a))
     return START + formed + compared(problem) + _SCALED * entries

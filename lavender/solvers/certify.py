@@ -29,7 +29,7 @@ from lavender.judge.certificates import Proof, list_conflicting_blocks, prove
 from lavender.judge.residuals import residual
 from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
-from lavender.problem.ordering import blocks_of_each
+from lavender.problem.ordering import blocks_by_island
 from lavender.solvers.islands import islands, restrict, rows_of
 from lavender.solvers.newton_systems import general
 from lavender.solvers.registry import get
@@ -223,7 +223,7 @@ def _parts(log: SolveLog) -> Any:
     if count <= 1:
         yield problem, slice(None)
         return
-    blocks = blocks_of_each(count, label)
+    blocks = blocks_by_island(count, label)
     for i in sorted(_wrong(log, label), key=lambda i: len(blocks[i])):
         rows = rows_of(problem, blocks[i])
         yield restrict(problem, blocks[i], rows), rows

@@ -136,7 +136,7 @@ class Newton(Solver):
         bodies = problem.rows is not None and problem.rows.n_bodies > 0 and self.form != "impulse"
         if bodies:
             return over_bodies(problem)
-        few = not is_dense(problem.most_entries, problem.m, problem.law == "cone")
+        few = not is_dense(problem.max_entries, problem.m, problem.law == "cone")
         return over_rows(problem) + (analysed(problem) if few else 0.0)
 
     def prepare(self, problem: Problem) -> NewtonState:

@@ -163,7 +163,7 @@ def test_an_error_of_one_thread_stops_the_others():
 
 def test_threads_that_ask_for_threads_do_not_wait_for_each_other(monkeypatch):
     """All that are kept are busy with calls that want more: what nobody begins is nobody's."""
-    monkeypatch.setattr(threads, "MOST", 1)
+    monkeypatch.setattr(threads, "MAX_THREADS", 1)
     threads.thread_pool.cache_clear()
     two, inner = threading.Barrier(2, timeout=10.0), []
 
