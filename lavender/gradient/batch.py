@@ -166,7 +166,7 @@ def derivatives(problems: Iterable[Problem], solutions: Iterable[Any]) -> Deriva
     if len(problems) != len(impulses):
         raise InputError(f"{len(impulses)} solutions for {len(problems)} problems; one for each is needed")
     linears = Linears(
-        [_get_data(p) for p in problems], impulses.placed if is_batch else impulses, MAX_KERNEL_ROWS
+        [_get_data(p) for p in problems], impulses.flat_impulses if is_batch else impulses, MAX_KERNEL_ROWS
     )
     separate = {}
     for i in linears.leave(MAX_ACCEPTED_RESIDUAL):

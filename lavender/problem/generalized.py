@@ -305,27 +305,27 @@ class Generalized:
     def momentum_of(self, v: FloatArray) -> FloatArray:
         """Compute M v (nv,) [kg m/s] for velocities v (nv,)."""
         v = as_array("v", v, (self.nv,), finite=False)
-        return self.in_original_order(self.operator.momentum(v if self.order is None else v[self.order]))
+        return self._in_original_order(self.operator.momentum(v if self.order is None else v[self.order]))
 
     def force(self, impulse: FloatArray) -> FloatArray:
         """Compute J^T impulse (nv,) [N s] for impulses (m,)."""
         impulse = as_array("impulse", impulse, (self.m,), finite=False)
-        return self.in_original_order(self.operator.force(impulse))
+        return self._in_original_order(self.operator.force(impulse))
 
     def solve(self, x: Any) -> FloatArray:
         """Compute M^-1 x (nv,)."""
         x = as_array("x", x, (self.nv,))
         out = x.copy() if self.order is None else x[self.order]
         self.operator.solve(out)
-        return self.in_original_order(out)
+        return self._in_original_order(out)
 
     def change(self, impulse: FloatArray) -> FloatArray:
         """Compute the velocity change M^-1 J^T impulse (nv,) [m/s, rad/s] by impulses (m,)."""
         x = self.operator.force(as_array("impulse", impulse, (self.m,), finite=False))
         self.operator.solve(x)
-        return self.in_original_order(x)
+        return self._in_original_order(x)
 
-    def in_original_order(self, x: FloatArray) -> FloatArray:
+    def _in_original_order(self, x: FloatArray) -> FloatArray:
         """Permute x (nv,) from the order of the factor to the original order."""
         if self.order is None:
             return x
