@@ -25,7 +25,7 @@ import scipy.sparse as sp
 from lavender import registry
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import InputError
-from lavender.external.as_qp import FORMS, QP, bound_rows, impulse_form, velocity_form
+from lavender.external.as_qp import PROGRAM_FORMS, QP, bound_rows, impulse_form, velocity_form
 from lavender.external.backend import Backend
 from lavender.external.backends import BACKENDS
 from lavender.external.qp_solver import QPSolver, refusal
@@ -376,14 +376,14 @@ def contestants(siconos: str = "") -> list[Contestant]:
     for backend in BACKENDS:
         if registry.specs()[backend.name].missing() is not None:
             continue
-        for form in FORMS[:2]:
+        for form in PROGRAM_FORMS[:2]:
             # Those whose call is quick enough for an adapter to weigh, with dense matrices and with sparse ones.
             ways = QUICK.get(backend.name)
             made += [_backend(backend, form, "clarabel cones" if backend.cones else "")] if ways is None else [
                 _backend(replace(backend, dense=dense, warm=False), form, f"{backend.name}{word}, own interface")
                 for word, dense in ways
             ]  # fmt: skip
-    made += [_cone(name, form) for name in ("scs", "qoco") if _installed(name) for form in FORMS[:2]]
+    made += [_cone(name, form) for name in ("scs", "qoco") if _installed(name) for form in PROGRAM_FORMS[:2]]
     if _installed("pinocchio"):
         made += [_pinocchio(None), _pinocchio(20)]
     made += [_scipy("banded"), _scipy("spsolve")]

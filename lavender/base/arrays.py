@@ -32,7 +32,7 @@ FLOAT_DTYPES = {FLOAT32, FLOAT64}  # Batches read arrays of these dtypes in plac
 
 
 def _matches_shape(actual: tuple[int, ...], required: tuple[int | None, ...]) -> bool:
-    """Return whether a shape equals the required one, in which None stands for any length."""
+    """Return whether a shape equals the required one, in which None allows any length."""
     if len(actual) != len(required):
         return False
     for n, s in zip(required, actual, strict=True):  # noqa: SIM110 - a generator would double the time of the check
@@ -66,7 +66,7 @@ def as_array(
     value : array_like
         A scalar fills a one-dimensional shape of known length. An empty list fits any shape without rows.
     shape : tuple of int or None
-        Required shape; None stands for any length.
+        Required shape; None allows any length.
     dtype : {numpy.float64, numpy.int32}
     finite : bool, default True
         Reject numbers that are not finite, or above MOST in absolute value.

@@ -1,4 +1,4 @@
-"""Exceptions of lavender. Each message contains the value that was passed, the requirement, and what to do."""
+"""Exceptions of lavender. Each message contains the invalid value, the requirement and a remedy."""
 
 from __future__ import annotations
 

@@ -5,7 +5,7 @@ Answers are JSON and float64 arrays of a bounded size, and are never unpickled.
 
 No process pool of a library gives this (pebble 5.2.3 was measured): if the code handles SIGTERM or does not return to
 the interpreter, the pool kills it 3 s after its limit; processes that the code started run on; the parent unpickles
-what the code writes; and a script without `if __name__ == "__main__"` cannot use the pool.
+the output of the code; and a script without `if __name__ == "__main__"` cannot use the pool.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ MAX_ERROR_LENGTH = 500  # characters. Longer texts of errors are cut.
 #: If set, a process is killed together with the processes that it started.
 PROCESS_GROUPS = os.name == "posix"
 #: Not `-m`: it puts the current folder first, and in a checkout the sources hide the installed package.
-SCRIPT = (
+SERVE_SCRIPT = (
     "import sys; sys.path[:] = filter(None, sys.path); from lavender.base.subprocesses import serve; "
     "serve(*map(int, sys.argv[1:]))"
 )
@@ -43,11 +43,11 @@ Answer = tuple[dict[str, Any], Sequence[Any]]
 
 
 class ProcessEnded(Exception):
-    """The process ended before it answered; the text says how."""
+    """The process ended before it answered; the message describes how."""
 
 
 class InvalidAnswer(ValueError):
-    """The process sent bytes that are not an answer; the text says why."""
+    """The process sent bytes that are not an answer; the message has the reason."""
 
 
 class RemoteError(Exception):
@@ -119,7 +119,7 @@ class ProcessBackend:
             options = {"start_new_session": True, "pass_fds": (lifeline,)}
         try:
             self.popen = subprocess.Popen(
-                [sys.executable, "-c", SCRIPT, str(lifeline), str(self._memory)],
+                [sys.executable, "-c", SERVE_SCRIPT, str(lifeline), str(self._memory)],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.DEVNULL,
@@ -277,7 +277,7 @@ def unpack_answer(text: bytes, numbers: bytes) -> tuple[dict[str, Any], list[Any
 
 def serve(lifeline: int, memory: int) -> None:
     """Answer requests until the pipe ends: the first names the function, the others hold its arguments."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # The parent decides what Ctrl-C does.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # The parent handles Ctrl-C.
     if lifeline >= 0:
         _end_with_parent(lifeline)
     requests, answers = _take_streams()
@@ -316,7 +316,7 @@ def _pack_answer(fields: dict[str, Any], arrays: Sequence[Any]) -> tuple[bytes, 
 
 
 def _take_streams() -> tuple[IO[bytes], IO[bytes]]:
-    """Return the streams of requests and answers; discard what is printed from now on."""
+    """Return the streams of requests and answers; discard all later output."""
     requests, answers = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
     null = os.open(os.devnull, os.O_RDWR)
     os.dup2(null, 0)
@@ -353,7 +353,7 @@ def limit_cpu_time(extra: float) -> None:
     """Have the system kill this process after `extra` more CPU time [s], in case the parent no longer can."""
     with contextlib.suppress(
         ImportError, ValueError, OSError, OverflowError
-    ):  # OverflowError: inf is no limit.
+    ):  # OverflowError: the limit is inf.
         import resource
 
         hard = resource.getrlimit(resource.RLIMIT_CPU)[1]

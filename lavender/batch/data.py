@@ -27,7 +27,7 @@ from lavender.base.arrays import (
     shape_of,
 )
 from lavender.base.errors import InputError
-from lavender.problem import FRICTION, Problem
+from lavender.problem import FRICTION_LAWS, Problem
 from lavender.problem.cones import Cones
 from lavender.problem.generalized import MAX_ASYMMETRY, MAX_ASYMMETRY_FLOAT32
 from lavender.problem.rows import Rows
@@ -109,7 +109,7 @@ class Batch(Sequence[Problem]):
         row_ptr: ArrayLike | None = None,
         velocity_ptr: ArrayLike | None = None,
     ) -> None:
-        friction = one_of("friction", friction, FRICTION)
+        friction = one_of("friction", friction, FRICTION_LAWS)
         values, *pattern = M if isinstance(M, tuple) else (M,)
         jac, mass, free = (as_floats(name, x) for name, x in (("J", J), ("M", values), ("v_free", v_free)))
         if row_ptr is not None and count is None:
@@ -251,7 +251,7 @@ class Batch(Sequence[Problem]):
     def _make_empty(cls, n: int, m: int, friction: Any, precision: str) -> Batch:
         """Build a batch of n worlds with m rows and no arrays."""
         batch: Batch = object.__new__(cls)
-        friction = one_of("friction", friction, FRICTION)
+        friction = one_of("friction", friction, FRICTION_LAWS)
         batch._n, batch.friction, batch.precision, batch._arrays = n, friction, precision, None
         batch.shape, batch.velocity_shape = (n, m), (n, 0)
         batch.at = np.zeros((n, len(PLACE)), np.int64)

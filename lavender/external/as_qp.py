@@ -51,7 +51,7 @@ from lavender.judge.certificates import check_certificate
 from lavender.judge.residuals import reference
 from lavender.problem import Problem
 
-FORMS = ("impulse", "velocity", "auto")
+PROGRAM_FORMS = ("impulse", "velocity", "auto")
 IntpArray = npt.NDArray[np.intp]
 MAX_BACKEND_NUMBER = 1e20  # Backends treat numbers from here on as infinite, or fail.
 # A row whose scaled |b| is larger is assumed to stay at its bound: backends lose as many digits as the largest b has,
@@ -359,7 +359,7 @@ def choose_form(problem: Problem, form: str, definite: bool = False) -> str:
     CapabilityError
         "velocity" for a problem without rows.
     """
-    form = one_of("form", form, FORMS)
+    form = one_of("form", form, PROGRAM_FORMS)
     rows = problem.rows
     if form == "velocity" and rows is None:
         raise CapabilityError(

@@ -160,8 +160,8 @@ def _has_size(y: Any, size: int) -> bool:
     return y is not None and np.size(y) == size
 
 
-def _describe_result(found: bool | None, x: Any) -> str:
-    return "solved" if found else "not solved" if x is not None else "not solved, nothing returned"
+def _describe_result(is_solved: bool | None, x: Any) -> str:
+    return "solved" if is_solved else "not solved" if x is not None else "not solved, nothing returned"
 
 
 def _get_iterations(extras: Mapping[str, Any]) -> int | None:

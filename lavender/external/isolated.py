@@ -25,7 +25,7 @@ from lavender.judge.solution import Status
 from lavender.problem import Problem
 
 #: Fields of `running.Answer`, in the order in which they are sent.
-ARRAYS = ("x", "zeta", "xi", "direction", "contradiction")
+ANSWER_ARRAYS = ("x", "zeta", "xi", "direction", "contradiction")
 MAX_BACKEND_MESSAGE_LENGTH = 500  # characters. Longer messages of backends are cut.
 STOPPABLE_LIMIT_RATIO = 2.0  # A backend that accepts a time limit is killed after this multiple of its limit.
 ENTRY_SIZE = 12.0  # bytes that one matrix entry of a program needs in a request
@@ -68,7 +68,7 @@ def call_backend(
     Raises
     ------
     InputError
-        The backend does not know a setting, or a setting cannot be pickled.
+        The backend has no such setting, or a setting cannot be pickled.
     Failed
         The backend raised an exception, or its process died.
     """
@@ -109,7 +109,7 @@ def call_backend(
     idle_processes.append(process)
     try:  # The backend may have written anything.
         work = {str(kind): int(count) for kind, count in fields["work"].items()}
-        by_name = dict(zip(ARRAYS, arrays, strict=True))
+        by_name = dict(zip(ANSWER_ARRAYS, arrays, strict=True))
         return Answer(status=Status[fields["status"]], message=str(fields["message"]), work=work, **by_name)
     except (ValueError, TypeError, KeyError, AttributeError) as error:
         raise Failed(f"the process of the backend sent an invalid answer ({error})") from None
@@ -162,4 +162,4 @@ def run_backend(
     work = {str(kind): int(count) for kind, count in answer.work.items()}
     message = str(answer.message or "; ".join(printed))[:MAX_BACKEND_MESSAGE_LENGTH]
     fields = {"status": answer.status.name, "message": message, "work": work}
-    return fields, [getattr(answer, name) for name in ARRAYS]
+    return fields, [getattr(answer, name) for name in ANSWER_ARRAYS]

@@ -56,7 +56,7 @@ MAX_MATRIX_ENTRIES = 4e6  # Problems whose A has more entries than this have no 
 MAX_UNCERTAINTY_STEPS = (
     8  # Every row counts as uncertain after this many rounds that each found further uncertain rows.
 )
-MAX_RADIUS_STEPS = 8  # Steps of the iteration for (5), each of which doubles what it assumes of |dy|.
+MAX_RADIUS_STEPS = 8  # Steps of the iteration for (5); each doubles the assumed bound of |dy|.
 MAX_INVERSE_ERROR = 0.1  # G counts as singular if ||I - G^-1 G|| may be larger.
 CONTRACTION_MARGIN = (
     1e-9  # (3) and (4) must contract by at least this much, which covers the rounding of their norms.

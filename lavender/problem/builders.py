@@ -29,7 +29,7 @@ from lavender.problem.program import convert_program, unpack_program
 from lavender.problem.rows import Rows
 from lavender_ext.core.problem import rows_velocity
 
-P = TypeVar("P", bound="Builders")
+ProblemT = TypeVar("ProblemT", bound="Builders")
 
 #: Keywords that every method which builds a problem passes on to `Problem`.
 PROBLEM_KEYWORDS = ("name", "names", "key", "friction", "guess", "compliance", "precision", "copy")
@@ -49,7 +49,7 @@ class Builders(Operators):
     """Class methods that build a problem."""
 
     @classmethod
-    def linear(cls: type[P], A: Any, b: ArrayLike, **more: Any) -> P:
+    def linear(cls: type[ProblemT], A: Any, b: ArrayLike, **more: Any) -> ProblemT:
         """Build the linear system A lambda = b, in which every row is unbounded.
 
         Parameters
@@ -65,8 +65,13 @@ class Builders(Operators):
 
     @classmethod
     def lcp(
-        cls: type[P], A: Any, b: ArrayLike, lower: ArrayLike = 0.0, upper: ArrayLike = np.inf, **more: Any
-    ) -> P:
+        cls: type[ProblemT],
+        A: Any,
+        b: ArrayLike,
+        lower: ArrayLike = 0.0,
+        upper: ArrayLike = np.inf,
+        **more: Any,
+    ) -> ProblemT:
         """Build a boxed LCP: lower <= lambda <= upper complementary to w = A lambda - b.
 
         Parameters
@@ -87,7 +92,7 @@ class Builders(Operators):
 
     @classmethod
     def contact(
-        cls: type[P],
+        cls: type[ProblemT],
         A: Any,
         b: ArrayLike,
         mu: ArrayLike,
@@ -95,7 +100,7 @@ class Builders(Operators):
         *,
         rolling: ArrayLike | None = None,
         **more: Any,
-    ) -> P:
+    ) -> ProblemT:
         """Build a problem of k contacts with m / k rows each: normal, up to two tangents, spin, rolling.
 
         Parameters
@@ -150,14 +155,14 @@ class Builders(Operators):
 
     @classmethod
     def from_findex(
-        cls: type[P],
+        cls: type[ProblemT],
         A: Any,
         b: ArrayLike,
         lower: ArrayLike,
         upper: ArrayLike,
         findex: ArrayLike,
         **more: Any,
-    ) -> P:
+    ) -> ProblemT:
         """Build a problem from the arrays of ODE, Bullet and DART, with a separate bound for each tangent.
 
         Friction rows must directly follow their normal row. If they do not, the problem's rows are a permutation of
@@ -227,7 +232,7 @@ class Builders(Operators):
 
     @classmethod
     def from_rows(
-        cls: type[P],
+        cls: type[ProblemT],
         rows: Rows,
         target: ArrayLike = 0.0,
         *,
@@ -239,7 +244,7 @@ class Builders(Operators):
         rolling: ArrayLike | None = None,
         shape: str = "disk",
         **more: Any,
-    ) -> P:
+    ) -> ProblemT:
         """Build the problem of a step from rows of bodies, with b = target - J v*.
 
         Parameters
@@ -309,7 +314,7 @@ class Builders(Operators):
 
     @classmethod
     def from_jacobian(
-        cls: type[P],
+        cls: type[ProblemT],
         J: Any,
         M: Any,
         v_free: ArrayLike,
@@ -321,7 +326,7 @@ class Builders(Operators):
         names: Sequence[str] | None = None,
         dof_names: Sequence[str] | None = None,
         **more: Any,
-    ) -> P:
+    ) -> ProblemT:
         """Build the problem of a step in generalised coordinates: w = J v+ - target + compliance lambda.
 
         Parameters
@@ -392,7 +397,7 @@ class Builders(Operators):
 
     @classmethod
     def from_qp(
-        cls: type[P],
+        cls: type[ProblemT],
         P: Any,
         q: ArrayLike | None = None,
         G: Any = None,
@@ -402,7 +407,7 @@ class Builders(Operators):
         lb: ArrayLike | None = None,
         ub: ArrayLike | None = None,
         **more: Any,
-    ) -> P:
+    ) -> ProblemT:
         """Build a convex quadratic program: min 1/2 x.P x + q.x subject to G x <= h, A x = b, lb <= x <= ub.
 
         If P is positive definite, x are generalised velocities with the mass matrix P, and every solver of bounded rows
@@ -450,7 +455,7 @@ class Builders(Operators):
         return cls(**qp.problem_fields(), qp=qp, **more)
 
     def updated(
-        self: P,
+        self: ProblemT,
         *,
         J: Any = None,
         M: Any = None,
@@ -458,7 +463,7 @@ class Builders(Operators):
         b: ArrayLike | None = None,
         target: ArrayLike | None = None,
         guess: ArrayLike | None = None,
-    ) -> P:
+    ) -> ProblemT:
         """Return a problem of the same structure with new numbers; arguments that are omitted keep their values.
 
         Parameters

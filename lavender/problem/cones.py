@@ -69,7 +69,7 @@ __all__ = [
 
 ROW, CONTACT, CONTACT_SPIN, ROUND, CONTACT_BOX, CONTACT_ROLLING, CONTACT_ELLIPSE = kernels.KINDS
 
-FIELDS = ("ptr", "kind", "lower", "upper", "mu", "patch_radius", "rolling")
+CONES_FIELDS = ("ptr", "kind", "lower", "upper", "mu", "patch_radius", "rolling")
 SPIN_COEFFICIENT_LABEL = "mu patch_radius (of boxes and ellipses mu_2)"  # name of the product in messages
 # For each kind of contact: minimum and maximum number of rows, its name, and its permitted rows.
 CONTACT_ROWS = {
@@ -157,9 +157,9 @@ class Cones:
 
     def __getattr__(self, name: str) -> Any:
         # The arrays of the fields are created when one of them is first read.
-        if name not in FIELDS:
+        if name not in CONES_FIELDS:
             raise AttributeError(f"Cones have no {name}")
-        self.__dict__.update(zip(FIELDS, self._blocks.arrays, strict=True))
+        self.__dict__.update(zip(CONES_FIELDS, self._blocks.arrays, strict=True))
         return self.__dict__[name]
 
     @classmethod

@@ -36,7 +36,7 @@ from lavender_ext.core.problem import LAWS as FRICTION_NUMBER
 from lavender_ext.core.problem import general_data
 from lavender_ext.judge import measure
 
-FRICTION = tuple(FRICTION_NUMBER)
+FRICTION_LAWS = tuple(FRICTION_NUMBER)
 # A solver that supports a law supports the laws that it contains: linear < lcp < coulomb | cone.
 LAWS = ("linear", "lcp", "coulomb", "cone")
 # Forms of A: rows of bodies, a matrix, or J and M in generalised coordinates.
@@ -120,7 +120,7 @@ class ProblemData:
         _check_rhs(self.b)
         if (self.matrix is None) + (self.rows is None) + (self.generalized is None) != 2:
             raise InputError("give matrix=, rows= or generalized=, one of them")
-        put(self, "friction", one_of("friction", self.friction, FRICTION))
+        put(self, "friction", one_of("friction", self.friction, FRICTION_LAWS))
         if self.precision is None or (isinstance(self.precision, str) and not self.precision):
             put(self, "precision", getattr(self.rows, "precision", "float64"))
         put(self, "precision", one_of("precision", self.precision, PRECISIONS))

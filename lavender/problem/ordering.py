@@ -33,7 +33,7 @@ from lavender_ext.factor.graph import matrix_components
 
 # The engine creates contacts in the order of its bodies, so it does not need "local".
 ENGINE_ORDERS = ("given", "reverse", "symmetric", "random", "colored", "bottom_up", "top_down")
-ORDERS = (*ENGINE_ORDERS, "local")
+SWEEP_ORDERS = (*ENGINE_ORDERS, "local")
 
 
 @dataclass
@@ -108,8 +108,8 @@ def block_order(
         if not np.array_equal(np.sort(blocks), np.arange(k)):
             raise InputError(f"order must hold every block from 0 to {k - 1} once")
         return Order(blocks, k, GIVEN, rng)
-    if order not in ORDERS:
-        raise UnknownName("order", order, ORDERS)
+    if order not in SWEEP_ORDERS:
+        raise UnknownName("order", order, SWEEP_ORDERS)
     if ground is not None and order not in ("bottom_up", "top_down"):
         raise InputError(f"ground= goes with bottom_up and top_down, not with {order!r}")
     blocks = np.arange(k, dtype=np.int32)

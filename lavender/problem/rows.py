@@ -37,7 +37,7 @@ UNITS = {
 class Rows:
     """Bodies, joints and contacts of one step: J and M^-1, from which A is not formed.
 
-    Bodies are numbered 0 to n - 1; -1 stands for the static world. The blocks of the problem are the kj joints,
+    Bodies are numbered 0 to n - 1; -1 is the static world. The blocks of the problem are the kj joints,
     followed by the c contacts. A contact between bodies a and b has the normal n from a to b, the tangents t1 and
     t2 = n x t1, and arms from the bodies' centres to the contact point. Its rows are
 
@@ -73,7 +73,7 @@ class Rows:
         True copies the arrays. False uses arrays without a copy if their type fits; they are then shared with the
         caller and marked read-only, and inertias are not symmetrised.
 
-    An empty list stands for no joints, contacts or bodies. float32 arrays are converted to float64. Normals and
+    An empty list means no joints, contacts or bodies. float32 arrays are converted to float64. Normals and
     tangents that differ from orthogonal unit vectors by up to 1e-5 are corrected, and so are inertias that are
     asymmetric by as much. If all arrays of numbers are float32, the `precision` of the rows and of their problems is
     "float32".

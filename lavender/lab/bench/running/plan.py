@@ -13,7 +13,7 @@ from lavender.base.errors import InputError, UnknownName
 from lavender.lab.bench.record import CaseInfo, Record
 from lavender.lab.bench.running.timing import Ask, Task
 from lavender.problem import Problem
-from lavender.problem.ordering import ORDERS
+from lavender.problem.ordering import SWEEP_ORDERS
 from lavender.solvers.registry import SolverSpec
 
 # A motion error is reached by solves to tighter and tighter residuals: the first, the last, and their maximum number.
@@ -91,8 +91,8 @@ class Plan:
             flag(name, getattr(self, name))
         for word in self.orders:
             name, _, seed = str(word).partition(":")
-            if name not in ORDERS:
-                raise UnknownName("order", name, ORDERS)
+            if name not in SWEEP_ORDERS:
+                raise UnknownName("order", name, SWEEP_ORDERS)
             if seed and not (name == "random" and seed.isdecimal()):
                 raise InputError(f"order {word!r}: only random takes a seed, a whole number: random:3")
         # each once: what stands twice would be run twice, and move the middle
