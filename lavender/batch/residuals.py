@@ -212,7 +212,9 @@ class Residuals(Many):
     @cached_property
     def verdict(self) -> np.ndarray:
         """Verdict of each world (n,), as `Residual.verdict`; "" for an invalid world."""
-        nothing_to_do = (self._numbers("relative_at_zero") < 0.5) | (self._numbers("reference_speed") < AT_REST)
+        nothing_to_do = (self._numbers("relative_at_zero") < 0.5) | (
+            self._numbers("reference_speed") < AT_REST
+        )
         for i, value in self._nothing_to_do.items():
             nothing_to_do[i] = value
         names = "relative", "roundoff_floor", "above_floor", "energy", "speed", "rhs_energy"

@@ -335,7 +335,7 @@ def solve_many(
     more = {"tol": tol, "max_iter": max_iter, **options}
     # The compiled loop is used under the conditions under which `solve` makes a single compiled call.
     uses_loop = (
-        spec.own and not options and max_iter is None and isinstance(tol, float) and 0.0 < tol < np.inf
+        spec.builtin and not options and max_iter is None and isinstance(tol, float) and 0.0 < tol < np.inf
     )
     small = spec.small if uses_loop else None
     limits = (small.limits, small.rules) if small is not None else (None, None)

@@ -104,7 +104,10 @@ class Foreign(Solver):
         if not isinstance(unchecked.status, Status):
             error = error or f"claims the status {claim.status!r:.60}; a lavender.Status is needed"
         elif unchecked.status is Status.INVALID_PROBLEM:
-            error = error or "claims the status INVALID_PROBLEM, which only `solve_many` returns, for invalid data"
+            error = (
+                error
+                or "claims the status INVALID_PROBLEM, which only `solve_many` returns, for invalid data"
+            )
         elif not _is_count(claim.iterations):
             error = error or f"claims {claim.iterations!r:.60} iterations; a whole number from 0 is needed"
         elif iterations > max_iter:

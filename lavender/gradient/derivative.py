@@ -613,7 +613,7 @@ def derivative(problem: Problem, solution: Any) -> Derivative:
         if not (error.nothing_to_do and error.rounds):
             raise InputError(
                 f"this is not a solution of this problem: its relative residual is {error.relative:.2e}; a derivative "
-                f"needs {MAX_ACCEPTED_RESIDUAL:g} or the floor ({error.roundoff_floor:.1e}): solve with tol=1e-10, or give the "
-                "problem that it solves"
+                f"needs {MAX_ACCEPTED_RESIDUAL:g} or the floor ({error.roundoff_floor:.1e}): solve with tol=1e-10, or "
+                "give the problem that it solves"
             )
     return Derivative(problem, linear)

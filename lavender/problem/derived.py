@@ -17,8 +17,8 @@ T = TypeVar("T")
 class Derived:
     """Values computed from a problem's data; copies of a problem do not share them.
 
-    Every entry is written complete by one assignment, so another thread reads a complete value or None. Two threads that
-    read None compute identical bits.
+    Every entry is written complete by one assignment, so another thread reads a complete value or None. Two threads
+    that read None compute identical bits.
 
     Attributes
     ----------
