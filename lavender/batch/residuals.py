@@ -25,7 +25,15 @@ from lavender.base.arrays import (
 from lavender.base.errors import InputError, LavenderError
 from lavender.base.threads import run_on_threads
 from lavender.batch.data import ERRORS, Batch
-from lavender.judge.residuals import AT_REST, ENOUGH, TOL, VERDICTS, Residual, residual, verdict_of
+from lavender.judge.residuals import (
+    DEFAULT_THRESHOLD,
+    MAX_REST_VELOCITY,
+    TOL,
+    VERDICTS,
+    Residual,
+    residual,
+    verdict_of,
+)
 from lavender.problem import PRECISIONS, Problem, check_problem
 from lavender.problem.derived import cached_property
 from lavender_ext.batch.many import CODE, NUMBER, PLACE, Hand, Worlds, data_of
@@ -213,7 +221,7 @@ class Residuals(Many):
     def verdict(self) -> np.ndarray:
         """Verdict of each world (n,), as `Residual.verdict`; "" for an invalid world."""
         nothing_to_do = (self._numbers("relative_at_zero") < 0.5) | (
-            self._numbers("reference_speed") < AT_REST
+            self._numbers("reference_speed") < MAX_REST_VELOCITY
         )
         for i, value in self._nothing_to_do.items():
             nothing_to_do[i] = value
@@ -255,7 +263,7 @@ def residual_many(
     impulses: Any,
     *,
     precision: str | None = None,
-    threshold: float = ENOUGH,
+    threshold: float = DEFAULT_THRESHOLD,
     threads: int = 1,
     errors: str = "raise",
 ) -> Residuals:

@@ -20,7 +20,7 @@ from lavender.io import mujoco as adapter
 from lavender.io import npz
 from lavender.io.states import read_states
 from lavender.io.stored import ENGINE, as_path, first_bytes, folder_for_steps, write_text
-from lavender.judge.residuals import AT_FLOOR, ENOUGH, UNCONVERGED, WRONG, residual
+from lavender.judge.residuals import AT_FLOOR, DEFAULT_THRESHOLD, UNCONVERGED, WRONG, residual
 from lavender.problem import PRECISIONS, Problem
 
 CONTROLS = ("zero", "random")
@@ -37,7 +37,7 @@ class Recording:
     left_out: tuple[str, ...] = field(default=())  # why a step could not be exported, one line each
     above_floor: int = 0  # of MuJoCo's answers, those that rounding does not explain
     stopped: int = 0  # of these, those more than `threshold` off
-    threshold: float = ENOUGH  # m/s
+    threshold: float = DEFAULT_THRESHOLD  # m/s
     worst: str = ""  # verdict of the worst answer, by how much it is off, and where
 
     def __str__(self) -> str:
@@ -65,7 +65,7 @@ def record(
     states: Any = None,
     replace: bool = False,
     precision: str = "float64",
-    threshold: float = ENOUGH,
+    threshold: float = DEFAULT_THRESHOLD,
 ) -> Recording:
     """Step a MuJoCo simulation and keep the problem of every `every`-th step.
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from lavender.base.arrays import several
 from lavender.base.errors import InputError, LavenderError, format_error
-from lavender.judge.residuals import FLOOR_MOST, WRONG
+from lavender.judge.residuals import MAX_EXCUSED_RESIDUAL, WRONG
 from lavender.judge.solution import CONTRADICTED, NOT_PROVEN, Solution, Status, uninterrupted
 from lavender.lab.bench.running.worker import TaskFailed, Worker, solve_isolated
 from lavender.lab.motion.bound import separation
@@ -255,7 +255,7 @@ def _reference(
             failed.append(f"{name}: {format_error(error)}")
             continue
         r = solution.residual
-        needed = max(REFERENCE_TOL, min(10.0 * r.roundoff_floor, FLOOR_MOST))
+        needed = max(REFERENCE_TOL, min(10.0 * r.roundoff_floor, MAX_EXCUSED_RESIDUAL))
         if r.relative <= needed:
             note = f"relative {r.relative:.1e}"
             return solution, name, note + (f" ({'; '.join(failed)})" if failed else "")

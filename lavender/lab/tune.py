@@ -35,7 +35,7 @@ from lavender.base.errors import InputError
 from lavender.batch.residuals import residual_many
 from lavender.io.efc import from_mujoco_many
 from lavender.io.recording import Control
-from lavender.judge.residuals import ENOUGH
+from lavender.judge.residuals import DEFAULT_THRESHOLD
 from lavender.lab.audit import AT_ONCE
 from lavender.lab.bench.running.runner import Event
 from lavender.lab.report.figures import Curve, Figure
@@ -441,7 +441,7 @@ def tune(
     states: Any = None,
     ahead: int = 10,
     rounds: int = 5,
-    threshold: float = ENOUGH,
+    threshold: float = DEFAULT_THRESHOLD,
     watch: Callable[[Event], None] | None = None,
 ) -> Tuning:
     """Measure MuJoCo's settings on worlds of a model.

@@ -29,7 +29,7 @@ import numpy as np
 from lavender.base.arrays import FloatArray
 from lavender.base.deadline import Deadline
 from lavender.judge.certificates import MAX_POLISHED_SLACK, check_certificate
-from lavender.judge.residuals import FLOOR_MOST, judged, remember
+from lavender.judge.residuals import MAX_EXCUSED_RESIDUAL, judged, remember
 from lavender.judge.solution import Claim, Status, summed
 from lavender.problem import Problem
 from lavender.solvers.factors import SMALL_SIZE, GeneralFactor, PanelsLU
@@ -191,7 +191,7 @@ class _Run:
 
     @property
     def floor(self) -> float:
-        return 0.0 if self.kept is None else self.kept.floor
+        return 0.0 if self.kept is None else self.kept.roundoff_floor
 
     def put_best(self) -> None:
         pivot = self.state.pivot
@@ -202,7 +202,7 @@ class _Run:
             remember(self.problem, self.kept)
 
     def good(self) -> bool:
-        return self.best <= max(self.least, min(self.floor, FLOOR_MOST))
+        return self.best <= max(self.least, min(self.floor, MAX_EXCUSED_RESIDUAL))
 
     def at_floor(self) -> bool:
         return self.kept is not None and self.kept.above_floor <= self.tol

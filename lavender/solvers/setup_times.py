@@ -67,7 +67,7 @@ def estimate_refusal_time(problem: Problem, spec: SolverSpec) -> float:
     """Estimate the time [s] of `SolverSpec.refusal`: adapters of other packages read a whole matrix."""
     if not spec.external or problem.matrix is None or "_scan" in problem.__dict__:
         return 0.0
-    return residuals.setup_time(problem) + residuals.READ * float(problem.matrix.size)
+    return residuals.setup_time(problem) + residuals.READ_TIME_PER_ENTRY * float(problem.matrix.size)
 
 
 def loading(*modules: str) -> float:
@@ -78,7 +78,7 @@ def loading(*modules: str) -> float:
 def compared(problem: Problem) -> float:
     """Whether A is symmetric, where it is not known yet."""
     known = problem.matrix is None or "_scan" in problem.__dict__
-    return 0.0 if known else residuals.READ * problem.max_entries
+    return 0.0 if known else residuals.READ_TIME_PER_ENTRY * problem.max_entries
 
 
 def over_rows(problem: Problem) -> float:

@@ -9,7 +9,14 @@ import numpy as np
 from lavender.base.arrays import FloatArray
 from lavender.base.deadline import NEVER, Deadline
 from lavender.judge.certificates import check_certificate
-from lavender.judge.residuals import FLOOR_MOST, best_of_islands, judged, known, remember, remembered
+from lavender.judge.residuals import (
+    MAX_EXCUSED_RESIDUAL,
+    best_of_islands,
+    judged,
+    known,
+    remember,
+    remembered,
+)
 from lavender.judge.solution import Claim, SolverStage, Status, summed
 from lavender.problem import Problem
 from lavender.solvers.small import NO_TIME, NOTHING, told
@@ -90,7 +97,7 @@ class SolveLog:
         return self.status not in (Status.STALLED, Status.NUMERICAL_ERROR)
 
     def at_floor(self) -> bool:
-        if self.best > FLOOR_MOST:
+        if self.best > MAX_EXCUSED_RESIDUAL:
             return False
         last = remembered(self.problem, self.impulse) or judged(self.problem, self.impulse)
         return bool(last.above_floor <= self.tol)

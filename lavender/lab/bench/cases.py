@@ -21,7 +21,7 @@ from lavender import io
 from lavender.base.arrays import FloatArray, flag, several, whole_number
 from lavender.base.errors import InputError, SolverUnavailable
 from lavender.io.stored import ENGINE, SUFFIXES, whole_file
-from lavender.judge.residuals import ENOUGH, Residual, nothing_to_do, residual
+from lavender.judge.residuals import DEFAULT_THRESHOLD, Residual, nothing_to_do, residual
 from lavender.lab import suite
 from lavender.lab.bench.record import CaseInfo, file_name, printable
 from lavender.lab.diagnostics import diagnose
@@ -62,7 +62,7 @@ class Item:
         """The problem; loading errors come from here."""
         return self.load()
 
-    def judged(self, precision: str | None = None, threshold: float = ENOUGH) -> Residual | None:
+    def judged(self, precision: str | None = None, threshold: float = DEFAULT_THRESHOLD) -> Residual | None:
         """The answer stored beside the problem, judged; None where there is none, or one of another problem."""
         impulse = self.stored()
         if impulse is None or impulse.shape != (self.problem.m,):

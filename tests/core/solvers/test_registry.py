@@ -45,7 +45,7 @@ def test_specs_are_copied_and_pickled(again):
         {"laws": "lcp"},
         {"laws": None},
         {"laws": [["lcp"], 3]},
-        {"boxes": "cone"},
+        {"box_friction_laws": "cone"},
         {"summary": None},
         {"requires": "numpy"},
         {"options": ["omega"]},
