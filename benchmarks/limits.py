@@ -108,7 +108,7 @@ def set_ups(name: str) -> Iterator[tuple[str, Callable[[], float], float]]:
 
     def ready() -> Problem:
         problem = make()
-        residuals.reference(problem)
+        residuals.get_reference(problem)
         return problem
 
     problem, cold = ready(), make()
@@ -117,7 +117,7 @@ def set_ups(name: str) -> Iterator[tuple[str, Callable[[], float], float]]:
     yield (
         "his pass",
         lambda: residuals.judging_time(problem) - residuals.RESULT_TIME,
-        least(ready, lambda p: residuals.judged(p, impulse)),
+        least(ready, lambda p: residuals.judge_impulse(p, impulse)),
     )
     stretched = with_ellipses(make())
     if stretched.cones.has_ellipse:

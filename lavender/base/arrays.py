@@ -174,7 +174,7 @@ def shape_of(name: str, value: Any) -> tuple[int, ...]:
         raise InputError(f"{name} is not an array of numbers ({error})") from None
 
 
-def places(i: Any, n: int, thing: str = "world") -> int | list[int]:
+def resolve_index(i: Any, n: int, thing: str = "world") -> int | list[int]:
     """Resolve an index of a sequence of n items.
 
     Parameters
@@ -206,7 +206,7 @@ def places(i: Any, n: int, thing: str = "world") -> int | list[int]:
             raise IndexError(f"{thing} {i}; there are {n}")
         return range(n)[i]
     check_unmasked(name, i)
-    entries = several(name, i, "whole numbers, or a mask,")
+    entries = check_sequence(name, i, "whole numbers, or a mask,")
     shape = shape_of(name, entries)
     index = np.array(entries)
     if len(shape) != 1 or (index.dtype.kind not in "biu" and index.size):
@@ -215,7 +215,7 @@ def places(i: Any, n: int, thing: str = "world") -> int | list[int]:
     return positions
 
 
-def number(
+def check_float(
     name: str, value: object, *, low: float = -np.inf, high: float = np.inf, above: float | None = None
 ) -> float:
     """Return `value` as a float; raise InputError unless it is finite, in [low, high], and larger than `above`."""
@@ -239,7 +239,7 @@ def number(
     return x
 
 
-def whole_number(name: str, value: object, low: int = 0, high: int | None = 2**31 - 1) -> int:
+def check_int(name: str, value: object, low: int = 0, high: int | None = 2**31 - 1) -> int:
     """Return `value` as an int; raise InputError unless it is an integer in [low, high] (high None: no limit)."""
     if (
         isinstance(value, (bool, np.timedelta64))
@@ -252,7 +252,7 @@ def whole_number(name: str, value: object, low: int = 0, high: int | None = 2**3
     return int(value)
 
 
-def flag(name: str, value: object) -> bool:
+def check_bool(name: str, value: object) -> bool:
     """Return `value` as a bool; raise InputError unless it is True or False."""
     if not isinstance(value, (bool, np.bool_)):
         raise InputError(f"{name} is {value!r}; True or False is needed")
@@ -312,7 +312,7 @@ def precision_of(*values: Any) -> str:
     return "float32" if is_single else "float64"
 
 
-def borrowed(name: str, value: Any, shape: tuple[int | None, ...]) -> np.ndarray:
+def as_array_view(name: str, value: Any, shape: tuple[int | None, ...]) -> np.ndarray:
     """Convert `value` as `as_array` with copy=False, for immediate use: the caller's array stays writable."""
     return as_array(name, value.view() if type(value) is np.ndarray else value, shape, copy=False)
 
@@ -391,7 +391,7 @@ def check_not_negative(name: str, array: np.ndarray) -> None:
         raise InputError(f"{name} must not be negative; entry [{i}] is {array[i]}")
 
 
-def several(name: str, value: Any, things: str) -> list[Any]:
+def check_sequence(name: str, value: Any, things: str) -> list[Any]:
     """Return a sequence as a list; raise InputError for texts, sparse matrices and objects that are not sequences."""
     is_sequence = (
         isinstance(value, Iterable) and getattr(value, "ndim", 1) != 0 and not isinstance(value, type)
@@ -401,7 +401,7 @@ def several(name: str, value: Any, things: str) -> list[Any]:
     return list(value)
 
 
-def one_of(name: str, value: Any, choices: Sequence[str]) -> str:
+def check_choice(name: str, value: Any, choices: Sequence[str]) -> str:
     """Return `value` as a str; raise InputError unless it is one of the choices."""
     if not isinstance(value, str) or value not in choices:
         raise InputError(f"{name} is {value!r}; {' or '.join(map(repr, choices))} is needed")
@@ -410,13 +410,13 @@ def one_of(name: str, value: Any, choices: Sequence[str]) -> str:
 
 def as_names(things: str, value: Any, count: int) -> tuple[str, ...]:
     """Return names of `count` things as a tuple; raise InputError for another number of names."""
-    names = tuple(map(str, several(f"names of {things}", value, f"{count} words")))
+    names = tuple(map(str, check_sequence(f"names of {things}", value, f"{count} words")))
     if len(names) != count:
         raise InputError(f"{len(names)} names for {count} {things}; one for each is needed")
     return names
 
 
-def equal(x: object, y: object) -> bool:
+def are_equal(x: object, y: object) -> bool:
     """Return whether two fields are equal: arrays in shape and every value, None only with None."""
     if x is None or y is None:
         return x is y
@@ -425,7 +425,7 @@ def equal(x: object, y: object) -> bool:
     return bool(x == y)
 
 
-def table_of(facts: Mapping[str, Any], title: str) -> str:
+def format_html_table(facts: Mapping[str, Any], title: str) -> str:
     """Format facts as a small HTML table for notebooks; every text is escaped."""
     from html import escape
 

@@ -18,12 +18,12 @@ from lavender.base.arrays import (
     FloatArray,
     as_array,
     as_floats,
+    check_choice,
+    check_sequence,
     check_sizes,
     check_unmasked,
-    one_of,
-    places,
     precision_of,
-    several,
+    resolve_index,
     shape_of,
 )
 from lavender.base.errors import InputError
@@ -109,7 +109,7 @@ class Batch(Sequence[Problem]):
         row_ptr: ArrayLike | None = None,
         velocity_ptr: ArrayLike | None = None,
     ) -> None:
-        friction = one_of("friction", friction, FRICTION_LAWS)
+        friction = check_choice("friction", friction, FRICTION_LAWS)
         values, *pattern = M if isinstance(M, tuple) else (M,)
         jac, mass, free = (as_floats(name, x) for name, x in (("J", J), ("M", values), ("v_free", v_free)))
         if row_ptr is not None and count is None:
@@ -251,7 +251,7 @@ class Batch(Sequence[Problem]):
     def _make_empty(cls, n: int, m: int, friction: Any, precision: str) -> Batch:
         """Build a batch of n worlds with m rows and no arrays."""
         batch: Batch = object.__new__(cls)
-        friction = one_of("friction", friction, FRICTION_LAWS)
+        friction = check_choice("friction", friction, FRICTION_LAWS)
         batch._n, batch.friction, batch.precision, batch._arrays = n, friction, precision, None
         batch.shape, batch.velocity_shape = (n, m), (n, 0)
         batch.at = np.zeros((n, len(PLACE)), np.int64)
@@ -344,7 +344,7 @@ class Batch(Sequence[Problem]):
     def __getitem__(self, i: Any) -> list[Problem]: ...
     def __getitem__(self, i: Any) -> Any:
         """Return world i as a `Problem` made of copies, or a list of problems; raise InputError for invalid numbers."""
-        i = places(i, self._n)
+        i = resolve_index(i, self._n)
         if isinstance(i, list):
             return [self[j] for j in i]
         if self._bodies is not None:
@@ -602,7 +602,7 @@ def _flatten_ragged(name: str, x: np.ndarray, sizes: Any) -> tuple[np.ndarray, A
 
 def _concatenate_cones(cones: Any, n: int) -> Cones:
     """Concatenate the blocks of n worlds."""
-    cones_of_worlds = several("cones", cones, f"Cones, one for each of {n} worlds,")
+    cones_of_worlds = check_sequence("cones", cones, f"Cones, one for each of {n} worlds,")
     if len(cones_of_worlds) != n or not all(isinstance(c, Cones) for c in cones_of_worlds):
         raise InputError(
             f"cones has {len(cones_of_worlds)} entries; a Cones, or one for each of {n} worlds, is needed"

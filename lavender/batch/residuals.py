@@ -15,12 +15,12 @@ import numpy as np
 from lavender.base.arrays import (
     FloatArray,
     as_array,
-    number,
-    one_of,
-    places,
+    check_choice,
+    check_float,
+    check_int,
+    check_sequence,
     read_only,
-    several,
-    whole_number,
+    resolve_index,
 )
 from lavender.base.errors import InputError, LavenderError
 from lavender.base.threads import run_on_threads
@@ -31,8 +31,8 @@ from lavender.judge.residuals import (
     TOL,
     VERDICTS,
     Residual,
+    compute_verdict,
     residual,
-    verdict_of,
 )
 from lavender.problem import PRECISIONS, Problem, check_problem
 from lavender.problem.derived import cached_property
@@ -137,7 +137,7 @@ class Many:
 
     def __getitem__(self, i: Any) -> Any:
         """Return the result of world i, or a list of results; raise the error of an invalid world."""
-        i = places(i, len(self))
+        i = resolve_index(i, len(self))
         if isinstance(i, list):
             return [self[j] for j in i]
         if i in self.faults:
@@ -232,7 +232,7 @@ class Residuals(Many):
             self.precision,
             strict=True,
         )
-        verdicts = [verdict_of(*x, self.threshold) for x in arguments]  # type: ignore[call-arg]
+        verdicts = [compute_verdict(*x, self.threshold) for x in arguments]  # type: ignore[call-arg]
         for i in self.faults:
             verdicts[i] = ""
         return read_only(np.array(verdicts, f"U{max(map(len, VERDICTS))}"))
@@ -304,9 +304,9 @@ def residual_many(
     """
     worlds = check_problems(problems, errors)
     if precision is not None:
-        precision = one_of("precision", precision, PRECISIONS)
-    threshold = number("threshold", threshold, low=0.0)
-    threads = whole_number("threads", threads, 1, None)
+        precision = check_choice("precision", precision, PRECISIONS)
+    threshold = check_float("threshold", threshold, low=0.0)
+    threads = check_int("threads", threads, 1, None)
     if isinstance(worlds, Batch):
         starts: Any = worlds.impulses("impulses", impulses)
         precisions = len(worlds) * [worlds.precision if precision is None else precision]
@@ -334,12 +334,12 @@ def residual_many(
 
 def check_problems(problems: Any, errors: str) -> Any:
     """Return a batch, or a list of problems; raise InputError for other arguments or an unknown `errors`."""
-    one_of("errors", errors, ERRORS)
+    check_choice("errors", errors, ERRORS)
     if isinstance(problems, Problem):
         raise InputError("problems is one Problem; a list of them is needed, or `solve`")
     if isinstance(problems, Batch):
         return problems
-    problems = several("problems", problems, "Problems, or a Batch,")
+    problems = check_sequence("problems", problems, "Problems, or a Batch,")
     for problem in problems:
         if type(problem) is not Problem:
             check_problem(problem)
@@ -348,7 +348,7 @@ def check_problems(problems: Any, errors: str) -> Any:
 
 def check_impulses(problems: Any, impulses: Any) -> list[Any]:
     """Convert the impulses (m,) [N s] of each problem; its guess replaces None."""
-    impulses = several("impulses", impulses, "(m,), one for each problem,")
+    impulses = check_sequence("impulses", impulses, "(m,), one for each problem,")
     if len(impulses) != len(problems):
         raise InputError(f"{len(impulses)} impulses for {len(problems)} problems; one for each is needed")
     return [

@@ -12,12 +12,12 @@ from typing import Any, overload
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray, read_only, whole_number
+from lavender.base.arrays import FloatArray, check_int, read_only
 from lavender.base.deadline import NEVER, Deadline
 from lavender.base.errors import InputError, LavenderError
 from lavender.batch.data import Batch
 from lavender.batch.residuals import Many, check_impulses, check_problems
-from lavender.judge.residuals import judged, reading_time
+from lavender.judge.residuals import judge_impulse, reading_time
 from lavender.judge.solution import CONTRADICTED, Solution, Status, uninterrupted
 from lavender.problem import Problem
 from lavender.problem.derived import cached_property
@@ -250,7 +250,7 @@ class Solutions(Many, Sequence[Solution]):
     def _make_postponed_fields(self, i: int, impulse: FloatArray, status: Status) -> dict[str, Any]:
         """Compute the fields of a solution that are not needed before its first use."""
         problem = self.problems[i]
-        judgement = judged(problem, impulse).refine(self.tol)
+        judgement = judge_impulse(problem, impulse).refine(self.tol)
         is_start = self._worlds.code[i] in (CODE["late"], CODE["started"])
         counts = None if is_start else self._counts(problem, i)
         fields = rest_of(problem, self._spec, judgement, counts, self.start(i), status)
@@ -323,7 +323,7 @@ def solve_many(
         Ctrl-C was pressed; each thread completes its current world.
     """
     worlds = check_problems(problems, errors)
-    threads = whole_number("threads", threads, 1, None)
+    threads = check_int("threads", threads, 1, None)
     spec, limit = get(solver), seconds_of(time_limit)
     deadline = NEVER if limit == np.inf else Deadline(limit)
     check_budget(spec, tol, max_iter)

@@ -51,7 +51,7 @@ def check(
     with --precision or --threshold, a stored solution is neither at its floor nor close enough.
     Exit code 2: a named file cannot be read, or these options find no stored solution.
     """
-    from lavender.base.arrays import number
+    from lavender.base.arrays import check_float
     from lavender.judge.residuals import AT_FLOOR, CLOSE
     from lavender.lab import bench
     from lavender.lab.check import cross_check
@@ -67,8 +67,8 @@ def check(
     reading = Reading(partial(say, style="yellow"))
     asked = precision is not None or was_given(context, "threshold")
     bench.solver_names([*(solvers or ()), reference])
-    number("tol", tol, low=0.0)
-    number("threshold", threshold, low=0.0)
+    check_float("tol", tol, low=0.0)
+    check_float("threshold", threshold, low=0.0)
     seconds_of(time_limit)
     for item in bench.resolve(files):
         with reading(item):

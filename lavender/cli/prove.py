@@ -22,7 +22,7 @@ def prove(files: tuple[str, ...], solver: str, tol: float) -> None:
     Exit code 1: an answer without a proof, or a file in a folder that cannot be read. Exit code 2: a named file cannot
     be read.
     """
-    from lavender.base.arrays import number
+    from lavender.base.arrays import check_float
     from lavender.lab.bench.cases import resolve
     from lavender.lab.bench.running.worker import Worker, solve_isolated
     from lavender.lab.proof import prove as enclose
@@ -30,7 +30,7 @@ def prove(files: tuple[str, ...], solver: str, tol: float) -> None:
     from lavender.solvers.registry import get
 
     one_thread()
-    number(
+    check_float(
         "tol", tol, low=0.0
     )  # refused before anything is read, as are an unknown solver and a missing package
     get(solver)

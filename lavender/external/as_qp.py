@@ -44,11 +44,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from lavender.base.arrays import FloatArray, one_of
+from lavender.base.arrays import FloatArray, check_choice
 from lavender.base.errors import CapabilityError
 from lavender.base.lazy_import import sparse as sp
 from lavender.judge.certificates import check_certificate
-from lavender.judge.residuals import reference
+from lavender.judge.residuals import get_reference
 from lavender.problem import Problem
 
 PROGRAM_FORMS = ("impulse", "velocity", "auto")
@@ -359,7 +359,7 @@ def choose_form(problem: Problem, form: str, definite: bool = False) -> str:
     CapabilityError
         "velocity" for a problem without rows.
     """
-    form = one_of("form", form, PROGRAM_FORMS)
+    form = check_choice("form", form, PROGRAM_FORMS)
     rows = problem.rows
     if form == "velocity" and rows is None:
         raise CapabilityError(
@@ -383,7 +383,7 @@ def residual_target(problem: Problem, tol: float) -> float:
 
     E <= sqrt(m) sigma eps,  V <= max sqrt(nu) sigma eps
     """
-    energy, velocity = reference(problem)
+    energy, velocity = get_reference(problem)
     sigma = _compute_scale(problem)
     limits = [
         start / (size * sigma)
@@ -731,7 +731,7 @@ def _find_far_rows(problem: Problem, sigma: float, threshold: float) -> tuple[In
 
 def _compute_scale(problem: Problem) -> float:
     """Compute sigma = max(E0 / sqrt(m), V0 sqrt(heaviest mass)) [J^1/2]; 1 if it is 0 or not finite."""
-    energy, velocity = reference(problem)
+    energy, velocity = get_reference(problem)
     if problem.has_singular_program:
         heaviest = 0.0
     elif problem.rows is None:

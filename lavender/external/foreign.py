@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray, number, read_only
+from lavender.base.arrays import FloatArray, check_float, read_only
 from lavender.base.deadline import Deadline
 from lavender.base.errors import InputError
-from lavender.judge.residuals import reference, residual
+from lavender.judge.residuals import get_reference, residual
 from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
 from lavender.solvers.registry import Solver
@@ -55,7 +55,9 @@ class Foreign(Solver):
     def setup_time(self, problem: Problem) -> float:
         """Return the solver's estimate of the time [s] of `prepare`, 0 if it has none."""
         estimate = self._call_optional("setup_time", problem)
-        return 0.0 if estimate is None else number(f"setup_time of solver {self.name!r}", estimate, low=0.0)
+        return (
+            0.0 if estimate is None else check_float(f"setup_time of solver {self.name!r}", estimate, low=0.0)
+        )
 
     def start_workers(self, state: State, time_limit: float) -> None:
         """Start worker processes before the clock of a time limit starts."""
@@ -191,5 +193,5 @@ def _copy_problem(problem: Problem) -> Problem:
         generalized=deepcopy(problem.generalized),
         copy=True,
     )
-    reference(copied)  # Compute the judge's norms before the solver has access to the copy.
+    get_reference(copied)  # Compute the judge's norms before the solver has access to the copy.
     return copied

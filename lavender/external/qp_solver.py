@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray, flag
+from lavender.base.arrays import FloatArray, check_bool
 from lavender.base.deadline import Deadline
 from lavender.base.errors import CapabilityError, InputError
 from lavender.base.lazy_import import import_numerics
@@ -16,7 +16,7 @@ from lavender.external.as_qp import QP, choose_form, impulse_form, program_form,
 from lavender.external.backend import Backend
 from lavender.external.isolated import ENTRY_SIZE, TRANSFER_RATE, IsolatedBackend, start_process
 from lavender.external.running import call_until_accepted
-from lavender.judge.residuals import quick
+from lavender.judge.residuals import compute_relative
 from lavender.judge.solution import Claim, Status, summed
 from lavender.problem import Problem
 from lavender.solvers.registry import Solver
@@ -47,7 +47,7 @@ class QPSolver(Solver):
             raise InputError(
                 f"settings is a {type(self.settings).__name__}; a mapping of names to values is needed"
             )
-        flag("isolate", self.isolate)
+        check_bool("isolate", self.isolate)
 
     def setup_time(self, problem: Problem) -> float:
         """Estimate the time [s] to form the program, and to send it if the backend runs in another process."""
@@ -135,7 +135,7 @@ def _assumption_fails(qp: QP, impulse: FloatArray, claim: Claim) -> bool:
     if claim.status is Status.INFEASIBLE:
         return True
     w, error = np.empty(len(impulse)), np.empty(len(impulse))
-    quick(qp.problem, impulse, w, error)
+    compute_relative(qp.problem, impulse, w, error)
     return bool(np.any(error[qp.assumed] != 0.0))
 
 

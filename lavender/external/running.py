@@ -19,7 +19,7 @@ from lavender.base.deadline import Deadline
 from lavender.base.errors import InputError
 from lavender.external.as_qp import QP, residual_target
 from lavender.judge.certificates import check_certificate
-from lavender.judge.residuals import quick
+from lavender.judge.residuals import compute_relative
 from lavender.judge.solution import Claim, Status, summed
 from lavender.problem import Problem
 from lavender.solvers.certify import check_infeasible
@@ -172,13 +172,13 @@ def call_until_accepted(
     start, best = impulse.copy(), None
     work: dict[str, int] = {"backend_calls": 0}
     w, e = np.empty(problem.m), np.empty(problem.m)
-    if tol > 0.0 and quick(problem, impulse, w, e)[0] == 0.0:
+    if tol > 0.0 and compute_relative(problem, impulse, w, e)[0] == 0.0:
         return Claim(Status.CONVERGED, 0, work, "the start is a solution", qp.form)
     limits = _make_limits(problem, tol, max_iter, time_limit)
     while limits:
         last = _call_once(qp, impulse, call, limits.pop(0), settings, noisy)
         work = summed((work, last.work))
-        relative, above = quick(problem, impulse, w, e, floor=True)
+        relative, above = compute_relative(problem, impulse, w, e, floor=True)
         if best is None or relative < best[0]:
             best = (relative, last, impulse.copy(), above)
         remaining = max_iter - work.get("iterations", 0)

@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray, IntArray, places, several
+from lavender.base.arrays import FloatArray, IntArray, check_sequence, resolve_index
 from lavender.base.errors import InputError
 from lavender.batch.solve import Solutions
 from lavender.gradient.derivative import MAX_ACCEPTED_RESIDUAL, Derivative, derivative
 from lavender.gradient.result import INPUTS, MATRICES, Gradient
 from lavender.gradient.system import MAX_KERNEL_ROWS
-from lavender.judge.residuals import reference
+from lavender.judge.residuals import get_reference
 from lavender.problem import Problem
 from lavender.problem.derived import cached_property
 from lavender_ext.derivative.linear import Linears
@@ -38,7 +38,7 @@ class _LazySequence(Sequence[Any]):
 
     def __getitem__(self, i: Any) -> Any:
         """Return the object of problem i, or a list of objects for a slice, a mask or a list of integers."""
-        i = places(i, self._n)
+        i = resolve_index(i, self._n)
         return [self._get(j) for j in i] if isinstance(i, list) else self._get(i)
 
     def __iter__(self) -> Iterator[Any]:
@@ -119,7 +119,7 @@ class Derivatives(_LazySequence):
         """
         n, arguments = len(self), {"velocity": velocity, "impulse": impulse, "slack": slack}
         cotangents = {
-            name: [None] * n if x is None else several(name, x, "cotangents, one for each problem,")
+            name: [None] * n if x is None else check_sequence(name, x, "cotangents, one for each problem,")
             for name, x in arguments.items()
         }
         for name, x in cotangents.items():
@@ -156,12 +156,12 @@ def derivatives(problems: Iterable[Problem], solutions: Iterable[Any]) -> Deriva
     """
     if isinstance(problems, Problem):
         raise InputError("problems is one Problem; a list of them is needed, or `derivative`")
-    problems = several("problems", problems, "Problems")
+    problems = check_sequence("problems", problems, "Problems")
     is_batch = isinstance(solutions, Solutions) and not solutions.faults
     impulses: Any = (
         solutions
         if is_batch
-        else [getattr(x, "impulse", x) for x in several("solutions", solutions, "Solutions")]
+        else [getattr(x, "impulse", x) for x in check_sequence("solutions", solutions, "Solutions")]
     )
     if len(problems) != len(impulses):
         raise InputError(f"{len(impulses)} solutions for {len(problems)} problems; one for each is needed")
@@ -185,5 +185,5 @@ def _get_data(problem: Problem) -> Any:
     view = problem.derived.view
     assert view is not None
     if view.reference_energy < 0.0:
-        reference(problem)
+        get_reference(problem)
     return view

@@ -14,7 +14,7 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray, as_array, number, one_of, whole_number
+from lavender.base.arrays import FloatArray, as_array, check_choice, check_float, check_int
 from lavender.base.errors import InputError, LavenderError
 from lavender.io import mujoco as adapter
 from lavender.io import npz
@@ -111,9 +111,9 @@ def record(
         that holds a recording; MuJoCo ends in an error (out of memory, what it does not support).
     """
     mj = adapter._mujoco(model, data)[0].mj
-    steps, every = whole_number("steps", steps, 1), whole_number("every", every, 1)
-    precision = one_of("precision", precision, PRECISIONS)
-    threshold = number("threshold", threshold, low=0.0)
+    steps, every = check_int("steps", steps, 1), check_int("every", every, 1)
+    precision = check_choice("precision", precision, PRECISIONS)
+    threshold = check_float("threshold", threshold, low=0.0)
     drive = drive_of(model, control, seed)
     starts = None if states is None else read_states(mj, model, states).take(steps)
     firsts = {} if starts is None else {steps * i // len(starts): i for i in range(len(starts))}
@@ -256,7 +256,7 @@ def drive_of(model: Any, control: Control, seed: int) -> Callable[[Any, int], Fl
             )
         if control == "zero":
             return lambda data, step: np.zeros(n)
-        rng = np.random.default_rng(whole_number("seed", seed, high=None))
+        rng = np.random.default_rng(check_int("seed", seed, high=None))
         limited = np.array(model.actuator_ctrllimited, bool)[:, None]
         low, high = np.where(limited, np.array(model.actuator_ctrlrange), [-1.0, 1.0]).T
         return lambda data, step: rng.uniform(low, high)

@@ -40,7 +40,7 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray
 from lavender.base.deadline import NEVER, Deadline, TooLate
-from lavender.judge.residuals import reference, relative_of
+from lavender.judge.residuals import divide_by_reference, get_reference
 from lavender.problem import Problem
 
 __all__ = ["Proof", "check_certificate", "format_lower_bound", "list_conflicting_blocks", "prove"]
@@ -339,7 +339,7 @@ def _compute_min_residual(problem: Problem, net: float, y: FloatArray, z: FloatA
     If b was computed, its rounding is that of target and J v*.
     """
     data, size = problem.metric, np.abs(problem.b)
-    reference(problem)
+    get_reference(problem)
     energy = net / (_energy_norm(data, y * data.d) + _energy_norm(data, z))
     velocity = 0.0 if np.any(z) else net / np.sum(data.d * np.abs(y) / data.weight)
     if not energy + velocity < math.inf:
@@ -350,8 +350,8 @@ def _compute_min_residual(problem: Problem, net: float, y: FloatArray, z: FloatA
     b_rounding = 4.0 * UNIT_ROUNDOFF * size
     max_velocity = np.max(data.weight * b_rounding / data.d)
     return (
-        relative_of(data, energy, velocity),
-        relative_of(data, _energy_norm(data, b_rounding), max_velocity),
+        divide_by_reference(data, energy, velocity),
+        divide_by_reference(data, _energy_norm(data, b_rounding), max_velocity),
     )
 
 

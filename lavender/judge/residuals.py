@@ -52,7 +52,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lavender.base.arrays import ArrayLike, FloatArray, IntArray, as_array, number, one_of, read_only
+from lavender.base.arrays import (
+    ArrayLike,
+    FloatArray,
+    IntArray,
+    as_array,
+    check_choice,
+    check_float,
+    read_only,
+)
 from lavender.base.errors import InputError
 from lavender.base.renamed import build_attribute_error
 from lavender.problem import PRECISIONS, Problem, check_problem
@@ -216,7 +224,7 @@ class Residual:
         Wrong: not finite, or an error as large as that of the zero impulse. A residual cannot distinguish a smaller
         mistake from a stop before convergence: a different mu, for example, leaves the same error.
         """
-        return verdict_of(
+        return compute_verdict(
             self.relative, self.roundoff_floor, self.above_floor, self.energy, self.velocity, self.energy_rhs,
             self.nothing_to_do, self.precision, self.threshold,
         )  # fmt: skip
@@ -236,8 +244,8 @@ class Residual:
 
     @property
     def nothing_to_do(self) -> bool:
-        """Whether the zero impulse is a solution (see `nothing_to_do`): read `energy` and `velocity` instead."""
-        return nothing_to_do(self._problem)
+        """Whether the zero impulse is a solution (see `is_solved_by_zero`): read `energy` and `velocity` instead."""
+        return is_solved_by_zero(self._problem)
 
     @property
     def energy_rhs(self) -> float:
@@ -259,7 +267,7 @@ class Residual:
     def islands(self) -> Islands:
         """Error of each island, in the order of their first blocks."""
         problem = self._problem.disk
-        reference(problem)
+        get_reference(problem)
         label, table = measure.by_island(problem.metric, self._impulse)
         return Islands(label, *table.T)
 
@@ -281,7 +289,7 @@ def _at_floor(relative: float, above_floor: float, precision: str) -> bool:
     return above_floor == 0.0 and (precision == "float64" or relative < 1.0)
 
 
-def verdict_of(
+def compute_verdict(
     relative: float,
     floor: float,
     above_floor: float,
@@ -306,12 +314,12 @@ def verdict_of(
     return UNCONVERGED if relative < 1.0 else WRONG
 
 
-def relative_of(data: Any, energy: float, velocity: float) -> float:
+def divide_by_reference(data: Any, energy: float, velocity: float) -> float:
     """Compute the relative residual of two errors [sqrt J, m/s]; inf if one is not finite or has no reference."""
     return measure.compare(energy, velocity, data.reference_energy, data.reference_velocity)
 
 
-def reference(problem: Problem) -> tuple[float, float]:
+def get_reference(problem: Problem) -> tuple[float, float]:
     """Return E0 [sqrt J] and V0 [m/s] over all rows; the references of all islands are computed once per problem."""
     data = problem.metric
     if data.reference_energy < 0.0:
@@ -323,22 +331,22 @@ def reference(problem: Problem) -> tuple[float, float]:
     return data.reference_energy, data.reference_velocity
 
 
-def nothing_to_do(problem: Problem) -> bool:
+def is_solved_by_zero(problem: Problem) -> bool:
     """Return whether the zero impulse solves every island (`lavender_ext/judge/reference.pxd`), or V0 < 1e-9 m/s.
 
     The relative residual of such a problem compares rounding with rounding, so read its errors in units.
     """
     problem = problem.disk
-    reference(problem)
+    get_reference(problem)
     data = problem.metric
     return bool(data.relative_at_zero < 0.5 or data.reference_velocity < MAX_REST_VELOCITY)
 
 
-def judged(problem: Problem, impulse: FloatArray) -> measure.Judged:
+def judge_impulse(problem: Problem, impulse: FloatArray) -> measure.Judged:
     """Judge an impulse (m,) [N s]. The result refers to the array, which must not change afterwards."""
     data = problem.metric
     if data.reference_energy < 0.0:
-        reference(problem)
+        get_reference(problem)
     return measure.Judged(data, impulse)
 
 
@@ -350,7 +358,7 @@ def best_of_islands(
     Of the starts an island keeps the one with the lowest relative residual. An impulse replaces it if it solves the
     island, or if its energy is lower there and its relative residual no larger.
     """
-    reference(problem)
+    get_reference(problem)
     best: FloatArray = measure.best_of_islands(problem.metric, list(starts), list(impulses), tol)
     return best
 
@@ -393,12 +401,12 @@ def _estimate_pass(problem: Problem) -> tuple[float, float]:
     return float(problem.matrix.size), READ_TIME_PER_ENTRY * float(problem.matrix.size)
 
 
-def remember(problem: Problem, last: measure.Judged) -> None:
+def store_result(problem: Problem, last: measure.Judged) -> None:
     """Store a result for the next call of `residual` with the same impulse, bit for bit."""
     problem.derived.cache[JUDGED_KEY] = last
 
 
-def remembered(problem: Problem, impulse: FloatArray) -> measure.Judged | None:
+def find_stored(problem: Problem, impulse: FloatArray) -> measure.Judged | None:
     """Return the stored result if it belongs to `impulse`, bit for bit, and to this problem; else None."""
     last: measure.Judged | None = problem.derived.cache.get(JUDGED_KEY)
     if last is None or last.data is not problem.metric or not measure.same_bits(last.impulse, impulse):
@@ -406,23 +414,23 @@ def remembered(problem: Problem, impulse: FloatArray) -> measure.Judged | None:
     return last
 
 
-def known(problem: Problem, impulse: FloatArray) -> float | None:
+def find_known_relative(problem: Problem, impulse: FloatArray) -> float | None:
     """Return the relative residual if `impulse` is the stored or the zero impulse, bit for bit; else None."""
-    last = remembered(problem, impulse)
+    last = find_stored(problem, impulse)
     if last is not None:
         return float(last.relative)
     start: float = problem.metric.relative_at_zero
     return start if start >= 0.0 and measure.same_bits(problem._start, impulse) else None
 
 
-def quick(
+def compute_relative(
     problem: Problem, impulse: FloatArray, w: FloatArray, e: FloatArray, floor: bool = False
 ) -> tuple[float, float]:
     """Compute (relative, above_floor) of `Residual` for a solver's stopping test, with w, e as scratch (m,).
 
     Without `floor` both are the relative residual.
     """
-    reference(problem)
+    get_reference(problem)
     _, _, relative, above = measure.judge(problem.metric, impulse, w, e, floor)
     return relative, above
 
@@ -471,28 +479,28 @@ def residual(
     ('stopped before convergence', True)
     """
     check_problem(problem)
-    precision = problem.precision if precision is None else one_of("precision", precision, PRECISIONS)
+    precision = problem.precision if precision is None else check_choice("precision", precision, PRECISIONS)
     if type(impulse) is not np.ndarray or impulse.dtype != float or not impulse.flags.c_contiguous:
         impulse = as_array("impulse", impulse, (None,), finite=False, unit="N s")
     if impulse.shape != (problem.m,):
         raise InputError(f"impulse has shape {impulse.shape}; ({problem.m},) is needed")
     if problem.cones.has_ellipse:
-        return unstretched(
+        return convert_from_disk(
             problem, residual(problem.disk, problem.on_disk(impulse), precision, threshold, tol)
         )
-    judgement = remembered(problem, impulse)
+    judgement = find_stored(problem, impulse)
     problem.derived.cache.pop(JUDGED_KEY, None)
     if judgement is None:
-        judgement = judged(problem, impulse)
+        judgement = judge_impulse(problem, impulse)
     if tol != TOL and not (type(tol) is float and tol >= 0.0):
-        tol = number("tol", tol, low=0.0)
-    result = told(problem, judgement.refine(tol) if judgement.loss > 0.1 * tol else judgement)
+        tol = check_float("tol", tol, low=0.0)
+    result = make_residual(problem, judgement.refine(tol) if judgement.loss > 0.1 * tol else judgement)
     if type(threshold) is not float or threshold != DEFAULT_THRESHOLD:
-        result = replace(result, threshold=number("threshold", threshold, low=0.0))
+        result = replace(result, threshold=check_float("threshold", threshold, low=0.0))
     return result if precision == "float64" else _with_float32_floor(problem, result, impulse)
 
 
-def unstretched(problem: Problem, of_disk: Residual) -> Residual:
+def convert_from_disk(problem: Problem, of_disk: Residual) -> Residual:
     """Convert the residual of `problem.disk` to one of `problem`, which has ellipses."""
     s = problem.cones.stretch
     with np.errstate(over="ignore"):
@@ -503,7 +511,7 @@ def unstretched(problem: Problem, of_disk: Residual) -> Residual:
 def _with_float32_floor(problem: Problem, result: Residual, impulse: FloatArray) -> Residual:
     """Replace the floor of a residual by the floor of float32."""
     with np.errstate(over="ignore", invalid="ignore"):  # An impulse that is not finite has no floor.
-        of_impulse, of_data, of_velocities = rounded(problem, impulse)
+        of_impulse, of_data, of_velocities = estimate_float32_errors(problem, impulse)
         relative = [result.relative] if result.worst_island < 0 else result.islands.relative.tolist()
         squares = of_impulse, of_data, of_velocities, of_impulse + of_data + of_velocities
     floors = [measure.size_of_square(problem.metric, x) for x in squares]
@@ -517,7 +525,9 @@ def _with_float32_floor(problem: Problem, result: Residual, impulse: FloatArray)
     return replace(result, precision="float32", roundoff_floor=floor, above_floor=above, rounding=rounding)
 
 
-def rounded(problem: Problem, impulse: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def estimate_float32_errors(
+    problem: Problem, impulse: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the squared changes of w (m,) [m2/s2] that float32 causes by (1), by (2, 3 or 4), by (5) of the module."""
     general = problem.generalized
     if general is not None:
@@ -549,7 +559,7 @@ def _squared(a: Any) -> Any:
     return a.multiply(a).tocsr()
 
 
-def told(problem: Problem, judgement: measure.Judged) -> Residual:
+def make_residual(problem: Problem, judgement: measure.Judged) -> Residual:
     """Build a `Residual` from a raw judge pass."""
     residual: Residual = object.__new__(Residual)
     state = {

@@ -26,7 +26,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray, number
+from lavender.base.arrays import FloatArray, check_float
 from lavender.base.errors import InputError, check_name
 from lavender.batch.data import Batch
 from lavender.batch.residuals import residual_many
@@ -411,7 +411,7 @@ def audit(
         raise InputError(f"precision is {precision!r}; {' or '.join(PRECISIONS)}, of MuJoCo alone, is needed")
     check_workers(workers)
     runs = Runs(os.fspath(model), worlds, steps, control=control, seed=seed, spread=spread).start_from(states)
-    how = precision or "float64", number("threshold", threshold, low=0.0)
+    how = precision or "float64", check_float("threshold", threshold, low=0.0)
     numbers, verdict = np.full((len(NUMBERS), worlds, steps), np.nan), np.full((worlds, steps), -1, np.int8)
     rows, contacts = np.zeros((2, worlds, steps), int)
     result = Audit(

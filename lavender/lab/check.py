@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from lavender.base.arrays import several
+from lavender.base.arrays import check_sequence
 from lavender.base.errors import InputError, LavenderError, format_error
 from lavender.judge.residuals import MAX_EXCUSED_RESIDUAL, WRONG
 from lavender.judge.solution import CONTRADICTED, NOT_PROVEN, Solution, Status, uninterrupted
@@ -191,7 +191,7 @@ def cross_check(
         problem = replace(problem, guess=None, copy=False)
     if isinstance(solvers, str):
         solvers = [solvers]
-    names = available(problem) if solvers is None else several("solvers", solvers, "names")
+    names = available(problem) if solvers is None else check_sequence("solvers", solvers, "names")
     reasons = known(problem)
     for name in (reference, *names):
         if not isinstance(name, str) or name not in reasons:

@@ -29,7 +29,7 @@ from typing import Any
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray, number, whole_number
+from lavender.base.arrays import FloatArray, check_float, check_int
 from lavender.base.deadline import seconds
 from lavender.base.errors import InputError
 from lavender.batch.residuals import residual_many
@@ -474,10 +474,10 @@ def tune(
     CapabilityError
         An integrator whose problem is not of M.
     """
-    own: dict[str, Any] = {"worlds": whole_number("worlds", worlds, 2, None), "steps": steps}
+    own: dict[str, Any] = {"worlds": check_int("worlds", worlds, 2, None), "steps": steps}
     runs = Runs(os.fspath(model), **own, control=control, seed=seed, spread=spread).start_from(states)
-    ahead, rounds = whole_number("ahead", ahead, 1, None), whole_number("rounds", rounds, 1, None)
-    threshold = number("threshold", threshold, low=0.0)
+    ahead, rounds = check_int("ahead", ahead, 1, None), check_int("rounds", rounds, 1, None)
+    threshold = check_float("threshold", threshold, low=0.0)
     if steps % ahead:
         raise InputError(f"steps is {steps} and ahead {ahead}; a multiple of it is needed")
     mj, made = runs.load()

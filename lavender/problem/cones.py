@@ -29,15 +29,15 @@ from lavender.base.arrays import (
     ArrayLike,
     FloatArray,
     IntArray,
+    are_equal,
     as_array,
     check_inside,
+    check_int,
     check_not_nan,
     check_sizes,
-    equal,
-    places,
     read_only,
+    resolve_index,
     shape_of,
-    whole_number,
 )
 from lavender.base.errors import InputError
 from lavender.problem.derived import cached_property
@@ -255,7 +255,7 @@ class Cones:
     @classmethod
     def free(cls, m: int) -> Cones:
         """Build m unbounded rows, each a separate block: a linear system."""
-        return cls._from_blocks(kernels.free_rows(whole_number("m", m, high=2**31 - 2)))
+        return cls._from_blocks(kernels.free_rows(check_int("m", m, high=2**31 - 2)))
 
     @classmethod
     def contacts(
@@ -307,7 +307,7 @@ class Cones:
         True
         """
         if type(tangents) is not int or not 0 <= tangents <= 5:
-            tangents = whole_number("tangents", tangents, 0, 5)
+            tangents = check_int("tangents", tangents, 0, 5)
         is_box = check_shape("shape", shape) == "box"
         is_pair = type(mu) is not float and len(shape_of("mu", mu)) > 1
         if patch_radius is not None or rolling is not None or tangents != 2:
@@ -320,7 +320,7 @@ class Cones:
             mu, ratio = convert_ellipse_coefficients(mu)
             pair_kind = 0 if ratio is None else CONTACT_ELLIPSE
         size_of_mu = 1 if type(mu) is float or np.ndim(mu) == 0 else shape_of("mu", mu)[0]
-        k = size_of_mu if count is None else whole_number("count", count)
+        k = size_of_mu if count is None else check_int("count", count)
         if type(mu) is not float or not (mu == 0.0 or LEAST <= mu <= MOST):
             mu = check_coefficients("mu", mu, k)
         if patch_radius is not None:
@@ -548,7 +548,7 @@ class Cones:
             A block does not exist.
         """
         try:
-            indices = places(blocks, self.n_blocks, "block")
+            indices = resolve_index(blocks, self.n_blocks, "block")
         except IndexError as error:
             raise InputError(f"blocks: {error}") from None
         return self._take_blocks(np.array(indices if isinstance(indices, list) else [indices], np.int32))
@@ -581,7 +581,7 @@ class Cones:
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Cones):
             return NotImplemented
-        return all(map(equal, self._blocks.arrays, other._blocks.arrays))
+        return all(map(are_equal, self._blocks.arrays, other._blocks.arrays))
 
     __hash__ = None  # type: ignore[assignment]
 

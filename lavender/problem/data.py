@@ -11,18 +11,18 @@ import numpy as np
 from lavender.base.arrays import (
     ArrayLike,
     FloatArray,
+    are_equal,
     as_array,
     as_csr,
     as_names,
+    check_choice,
     check_finite,
+    check_int,
     check_sizes,
     check_unmasked,
-    equal,
-    one_of,
+    format_html_table,
     read_only,
     shape_of,
-    table_of,
-    whole_number,
 )
 from lavender.base.errors import InputError
 from lavender.base.lazy_import import issparse
@@ -120,10 +120,10 @@ class ProblemData:
         _check_rhs(self.b)
         if (self.matrix is None) + (self.rows is None) + (self.generalized is None) != 2:
             raise InputError("give matrix=, rows= or generalized=, one of them")
-        put(self, "friction", one_of("friction", self.friction, FRICTION_LAWS))
+        put(self, "friction", check_choice("friction", self.friction, FRICTION_LAWS))
         if self.precision is None or (isinstance(self.precision, str) and not self.precision):
             put(self, "precision", getattr(self.rows, "precision", "float64"))
-        put(self, "precision", one_of("precision", self.precision, PRECISIONS))
+        put(self, "precision", check_choice("precision", self.precision, PRECISIONS))
         if self.friction != "cone" and self.cones.has_round:
             raise InputError(
                 "a round cone of more than two tangents has no Coulomb law here: give friction='cone'"
@@ -257,7 +257,7 @@ class ProblemData:
         InputError
             The problem has no such row.
         """
-        row = whole_number("row", row, high=self.m - 1)
+        row = check_int("row", row, high=self.m - 1)
         return int(np.searchsorted(self.cones.ptr, row, side="right")) - 1
 
     def block_name(self, block: int) -> str:
@@ -268,7 +268,7 @@ class ProblemData:
         InputError
             The problem has no such block.
         """
-        block = whole_number("block", block, high=self.n_blocks - 1)
+        block = check_int("block", block, high=self.n_blocks - 1)
         return (
             self.names[block] if self.names else self.row_name(int(self.cones.ptr[block])).rsplit(", ", 1)[0]
         )
@@ -303,14 +303,14 @@ class ProblemData:
         if not isinstance(other, ProblemData):
             return NotImplemented
         compared = (f.name for f in fields(self) if f.init and f.compare and f.name not in ("matrix", "copy"))
-        if not all(equal(getattr(self, name), getattr(other, name)) for name in compared):
+        if not all(are_equal(getattr(self, name), getattr(other, name)) for name in compared):
             return False
         if issparse(self.matrix) and issparse(other.matrix):
             return all(
-                equal(getattr(self.matrix, n), getattr(other.matrix, n))
+                are_equal(getattr(self.matrix, n), getattr(other.matrix, n))
                 for n in ("indptr", "indices", "data")
             )
-        return type(self.matrix) is type(other.matrix) and equal(self.matrix, other.matrix)
+        return type(self.matrix) is type(other.matrix) and are_equal(self.matrix, other.matrix)
 
     __hash__ = None  # type: ignore[assignment]
 
@@ -335,7 +335,7 @@ class ProblemData:
             "other blocks": self.n_blocks - contacts,
             "given by": repr(self).rpartition(", ")[2].rstrip(">"),
         }
-        return table_of(facts, self.name or "Problem")
+        return format_html_table(facts, self.name or "Problem")
 
 
 def _check_rhs(b: FloatArray) -> None:

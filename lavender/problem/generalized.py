@@ -17,14 +17,14 @@ import numpy as np
 from lavender.base.arrays import (
     FloatArray,
     IntArray,
+    are_equal,
     as_array,
+    as_array_view,
     as_csr,
     as_names,
-    borrowed,
-    equal,
+    check_int,
     precision_of,
     read_only,
-    whole_number,
 )
 from lavender.base.errors import InputError
 from lavender.base.lazy_import import issparse
@@ -130,7 +130,7 @@ class Generalized:
         return new
 
     @classmethod
-    def laid_out(cls, jac: Compressed, mass: Compressed) -> Generalized:
+    def from_validated(cls, jac: Compressed, mass: Compressed) -> Generalized:
         """Build from checked arrays as `compressed`, without the factor of M and v*, which `shifted` computes."""
         new = object.__new__(cls)
         new._make_operator(jac, mass, len(mass[0]) - 1)
@@ -251,7 +251,7 @@ class Generalized:
 
     def velocity_name(self, i: int) -> str:
         """Return the name of velocity i; raise InputError if it does not exist."""
-        i = whole_number("i", i, high=self.nv - 1)
+        i = check_int("i", i, high=self.nv - 1)
         return f"velocity {i}" if self.names is None else self.names[i]
 
     @cached_property
@@ -347,10 +347,10 @@ class Generalized:
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Generalized):
             return NotImplemented
-        if self.names != other.names or not equal(self.v_free, other.v_free):
+        if self.names != other.names or not are_equal(self.v_free, other.v_free):
             return False
         return all(
-            equal(getattr(a, n), getattr(b, n))
+            are_equal(getattr(a, n), getattr(b, n))
             for a, b in ((self.jac, other.jac), (self.mass, other.mass))
             for n in ("indptr", "indices", "data")
         )
@@ -370,7 +370,7 @@ class Generalized:
 def _convert_jacobian(jac: Any, n: int) -> Compressed:
     """Convert J to checked compressed rows."""
     sparse = issparse(jac)
-    array = jac if sparse else borrowed("J", jac, (None, None))
+    array = jac if sparse else as_array_view("J", jac, (None, None))
     if len(array.shape) != 2 or array.shape[1] != n:
         raise InputError(f"J has shape {array.shape}; (any, {n}) is needed, as M has {n} velocities")
     return compressed("J", array) if sparse else dense_to_csr(array)
@@ -405,7 +405,7 @@ def lower_of(
         The matrix is not square, or not symmetric to `max_asymmetry`; the message then ends with `hint`.
     """
     sparse = issparse(matrix)
-    array = matrix if sparse else borrowed(name, matrix, (None, None))
+    array = matrix if sparse else as_array_view(name, matrix, (None, None))
     if len(array.shape) != 2 or array.shape[0] != array.shape[1]:
         raise InputError(f"{name} has shape {array.shape}; a square matrix is needed")
     lower, (i, j, asymmetry) = (

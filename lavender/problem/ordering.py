@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from lavender.base.arrays import IntArray, as_array, whole_number
+from lavender.base.arrays import IntArray, as_array, check_int
 from lavender.base.errors import CapabilityError, InputError, UnknownName
 from lavender.base.lazy_import import sparse as sp
 from lavender.problem import Problem
@@ -98,7 +98,7 @@ def block_order(
     split = 0 if problem.rows is None else problem.rows.n_joints
     if type(order) is str and order == "given" and ground is None and type(seed) is int and seed == 0:
         return Order(np.arange(k, dtype=np.int32), split, GIVEN, np.zeros(1, np.uint64), is_given=True)
-    rng = np.array([whole_number("seed", seed, high=None) % 2**64], np.uint64)
+    rng = np.array([check_int("seed", seed, high=None) % 2**64], np.uint64)
     if seed and not (isinstance(order, str) and order == "random"):
         raise InputError(f"seed={seed} goes with order='random'; no other order draws lots")
     if not isinstance(order, str):

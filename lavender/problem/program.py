@@ -37,7 +37,7 @@ from lavender.base.arrays import (
     FloatArray,
     IntArray,
     as_array,
-    borrowed,
+    as_array_view,
     check_not_nan,
     check_sizes,
     read_only,
@@ -442,7 +442,7 @@ def _matrix(name: str, given: Any, n: int, sign: float) -> Compressed:
     """Rows of a dense or sparse matrix of n columns times a sign, without zeros, checked; one dimension is one row."""
     sparse = issparse(given)
     if not sparse:
-        dense = borrowed(name, given, (None,) * max(1, len(shape_of(name, given))))
+        dense = as_array_view(name, given, (None,) * max(1, len(shape_of(name, given))))
         given = dense[None] if dense.ndim == 1 else dense
     if len(given.shape) != 2 or given.shape[1] != n:
         raise InputError(f"{name} has shape {given.shape}; (any, {n}) is needed, as q has {n} entries")
@@ -533,7 +533,7 @@ def _definite(lower: Compressed, jac: Compressed, q: FloatArray) -> Generalized 
     InputError
         P is not positive semidefinite.
     """
-    momentum, unfactored = -q, Generalized.laid_out(jac, lower)
+    momentum, unfactored = -q, Generalized.from_validated(jac, lower)
     definite = _shifted(unfactored, np.zeros(len(q)), momentum)
     if definite is not None and definite.operator.least_pivot > SINGULAR:
         return definite

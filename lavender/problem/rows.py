@@ -11,9 +11,9 @@ from lavender.base.arrays import (
     ArrayLike,
     FloatArray,
     IntArray,
+    are_equal,
     as_array,
     check_sizes,
-    equal,
     precision_of,
     read_only,
     shape_of,
@@ -278,7 +278,7 @@ class Rows:
         if not isinstance(other, Rows):
             return NotImplemented
         return all(
-            equal(getattr(self, f.name), getattr(other, f.name)) for f in fields(self) if f.name != "copy"
+            are_equal(getattr(self, f.name), getattr(other, f.name)) for f in fields(self) if f.name != "copy"
         )
 
     __hash__ = None  # type: ignore[assignment]

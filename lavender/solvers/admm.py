@@ -23,7 +23,7 @@ from lavender.base.deadline import Deadline, Stopwatch, TooLate
 from lavender.base.errors import BREAKDOWN, InputError
 from lavender.base.lazy_import import import_numerics
 from lavender.base.lazy_import import sparse as sp
-from lavender.judge.residuals import reference
+from lavender.judge.residuals import get_reference
 from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
 from lavender.solvers._accelerated import LARGEST_MEMORY
@@ -72,7 +72,7 @@ class AdmmState:
     """Scaled problem, factorisation for the current rho, and the vectors of the run, which `open` makes."""
 
     def __init__(self, problem: Problem, memory: int, relaxation: float) -> None:
-        reference(problem)
+        get_reference(problem)
         self.problem, self.memory, self.relaxation = problem, memory, relaxation
         self.deadline = Deadline()  # nothing is begun that is expected to end later
         self.factorisations = self.reported = 0  # factors: all, and those that an earlier run has told

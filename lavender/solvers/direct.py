@@ -29,7 +29,7 @@ import numpy as np
 from lavender.base.arrays import FloatArray
 from lavender.base.deadline import Deadline
 from lavender.judge.certificates import MAX_POLISHED_SLACK, check_certificate
-from lavender.judge.residuals import MAX_EXCUSED_RESIDUAL, judged, remember
+from lavender.judge.residuals import MAX_EXCUSED_RESIDUAL, judge_impulse, store_result
 from lavender.judge.solution import Claim, Status, summed
 from lavender.problem import Problem
 from lavender.solvers.factors import SMALL_SIZE, GeneralFactor, PanelsLU
@@ -175,7 +175,7 @@ class _Run:
 
     def judge(self, x: FloatArray) -> float:
         """Relative residual of x, which must not change any more; the best becomes the result."""
-        found = judged(self.problem, x)
+        found = judge_impulse(self.problem, x)
         self.keep(found)
         relative: float = found.relative
         return relative
@@ -199,7 +199,7 @@ class _Run:
             self.keep(pivot.rows.best)  # an error, or Ctrl-C, ended it between two rounds
         if self.kept is not None:
             self.impulse[:] = self.kept.impulse
-            remember(self.problem, self.kept)
+            store_result(self.problem, self.kept)
 
     def good(self) -> bool:
         return self.best <= max(self.least, min(self.floor, MAX_EXCUSED_RESIDUAL))

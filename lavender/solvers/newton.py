@@ -33,11 +33,11 @@ from typing import Any
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray, one_of
+from lavender.base.arrays import FloatArray, check_choice
 from lavender.base.deadline import Deadline, Stopwatch, TooLate
 from lavender.base.errors import CapabilityError, InputError
 from lavender.judge.certificates import check_certificate
-from lavender.judge.residuals import quick
+from lavender.judge.residuals import compute_relative
 from lavender.judge.solution import Claim, Status, counted, summed
 from lavender.problem import OPERATORS, Problem
 from lavender.solvers.costs import SOFT, STEPS, Count, factorisations, newton_cost
@@ -145,7 +145,7 @@ class Newton(Solver):
 
     @np.errstate(all="ignore")  # what overflows is judged
     def _prepare(self, problem: Problem, like: System | None) -> NewtonState:
-        one_of("form", self.form, FORMS)
+        check_choice("form", self.form, FORMS)
         if self.form == "velocity" and problem.matrix is not None:
             raise InputError(
                 "form='velocity' needs a problem with J and M (Problem.from_rows, Problem.from_jacobian); this one "
@@ -235,7 +235,7 @@ class Newton(Solver):
         if bodies is None and (self.form == "velocity" or problem.m > ROWS or problem.cones.has_round):
             return claim
         w, e = np.empty(problem.m), np.empty(problem.m)
-        best, above = quick(problem, impulse, w, e, True)
+        best, above = compute_relative(problem, impulse, w, e, True)
         if above <= tol:
             return claim
         before = impulse.copy()
@@ -245,7 +245,7 @@ class Newton(Solver):
         more = self._run_system(
             problem, system if system.solve.m else None, impulse, left, tol, deadline.remaining(1e-3)
         )
-        if not quick(problem, impulse, w, e)[0] <= best:
+        if not compute_relative(problem, impulse, w, e)[0] <= best:
             impulse[:] = before
         work = summed((claim.work, more.work))
         form = f"{claim.form}, then {more.form or 'impulse'}"

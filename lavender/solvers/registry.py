@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from functools import cache
 from typing import Any, Protocol
 
-from lavender.base.arrays import FloatArray, flag, whole_number
+from lavender.base.arrays import FloatArray, check_bool, check_int
 from lavender.base.deadline import Deadline
 from lavender.base.errors import InputError, SolverUnavailable, UnknownName, check_name, format_error
 from lavender.base.lazy_import import import_lock, import_locked
@@ -266,8 +266,8 @@ class SolverSpec:
         for name, kind in self.__dataclass_fields__.items():
             value = getattr(self, name)
             if kind.type == "bool" and not isinstance(value, bool):  # as __future__ leaves annotations
-                flag(f"{name} of solver {self.name!r}", value)
-        object.__setattr__(self, "max_iter", whole_number(f"max_iter of solver {self.name!r}", self.max_iter))
+                check_bool(f"{name} of solver {self.name!r}", value)
+        object.__setattr__(self, "max_iter", check_int(f"max_iter of solver {self.name!r}", self.max_iter))
         if not self.resumable:
             object.__setattr__(self, "callback", False)
             object.__setattr__(self, "history", False)
@@ -459,7 +459,7 @@ def register(spec: SolverSpec, *, replace: bool = False) -> None:
         `spec` is not a SolverSpec, or the name is in use.
     """
     load()
-    _add(spec, flag("replace", replace))
+    _add(spec, check_bool("replace", replace))
 
 
 def _add(spec: SolverSpec, replace: bool) -> None:
@@ -541,7 +541,7 @@ def available(problem: Problem | None = None, *, law: str | None = None, **capab
     if law is not None:
         check_name("law", law, LAWS)
     for name, value in capabilities.items():
-        flag(name, value)
+        check_bool(name, value)
     table = specs()
     return [
         name

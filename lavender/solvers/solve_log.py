@@ -12,10 +12,10 @@ from lavender.judge.certificates import check_certificate
 from lavender.judge.residuals import (
     MAX_EXCUSED_RESIDUAL,
     best_of_islands,
-    judged,
-    known,
-    remember,
-    remembered,
+    find_known_relative,
+    find_stored,
+    judge_impulse,
+    store_result,
 )
 from lavender.judge.solution import Claim, SolverStage, Status, summed
 from lavender.problem import Problem
@@ -46,12 +46,12 @@ class SolveLog:
 
     def offer(self, impulse: FloatArray) -> None:
         """Judge an impulse (m,) and keep it in the islands where it is the best, also for the final judgement."""
-        relative = known(self.problem, impulse)
+        relative = find_known_relative(self.problem, impulse)
         if relative is None:
-            last = judged(self.problem, impulse.copy())
+            last = judge_impulse(self.problem, impulse.copy())
             relative, impulse = float(last.relative), last.impulse
             if relative < self.best:
-                remember(self.problem, last)
+                store_result(self.problem, last)
         if relative < self.best:
             self.best, self.impulse = relative, impulse.copy()
         if self.best > self.tol:
@@ -99,7 +99,7 @@ class SolveLog:
     def at_floor(self) -> bool:
         if self.best > MAX_EXCUSED_RESIDUAL:
             return False
-        last = remembered(self.problem, self.impulse) or judged(self.problem, self.impulse)
+        last = find_stored(self.problem, self.impulse) or judge_impulse(self.problem, self.impulse)
         return bool(last.above_floor <= self.tol)
 
     @property

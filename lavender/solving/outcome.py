@@ -12,7 +12,7 @@ import numpy as np
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import InputError
 from lavender.judge.certificates import format_lower_bound, prove
-from lavender.judge.residuals import Residual, best_of_islands, reference, relative_of, residual
+from lavender.judge.residuals import Residual, best_of_islands, divide_by_reference, get_reference, residual
 from lavender.judge.solution import (
     CONFIRMED,
     CONTRADICTED,
@@ -71,7 +71,7 @@ def finish(
     if (
         status in (CONVERGED, STALLED)
         and tol < relative == judged.roundoff_floor
-        and relative_of(problem.metric, judged.energy, judged.velocity) <= tol
+        and divide_by_reference(problem.metric, judged.energy, judged.velocity) <= tol
     ):
         status = DIVERGED
         message = _joined(message, "beside such impulses float64 loses b")
@@ -215,7 +215,7 @@ def _holds_as_formed(problem: Problem, impulse: FloatArray, tol: float) -> bool:
         formed = problem.csr_data
     except InputError:  # too large to be formed: no solver has
         return False
-    reference(problem)
+    get_reference(problem)
     formed.share_reference(problem.metric)
     return bool(Judged(formed, impulse).above_floor <= tol)
 

@@ -250,7 +250,7 @@ NOT_CALLED = {
         "a result: the package makes it",
     ),
     **dict.fromkeys(
-        ("Batch.worlds", "Generalized.compressed", "Generalized.laid_out", "Generalized.restrict",
+        ("Batch.worlds", "Generalized.compressed", "Generalized.from_validated", "Generalized.restrict",
          "Generalized.shifted", "Generalized.with_scaled_rows", "Batch.start", "Solutions.mark_late",
          "Problem.on_disk", "Residuals.store", "Solution.late", "Solution.of", "Solution.unstretched",
          "Solutions.store", "Solutions.store_late", "Solutions.start", "Batch.rows_of"),

@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from lavender.base.arrays import FloatArray, number
+from lavender.base.arrays import FloatArray, check_float
 from lavender.base.errors import CapabilityError, InputError
 from lavender.base.lazy_import import lapack
 from lavender.base.lazy_import import sparse as sp
@@ -129,7 +129,7 @@ def redundancy(problem: Problem, *, tol: float = 1e-12) -> Redundancy:
         Asymmetric or indefinite A with an island of more than 1,200 rows; numbers whose products are beyond float64.
     """
     check_problem(problem)
-    if not number("tol", tol, low=0.0) < 1.0:
+    if not check_float("tol", tol, low=0.0) < 1.0:
         raise InputError(f"tol is {tol}; a share from 0 to 1 is needed")
     if problem.precision == "float32":
         tol = max(tol, SHARE_OF_FLOAT32)

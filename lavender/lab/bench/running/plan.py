@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Any
 
-from lavender.base.arrays import flag, number, several, whole_number
+from lavender.base.arrays import check_bool, check_float, check_int, check_sequence
 from lavender.base.errors import InputError, UnknownName
 from lavender.lab.bench.record import CaseInfo, Record
 from lavender.lab.bench.running.timing import Ask, Task
@@ -73,7 +73,7 @@ class Plan:
 
     def __post_init__(self) -> None:
         for name in ("levels", "budgets", "orders", "speed_levels", "times", "sweeps"):
-            given = several(name, getattr(self, name), "words" if name == "orders" else "numbers")
+            given = check_sequence(name, getattr(self, name), "words" if name == "orders" else "numbers")
             object.__setattr__(self, name, tuple(given))
         for name, values in (
             ("level", self.levels),
@@ -81,14 +81,14 @@ class Plan:
             ("time budget", self.times),
         ):
             for value in values:
-                number(name, value, above=0.0)
+                check_float(name, value, above=0.0)
         if not self.levels and not self.budgets:
             raise InputError("nothing to run: give levels, budgets or both")
-        whole_number("repeats", self.repeats, 1)
-        number("time_limit", self.time_limit, above=0.0)
-        number("pass_limit", self.pass_limit, above=0.0)
+        check_int("repeats", self.repeats, 1)
+        check_float("time_limit", self.time_limit, above=0.0)
+        check_float("pass_limit", self.pass_limit, above=0.0)
         for name in ("warm", "campaign", "motion", "prove"):
-            flag(name, getattr(self, name))
+            check_bool(name, getattr(self, name))
         for word in self.orders:
             name, _, seed = str(word).partition(":")
             if name not in SWEEP_ORDERS:
@@ -101,7 +101,7 @@ class Plan:
                 self, name, tuple(sorted({float(x) for x in getattr(self, name)}, reverse=True))
             )
         for name in ("budgets", "sweeps"):
-            counts = {whole_number("budget", n, 1) for n in getattr(self, name)}
+            counts = {check_int("budget", n, 1) for n in getattr(self, name)}
             object.__setattr__(self, name, tuple(sorted(counts)))
         object.__setattr__(self, "times", tuple(sorted({float(t) for t in self.times})))
         object.__setattr__(self, "orders", tuple(dict.fromkeys(self.orders)))
