@@ -90,7 +90,7 @@ def _limits(eps: float, n: int, limit: float) -> Limits:
 def _impulse(qp: QP, x: FloatArray | None, zeta: FloatArray | None) -> FloatArray:
     if x is None or len(x) != qp.n or (qp.form == "velocity" and (zeta is None or len(zeta) != len(qp.b))):
         return qp.problem.start()
-    return qp.impulse(x, np.zeros(0) if zeta is None else zeta)
+    return qp.impulse(x, np.zeros(0) if zeta is None else zeta, np.zeros(qp.n))
 
 
 def _backend(backend: Backend, form: str, own: str = "") -> Contestant:
