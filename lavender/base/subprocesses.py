@@ -111,6 +111,7 @@ class ProcessBackend:
             raise ProcessEnded(f"{error.kind}: {error}") from None
 
     def _start(self) -> None:
+        """Start the process, with a pipe that closes when this process ends."""
         path = os.pathsep.join(p or os.getcwd() for p in sys.path)
         options: dict[str, Any] = {}
         lifeline = -1

@@ -164,6 +164,7 @@ class Solutions(Many, Sequence[Solution]):
         self._late_worlds.append(i)
 
     def _judge_late_worlds(self) -> None:
+        """Judge the starts of late worlds."""
         # Another thread may do the same at the same time, with the same numbers.
         for i in self._late_worlds:
             try:

@@ -505,9 +505,8 @@ class Builders(Operators):
         if general is not None and general.m != self.m:
             raise InputError(f"J has {general.m} rows; {self.m} are needed, as the problem has")
         if target is not None and general is not None:
-            with np.errstate(
-                over="ignore", invalid="ignore"
-            ):  # The class rejects entries that are not finite.
+            # The class rejects entries that are not finite.
+            with np.errstate(over="ignore", invalid="ignore"):
                 b = as_array("target", target, (self.m,), unit="m/s") - general.velocity_of(general.v_free)
         # Arrays are copied here, so the new problem can use them with copy=False.
         rhs = self.b if b is None else as_array("b", b, (self.m,), unit="m/s")

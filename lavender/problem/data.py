@@ -175,6 +175,7 @@ class ProblemData:
         _check_rhs(self.b)
 
     def _check_rows(self, rows: Rows, m: int, k: int) -> None:
+        """Raise InputError if the rows do not fit the cones of k blocks with m rows, or the compliance is invalid."""
         if not isinstance(rows, Rows):
             raise InputError(f"rows is a {type(rows).__name__}; a Rows is needed")
         self._check_compliance(m)
@@ -191,6 +192,7 @@ class ProblemData:
             raise InputError("cones.ptr and rows.joint_ptr disagree about the rows of the joints")
 
     def _check_generalized(self, generalized: Generalized, m: int) -> None:
+        """Raise InputError if J does not have m rows, or the compliance is invalid; set the view for kernels."""
         if not isinstance(generalized, Generalized):
             raise InputError(f"generalized is a {type(generalized).__name__}; a Generalized is needed")
         if generalized.m != m:
@@ -201,6 +203,7 @@ class ProblemData:
         )
 
     def _check_compliance(self, m: int) -> None:
+        """Convert the compliance to a checked array (m,) [1/kg]; the default is 0."""
         put = object.__setattr__
         if self.compliance is None:
             put(self, "compliance", read_only(np.zeros(m)))

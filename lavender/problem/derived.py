@@ -85,6 +85,7 @@ class once(cached_property[T]):
     """A `cached_property` of an object with `derived`, which one thread computes while others wait."""
 
     def _compute(self, instance: Any) -> T:
+        """Compute the property under the lock of the object, unless another thread has done so."""
         attributes, derived = instance.__dict__, instance.derived
         if derived.process is not _process:
             derived.lock, derived.process = RLock(), _process

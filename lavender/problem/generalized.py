@@ -191,6 +191,7 @@ class Generalized:
         names: Sequence[str] | None,
         like: kernels.Operator | None = None,
     ) -> None:
+        """Set all attributes from checked arrays, and factor M."""
         n = len(v_free)
         self.__dict__["v_free"] = v_free
         self.__dict__["names"] = None if names is None else as_names("velocities", names, n)
