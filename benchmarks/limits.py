@@ -58,7 +58,7 @@ RATES = {
         "DISK_A_ROW",
         "DISK_A_ENTRY",
     ),
-    residuals: ("RESULT", "PASS", "WHITENED", "READ"),
+    residuals: ("RESULT_TIME", "PASS_TIME_PER_PRODUCT", "WHITENING_TIME_PER_PRODUCT", "READ_TIME_PER_ENTRY"),
 }
 
 
@@ -108,7 +108,7 @@ def set_ups(name: str) -> Iterator[tuple[str, Callable[[], float], float]]:
 
     def ready() -> Problem:
         problem = make()
-        residuals.reference(problem)
+        residuals.get_reference(problem)
         return problem
 
     problem, cold = ready(), make()
@@ -116,8 +116,8 @@ def set_ups(name: str) -> Iterator[tuple[str, Callable[[], float], float]]:
     yield "the judge", lambda: residuals.setup_time(cold), least(make, lambda p: p.metric)
     yield (
         "his pass",
-        lambda: residuals.judging_time(problem) - residuals.RESULT,
-        least(ready, lambda p: residuals.judged(p, impulse)),
+        lambda: residuals.judging_time(problem) - residuals.RESULT_TIME,
+        least(ready, lambda p: residuals.judge_impulse(p, impulse)),
     )
     stretched = with_ellipses(make())
     if stretched.cones.has_ellipse:
@@ -218,6 +218,6 @@ def show_rates(names: tuple[str, ...]) -> None:
     lines = [
         [key[1], f"{getattr(*key):.2g}", f"{x:.2g}"]
         for key, x in zip(at, found, strict=True)
-        if key[1] != "RESULT"
+        if key[1] != "RESULT_TIME"
     ]
     click.echo("\n" + markdown(["rate [s]", "now", "fitted"], lines))

@@ -1,4 +1,4 @@
-"""A step's solve as a function of JAX, with a gradient by all of its arguments (extra: jax).
+"""The solve of one step as a JAX function, with gradients by all of its arguments (extra: jax).
 
 ```python
 jax.config.update("jax_enable_x64", True)
@@ -13,7 +13,7 @@ from functools import lru_cache, partial
 from typing import Any
 
 from lavender.base.errors import InputError, SolverUnavailable
-from lavender.gradient.layer import NAMES, SIZES, Step, shapes, step
+from lavender.gradient.layer import ARGUMENT_AXES, ARGUMENTS, Step, make_step, result_shapes
 from lavender.problem.cones import Cones
 
 try:
@@ -26,35 +26,37 @@ except ImportError as error:
 
 
 def _call(function: Any, like: Any, arrays: Any) -> Any:
-    # What vmap adds are leading axes, on all arrays alike.
+    # `vmap` adds a leading axis to every array.
     return jax.pure_callback(function, like, *arrays, vmap_method="broadcast_all")
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0,))
-def _solve(made: Step, *arrays: Any) -> Any:
-    like = tuple(jax.ShapeDtypeStruct(shape, jnp.float64) for shape in shapes(arrays))
-    return _call(made.forward, like, arrays)
+def _solve(step: Step, *arrays: Any) -> Any:
+    like = tuple(jax.ShapeDtypeStruct(shape, jnp.float64) for shape in result_shapes(arrays))
+    return _call(step.forward, like, arrays)
 
 
-def _forward(made: Step, *given: Any) -> Any:
-    arrays = tuple(x.value for x in given)
-    found = _solve(made, *arrays)
-    # An array kept is traced: what is needed stands in the structure, where jit compiles for it.
-    return found, (arrays, found[1], tuple(() if x.perturbed else None for x in given))
+def _forward(step: Step, *arguments: Any) -> Any:
+    """Solve, and return the result and the data for `_backward`."""
+    arrays = tuple(x.value for x in arguments)
+    result = _solve(step, *arrays)
+    # Saved values are traced, but `jit` compiles for each structure: () or None marks whether a gradient is needed.
+    return result, (arrays, result[1], tuple(() if x.perturbed else None for x in arguments))
 
 
-def _backward(made: Step, kept: Any, cotangents: Any) -> Any:
-    arrays, impulse, perturbed = kept
+def _backward(step: Step, saved: Any, cotangents: Any) -> Any:
+    """Compute the gradients by all arrays from the data of `_forward`."""
+    arrays, impulse, perturbed = saved
     needed = tuple(x is not None for x in perturbed)
     like = tuple(jax.ShapeDtypeStruct(x.shape, jnp.float64) for x in arrays)
     zero = jax.custom_derivatives.SymbolicZero
-    given = (jnp.zeros(x.shape, x.dtype) if isinstance(x, zero) else x for x in cotangents)
-    return _call(_back_of(made, needed), like, (*arrays, impulse, *given))
+    dense = (jnp.zeros(x.shape, x.dtype) if isinstance(x, zero) else x for x in cotangents)
+    return _call(_make_adjoint(step, needed), like, (*arrays, impulse, *dense))
 
 
-@lru_cache(maxsize=256)  # of one object JAX keeps what it compiled
-def _back_of(made: Step, needed: tuple[bool, ...]) -> Any:
-    return partial(made.backward, needed)
+@lru_cache(maxsize=256)  # JAX caches compiled callbacks by the identity of their object.
+def _make_adjoint(step: Step, needed: tuple[bool, ...]) -> Any:
+    return partial(step.backward, needed)
 
 
 _solve.defvjp(_forward, _backward, symbolic_zeros=True)
@@ -73,30 +75,33 @@ def solve(
     solver: str = "auto",
     tol: float = 1e-10,
 ) -> tuple[Any, Any]:
-    """Velocities after a step and its impulses, with gradients by all arrays.
+    """Compute the velocities after a step and its impulses, with gradients by all arrays.
 
-    Parameters and results are those of `lavender.torch.solve`, of arrays of JAX. The solve itself runs on the
-    CPU, outside of what JAX compiles.
+    Parameters and results are as for `lavender.torch.solve`, with JAX arrays. The solve runs on the CPU, outside of the
+    code that JAX compiles.
 
     Raises
     ------
     InputError
-        Types and shapes that do not fit; also where 64-bit numbers are not switched on.
+        A dtype or shape is wrong, or 64-bit numbers are not enabled in JAX.
     RuntimeError
-        JAX's own, with the words of the error in it: what only numbers tell, such as a negative mu or no solution.
+        Raised by JAX with the message of an error that depends on numbers, such as a negative mu or a failed solve.
     """
-    given = [jnp.asarray(x) for x in (J, M, v_free, mu)]
-    none = jnp.zeros(given[0].shape[-2:-1], given[0].dtype)
-    given += [none if x is None else jnp.asarray(x) for x in (target, compliance)]
-    for name, x in zip(NAMES, given, strict=True):
+    arguments = [jnp.asarray(x) for x in (J, M, v_free, mu)]
+    zeros = jnp.zeros(arguments[0].shape[-2:-1], arguments[0].dtype)
+    arguments += [zeros if x is None else jnp.asarray(x) for x in (target, compliance)]
+    for name, x in zip(ARGUMENTS, arguments, strict=True):
         if x.dtype != jnp.float64:
             raise InputError(
                 f"{name} is {x.dtype}; float64 is needed: jax.config.update('jax_enable_x64', True) before it is made"
             )
-    shapes(given)
-    # As many axes of a batch on all arrays: `broadcast_all` of vmap puts its own before them.
-    most = max(x.ndim - n for x, n in zip(given, SIZES, strict=True))
-    given = [x.reshape(*(1,) * (most + n - x.ndim), *x.shape) for x, n in zip(given, SIZES, strict=True)]
-    given[1] = 0.5 * (given[1] + jnp.swapaxes(given[1], -1, -2))
-    velocity, impulse = _solve(step(given, cones, friction, solver, tol), *given)
+    result_shapes(arguments)  # raises InputError
+    # `broadcast_all` of `vmap` adds its axis at the front, so all arrays need the same number of batch axes.
+    batch_axes = max(x.ndim - n for x, n in zip(arguments, ARGUMENT_AXES, strict=True))
+    arguments = [
+        x.reshape(*(1,) * (batch_axes + n - x.ndim), *x.shape)
+        for x, n in zip(arguments, ARGUMENT_AXES, strict=True)
+    ]
+    arguments[1] = 0.5 * (arguments[1] + jnp.swapaxes(arguments[1], -1, -2))
+    velocity, impulse = _solve(make_step(arguments, cones, friction, solver, tol), *arguments)
     return velocity, impulse

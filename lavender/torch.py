@@ -1,4 +1,4 @@
-"""A step's solve as a function of PyTorch, with a gradient by all of its arguments (extra: torch).
+"""The solve of one step as a PyTorch function, with gradients by all of its arguments (extra: torch).
 
 ```python
 from lavender.torch import solve
@@ -12,7 +12,7 @@ from __future__ import annotations
 from typing import Any
 
 from lavender.base.errors import InputError, SolverUnavailable
-from lavender.gradient.layer import NAMES, SIZES, Step, shapes, step
+from lavender.gradient.layer import ARGUMENT_AXES, ARGUMENTS, Step, make_step, result_shapes
 from lavender.problem.cones import Cones
 
 try:
@@ -24,65 +24,69 @@ except ImportError as error:
 
 
 class _Solve(torch.autograd.Function):  # type: ignore[misc]
-    """Forward and backward; a batch by `vmap` is leading axes."""
+    """The solve; `vmap` adds a leading batch axis."""
 
     @staticmethod
-    def forward(made: Step, *arrays: Any) -> Any:
-        """Velocity and impulse."""
-        return tuple(map(torch.from_numpy, made.forward(*(x.detach().numpy() for x in arrays))))
+    def forward(step: Step, *arrays: Any) -> Any:
+        """Compute velocity and impulse."""
+        return tuple(map(torch.from_numpy, step.forward(*(x.detach().numpy() for x in arrays))))
 
     @staticmethod
     def setup_context(ctx: Any, inputs: Any, output: Any) -> None:
-        """What the backward pass reads."""
-        ctx.made = inputs[0]
+        """Save the arguments and the impulse for the backward pass."""
+        ctx.step = inputs[0]
         ctx.save_for_backward(*inputs[1:], output[1])
 
     @staticmethod
     def backward(ctx: Any, *cotangents: Any) -> Any:
-        """Gradients by all arrays."""
-        return None, *_Back.apply(ctx.made, ctx.needs_input_grad[1:], *ctx.saved_tensors, *cotangents)
+        """Compute the gradients by all arrays."""
+        return None, *_Adjoint.apply(ctx.step, ctx.needs_input_grad[1:], *ctx.saved_tensors, *cotangents)
 
     @staticmethod
-    def vmap(info: Any, in_dims: Any, made: Step, *arrays: Any) -> Any:
-        """One more leading axis."""
-        return _Solve.apply(made, *_leading(info, in_dims[1:], arrays, SIZES)), (0, 0)
+    def vmap(info: Any, in_dims: Any, step: Step, *arrays: Any) -> Any:
+        """Solve with one more leading batch axis."""
+        return _Solve.apply(step, *_move_batch_axis(info, in_dims[1:], arrays, ARGUMENT_AXES)), (0, 0)
 
 
-class _Back(torch.autograd.Function):  # type: ignore[misc]
-    """The adjoint, which has no derivative of its own."""
+class _Adjoint(torch.autograd.Function):  # type: ignore[misc]
+    """The adjoint, which cannot be differentiated again."""
 
     @staticmethod
-    def forward(made: Step, needed: Any, *arrays: Any) -> Any:
-        """Gradients by all arrays."""
-        return tuple(map(torch.from_numpy, made.backward(needed, *(x.detach().numpy() for x in arrays))))
+    def forward(step: Step, needed: Any, *arrays: Any) -> Any:
+        """Compute the gradients by all arrays."""
+        return tuple(map(torch.from_numpy, step.backward(needed, *(x.detach().numpy() for x in arrays))))
 
     @staticmethod
     def setup_context(ctx: Any, inputs: Any, output: Any) -> None:
-        """Nothing is kept."""
+        """Save nothing."""
 
     @staticmethod
     def backward(ctx: Any, *cotangents: Any) -> Any:
-        """Refused: second derivatives."""
+        """Raise NotImplementedError: there are no second derivatives."""
         raise NotImplementedError("lavender.torch has first derivatives alone: no gradient of a gradient")
 
     @staticmethod
-    def vmap(info: Any, in_dims: Any, made: Step, needed: Any, *arrays: Any) -> Any:
-        """One more leading axis."""
-        sizes = (*SIZES, 1, 1, 1)
-        return _Back.apply(made, needed, *_leading(info, in_dims[2:], arrays, sizes)), (0,) * len(NAMES)
+    def vmap(info: Any, in_dims: Any, step: Step, needed: Any, *arrays: Any) -> Any:
+        """Compute the gradients with one more leading batch axis."""
+        axes = (*ARGUMENT_AXES, 1, 1, 1)
+        batched = _move_batch_axis(info, in_dims[2:], arrays, axes)
+        return _Adjoint.apply(step, needed, *batched), (0,) * len(ARGUMENTS)
 
 
-def _leading(info: Any, dims: Any, arrays: Any, sizes: Any) -> list[Any]:
-    # The new axis before all others, of every array: axes of a batch inside come after it.
-    inner = max(x.ndim - (d is not None) - n for x, d, n in zip(arrays, dims, sizes, strict=True))
+def _move_batch_axis(info: Any, dims: Any, arrays: Any, axes: Any) -> list[Any]:
+    """Move the new batch axis of every array to the front, before the batch axes that the arrays already have.
+
+    `axes`: number of axes of each array without batch axes.
+    """
+    n_inner = max(x.ndim - (d is not None) - n for x, d, n in zip(arrays, dims, axes, strict=True))
     out = []
-    for x, d, n in zip(arrays, dims, sizes, strict=True):
+    for x, d, n in zip(arrays, dims, axes, strict=True):
         y = x.expand(info.batch_size, *x.shape) if d is None else x.movedim(d, 0)
-        out.append(y.reshape(y.shape[0], *(1,) * (inner - (y.ndim - 1 - n)), *y.shape[1:]).contiguous())
+        out.append(y.reshape(y.shape[0], *(1,) * (n_inner - (y.ndim - 1 - n)), *y.shape[1:]).contiguous())
     return out
 
 
-@torch.compiler.disable  # type: ignore[untyped-decorator]  # a compiled function calls it between its parts
+@torch.compiler.disable  # type: ignore[untyped-decorator]  # `torch.compile` splits its graph at this call
 def solve(
     J: Any,
     M: Any,
@@ -96,23 +100,24 @@ def solve(
     solver: str = "auto",
     tol: float = 1e-10,
 ) -> tuple[Any, Any]:
-    """Velocities after a step and its impulses, with gradients by all tensors.
+    """Compute the velocities after a step and its impulses, with gradients by all tensors.
 
     Parameters
     ----------
     J : (..., m, nv)
-        Rows of constraints; without `cones` those of contacts, each a normal and the same number of tangents.
+        Rows of constraints. Without `cones` they are rows of contacts, each with a normal and the same number of
+        tangents.
     M : (..., nv, nv) kg, kg m^2
-        Its symmetric part is taken.
+        Its symmetric part is used.
     v_free : (..., nv) m/s, rad/s
     mu : (..., k)
-        Of every contact.
+        Friction coefficient of each contact.
     target, compliance : (..., m), optional
         m/s and 1/kg; default 0.
     cones : Cones, optional
-        Bounds of the rows; its mu is not read.
+        Bounds of the rows; its mu is not used.
     friction, solver, tol
-        As `Problem.from_jacobian` and `lavender.solve`.
+        As for `Problem.from_jacobian` and `lavender.solve`.
 
     Returns
     -------
@@ -122,17 +127,17 @@ def solve(
     Raises
     ------
     InputError
-        Shapes that do not fit, another type than float64, or a device other than the CPU.
+        The shapes disagree, a dtype is not float64, or a device is not the CPU.
     SolveFailed
         A member of the batch was not solved to `tol` or its floor.
     CapabilityError
-        In the backward pass, where impulses that are not unique are differentiated, or where by a tensor that requires
-        a gradient there is none (rows that share a load, by J).
+        In the backward pass: the differentiated impulses are not unique, or the gradient by a tensor that requires one
+        does not exist (for example by J if rows share a load).
     """
-    given = [J, M, v_free, mu, target, compliance]
-    for i, (name, x) in enumerate(zip(NAMES, given, strict=True)):
+    arguments = [J, M, v_free, mu, target, compliance]
+    for i, (name, x) in enumerate(zip(ARGUMENTS, arguments, strict=True)):
         if x is None and i > 3:
-            given[i] = torch.zeros(J.shape[-2:-1], dtype=torch.float64)
+            arguments[i] = torch.zeros(J.shape[-2:-1], dtype=torch.float64)
         elif not isinstance(x, torch.Tensor):
             raise InputError(
                 f"{name} is {type(x).__name__}; a tensor of float64 is needed: torch.as_tensor({name})"
@@ -141,7 +146,7 @@ def solve(
             raise InputError(
                 f"{name} is {x.dtype} on {x.device}; a tensor of float64 on the CPU is needed: {name}.double().cpu()"
             )
-    shapes(given)
-    given[1] = 0.5 * (given[1] + given[1].transpose(-1, -2))
-    velocity, impulse = _Solve.apply(step(given, cones, friction, solver, tol), *given)
+    result_shapes(arguments)  # raises InputError
+    arguments[1] = 0.5 * (arguments[1] + arguments[1].transpose(-1, -2))
+    velocity, impulse = _Solve.apply(make_step(arguments, cones, friction, solver, tol), *arguments)
     return velocity, impulse

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from lavender.base.errors import InputError
-from lavender.judge.residuals import Residual, nothing_to_do, residual
+from lavender.judge.residuals import Residual, is_solved_by_zero, residual
 from lavender.problem import Problem
 from lavender.problem.cones import ROW
 
@@ -118,7 +118,7 @@ def exchange(problem: Problem, iterations: int = 40) -> list[Any]:
 
 def planted(problem: Problem, rng: np.random.Generator) -> list[Stop]:
     """Answers at their floor, unfinished iterates, and last steps cut short; nothing where there is nothing to do."""
-    if problem.m == 0 or nothing_to_do(problem):
+    if problem.m == 0 or is_solved_by_zero(problem):
         return []
     found, exact = newton(problem, np.float32), newton(problem, np.float64)[-1][1]
     impulses = [impulse for _, impulse in found]

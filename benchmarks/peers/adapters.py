@@ -25,12 +25,12 @@ import scipy.sparse as sp
 from lavender import registry
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import InputError
-from lavender.external.as_qp import FORMS, QP, bound_rows, impulse_form, velocity_form
+from lavender.external.as_qp import PROGRAM_FORMS, QP, bound_rows, impulse_form, velocity_form
 from lavender.external.backend import Backend
 from lavender.external.backends import BACKENDS
 from lavender.external.qp_solver import QPSolver, refusal
 from lavender.external.running import Limits
-from lavender.judge.residuals import reference
+from lavender.judge.residuals import get_reference
 from lavender.lab.bench.stopwatch import measure_backend_time
 from lavender.problem import Problem
 from lavender.problem.cones import CONTACT
@@ -90,7 +90,7 @@ def _limits(eps: float, n: int, limit: float) -> Limits:
 def _impulse(qp: QP, x: FloatArray | None, zeta: FloatArray | None) -> FloatArray:
     if x is None or len(x) != qp.n or (qp.form == "velocity" and (zeta is None or len(zeta) != len(qp.b))):
         return qp.problem.start()
-    return qp.impulse(x, np.zeros(0) if zeta is None else zeta)
+    return qp.impulse(x, np.zeros(0) if zeta is None else zeta, np.zeros(qp.n))
 
 
 def _backend(backend: Backend, form: str, own: str = "") -> Contestant:
@@ -195,7 +195,7 @@ def _pinocchio(lanczos: int | None) -> Contestant:
 
         m, c = problem.m, problem.n_blocks
         order = (np.arange(c)[:, None] * 3 + np.array([1, 2, 0])).ravel()
-        unit, speed = float(np.mean(problem.d)), max(reference(problem)[1], 1e-300)  # 1/kg, m/s
+        unit, speed = float(np.mean(problem.d)), max(get_reference(problem)[1], 1e-300)  # 1/kg, m/s
         a = sp.csc_matrix(problem.csr[order][:, order] / unit)
         g = -problem.b[order] / speed
         model = pin.Model()
@@ -376,14 +376,14 @@ def contestants(siconos: str = "") -> list[Contestant]:
     for backend in BACKENDS:
         if registry.specs()[backend.name].missing() is not None:
             continue
-        for form in FORMS[:2]:
+        for form in PROGRAM_FORMS[:2]:
             # Those whose call is quick enough for an adapter to weigh, with dense matrices and with sparse ones.
             ways = QUICK.get(backend.name)
             made += [_backend(backend, form, "clarabel cones" if backend.cones else "")] if ways is None else [
                 _backend(replace(backend, dense=dense, warm=False), form, f"{backend.name}{word}, own interface")
                 for word, dense in ways
             ]  # fmt: skip
-    made += [_cone(name, form) for name in ("scs", "qoco") if _installed(name) for form in FORMS[:2]]
+    made += [_cone(name, form) for name in ("scs", "qoco") if _installed(name) for form in PROGRAM_FORMS[:2]]
     if _installed("pinocchio"):
         made += [_pinocchio(None), _pinocchio(20)]
     made += [_scipy("banded"), _scipy("spsolve")]
@@ -412,14 +412,14 @@ def _ours(name: str, scratch: bool) -> Contestant:
             start = process_time()
             prepared = prepare(given, name)
             seconds = process_time() - start
-            reference(given)  # the judge's
+            get_reference(given)  # the judge's
             first = given.start()
             start = process_time()
             impulse = prepared.solve(impulse=first, tol=tol, max_iter=2**31 - 1, time_limit=limit).impulse
             return seconds + process_time() - start, impulse
 
         if not scratch:
-            reference(problem)
+            get_reference(problem)
             if problem.csr_data.d.size and "rows" in registry.get(name).operators:
                 _ = problem.data
         for tol in TARGETS:

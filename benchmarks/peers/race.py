@@ -10,7 +10,7 @@ from time import monotonic
 from typing import Any
 
 from benchmarks.peers.adapters import SCRATCH, TARGETS, Contestant, Result
-from lavender.external.running import quiet
+from lavender.external.running import capture_output
 from lavender.judge.residuals import residual
 from lavender.lab.bench.running.timing import one_thread
 from lavender.problem import Problem
@@ -23,7 +23,7 @@ PATIENCE = 10.0  # s, wall, beyond four times the limit of a call, before a cont
 def _child(pipe: Any, contestant: Contestant, problem: Problem, limit: float) -> None:
     # In a process of its own: (seconds, residual) of each setting, then None or why it stopped.
     try:
-        with one_thread(contestant.name), quiet(noisy=True):
+        with one_thread(contestant.name), capture_output(noisy=True):
             least = max(min(TARGETS), 2.0 * residual(problem, problem.start()).roundoff_floor)
             for call in contestant.runs(problem, limit):
                 began = monotonic()

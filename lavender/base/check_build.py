@@ -1,4 +1,4 @@
-"""Raise an ImportError that says what to do if the kernels are not built. Imported before other modules."""
+"""Raise an ImportError with instructions if the kernels are not built. Imported before other modules."""
 
 import importlib.util
 

@@ -1,7 +1,7 @@
-"""The deadline of a solve: the only clock of solvers, read between their steps.
+"""The deadline of a solve: the only clock that solvers read, between their steps.
 
-It is the caller's: it runs from the call of `solve` to its return. What cannot be stopped is begun only if its counted
-time fits in what is left, and the time of what always follows, the judge's last pass, is kept free.
+It covers the time from the call of `solve` to its return. A step that cannot be interrupted starts only if its
+estimated time fits into the remaining time. The time of the judge's last pass, which always follows, is reserved.
 """
 
 from __future__ import annotations
@@ -9,7 +9,8 @@ from __future__ import annotations
 import math
 from time import perf_counter
 
-CHUNK_TIME = 0.01  # s between two readings of the clock; five times that is still unnoticeable after Ctrl-C
+# s between two readings of the clock, which also bounds the delay after Ctrl-C. Users notice delays of about 50 ms.
+CHUNK_TIME = 0.01
 
 
 class TooLate(Exception):
@@ -17,7 +18,7 @@ class TooLate(Exception):
 
 
 class Stopwatch:
-    """Measures a step: seconds since this object was made."""
+    """Measures the time since its creation."""
 
     __slots__ = ("_start",)
 
@@ -26,48 +27,55 @@ class Stopwatch:
 
     @property
     def seconds(self) -> float:
-        """Seconds since it was made."""
+        """Seconds since the creation of this object."""
         return perf_counter() - self._start
 
 
 class Deadline:
-    """A moment `limit` [s] from now, or never."""
+    """A time after which a solve must end.
 
-    __slots__ = ("_at",)
+    Parameters
+    ----------
+    limit : float or None, s
+        Time from `start` to the deadline; None for no deadline.
+    start : float, optional, s
+        Reading of `time.perf_counter`. Default: now.
+    """
 
-    def __init__(self, limit: float | None = None, begun: float | None = None) -> None:
-        """`begun`: reading of this clock that the limit counts from; default: now."""
-        self._at = math.inf
+    __slots__ = ("_end",)
+
+    def __init__(self, limit: float | None = None, start: float | None = None) -> None:
+        self._end = math.inf
         if limit is not None:
-            self._at = (perf_counter() if begun is None else begun) + limit
+            self._end = (perf_counter() if start is None else start) + limit
 
     @property
     def is_set(self) -> bool:
-        """Whether there is a limit."""
-        return self._at < math.inf
+        """Whether there is a time limit."""
+        return self._end < math.inf
 
-    def keep(self, seconds: float) -> None:
-        """End so much earlier: kept for what always follows."""
-        self._at -= seconds
+    def reserve(self, seconds: float) -> None:
+        """Move the deadline `seconds` earlier, to reserve time for work that follows the solve."""
+        self._end -= seconds
 
     def passed(self, step: float = 0.0) -> bool:
-        """Whether a step of so many seconds, begun now, would end after the deadline."""
-        return self._at < math.inf and perf_counter() + step >= self._at
+        """Return whether a step of `step` seconds that starts now would end after the deadline."""
+        return self._end < math.inf and perf_counter() + step >= self._end
 
     def nanoseconds(self) -> float:
-        """What is left, in the unit of counted costs; inf without a limit."""
-        return 1e9 * (self._at - perf_counter())
+        """Return the remaining time [ns], the unit of estimated costs; inf without a limit."""
+        return 1e9 * (self._end - perf_counter())
 
-    def left(self, least: float = 0.0) -> float | None:
-        """Seconds until then, at least `least`; None without a limit."""
-        return None if self._at == math.inf else max(self._at - perf_counter(), least)
+    def remaining(self, minimum: float = 0.0) -> float | None:
+        """Return the remaining time [s], at least `minimum`; None without a limit."""
+        return None if self._end == math.inf else max(self._end - perf_counter(), minimum)
 
 
 NEVER = Deadline()
 
 
 def seconds(t: float) -> str:
-    """Three digits and a unit: 12.3 µs, 4.56 ms, 7.89 s."""
+    """Format a time [s] with three digits and a unit: 12.3 µs, 4.56 ms, 7.89 s."""
     if not math.isfinite(t):
         return "–"
     for scale, unit in ((1.0, "s"), (1e-3, "ms"), (1e-6, "µs")):

@@ -1,4 +1,4 @@
-"""What lavender raises. Every message says what came, what was needed, and what to do."""
+"""Exceptions of lavender. Each message contains the invalid value, the requirement and a remedy."""
 
 from __future__ import annotations
 
@@ -19,48 +19,52 @@ __all__ = [
     "TooLarge",
     "UnknownName",
     "check_name",
-    "last_words",
+    "format_error",
     "reject_former_names",
 ]
 
 
 class LavenderError(Exception):
-    """Base of everything lavender raises on purpose."""
+    """Base class of all exceptions of lavender."""
 
 
 class InputError(LavenderError, ValueError):
-    """An argument, array or file that lavender cannot take."""
+    """An argument, array or file is invalid."""
 
 
 class TooLarge(InputError):
-    """A matrix of more entries than indices reach; whoever needs it finds out when it is formed."""
+    """A matrix has more entries than 32-bit indices allow; raised when the matrix is first needed."""
 
 
 class UnknownName(LavenderError, KeyError):
-    """A solver, option, order, scene or case that does not exist; the message names the nearest.
+    """A solver, option, order, scene or case does not exist; the message suggests similar names.
 
     Parameters
     ----------
-    kind : word for the thing, such as "option of solver 'pgs'"
-    name : the unknown name
-    known : names that exist
-    successor : the present name, if `name` is a former one; the message suggests it
+    kind : str
+        Kind of the name, such as "solver" or "option of admm".
+    name : object
+        The unknown name.
+    known : iterable of str
+        Valid names.
+    successor : str
+        Present name if `name` is a former one; the message suggests it.
     """
 
     def __init__(self, kind: str, name: object, known: Iterable[str], successor: str = "") -> None:
-        import difflib  # needed only where something went wrong
+        import difflib  # not imported unless an error occurs
 
         known = sorted(set(known))
-        plain = {word.lower(): word for word in reversed(known)}
-        near = [plain[w] for w in difflib.get_close_matches(str(name).lower(), plain, n=3, cutoff=0.5)]
-        near = [successor] if successor else near
+        by_lower_case = {word.lower(): word for word in reversed(known)}
+        matches = difflib.get_close_matches(str(name).lower(), by_lower_case, n=3, cutoff=0.5)
+        similar = [successor] if successor else [by_lower_case[match] for match in matches]
         hint = (
-            f"did you mean {' or '.join(map(repr, near))}?"
-            if near
+            f"did you mean {' or '.join(map(repr, similar))}?"
+            if similar
             else f"known: {', '.join(known) or 'none'}"
         )
-        what, of, owner = kind.partition(" of ")
-        self.message = f"unknown {what} {name!r}{of}{owner}; {hint}"
+        noun, of, owner = kind.partition(" of ")
+        self.message = f"unknown {noun} {name!r}{of}{owner}; {hint}"
         super().__init__(self.message)
 
     def __str__(self) -> str:
@@ -68,12 +72,12 @@ class UnknownName(LavenderError, KeyError):
         return self.message
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # Between processes exceptions travel by their arguments; those of __init__ are others.
-        return _restored, (self.message,)
+        # By default, an exception is unpickled by calling its class with `args`, which does not fit `__init__`.
+        return _restore_unknown_name, (self.message,)
 
 
 def check_name(kind: str, name: object, known: Collection[str]) -> str:
-    """Return a name of those that are known; raise UnknownName for every other value."""
+    """Return `name`; raise UnknownName unless it is one of the known names."""
     if not isinstance(name, str) or name not in known:
         raise UnknownName(kind, name, known)
     return name
@@ -109,33 +113,33 @@ def reject_former_names(**successors: str) -> Callable[[_Callable], _Callable]:
     return decorate
 
 
-def _restored(message: str) -> UnknownName:
+def _restore_unknown_name(message: str) -> UnknownName:
     error = UnknownName.__new__(UnknownName, message)
     error.message = message
     return error
 
 
 class SolverUnavailable(LavenderError):
-    """A known solver whose package is not installed here."""
+    """The package of a known solver is not installed."""
 
 
 class CapabilityError(LavenderError):
-    """A solver or format that cannot take this problem or option; the message says which can."""
+    """A solver or format does not support this problem or option; the message names alternatives."""
 
 
 class InUse(LavenderError, RuntimeError):
-    """An object that serves one thread at a time is at work for another one, or for the caller of this callback."""
+    """An object that serves one thread at a time is used by another thread, or by the caller of this callback."""
 
 
-# What may end a run of numbers that are valid, and makes a result with the error as its message: arithmetic that breaks
-# down, memory that is not there, an A that is too large and was not needed before.
+# Exceptions that valid numbers can cause; a solve that ends with one returns a result with the error as its message:
+# a breakdown of arithmetic, missing memory, an A that is too large and is first needed now.
 BREAKDOWN = (ArithmeticError, np.linalg.LinAlgError, MemoryError, TooLarge)
 
 
-def last_words(error: BaseException) -> str:
-    """Its class and what it says, on one line."""
+def format_error(error: BaseException) -> str:
+    """Return the class and message of an exception on one line."""
     return " ".join(f"{type(error).__name__}: {error}".removesuffix(": ").split())
 
 
 class SolveFailed(LavenderError):
-    """Raised only by `Solution.raise_for_status`."""
+    """The judge does not accept a result; raised only by `Solution.raise_for_status`."""

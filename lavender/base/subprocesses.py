@@ -5,7 +5,7 @@ Answers are JSON and float64 arrays of a bounded size, and are never unpickled.
 
 No process pool of a library gives this (pebble 5.2.3 was measured): if the code handles SIGTERM or does not return to
 the interpreter, the pool kills it 3 s after its limit; processes that the code started run on; the parent unpickles
-what the code writes; and a script without `if __name__ == "__main__"` cannot use the pool.
+the output of the code; and a script without `if __name__ == "__main__"` cannot use the pool.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ MAX_ERROR_LENGTH = 500  # characters. Longer texts of errors are cut.
 #: If set, a process is killed together with the processes that it started.
 PROCESS_GROUPS = os.name == "posix"
 #: Not `-m`: it puts the current folder first, and in a checkout the sources hide the installed package.
-SCRIPT = (
+SERVE_SCRIPT = (
     "import sys; sys.path[:] = filter(None, sys.path); from lavender.base.subprocesses import serve; "
     "serve(*map(int, sys.argv[1:]))"
 )
@@ -43,11 +43,11 @@ Answer = tuple[dict[str, Any], Sequence[Any]]
 
 
 class ProcessEnded(Exception):
-    """The process ended before it answered; the text says how."""
+    """The process ended before it answered; the message describes how."""
 
 
 class InvalidAnswer(ValueError):
-    """The process sent bytes that are not an answer; the text says why."""
+    """The process sent bytes that are not an answer; the message has the reason."""
 
 
 class RemoteError(Exception):
@@ -59,7 +59,7 @@ class RemoteError(Exception):
 
 
 class ProcessBackend:
-    """Calls one function in a process that is started by `start` and kept between calls.
+    """Calls one function in another process, which `start` starts and later calls reuse.
 
     When this process ends, the system kills the other one.
 
@@ -111,6 +111,7 @@ class ProcessBackend:
             raise ProcessEnded(f"{error.kind}: {error}") from None
 
     def _start(self) -> None:
+        """Start the process, with a pipe that closes when this process ends."""
         path = os.pathsep.join(p or os.getcwd() for p in sys.path)
         options: dict[str, Any] = {}
         lifeline = -1
@@ -119,7 +120,7 @@ class ProcessBackend:
             options = {"start_new_session": True, "pass_fds": (lifeline,)}
         try:
             self.popen = subprocess.Popen(
-                [sys.executable, "-c", SCRIPT, str(lifeline), str(self._memory)],
+                [sys.executable, "-c", SERVE_SCRIPT, str(lifeline), str(self._memory)],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.DEVNULL,
@@ -160,7 +161,7 @@ class ProcessBackend:
         assert process is not None
         received: list[tuple[bytes, bytes] | BaseException] = []
 
-        # If a process that left the group holds a pipe, this thread waits alone.
+        # If a process that left the group still holds a pipe, only this thread waits for it.
         def exchange() -> None:
             try:
                 assert process.stdin is not None and process.stdout is not None
@@ -255,7 +256,7 @@ def unpack_answer(text: bytes, numbers: bytes) -> tuple[dict[str, Any], list[Any
     ------
     RemoteError
     InvalidAnswer
-        The text is not a JSON object, or the arrays have other sizes than it says.
+        The text is not a JSON object, or the arrays do not have the sizes in it.
     """
     try:
         fields = json.loads(text)
@@ -277,7 +278,7 @@ def unpack_answer(text: bytes, numbers: bytes) -> tuple[dict[str, Any], list[Any
 
 def serve(lifeline: int, memory: int) -> None:
     """Answer requests until the pipe ends: the first names the function, the others hold its arguments."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # The parent decides what Ctrl-C does.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # The parent handles Ctrl-C.
     if lifeline >= 0:
         _end_with_parent(lifeline)
     requests, answers = _take_streams()
@@ -316,7 +317,7 @@ def _pack_answer(fields: dict[str, Any], arrays: Sequence[Any]) -> tuple[bytes, 
 
 
 def _take_streams() -> tuple[IO[bytes], IO[bytes]]:
-    """Return the streams of requests and answers; discard what is printed from now on."""
+    """Return the streams of requests and answers; discard all later output."""
     requests, answers = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
     null = os.open(os.devnull, os.O_RDWR)
     os.dup2(null, 0)
@@ -353,7 +354,7 @@ def limit_cpu_time(extra: float) -> None:
     """Have the system kill this process after `extra` more CPU time [s], in case the parent no longer can."""
     with contextlib.suppress(
         ImportError, ValueError, OSError, OverflowError
-    ):  # OverflowError: inf is no limit.
+    ):  # OverflowError: the limit is inf.
         import resource
 
         hard = resource.getrlimit(resource.RLIMIT_CPU)[1]

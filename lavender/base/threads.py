@@ -1,6 +1,6 @@
-"""Work on several threads at the same time, by threads that are kept from call to call.
+"""Run a function on several threads, which are reused by later calls.
 
-A thread takes 0.07 ms to begin and to end, one that waits 0.01: as much as some calls have to do.
+To start and end a thread takes 0.07 ms, to wake a waiting one 0.01 ms; some calls take no longer than that.
 """
 
 from __future__ import annotations
@@ -15,42 +15,44 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-MOST = 1024  # one is begun when there is work and none waits
+MAX_THREADS = (
+    1024  # Further calls wait. The pool starts a thread only if there is work and no thread is idle.
+)
 
 
 @cache
-def helpers() -> ThreadPoolExecutor:
-    """The threads."""
-    from concurrent.futures import ThreadPoolExecutor  # 5 ms to import, needed only here
+def thread_pool() -> ThreadPoolExecutor:
+    """Return the pool of threads of this process."""
+    from concurrent.futures import ThreadPoolExecutor  # takes 5 ms to import, and is only needed here
 
-    return ThreadPoolExecutor(MOST, thread_name_prefix="lavender")
+    return ThreadPoolExecutor(MAX_THREADS, thread_name_prefix="lavender")
 
 
 if hasattr(os, "register_at_fork"):  # not on Windows
-    os.register_at_fork(after_in_child=helpers.cache_clear)  # a fork's child has none of them
+    os.register_at_fork(after_in_child=thread_pool.cache_clear)  # A forked process has none of the threads.
 
 
-def together(work: Callable[[bytearray], T], threads: int) -> list[T]:
-    """What `work(stop)` returns on this thread and on up to `threads - 1` others.
+def run_on_threads(work: Callable[[bytearray], T], threads: int) -> list[T]:
+    """Call `work(stop)` on this thread and on up to `threads - 1` others, and return all results.
 
-    Each call takes what is to do from one place until nothing is left, so one that no thread began meanwhile never is.
-    It begins nothing more when `stop[0]` is not 0, which is so after an error or Ctrl-C; either comes out when all have
-    ended.
+    Each call processes items of a common queue until the queue is empty. Calls that no thread has started by then are
+    cancelled. `work` must start no further item once `stop[0]` is not 0: it is set after an error or Ctrl-C, which is
+    raised when all calls have ended.
     """
     stop = bytearray(1)
 
-    def working() -> T:
+    def run() -> T:
         try:
             return work(stop)
         except BaseException:
             stop[0] = 1
             raise
 
-    others = [helpers().submit(working) for _ in range(threads - 1)]
+    futures = [thread_pool().submit(run) for _ in range(threads - 1)]
     try:
-        return [working(), *(other.result() for other in others if not other.cancel())]
+        return [run(), *(future.result() for future in futures if not future.cancel())]
     finally:
-        stop[0] = 1  # Ctrl-C may come while this thread waits
-        for other in others:
-            if not other.cancel():
-                other.exception()
+        stop[0] = 1  # Ctrl-C may have interrupted the wait of this thread.
+        for future in futures:
+            if not future.cancel():
+                future.exception()

@@ -1,7 +1,7 @@
-"""Worlds by the thousand: the arrays of many problems, as trainers and engines hold them, without an object for each.
+"""Arrays of many problems (worlds), as trainers and engines store them, without an object for each world.
 
-`lavender.solve_many(batch)` solves them, `lavender.residual_many(batch, impulses)` judges; `batch[i]` is a `Problem`.
-Arrays are read where they stand, in float32 or float64: what is made of one world is made when its turn comes.
+`lavender.solve_many(batch)` solves them, `lavender.residual_many(batch, impulses)` judges impulses; `batch[i]` is a
+`Problem`. Arrays of float32 or float64 are read in place; data of a world are derived when it is solved.
 """
 
 from __future__ import annotations
@@ -13,23 +13,23 @@ from typing import Any, overload
 import numpy as np
 
 from lavender.base.arrays import (
-    FLOATS,
+    FLOAT_DTYPES,
     ArrayLike,
     FloatArray,
     as_array,
     as_floats,
+    check_choice,
+    check_sequence,
     check_sizes,
     check_unmasked,
-    one_of,
-    places,
     precision_of,
-    several,
+    resolve_index,
     shape_of,
 )
 from lavender.base.errors import InputError
-from lavender.problem import FRICTION, Problem
+from lavender.problem import FRICTION_LAWS, Problem
 from lavender.problem.cones import Cones
-from lavender.problem.generalized import ASYMMETRY, ASYMMETRY32
+from lavender.problem.generalized import MAX_ASYMMETRY, MAX_ASYMMETRY_FLOAT32
 from lavender.problem.rows import Rows
 from lavender_ext.batch.many import PLACE, Worlds
 from lavender_ext.core.problem import LAWS, zero_impulse
@@ -37,52 +37,53 @@ from lavender_ext.core.problem import LAWS, zero_impulse
 __all__ = ["Batch"]
 
 ERRORS = ("raise", "status")
-FIELDS = ("inv_mass", "inv_inertia", "v_free", "jac", "normal", "tangent", "arm_a", "arm_b")  # of bodies
-PAIRS = ("joint_body", "contact_body")
+BODY_FIELDS = ("inv_mass", "inv_inertia", "v_free", "jac", "normal", "tangent", "arm_a", "arm_b")
+BODY_PAIRS = ("joint_body", "contact_body")
 
 
 class Batch(Sequence[Problem]):
-    """n problems in generalised coordinates in a few arrays: w = J v+ - target + compliance lambda in each.
+    """n problems in generalised coordinates, w = J v+ - target + compliance lambda, stored in a few arrays.
 
-    Three layouts: stacked, all worlds of one size; padded, with `count`; ragged, with `row_ptr`, one array of all rows.
-    Arrays of float32 and float64 are read in place where each world's numbers stand row by row, and must not
-    change while results are read; others are copied. Where all of J, M and v_free are float32, so is `precision`.
+    There are three layouts: stacked (all worlds of one size), padded (with `count`) and ragged (with `row_ptr`, arrays
+    of all rows). Arrays of float32 and float64 in which each world is stored row by row are read in place; they must
+    not change while results are read. Other arrays are copied. If J, M and v_free are float32, `precision` is
+    "float32".
 
     Parameters
     ----------
-    J : (n, m, nv), or ragged (rows of all worlds, nv), or of worlds of several nv one array of all entries
+    J : (n, m, nv), ragged (rows of all worlds, nv), or with `velocity_ptr` one array of all entries
         Rows in the order of the cones.
-    M : (n, nv, nv), or (nv, nv) of all; or one array of all entries
-        Or lower triangles in compressed rows of one pattern, as MuJoCo holds them: (values (n, entries), indices,
-        indptr), columns ascending in each row and the diagonal last.
+    M : (n, nv, nv), (nv, nv) for all worlds, or one array of all entries
+        Or lower triangles in compressed rows with one pattern, as in MuJoCo: (values (n, entries), indices, indptr),
+        columns ascending in each row and the diagonal last.
     v_free : (n, nv), or one array (with `velocity_ptr`), m/s, rad/s
     target : scalar, (m,), (n, m), or ragged one array of all rows, m/s
     cones : Cones, or a sequence of n of them
-        Of each world, or of the rows of all worlds one after the other, without what pads them.
+        Blocks of each world, or of the concatenated rows of all worlds, without padding rows.
     compliance : as target, 1/kg, optional
     mu : (n, k) or ragged one array of all blocks, optional
-        Coefficients of friction, world by world, in the place of those of the cones.
+        Coefficients of friction of each world, which replace those of the cones.
     friction : {"coulomb", "cone"}
     count : (n,) int, optional
-        Rows of each world where J (n, m, nv) has room for m: the first ones count.
+        Number of rows of each world, if J (n, m, nv) is padded to m rows at the end.
     row_ptr : (n + 1,) int, optional
-        First row of each world, then the number of rows.
+        First row of each world, followed by the number of rows.
     velocity_ptr : (n + 1,) int, optional
-        The same of velocities, where their number differs; with `row_ptr`.
+        First velocity of each world, followed by their number, if worlds have different numbers; with `row_ptr`.
 
     Raises
     ------
     InputError
-        Shapes that do not fit. What is wrong with the numbers of one world is told where it is solved, by its number.
+        The shapes disagree. Invalid numbers of a world are reported when it is solved, with its index.
 
     Examples
     --------
-    A block of 1 to 3 kg on the ground, pushed along by 2 m/s:
+    Blocks of 1 to 3 kg that slide on the ground at 2 m/s:
 
     >>> import numpy as np
     >>> import lavender as lv
     >>> mass = np.array([1.0, 2.0, 3.0])
-    >>> J = np.broadcast_to(np.eye(2)[::-1], (3, 2, 2))  # normal: upwards; tangent: along
+    >>> J = np.broadcast_to(np.eye(2)[::-1], (3, 2, 2))  # normal: upwards; tangent: along the motion
     >>> v_free = np.tile([2.0, -1.0], (3, 1))
     >>> cones = lv.Cones.contacts(0.5, tangents=1)
     >>> batch = lv.Batch(J, mass[:, None, None] * np.eye(2), v_free, cones=cones)
@@ -108,7 +109,7 @@ class Batch(Sequence[Problem]):
         row_ptr: ArrayLike | None = None,
         velocity_ptr: ArrayLike | None = None,
     ) -> None:
-        friction = one_of("friction", friction, FRICTION)
+        friction = check_choice("friction", friction, FRICTION_LAWS)
         values, *pattern = M if isinstance(M, tuple) else (M,)
         jac, mass, free = (as_floats(name, x) for name, x in (("J", J), ("M", values), ("v_free", v_free)))
         if row_ptr is not None and count is None:
@@ -128,41 +129,44 @@ class Batch(Sequence[Problem]):
             sizes, nvs = np.diff(rows), np.diff(velocities)
             self.shape: tuple[int, ...] = (int(rows[-1]),)
             self.velocity_shape: tuple[int, ...] = (int(velocities[-1]),)
-            room = None
+            capacity = None
         elif row_ptr is None and velocity_ptr is None and jac.ndim == 3:
-            n, room, nv = jac.shape
-            sizes = np.full(n, room) if count is None else check_counts("count", count, n, room)
+            n, capacity, nv = jac.shape
+            sizes = np.full(n, capacity) if count is None else check_counts("count", count, n, capacity)
             nvs = np.full(n, nv)
-            rows, velocities = room * np.arange(n + 1), nv * np.arange(n + 1)
-            self.shape, self.velocity_shape = (n, room), (n, nv)
+            rows, velocities = capacity * np.arange(n + 1), nv * np.arange(n + 1)
+            self.shape, self.velocity_shape = (n, capacity), (n, nv)
         else:
             raise InputError(
                 f"J has shape {jac.shape}; stacked it is (n, m, nv), ragged (rows, nv) with row_ptr"
             )
         self._n, self.friction = n, friction
         self.precision = precision_of(*(np.asarray(x) for x in (jac, mass, free)))
+        # offsets and sizes of each world (n, columns of PLACE)
         self.at = at = np.zeros((n, len(PLACE)), np.int64)
         at[:, PLACE["rows"]], at[:, PLACE["velocities"]] = sizes, nvs
         at[:, PLACE["row"]], at[:, PLACE["velocity"]] = rows[:-1], velocities[:-1]
-        self._place_cones(cones)
+        self._set_cones(cones)
         self._pattern = check_triangle(pattern, nvs, mass) if pattern else None
-        if room is not None and mass.ndim == 2 and not pattern:
+        if capacity is not None and mass.ndim == 2 and not pattern:
             mass = np.broadcast_to(mass, (n, *mass.shape))
-        square = (None, None) if room is None else ((room, nv), (nv, nv))
-        jac, at[:, PLACE["jac"]], self._jac_row = _matrices("J", jac, n, square[0], sizes * nvs)
+        shapes = (None, None) if capacity is None else ((capacity, nv), (nv, nv))
+        jac, at[:, PLACE["jac"]], self._jac_row = _flatten_matrices("J", jac, n, shapes[0], sizes * nvs)
         if self._pattern is None:
-            mass, at[:, PLACE["mass"]], self._mass_row = _matrices("M", mass, n, square[1], nvs * nvs)
+            mass, at[:, PLACE["mass"]], self._mass_row = _flatten_matrices("M", mass, n, shapes[1], nvs * nvs)
         else:
             entries = len(self._pattern[1])
-            (mass, at[:, PLACE["mass"]]), self._mass_row = _vectors("M", mass, n, entries, None), 0
-        free, at[:, PLACE["free"]] = _vectors("v_free", free, n, nv if room is not None else None, nvs)
-        goal, at[:, PLACE["target"]] = _vectors("target", target, n, room, sizes)
-        soft, at[:, PLACE["soft"]] = _vectors(
-            "compliance", 0.0 if compliance is None else compliance, n, room, sizes
+            (mass, at[:, PLACE["mass"]]), self._mass_row = _flatten_vectors("M", mass, n, entries, None), 0
+        free, at[:, PLACE["free"]] = _flatten_vectors(
+            "v_free", free, n, nv if capacity is not None else None, nvs
         )
-        self._arrays: Any = (jac, mass, free, goal, soft, self._frictions(mu))
+        goal, at[:, PLACE["target"]] = _flatten_vectors("target", target, n, capacity, sizes)
+        soft, at[:, PLACE["soft"]] = _flatten_vectors(
+            "compliance", 0.0 if compliance is None else compliance, n, capacity, sizes
+        )
+        self._arrays: Any = (jac, mass, free, goal, soft, self._flatten_mu(mu))
 
-    # -- other ways to make one ------------------------------------------------------------------------
+    # -- other constructors ----------------------------------------------------------------------------
 
     @classmethod
     def of_matrices(
@@ -174,87 +178,101 @@ class Batch(Sequence[Problem]):
         mu: Any = None,
         friction: str = "coulomb",
     ) -> Batch:
-        """Of matrices A (n, m, m) [1/kg] and b (n, m) [m/s]; each becomes a `Problem` when its turn comes."""
+        """Build a batch of matrix problems; each becomes a `Problem` when it is solved.
+
+        Parameters
+        ----------
+        A : (n, m, m) 1/kg
+        b : (n, m) m/s
+        cones, mu, friction
+            As for `Batch`.
+        """
         matrix, rhs = as_floats("A", A), as_floats("b", b)
         if matrix.ndim != 3 or matrix.shape[1] != matrix.shape[2] or rhs.shape != matrix.shape[:2]:
             raise InputError(f"A has shape {matrix.shape} and b {rhs.shape}; (n, m, m) and (n, m) are needed")
         n, m = rhs.shape
-        made = cls._of_form(n, m, friction, precision_of(matrix, rhs))
-        made._place_cones(cones)
-        at, place = made.at, PLACE
-        flat, at[:, place["jac"]], made._jac_row = _matrices("A", matrix, n, (m, m), None)
-        goal, at[:, place["target"]] = _vectors("b", rhs, n, m, None)
-        made._arrays = flat, None, None, goal, None, made._frictions(mu)
-        return made
+        batch = cls._make_empty(n, m, friction, precision_of(matrix, rhs))
+        batch._set_cones(cones)
+        at = batch.at
+        flat, at[:, PLACE["jac"]], batch._jac_row = _flatten_matrices("A", matrix, n, (m, m), None)
+        goal, at[:, PLACE["target"]] = _flatten_vectors("b", rhs, n, m, None)
+        batch._arrays = flat, None, None, goal, None, batch._flatten_mu(mu)
+        return batch
 
     @classmethod
     def of_bodies(cls, fields: Mapping[str, Any], **bounds: Any) -> Batch:
-        """Of rows of bodies: fields of `Rows` and bounds of `Problem.from_rows`, stacked or one for all worlds.
+        """Build a batch of problems with bodies, from fields of `Rows` and bounds of `Problem.from_rows`.
 
         Parameters
         ----------
         fields : mapping
-            `inv_mass` (n, bodies), `v_free` (n, bodies, 6), `normal` (n, c, 3), ...; what has the dimensions of one
-            world, such as `contact_body` (c, 2), is shared. At least one field is stacked.
+            `inv_mass` (n, bodies), `v_free` (n, bodies, 6), `normal` (n, c, 3), ... An array with the dimensions of one
+            world, such as `contact_body` (c, 2), is used for all worlds. At least one array is stacked.
         **bounds
-            `target`, `mu`, ..., the same way: (m,) or (n, m); and words such as friction.
+            `target`, `mu`, ..., each (m,) for all worlds or (n, m); and keywords such as friction.
+
+        Raises
+        ------
+        InputError
+            A field does not exist, or stacked arrays have different lengths or are missing.
         """
-        known = {"inv_mass": 1, "inv_inertia": 3, "v_free": 2, "jac": 2, "joint_ptr": 1, "joint_body": 2, "normal": 2,
-                 "tangent": 2, "arm_a": 2, "arm_b": 2, "contact_body": 2}  # fmt: skip
+        n_axes = {"inv_mass": 1, "inv_inertia": 3, "v_free": 2, "jac": 2, "joint_ptr": 1, "joint_body": 2, "normal": 2,
+                  "tangent": 2, "arm_a": 2, "arm_b": 2, "contact_body": 2}  # fmt: skip
         if not isinstance(fields, Mapping):
             raise InputError(f"fields is {fields!r:.60}; a mapping of arrays of Rows is needed")
-        unknown = set(fields) - set(known)
+        unknown = set(fields) - set(n_axes)
         if unknown:
-            raise InputError(f"fields has {sorted(unknown)}; the arrays of Rows are {', '.join(known)}")
+            raise InputError(f"fields has {sorted(unknown)}; the arrays of Rows are {', '.join(n_axes)}")
         for name, x in (*fields.items(), *bounds.items()):
             shape_of(name, x)
             check_unmasked(name, x)
-        parts = {name: np.asarray(x) for name, x in fields.items()}
+        arrays = {name: np.asarray(x) for name, x in fields.items()}
         more = {name: np.asarray(x) if np.ndim(x) else x for name, x in bounds.items() if x is not None}
-        lengths = {len(x) for name, x in parts.items() if x.ndim == known[name] + 1}
+        lengths = {len(x) for name, x in arrays.items() if x.ndim == n_axes[name] + 1}
         lengths |= {len(x) for x in more.values() if isinstance(x, np.ndarray) and x.ndim == 2}
         if len(lengths) != 1:
             raise InputError(
                 f"stacked arrays are of {sorted(lengths)} worlds; one number of them, in at least one array, is needed"
             )
         n = lengths.pop()
-        made = cls._of_form(n, 0, more.get("friction", "coulomb"), "float64")
-        made._bodies = parts, more, {name for name, x in parts.items() if x.ndim > known[name]}
+        batch = cls._make_empty(n, 0, more.get("friction", "coulomb"), "float64")
+        batch._bodies = arrays, more, {name for name, x in arrays.items() if x.ndim > n_axes[name]}
         if n:
-            first = made[0]
-            made.shape, made.precision = (n, first.m), first.precision
-            made.at[:, PLACE["rows"]], made.at[:, PLACE["row"]] = first.m, first.m * np.arange(n)
+            first = batch[0]
+            batch.shape, batch.precision = (n, first.m), first.precision
+            batch.at[:, PLACE["rows"]], batch.at[:, PLACE["row"]] = first.m, first.m * np.arange(n)
             nv = 6 * first.rows.n_bodies if first.rows is not None else 0
-            made.velocity_shape = (n, nv)
-            made.at[:, PLACE["velocities"]], made.at[:, PLACE["velocity"]] = nv, nv * np.arange(n)
-            made.at[:, PLACE["blocks"]] = first.cones.n_blocks
-        return made
+            batch.velocity_shape = (n, nv)
+            batch.at[:, PLACE["velocities"]], batch.at[:, PLACE["velocity"]] = nv, nv * np.arange(n)
+            batch.at[:, PLACE["blocks"]] = first.cones.n_blocks
+        return batch
 
     @classmethod
-    def _of_form(cls, n: int, m: int, friction: Any, precision: str) -> Batch:
-        made: Batch = object.__new__(cls)
-        friction = one_of("friction", friction, FRICTION)
-        made._n, made.friction, made.precision, made._arrays = n, friction, precision, None
-        made.shape, made.velocity_shape = (n, m), (n, 0)
-        made.at = np.zeros((n, len(PLACE)), np.int64)
-        made.at[:, PLACE["rows"]], made.at[:, PLACE["row"]] = m, m * np.arange(n)
-        return made
+    def _make_empty(cls, n: int, m: int, friction: Any, precision: str) -> Batch:
+        """Build a batch of n worlds with m rows and no arrays."""
+        batch: Batch = object.__new__(cls)
+        friction = check_choice("friction", friction, FRICTION_LAWS)
+        batch._n, batch.friction, batch.precision, batch._arrays = n, friction, precision, None
+        batch.shape, batch.velocity_shape = (n, m), (n, 0)
+        batch.at = np.zeros((n, len(PLACE)), np.int64)
+        batch.at[:, PLACE["rows"]], batch.at[:, PLACE["row"]] = m, m * np.arange(n)
+        return batch
 
-    names_of: Callable[[int], Sequence[str]] | None = None  # of the blocks of a world
+    names_of: Callable[[int], Sequence[str]] | None = None  # returns the names of a world's blocks
     contact_counts: np.ndarray | None = None  # (n,) contacts with rows; None if not known
-    _shared = True
+    _has_shared_cones = True
     _pattern: tuple[np.ndarray, np.ndarray] | None = None
     _jac_row = _mass_row = 0
-    # Of `of_bodies`: fields, bounds, and which fields are stacked.
+    # Arguments of `of_bodies`: fields, bounds, and the names of the stacked fields.
     _bodies: tuple[dict[str, Any], dict[str, Any], set[str]] | None = None
 
     # -- blocks ----------------------------------------------------------------------------------------
 
-    def _place_cones(self, cones: Any) -> None:
-        """One Cones of all worlds, or of each; where each world's blocks and rows begin there."""
+    def _set_cones(self, cones: Any) -> None:
+        """Store the cones of all worlds or of each world, and the offsets of each world's blocks and rows in them."""
         at, sizes = self.at, self.at[:, PLACE["rows"]]
         if not isinstance(cones, Cones):
-            cones = _joined(cones, len(self))
+            cones = _concatenate_cones(cones, len(self))
         self.cones = cones
         if cones.has_round and self.friction != "cone":
             raise InputError(
@@ -263,51 +281,49 @@ class Batch(Sequence[Problem]):
         if len(self) and (sizes == cones.n_rows).all():
             at[:, PLACE["blocks"]] = cones.n_blocks
             return
-        self._shared = False
-        first = _firsts(sizes)
+        self._has_shared_cones = False
+        first = _offsets_of_sizes(sizes)
         if len(self) and first[-1] + sizes[-1] != cones.n_rows:
-            each = (
+            alternative = (
                 f", or {sizes[0]} of each"
                 if (sizes == sizes[0]).all()
-                else "; one Cones of each world goes only where all have as many rows: give a list of them"
+                else "; one Cones for all worlds needs worlds of equal size: give a list of Cones"
             )
             raise InputError(
-                f"cones have {cones.n_rows} rows; {first[-1] + sizes[-1]} of all worlds are needed, without what "
-                f"pads them{each}"
+                f"cones have {cones.n_rows} rows; {first[-1] + sizes[-1]} of all worlds are needed, without "
+                f"padding rows{alternative}"
             )
         ends = first + sizes
         block, last = np.searchsorted(cones.ptr, first), np.searchsorted(cones.ptr, ends)
-        off = np.flatnonzero((cones.ptr[block] != first) | (cones.ptr[last] != ends))
-        if len(off):
+        bad = np.flatnonzero((cones.ptr[block] != first) | (cones.ptr[last] != ends))
+        if len(bad):
             raise InputError(
-                f"a block of the cones begins in world {off[0]} and ends in the next; or their sizes differ"
+                f"a block of the cones begins in world {bad[0]} and ends in the next; or their sizes differ"
             )
         at[:, PLACE["block"]], at[:, PLACE["blocks"]], at[:, PLACE["cone_row"]] = block, last - block, first
 
-    def _frictions(self, mu: Any) -> np.ndarray | None:
-        """mu of all worlds, flat."""
+    def _flatten_mu(self, mu: Any) -> np.ndarray | None:
+        """Return mu of all worlds as a flat array."""
         if mu is None:
             return None
-        k = self.at[:, PLACE["blocks"]]
-        each = self.cones.n_blocks if self._shared else None
-        found, self.at[:, PLACE["mu"]] = _vectors("mu", mu, len(self), each, k)
-        return found
+        block_counts = self.at[:, PLACE["blocks"]]
+        n_blocks = self.cones.n_blocks if self._has_shared_cones else None
+        flat, self.at[:, PLACE["mu"]] = _flatten_vectors("mu", mu, len(self), n_blocks, block_counts)
+        return flat
 
     def _cones_of(self, i: int, mu: FloatArray | None = None) -> Cones:
-        """Blocks of world i, with their own mu (k,) where it is given."""
-        place = self.at[i]
-        block, k = (int(place[PLACE[name]]) for name in ("block", "blocks"))
-        c = self.cones
-        if self._shared and mu is None:
-            return c
-        part = c._take_blocks(np.arange(block, block + k))
+        """Return the blocks of world i, with mu (k,) if it is given."""
+        block, k = (int(self.at[i, PLACE[name]]) for name in ("block", "blocks"))
+        if self._has_shared_cones and mu is None:
+            return self.cones
+        cones = self.cones._take_blocks(np.arange(block, block + k))
         if mu is None:
-            return part
+            return cones
         check_sizes("mu", mu, "-")
-        return replace(part, mu=mu)
+        return replace(cones, mu=mu)
 
     def __getstate__(self) -> dict[str, Any]:
-        # Copies and pickles hold the names themselves: what makes them may hold an engine's model.
+        # Copies and pickles hold the names, because the function `names_of` may hold an engine's model.
         if self.names_of is None:
             return self.__dict__
         return self.__dict__ | {"names_of": tuple(map(self.names_of, range(len(self)))).__getitem__}
@@ -316,7 +332,7 @@ class Batch(Sequence[Problem]):
 
     @property
     def row_counts(self) -> np.ndarray:
-        """(n,) rows of each world."""
+        """Number of rows of each world (n,)."""
         return self.at[:, PLACE["rows"]].copy()
 
     def __len__(self) -> int:
@@ -327,46 +343,50 @@ class Batch(Sequence[Problem]):
     @overload
     def __getitem__(self, i: Any) -> list[Problem]: ...
     def __getitem__(self, i: Any) -> Any:
-        """World i as a `Problem`, made of copies, or a list of several; InputError where numbers are no problem's."""
-        i = places(i, self._n)
+        """Return world i as a `Problem` made of copies, or a list of problems; raise InputError for invalid numbers."""
+        i = resolve_index(i, self._n)
         if isinstance(i, list):
             return [self[j] for j in i]
         if self._bodies is not None:
-            return self._of_bodies(i, *self._bodies)
-        jac, mass, free, target, soft, mu = (self._part(i, which) for which in range(6))
-        own = self._cones_of(i, None if mu is None else as_array("mu", mu, (None,)))
+            return self._make_body_problem(i, *self._bodies)
+        jac, mass, free, target, compliance, mu = (self._array_of_world(i, which) for which in range(6))
+        cones = self._cones_of(i, None if mu is None else as_array("mu", mu, (None,)))
         if mass is None:
-            return Problem(target, own, jac, friction=self.friction, precision=self.precision)
+            return Problem(target, cones, jac, friction=self.friction, precision=self.precision)
         return Problem.from_jacobian(
-            jac, mass, free, target=target, cones=own, compliance=soft, friction=self.friction,
+            jac, mass, free, target=target, cones=cones, compliance=compliance, friction=self.friction,
             precision=self.precision, names=None if self.names_of is None else self.names_of(i),
         )  # fmt: skip
 
-    def _of_bodies(self, i: int, parts: dict[str, Any], more: dict[str, Any], stacked: set[str]) -> Problem:
-        of: dict[str, Any] = {name: x[i] if name in stacked else x for name, x in parts.items()}
-        own: dict[str, Any] = {name: x[i] if np.ndim(x) == 2 else x for name, x in more.items()}
-        problem = Problem.from_rows(Rows(**of), **own)
+    def _make_body_problem(
+        self, i: int, arrays: dict[str, Any], more: dict[str, Any], stacked: set[str]
+    ) -> Problem:
+        """Build the problem of world i from the arguments of `of_bodies`."""
+        fields: dict[str, Any] = {name: x[i] if name in stacked else x for name, x in arrays.items()}
+        bounds: dict[str, Any] = {name: x[i] if np.ndim(x) == 2 else x for name, x in more.items()}
+        problem = Problem.from_rows(Rows(**fields), **bounds)
         if i and problem.m != self.shape[1]:
             raise InputError(
-                f"it has {problem.m} rows, the first world {self.shape[1]}: give tangents=, which mu 0 leaves out"
+                f"it has {problem.m} rows, the first world {self.shape[1]}: give tangents=, because contacts with mu 0 "
+                "have no tangents by default"
             )
         return problem
 
-    def _part(self, i: int, which: int) -> Any:
-        """One array of world i, as it stands."""
-        place = self.at[i]
-        m, nv, k = (int(place[PLACE[name]]) for name in ("rows", "velocities", "blocks"))
+    def _array_of_world(self, i: int, which: int) -> Any:
+        """Return an array of world i (0: J, 1: M, 2: v*, 3: target, 4: compliance, 5: mu), or None."""
+        offsets = self.at[i]
+        m, nv, k = (int(offsets[PLACE[name]]) for name in ("rows", "velocities", "blocks"))
         array = self._arrays[which]
-        first = int(place[PLACE[("jac", "mass", "free", "target", "soft", "mu")[which]]])
+        first = int(offsets[PLACE[("jac", "mass", "free", "target", "soft", "mu")[which]]])
         if array is None:
             return None
         if which == 1 and self._pattern is not None:
             ptr, col = self._pattern
-            row, whole = np.repeat(np.arange(nv), np.diff(ptr)), np.zeros((nv, nv), array.dtype)
-            whole[row, col] = whole[col, row] = array[first : first + len(col)]
-            return whole
+            row, dense = np.repeat(np.arange(nv), np.diff(ptr)), np.zeros((nv, nv), array.dtype)
+            dense[row, col] = dense[col, row] = array[first : first + len(col)]
+            return dense
         if self._arrays[1] is None:
-            nv = m  # of A in the place of J
+            nv = m  # The first array is A.
         if which < 2:
             rows, stride = ((m, self._jac_row), (nv, self._mass_row))[which]
             size = array.itemsize
@@ -380,45 +400,47 @@ class Batch(Sequence[Problem]):
         return array[first : first + (nv, m, m, k)[which - 2]]
 
     def rows_of(self, i: int) -> slice:
-        """Where world i stands in an impulse of all, flat."""
+        """Return the slice of world i in a flat array of all impulses."""
         first, m = (int(self.at[i, PLACE[name]]) for name in ("row", "rows"))
         return slice(first, first + m)
 
     def start(self, i: int) -> FloatArray:
-        """Zero impulses (m,) [N s] of world i, clipped to its bounds."""
+        """Return the zero impulse (m,) [N s] of world i, clipped to its bounds."""
         if self._arrays is None:
             return self[i].start()
         first, m = (int(self.at[i, PLACE[name]]) for name in ("cone_row", "rows"))
         return zero_impulse(self.cones.lower[first : first + m], self.cones.upper[first : first + m])
 
-    def impulses(self, name: str, given: Any) -> FloatArray:
-        """Impulses of all worlds [N s], of the batch's shape, finite or not, as a new flat array."""
-        array = as_array(name, given, self.shape, finite=False, unit="N s")
+    def impulses(self, name: str, value: Any) -> FloatArray:
+        """Convert impulses [N s] of the batch's shape to a new flat array; numbers need not be finite."""
+        array = as_array(name, value, self.shape, finite=False, unit="N s")
         return array.reshape(-1).copy()
 
     def worlds(self, impulse: FloatArray, velocity: FloatArray, cold: bool) -> Worlds:
-        """What the compiled loop works on; results into impulse and velocity, flat."""
-        made = Worlds(self.at, impulse, velocity, cold)
-        if self._bodies is not None and (read := self._read_bodies()):
-            made.of_bodies(*read)
+        """Build the data of the compiled loop, which writes results to the flat arrays `impulse` and `velocity`."""
+        worlds = Worlds(self.at, impulse, velocity, cold)
+        if self._bodies is not None and (body_arrays := self._get_body_arrays()):
+            worlds.of_bodies(*body_arrays)
         elif self._arrays is None or self.cones.has_ellipse:
-            made.of_objects([], [None] * len(self), [])
+            worlds.of_objects([], [None] * len(self), [])
         else:
             mass = self._arrays[1]
-            allowed = ASYMMETRY32 if mass is not None and mass.dtype == np.float32 else ASYMMETRY
-            made.of_arrays(
+            max_asymmetry = (
+                MAX_ASYMMETRY_FLOAT32 if mass is not None and mass.dtype == np.float32 else MAX_ASYMMETRY
+            )
+            worlds.of_arrays(
                 self._arrays,
                 (self._jac_row, self._mass_row),
                 self._pattern,
                 self.cones._blocks,
                 LAWS[self.friction],
-                allowed,
+                max_asymmetry,
             )
-        return made
+        return worlds
 
-    def _read_bodies(self) -> Any:
-        """What the compiled loop reads of bodies; None where worlds differ in more than numbers of one layout."""
-        parts, more, _ = self._bodies  # type: ignore[misc]
+    def _get_body_arrays(self) -> Any:
+        """Return the body arrays for the compiled loop, or None if the worlds do not share one layout."""
+        arrays, more, _ = self._bodies  # type: ignore[misc]
         stacked = {name for name, x in more.items() if np.ndim(x) == 2}
         if not stacked <= {"target", "compliance", "mu"} or "guess" in more or not len(self):
             return None
@@ -427,68 +449,71 @@ class Batch(Sequence[Problem]):
         except InputError:
             return None
         rows, n, mu = first.rows, len(self), more.get("mu", 0.0)
-        if rows is None or first.m != self.shape[1] or np.ndim(parts.get("joint_ptr", 0)) == 2:
+        if rows is None or first.m != self.shape[1] or np.ndim(arrays.get("joint_ptr", 0)) == 2:
             return None
         if "mu" in stacked and (mu.shape[1] != rows.n_contacts or ((mu > 0.0) != (mu[0] > 0.0)).any()):
             return None
-        one: dict[str, Any] = {name: getattr(rows, name) for name in (*FIELDS, *PAIRS)}
+        # arrays of the first world, which are used for all worlds unless a stacked array is given
+        of_first: dict[str, Any] = {name: getattr(rows, name) for name in (*BODY_FIELDS, *BODY_PAIRS)}
         goal = 0.0 if "target" in stacked else more.get("target", 0.0)
-        one["target"] = np.array(np.broadcast_to(goal, first.m), float)
-        one |= {"compliance": first.compliance, "mu": first.cones.mu[rows.n_joints :]}
-        found = {}
-        for name, own in one.items():
-            x, kind = {**parts, **more}.get(name, own), np.int32 if name in PAIRS else np.float64
-            if np.ndim(x) <= own.ndim:
-                found[name] = np.ascontiguousarray(own), 0
-            elif x.shape == (n, *own.shape) and (
-                x.dtype in FLOATS if kind is np.float64 else _are_indices(x)
+        of_first["target"] = np.array(np.broadcast_to(goal, first.m), float)
+        of_first |= {"compliance": first.compliance, "mu": first.cones.mu[rows.n_joints :]}
+        with_stride = {}
+        for name, default in of_first.items():
+            x, dtype = {**arrays, **more}.get(name, default), np.int32 if name in BODY_PAIRS else np.float64
+            if np.ndim(x) <= default.ndim:
+                with_stride[name] = np.ascontiguousarray(default), 0
+            elif x.shape == (n, *default.shape) and (
+                x.dtype in FLOAT_DTYPES if dtype is np.float64 else _are_indices(x)
             ):
-                found[name] = np.ascontiguousarray(x, kind), own.size
+                with_stride[name] = np.ascontiguousarray(x, dtype), default.size
             else:
                 return None
-        fields = [found[name] for name in (*FIELDS, "target", "compliance", "mu")]
+        fields = [with_stride[name] for name in (*BODY_FIELDS, "target", "compliance", "mu")]
+        pairs = [with_stride[name] for name in BODY_PAIRS]
         sizes = rows.n_bodies, rows.n_joints, rows.n_contacts
-        return fields, [found[name] for name in PAIRS], *sizes, first.cones._blocks, LAWS[first.friction]
+        return fields, pairs, *sizes, first.cones._blocks, LAWS[first.friction]
 
     def __repr__(self) -> str:
         return f"<Batch of {self._n} worlds, impulses {self.shape}, {self.precision}>"
 
 
-# -- what is given ------------------------------------------------------------------------------------
+# -- conversion of arguments --------------------------------------------------------------------------
 
 
 def _are_indices(x: np.ndarray) -> bool:
-    """Whether all are whole numbers of 32 bits."""
+    """Return whether all entries are integers of 32 bits."""
     return x.dtype.kind == "i" and (x.itemsize <= 4 or bool(((x >= -(2**31)) & (x < 2**31)).all()))
 
 
-def _firsts(sizes: Any) -> np.ndarray:
-    """Where each begins that follows the other."""
+def _offsets_of_sizes(sizes: Any) -> np.ndarray:
+    """Compute the offsets of consecutive parts from their sizes."""
     return (
         np.concatenate([[0], np.cumsum(sizes)[:-1]]).astype(np.int64) if len(sizes) else np.zeros(0, np.int64)
     )
 
 
-def _pointers(name: str, given: Any) -> np.ndarray:
-    ptr = as_array(name, given, (None,), dtype=np.int32).astype(np.int64)
+def _pointers(name: str, value: Any) -> np.ndarray:
+    """Convert pointers of worlds to an array (n + 1,); raise InputError for invalid ones."""
+    ptr = as_array(name, value, (None,), dtype=np.int32).astype(np.int64)
     if not len(ptr) or ptr[0] != 0 or (np.diff(ptr) < 0).any():
         raise InputError(f"{name} must start with 0 and not fall: the first of each world, then their number")
     return ptr
 
 
-def check_triangle(given: Sequence[Any], nvs: Any, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def check_triangle(arrays: Sequence[Any], nvs: Any, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return (indptr, indices) of lower triangles that worlds of nvs velocities share, from (indices, indptr)."""
-    if len(given) != 2:
-        raise InputError(f"M is a tuple of {1 + len(given)}; (values, indices, indptr) is needed")
+    if len(arrays) != 2:
+        raise InputError(f"M is a tuple of {1 + len(arrays)}; (values, indices, indptr) is needed")
     col, ptr = (
         as_array(name, x, (None,), dtype=np.int32)
-        for name, x in zip(("indices of M", "indptr of M"), given, strict=True)
+        for name, x in zip(("indices of M", "indptr of M"), arrays, strict=True)
     )
     nv = len(ptr) - 1
     row = np.repeat(np.arange(nv), np.maximum(np.diff(ptr), 0))
-    sound = nv >= 0 and ptr[:1] == 0 and (np.diff(ptr) > 0).all() and len(row) == len(col)
+    is_valid = nv >= 0 and ptr[:1] == 0 and (np.diff(ptr) > 0).all() and len(row) == len(col)
     if (
-        not sound
+        not is_valid
         or (col[ptr[1:] - 1] != np.arange(nv)).any()
         or not (np.diff(col)[np.diff(row) == 0] > 0).all()
     ):
@@ -501,9 +526,9 @@ def check_triangle(given: Sequence[Any], nvs: Any, values: np.ndarray) -> tuple[
     return ptr, col
 
 
-def check_counts(name: str, given: Any, n: int, capacity: int) -> np.ndarray:
-    """Numbers of rows of n worlds (n,), each from 0 to the rows that J has; InputError names the first other one."""
-    count = as_array(name, given, (n,), dtype=np.int32).astype(np.int64)
+def check_counts(name: str, value: Any, n: int, capacity: int) -> np.ndarray:
+    """Return the numbers of rows of n worlds (n,); raise InputError unless they are from 0 to the rows of J."""
+    count = as_array(name, value, (n,), dtype=np.int32).astype(np.int64)
     bad = np.flatnonzero((count < 0) | (count > capacity))
     if len(bad):
         raise InputError(
@@ -512,65 +537,74 @@ def check_counts(name: str, given: Any, n: int, capacity: int) -> np.ndarray:
     return count
 
 
-def _flat(x: np.ndarray) -> np.ndarray:
-    """All that an array spans in memory, as one dimension; its steps are whole numbers from 0 up."""
+def _view_memory(x: np.ndarray) -> np.ndarray:
+    """Return a flat view of all memory that an array spans; its strides must be multiples of an item from 0 up."""
     if not x.size:
         return np.zeros(0, x.dtype)
     length = 1 + sum((n - 1) * s // x.itemsize for n, s in zip(x.shape, x.strides, strict=True))
     return np.lib.stride_tricks.as_strided(x, (length,), (x.itemsize,), writeable=False)
 
 
-def _strided(x: np.ndarray) -> bool:
-    """Whether each world stands row by row in memory."""
-    whole = all(s >= 0 and s % x.itemsize == 0 for s in x.strides)
-    return whole and x.flags.aligned and (x.shape[-1] < 2 or x.strides[-1] == x.itemsize)
+def _is_readable_in_place(x: np.ndarray) -> bool:
+    """Return whether each world is stored row by row in aligned memory."""
+    has_item_strides = all(s >= 0 and s % x.itemsize == 0 for s in x.strides)
+    return has_item_strides and x.flags.aligned and (x.shape[-1] < 2 or x.strides[-1] == x.itemsize)
 
 
-def _matrices(
-    name: str, x: np.ndarray, n: int, each: tuple[int, int] | None, sizes: Any
+def _flatten_matrices(
+    name: str, x: np.ndarray, n: int, shape: tuple[int, int] | None, sizes: Any
 ) -> tuple[np.ndarray, Any, int]:
-    """Matrices of n worlds: flat, where each begins, and numbers from one row to the next (0: no more than it has).
+    """Return matrices of n worlds as a flat array, their offsets, and the stride of their rows.
 
-    each: shape of every one; None: as many entries as `sizes` says, one after the other.
+    Parameters
+    ----------
+    shape : (int, int) or None
+        Shape of every matrix. If None, the matrices are concatenated, have the numbers of entries `sizes` (n,) and the
+        stride 0, which means that their rows are contiguous.
     """
-    if each is None:
-        return *_ragged(name, x, sizes), 0
-    if x.shape != (n, *each):
-        raise InputError(f"{name} has shape {x.shape}; {(n, *each)} is needed")
-    if not _strided(x) or (each[0] > 1 and x.strides[1] < each[1] * x.itemsize):
+    if shape is None:
+        return *_flatten_ragged(name, x, sizes), 0
+    if x.shape != (n, *shape):
+        raise InputError(f"{name} has shape {x.shape}; {(n, *shape)} is needed")
+    if not _is_readable_in_place(x) or (shape[0] > 1 and x.strides[1] < shape[1] * x.itemsize):
         x = np.ascontiguousarray(x)
-    row = x.strides[1] // x.itemsize if each[0] > 1 else each[1]
-    return _flat(x), np.arange(n) * (x.strides[0] // x.itemsize), row
+    row_stride = x.strides[1] // x.itemsize if shape[0] > 1 else shape[1]
+    return _view_memory(x), np.arange(n) * (x.strides[0] // x.itemsize), row_stride
 
 
-def _vectors(name: str, given: Any, n: int, each: int | None, sizes: Any) -> tuple[np.ndarray, Any]:
-    """Vectors of n worlds, flat, and where each begins; a scalar, or one of one world, is of all."""
-    x = as_floats(name, given)
+def _flatten_vectors(name: str, value: Any, n: int, size: int | None, sizes: Any) -> tuple[np.ndarray, Any]:
+    """Return vectors of n worlds as a flat array, and their offsets; a scalar or a single vector is for all worlds.
+
+    `size`: size of every vector; None if the vectors are concatenated and have the sizes `sizes` (n,).
+    """
+    x = as_floats(name, value)
     if x.ndim == 0:
         return np.full(int(np.max(sizes, initial=0)), float(x)), 0
-    if each is None:
-        return _ragged(name, x, sizes)
-    if x.shape == (each,):
+    if size is None:
+        return _flatten_ragged(name, x, sizes)
+    if x.shape == (size,):
         return np.ascontiguousarray(x), 0
-    if x.shape != (n, each):
-        raise InputError(f"{name} has shape {x.shape}; {(n, each)} or ({each},) is needed")
-    x = x if _strided(x) else np.ascontiguousarray(x)
-    return _flat(x), np.arange(n) * (x.strides[0] // x.itemsize)
+    if x.shape != (n, size):
+        raise InputError(f"{name} has shape {x.shape}; {(n, size)} or ({size},) is needed")
+    x = x if _is_readable_in_place(x) else np.ascontiguousarray(x)
+    return _view_memory(x), np.arange(n) * (x.strides[0] // x.itemsize)
 
 
-def _ragged(name: str, x: np.ndarray, sizes: Any) -> tuple[np.ndarray, Any]:
-    """Numbers of all worlds one after the other, and where each begins."""
+def _flatten_ragged(name: str, x: np.ndarray, sizes: Any) -> tuple[np.ndarray, Any]:
+    """Return the concatenated numbers of all worlds, and their offsets."""
     total = int(np.sum(sizes))
     if x.size != total:
         raise InputError(
-            f"{name} has shape {x.shape}; {total} numbers are needed, those of all worlds one after the other"
+            f"{name} has shape {x.shape}; {total} numbers, those of all worlds in order, are needed"
         )
-    return np.ascontiguousarray(x).reshape(-1), _firsts(sizes)
+    return np.ascontiguousarray(x).reshape(-1), _offsets_of_sizes(sizes)
 
 
-def _joined(cones: Any, n: int) -> Cones:
-    """The blocks of n worlds one after the other."""
-    each = several("cones", cones, f"Cones, one for each of {n} worlds,")
-    if len(each) != n or not all(isinstance(c, Cones) for c in each):
-        raise InputError(f"cones is a Cones, or one for each of {n} worlds; {len(each)} things came")
-    return Cones._joined(each)
+def _concatenate_cones(cones: Any, n: int) -> Cones:
+    """Concatenate the blocks of n worlds."""
+    cones_of_worlds = check_sequence("cones", cones, f"Cones, one for each of {n} worlds,")
+    if len(cones_of_worlds) != n or not all(isinstance(c, Cones) for c in cones_of_worlds):
+        raise InputError(
+            f"cones has {len(cones_of_worlds)} entries; a Cones, or one for each of {n} worlds, is needed"
+        )
+    return Cones._concatenate(cones_of_worlds)

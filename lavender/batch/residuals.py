@@ -1,8 +1,7 @@
 """Residuals of many worlds in one call, bit-identical to single calls of `residual`, in arrays.
 
 One compiled loop processes the worlds of a `Batch`, or problems in generalised coordinates; threads share the worlds by
-an atomic counter. A single call handles every other problem. `lavender/batch/solve.py`
-solves with the same loop.
+an atomic counter. Every other problem is handled by a single call. `lavender/batch/solve.py` solves with the same loop.
 """
 
 from __future__ import annotations
@@ -16,150 +15,182 @@ import numpy as np
 from lavender.base.arrays import (
     FloatArray,
     as_array,
-    number,
-    one_of,
-    places,
+    check_choice,
+    check_float,
+    check_int,
+    check_sequence,
     read_only,
-    several,
-    whole_number,
+    resolve_index,
 )
 from lavender.base.errors import InputError, LavenderError
-from lavender.base.threads import together
+from lavender.base.threads import run_on_threads
 from lavender.batch.data import ERRORS, Batch
-from lavender.judge.residuals import AT_REST, ENOUGH, TOL, VERDICTS, Residual, residual, verdict_of
+from lavender.judge.residuals import (
+    DEFAULT_THRESHOLD,
+    MAX_REST_VELOCITY,
+    TOL,
+    VERDICTS,
+    Residual,
+    compute_verdict,
+    residual,
+)
 from lavender.problem import PRECISIONS, Problem, check_problem
 from lavender.problem.derived import cached_property
 from lavender_ext.batch.many import CODE, NUMBER, PLACE, Hand, Worlds, data_of
 
-DONE_ALL = -1  # of `Hand`: there are no more worlds
+NO_MORE_WORLDS = -1  # return value of the methods of `Hand`
 
 
 class Many:
-    """n worlds, and what the judge found of them; all arrays are read-only."""
+    """n worlds and their judged numbers; all arrays are read-only.
 
-    def __init__(self, given: Any, starts: Any, cold: bool) -> None:
-        """Of a batch, or of problems; starts: flat impulses [N s] of the batch, or (m,) or None of each problem."""
-        self.problems: Sequence[Problem] = given
+    Parameters
+    ----------
+    problems : Batch, or list of Problem
+    starts : array or list
+        Flat impulses [N s] of the batch, or (m,) or None for each problem.
+    cold : bool
+        Whether all worlds start from the zero impulse.
+    """
+
+    def __init__(self, problems: Any, starts: Any, cold: bool) -> None:
+        self.problems: Sequence[Problem] = problems
         self.faults: dict[int, LavenderError] = {}
-        self._unusable: dict[int, LavenderError] = {}  # starts, which go on as doing nothing
-        if isinstance(given, Batch):
-            place, self._sizes, self._first = given.at, given.at[:, PLACE["rows"]], given.at[:, PLACE["row"]]
-            self._impulse = np.zeros(int(np.prod(given.shape))) if cold else starts
-            self._velocity: FloatArray | None = np.zeros(int(np.prod(given.velocity_shape)))
-            self._worlds: Worlds = given.worlds(self._impulse, self._velocity, cold)
+        self._invalid_starts: dict[int, LavenderError] = {}  # These worlds start from the zero impulse.
+        if isinstance(problems, Batch):
+            at = problems.at
+            self._sizes, self._first = at[:, PLACE["rows"]], at[:, PLACE["row"]]
+            self._impulse = np.zeros(int(np.prod(problems.shape))) if cold else starts
+            self._velocity: FloatArray | None = np.zeros(int(np.prod(problems.velocity_shape)))
+            self._worlds: Worlds = problems.worlds(self._impulse, self._velocity, cold)
             return
-        self._data, self._sizes = data_of(given, Problem)
-        place = np.zeros((len(given), len(PLACE)), np.int64)
+        self._data, self._sizes = data_of(problems, Problem)
+        at = np.zeros((len(problems), len(PLACE)), np.int64)
         self._first = np.cumsum(self._sizes) - self._sizes
-        place[:, PLACE["rows"]], place[:, PLACE["row"]] = self._sizes, self._first
+        at[:, PLACE["rows"]], at[:, PLACE["row"]] = self._sizes, self._first
         self._impulse, self._velocity = np.zeros(int(self._sizes.sum())), None
-        self._worlds = Worlds(place, self._impulse, np.zeros(0), cold)
-        self._worlds.of_objects(given, self._data, starts)
+        self._worlds = Worlds(at, self._impulse, np.zeros(0), cold)
+        self._worlds.of_objects(problems, self._data, starts)
 
     @property
     def relative(self) -> FloatArray:
-        """(n,) relative residual, NaN of a world that is bad."""
+        """Relative residual (n,) [-]; NaN for an invalid world."""
         return self._numbers("relative")
 
     @property
     def energy(self) -> FloatArray:
-        """(n,) sqrt J, of the error."""
+        """Energy norm of the error (n,) [sqrt J]."""
         return self._numbers("energy")
 
     @property
     def velocity_error(self) -> FloatArray:
-        """(n,) m/s, of the worst row."""
+        """Velocity error of the worst row (n,) [m/s]."""
         return self._numbers("speed")
 
     @property
     def impulse_error(self) -> FloatArray:
-        """(n,) N s, of that row."""
+        """Impulse error of the worst row (n,) [N s]."""
         return self._numbers("push")
 
     @property
     def roundoff_floor(self) -> FloatArray:
-        """(n,) relative residual that rounding alone costs."""
+        """Relative residual that rounding alone can cause (n,) [-]."""
         return self._numbers("roundoff_floor")
 
     @property
     def worst_row(self) -> np.ndarray:
-        """(n,) row of the largest velocity error, counted in its world; -1 where there is none."""
-        self._read()
+        """Row of the largest velocity error (n,), as an index in its world; -1 if there is none."""
+        self._judge_late_worlds()
         return read_only(self._worlds.worst[:-1])
 
     def _numbers(self, which: str) -> FloatArray:
-        self._read()
+        self._judge_late_worlds()
         return read_only(self._worlds.numbers[NUMBER[which], :-1])
 
-    def _read(self) -> None:
-        """Judge what is not yet."""
+    def _judge_late_worlds(self) -> None:
+        """Judge worlds that were not judged during the call; a derived class may have some."""
 
     def _rows(self, i: int) -> slice:
         return slice(int(self._first[i]), int(self._first[i] + self._sizes[i]))
 
-    def _keep(self, i: int, found: Residual) -> None:
-        """What the judge found of a world that the loop left."""
-        known = {
-            "relative": found.relative, "energy": found.energy, "speed": found.velocity,
-            "roundoff_floor": found.roundoff_floor,
-            "reference_energy": found.energy_at_zero, "reference_speed": found.velocity_at_zero,
-            "above_floor": found.above_floor,
-            "push": abs(found.error[found.worst_row]) if found.worst_row >= 0 else 0.0,
+    def _store_residual(self, i: int, residual: Residual) -> None:
+        """Store the judged numbers of a world that the loop did not process."""
+        numbers = {
+            "relative": residual.relative, "energy": residual.energy, "speed": residual.velocity,
+            "roundoff_floor": residual.roundoff_floor,
+            "reference_energy": residual.energy_at_zero, "reference_speed": residual.velocity_at_zero,
+            "above_floor": residual.above_floor,
+            "push": abs(residual.error[residual.worst_row]) if residual.worst_row >= 0 else 0.0,
         }  # fmt: skip
-        for name, x in known.items():
+        for name, x in numbers.items():
             self._worlds.numbers[NUMBER[name], i] = x
-        self._worlds.worst[i] = found.worst_row
+        self._worlds.worst[i] = residual.worst_row
 
     def __getstate__(self) -> dict[str, Any]:
-        """What came of the worlds, without the loop that has ended."""
+        """Return the results without the data of the compiled loop."""
         loop = self._worlds
-        found = SimpleNamespace(numbers=loop.numbers, worst=loop.worst, counts=loop.counts, code=loop.code)
-        return vars(self) | {"_worlds": found, "_data": None}
+        results = SimpleNamespace(numbers=loop.numbers, worst=loop.worst, counts=loop.counts, code=loop.code)
+        return vars(self) | {"_worlds": results, "_data": None}
 
     def __len__(self) -> int:
         return len(self.problems)
 
     def __getitem__(self, i: Any) -> Any:
-        """Of world i, or a list of several."""
-        i = places(i, len(self))
+        """Return the result of world i, or a list of results; raise the error of an invalid world."""
+        i = resolve_index(i, len(self))
         if isinstance(i, list):
             return [self[j] for j in i]
         if i in self.faults:
             raise self.faults[i]
-        return self._one(i)
+        return self._get(i)
 
-    def _one(self, i: int) -> Any:
-        """Of a world whose data are a problem's."""
+    def _get(self, i: int) -> Any:
+        """Return the result of a valid world."""
         raise NotImplementedError
 
     def _run(
-        self, turn: Callable[[Hand], int], alone: Callable[[int], None], threads: int, errors: str
+        self,
+        process_next: Callable[[Hand], int],
+        process_single: Callable[[int], None],
+        threads: int,
+        errors: str,
     ) -> None:
-        """All worlds by `turn`; those that it leaves by `alone`; what is bad by its number in `faults`."""
+        """Process all worlds, and store the errors of invalid ones in `faults`.
 
-        def single(i: int, stop: bytearray) -> None:
+        Parameters
+        ----------
+        process_next : callable
+            Processes the next world in the compiled loop, or returns its index if a single call must process it.
+        process_single : callable
+            Processes a world by a single call.
+        threads : int
+        errors : {"raise", "status"}
+        """
+
+        def try_single(i: int, stop: bytearray) -> None:
             try:
-                alone(i)
+                process_single(i)
             except LavenderError as error:
-                self.faults[i] = self._fault(i, error)
+                self.faults[i] = self._make_fault(i, error)
                 stop[0] |= errors == "raise"
 
         def work(stop: bytearray) -> None:
             hand = Hand(self._worlds, stop)
-            while (i := turn(hand)) != DONE_ALL:
+            while (i := process_next(hand)) != NO_MORE_WORLDS:
                 if i >= 0:
-                    single(i, stop)
+                    try_single(i, stop)
 
-        together(work, min(threads, len(self)))
+        run_on_threads(work, min(threads, len(self)))
         for i in np.flatnonzero(self._worlds.code[:-1] == CODE["bad"]).tolist():
-            single(i, bytearray(1))  # which finds the words
+            try_single(i, bytearray(1))  # raises an error with a message
         if self.faults and errors == "raise":
             raise self.faults[min(self.faults)]
-        self.faults.update(self._unusable)
+        self.faults.update(self._invalid_starts)
         for i in self.faults:
             self._worlds.numbers[:, i] = np.nan
 
-    def _fault(self, i: int, error: LavenderError) -> LavenderError:
+    def _make_fault(self, i: int, error: LavenderError) -> LavenderError:
+        """Return the error of world i, with the index of the world for a batch."""
         if isinstance(self.problems, Batch) and isinstance(error, InputError):
             return InputError(f"world {i}: {error}")
         return error
@@ -170,56 +201,61 @@ class Residuals(Many):
 
     Parameters
     ----------
-    relative, energy, velocity_error, impulse_error, floor : (n,)
-        As of `Solutions`; the floor is that of `precision`.
+    relative, energy, velocity_error, impulse_error, roundoff_floor : (n,)
+        As for `Solutions`; the floor is that of `precision`.
     worst_row : (n,) int
     precision : {"float64", "float32"} or sequence of them
     threshold : float, m/s
-    faults : dict
-        What is wrong with the worlds whose data are no problem's, by their numbers.
+    faults : dict of int to LavenderError
+        Errors of invalid worlds, by their indices.
     """
 
-    def __init__(self, given: Any, starts: Any, precision: Sequence[str], threshold: float) -> None:
-        super().__init__(given, starts, False)
+    def __init__(self, problems: Any, starts: Any, precision: Sequence[str], threshold: float) -> None:
+        super().__init__(problems, starts, False)
         self.precision, self.threshold = precision, threshold
-        if not isinstance(given, Batch):
+        if not isinstance(problems, Batch):
             self._impulse[:] = np.concatenate([np.zeros(0), *starts])
-        self._nothing: dict[int, bool] = {}  # of worlds that the loop left
+        self._nothing_to_do: dict[int, bool] = {}  # of worlds that single calls processed
 
     @cached_property
     def verdict(self) -> np.ndarray:
-        """(n,) as `Residual.verdict`; "" of a bad world."""
-        nothing = (self._numbers("relative_at_zero") < 0.5) | (self._numbers("reference_speed") < AT_REST)
-        for i, known in self._nothing.items():
-            nothing[i] = known
-        names = "relative", "roundoff_floor", "above_floor", "energy", "speed", "rhs_energy"
-        each = zip(
-            *(self._numbers(name).tolist() for name in names), nothing.tolist(), self.precision, strict=True
+        """Verdict of each world (n,), as `Residual.verdict`; "" for an invalid world."""
+        nothing_to_do = (self._numbers("relative_at_zero") < 0.5) | (
+            self._numbers("reference_speed") < MAX_REST_VELOCITY
         )
-        words = [verdict_of(*x, self.threshold) for x in each]  # type: ignore[call-arg]
+        for i, value in self._nothing_to_do.items():
+            nothing_to_do[i] = value
+        names = "relative", "roundoff_floor", "above_floor", "energy", "speed", "rhs_energy"
+        arguments = zip(
+            *(self._numbers(name).tolist() for name in names),
+            nothing_to_do.tolist(),
+            self.precision,
+            strict=True,
+        )
+        verdicts = [compute_verdict(*x, self.threshold) for x in arguments]  # type: ignore[call-arg]
         for i in self.faults:
-            words[i] = ""
-        return read_only(np.array(words, f"U{max(map(len, VERDICTS))}"))
+            verdicts[i] = ""
+        return read_only(np.array(verdicts, f"U{max(map(len, VERDICTS))}"))
 
     @property
     def excess(self) -> FloatArray:
-        """(n,) relative residual over its floor."""
+        """Relative residual divided by its floor (n,)."""
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.where(self.relative == 0.0, 0.0, self.relative / self.roundoff_floor)
 
-    def keep(self, i: int, found: Residual) -> None:
-        """The residual of a world that the loop left."""
-        self._keep(i, found)
-        self._nothing[i] = found.nothing_to_do
-        self._worlds.numbers[NUMBER["rhs_energy"], i] = found.energy_rhs
+    def store(self, i: int, residual: Residual) -> None:
+        """Store the residual of a world that a single call processed."""
+        self._store_residual(i, residual)
+        self._nothing_to_do[i] = residual.nothing_to_do
+        self._worlds.numbers[NUMBER["rhs_energy"], i] = residual.energy_rhs
 
-    def _one(self, i: int) -> Residual:
+    def _get(self, i: int) -> Residual:
         return residual(self.problems[i], self._impulse[self._rows(i)], self.precision[i], self.threshold)
 
     def __repr__(self) -> str:
-        words, counts = np.unique(self.verdict, return_counts=True)
-        told = ", ".join(f"{n} {word or 'bad'}" for word, n in zip(words, counts, strict=True))
-        return f"<Residuals of {len(self)} worlds: {told}>"
+        verdicts, counts = np.unique(self.verdict, return_counts=True)
+        summary = ", ".join(f"{n} {verdict or 'bad'}" for verdict, n in zip(verdicts, counts, strict=True))
+        return f"<Residuals of {len(self)} worlds: {summary}>"
 
 
 def residual_many(
@@ -227,34 +263,34 @@ def residual_many(
     impulses: Any,
     *,
     precision: str | None = None,
-    threshold: float = ENOUGH,
+    threshold: float = DEFAULT_THRESHOLD,
     threads: int = 1,
     errors: str = "raise",
 ) -> Residuals:
-    """The judge alone, on impulses from anywhere: an error and a verdict for each world.
+    """Judge impulses of many worlds: compute an error and a verdict for each.
 
     Parameters
     ----------
     problems : Batch, or iterable of Problem
     impulses : N s
-        In the shape of the batch's impulses; of problems a sequence of (m,). Entries may be infinite or NaN.
+        An array of the batch's shape of impulses, or a sequence of (m,) for problems. Entries may be infinite or NaN.
     precision : {"float64", "float32"}, optional
-        In which the impulses were computed; default: that of each problem.
+        Precision in which the impulses were computed. Default: the precision of each problem.
     threshold : float, m/s
-        As `residual`.
+        As for `residual`.
     threads : int
     errors : {"raise", "status"}
-        As `solve_many`; the verdict of a bad world is empty.
+        As for `solve_many`; the verdict of an invalid world is empty.
 
     Returns
     -------
     Residuals
-        With the numbers of `residual` on each, to the bit.
+        Numbers that are bit-identical to those of `residual` for each world.
 
     Raises
     ------
     InputError
-        Shapes that do not fit, an unknown precision, a negative threshold, or a world that is bad.
+        The shapes disagree, the precision is unknown, the threshold is negative, or a world is invalid.
 
     Examples
     --------
@@ -266,55 +302,56 @@ def residual_many(
     >>> found.verdict.tolist(), found.velocity_error.round(6).tolist()
     (['at its floor', 'stopped before convergence', 'wrong'], [0.0, 0.1, 1.0])
     """
-    given = given_problems(problems, errors)
+    worlds = check_problems(problems, errors)
     if precision is not None:
-        precision = one_of("precision", precision, PRECISIONS)
-    threshold = number("threshold", threshold, low=0.0)
-    threads = whole_number("threads", threads, 1, None)
-    if isinstance(given, Batch):
-        starts: Any = given.impulses("impulses", impulses)
-        words = len(given) * [given.precision if precision is None else precision]
+        precision = check_choice("precision", precision, PRECISIONS)
+    threshold = check_float("threshold", threshold, low=0.0)
+    threads = check_int("threads", threads, 1, None)
+    if isinstance(worlds, Batch):
+        starts: Any = worlds.impulses("impulses", impulses)
+        precisions = len(worlds) * [worlds.precision if precision is None else precision]
     else:
-        starts = of_each(given, impulses)
+        starts = check_impulses(worlds, impulses)
         for i, start in enumerate(starts):
             if start is None:
                 raise InputError(
                     f"impulses of world {i} is None, and the problem has no guess; (m,) is needed"
                 )
-        words = [p.precision if precision is None else precision for p in given]
-    made = Residuals(given, starts, words, threshold)
-    single = isinstance(given, Batch) and "float32" in words
+        precisions = [p.precision if precision is None else precision for p in worlds]
+    residuals = Residuals(worlds, starts, precisions, threshold)
+    is_single_precision = isinstance(worlds, Batch) and "float32" in precisions
 
-    def alone(i: int) -> None:
-        made.keep(i, residual(given[i], made._impulse[made._rows(i)], words[i], threshold))
+    def judge_single(i: int) -> None:
+        impulse = residuals._impulse[residuals._rows(i)]
+        residuals.store(i, residual(worlds[i], impulse, precisions[i], threshold))
 
-    made._run(lambda hand: int(hand.judge(TOL, single)), alone, threads, errors)
-    for i, word in enumerate(words):  # The compiled loop judges the problems of a list for float64.
-        if word == "float32" and not single and i not in made.faults:
-            alone(i)
-    return made
+    residuals._run(lambda hand: int(hand.judge(TOL, is_single_precision)), judge_single, threads, errors)
+    for i, precision in enumerate(precisions):  # The compiled loop judges the problems of a list for float64.
+        if precision == "float32" and not is_single_precision and i not in residuals.faults:
+            judge_single(i)
+    return residuals
 
 
-def given_problems(problems: Any, errors: str) -> Any:
-    """A batch, or a list of problems."""
-    one_of("errors", errors, ERRORS)
+def check_problems(problems: Any, errors: str) -> Any:
+    """Return a batch, or a list of problems; raise InputError for other arguments or an unknown `errors`."""
+    check_choice("errors", errors, ERRORS)
     if isinstance(problems, Problem):
         raise InputError("problems is one Problem; a list of them is needed, or `solve`")
     if isinstance(problems, Batch):
         return problems
-    given = several("problems", problems, "Problems, or a Batch,")
-    for problem in given:
+    problems = check_sequence("problems", problems, "Problems, or a Batch,")
+    for problem in problems:
         if type(problem) is not Problem:
             check_problem(problem)
-    return given
+    return problems
 
 
-def of_each(given: Any, impulses: Any) -> list[Any]:
-    """Impulses (m,) [N s] of each problem, its guess where there are none."""
-    impulses = several("impulses", impulses, "(m,), one for each problem,")
-    if len(impulses) != len(given):
-        raise InputError(f"{len(impulses)} impulses for {len(given)} problems; one for each is needed")
+def check_impulses(problems: Any, impulses: Any) -> list[Any]:
+    """Convert the impulses (m,) [N s] of each problem; its guess replaces None."""
+    impulses = check_sequence("impulses", impulses, "(m,), one for each problem,")
+    if len(impulses) != len(problems):
+        raise InputError(f"{len(impulses)} impulses for {len(problems)} problems; one for each is needed")
     return [
         p.guess if x is None else as_array(f"impulses of world {i}", x, (p.m,), finite=False, unit="N s")
-        for i, (p, x) in enumerate(zip(given, impulses, strict=True))
+        for i, (p, x) in enumerate(zip(problems, impulses, strict=True))
     ]

@@ -1,7 +1,7 @@
-"""Many problems in one call: the results of `solve` on each, with the same bits, in arrays.
+"""Solve many problems in one call, with results that are bit-identical to those of `solve`, in arrays.
 
-The compiled loop of `lavender/batch/residuals.py` solves what it can; a single `solve` handles every other problem. A
-`Solution` is built at its first access.
+The compiled loop of `lavender/batch/residuals.py` solves the problems that it supports; every other problem is solved
+by a single `solve`. A `Solution` is built at its first access.
 """
 
 from __future__ import annotations
@@ -12,12 +12,12 @@ from typing import Any, overload
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray, read_only, whole_number
+from lavender.base.arrays import FloatArray, check_int, read_only
 from lavender.base.deadline import NEVER, Deadline
 from lavender.base.errors import InputError, LavenderError
 from lavender.batch.data import Batch
-from lavender.batch.residuals import Many, given_problems, of_each
-from lavender.judge.residuals import judged, reading_time
+from lavender.batch.residuals import Many, check_impulses, check_problems
+from lavender.judge.residuals import judge_impulse, reading_time
 from lavender.judge.solution import CONTRADICTED, Solution, Status, uninterrupted
 from lavender.problem import Problem
 from lavender.problem.derived import cached_property
@@ -38,39 +38,38 @@ from lavender_ext.judge.measure import all_finite
 
 __all__ = ["Solutions", "solve_many"]
 
-LATE, ENTRY = (
-    4e-6,
-    5e-9,
-)  # s, of the judge on a world of J and M whose turn comes too late, and for each multiply-add
-UNREAD = 4e-5  # s, of one that he reads later
-STATUS = np.array(list(Status), object)
-NUMBER_OF = {status: i for i, status in enumerate(Status)}
+# Worlds that are not started before the deadline are late: their start is judged.
+JUDGE_TIME_OF_LATE_WORLD = 4e-6  # s to judge a late world with J and M in the compiled loop, ...
+JUDGE_TIME_PER_PRODUCT = 5e-9  # ... and for each multiply-add.
+LATE_WORLD_TIME = 4e-5  # s to store a late world of a list that is judged when its numbers are read.
+STATUS_OF_INDEX = np.array(list(Status), object)
+INDEX_OF_STATUS = {status: i for i, status in enumerate(Status)}
 
 
 class Solutions(Many, Sequence[Solution]):
     """Results of `solve_many`, in read-only arrays; `many[i]` is the `Solution` of world i.
 
-    `many[many.success]`, `many[2:5]` and `many[[0, 7]]` are lists of solutions. Access to a world whose status is
+    `many[many.success]`, `many[2:5]` and `many[[0, 7]]` are lists of solutions. Access to a world with the status
     INVALID_PROBLEM raises its error.
 
     Parameters
     ----------
     impulse : N s
-        Of a stacked batch (n, m), 0 beyond the rows of a world that has fewer; else of all rows, where `ptr` says which
-        world they are of. NaN of a world that is INVALID_PROBLEM, like all its numbers; its counts are 0.
+        (n, m) for a stacked batch, with 0 in padding rows; else a flat array of all rows, see `ptr`. For a world with
+        the status INVALID_PROBLEM all numbers are NaN and all counts are 0.
     status : (n,) of Status
-        INVALID_PROBLEM where the data of a world are no problem's.
-    relative, energy, velocity_error, impulse_error, floor : (n,)
-        Of the judge: -, sqrt J, m/s and N s of the worst row, -.
+        INVALID_PROBLEM for a world with invalid data.
+    relative, energy, velocity_error, impulse_error, roundoff_floor : (n,)
+        Numbers of the judge [-, sqrt J, m/s, N s, -]; the errors are those of the worst row.
     worst_row, iterations : (n,) int
     tol : float, -
-    faults : dict
-        What is wrong with the worlds that are INVALID_PROBLEM, by their numbers.
+    faults : dict of int to LavenderError
+        Errors of worlds with the status INVALID_PROBLEM, by their indices.
     """
 
     def __init__(
         self,
-        given: Any,
+        problems: Any,
         starts: Any,
         cold: bool,
         tol: float,
@@ -78,14 +77,14 @@ class Solutions(Many, Sequence[Solution]):
         options: dict[str, Any],
         errors: str,
     ) -> None:
-        super().__init__(given, starts, cold)
+        super().__init__(problems, starts, cold)
         self.tol, self._spec, self._starts, self._cold = tol, spec, starts, cold
         self._options, self._errors = options, errors
-        self._kept: dict[int, Solution] = {}
-        self._unread: list[int] = []  # worlds whose turn came too late: their starts, not judged yet
-        self._seconds = 0.0  # share of each
-        # Of a batch the loop writes over the starts.
-        self._given = None if cold or not isinstance(given, Batch) else starts.copy()
+        self._solutions: dict[int, Solution] = {}
+        self._late_worlds: list[int] = []  # worlds with a start that is not judged yet
+        self._time_per_world = 0.0  # s, mean
+        # For a batch, the loop overwrites the starts.
+        self._given_starts = None if cold or not isinstance(problems, Batch) else starts.copy()
 
     def __getstate__(self) -> dict[str, Any]:
         return super().__getstate__() | {"_spec": self._spec.name}
@@ -95,108 +94,116 @@ class Solutions(Many, Sequence[Solution]):
 
     @property
     def impulse(self) -> FloatArray:
-        """See the class."""
+        """Impulses [N s], see the class."""
         shape = self.problems.shape if isinstance(self.problems, Batch) else self._impulse.shape
         return read_only(self._impulse.reshape(shape))
 
     @cached_property
     def velocity(self) -> FloatArray:
-        """v+ [m/s, rad/s]: of a stacked batch (n, nv); else of all worlds one after the other, none of a matrix."""
+        """v+ [m/s, rad/s]: (n, nv) for a stacked batch, else concatenated; problems given as a matrix have none."""
         if isinstance(self.problems, Batch):
-            self._read()
+            self._judge_late_worlds()
             return read_only(self._velocity.reshape(self.problems.velocity_shape))  # type: ignore[union-attr]
-        found = [np.zeros(0)]
+        velocities = [np.zeros(0)]
         for i, p in enumerate(self.problems):
             if p.matrix is None:
-                own = p.velocity(p._start if i in self.faults else self._impulse[self._rows(i)]).ravel()
-                found.append(np.full_like(own, np.nan) if i in self.faults else own)
-        return read_only(np.concatenate(found))
+                v = p.velocity(p._start if i in self.faults else self._impulse[self._rows(i)]).ravel()
+                velocities.append(np.full_like(v, np.nan) if i in self.faults else v)
+        return read_only(np.concatenate(velocities))
 
     @cached_property
     def status(self) -> np.ndarray:
-        """See the class."""
+        """Status of each world (n,), see the class."""
         code = self._worlds.code[:-1]
-        out = np.where(code == CODE["late"], NUMBER_OF[Status.TIME_LIMIT], NUMBER_OF[Status.CONVERGED])
-        for i, solution in self._kept.items():
-            out[i] = NUMBER_OF[solution.status]
+        out = np.where(
+            code == CODE["late"], INDEX_OF_STATUS[Status.TIME_LIMIT], INDEX_OF_STATUS[Status.CONVERGED]
+        )
+        for i, solution in self._solutions.items():
+            out[i] = INDEX_OF_STATUS[solution.status]
         for i in self.faults:
-            out[i] = NUMBER_OF[Status.INVALID_PROBLEM]
-        return read_only(STATUS[out])
+            out[i] = INDEX_OF_STATUS[Status.INVALID_PROBLEM]
+        return read_only(STATUS_OF_INDEX[out])
 
     @property
     def iterations(self) -> np.ndarray:
-        """(n,) in the solver's own unit."""
+        """Iterations (n,) in the solver's own unit."""
         return read_only(self._worlds.counts[:-1, 0])
 
     @property
     def success(self) -> np.ndarray:
-        """(n,) bool: the judge's relative residual is at most `tol`."""
+        """Whether the judge's relative residual of each world (n,) is at most `tol`."""
         return self.relative <= self.tol
 
     @property
     def ptr(self) -> np.ndarray:
-        """(n + 1,) first row of each world where `impulse` is flat, then the number of rows."""
+        """First row of each world in a flat `impulse`, followed by the number of rows (n + 1,)."""
         return np.append(self._first, self._impulse.size)
 
     @property
-    def placed(self) -> tuple[FloatArray, np.ndarray, np.ndarray]:
-        """All impulses [N s], flat; where each world's begin, and how many rows it has."""
+    def flat_impulses(self) -> tuple[FloatArray, np.ndarray, np.ndarray]:
+        """Flat array of all impulses [N s], and offset and number of rows of each world (n,)."""
         return read_only(self._impulse.view()), self._first, self._sizes
 
     def start(self, i: int) -> Any:
-        """The start (m,) [N s] of world i, None of one without."""
+        """Return the start (m,) [N s] of world i, or None if none was given."""
         if isinstance(self.problems, Batch):
-            return None if self._given is None else self._given[self._rows(i)]
+            return None if self._given_starts is None else self._given_starts[self._rows(i)]
         return self._starts[i]
 
-    def late(self, i: int, found: Solution) -> None:
-        """The start of a world whose turn came too late, judged when its numbers are read."""
-        self._kept[i] = found
-        self._impulse[self._rows(i)] = found.impulse
-        self._unread.append(i)
+    def store_late(self, i: int, solution: Solution) -> None:
+        """Store a late world, whose start is judged when its numbers are read."""
+        self._solutions[i] = solution
+        self._impulse[self._rows(i)] = solution.impulse
+        self._late_worlds.append(i)
 
     def mark_late(self, i: int) -> None:
-        """Keep the start of a late world of a batch, whose problem is made when its numbers are read."""
+        """Store the start of a late world of a batch, whose problem is built when its numbers are read."""
         if self._cold:
             self._impulse[self._rows(i)] = self.problems.start(i)  # type: ignore[attr-defined]
         self._worlds.code[i] = CODE["late"]
-        self._unread.append(i)
+        self._late_worlds.append(i)
 
-    def _read(self) -> None:
-        # A thread that comes meanwhile works out the same numbers.
-        for i in self._unread:
+    def _judge_late_worlds(self) -> None:
+        """Judge the starts of late worlds."""
+        # Another thread may do the same at the same time, with the same numbers.
+        for i in self._late_worlds:
             try:
-                self.keep(i, self._one(i))
+                self.store(i, self._get(i))
             except LavenderError as error:
                 if self._errors == "raise":
                     raise
                 self.faults[i], self._worlds.numbers[:, i] = error, np.nan
-                self.empty_refused()
-        self._unread = []
+                self.clear_invalid()
+        self._late_worlds = []
 
-    def keep(self, i: int, found: Solution) -> None:
-        """The solution of a world that the loop left."""
-        self._kept[i] = found
-        self._impulse[self._rows(i)] = found.impulse
-        self._keep(i, found.residual)
-        self._worlds.counts[i, 0] = found.iterations
-        problem = found.residual._problem
+    def store(self, i: int, solution: Solution) -> None:
+        """Store the solution of a world that a single call solved."""
+        self._solutions[i] = solution
+        self._impulse[self._rows(i)] = solution.impulse
+        self._store_residual(i, solution.residual)
+        self._worlds.counts[i, 0] = solution.iterations
+        problem = solution.residual._problem
         if self._velocity is not None and self._velocity.size and problem.matrix is None:
-            v = problem.velocity(found.impulse).ravel()
+            v = problem.velocity(solution.impulse).ravel()
             first = int(self.problems.at[i, PLACE["velocity"]])  # type: ignore[attr-defined]
             self._velocity[first : first + len(v)] = v
 
-    def _reading(self) -> float:
-        """What the results take [s] where nobody has his turn."""
+    def _time_to_judge_starts(self) -> float:
+        """Estimate the time [s] of the results if no world is started before the deadline."""
         if isinstance(self.problems, Batch):
-            rows, columns = (self.problems.at[:, PLACE[of]].astype(float) for of in ("rows", "velocities"))
-            entries = np.where(columns > 0.0, columns, rows)  # of a row; A has its own
-            return LATE * len(rows) + ENTRY * float(np.sum(rows * (2.0 * entries + 4.0)))
-        both = zip(self.problems, self._data, strict=True)
-        return sum(LATE + reading_time(p) if data and p.generalized else UNREAD for p, data in both)
+            rows, columns = (
+                self.problems.at[:, PLACE[name]].astype(float) for name in ("rows", "velocities")
+            )
+            entries = np.where(columns > 0.0, columns, rows)  # entries of a row of J, or of A
+            products = float(np.sum(rows * (2.0 * entries + 4.0)))
+            return JUDGE_TIME_OF_LATE_WORLD * len(rows) + JUDGE_TIME_PER_PRODUCT * products
+        return sum(
+            JUDGE_TIME_OF_LATE_WORLD + reading_time(p) if data and p.generalized else LATE_WORLD_TIME
+            for p, data in zip(self.problems, self._data, strict=True)
+        )
 
-    def empty_refused(self) -> None:
-        """What stands in the arrays for worlds that are INVALID_PROBLEM is no answer."""
+    def clear_invalid(self) -> None:
+        """Set the numbers of worlds with the status INVALID_PROBLEM to NaN and their counts to 0."""
         for i in self.faults:
             self._impulse[self._rows(i)] = np.nan
             self._worlds.counts[i], self._worlds.worst[i] = 0, -1
@@ -211,46 +218,55 @@ class Solutions(Many, Sequence[Solution]):
     def __getitem__(self, i: Any) -> Any:
         return super().__getitem__(i)
 
-    def _one(self, i: int) -> Solution:
-        if i not in self._kept:
-            self._kept[i] = self._make_late_solution(i) if i in self._unread else self._solution(i)
-        return self._kept[i]
+    def _get(self, i: int) -> Solution:
+        if i not in self._solutions:
+            make = self._make_late_solution if i in self._late_worlds else self._make_solution
+            self._solutions[i] = make(i)
+        return self._solutions[i]
 
     def _make_late_solution(self, i: int) -> Solution:
-        """Of a world of a batch of which nothing was read before the deadline."""
+        """Build the solution of a late world of a batch, of which nothing was read before the deadline."""
         try:
             problem = self.problems[i]
         except LavenderError as error:
-            raise self._fault(i, error) from None
+            raise self._make_fault(i, error) from None
         start = self._impulse[self._rows(i)]
         return unjudged(problem, self._spec, self._options, start, self.tol, f"{NO_TURN}, unjudged")
 
-    def _solution(self, i: int) -> Solution:
-        """Of a world that the loop ended."""
+    def _make_solution(self, i: int) -> Solution:
+        """Build the solution of a world that the compiled loop processed."""
         if not self._sizes[i]:
             return solve(self.problems[i], self._spec.name, tol=self.tol)
         impulse, late = self._impulse[self._rows(i)].copy(), self._worlds.code[i] == CODE["late"]
         impulse.setflags(write=False)
         status = Status.TIME_LIMIT if late else Status.CONVERGED
-        return Solution.late(impulse, status, self.tol, self._seconds, (self._rest, (i, impulse, status)))
+        return Solution.late(
+            impulse,
+            status,
+            self.tol,
+            self._time_per_world,
+            (self._make_postponed_fields, (i, impulse, status)),
+        )
 
-    def _rest(self, i: int, impulse: FloatArray, status: Status) -> dict[str, Any]:
+    def _make_postponed_fields(self, i: int, impulse: FloatArray, status: Status) -> dict[str, Any]:
+        """Compute the fields of a solution that are not needed before its first use."""
         problem = self.problems[i]
-        found = judged(problem, impulse).refine(self.tol)
-        started = self._worlds.code[i] in (CODE["late"], CODE["started"])
-        counts = None if started else self._counts(problem, i)
-        rest = rest_of(problem, self._spec, found, counts, self.start(i), status)
-        then = float(self._worlds.numbers[NUMBER["relative"], i])
-        if status is Status.CONVERGED and found.relative != then:  # the same data have the same bits
-            rest["claim_check"] = CONTRADICTED
-            rest["status_conflict"] = (
-                f"says {status.name} of other data, with relative residual {then:.2e} (now {found.relative:.2e}): "
-                f"the arrays of world {i} were written over after the solve"
+        judgement = judge_impulse(problem, impulse).refine(self.tol)
+        is_start = self._worlds.code[i] in (CODE["late"], CODE["started"])
+        counts = None if is_start else self._counts(problem, i)
+        fields = rest_of(problem, self._spec, judgement, counts, self.start(i), status)
+        solved_relative = float(self._worlds.numbers[NUMBER["relative"], i])
+        # Equal data have bit-identical residuals.
+        if status is Status.CONVERGED and judgement.relative != solved_relative:
+            fields["claim_check"] = CONTRADICTED
+            fields["status_conflict"] = (
+                f"says {status.name} of other data, with relative residual {solved_relative:.2e} (now "
+                f"{judgement.relative:.2e}): the arrays of world {i} were written over after the solve"
             )
-        return rest
+        return fields
 
     def _counts(self, problem: Problem, i: int) -> tuple[int, ...]:
-        """What the loop did for world i."""
+        """Return the counts of the compiled loop for world i."""
         counts = tuple(self._worlds.counts[i].tolist())
         return counts if problem.generalized is None else counts[:4]
 
@@ -271,131 +287,141 @@ def solve_many(
     errors: str = "raise",
     **options: Any,
 ) -> Solutions:
-    """Solve many problems, with the bits of `solve` on each for any number of threads.
+    """Solve many problems, with results that are bit-identical to those of `solve` for any number of threads.
 
     Parameters
     ----------
     problems : Batch, or iterable of Problem
     solver : str
     impulse : N s, optional
-        Of a batch, in the shape of its impulses: warm starts. Default: from doing nothing.
+        For a batch: warm starts, an array of the batch's shape of impulses. Default: the zero impulse.
     impulses : sequence of (m,) N s, optional
-        Of problems: warm start of each, None for one without; default: as `solve`.
+        For problems: warm start of each, or None. Default: as for `solve`.
     threads : int
-        Worlds solved at the same time; each thread takes the next one that nobody has.
+        Number of worlds that are solved at the same time. Each thread starts the next world that no thread has started.
     tol, max_iter, **options
-        As `solve`.
+        As for `solve`.
     time_limit : float, optional, s
-        Limit of the whole call on the wall clock. Worlds take their turns in order, each with all of the time left;
-        those whose turn comes too late keep their start, with status TIME_LIMIT; the data of such a world of a batch
-        may be checked only when its numbers are read.
+        Limit of the wall-clock time of the whole call. Worlds are solved in order, each with all of the remaining time.
+        Worlds that are not started in time keep their start and have the status TIME_LIMIT. In a batch, their data may
+        not be checked before their numbers are read.
     errors : {"raise", "status"}
-        Of a world whose data or start are refused (NaN, an M that is not definite, a negative mu): raise what is wrong
-        with the first, or go on and give it the status INVALID_PROBLEM; `Solutions.faults` has the words.
+        For worlds with invalid data or an invalid start (NaN, an M that is not definite, a negative mu): raise the
+        error of the first one, or give them the status INVALID_PROBLEM and store the errors in `Solutions.faults`.
 
     Returns
     -------
     Solutions
-        In the order of the worlds: arrays, and `many[i]` a `Solution`.
+        Arrays in the order of the worlds; `many[i]` is a `Solution`.
 
     Raises
     ------
     InputError
-        `threads` is not a whole number from 1, starts do not fit the problems, or as `solve`.
+        `threads` is not a whole number from 1, starts do not fit the problems, or as for `solve`.
     UnknownName, CapabilityError, SolverUnavailable
-        As `solve`, for the first world that is refused.
+        As for `solve`, for the first world that is not accepted.
     KeyboardInterrupt
-        Ctrl-C; a thread ends the world that it has in hand.
+        Ctrl-C was pressed; each thread completes its current world.
     """
-    given = given_problems(problems, errors)
-    threads = whole_number("threads", threads, 1, None)
+    worlds = check_problems(problems, errors)
+    threads = check_int("threads", threads, 1, None)
     spec, limit = get(solver), seconds_of(time_limit)
     deadline = NEVER if limit == np.inf else Deadline(limit)
     check_budget(spec, tol, max_iter)
-    starts, unusable = _starts(given, impulse, impulses, errors)
-    made = Solutions(given, starts, starts is None, tol, spec, options, errors)
-    made._unusable = unusable
-    # What the results of those to come take is kept free.
+    starts, invalid_starts = _check_starts(worlds, impulse, impulses, errors)
+    solutions = Solutions(worlds, starts, starts is None, tol, spec, options, errors)
+    solutions._invalid_starts = invalid_starts
     if deadline.is_set:
-        deadline.keep(made._reading())
+        deadline.reserve(solutions._time_to_judge_starts())
     more = {"tol": tol, "max_iter": max_iter, **options}
-    # What `solve` would ask of one compiled call.
-    together = (
+    # The compiled loop is used under the conditions under which `solve` makes a single compiled call.
+    uses_loop = (
         spec.builtin and not options and max_iter is None and isinstance(tol, float) and 0.0 < tol < np.inf
     )
-    small = spec.small if together else None
-    asked = (small.limits, small.rules) if small is not None else (None, None)
+    small = spec.small if uses_loop else None
+    limits = (small.limits, small.rules) if small is not None else (None, None)
 
-    def turn(hand: Hand) -> int:
+    def process_next(hand: Hand) -> int:
         if not deadline.is_set:
-            return int(hand.solve(tol, *asked))
+            return int(hand.solve(tol, *limits))
         if deadline.passed(0.0):
             return int(hand.judge(tol, False, True))
-        return int(hand.solve(tol, *asked, COUNTED * (deadline.left(LEAST) or LEAST)))
+        return int(hand.solve(tol, *limits, COUNTED * (deadline.remaining(LEAST) or LEAST)))
 
-    def alone(i: int) -> None:
-        # The first late world of a batch is made, so that a solver that refuses its kind says so; the others are not.
-        is_another = isinstance(given, Batch) and made._unread and made._worlds.code[i] != CODE["bad"]
-        if is_another and deadline.passed():
-            made.mark_late(i)
+    def solve_single(i: int) -> None:
+        # The problem of the first late world of a batch is built, so that a solver that does not accept it raises an
+        # error. The problems of other late worlds are not built.
+        is_further_world = (
+            isinstance(worlds, Batch) and solutions._late_worlds and solutions._worlds.code[i] != CODE["bad"]
+        )
+        if is_further_world and deadline.passed():
+            solutions.mark_late(i)
             return
-        problem, start = given[i], made.start(i)
-        if small is not None and made._worlds.code[i] == CODE["tried"] and not deadline.is_set:
-            small.in_vain(problem, start, tol, made._counts(problem, i))
+        problem, start = worlds[i], solutions.start(i)
+        if small is not None and solutions._worlds.code[i] == CODE["tried"] and not deadline.is_set:
+            small.in_vain(problem, start, tol, solutions._counts(problem, i))
         if deadline.is_set:
-            if not isinstance(given, Batch):
-                deadline.keep(-UNREAD)
+            if not isinstance(worlds, Batch):
+                deadline.reserve(-LATE_WORLD_TIME)
             if deadline.passed():
                 check_taken(problem, spec, deadline)
-                made.late(i, unjudged(problem, spec, options, start, tol, f"{NO_TURN}, unjudged"))
+                unsolved = unjudged(problem, spec, options, start, tol, f"{NO_TURN}, unjudged")
+                solutions.store_late(i, unsolved)
                 return
-        found = solve(problem, solver, impulse=start, time_limit=deadline.left(LEAST), **more)
-        is_judged = found.status is not Status.TIME_LIMIT or "residual" in vars(found)
-        keep = made.keep if is_judged else made.late
-        keep(i, found if "callback" in options else uninterrupted(found))
+        solution = solve(problem, solver, impulse=start, time_limit=deadline.remaining(LEAST), **more)
+        is_judged = solution.status is not Status.TIME_LIMIT or "residual" in vars(solution)
+        store = solutions.store if is_judged else solutions.store_late
+        store(i, solution if "callback" in options else uninterrupted(solution))
 
     begin = perf_counter()
-    made._run(turn, alone, threads, errors)
-    made.empty_refused()
-    made._seconds = (perf_counter() - begin) / max(1, len(given))
-    if not isinstance(given, Batch):
-        made._worlds.remember(made._data)
-    return made
+    solutions._run(process_next, solve_single, threads, errors)
+    solutions.clear_invalid()
+    solutions._time_per_world = (perf_counter() - begin) / max(1, len(worlds))
+    if not isinstance(worlds, Batch):
+        solutions._worlds.remember(solutions._data)
+    return solutions
 
 
-def _starts(given: Any, impulse: Any, impulses: Any, errors: str) -> tuple[Any, dict[int, LavenderError]]:
-    """Flat impulses of a batch, or of each problem (m,) or None; None: doing nothing everywhere.
+def _check_starts(
+    worlds: Any, impulse: Any, impulses: Any, errors: str
+) -> tuple[Any, dict[int, LavenderError]]:
+    """Convert the starts of all worlds.
 
-    Beside what is wrong with those that are not finite, in whose place stands doing nothing.
+    Returns
+    -------
+    starts : array, list or None
+        Flat impulses [N s] of a batch; (m,) or None for each problem of a list. None: all start from the zero impulse.
+    invalid : dict of int to LavenderError
+        Errors of starts that are not finite, which are replaced by the zero impulse.
     """
-    unusable = dict[int, LavenderError]()
+    invalid = dict[int, LavenderError]()
 
-    def is_usable(i: int, start: FloatArray) -> bool:
+    def is_valid(i: int, start: FloatArray) -> bool:
         if all_finite(start):
             return True
         bad = np.flatnonzero(~np.isfinite(start))[0]
-        unusable[i] = InputError(
+        invalid[i] = InputError(
             f"world {i}: impulse [N s] is {start[bad]} at row {bad}; a finite start is needed"
         )
         if errors == "raise":
-            raise unusable[i]
+            raise invalid[i]
         return False
 
-    if isinstance(given, Batch):
+    if isinstance(worlds, Batch):
         if impulses is not None:
             raise InputError(
                 "impulses are of a list of problems; give impulse=, one array of the whole batch"
             )
         if impulse is None:
-            return None, unusable
-        flat = given.impulses("impulse", impulse)
+            return None, invalid
+        flat = worlds.impulses("impulse", impulse)
         if not all_finite(flat):
-            for i in range(len(given)):
-                rows = given.rows_of(i)
-                if not is_usable(i, flat[rows]):
+            for i in range(len(worlds)):
+                rows = worlds.rows_of(i)
+                if not is_valid(i, flat[rows]):
                     flat[rows] = 0.0
-        return flat, unusable
+        return flat, invalid
     if impulse is not None:
         raise InputError("impulse is of one problem; give impulses=, one for each (None where there is none)")
-    starts = [p.guess for p in given] if impulses is None else of_each(given, impulses)
-    return [x if x is None or is_usable(i, x) else None for i, x in enumerate(starts)], unusable
+    starts = [p.guess for p in worlds] if impulses is None else check_impulses(worlds, impulses)
+    return [x if x is None or is_valid(i, x) else None for i, x in enumerate(starts)], invalid

@@ -49,7 +49,7 @@ def check(
     with --precision or --threshold, a stored solution is neither at its floor nor close enough.
     Exit code 2: a named file cannot be read, or no file has a stored solution for these options.
     """
-    from lavender.base.arrays import number
+    from lavender.base.arrays import check_float
     from lavender.judge.residuals import AT_FLOOR, CLOSE
     from lavender.lab import bench
     from lavender.lab.check import cross_check
@@ -65,8 +65,8 @@ def check(
     errors = ErrorReporter(partial(echo, style="yellow"))
     judges_stored = precision is not None or was_given(context, "threshold")
     bench.solver_names([*(solvers or ()), reference])
-    number("tol", tol, low=0.0)
-    number("threshold", threshold, low=0.0)
+    check_float("tol", tol, low=0.0)
+    check_float("threshold", threshold, low=0.0)
     seconds_of(time_limit)
     for item in bench.resolve(files):
         with errors(item):

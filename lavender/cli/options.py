@@ -69,9 +69,9 @@ def _is_number(word: str) -> bool:
 
 
 def _is_order(word: str) -> bool:
-    from lavender.problem.ordering import ORDERS
+    from lavender.problem.ordering import SWEEP_ORDERS
 
-    return word.partition(":")[0] in ORDERS
+    return word.partition(":")[0] in SWEEP_ORDERS
 
 
 def _is_solver(word: str) -> bool:

@@ -25,7 +25,7 @@ def prove(files: tuple[str, ...], solver: str, tol: float) -> None:
     Exit code 1: a result has no proof, or a file in a folder cannot be read. Exit code 2: a named file cannot
     be read.
     """
-    from lavender.base.arrays import number
+    from lavender.base.arrays import check_float
     from lavender.lab.bench.cases import resolve
     from lavender.lab.bench.running.worker import Worker, solve_isolated
     from lavender.lab.proof import prove as enclose
@@ -34,7 +34,7 @@ def prove(files: tuple[str, ...], solver: str, tol: float) -> None:
 
     one_thread()
     # Check the arguments before any file is read.
-    number("tol", tol, low=0.0)
+    check_float("tol", tol, low=0.0)
     get(solver)
     require()
     unmet, errors = False, ErrorReporter()

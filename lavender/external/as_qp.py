@@ -1,4 +1,4 @@
-"""A problem as a convex program, in three forms. Pure conversion: nothing here solves.
+"""Convert a problem to a convex program, in one of three forms.
 
 All are written as
 
@@ -6,7 +6,7 @@ All are written as
 
 with multipliers zeta of the rows and xi of the bounds:  P x + q + A^T zeta + xi = 0.
 
-Impulse form, x = S^-1 lambda / sigma, S = D^-1/2 (unit diagonal where `unit_diagonal`):
+Impulse form, x = S^-1 lambda / sigma, S = D^-1/2 (with `unit_diagonal`, else one number for all rows):
 
     P = S A S,  q = -S b / sigma,  bounds of lambda;  friction  |x_t| <= a x_n,  a = mu S_n / S_t
 
@@ -15,24 +15,24 @@ Velocity form, from `Problem.velocity_form` (K, theta, g; y = M^1/2 times the ch
     min 1/2 |y|^2 + 1/2 |p|^2 - (K~^T r).(y, p) + (u - l).t,   K~ = [K, theta^1/2],  w = K~ (y, p) - g
 
     free row                w = 0                          r = 0
-    lower bound alone       w >= 0                         r = l
-    both bounds             w + t >= 0, t >= 0             r = l, the multiplier ends at u - l
-    upper bound alone       -w >= 0                        r = u
+    only a lower bound      w >= 0                         r = l
+    both bounds             w + t >= 0, t >= 0             r = l, the multiplier is at most u - l
+    only an upper bound     -w >= 0                        r = u
     disk and spin           w_n - a_s t >= a |w_t|,  t >= |w_s|;  a second disk likewise, t >= a_r |w_r|
 
-and z = r + T zeta, lambda = sigma S z, where the rows are A = -T^T K~ (t aside). Its size is that of
-the velocities, and J is never squared.
+with z = r + T zeta, lambda = sigma S z, and the rows A = -T^T K~ (without the columns of t). Its number of unknowns is
+the number of velocities, and J J^T is never formed.
 
-Program form, of a quadratic program with a singular P (`Problem.from_qp`; (5) of `problem/program.py`): the program
-itself, with lb and ub for the bounds. S is one number for all variables and another for all rows, the geometric mean of
-r^-1/2, where r_i is the largest entry of row i of (5); sigma is the root mean square of r^-1/2 times the violation of
-the rows of (5) at zero.
+Program form, of a quadratic program with a singular P (`Problem.from_qp`; `problem/program.py` (5)): the program with
+lb and ub for the bounds. S is one number for all variables and another for all rows, the geometric mean of r^-1/2, with
+r_i the largest entry of row i of (5); sigma is the root mean square of r^-1/2 times the violation of the rows of (5) at
+zero.
 
-sigma = max(E0 / sqrt(m), V0 sqrt(heaviest mass)) makes the first two free of units, with unknowns near 1 also at
-large mass ratios; a residual of x times sigma is a residual of the judge. Rows whose impulse is known
-(lower = upper, friction with mu = 0, rows of A that are all zero) are taken out first. So are rows and contacts that b
-pushes to a bound by more than FAR_FROM_BOUND times the size of the unknowns, as placeholder bounds do: a tolerance of
-the backend is relative to its largest number. `QPSolver` checks them at the answer.
+sigma = max(E0 / sqrt(m), V0 sqrt(heaviest mass)) makes the first two forms free of units, with unknowns near 1 also at
+large mass ratios; a residual of x times sigma is a residual of the judge. Rows whose impulse is known are removed:
+lower = upper, friction with mu = 0, rows of A that are zero. Rows and contacts that b pushes to a bound by more than
+MAX_SCALED_RHS times the size of the unknowns (for example at placeholder bounds) are also removed, because the
+tolerance of a backend is relative to its largest number. `QPSolver` checks them at the solution.
 """
 
 from __future__ import annotations
@@ -44,124 +44,188 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from lavender.base.arrays import FloatArray, one_of
+from lavender.base.arrays import FloatArray, check_choice
 from lavender.base.errors import CapabilityError
 from lavender.base.lazy_import import sparse as sp
 from lavender.judge.certificates import check_certificate
-from lavender.judge.residuals import reference
+from lavender.judge.residuals import get_reference
 from lavender.problem import Problem
 
-FORMS = ("impulse", "velocity", "auto")
+PROGRAM_FORMS = ("impulse", "velocity", "auto")
 IntpArray = npt.NDArray[np.intp]
-LARGEST = 1e20  # of a program's numbers: from there on backends read infinity, or break
+MAX_BACKEND_NUMBER = 1e20  # Backends treat numbers from here on as infinite, or fail.
 # A row whose scaled |b| is larger is assumed to stay at its bound: backends lose as many digits as the largest b has,
-# and rows that act have b near 1. If the assumption fails, the backend is called once more with all rows.
-FAR_FROM_BOUND = 1e2
-# The same for the rows of a program: x is often larger than the bounds that act.
-PROGRAM_FAR_FROM_BOUND = 1e6
-MASS_RATIO = 1e3  # from here on the velocity form is more accurate, whatever the sizes
+# and active rows have b near 1. If the assumption fails, the backend is called once more with all rows.
+MAX_SCALED_RHS = 1e2
+MAX_SCALED_PROGRAM_RHS = (
+    1e6  # The same for the program form, in which x is often larger than the active bounds.
+)
+VELOCITY_FORM_MASS_RATIO = 1e3  # From this mass ratio on, the velocity form is more accurate at all sizes.
 
 
 @dataclass(frozen=True)
 class _Disk:
-    """|(x_t / a_t over all tangents)| <= x_n: two tangents, a the same, or a round cone of up to five."""
+    """Friction component |(x_t / a_t over all tangents)| <= x_n: two tangents with equal a_t, or a round cone.
+
+    Parameters
+    ----------
+    normal : int
+    tangents : tuple of int
+    ratios : tuple of float
+        a_t.
+    """
 
     normal: int
     tangents: tuple[int, ...]
-    ratios: tuple[float, ...]  # a
+    ratios: tuple[float, ...]
 
 
 @dataclass(frozen=True)
 class _FrictionRows:
-    """Rows of friction among the kept ones, with a = mu S_n / S_t (times r on spin) in scaled unknowns."""
+    """Friction components of the unknown rows, with a = mu S_n / S_t (times r for spin) in scaled unknowns.
 
-    pairs: list[tuple[int, int, float]]  # normal, the row bounded by |x| <= a x_n, a
+    Parameters
+    ----------
+    pairs : list of (normal row, friction row, a)
+        Components of one row, |x| <= a x_n.
+    disks : list of _Disk
+        Components of several rows.
+    """
+
+    pairs: list[tuple[int, int, float]]
     disks: list[_Disk]
 
     @property
     def cones(self) -> tuple[int, ...]:
+        """Size of the second-order cone of each disk."""
         return tuple(1 + len(disk.tangents) for disk in self.disks)
 
     @property
     def members(self) -> list[int]:
+        """All rows of all components."""
         return [i for p in self.pairs for i in p[:2]] + [
             i for d in self.disks for i in (d.normal, *d.tangents)
         ]
 
 
 @dataclass(frozen=True)
-class _Parts:
-    """What both forms share: rows that stay, impulses of those that do not, scaling."""
+class _ScaledProblem:
+    """Unknown rows, known impulses and scaling, which both forms use.
+
+    Parameters
+    ----------
+    problem : Problem
+    unknown_rows : (k,) int
+        Rows of the problem whose impulses are unknowns of the program.
+    fixed : (m,), N s
+        Impulses of the other rows; 0 for unknown rows.
+    assumed : (n,) int
+        Rows that are assumed to stay at their bound.
+    root : (k,), kg^1/2
+        S.
+    sigma : float, J^1/2
+    """
 
     problem: Problem
-    kept: IntpArray  # (k,) rows of the problem that are unknown here
-    fixed: FloatArray  # (m,) N s, impulse of the rows that are not; 0 elsewhere
-    assumed: IntpArray  # rows that are assumed to stay at their bound
-    root: FloatArray  # (k,) S, kg^1/2
-    sigma: float  # J^1/2
+    unknown_rows: IntpArray
+    fixed: FloatArray
+    assumed: IntpArray
+    root: FloatArray
+    sigma: float
 
     @classmethod
-    def of(cls, problem: Problem, unit_diagonal: bool, assume: bool) -> _Parts:
+    def of(cls, problem: Problem, unit_diagonal: bool, assume: bool) -> _ScaledProblem:
+        """Scale a problem; `assume` also removes rows that are far from leaving their bound."""
         c = problem.cones
         known = (c.lower == c.upper) & np.isfinite(c.lower)
         fixed = np.where(known, c.lower, 0.0)
         size = np.diff(c.ptr)
-        alone = np.repeat(~c.is_contact | (size == 1), size)
+        has_own_bound = np.repeat(~c.is_contact | (size == 1), size)
         for i in np.asarray(problem.metric.empty, int):
-            # A row of zeros: b alone decides, and where no finite bound meets it the front door has said so.
-            if alone[i]:
+            # The row of A is zero: the sign of b determines the bound. Without a finite bound there is no solution,
+            # which the validation of the input reports.
+            if has_own_bound[i]:
                 bound = c.upper[i] if problem.b[i] > 0.0 else c.lower[i] if problem.b[i] < 0.0 else 0.0
                 known[i] = True
                 fixed[i] = np.clip(bound if np.isfinite(bound) else 0.0, c.lower[i], c.upper[i])
         known[c.friction_rows] = c.reach[c.friction_rows] == 0.0
-        sigma, assumed = _sigma(problem), np.zeros(0, np.intp)
+        sigma, assumed = _compute_scale(problem), np.zeros(0, np.intp)
         if assume:
-            far = PROGRAM_FAR_FROM_BOUND if problem.has_singular_program else FAR_FROM_BOUND
-            assumed, at = _far_rows(problem, sigma, far)
-            assumed, at = assumed[~known[assumed]], at[~known[assumed]]
-            known[assumed], fixed[assumed] = True, at
-        kept = np.flatnonzero(~known)
-        d = problem.d[kept]
+            threshold = MAX_SCALED_PROGRAM_RHS if problem.has_singular_program else MAX_SCALED_RHS
+            assumed, bounds = _find_far_rows(problem, sigma, threshold)
+            assumed, bounds = assumed[~known[assumed]], bounds[~known[assumed]]
+            known[assumed], fixed[assumed] = True, bounds
+        unknown = np.flatnonzero(~known)
+        d = problem.d[unknown]
         if not unit_diagonal and len(d):
             d = np.full(len(d), np.exp(np.mean(np.log(d))))
-        return cls(problem, kept, fixed, assumed, 1.0 / np.sqrt(d), sigma)
+        return cls(problem, unknown, fixed, assumed, 1.0 / np.sqrt(d), sigma)
 
     def friction_rows(self) -> _FrictionRows:
+        """Return the friction components with indices of unknown rows."""
         c = self.problem.cones
-        reach = c.reach
-        place = np.full(self.problem.m, -1)
-        place[self.kept] = np.arange(len(self.kept))
+        coefficient = c.reach
+        unknown_of_row = np.full(self.problem.m, -1)
+        unknown_of_row[self.unknown_rows] = np.arange(len(self.unknown_rows))
         pairs: list[tuple[int, int, float]] = []
         disks: list[_Disk] = []
-        for i, part in c.parts():
-            if place[part[0]] < 0:
+        for block, rows in c.parts():
+            if unknown_of_row[rows[0]] < 0:
                 continue
-            j, at = int(place[c.ptr[i]]), [int(place[t]) for t in part]
-            ratio = [float(reach[t] * self.root[j] / self.root[s]) for t, s in zip(part, at, strict=True)]
-            if len(part) == 1:
-                pairs.append((j, at[0], ratio[0]))
+            normal = int(unknown_of_row[c.ptr[block]])
+            tangents = [int(unknown_of_row[row]) for row in rows]
+            ratios = [
+                float(coefficient[row] * self.root[normal] / self.root[t])
+                for row, t in zip(rows, tangents, strict=True)
+            ]
+            if len(rows) == 1:
+                pairs.append((normal, tangents[0], ratios[0]))
             else:
-                disks.append(_Disk(j, tuple(at), tuple(ratio)))
+                disks.append(_Disk(normal, tuple(tangents), tuple(ratios)))
         return _FrictionRows(pairs, disks)
 
 
 @dataclass(frozen=True)
-class QP(_Parts):
-    """A convex program and the way back; see the module. All arrays are free of units."""
+class QP(_ScaledProblem):
+    """A convex program, and the conversion of its solutions; see the module. All arrays are free of units.
 
-    form: str  # "impulse", "velocity" or "program"
-    P: sp.csc_matrix  # (n, n) symmetric, both triangles
-    q: FloatArray  # (n,)
-    A: sp.csc_matrix  # (r, n)
-    b: FloatArray  # (r,)
-    n_zero: int  # rows with s = 0, first
-    n_nonneg: int  # rows with s >= 0, next
-    soc: tuple[int, ...]  # sizes of the second-order cones, last
-    lb: FloatArray | None  # (n,), or no bounds at all
-    ub: FloatArray | None  # (n,)
-    back: sp.csr_matrix  # T (k, r), velocity form
-    shift: FloatArray  # r (k,), velocity form
-    lift: sp.csr_matrix  # K~ (k, n - number of t), velocity form
+    Parameters
+    ----------
+    form : {"impulse", "velocity", "program"}
+    P : (n, n)
+        Symmetric, both triangles.
+    q : (n,)
+    A, b : (r, n), (r,)
+        Rows with s = 0, then s >= 0, then second-order cones.
+    n_zero : int
+        Number of rows with s = 0.
+    n_nonneg : int
+        Number of rows with s >= 0.
+    soc : tuple of int
+        Sizes of the second-order cones.
+    lb, ub : (n,) or None
+        Bounds; None without any.
+    multiplier_map : (k, r)
+        T of the velocity form.
+    shift : (k,)
+        r of the velocity form.
+    velocity_map : (k, n - number of t)
+        K~ of the velocity form.
+    """
+
+    form: str
+    P: sp.csc_matrix
+    q: FloatArray
+    A: sp.csc_matrix
+    b: FloatArray
+    n_zero: int
+    n_nonneg: int
+    soc: tuple[int, ...]
+    lb: FloatArray | None
+    ub: FloatArray | None
+    multiplier_map: sp.csr_matrix
+    shift: FloatArray
+    velocity_map: sp.csr_matrix
 
     @property
     def n(self) -> int:
@@ -170,25 +234,26 @@ class QP(_Parts):
 
     @property
     def nbytes(self) -> int:
-        """Bytes of its matrices, and of the problem's."""
-        own = sum(x.data.nbytes + x.indices.nbytes for x in (self.P, self.A, self.back, self.lift))
+        """Size [bytes] of the matrices of the program and of the problem."""
+        matrices = self.P, self.A, self.multiplier_map, self.velocity_map
+        program = sum(x.data.nbytes + x.indices.nbytes for x in matrices)
         matrix = self.problem.matrix
-        return own + (0 if matrix is None else getattr(matrix, "data", matrix).nbytes)
+        return program + (0 if matrix is None else getattr(matrix, "data", matrix).nbytes)
 
     @property
     def is_bounds_only(self) -> bool:
-        """No rows, and no bound that is finite: a backend may call it unconstrained."""
+        """Whether the program has no rows and no finite bounds: a backend may treat it as unconstrained."""
         no_bound = self.lb is None or self.ub is None or not np.isfinite([self.lb, self.ub]).any()
         return len(self.b) == 0 and no_bound
 
     @property
-    def fits(self) -> bool:
-        """Its numbers are below LARGEST; bounds may be infinite on their own side.
+    def is_representable(self) -> bool:
+        """Whether all numbers are below MAX_BACKEND_NUMBER. Lower bounds may be -inf, upper bounds inf.
 
-        Where nothing overflows in the program's units they are near 1.
+        Unless the scaling overflows, the numbers are near 1.
         """
         numbers = (self.P.data, self.q, self.A.data, self.b)
-        if not all(np.abs(x).max(initial=0.0) < LARGEST for x in numbers):
+        if not all(np.abs(x).max(initial=0.0) < MAX_BACKEND_NUMBER for x in numbers):
             return False
         if not (
             np.isfinite(self.root).all() and np.isfinite(self.shift).all() and np.isfinite(self.fixed).all()
@@ -200,53 +265,62 @@ class QP(_Parts):
 
     @property
     def is_definite(self) -> bool:
-        """Velocity form: P has no zero on its diagonal, as no row needs a t."""
-        return self.form == "velocity" and self.n == self.lift.shape[1]
+        """Whether P is positive definite: the velocity form without unknowns t."""
+        return self.form == "velocity" and self.n == self.velocity_map.shape[1]
 
     def impulse(self, x: FloatArray, zeta: FloatArray, xi: FloatArray) -> FloatArray:
-        """lambda (m,) [N s] of an answer, rounding outside constant bounds clipped; xi matters to a program alone."""
+        """Compute lambda (m,) [N s] from a solution, clipped to constant bounds; only the program form uses xi."""
         lam = self.fixed.copy()
-        z = x if self.form == "impulse" else self.shift + self.back @ zeta
-        lam[self.kept] = self.sigma * self.root * z
+        z = x if self.form == "impulse" else self.shift + self.multiplier_map @ zeta
+        lam[self.unknown_rows] = self.sigma * self.root * z
         c = self.problem.cones
         return np.clip(lam, c.lower, c.upper, out=lam)
 
     def direction(self, x: FloatArray | None, zeta: FloatArray | None) -> FloatArray | None:
-        """Certificate (m,) that no solution exists, of an unbounded x or of contradicting rows; None without one."""
-        given = x if self.form == "impulse" else zeta
-        if given is None or len(given) != (self.n if self.form == "impulse" else len(self.b)):
+        """Compute a certificate (m,) of infeasibility from a backend's certificate; None if there is none.
+
+        In the impulse form x is a direction in which the objective is unbounded, in the velocity form zeta are
+        multipliers that prove that the rows contradict each other.
+        """
+        vector = x if self.form == "impulse" else zeta
+        if vector is None or len(vector) != (self.n if self.form == "impulse" else len(self.b)):
             return None
         y = np.zeros(self.problem.m)
-        y[self.kept] = self.root * (given if self.form == "impulse" else self.back @ given)
+        y[self.unknown_rows] = self.root * (
+            vector if self.form == "impulse" else self.multiplier_map @ vector
+        )
         c = self.problem.cones
-        # Out of the recession cone of the bounds by rounding only.
+        # Remove rounding errors outside of the recession cone of the bounds.
         y = np.clip(
             y, np.where(np.isfinite(c.lower), 0.0, -np.inf), np.where(np.isfinite(c.upper), 0.0, np.inf)
         )
-        big = np.abs(y).max(initial=0.0)
-        return y / big if 0.0 < big < np.inf else None
+        size = np.abs(y).max(initial=0.0)
+        return y / size if 0.0 < size < np.inf else None
 
     def multiplier(self, x: FloatArray, xi: FloatArray) -> FloatArray:
-        """The backend's own multiplier of the bounds of lambda, z (m,) [m/s] with A lambda - b + z = 0.
+        """Compute the backend's multiplier of the bounds of lambda, z (m,) [m/s] with A lambda - b + z = 0.
 
-        Impulse form: xi. Velocity form: -w of its own velocities. Rows that were taken out: their slack.
+        In the impulse form it is xi, in the velocity form -w of the backend's velocities. Rows that were removed have
+        their slack.
         """
         if self.form == "impulse":
             lam = self.fixed.copy()
-            lam[self.kept] = self.sigma * self.root * x
+            lam[self.unknown_rows] = self.sigma * self.root * x
             if not np.isfinite(lam).all():
                 return np.full(self.problem.m, np.nan)
             z = -self.problem.slack(lam)
-            z[self.kept] = xi * (self.sigma / self.root)
+            z[self.unknown_rows] = xi * (self.sigma / self.root)
             return z
         z = np.zeros(self.problem.m)
-        g = self.problem.b[self.kept] * (self.root / self.sigma)
-        z[self.kept] = -(self.lift @ x[: self.lift.shape[1]] - g) * (self.sigma / self.root)
+        g = self.problem.b[self.unknown_rows] * (self.root / self.sigma)
+        z[self.unknown_rows] = -(self.velocity_map @ x[: self.velocity_map.shape[1]] - g) * (
+            self.sigma / self.root
+        )
         return z
 
     def start(self, impulse: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """(x, zeta, xi) of a warm start (m,) [N s]; for programs without second-order cones."""
-        z = impulse[self.kept] / (self.sigma * self.root)
+        """Compute (x, zeta, xi) from a start (m,) [N s], for programs without second-order cones."""
+        z = impulse[self.unknown_rows] / (self.sigma * self.root)
         xi = np.zeros(self.n)
         if self.form == "impulse":
             if self.lb is not None and self.ub is not None:
@@ -255,24 +329,37 @@ class QP(_Parts):
                 xi = np.where(at_low, np.minimum(-gradient, 0.0), 0.0) + np.where(
                     at_high, np.maximum(-gradient, 0.0), 0.0
                 )
-            # The equality form of a linear system: P x - b = 0 with P (x + zeta) = 0.
+            # Equality form of a linear system: P x - b = 0 with P (x + zeta) = 0.
             return z, -z if len(self.b) else np.zeros(0), xi
-        ny = self.lift.shape[1]
-        zeta = self.back.T @ (z - self.shift)
+        ny = self.velocity_map.shape[1]
+        zeta = self.multiplier_map.T @ (z - self.shift)
         zeta[self.n_zero :] = np.maximum(zeta[self.n_zero :], 0.0)
         x = np.zeros(self.n)
-        x[:ny] = self.lift.T @ (self.back @ zeta) - self.q[:ny]
+        x[:ny] = self.velocity_map.T @ (self.multiplier_map @ zeta) - self.q[:ny]
         x[ny:] = np.maximum(self.A[:, ny:].T @ (self.A[:, :ny] @ x[:ny] - self.b) * -1.0, 0.0)
         return x, zeta, xi
 
 
-def pick_form(problem: Problem, form: str, definite: bool = False) -> str:
-    """The form that `form` asks for, "impulse" or "velocity".
+def choose_form(problem: Problem, form: str, definite: bool = False) -> str:
+    """Choose the form of the program, "impulse" or "velocity".
 
-    "auto" takes the velocity form where rows are known and m > 6 n, the mass ratio is 1e3 or more, or
-    the backend needs a definite P (`definite`).
+    Parameters
+    ----------
+    problem : Problem
+    form : {"impulse", "velocity", "auto"}
+        "auto" chooses the velocity form if the problem has rows and m > 6 n, the mass ratio is at least
+        VELOCITY_FORM_MASS_RATIO, or `definite` is set.
+    definite : bool
+        Whether the backend needs a positive definite P.
+
+    Raises
+    ------
+    InputError
+        There is no such form.
+    CapabilityError
+        "velocity" for a problem without rows.
     """
-    form = one_of("form", form, FORMS)
+    form = check_choice("form", form, PROGRAM_FORMS)
     rows = problem.rows
     if form == "velocity" and rows is None:
         raise CapabilityError(
@@ -284,17 +371,21 @@ def pick_form(problem: Problem, form: str, definite: bool = False) -> str:
         return "impulse"
     moving = rows.inv_mass[rows.inv_mass > 0.0]
     ratio = moving.max() / moving.min() if len(moving) else 1.0
-    return "velocity" if definite or problem.m > 6 * rows.n_bodies or ratio >= MASS_RATIO else "impulse"
+    return (
+        "velocity"
+        if definite or problem.m > 6 * rows.n_bodies or ratio >= VELOCITY_FORM_MASS_RATIO
+        else "impulse"
+    )
 
 
-def target(problem: Problem, tol: float) -> float:
-    """Largest residual of one unknown [-] with which the judge's relative residual is at most `tol`.
+def residual_target(problem: Problem, tol: float) -> float:
+    """Compute the largest residual eps of one unknown [-] with which the judge's relative residual is at most `tol`.
 
     E <= sqrt(m) sigma eps,  V <= max sqrt(nu) sigma eps
     """
-    energy, velocity = reference(problem)
-    sigma = _sigma(problem)
-    each = [
+    energy, velocity = get_reference(problem)
+    sigma = _compute_scale(problem)
+    limits = [
         start / (size * sigma)
         for start, size in (
             (energy, np.sqrt(problem.m)),
@@ -302,46 +393,52 @@ def target(problem: Problem, tol: float) -> float:
         )
         if start > 0.0 and size > 0.0
     ]
-    return tol * min([1.0, *each])
+    return tol * min([1.0, *limits])
 
 
 def impulse_form(
     problem: Problem, *, unit_diagonal: bool = True, equality: bool = False, assume: bool = False
 ) -> QP:
-    """min 1/2 l.A l - b.l over the bounds or friction cones of a symmetric problem.
+    """Build the impulse form: min 1/2 l.A l - b.l over the bounds or friction cones of a symmetric problem.
 
-    `unit_diagonal` scales by D^-1/2, otherwise by one number, so that P is A in other units; `equality` writes a linear
-    system as min 1/2 x.P x subject to P x = -q, for backends that need a row; `assume` takes rows out that are far from
-    leaving their bound.
+    Parameters
+    ----------
+    problem : Problem
+    unit_diagonal : bool
+        Scale by D^-1/2; otherwise by one number, so that P is A in other units.
+    equality : bool
+        Write a linear system as min 1/2 x.P x subject to P x = -q, for backends that need a row.
+    assume : bool
+        Remove rows that are far from leaving their bound.
     """
-    parts = _Parts.of(problem, unit_diagonal, assume)
-    c, kept, root, sigma = problem.cones, parts.kept, parts.root, parts.sigma
+    scaled = _ScaledProblem.of(problem, unit_diagonal, assume)
+    c, unknown, root, sigma = problem.cones, scaled.unknown_rows, scaled.root, scaled.sigma
     a = problem.csr
     scale = sp.diags_array(root)
-    p = sp.csc_matrix(scale @ a[kept][:, kept] @ scale)
-    b = problem.b - (a @ parts.fixed if parts.fixed.any() else 0.0)
-    q = -root * b[kept] / sigma
-    rows, k = parts.friction_rows(), len(kept)
+    p = sp.csc_matrix(scale @ a[unknown][:, unknown] @ scale)
+    b = problem.b - (a @ scaled.fixed if scaled.fixed.any() else 0.0)
+    q = -root * b[unknown] / sigma
+    rows, k = scaled.friction_rows(), len(unknown)
     lb = ub = None
     if not problem.cones.is_free:
-        lb, ub = c.lower[kept] / (root * sigma), c.upper[kept] / (root * sigma)
+        lb, ub = c.lower[unknown] / (root * sigma), c.upper[unknown] / (root * sigma)
     matrix, rhs, n_zero = sp.csc_matrix((0, k)), np.zeros(0), 0
     if equality:
         matrix, rhs, n_zero, q = p, -q, k, np.zeros(k)
     elif rows.members:
-        # s = a x_n - x_t >= 0, s = a x_n + x_t >= 0;  s = (a x_n, x_t) in the cone of the disk.
-        put = _Entries()
+        # pairs: s = a x_n - x_t >= 0 and s = a x_n + x_t >= 0; disks: s = (a x_n, x_t) in a second-order cone
+        builder = _RowBuilder()
         for n, t, ratio in rows.pairs:
-            put.row([(n, -ratio), (t, 1.0)])
-            put.row([(n, -ratio), (t, -1.0)])
+            builder.add_row([(n, -ratio), (t, 1.0)])
+            builder.add_row([(n, -ratio), (t, -1.0)])
         for disk in rows.disks:
-            put.row([(disk.normal, -disk.ratios[0])])
+            builder.add_row([(disk.normal, -disk.ratios[0])])
             for t, ratio in zip(disk.tangents, disk.ratios, strict=True):
-                put.row([(t, -disk.ratios[0] / ratio)])
-        matrix = put.matrix(k)
+                builder.add_row([(t, -disk.ratios[0] / ratio)])
+        matrix = builder.matrix(k)
         rhs = np.zeros(matrix.shape[0])
     return QP(
-        **vars(parts),
+        **vars(scaled),
         form="impulse",
         P=p,
         q=q,
@@ -352,44 +449,49 @@ def impulse_form(
         soc=rows.cones,
         lb=lb,
         ub=ub,
-        back=sp.csr_matrix((k, len(rhs))),
+        multiplier_map=sp.csr_matrix((k, len(rhs))),
         shift=np.zeros(k),
-        lift=sp.csr_matrix((k, 0)),
+        velocity_map=sp.csr_matrix((k, 0)),
     )
 
 
 def velocity_form(problem: Problem, *, assume: bool = False) -> QP:
-    """The mass-scaled velocity form of a problem with rows; `assume` as in `impulse_form`."""
+    """Build the mass-scaled velocity form of a problem with rows; `assume` as for `impulse_form`."""
     form = problem.velocity_form()
-    parts = _Parts.of(problem, True, assume)
-    c, kept, root, sigma = problem.cones, parts.kept, parts.root, parts.sigma
-    k = len(kept)
+    scaled = _ScaledProblem.of(problem, True, assume)
+    c, unknown, root, sigma = problem.cones, scaled.unknown_rows, scaled.root, scaled.sigma
+    k = len(unknown)
+    # K~ = [K, theta^1/2]
     jac = sp.csr_matrix(form.jacobian)
-    theta = form.theta[kept]
+    theta = form.theta[unknown]
     soft = np.flatnonzero(theta > 0.0)
-    soften = sp.csr_matrix((np.sqrt(theta[soft]), (soft, np.arange(len(soft)))), shape=(k, len(soft)))
-    lift = sp.csr_matrix(sp.hstack([jac[kept], soften]))
-    ny = lift.shape[1]
-    g = form.rhs[kept] / sigma
-    low, high = c.lower[kept] / (root * sigma), c.upper[kept] / (root * sigma)
-    rows = parts.friction_rows()
-    plain = np.ones(k, bool)
-    plain[rows.members] = False
+    root_theta = sp.csr_matrix((np.sqrt(theta[soft]), (soft, np.arange(len(soft)))), shape=(k, len(soft)))
+    velocity_map = sp.csr_matrix(sp.hstack([jac[unknown], root_theta]))
+    ny = velocity_map.shape[1]
+    g = form.rhs[unknown] / sigma
+    # kinds of bounded rows
+    low, high = c.lower[unknown] / (root * sigma), c.upper[unknown] / (root * sigma)
+    rows = scaled.friction_rows()
+    is_bounded_row = np.ones(k, bool)
+    is_bounded_row[rows.members] = False
     has_low, has_high = np.isfinite(low), np.isfinite(high)
-    free = np.flatnonzero(plain & ~has_low & ~has_high)
-    lower = np.flatnonzero(plain & has_low)
-    both = np.flatnonzero(plain & has_low & has_high)
-    upper = np.flatnonzero(plain & ~has_low & has_high)
+    free = np.flatnonzero(is_bounded_row & ~has_low & ~has_high)
+    lower = np.flatnonzero(is_bounded_row & has_low)
+    both = np.flatnonzero(is_bounded_row & has_low & has_high)
+    upper = np.flatnonzero(is_bounded_row & ~has_low & has_high)
     shift = np.zeros(k)
     shift[lower], shift[upper] = low[lower], high[upper]
-    put, slack, n, n_alone = _velocity_rows(rows, free, lower, both, upper, ny)
-    back = sp.csr_matrix(put.matrix(k).T)
-    velocities = sp.hstack([-(back.T @ lift), sp.csc_matrix((back.shape[1], n - ny))])
-    matrix = sp.csc_matrix(velocities + slack.matrix(n))
+    # rows A = -T^T K~ and entries of t
+    columns_of_t, t_entries, n, n_normals = _build_velocity_rows(rows, free, lower, both, upper, ny)
+    multiplier_map = sp.csr_matrix(columns_of_t.matrix(k).T)
+    velocities = sp.hstack(
+        [-(multiplier_map.T @ velocity_map), sp.csc_matrix((multiplier_map.shape[1], n - ny))]
+    )
+    matrix = sp.csc_matrix(velocities + t_entries.matrix(n))
     q = np.zeros(n)
     known = np.zeros(ny)
-    known[: jac.shape[1]] = jac.T @ (parts.fixed / (form.scale * sigma))
-    q[:ny] = -(lift.T @ shift) - known
+    known[: jac.shape[1]] = jac.T @ (scaled.fixed / (form.scale * sigma))
+    q[:ny] = -(velocity_map.T @ shift) - known
     q[ny : ny + len(both)] = high[both] - low[both]
     lb = ub = None
     if n > ny:
@@ -397,45 +499,56 @@ def velocity_form(problem: Problem, *, assume: bool = False) -> QP:
         lb[ny:] = 0.0
     diagonal = np.zeros(n)
     diagonal[:ny] = 1.0
-    n_nonneg = len(lower) + len(upper) + 2 * len(rows.pairs) + n_alone
+    n_nonneg = len(lower) + len(upper) + 2 * len(rows.pairs) + n_normals
     return QP(
-        **vars(parts),
+        **vars(scaled),
         form="velocity",
         P=sp.csc_matrix(sp.diags_array(diagonal)),
         q=q,
         A=matrix,
-        b=-(back.T @ g),
+        b=-(multiplier_map.T @ g),
         n_zero=len(free),
         n_nonneg=n_nonneg,
         soc=rows.cones,
         lb=lb,
         ub=ub,
-        back=back,
+        multiplier_map=multiplier_map,
         shift=shift,
-        lift=lift,
+        velocity_map=velocity_map,
     )
 
 
 @dataclass(frozen=True)
 class ProgramQP(QP):
-    """The program form: a quadratic program in the units S, sigma, and the way back to x and the multipliers."""
+    """The program form: a quadratic program in the units S and sigma, with the conversion of its solutions.
 
-    n_x: int  # rows of the problem that are kept and are variables; they come first in `kept`
-    general: IntpArray  # (r,) rows of the problem that are rows of A
-    signs: FloatArray  # (r,) -1 for equations, 1 for G: multipliers over zeta
-    bounds: tuple[tuple[float, IntpArray, IntpArray], ...]  # sign of xi, rows of the problem, their unknowns
+    Parameters
+    ----------
+    n_x : int
+        Number of unknown rows that are variables; they are the first ones of `unknown_rows`.
+    general : (r,) int
+        Rows of the problem that are rows of A.
+    signs : (r,)
+        Multiplier over zeta: -1 for equations, 1 for G.
+    bounds : tuple of (sign of xi, rows of the problem, their unknowns)
+    """
+
+    n_x: int
+    general: IntpArray
+    signs: FloatArray
+    bounds: tuple[tuple[float, IntpArray, IntpArray], ...]
 
     def impulse(self, x: FloatArray, zeta: FloatArray, xi: FloatArray) -> FloatArray:
-        """x and the multipliers (m,), rounding outside constant bounds clipped."""
+        """Return x and the multipliers (m,), clipped to constant bounds."""
         c, lam = self.problem.cones, self.fixed.copy()
-        lam[self.kept[: self.n_x]] = self.sigma * self.root[: self.n_x] * x
+        lam[self.unknown_rows[: self.n_x]] = self.sigma * self.root[: self.n_x] * x
         lam += self.sigma * self._multipliers(zeta, xi)
         return np.clip(lam, c.lower, c.upper, out=lam)
 
     def _multipliers(self, zeta: FloatArray, xi: FloatArray) -> FloatArray:
-        """(m,) over sigma, 0 for variables; of a bound with a multiplier of the other sign 0."""
+        """Return multipliers over sigma (m,); 0 for variables, and for bounds with a multiplier of the wrong sign."""
         lam, scale = np.zeros(self.problem.m), np.zeros(self.problem.m)
-        scale[self.kept] = self.root
+        scale[self.unknown_rows] = self.root
         lam[self.general] = scale[self.general] * self.signs * zeta
         for sign, rows, at in self.bounds:
             force = xi[at] / self.root[at]
@@ -443,14 +556,14 @@ class ProgramQP(QP):
         return lam
 
     def direction(self, x: FloatArray | None, zeta: FloatArray | None) -> FloatArray | None:
-        """Certificate (m,) that no solution exists: contradicting rows, or a direction of unlimited decrease."""
+        """Compute a certificate (m,) of infeasibility: contradicting rows, or a direction of unlimited decrease."""
         candidates = []
         if zeta is not None and len(zeta) == len(self.b):
-            # Backends return multipliers of rows alone; those of the bounds balance them.
+            # Backends return the multipliers of rows only; the multipliers of bounds balance them.
             candidates.append(self._multipliers(zeta, -(self.A.T @ zeta)))
         if x is not None and len(x) == self.n:
             y = np.zeros(self.problem.m)
-            y[self.kept[: self.n_x]] = self.root[: self.n_x] * x
+            y[self.unknown_rows[: self.n_x]] = self.root[: self.n_x] * x
             candidates.append(y)
         c = self.problem.cones
         candidates = [np.where(np.isfinite(c.lower), np.maximum(y, 0.0), y) for y in candidates]
@@ -459,57 +572,58 @@ class ProgramQP(QP):
         return next(proofs, candidates[0] if candidates else None)
 
     def multiplier(self, x: FloatArray, xi: FloatArray) -> FloatArray:
-        """Not defined for x and multipliers together: NaN (m,)."""
+        """Return NaN (m,): this multiplier is not defined for x and multipliers together."""
         return np.full(self.problem.m, np.nan)
 
     def start(self, impulse: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """(x, zeta, xi) of a start (m,)."""
+        """Compute (x, zeta, xi) from a start (m,)."""
         scaled = np.zeros(self.problem.m)
-        scaled[self.kept] = impulse[self.kept] / (self.sigma * self.root)
+        scaled[self.unknown_rows] = impulse[self.unknown_rows] / (self.sigma * self.root)
         xi = np.zeros(self.n)
         for sign, rows, at in self.bounds:
             np.add.at(xi, at, (sign or -1.0) * impulse[rows] * self.root[at] / self.sigma)
-        return scaled[self.kept[: self.n_x]], self.signs * scaled[self.general], xi
+        return scaled[self.unknown_rows[: self.n_x]], self.signs * scaled[self.general], xi
 
 
 def program_form(problem: Problem, *, assume: bool = False) -> ProgramQP:
     """Write a quadratic program with a singular P in the units of its problem; `assume` as in `impulse_form`."""
-    parts, qp = _Parts.of(problem, True, assume), problem.qp
-    kept, n = parts.kept, len(qp.q)
-    n_x = int(np.searchsorted(kept, n))
-    # One unit for all variables and one for all rows: backends balance what they get, and with rows and columns that
-    # are balanced twice, piqp 0.7 called a public program infeasible.
-    row_size = abs(problem.csr[kept]).max(axis=1).toarray().ravel()
+    scaled, qp = _ScaledProblem.of(problem, True, assume), problem.qp
+    unknown, n = scaled.unknown_rows, len(qp.q)
+    n_x = int(np.searchsorted(unknown, n))
+    # One unit for all variables and one for all rows, because backends balance rows and columns themselves. With rows
+    # and columns balanced twice, piqp 0.7 reported that a feasible public program is infeasible.
+    row_size = abs(problem.csr[unknown]).max(axis=1).toarray().ravel()
     root = 1.0 / np.sqrt(row_size)
-    wrong = np.where(
-        kept < n + qp.free, np.abs(problem.b[kept]), np.maximum(problem.b[kept], 0.0)
-    )  # at x = 0
-    sigma = float(np.sqrt(np.mean((root * wrong) ** 2))) or 1.0
-    for part in (root[:n_x], root[n_x:]):
-        if len(part):
-            part[:] = np.exp(np.mean(np.log(part)))
-    parts = replace(parts, root=root, sigma=sigma)
+    # violation of the rows at x = 0
+    violation = np.where(
+        unknown < n + qp.free, np.abs(problem.b[unknown]), np.maximum(problem.b[unknown], 0.0)
+    )
+    sigma = float(np.sqrt(np.mean((root * violation) ** 2))) or 1.0
+    for roots in (root[:n_x], root[n_x:]):
+        if len(roots):
+            roots[:] = np.exp(np.mean(np.log(roots)))
+    scaled = replace(scaled, root=root, sigma=sigma)
     unit = root[:n_x]
     scale = np.zeros(problem.m)
-    scale[kept] = root
-    place = np.full(n, -1)
-    place[kept[:n_x]] = np.arange(n_x)
-    is_kept = np.zeros(problem.m, bool)
-    is_kept[kept] = True
-    # Rows of (2) of problem/program.py, one kind after the other.
-    none = np.zeros(0, np.intp)
-    fixed, lower, upper = (none if at is None else at for at in (qp.fixed, qp.lower, qp.upper))
+    scale[unknown] = root
+    index_of = np.full(n, -1)
+    index_of[unknown[:n_x]] = np.arange(n_x)
+    is_unknown = np.zeros(problem.m, bool)
+    is_unknown[unknown] = True
+    # Rows of `problem/program.py` (2), by kind.
+    empty = np.zeros(0, np.intp)
+    fixed, lower, upper = (empty if at is None else at for at in (qp.fixed, qp.lower, qp.upper))
     n_a, n_g = qp.free - len(fixed), len(qp.target) - qp.free - len(lower) - len(upper)
     ends = n + np.cumsum([0, n_a, len(fixed), n_g, len(lower), len(upper)])
-    rows_a, rows_f, rows_g, rows_l, rows_u = (np.arange(*of) for of in itertools.pairwise(ends))
-    rows_a, rows_g = rows_a[is_kept[rows_a]], rows_g[is_kept[rows_g]]
+    rows_a, rows_f, rows_g, rows_l, rows_u = (np.arange(*ends_of) for ends_of in itertools.pairwise(ends))
+    rows_a, rows_g = rows_a[is_unknown[rows_a]], rows_g[is_unknown[rows_g]]
     bounds = []
     lb, ub = np.full(n_x, -np.inf), np.full(n_x, np.inf)
     for sign, rows, at, sides in (
         (0.0, rows_f, fixed, (lb, ub)), (-1.0, rows_l, lower, (lb,)), (1.0, rows_u, upper, (ub,)),
     ):  # fmt: skip
-        on = is_kept[rows] & is_kept[at]
-        rows, at = rows[on], place[at[on]]
+        both = is_unknown[rows] & is_unknown[at]
+        rows, at = rows[both], index_of[at[both]]
         for side in sides:
             side[at] = (-1.0 if sign > 0.0 else 1.0) * problem.b[rows] / (sigma * unit[at])
         bounds.append((sign, rows, at))
@@ -517,15 +631,17 @@ def program_form(problem: Problem, *, assume: bool = False) -> ProgramQP:
     signs = np.concatenate([np.full(len(rows_a), -1.0), np.ones(len(rows_g))])
     jac = (
         sp.diags_array(-signs * scale[general])
-        @ qp.jacobian[general - n][:, kept[:n_x]]
+        @ qp.jacobian[general - n][:, unknown[:n_x]]
         @ sp.diags_array(unit)
     )
     has_bounds = any(len(rows) for _, rows, _ in bounds)
     return ProgramQP(
-        **vars(parts),
+        **vars(scaled),
         form="program",
-        P=sp.csc_matrix(sp.diags_array(unit) @ qp.hessian[kept[:n_x]][:, kept[:n_x]] @ sp.diags_array(unit)),
-        q=qp.q[kept[:n_x]] * unit / sigma,
+        P=sp.csc_matrix(
+            sp.diags_array(unit) @ qp.hessian[unknown[:n_x]][:, unknown[:n_x]] @ sp.diags_array(unit)
+        ),
+        q=qp.q[unknown[:n_x]] * unit / sigma,
         A=sp.csc_matrix(jac),
         b=-signs * scale[general] * qp.target[general - n] / sigma,
         n_zero=len(rows_a),
@@ -533,9 +649,9 @@ def program_form(problem: Problem, *, assume: bool = False) -> ProgramQP:
         soc=(),
         lb=lb if has_bounds else None,
         ub=ub if has_bounds else None,
-        back=sp.csr_matrix((len(kept), len(general))),
-        shift=np.zeros(len(kept)),
-        lift=sp.csr_matrix((len(kept), 0)),
+        multiplier_map=sp.csr_matrix((len(unknown), len(general))),
+        shift=np.zeros(len(unknown)),
+        velocity_map=sp.csr_matrix((len(unknown), 0)),
         n_x=n_x,
         general=general,
         signs=signs,
@@ -543,63 +659,79 @@ def program_form(problem: Problem, *, assume: bool = False) -> ProgramQP:
     )
 
 
-def _velocity_rows(
+def _build_velocity_rows(
     rows: _FrictionRows, free: IntpArray, lower: IntpArray, both: IntpArray, upper: IntpArray, ny: int
-) -> tuple[_Entries, _Entries, int, int]:
-    """Columns of T, entries of the t in their rows, number of unknowns, normals bounded by a sum of t alone."""
-    put, slack = _Entries(), _Entries()
-    t_of = {int(i): ny + j for j, i in enumerate(both)}
+) -> tuple[_RowBuilder, _RowBuilder, int, int]:
+    """Build the rows of the velocity form.
+
+    Returns
+    -------
+    columns, t_entries : _RowBuilder
+        Columns of T, and the entries of the unknowns t, for each row of the program.
+    n : int
+        Number of unknowns.
+    n_normals : int
+        Number of normals that are bounded by a sum of t only.
+    """
+    columns, t_entries = _RowBuilder(), _RowBuilder()
+    # bounded rows; those with both bounds have a t
+    t_of_row = {int(i): ny + j for j, i in enumerate(both)}
     n = ny + len(both)
     for i in free:
-        put.row([(int(i), 1.0)])
-        slack.row([])
+        columns.add_row([(int(i), 1.0)])
+        t_entries.add_row([])
     for i in lower:
-        put.row([(int(i), 1.0)])
-        slack.row([(t_of[int(i)], -1.0)] if int(i) in t_of else [])
+        columns.add_row([(int(i), 1.0)])
+        t_entries.add_row([(t_of_row[int(i)], -1.0)] if int(i) in t_of_row else [])
     for i in upper:
-        put.row([(int(i), -1.0)])
-        slack.row([])
-    heads: dict[int, list[tuple[int, float]]] = {}
+        columns.add_row([(int(i), -1.0)])
+        t_entries.add_row([])
+    # friction rows with a bound of their own: t >= |w_t|
+    t_of_normal: dict[int, list[tuple[int, float]]] = {}
     for normal, tangent, ratio in rows.pairs:
-        heads.setdefault(normal, []).append((n, ratio))
+        t_of_normal.setdefault(normal, []).append((n, ratio))
         for sign in (-1.0, 1.0):
-            put.row([(tangent, sign)])
-            slack.row([(n, -1.0)])
+            columns.add_row([(tangent, sign)])
+            t_entries.add_row([(n, -1.0)])
         n += 1
-    second: dict[int, int] = {}  # disk -> its t, where its normal has a disk before it
+    # second disk of a contact: t >= |w|
+    t_of_disk: dict[int, int] = {}
     for k_disk, disk in enumerate(rows.disks):
         if any(d.normal == disk.normal for d in rows.disks[:k_disk][-1:]):
-            heads.setdefault(disk.normal, []).append((n, 1.0))
-            second[k_disk] = n
+            t_of_normal.setdefault(disk.normal, []).append((n, 1.0))
+            t_of_disk[k_disk] = n
             n += 1
-    alone = [normal for normal in heads if normal not in {d.normal for d in rows.disks}]
-    for normal in alone:
-        put.row([(normal, 1.0)])
-        slack.row(heads[normal])
+    # normals without a disk: w_n >= sum of t
+    normals = [normal for normal in t_of_normal if normal not in {d.normal for d in rows.disks}]
+    for normal in normals:
+        columns.add_row([(normal, 1.0)])
+        t_entries.add_row(t_of_normal[normal])
+    # disks, as second-order cones
     for k_disk, disk in enumerate(rows.disks):
-        own = second.get(k_disk)
-        put.row([(disk.normal, 1.0)] if own is None else [])
-        slack.row(heads.get(disk.normal, []) if own is None else [(own, -1.0)])
+        t = t_of_disk.get(k_disk)
+        columns.add_row([(disk.normal, 1.0)] if t is None else [])
+        t_entries.add_row(t_of_normal.get(disk.normal, []) if t is None else [(t, -1.0)])
         for tangent, ratio in zip(disk.tangents, disk.ratios, strict=True):
-            put.row([(tangent, ratio)])
-            slack.row([])
-    return put, slack, n, len(alone)
+            columns.add_row([(tangent, ratio)])
+            t_entries.add_row([])
+    return columns, t_entries, n, len(normals)
 
 
-def _far_rows(problem: Problem, sigma: float, threshold: float) -> tuple[IntpArray, FloatArray]:
-    """Find rows (contacts as a whole) that b pushes to a bound by more than the threshold, and their impulses."""
+def _find_far_rows(problem: Problem, sigma: float, threshold: float) -> tuple[IntpArray, FloatArray]:
+    """Find rows (complete contacts) that b pushes to a bound by more than the threshold, and their impulses."""
     c, push = problem.cones, problem.b / (np.sqrt(problem.d) * sigma)
-    at = np.where(push < 0.0, c.lower, c.upper)
-    far = (np.abs(push) > threshold) & np.isfinite(at) & ~c.friction_rows
-    # All of a contact whose normal row is far; a contact of which only friction is far stays.
+    bound = np.where(push < 0.0, c.lower, c.upper)
+    is_far = (np.abs(push) > threshold) & np.isfinite(bound) & ~c.friction_rows
+    # All rows of a contact whose normal row is far; a contact with only far friction rows is not included.
     first = np.repeat(c.ptr[:-1], np.diff(c.ptr))
-    of_contact = c.friction_rows & far[first]
-    rows = np.flatnonzero(far | of_contact)
-    return rows, np.where(of_contact, 0.0, at)[rows]
+    is_far_friction = c.friction_rows & is_far[first]
+    rows = np.flatnonzero(is_far | is_far_friction)
+    return rows, np.where(is_far_friction, 0.0, bound)[rows]
 
 
-def _sigma(problem: Problem) -> float:
-    energy, velocity = reference(problem)
+def _compute_scale(problem: Problem) -> float:
+    """Compute sigma = max(E0 / sqrt(m), V0 sqrt(heaviest mass)) [J^1/2]; 1 if it is 0 or not finite."""
+    energy, velocity = get_reference(problem)
     if problem.has_singular_program:
         heaviest = 0.0
     elif problem.rows is None:
@@ -612,19 +744,21 @@ def _sigma(problem: Problem) -> float:
     return float(sigma) if 0.0 < sigma < np.inf else 1.0
 
 
-class _Entries:
-    """Rows of a sparse matrix, one after the other."""
+class _RowBuilder:
+    """Builder of a sparse matrix from its rows in order."""
 
     def __init__(self) -> None:
         self.ptr, self.column, self.value = [0], list[int](), list[float]()
 
-    def row(self, entries: list[tuple[int, float]]) -> None:
+    def add_row(self, entries: list[tuple[int, float]]) -> None:
+        """Add a row of (column, value) entries."""
         for column, value in entries:
             self.column.append(column)
             self.value.append(value)
         self.ptr.append(len(self.column))
 
     def matrix(self, columns: int) -> sp.csc_matrix:
+        """Return the matrix with this number of columns."""
         shape = (len(self.ptr) - 1, columns)
         return sp.csc_matrix(
             sp.csr_matrix((np.array(self.value, float), np.array(self.column, int), self.ptr), shape)
@@ -632,28 +766,34 @@ class _Entries:
 
 
 def bound_rows(qp: QP) -> list[tuple[float, sp.csr_matrix, FloatArray, Any]]:
-    """Finite bounds as rows sign x[at] <= h: (sign, rows of the identity, h, at) for upper, then lower."""
+    """Return finite bounds as rows sign x[indices] <= h.
+
+    Returns
+    -------
+    list of (sign, rows of the identity, h, indices)
+        For upper bounds, then for lower bounds; empty if there are none.
+    """
     if qp.lb is None or qp.ub is None:
         return []
     eye = sp.csr_matrix(sp.eye_array(qp.n))
-    found = []
+    groups = []
     for sign, bound in ((1.0, qp.ub), (-1.0, qp.lb)):
-        at = np.flatnonzero(np.isfinite(bound))
-        found.append((sign, eye[at], sign * bound[at], at))
-    return found
+        indices = np.flatnonzero(np.isfinite(bound))
+        groups.append((sign, eye[indices], sign * bound[indices], indices))
+    return groups
 
 
 def bound_multipliers(qp: QP, z: FloatArray) -> FloatArray:
-    """xi (n,) of the multipliers of `bound_rows`, which z begins with."""
+    """Compute xi (n,) from the multipliers of `bound_rows`, the first entries of z."""
     xi, first = np.zeros(qp.n), 0
-    for sign, _, _, at in bound_rows(qp):
-        xi[at] += sign * z[first : first + len(at)]
-        first += len(at)
+    for sign, _, _, indices in bound_rows(qp):
+        xi[indices] += sign * z[first : first + len(indices)]
+        first += len(indices)
     return xi
 
 
-def two_sided(qp: QP, identity: bool) -> tuple[sp.csc_matrix, FloatArray, FloatArray]:
-    """Rows l <= C x <= u; with `identity` the bounds of x as rows after them."""
+def two_sided_rows(qp: QP, identity: bool) -> tuple[sp.csc_matrix, FloatArray, FloatArray]:
+    """Return C, l and u of the rows l <= C x <= u; with `identity` the bounds of x are further rows."""
     low = np.full(len(qp.b), -np.inf)
     low[: qp.n_zero] = qp.b[: qp.n_zero]
     if not identity or qp.lb is None or qp.ub is None:

@@ -1,8 +1,7 @@
-"""What a QP backend needs and can do, as data, and one run of it: by its own interface, or through qpsolvers.
+"""Description of a QP backend, and one run of it by its own interface or through qpsolvers.
 
-qpsolvers passes on the iterate and the multipliers of every one of them. Without a constraint it hands some backends'
-problems to SciPy's LSQR; here infinite bounds, or the equality form, keep the backend itself at work, and an answer of
-LSQR is refused.
+qpsolvers returns iterates and multipliers of all backends. It solves problems without constraints by SciPy's LSQR
+instead of some backends. Here infinite bounds, or the equality form, prevent this, and a result of LSQR is rejected.
 """
 
 from __future__ import annotations
@@ -16,35 +15,69 @@ import numpy as np
 from lavender.base.arrays import FloatArray
 from lavender.base.lazy_import import sparse as sp
 from lavender.external.as_qp import QP, bound_multipliers, bound_rows
-from lavender.external.running import Answer, Call, Limits, at_least, proof, quiet
+from lavender.external.running import Answer, Call, Limits, capture_output, check_iterate, clamp_tolerance
 from lavender.judge.solution import Status
 
 
 @dataclass(frozen=True)
 class Backend:
-    """One line of the table: what a backend needs and can do."""
+    """Requirements and capabilities of a backend.
+
+    Parameters
+    ----------
+    name : str
+    modules : tuple of str
+        Modules that can be imported if the backend is installed.
+    install : str
+        Packages that pip installs.
+    summary, reference : str
+    call : callable, optional
+        Function that calls the backend's own interface. Default: it is called through qpsolvers.
+    settings : mapping, optional
+        For qpsolvers: the backend's option names, with a field of `Limits` (a str) or a fixed value. None if the
+        backend runs at its own tolerances.
+    min_tolerance : float
+        Smallest tolerance that the backend accepts.
+    max_iter : int
+        Default limit of iterations.
+    dense : bool
+        Whether it accepts dense matrices only.
+    definite : bool
+        Whether it needs a positive definite P, which the velocity form has.
+    warm : bool
+        Whether it uses a start point.
+    stoppable : bool
+        Whether it accepts a time limit.
+    linear : {"bounds", "equality", ""}
+        How problems without constraints are passed: with infinite bounds, in the equality form, or not at all.
+    finite : bool
+        Whether it rejects infinite bounds; the finite ones are then passed as rows.
+    noisy : bool
+        Whether it prints even if output is disabled.
+    cones : bool
+        Whether it accepts second-order cones, and so the convex relaxation of friction.
+    """
 
     name: str
-    modules: tuple[str, ...]  # importable where it is installed
+    modules: tuple[str, ...]
     install: str
     summary: str
     reference: str
-    call: Call | None = None  # its own interface; None goes through qpsolvers
-    # through qpsolvers: by its own names fields of Limits, or what is fixed; None: runs at its own tolerances
+    call: Call | None = None
     settings: Mapping[str, Any] | None = None
-    least: float = 0.0  # tolerance that it takes
+    min_tolerance: float = 0.0
     max_iter: int = 10_000
-    dense: bool = False  # takes dense matrices only
-    definite: bool = False  # needs a positive definite P, which the velocity form has
-    warm: bool = False  # uses a start point
-    stoppable: bool = False  # takes a time limit
-    linear: str = "bounds"  # what keeps it at work without constraints: "bounds", "equality", or "" (refused)
-    finite: bool = False  # takes no infinite bounds: the finite ones become rows
-    noisy: bool = False  # prints even when told not to
-    cones: bool = False  # takes second-order cones, so the convex relaxation of friction
+    dense: bool = False
+    definite: bool = False
+    warm: bool = False
+    stoppable: bool = False
+    linear: str = "bounds"
+    finite: bool = False
+    noisy: bool = False
+    cones: bool = False
 
     def run(self, qp: QP, impulse: FloatArray, limit: Limits, settings: dict[str, Any]) -> Answer:
-        """One run of it, in this process."""
+        """Run the backend once, in this process."""
         if self.call is not None:
             return self.call(qp, impulse, limit, settings)
         return _through_qpsolvers(self, qp, impulse, limit, settings)
@@ -53,63 +86,67 @@ class Backend:
 def _through_qpsolvers(
     backend: Backend, qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, Any]
 ) -> Answer:
+    """Call a backend through qpsolvers."""
     import qpsolvers
 
-    known = {**vars(limit), "eps": at_least(limit.eps, backend.least) if backend.least else limit.eps}
-    given = {name: known[x] if isinstance(x, str) else x for name, x in (backend.settings or {}).items()}
-    settings = {name: x for name, x in given.items() if x is not None}  # no time limit, if none is asked for
+    eps = clamp_tolerance(limit.eps, backend.min_tolerance) if backend.min_tolerance else limit.eps
+    limits = {**vars(limit), "eps": eps}
+    options = {name: limits[x] if isinstance(x, str) else x for name, x in (backend.settings or {}).items()}
+    settings = {name: x for name, x in options.items() if x is not None}  # The time limit can be None.
     if backend.warm:
         settings.update(_warm_settings(backend.name, qp, impulse))
     settings.update(extra)
+    # equality rows, then inequality rows
     z = qp.n_zero
     dense = backend.dense
     p = qp.P.toarray() if dense else qp.P
     rows = qp.A.toarray() if dense else qp.A
     lb, ub = qp.lb, qp.ub
-    inequality, side = rows[z:], qp.b[z:]
+    inequality, rhs = rows[z:], qp.b[z:]
     bounds = bound_rows(qp) if backend.finite else []
     if bounds:
         lb = ub = None
         inequality = sp.csc_matrix(sp.vstack([inequality, *(s * m for s, m, _, _ in bounds)]))
         inequality = inequality.toarray() if dense else inequality
-        side = np.concatenate([side, *(h for _, _, h, _ in bounds)])
-    g, h = (inequality, side) if len(side) else (None, None)
+        rhs = np.concatenate([rhs, *(h for _, _, h, _ in bounds)])
+    g, h = (inequality, rhs) if len(rhs) else (None, None)
     a, b = (rows[:z], qp.b[:z]) if z else (None, None)
     if lb is None and g is None and a is None:
-        lb, ub = np.full(qp.n, -np.inf), np.full(qp.n, np.inf)  # infinite bounds: no hand-over to LSQR
+        lb, ub = np.full(qp.n, -np.inf), np.full(qp.n, np.inf)  # With bounds, qpsolvers does not use LSQR.
     problem = qpsolvers.Problem(p, qp.q, g, h, a, b, lb, ub)
     x0 = settings.pop("initvals", None)
-    with quiet(False) as said:
+    with capture_output(False) as warnings:
         solution = qpsolvers.solve_problem(problem, backend.name, initvals=x0, **settings)
-    words = "; ".join(said)
-    if "LSQR" in words:
+    warning = "; ".join(warnings)
+    if "LSQR" in warning:
         return Answer(
             Status.NUMERICAL_ERROR, f"qpsolvers ran LSQR in place of {backend.name}; its answer is not used"
         )
+    # iterate and multipliers
     extras = solution.extras or {}
-    status, own = _status_of(solution, extras)
+    status, status_text = _get_status(solution, extras)
     zeta = np.zeros(len(qp.b))
     x = None if solution.x is None else np.asarray(solution.x, float).ravel()
-    if z and _given(solution.y, z):
+    if z and _has_size(solution.y, z):
         zeta[:z] = solution.y
     elif z:
         x = x if qp.form == "impulse" else None
-    if len(qp.b) > z and _given(solution.z, len(side)):
+    if len(qp.b) > z and _has_size(solution.z, len(rhs)):
         zeta[z:] = np.asarray(solution.z)[: len(qp.b) - z]
     elif len(qp.b) > z:
-        x = None  # multipliers are the answer of the velocity form
-    xi = np.asarray(solution.z_box, float) if _given(solution.z_box, qp.n) else None
-    if bounds and _given(solution.z, len(side)):
+        x = None  # The solution of the velocity form consists of multipliers.
+    xi = np.asarray(solution.z_box, float) if _has_size(solution.z_box, qp.n) else None
+    if bounds and _has_size(solution.z, len(rhs)):
         xi = bound_multipliers(qp, np.asarray(solution.z)[len(qp.b) - z :])
-    iterations = _iterations(extras)
+    iterations = _get_iterations(extras)
     work = {} if iterations is None else {"iterations": iterations}
-    words = own or words or _words(solution.found, x)
+    message = status_text or warning or _describe_result(solution.found, x)
     if backend.settings is None:
-        words += ", at its own tolerance"
-    direction, contradiction = proof(qp, x, zeta) if status is Status.INFEASIBLE else (None, None)
+        message += ", at its own tolerance"
+    direction, contradiction = check_iterate(qp, x, zeta) if status is Status.INFEASIBLE else (None, None)
     return Answer(
         status=status,
-        words=words,
+        message=message,
         x=x,
         zeta=zeta,
         xi=xi,
@@ -119,15 +156,16 @@ def _through_qpsolvers(
     )
 
 
-def _given(y: Any, size: int) -> bool:
+def _has_size(y: Any, size: int) -> bool:
     return y is not None and np.size(y) == size
 
 
-def _words(found: bool | None, x: Any) -> str:
-    return "solved" if found else "not solved" if x is not None else "not solved, nothing returned"
+def _describe_result(is_solved: bool | None, x: Any) -> str:
+    return "solved" if is_solved else "not solved" if x is not None else "not solved, nothing returned"
 
 
-def _iterations(extras: Mapping[str, Any]) -> int | None:
+def _get_iterations(extras: Mapping[str, Any]) -> int | None:
+    """Find the number of iterations in the backend's data; None if it is not there."""
     info = extras.get("info", extras)
     for source in (info, extras):
         for name in ("iter", "iterations", "num_iterations", "nbIter", "num_iter"):
@@ -135,41 +173,42 @@ def _iterations(extras: Mapping[str, Any]) -> int | None:
             if isinstance(value, (int, np.integer)):
                 return int(value)
             if isinstance(value, (tuple, list, np.ndarray)) and len(value):
-                return int(value[0])  # quadprog: added and dropped constraints
+                return int(value[0])  # quadprog returns the numbers of added and of dropped constraints.
     stats = extras.get("stats")
     return len(stats) if isinstance(stats, list) else None
 
 
-def _status_of(solution: Any, extras: Mapping[str, Any]) -> tuple[Status, str]:
-    """Status and the backend's own words, as far as qpsolvers passes them on."""
+def _get_status(solution: Any, extras: Mapping[str, Any]) -> tuple[Status, str]:
+    """Return the status, and the backend's text for it if qpsolvers returns one."""
     info = extras.get("info", extras)
-    words = ""
+    text = ""
     for name in ("status", "exitFlag"):
         value = info.get(name) if isinstance(info, Mapping) else getattr(info, name, None)
         if value is None:
             value = extras.get(name)
         if value is not None:
-            words = str(getattr(value, "name", value))
-            words = f"status {words}" if words.lstrip("-").isdigit() else words
+            text = str(getattr(value, "name", value))
+            text = f"status {text}" if text.lstrip("-").isdigit() else text
             break
-    low = words.lower()
+    lower_case = text.lower()
     if solution.found:
-        return Status.CONVERGED, words
+        return Status.CONVERGED, text
     if "exitFlag" in (info if isinstance(info, Mapping) else ()):
         ecos = {1: Status.INFEASIBLE, 2: Status.INFEASIBLE, 10: Status.STALLED, -1: Status.MAX_ITERATIONS}
-        return ecos.get(int(info["exitFlag"]), Status.NUMERICAL_ERROR), words
-    if "infeas" in low or "unbounded" in low:
-        return Status.INFEASIBLE, words
-    if "time" in low:
-        return Status.TIME_LIMIT, words
-    if "max" in low and "iter" in low:
-        return Status.MAX_ITERATIONS, words
-    if "inaccurate" in low or "unknown" in low:
-        return Status.STALLED, words
-    return Status.NUMERICAL_ERROR, words
+        return ecos.get(int(info["exitFlag"]), Status.NUMERICAL_ERROR), text
+    if "infeas" in lower_case or "unbounded" in lower_case:
+        return Status.INFEASIBLE, text
+    if "time" in lower_case:
+        return Status.TIME_LIMIT, text
+    if "max" in lower_case and "iter" in lower_case:
+        return Status.MAX_ITERATIONS, text
+    if "inaccurate" in lower_case or "unknown" in lower_case:
+        return Status.STALLED, text
+    return Status.NUMERICAL_ERROR, text
 
 
 def _warm_settings(name: str, qp: QP, impulse: FloatArray) -> dict[str, Any]:
+    """Return the settings that start a backend from an impulse (m,) [N s]."""
     x, zeta, xi = qp.start(impulse)
     if name == "proxqp":
         from proxsuite import proxqp

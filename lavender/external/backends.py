@@ -1,13 +1,15 @@
-"""Every backend of qpsolvers by its own name, on linear problems and boxed LCPs with symmetric A.
+"""Specs of all backends of qpsolvers, for linear problems and boxed LCPs with symmetric A.
 
     min 1/2 l.A l - b.l,  lower <= l <= upper        (impulse form), or the velocity form of `as_qp`
 
-`clarabel_cone` adds the convex relaxation of friction, disk and spin as second-order cones, a round cone as one:
+`clarabel_cone` also supports the convex relaxation of friction. Disk and spin are second-order cones; a round cone is
+one cone:
 
     l_n >= 0,  |l_t| <= mu l_n,  |l_s| <= mu r l_n,  or the dual cone w_n >= a |w_t| + a_s |w_s|
 
-Backends of which qpsolvers passes on the iterate but not what happened (iterations, exit flag,
-certificates, warm start) are called by their own interface (`native.py`), the others through it (`backend.py`).
+Some backends are called by their own interface (`native.py`), because qpsolvers returns their iterates but not their
+iterations, exit flags and certificates, and has no warm start for them. The others are called through qpsolvers
+(`backend.py`).
 """
 
 from __future__ import annotations
@@ -16,11 +18,11 @@ from functools import partial
 
 from lavender.external import native
 from lavender.external.backend import Backend
-from lavender.external.qp_solver import OPTIONS, QPSolver, refusal
+from lavender.external.qp_solver import OPTION_HELP, QPSolver, refusal
 from lavender.solvers.registry import SolverSpec
 
-#: Settings of those that go through qpsolvers, by their names there: a word is a field of `Limits`, all else is fixed.
-PROXIMAL = {  # without the gap proxqp accepts multipliers on bounds that are not active (met on a redundant stack)
+#: Options of backends that qpsolvers calls: a str is a field of `Limits`, other values are fixed.
+PROXIMAL = {  # Without the gap, proxqp accepts multipliers of inactive bounds (observed on a redundant stack).
     "eps_abs": "eps", "eps_rel": 0.0, "max_iter": "max_iter",
     "check_duality_gap": True, "eps_duality_gap_abs": "gap", "eps_duality_gap_rel": "gap_relative",
 }  # fmt: skip
@@ -75,16 +77,16 @@ BACKENDS: tuple[Backend, ...] = (
             "Domahidi, Chu, Boyd 2013, ECOS", settings=ECOS, max_iter=100,
             dense=True, definite=True, linear="equality", finite=True),
     Backend("gurobi", ("qpsolvers", "gurobipy"), "gurobipy", "interior point and simplex", "Gurobi manual",
-            settings=GUROBI, least=1e-9, stoppable=True, noisy=True),
+            settings=GUROBI, min_tolerance=1e-9, stoppable=True, noisy=True),
     Backend("copt", ("qpsolvers", "coptpy"), "coptpy", "interior point", "COPT manual",
-            settings=COPT, least=1e-9, stoppable=True, noisy=True),
+            settings=COPT, min_tolerance=1e-9, stoppable=True, noisy=True),
     Backend("mosek", ("qpsolvers", "cvxopt", "mosek"), "cvxopt mosek", "interior point", "MOSEK manual", noisy=True),
     Backend("qtqp", ("qpsolvers", "qtqp"), "qtqp", "primal-dual interior point", "QTQP manual",
             settings=QTQP, max_iter=200, linear=""),
     Backend("pyqpmad", ("qpsolvers", "pyqpmad"), "pyqpmad", "dual active set, positive definite A",
-            "Goldfarb, Idnani 1983", settings=PYQPMAD, least=1e-12, dense=True, definite=True),
+            "Goldfarb, Idnani 1983", settings=PYQPMAD, min_tolerance=1e-12, dense=True, definite=True),
     Backend("qpax", ("qpsolvers", "qpax"), "qpax", "interior point in JAX", "Tracy, Manchester 2024, qpax",
-            settings=QPAX, least=1e-12, max_iter=30, dense=True, noisy=True),
+            settings=QPAX, min_tolerance=1e-12, max_iter=30, dense=True, noisy=True),
     Backend("jaxopt_osqp", ("qpsolvers", "jaxopt"), "jaxopt", "operator splitting in JAX", ADMM,
             dense=True, noisy=True),
     Backend("hpipm", ("qpsolvers", "hpipm_python"), "hpipm_python (github.com/giaf/hpipm)", "interior point",
@@ -104,15 +106,15 @@ BACKENDS: tuple[Backend, ...] = (
 )  # fmt: skip
 
 
-def _spec(backend: Backend) -> SolverSpec:
+def _make_spec(backend: Backend) -> SolverSpec:
+    """Build the registry entry of a backend."""
     laws = {"lcp"} | ({"linear"} if backend.linear else set()) | ({"cone"} if backend.cones else set())
     return SolverSpec(
         name=backend.name,
         factory=partial(QPSolver, backend),
         laws=frozenset(laws),
-        box_friction_laws=frozenset()
-        if backend.definite
-        else frozenset({"cone"}),  # as edges of cones A is singular
+        # Boxes as edges of cones make A singular.
+        box_friction_laws=frozenset() if backend.definite else frozenset({"cone"}),
         resumable=False,
         external=True,
         impulse=backend.warm,
@@ -120,7 +122,7 @@ def _spec(backend: Backend) -> SolverSpec:
         round_cones=backend.cones,
         supports_rolling=backend.cones,
         max_iter=backend.max_iter,
-        options=OPTIONS,
+        options=OPTION_HELP,
         requires=backend.modules,
         install=backend.install,
         summary=backend.summary if backend.cones else f"{backend.summary} (QP backend)",
@@ -129,4 +131,4 @@ def _spec(backend: Backend) -> SolverSpec:
     )
 
 
-SPECS: tuple[SolverSpec, ...] = tuple(map(_spec, BACKENDS))
+SPECS: tuple[SolverSpec, ...] = tuple(map(_make_spec, BACKENDS))

@@ -1,7 +1,7 @@
-"""Run backends under a time limit in other processes, which are kept from call to call.
+"""Run backends with a time limit in other processes, which later calls reuse.
 
 A process that does not answer in time is killed, and the next call starts another. Backends that accept a time limit
-get it and have as long again to return what they have; some read the clock only every few seconds.
+are killed after twice that limit, because some of them read the clock only every few seconds.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from lavender.base.errors import InputError
 from lavender.base.subprocesses import InvalidAnswer, ProcessBackend, ProcessEnded, RemoteError
 from lavender.external.as_qp import QP, impulse_form
 from lavender.external.backend import Backend
-from lavender.external.running import Answer, Failed, Limits, quiet
+from lavender.external.running import Answer, Failed, Limits, capture_output
 from lavender.judge.solution import Status
 from lavender.problem import Problem
 
 #: Fields of `running.Answer`, in the order in which they are sent.
-ARRAYS = ("x", "zeta", "xi", "direction", "contradiction")
-MAX_MESSAGE_LENGTH = 500  # characters. Longer messages of backends are cut.
+ANSWER_ARRAYS = ("x", "zeta", "xi", "direction", "contradiction")
+MAX_BACKEND_MESSAGE_LENGTH = 500  # characters. Longer messages of backends are cut.
 STOPPABLE_LIMIT_RATIO = 2.0  # A backend that accepts a time limit is killed after this multiple of its limit.
 ENTRY_SIZE = 12.0  # bytes that one matrix entry of a program needs in a request
 TRANSFER_RATE = 3e8  # bytes/s. Programs that would take longer to send than the limit time out.
@@ -36,8 +36,8 @@ idle_processes: list[ProcessBackend] = []
 
 
 def start_process(backend: Backend) -> None:
-    """Have a process ready that has imported the backend's code, before the clock of a time limit starts."""
-    process = _take() or ProcessBackend(run_backend)
+    """Start a process that has imported the backend's code, before the clock of a time limit starts."""
+    process = _take_idle() or ProcessBackend(run_backend)
     with suppress(ProcessEnded):  # If the system starts no process, the backend runs in this one.
         process.start()
         with suppress(TimeoutError, InvalidAnswer, RemoteError):  # The call itself reports them.
@@ -50,13 +50,13 @@ class IsolatedBackend:
 
     def __init__(self, backend: Backend) -> None:
         self.backend = backend
-        self.place = "to its end"
+        self.manner = "to its end"
 
     def __call__(self, qp: QP, impulse: FloatArray, limit: Limits, settings: dict[str, Any]) -> Answer:
         answer = call_backend(self.backend, qp, impulse, limit, settings)
         if answer is None:
             return self.backend.run(qp, impulse, limit, settings)
-        self.place = "in a process of its own"
+        self.manner = "in a process of its own"
         return answer
 
 
@@ -68,7 +68,7 @@ def call_backend(
     Raises
     ------
     InputError
-        The backend does not know a setting, or a setting cannot be pickled.
+        The backend has no such setting, or a setting cannot be pickled.
     Failed
         The backend raised an exception, or its process died.
     """
@@ -77,7 +77,7 @@ def call_backend(
         return Answer(
             Status.TIME_LIMIT, "ended at the time limit: to hand the program over would take longer"
         )
-    process = _take()
+    process = _take_idle()
     if process is None:
         return None
     try:
@@ -100,7 +100,7 @@ def call_backend(
     except ProcessEnded as error:
         raise Failed(f"the process of the backend died ({error})") from None
     except InvalidAnswer as error:
-        raise Failed(f"the process of the backend sent what is no answer ({error})") from None
+        raise Failed(f"the process of the backend sent an invalid answer ({error})") from None
     except RemoteError as error:
         idle_processes.append(process)
         raise (
@@ -109,13 +109,13 @@ def call_backend(
     idle_processes.append(process)
     try:  # The backend may have written anything.
         work = {str(kind): int(count) for kind, count in fields["work"].items()}
-        by_name = dict(zip(ARRAYS, arrays, strict=True))
-        return Answer(status=Status[fields["status"]], words=str(fields["words"]), work=work, **by_name)
+        by_name = dict(zip(ANSWER_ARRAYS, arrays, strict=True))
+        return Answer(status=Status[fields["status"]], message=str(fields["message"]), work=work, **by_name)
     except (ValueError, TypeError, KeyError, AttributeError) as error:
-        raise Failed(f"the process of the backend sent what is no answer ({error})") from None
+        raise Failed(f"the process of the backend sent an invalid answer ({error})") from None
 
 
-def _take() -> ProcessBackend | None:
+def _take_idle() -> ProcessBackend | None:
     """Return a process that runs and has no call; None if there is none."""
     while True:
         try:
@@ -139,7 +139,7 @@ if hasattr(os, "register_at_fork"):  # Windows has none. A forked process must n
 
 # -- in the other process -----------------------------------------------------------------------------
 
-_warm: set[str] = set()  # names of the backends that were warmed up
+_warmed_up: set[str] = set()  # names of the backends that were warmed up
 
 
 def run_backend(
@@ -151,15 +151,15 @@ def run_backend(
 ) -> subprocesses.Answer:
     """Run a backend; without a program, solve a tiny one, because backends import their code when they first solve."""
     if qp is None or impulse is None or limit is None or settings is None:
-        if backend.name not in _warm:
-            _warm.add(backend.name)
-            with suppress(Exception), quiet(backend.noisy):
+        if backend.name not in _warmed_up:
+            _warmed_up.add(backend.name)
+            with suppress(Exception), capture_output(backend.noisy):
                 tiny = impulse_form(Problem.lcp(np.eye(1), np.ones(1)))
                 backend.run(tiny, np.zeros(1), Limits(1e-3, 1e-3, 1e-3, 100, None), {})
         return {}, ()
-    with quiet(backend.noisy) as printed:
+    with capture_output(backend.noisy) as printed:
         answer = backend.run(qp, impulse, limit, settings)
     work = {str(kind): int(count) for kind, count in answer.work.items()}
-    message = str(answer.words or "; ".join(printed))[:MAX_MESSAGE_LENGTH]
-    fields = {"status": answer.status.name, "words": message, "work": work}
-    return fields, [getattr(answer, name) for name in ARRAYS]
+    message = str(answer.message or "; ".join(printed))[:MAX_BACKEND_MESSAGE_LENGTH]
+    fields = {"status": answer.status.name, "message": message, "work": work}
+    return fields, [getattr(answer, name) for name in ANSWER_ARRAYS]

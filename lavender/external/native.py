@@ -1,6 +1,6 @@
-"""Backends that are called by their own interface, a function each.
+"""Calls of backends by their own interface, one function for each.
 
-qpsolvers passes on their iterate, but not what happened: iterations, exit flag, certificates, warm start.
+Through qpsolvers, these backends have no warm start, and their iterations, exit flags and certificates are lost.
 """
 
 from __future__ import annotations
@@ -13,17 +13,25 @@ import numpy as np
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import InputError
 from lavender.base.lazy_import import sparse as sp
-from lavender.external.as_qp import QP, bound_multipliers, bound_rows, two_sided
-from lavender.external.running import EPS_MIN, Answer, Limits, at_least, certificate, proof, quiet, set_all
+from lavender.external.as_qp import QP, bound_multipliers, bound_rows, two_sided_rows
+from lavender.external.running import (
+    MIN_TOLERANCE,
+    Answer,
+    Limits,
+    capture_output,
+    check_iterate,
+    clamp_tolerance,
+    copy_certificate,
+    set_options,
+)
 from lavender.judge.solution import Status
 
-DAQP_PROXIMAL = (
-    1e-2  # Weight of proximal steps of a P with unit diagonal: 64 iterations on a program where 1e-8 failed.
-)
+# Weight of DAQP's proximal steps for a P with unit diagonal. A program that failed with 1e-8 takes 64 iterations.
+DAQP_PROXIMAL_WEIGHT = 1e-2
 
 
 def call_clarabel(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, Any]) -> Answer:
-    """Clarabel: interior point, homogeneous embedding, second-order cones (Goulart, Chen 2024)."""
+    """Call Clarabel: interior point, homogeneous embedding, second-order cones (Goulart, Chen 2024)."""
     import clarabel
 
     first = qp.n_zero + qp.n_nonneg
@@ -45,12 +53,12 @@ def call_clarabel(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, A
     settings.tol_gap_abs = limit.gap
     settings.tol_gap_rel = limit.gap_relative
     settings.tol_ktratio = 1e-10
-    # Where it cannot get further it says so; "almost solved" is no claim at these tolerances.
+    # With reduced tolerances equal to the tolerances, "almost solved" is not reported for a looser tolerance.
     settings.reduced_tol_feas, settings.reduced_tol_gap_abs = limit.eps, limit.gap
     settings.reduced_tol_gap_rel = limit.gap_relative
     if limit.time_limit is not None:
         settings.time_limit = limit.time_limit
-    set_all(settings, extra, "clarabel")
+    set_options(settings, extra, "clarabel")
     solver = clarabel.DefaultSolver(sp.csc_matrix(sp.triu(qp.P)), qp.q, stacked, rhs, cones, settings)
     result = solver.solve()
     name = str(result.status)
@@ -69,20 +77,20 @@ def call_clarabel(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, A
     zeta = np.concatenate([z[:first], z[first + n_bounds :]])
     xi = bound_multipliers(qp, z[first:])
     almost = name in ("AlmostPrimalInfeasible", "AlmostDualInfeasible")
-    if almost and any(part is not None for part in proof(qp, x, zeta)):
+    if almost and any(part is not None for part in check_iterate(qp, x, zeta)):
         status = Status.INFEASIBLE  # its own test is stricter than the certificate needs
-    # One factorisation before the first step and one for each.
+    # One factorisation before the first step and one for each step.
     work = {"iterations": result.iterations, "factorisations": result.iterations + 1}
     return Answer(
-        status=status, words=name, x=x, zeta=zeta, xi=xi, work=work, direction=x, contradiction=zeta
+        status=status, message=name, x=x, zeta=zeta, xi=xi, work=work, direction=x, contradiction=zeta
     )
 
 
 def call_daqp(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, Any]) -> Answer:
-    """DAQP: dual active set, dense (Arnström, Bemporad, Axehill 2022)."""
+    """Call DAQP: dual active set, dense (Arnström, Bemporad, Axehill 2022)."""
     import daqp
 
-    _, low, high = two_sided(qp, False)
+    _, low, high = two_sided_rows(qp, False)
     lb = np.zeros(0) if qp.lb is None else qp.lb
     ub = np.zeros(0) if qp.ub is None else qp.ub
     low, high = (np.clip(np.concatenate(p), -1e30, 1e30) for p in ((lb, low), (ub, high)))
@@ -91,20 +99,20 @@ def call_daqp(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, Any])
     x0, _, _ = qp.start(impulse)
     settings: dict[str, Any] = {
         "iter_limit": limit.max_iter,
-        "primal_tol": at_least(limit.eps, 1e-11),
-        "dual_tol": at_least(limit.eps, 1e-13),
+        "primal_tol": clamp_tolerance(limit.eps, 1e-11),
+        "dual_tol": clamp_tolerance(limit.eps, 1e-13),
     }
     if limit.repeated:
-        # Its regularisation of a singular P is 1e-6 by default, and so is the multiplier that it leaves on rows that do
-        # not act. Proximal steps to the last digits leave none.
-        settings |= {"eps_prox": DAQP_PROXIMAL, "eta_prox": EPS_MIN}
+        # By default, DAQP regularises a singular P by 1e-6, which leaves multipliers of this size on inactive rows.
+        # Proximal steps with a small tolerance avoid them.
+        settings |= {"eps_prox": DAQP_PROXIMAL_WEIGHT, "eta_prox": MIN_TOLERANCE}
     if limit.time_limit is not None:
         settings["time_limit"] = limit.time_limit
     dense = qp.A.toarray() if len(qp.b) else np.zeros((0, qp.n))
     x, _, flag, info = daqp.solve(
         qp.P.toarray(), qp.q.copy(), dense, high, low, sense, primal_start=x0, **{**settings, **extra}
     )
-    words = {
+    message = {
         1: "optimal",
         2: "soft optimal",
         -1: "infeasible",
@@ -124,10 +132,10 @@ def call_daqp(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, Any])
     }
     multipliers = np.asarray(info["lam"])
     k = len(lb)
-    direction, contradiction = proof(qp, np.asarray(x), multipliers[k:])
+    direction, contradiction = check_iterate(qp, np.asarray(x), multipliers[k:])
     return Answer(
         status=status.get(int(flag), Status.NUMERICAL_ERROR),
-        words=f"{words} (exit flag {flag})",
+        message=f"{message} (exit flag {flag})",
         x=np.asarray(x),
         zeta=multipliers[k:],
         xi=multipliers[:k],
@@ -138,19 +146,19 @@ def call_daqp(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, Any])
 
 
 @cache
-def _greeted() -> None:
-    """The first HiGHS of a process greets on standard output where it is made, whatever it is told; no other does."""
+def _print_banner() -> None:
+    """Create the first HiGHS object of a process, which always prints a banner to standard output, and discard it."""
     import highspy
 
-    with quiet(noisy=True):
+    with capture_output(noisy=True):
         highspy.Highs()  # type: ignore[no-untyped-call]
 
 
 def call_highs(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, Any]) -> Answer:
-    """HiGHS: null-space active set (Huangfu, Hall 2018)."""
+    """Call HiGHS: null-space active set (Huangfu, Hall 2018)."""
     import highspy
 
-    rows, low, high = two_sided(qp, False)
+    rows, low, high = two_sided_rows(qp, False)
     model = highspy.HighsModel()
     lower = sp.csc_matrix(sp.tril(qp.P))
     model.hessian_.dim_ = qp.n
@@ -169,14 +177,14 @@ def call_highs(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, Any]
         lp.a_matrix_.start_, lp.a_matrix_.index_, lp.a_matrix_.value_ = rows.indptr, rows.indices, rows.data
         lp.a_matrix_.num_row_, lp.a_matrix_.num_col_ = rows.shape
         lp.row_lower_, lp.row_upper_ = low, high
-    _greeted()
+    _print_banner()
     solver: Any = highspy.Highs()  # type: ignore[no-untyped-call]
     settings: dict[str, Any] = {
         "output_flag": False,
         "threads": 1,
-        "primal_feasibility_tolerance": at_least(limit.eps, 1e-10),
-        "dual_feasibility_tolerance": at_least(limit.eps, 1e-10),
-        "qp_regularization_value": 1e-13,  # its default shifts the diagonal by 1e-7: another problem
+        "primal_feasibility_tolerance": clamp_tolerance(limit.eps, 1e-10),
+        "dual_feasibility_tolerance": clamp_tolerance(limit.eps, 1e-10),
+        "qp_regularization_value": 1e-13,  # The default shifts the diagonal by 1e-7, which changes the problem.
         "qp_iteration_limit": limit.max_iter,
     }
     if limit.time_limit is not None:
@@ -199,7 +207,7 @@ def call_highs(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, Any]
             "Iteration limit reached": Status.MAX_ITERATIONS,
             "Time limit reached": Status.TIME_LIMIT,
         }.get(name, Status.NUMERICAL_ERROR),
-        words=name,
+        message=name,
         x=x,
         zeta=-np.array(answer.row_dual) if dual else None,
         xi=-np.array(answer.col_dual) if dual else None,
@@ -208,11 +216,11 @@ def call_highs(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, Any]
 
 
 @cache
-def _algebra() -> str:
-    """The algebra that OSQP takes by itself, found once.
+def _get_algebra() -> str:
+    """Return the default algebra of OSQP.
 
-    `osqp.OSQP()` would look for the modules of two others every time, which takes 0.2 ms and locks of the import: a
-    process that is forked meanwhile waits for them for ever.
+    Without it, every `osqp.OSQP()` searches the modules of two other algebras. This takes 0.2 ms and import locks,
+    for which a process that is forked meanwhile waits forever.
     """
     import osqp
 
@@ -220,11 +228,11 @@ def _algebra() -> str:
 
 
 def call_osqp(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, Any]) -> Answer:
-    """OSQP: operator splitting with polishing (Stellato et al. 2020)."""
+    """Call OSQP: operator splitting with polishing (Stellato et al. 2020)."""
     import osqp
 
-    rows, low, high = two_sided(qp, True)
-    solver = osqp.OSQP(algebra=_algebra())
+    rows, low, high = two_sided_rows(qp, True)
+    solver = osqp.OSQP(algebra=_get_algebra())
     settings = {
         "eps_abs": limit.eps,
         "eps_rel": 0.0,
@@ -234,10 +242,10 @@ def call_osqp(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, Any])
         "polishing": True,
         "polish_refine_iter": 10,
         "scaled_termination": False,
-        "check_dualgap": False,  # its multipliers are complementary by construction
+        "check_dualgap": False,  # OSQP's multipliers are complementary by construction.
         "check_termination": 25,
         "adaptive_rho": True,
-        "adaptive_rho_interval": 50,  # iterations, never times: the same bits every run
+        "adaptive_rho_interval": 50,  # in iterations; an interval in time would make results irreproducible
         "verbose": False,
     }
     if limit.time_limit is not None:
@@ -250,9 +258,9 @@ def call_osqp(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, Any])
     try:
         solver.setup(p, qp.q, rows, low, high, **{**settings, **extra})
     except osqp.OSQPException as error:
-        # Its text is a number: 4 = the factorisation met a P that is not positive semidefinite.
-        words = "P is not positive semidefinite" if str(error) == "4" else "see its list of error codes"
-        return Answer(Status.NUMERICAL_ERROR, f"OSQPException {error}: {words}")
+        # The text is an error code; 4: the factorisation found that P is not positive semidefinite.
+        message = "P is not positive semidefinite" if str(error) == "4" else "see its list of error codes"
+        return Answer(Status.NUMERICAL_ERROR, f"OSQPException {error}: {message}")
     x, zeta, xi = qp.start(impulse)
     solver.warm_start(x=x, y=np.concatenate([zeta, xi])[: len(low)])
     result = solver.solve(raise_error=False)
@@ -273,21 +281,21 @@ def call_osqp(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, Any])
     polished = {1: ", polished", -1: ", polishing failed"}.get(int(info.status_polish), "")
     return Answer(
         status=status,
-        words=f"{info.status}{polished}",
+        message=f"{info.status}{polished}",
         x=np.asarray(result.x),
         zeta=y[:r],
         xi=y[r:],
         work={"iterations": info.iter, "factorisations": 1 + info.rho_updates},
-        direction=certificate(result.dual_inf_cert, qp.n),
-        contradiction=certificate(None if result.prim_inf_cert is None else result.prim_inf_cert[:r], r),
+        direction=copy_certificate(result.dual_inf_cert, qp.n),
+        contradiction=copy_certificate(None if result.prim_inf_cert is None else result.prim_inf_cert[:r], r),
     )
 
 
 def call_qpalm(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, Any]) -> Answer:
-    """QPALM: proximal augmented Lagrangian, semismooth Newton (Hermans, Themelis, Patrinos 2022)."""
+    """Call QPALM: proximal augmented Lagrangian, semismooth Newton (Hermans, Themelis, Patrinos 2022)."""
     import qpalm
 
-    rows, low, high = two_sided(qp, True)
+    rows, low, high = two_sided_rows(qp, True)
     data = qpalm.Data(qp.n, len(low))
     data.Q, data.q = qp.P, qp.q
     if len(low):
@@ -300,7 +308,7 @@ def call_qpalm(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, Any]
     settings.max_iter = settings.inner_max_iter = max(limit.max_iter, 1)
     if limit.time_limit is not None:
         settings.time_limit = limit.time_limit
-    set_all(settings, extra, "qpalm")
+    set_options(settings, extra, "qpalm")
     solver = qpalm.Solver(data, settings)
     x, zeta, xi = qp.start(impulse)
     solver.warm_start(x, np.concatenate([zeta, xi])[: len(low)])
@@ -317,13 +325,15 @@ def call_qpalm(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, Any]
     y = np.array(solver.solution.y)
     return Answer(
         status=status,
-        words=name,
+        message=name,
         x=np.array(solver.solution.x),
         zeta=y[:r],
         xi=y[r:],
         work={"iterations": solver.info.iter, "outer": solver.info.iter_out},
-        direction=certificate(np.array(solver.dual_inf_certificate), qp.n) if "dual inf" in name else None,
-        contradiction=certificate(np.array(solver.prim_inf_certificate)[:r], r)
+        direction=copy_certificate(np.array(solver.dual_inf_certificate), qp.n)
+        if "dual inf" in name
+        else None,
+        contradiction=copy_certificate(np.array(solver.prim_inf_certificate)[:r], r)
         if "primal inf" in name
         else None,
     )

@@ -8,15 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray, flag
+from lavender.base.arrays import FloatArray, check_bool
 from lavender.base.deadline import Deadline
 from lavender.base.errors import CapabilityError, InputError
 from lavender.base.lazy_import import import_numerics
-from lavender.external.as_qp import QP, impulse_form, pick_form, program_form, velocity_form
+from lavender.external.as_qp import QP, choose_form, impulse_form, program_form, velocity_form
 from lavender.external.backend import Backend
 from lavender.external.isolated import ENTRY_SIZE, TRANSFER_RATE, IsolatedBackend, start_process
-from lavender.external.running import ask
-from lavender.judge.residuals import quick
+from lavender.external.running import call_until_accepted
+from lavender.judge.residuals import compute_relative
 from lavender.judge.solution import Claim, Status, summed
 from lavender.problem import Problem
 from lavender.solvers.registry import Solver
@@ -24,17 +24,17 @@ from lavender.solvers.registry import Solver
 MAX_DENSE_SIZE = 2**30  # bytes. A backend for dense matrices rejects a problem with a larger matrix.
 FORM_TIME = 1e-3  # s. Forming any program takes up to this, 1.5 times the measured time.
 FORM_TIME_PER_ENTRY = 1.2e-7  # s. Additional time for each entry of A, 1.5 times the measured time.
-OPTIONS = {
+OPTION_HELP = {
     "isolate": "given a time_limit, run the backend in another process, which is killed at the limit; default True",
     "form": "'impulse', 'velocity' (needs rows) or 'auto' (default): by size, mass ratio and backend; not of programs",
     "unit_diagonal": "impulse form: scale A to a unit diagonal, default True",
-    "settings": "mapping passed to the backend, over those that tol gives",
+    "settings": "mapping of the backend's options; they override the options that tol determines",
 }
 
 
 @dataclass(frozen=True)
 class QPSolver(Solver):
-    """A backend with its options; `OPTIONS` describes them."""
+    """A backend with its options; `OPTION_HELP` describes them."""
 
     backend: Backend
     form: str = "auto"
@@ -47,23 +47,24 @@ class QPSolver(Solver):
             raise InputError(
                 f"settings is a {type(self.settings).__name__}; a mapping of names to values is needed"
             )
-        flag("isolate", self.isolate)
+        check_bool("isolate", self.isolate)
 
     def setup_time(self, problem: Problem) -> float:
         """Estimate the time [s] to form the program, and to send it if the backend runs in another process."""
         entry = FORM_TIME_PER_ENTRY + (ENTRY_SIZE / TRANSFER_RATE if self.isolate else 0.0)
-        return FORM_TIME + entry * problem.most_entries
+        return FORM_TIME + entry * problem.max_entries
 
     @np.errstate(all="ignore")  # The judge finds overflows.
     def prepare(self, problem: Problem) -> QP:
         return self._form(problem, True)
 
     def _form(self, problem: Problem, assume: bool) -> QP:
+        """Write the problem as a program for the backend; raise CapabilityError if the backend cannot solve it."""
         b = self.backend
         qp: QP | None = None
         if problem.has_singular_program:
             qp = program_form(problem, assume=assume)
-        elif pick_form(problem, self.form, b.definite) == "velocity":
+        elif choose_form(problem, self.form, b.definite) == "velocity":
             qp = velocity_form(problem, assume=assume)
         if qp is not None and b.definite and self.form == "auto" and not qp.is_definite:
             qp = None
@@ -74,7 +75,7 @@ class QPSolver(Solver):
                 equality=b.linear == "equality" and problem.cones.is_free,
                 assume=assume,
             )
-        if len(qp.kept) and qp.is_bounds_only and not b.linear:
+        if len(qp.unknown_rows) and qp.is_bounds_only and not b.linear:
             raise CapabilityError(
                 f"solver {b.name!r} takes no problem without inequalities, and qpsolvers would hand it to LSQR; "
                 "use direct or another backend"
@@ -90,30 +91,36 @@ class QPSolver(Solver):
     def run(
         self, state: QP, impulse: FloatArray, max_iter: int, tol: float, time_limit: float | None = None
     ) -> Claim:
-        qp, b, none = state, self.backend, {"backend_calls": 0}
-        if not len(qp.kept):
+        qp, b, no_work = state, self.backend, {"backend_calls": 0}
+        if not len(qp.unknown_rows):
             impulse[:] = qp.fixed
-            return Claim(Status.CONVERGED, 0, none, "every row was decided by its bounds", qp.form)
+            return Claim(Status.CONVERGED, 0, no_work, "every impulse is determined by its bounds", qp.form)
         if max_iter == 0:
-            return Claim(Status.MAX_ITERATIONS, 0, none, "", qp.form)
-        if not qp.fits:
-            words = "as a quadratic program the problem has numbers that overflow; the backend was not called"
-            return Claim(Status.NUMERICAL_ERROR, 0, none, words, qp.form)
+            return Claim(Status.MAX_ITERATIONS, 0, no_work, "", qp.form)
+        if not qp.is_representable:
+            message = (
+                "as a quadratic program the problem has numbers that overflow; the backend was not called"
+            )
+            return Claim(Status.NUMERICAL_ERROR, 0, no_work, message, qp.form)
         isolated = IsolatedBackend(b) if self.isolate and time_limit is not None else None
         deadline, start = Deadline(time_limit), impulse.copy()
-        claim = ask(qp, impulse, isolated or b.run, max_iter, tol, time_limit, self.settings, b.noisy)
+        claim = call_until_accepted(
+            qp, impulse, isolated or b.run, max_iter, tol, time_limit, self.settings, b.noisy
+        )
         if len(qp.assumed) and not deadline.passed() and _assumption_fails(qp, impulse, claim):
-            before, impulse[:] = claim, start
-            left = max(1, max_iter - before.iterations)
+            first_claim, impulse[:] = claim, start
+            remaining = max(1, max_iter - first_claim.iterations)
             qp = self._form(qp.problem, False)
             call = isolated or b.run
-            claim = ask(qp, impulse, call, left, tol, deadline.left(), self.settings, b.noisy)
-            work = summed((before.work, claim.work))
-            claim = replace(claim, work=work, iterations=before.iterations + claim.iterations)
+            claim = call_until_accepted(
+                qp, impulse, call, remaining, tol, deadline.remaining(), self.settings, b.noisy
+            )
+            work = summed((first_claim.work, claim.work))
+            claim = replace(claim, work=work, iterations=first_claim.iterations + claim.iterations)
         if time_limit is None or b.stoppable:
             return claim
-        place = "to its end" if isolated is None else isolated.place
-        return replace(claim, message=f"{claim.message}; takes no time limit and ran {place}")
+        manner = "to its end" if isolated is None else isolated.manner
+        return replace(claim, message=f"{claim.message}; takes no time limit and ran {manner}")
 
     def start_workers(self, qp: QP, time_limit: float) -> None:
         """Import the backend's code, in the process that runs it, before the clock of a time limit starts."""
@@ -128,7 +135,7 @@ def _assumption_fails(qp: QP, impulse: FloatArray, claim: Claim) -> bool:
     if claim.status is Status.INFEASIBLE:
         return True
     w, error = np.empty(len(impulse)), np.empty(len(impulse))
-    quick(qp.problem, impulse, w, error)
+    compute_relative(qp.problem, impulse, w, error)
     return bool(np.any(error[qp.assumed] != 0.0))
 
 
@@ -139,7 +146,7 @@ def refusal(problem: Problem) -> str | None:
     if not problem.is_symmetric:
         return (
             f"needs a symmetric A; here A - A^T is {problem.asymmetry:.1e} of A "
-            "(pgs takes it as it is; a Problem of (A + A^T)/2 is another problem, if that error is small enough)"
+            "(pgs accepts it; a Problem of (A + A^T)/2 is another problem, if that error is small enough)"
         )
     if problem.matrix is not None and problem.m:
         diagonal = problem.csr.diagonal()

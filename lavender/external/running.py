@@ -1,4 +1,4 @@
-"""What every adapter shares: one call of a backend, and how its answer becomes a claim."""
+"""Call a backend, with stricter tolerances if needed, and convert its answer to a claim."""
 
 from __future__ import annotations
 
@@ -17,71 +17,108 @@ import numpy as np
 from lavender.base.arrays import FloatArray
 from lavender.base.deadline import Deadline
 from lavender.base.errors import InputError
-from lavender.external.as_qp import QP, target
+from lavender.external.as_qp import QP, residual_target
 from lavender.judge.certificates import check_certificate
-from lavender.judge.residuals import quick
+from lavender.judge.residuals import compute_relative
 from lavender.judge.solution import Claim, Status, summed
 from lavender.problem import Problem
 from lavender.solvers.certify import check_infeasible
 
-EPS_MIN = 1e-14  # Smallest tolerance passed to a backend; its own arithmetic stops there.
-GAP_MIN = 1e-18
-# Of the objective: what the sums of a gap lose to rounding at a large mass ratio; and when asked again.
-GAP_RELATIVE, GAP_RELATIVE_MIN = 1e-13, 1e-16
+MIN_TOLERANCE = (
+    1e-14  # Smallest tolerance passed to a backend; rounding in its arithmetic prevents smaller residuals.
+)
+MIN_GAP = 1e-18  # Smallest absolute gap of objectives passed to a backend.
+# Gap relative to the objective in the first call: at large mass ratios, rounding of the sums causes about as much.
+MAX_RELATIVE_GAP = 1e-13
+MIN_RELATIVE_GAP = 1e-16  # The same in the last, strictest call.
 OUT_OF_BUDGET = (Status.MAX_ITERATIONS, Status.TIME_LIMIT, Status.INTERRUPTED)
-LEFT = 1e-8  # relative residual that a gap of GAP_RELATIVE_MIN may leave, as its root
+MAX_GAP_RESIDUAL = 1e-8  # The root of MIN_RELATIVE_GAP: relative residual that a gap of this size can cause.
 
 
 @dataclass(frozen=True)
 class Limits:
-    """What one call may use; tolerances in the units of `QP`, absolute."""
+    """Tolerances and limits of one call. Tolerances are absolute, in the units of `QP`.
 
-    eps: float  # residual of stationarity and of the constraints
-    gap: float  # difference of objectives
-    gap_relative: float  # the same, of the objective; either will do
+    Parameters
+    ----------
+    eps : float
+        Residual of stationarity and of the constraints.
+    gap : float
+        Difference of the primal and dual objectives.
+    gap_relative : float
+        The same relative to the objective; one of both suffices.
+    max_iter : int
+    time_limit : float or None, s
+    repeated : bool
+        Whether the judge rejected the answer of an earlier call.
+    """
+
+    eps: float
+    gap: float
+    gap_relative: float
     max_iter: int
-    time_limit: float | None  # s
-    repeated: bool = False  # the judge did not accept the answer of a call before
+    time_limit: float | None
+    repeated: bool = False
 
 
 @dataclass(frozen=True)
 class Answer:
-    """What a backend returned; arrays None where it gave none."""
+    """Result of one call of a backend. Arrays that it did not return are None.
+
+    Parameters
+    ----------
+    status : Status
+    message : str
+        The backend's own text.
+    x : (n,)
+    zeta : (r,)
+        Multipliers of the rows.
+    xi : (n,)
+        Multipliers of the bounds; (0,) if there are none.
+    work : mapping of str to int
+    direction : (n,)
+        Direction in which the objective is unbounded.
+    contradiction : (r,)
+        Multipliers that prove that the rows contradict each other.
+    """
 
     status: Status
-    words: str  # the backend's own
-    x: FloatArray | None = None  # (n,)
-    zeta: FloatArray | None = None  # (r,) multipliers of the rows
-    xi: FloatArray | None = None  # (n,) of the bounds, or (0,) where there are none
+    message: str
+    x: FloatArray | None = None
+    zeta: FloatArray | None = None
+    xi: FloatArray | None = None
     work: Mapping[str, int] = field(default_factory=dict)
-    direction: FloatArray | None = None  # of an unbounded x
-    contradiction: FloatArray | None = None  # multipliers that prove the rows contradict each other
+    direction: FloatArray | None = None
+    contradiction: FloatArray | None = None
 
 
-def at_least(limit: float, least: float) -> float:
-    """A tolerance that a backend takes: not below `least`, not above 1e-2."""
-    return min(max(limit, least), 1e-2)
+def clamp_tolerance(tolerance: float, minimum: float) -> float:
+    """Limit a tolerance to the range from `minimum` to 1e-2."""
+    return min(max(tolerance, minimum), 1e-2)
 
 
-def proof(
+def check_iterate(
     qp: QP, x: FloatArray | None, zeta: FloatArray | None
 ) -> tuple[FloatArray | None, FloatArray | None]:
-    """The iterate as a certificate, where it is one: backends without a field for it return it as iterate."""
+    """Return (x, zeta) if the iterate is a certificate of infeasibility, else (None, None).
+
+    Some backends return a certificate as their iterate.
+    """
     y = qp.direction(x, zeta)
     return (x, zeta) if y is not None and check_certificate(qp.problem, y) is None else (None, None)
 
 
-def set_all(target: Any, settings: Mapping[str, Any], name: str) -> None:
-    """Put settings on an object of the backend `name`; InputError for one that it does not have."""
+def set_options(options: Any, settings: Mapping[str, Any], name: str) -> None:
+    """Set attributes of the options object of the backend `name`; raise InputError for unknown ones."""
     for key, value in settings.items():
-        if not hasattr(target, key):
-            known = sorted(k for k in dir(target) if not k.startswith("_"))
+        if not hasattr(options, key):
+            known = sorted(k for k in dir(options) if not k.startswith("_"))
             raise InputError(f"{name} has no setting {key!r}; known: {', '.join(known)}")
-        setattr(target, key, value)
+        setattr(options, key, value)
 
 
-def certificate(y: Any, size: int) -> FloatArray | None:
-    """A proof of infeasibility as the backend gave it, where it is one by its shape."""
+def copy_certificate(y: Any, size: int) -> FloatArray | None:
+    """Copy a backend's certificate of infeasibility; None if it has another size, is zero or is not finite."""
     if y is None or np.size(y) != size or not np.isfinite(y).all() or not np.any(y):
         return None
     return np.array(y, float)
@@ -91,10 +128,10 @@ Call = Callable[[QP, FloatArray, Limits, dict[str, Any]], Answer]
 
 
 class Failed(Exception):
-    """A backend failed in a process of its own; the text says how."""
+    """A backend failed in another process; the message describes the failure."""
 
 
-def ask(
+def call_until_accepted(
     qp: QP,
     impulse: FloatArray,
     call: Call,
@@ -104,37 +141,58 @@ def ask(
     settings: Mapping[str, Any],
     noisy: bool,
 ) -> Claim:
-    """Run the backend and write its iterate to `impulse`, or leave the start point and say why.
+    """Run the backend until the judge accepts its iterate, and write the best iterate to `impulse`.
 
-    A backend that says it is done where the judge does not find `tol` is asked again, 100 times more
-    closely, at most three times in all: its tests are not the judge's. The answer with the smallest residual is kept
-    with its claim, whatever later calls end with, unless a later one proves that there is no solution. An
-    interior-point method leaves sqrt(x w) on a row where impulse and slack both vanish, so its gap falls towards eps^2.
+    The stopping tests of backends differ from the judge's. If a backend claims convergence and the judge's residual is
+    above `tol`, it is called again with 100 times smaller tolerances, at most three times in all. The answer with the
+    smallest residual and its claim are returned, unless a later call proves that there is no solution. If no call
+    returns an iterate, `impulse` is the start point.
+
+    An interior-point method leaves an error sqrt(x w) on a row whose impulse and slack both vanish, so the tolerance of
+    its gap decreases towards eps^2.
+
+    Parameters
+    ----------
+    qp : QP
+    impulse : (m,), N s
+        Start point; overwritten.
+    call : callable
+        Function that runs the backend once.
+    max_iter : int
+        Limit of the iterations of all calls.
+    tol : float, -
+        Relative residual; 0 for one call with the smallest tolerances.
+    time_limit : float or None, s
+    settings : mapping
+        Additional options of the backend.
+    noisy : bool
+        Whether the backend prints by compiled code.
     """
     problem, deadline = qp.problem, Deadline(time_limit)
     start, best = impulse.copy(), None
     work: dict[str, int] = {"backend_calls": 0}
     w, e = np.empty(problem.m), np.empty(problem.m)
-    if tol > 0.0 and quick(problem, impulse, w, e)[0] == 0.0:
+    if tol > 0.0 and compute_relative(problem, impulse, w, e)[0] == 0.0:
         return Claim(Status.CONVERGED, 0, work, "the start is a solution", qp.form)
-    limits = _levels(problem, tol, max_iter, time_limit)
+    limits = _make_limits(problem, tol, max_iter, time_limit)
     while limits:
-        last = _once(qp, impulse, call, limits.pop(0), settings, noisy)
+        last = _call_once(qp, impulse, call, limits.pop(0), settings, noisy)
         work = summed((work, last.work))
-        relative, above = quick(problem, impulse, w, e, floor=True)
+        relative, above = compute_relative(problem, impulse, w, e, floor=True)
         if best is None or relative < best[0]:
             best = (relative, last, impulse.copy(), above)
-        left = max_iter - work.get("iterations", 0)
+        remaining = max_iter - work.get("iterations", 0)
         if (
             last.status is not Status.CONVERGED
             or above <= tol
-            or left <= 0
+            or remaining <= 0
             or deadline.passed()
-            or np.any(e[qp.assumed] != 0.0)  # another program is to be solved
+            or np.any(e[qp.assumed] != 0.0)  # An assumption fails: the caller solves another program.
         ):
             break
         limits = [
-            replace(level, max_iter=left, time_limit=deadline.left(), repeated=True) for level in limits
+            replace(limit, max_iter=remaining, time_limit=deadline.remaining(), repeated=True)
+            for limit in limits
         ]
         if limits:
             impulse[:] = start
@@ -145,56 +203,57 @@ def ask(
         if proved:
             return replace(infeasible, work=work, iterations=work.get("iterations", 0))
     relative, claim, impulse[:], above = best
-    status, words = claim.status, claim.message
+    status, message = claim.status, claim.message
     if last is not claim and last.status is not Status.CONVERGED and relative > tol:
-        # The best answer and its own claim are kept: a stricter call that fails says nothing about that answer.
+        # Return the best answer with its own claim: the failure of a stricter call does not affect it.
         status = last.status if last.status in OUT_OF_BUDGET else Status.STALLED
-        words = f"{words}; asked more closely: {last.message}"
+        message = f"{message}; with stricter tolerances: {last.message}"
     if status is Status.NUMERICAL_ERROR and claim.dual is not None and relative <= tol:
-        # It broke down, in its own words, after it had got there.
+        # The backend reports a failure, but its iterate is a solution.
         status = Status.STALLED
     if tol == 0.0 and status is Status.CONVERGED:
-        status, words = Status.STALLED, f"{words}; tol=0: ran at its tightest tolerance"
+        status, message = Status.STALLED, f"{message}; tol=0: ran at its smallest tolerance"
     elif status is Status.CONVERGED and relative > tol and not above <= tol:
-        # Its tests are of other norms: it says nothing false where it could not be asked more closely.
+        # The backend's tests use other norms, so its claim is not false if there was no stricter call.
         if limits:
             status = Status.TIME_LIMIT if deadline.passed() else Status.MAX_ITERATIONS
-            words = f"{words}; nothing was left to ask more closely"
-        elif relative <= LEFT:
-            status, words = Status.STALLED, f"{words}; its own tests were met at their tightest"
-    done = work.get("iterations", 0)
-    if done > max_iter:
-        words = f"{words}; {done} iterations, where {max_iter} were asked for at most"
-    return replace(claim, status=status, message=words, work=work, iterations=done)
+            message = f"{message}; no iterations or time remained for stricter tolerances"
+        elif relative <= MAX_GAP_RESIDUAL:
+            status, message = Status.STALLED, f"{message}; its own tests passed at the strictest tolerances"
+    iterations = work.get("iterations", 0)
+    if iterations > max_iter:
+        message = f"{message}; {iterations} iterations, more than the limit of {max_iter}"
+    return replace(claim, status=status, message=message, work=work, iterations=iterations)
 
 
-def _levels(problem: Problem, tol: float, max_iter: int, time_limit: float | None) -> list[Limits]:
-    """What is asked for first, and then more closely."""
-    eps = max(0.5 * target(problem, tol), EPS_MIN)
-    # Unknowns are near 1, so objectives lie between 1 and m: a gap below 1e-13 is often lost in its own sums.
+def _make_limits(problem: Problem, tol: float, max_iter: int, time_limit: float | None) -> list[Limits]:
+    """Return the limits of the first call and of the stricter ones."""
+    eps = max(0.5 * residual_target(problem, tol), MIN_TOLERANCE)
+    # Unknowns are near 1, so objectives are between 1 and m, and rounding of their sums often exceeds a gap of 1e-13.
     levels = [
-        (eps, 1e-2 * eps, GAP_RELATIVE),
-        (max(1e-2 * eps, EPS_MIN), max(1e-5 * eps, 1e-13), 1e-2 * GAP_RELATIVE),
-        (max(1e-4 * eps, EPS_MIN), max(1e-2 * eps * eps, GAP_MIN), GAP_RELATIVE_MIN),
+        (eps, 1e-2 * eps, MAX_RELATIVE_GAP),
+        (max(1e-2 * eps, MIN_TOLERANCE), max(1e-5 * eps, 1e-13), 1e-2 * MAX_RELATIVE_GAP),
+        (max(1e-4 * eps, MIN_TOLERANCE), max(1e-2 * eps * eps, MIN_GAP), MIN_RELATIVE_GAP),
     ]
     return [Limits(*level, max_iter, time_limit) for level in (levels[-1:] if tol == 0.0 else levels)]
 
 
-def _once(
+def _call_once(
     qp: QP, impulse: FloatArray, call: Call, limit: Limits, settings: Mapping[str, Any], noisy: bool
 ) -> Claim:
+    """Run the backend once, write its iterate to `impulse` if it is valid, and convert its answer to a claim."""
     try:
-        with quiet(noisy) as said:
+        with capture_output(noisy) as warning_texts:
             answer = call(qp, impulse, limit, dict(settings))
     except (KeyboardInterrupt, SystemExit, GeneratorExit, InputError):
         raise
     except Failed as failure:
-        words = f"{failure}; start point returned"
-        return Claim(Status.NUMERICAL_ERROR, 0, {"backend_calls": 1}, words, qp.form)
-    except BaseException as error:  # a backend may fail in any way; a panic of Rust is no Exception
-        words = f"{type(error).__name__}: {error}; start point returned"
-        return Claim(Status.NUMERICAL_ERROR, 0, {"backend_calls": 1}, words, qp.form)
-    status, words = answer.status, answer.words or "; ".join(said)
+        message = f"{failure}; start point returned"
+        return Claim(Status.NUMERICAL_ERROR, 0, {"backend_calls": 1}, message, qp.form)
+    except BaseException as error:  # A backend may raise anything; a panic of Rust is not an Exception.
+        message = f"{type(error).__name__}: {error}; start point returned"
+        return Claim(Status.NUMERICAL_ERROR, 0, {"backend_calls": 1}, message, qp.form)
+    status, message = answer.status, answer.message or "; ".join(warning_texts)
     work = {"backend_calls": 1, **{k: int(v) for k, v in answer.work.items()}}
     certificate = None
     if status is Status.INFEASIBLE:
@@ -202,27 +261,27 @@ def _once(
     x, zeta = answer.x, answer.zeta
     unknown = np.full(qp.n, 0.0 if qp.lb is None else np.nan)
     xi = answer.xi if answer.xi is not None and len(answer.xi) == qp.n else unknown
-    found = x is not None and len(x) == qp.n and bool(np.isfinite(x).all())
+    is_valid = x is not None and len(x) == qp.n and bool(np.isfinite(x).all())
     if qp.form != "impulse":
-        found = found and zeta is not None and len(zeta) == len(qp.b) and bool(np.isfinite(zeta).all())
+        is_valid = is_valid and zeta is not None and len(zeta) == len(qp.b) and bool(np.isfinite(zeta).all())
     dual, lam = None, impulse
-    if found:
+    if is_valid:
         assert x is not None
         lam = qp.impulse(x, np.zeros(0) if zeta is None else zeta, xi)
-        found = bool(np.isfinite(lam).all())
-    if found and status is not Status.INFEASIBLE:
+        is_valid = bool(np.isfinite(lam).all())
+    if is_valid and status is not Status.INFEASIBLE:
         assert x is not None
         impulse[:] = lam
         dual = qp.multiplier(x, xi)
     elif status is not Status.INFEASIBLE:
         if status not in (Status.TIME_LIMIT, Status.INTERRUPTED):
             status = Status.NUMERICAL_ERROR
-        words = f"{words}; no iterate, start point returned".removeprefix("; ")
+        message = f"{message}; no iterate, start point returned".removeprefix("; ")
     return Claim(
         status=status,
         iterations=work.get("iterations", 0),
         work=work,
-        message=words,
+        message=message,
         form=qp.form,
         dual=dual,
         certificate=certificate,
@@ -230,73 +289,76 @@ def _once(
 
 
 @contextlib.contextmanager
-def quiet(noisy: bool) -> Iterator[list[str]]:
-    """Collect the warnings of a backend and swallow what it writes to sys.stdout and sys.stderr, in this thread alone.
+def capture_output(noisy: bool) -> Iterator[list[str]]:
+    """Collect the warnings of a backend, and discard its output to sys.stdout and sys.stderr, in this thread only.
 
-    With `noisy` also what compiled code prints: that needs the file descriptors of the whole process,
-    so only backends known to print pay for it.
+    `noisy` also discards output of compiled code. This redirects the file descriptors of the whole process, so it is
+    only used for backends that are known to print.
     """
-    said: list[str] = []
-    with _by_thread, _nowhere if noisy else contextlib.nullcontext():
-        outer, _here.said, _here.printed = (_here.said, _here.printed), said, io.StringIO()
+    collected: list[str] = []
+    with _redirect_streams, _discard_descriptors if noisy else contextlib.nullcontext():
+        outer = _thread_output.warnings, _thread_output.text
+        _thread_output.warnings, _thread_output.text = collected, io.StringIO()
         try:
-            yield said
+            yield collected
         finally:
-            _here.said, _here.printed = outer
+            _thread_output.warnings, _thread_output.text = outer
 
 
-class _Here(threading.local):
-    """Where words of this thread go while it runs a backend; None while it runs none."""
+class _ThreadOutput(threading.local):
+    """Destinations of this thread's warnings and output while it runs a backend, else None."""
 
-    said: list[str] | None = None
-    printed: io.StringIO | None = None
+    warnings: list[str] | None = None
+    text: io.StringIO | None = None
 
 
-_here = _Here()
+_thread_output = _ThreadOutput()
 
 
 class _Stream:
-    """Stands for sys.stdout or sys.stderr: the stream itself for threads that run no backend."""
+    """Replacement of sys.stdout or sys.stderr, which is the stream itself for threads that run no backend."""
 
     def __init__(self, stream: Any) -> None:
         self._stream = stream
 
     def __getattr__(self, name: str) -> Any:
-        return getattr(self._stream if _here.printed is None else _here.printed, name)
+        return getattr(self._stream if _thread_output.text is None else _thread_output.text, name)
 
 
-class _Shared:
-    """A context of the whole process: the first thread enters it, the last one leaves it."""
+class _SharedContext:
+    """A context of the whole process, which the first thread enters and the last one leaves."""
 
-    def __init__(self, make: Callable[[], contextlib.AbstractContextManager[None]]) -> None:
-        self._make, self._lock, self._inside = make, threading.Lock(), 0
+    def __init__(self, make_context: Callable[[], contextlib.AbstractContextManager[None]]) -> None:
+        self._make_context, self._lock, self._n_threads = make_context, threading.Lock(), 0
         if hasattr(os, "register_at_fork"):  # not on Windows
             os.register_at_fork(
-                before=self._lock.acquire, after_in_parent=self._lock.release, after_in_child=self._forked
+                before=self._lock.acquire, after_in_parent=self._lock.release, after_in_child=self._reset
             )
 
-    def _forked(self) -> None:
-        if self._inside and _here.printed is None:  # of threads that the child does not have
-            self._inside = 0
+    def _reset(self) -> None:
+        """Leave the context in a forked process if only threads of the parent were in it."""
+        if self._n_threads and _thread_output.text is None:
+            self._n_threads = 0
             self._context.__exit__(None, None, None)
         self._lock.release()
 
     def __enter__(self) -> None:
         with self._lock:
-            if self._inside == 0:
-                self._context = self._make()
+            if self._n_threads == 0:
+                self._context = self._make_context()
                 self._context.__enter__()
-            self._inside += 1
+            self._n_threads += 1
 
     def __exit__(self, *error: object) -> None:
         with self._lock:
-            self._inside -= 1
-            if self._inside == 0:
+            self._n_threads -= 1
+            if self._n_threads == 0:
                 self._context.__exit__(None, None, None)
 
 
 @contextlib.contextmanager
-def _words_by_thread() -> Iterator[None]:
+def _streams_by_thread() -> Iterator[None]:
+    """Redirect warnings, sys.stdout and sys.stderr of threads that run a backend."""
     with (
         warnings.catch_warnings(),
         contextlib.redirect_stdout(_Stream(sys.stdout)),
@@ -304,19 +366,20 @@ def _words_by_thread() -> Iterator[None]:
     ):
         show = warnings.showwarning
 
-        def hear(message: Warning | str, category: type[Warning], *where: Any) -> None:
-            if _here.said is None:
-                show(message, category, *where)
+        def collect_warning(message: Warning | str, category: type[Warning], *location: Any) -> None:
+            if _thread_output.warnings is None:
+                show(message, category, *location)
             elif not issubclass(category, DeprecationWarning):
-                _here.said.append(str(message).strip())
+                _thread_output.warnings.append(str(message).strip())
 
-        warnings.showwarning = hear  # type: ignore[assignment]
+        warnings.showwarning = collect_warning  # type: ignore[assignment]
         warnings.simplefilter("always")
         yield
 
 
 @contextlib.contextmanager
 def _descriptors_to_null() -> Iterator[None]:
+    """Redirect the file descriptors of standard output and error to the null device."""
     for stream in (sys.__stdout__, sys.__stderr__):
         if stream is not None:
             stream.flush()
@@ -333,4 +396,7 @@ def _descriptors_to_null() -> Iterator[None]:
         os.close(null)
 
 
-_by_thread, _nowhere = _Shared(_words_by_thread), _Shared(_descriptors_to_null)
+_redirect_streams, _discard_descriptors = (
+    _SharedContext(_streams_by_thread),
+    _SharedContext(_descriptors_to_null),
+)

@@ -1,24 +1,25 @@
-"""Derivatives of a solution by the problem's data, and where they do not exist.
+"""Derivatives of a solution by the problem's data, and checks of their existence.
 
-A solution lambda with w = A lambda - b is a root of the natural map F of natural.pxd, block by block. Where every
-block is inside one case (it sticks, slides, is open, at a bound, free), F is smooth, and with z = D^1/2 lambda
+A solution lambda with w = A lambda - b is a root of the natural map F of natural.pxd, block by block. If every block
+is strictly inside one case (sticks, slides, open, at a bound, free), F is smooth, and with z = D^1/2 lambda
 
     G dz = P D^-1/2 (db - dA lambda) + D^1/2 dl + (dPi/de) de,    G = I - P + P H,   H = D^-1/2 A D^-1/2      (1)
     dA lambda = dJ v' + J M^-1 (dJ^T lambda - dM v') + dtheta lambda,   v' = M^-1 J^T lambda                  (2)
     dv = dv* + v'',   v'' = M^-1 (J^T dlambda + dJ^T lambda - dM v'),   dw = A dlambda + dA lambda - db        (3)
 
-e are the reaches of contacts (mu, mu r, mu_r), l the bounds that act. With cotangents c of lambda, x of w and y of v,
+e are the friction coefficients of rows (mu, mu r, mu_r), l the active bounds. With cotangents c of lambda, x of w and
+y of v,
 
     G^T q = D^-1/2 (c + J M^-1 y + A^T x),   s = D^-1/2 P^T q - x,   p = M^-1 (y - J^T s)                     (4)
     b: s    l: D^1/2 q    e: (dPi/de)^T q    A: -s lambda^T    theta: -s lambda                               (5)
-    J: lambda p^T - s v+^T    M: -p v'^T    v*: y - J^T s   (target and v* given, so that b follows J and v*)
+    J: lambda p^T - s v+^T    M: -p v'^T    v*: y - J^T s   (for fixed target and v*: b depends on J and v*)
 
-(the implicit function theorem and its adjoint). G is singular where rows repeat others; then
+by the implicit function theorem and its adjoint. G is singular if rows are linearly dependent. Then the iteration
 
     G_eps = G + eps P,    dz <- dz + G_eps^-1 (r - G dz)                                                      (6)
 
-ends at one of the solutions (Rockafellar 1976), and I - G_eps^-1 G, repeated, leaves of a random vector what is not
-determined.
+converges to one of the solutions (Rockafellar 1976), and repeated application of I - G_eps^-1 G projects a random
+vector on the null space of G.
 """
 
 from lavender.gradient.batch import Derivatives, derivatives

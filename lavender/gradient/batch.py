@@ -1,4 +1,4 @@
-"""Derivatives of many problems: prepared by one compiled call, and each `vjp` of all of them is another."""
+"""Derivatives of many problems: one compiled call prepares all of them, and each `vjp` is one more call."""
 
 from __future__ import annotations
 
@@ -7,39 +7,47 @@ from typing import Any
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray, IntArray, places, several
+from lavender.base.arrays import FloatArray, IntArray, check_sequence, resolve_index
 from lavender.base.errors import InputError
 from lavender.batch.solve import Solutions
-from lavender.gradient.derivative import ACCEPTED, Derivative, derivative
+from lavender.gradient.derivative import MAX_ACCEPTED_RESIDUAL, Derivative, derivative
 from lavender.gradient.result import INPUTS, MATRICES, Gradient
-from lavender.gradient.system import SMALL
-from lavender.judge.residuals import reference
+from lavender.gradient.system import MAX_KERNEL_ROWS
+from lavender.judge.residuals import get_reference
 from lavender.problem import Problem
 from lavender.problem.derived import cached_property
 from lavender_ext.derivative.linear import Linears
 
 
-class _Each(Sequence[Any]):
-    """One thing of each of many problems, made when it is first asked for."""
+class _LazySequence(Sequence[Any]):
+    """One object for each of many problems, created at its first use.
 
-    def __init__(self, n: int, kept: dict[int, Any]) -> None:
-        self._n, self._kept = n, kept
+    Parameters
+    ----------
+    n : int
+        Number of problems.
+    items : dict of int to object
+        Objects that exist already.
+    """
+
+    def __init__(self, n: int, items: dict[int, Any]) -> None:
+        self._n, self._items = n, items
 
     def __len__(self) -> int:
         return self._n
 
     def __getitem__(self, i: Any) -> Any:
-        """Of problem i, or a list of several."""
-        i = places(i, self._n)
-        return [self._one(j) for j in i] if isinstance(i, list) else self._one(i)
+        """Return the object of problem i, or a list of objects for a slice, a mask or a list of integers."""
+        i = resolve_index(i, self._n)
+        return [self._get(j) for j in i] if isinstance(i, list) else self._get(i)
 
     def __iter__(self) -> Iterator[Any]:
-        return map(self._one, range(self._n))
+        return map(self._get, range(self._n))
 
-    def _one(self, i: int) -> Any:
-        if i not in self._kept:
-            self._kept[i] = self._make(i)
-        return self._kept[i]
+    def _get(self, i: int) -> Any:
+        if i not in self._items:
+            self._items[i] = self._make(i)
+        return self._items[i]
 
     def _make(self, i: int) -> Any:
         raise NotImplementedError
@@ -48,40 +56,40 @@ class _Each(Sequence[Any]):
         return f"<{type(self).__name__} of {self._n} problems>"
 
 
-class Gradients(_Each):
-    """Gradients of many problems: `[i]` is the `Gradient` of problem i. Made by `Derivatives.vjp`.
+class Gradients(_LazySequence):
+    """Gradients of many problems, computed by `Derivatives.vjp`: `[i]` is the `Gradient` of problem i.
 
-    `b`, `mu`, `v_free` and what else is no matrix are those of all problems, one after the other in one array.
+    Attributes such as `b`, `mu` and `v_free` are the concatenated gradients of all problems; matrices have none.
     """
 
-    def __init__(self, of: Derivatives, numbers: FloatArray, alone: dict[int, Gradient]) -> None:
-        super().__init__(len(of), alone)
-        self._of, self._numbers, self._whole = of, numbers, not alone
+    def __init__(self, of: Derivatives, numbers: FloatArray, separate: dict[int, Gradient]) -> None:
+        super().__init__(len(of), separate)
+        self._of, self._numbers, self._is_complete = of, numbers, not separate
 
     def _make(self, i: int) -> Gradient:
-        return Gradient(self._of._one(i), self._numbers[self._of._linears.place(i)])
+        return Gradient(self._of._get(i), self._numbers[self._of._linears.place(i)])
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("_") or name not in INPUTS or name in MATRICES:
             raise AttributeError(
                 f"gradients have no {name!r} of all problems; [i] is the gradient of problem i"
             )
-        if self._whole and name in ("b", "target", "v_free"):
+        if self._is_complete and name in ("b", "target", "v_free"):
             of = self._of
             return self._numbers[of._velocities if name == "v_free" else of._rows]
         return np.concatenate([getattr(g, name) for g in self] or [np.zeros(0)])
 
 
-class Derivatives(_Each):
-    """Derivatives of many problems: `[i]` is the `Derivative` of problem i. Made by `lavender.derivatives`."""
+class Derivatives(_LazySequence):
+    """Derivatives of many problems, prepared by `lavender.derivatives`: `[i]` is the `Derivative` of problem i."""
 
-    def __init__(self, problems: list[Problem], linears: Linears, alone: dict[int, Derivative]) -> None:
-        super().__init__(len(problems), dict(alone))
-        self._problems, self._linears, self._alone = problems, linears, alone
+    def __init__(self, problems: list[Problem], linears: Linears, separate: dict[int, Derivative]) -> None:
+        super().__init__(len(problems), dict(separate))
+        self._problems, self._linears, self._separate = problems, linears, separate
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Copied or pickled they are prepared anew."""
-        return derivatives, (self._problems, [one._impulse for one in self])
+        """Pickle problems and impulses; a copy is prepared again."""
+        return derivatives, (self._problems, [each._impulse for each in self])
 
     def _make(self, i: int) -> Derivative:
         return Derivative(self._problems[i], self._linears.one(i))
@@ -95,80 +103,87 @@ class Derivatives(_Each):
         return self._linears.places(True)
 
     def vjp(self, *, velocity: Any = None, impulse: Any = None, slack: Any = None) -> Gradients:
-        """Gradients of each problem; cotangents are sequences, one for each, or arrays with problems first.
+        """Compute the gradients of each problem.
+
+        Parameters
+        ----------
+        velocity, impulse, slack : sequence or array, optional
+            Cotangents as for `Derivative.vjp`, one for each problem; the first axis of an array is the problem.
 
         Raises
         ------
         InputError
-            Another number of cotangents than of problems; as `Derivative.vjp`.
+            The number of cotangents differs from the number of problems; also as for `Derivative.vjp`.
         CapabilityError
-            As `Derivative.vjp`.
+            As for `Derivative.vjp`.
         """
-        n, given = len(self), {"velocity": velocity, "impulse": impulse, "slack": slack}
-        each = [
-            [None] * n if x is None else several(name, x, "cotangents, one for each problem,")
-            for name, x in given.items()
-        ]
-        for name, x in zip(given, each, strict=True):
+        n, arguments = len(self), {"velocity": velocity, "impulse": impulse, "slack": slack}
+        cotangents = {
+            name: [None] * n if x is None else check_sequence(name, x, "cotangents, one for each problem,")
+            for name, x in arguments.items()
+        }
+        for name, x in cotangents.items():
             if len(x) != n:
                 raise InputError(f"{name} has {len(x)} cotangents for {n} problems; one for each is needed")
-        numbers, left = self._linears.adjoint(*each)
-        alone = {}
-        for i in [*self._alone, *left]:
+        numbers, remaining = self._linears.adjoint(*cotangents.values())
+        separate = {}
+        for i in [*self._separate, *remaining]:
             try:
-                alone[i] = self._one(i).vjp(**{name: x[i] for name, x in zip(given, each, strict=True)})
+                separate[i] = self._get(i).vjp(**{name: x[i] for name, x in cotangents.items()})
             except InputError as error:
                 raise InputError(f"problem {i}: {error}") from None
-        return Gradients(self, numbers, alone)
+        return Gradients(self, numbers, separate)
 
 
 def derivatives(problems: Iterable[Problem], solutions: Iterable[Any]) -> Derivatives:
-    """`derivative` of each of many problems, as `solve_many` solves them; of J and M by one compiled call.
+    """Prepare the derivative of each of many problems; problems with J and M are prepared by one compiled call.
 
     Parameters
     ----------
     problems : iterable of Problem
     solutions : iterable of Solution, or (m,) N s
-        One for each.
+        One for each problem, for example from `solve_many`.
 
     Returns
     -------
     Derivatives
-        A sequence; its `vjp` takes cotangents of all.
+        A sequence; its `vjp` takes cotangents of all problems.
 
     Raises
     ------
     InputError
-        Another number of solutions than of problems, or as `derivative`, which names the problem.
+        The number of solutions differs from the number of problems; also as for `derivative`, with the problem's index.
     """
     if isinstance(problems, Problem):
         raise InputError("problems is one Problem; a list of them is needed, or `derivative`")
-    given = several("problems", problems, "Problems")
-    many = isinstance(solutions, Solutions) and not solutions.faults
-    answers: Any = (
+    problems = check_sequence("problems", problems, "Problems")
+    is_batch = isinstance(solutions, Solutions) and not solutions.faults
+    impulses: Any = (
         solutions
-        if many
-        else [getattr(x, "impulse", x) for x in several("solutions", solutions, "Solutions")]
+        if is_batch
+        else [getattr(x, "impulse", x) for x in check_sequence("solutions", solutions, "Solutions")]
     )
-    if len(given) != len(answers):
-        raise InputError(f"{len(answers)} solutions for {len(given)} problems; one for each is needed")
-    linears = Linears([_data(p) for p in given], answers.placed if many else answers, SMALL)
-    alone = {}
-    for i in linears.leave(ACCEPTED):
+    if len(problems) != len(impulses):
+        raise InputError(f"{len(impulses)} solutions for {len(problems)} problems; one for each is needed")
+    linears = Linears(
+        [_get_data(p) for p in problems], impulses.flat_impulses if is_batch else impulses, MAX_KERNEL_ROWS
+    )
+    separate = {}
+    for i in linears.leave(MAX_ACCEPTED_RESIDUAL):
         try:
-            alone[i] = derivative(given[i], answers[i])
+            separate[i] = derivative(problems[i], impulses[i])
         except InputError as error:
             raise InputError(f"problem {i}: {error}") from None
-    return Derivatives(given, linears, alone)
+    return Derivatives(problems, linears, separate)
 
 
-def _data(problem: Problem) -> Any:
-    """What the judge reads of J and M; None of what `derivative` prepares alone."""
+def _get_data(problem: Problem) -> Any:
+    """Return the judge's data of a problem with J and M, or None if `derivative` must prepare it separately."""
     general = problem.generalized if type(problem) is Problem else None
     if general is None or general.order is not None or problem.cones.has_ellipse:
         return None
     view = problem.derived.view
     assert view is not None
     if view.reference_energy < 0.0:
-        reference(problem)
+        get_reference(problem)
     return view

@@ -1,4 +1,4 @@
-"""A solution differentiated: prepared once, then both ways, and what says whether it exists."""
+"""Derivative of one solution: preparation, products in both directions, and checks of existence."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ import numpy.typing as npt
 from lavender.base.arrays import FloatArray, as_array, as_csr
 from lavender.base.errors import CapabilityError, InputError
 from lavender.base.lazy_import import issparse, lazy_module
-from lavender.gradient.chains import Bodies, Parts
-from lavender.gradient.result import BODIES, INPUTS, MATRICES, REACHES, Gradient
-from lavender.gradient.system import SMALL, System, prepared
+from lavender.gradient.chains import BodyChain, CoefficientRows
+from lavender.gradient.result import BODIES, COEFFICIENT_INPUTS, INPUTS, MATRICES, Gradient
+from lavender.gradient.system import MAX_KERNEL_ROWS, System, factor_dense
 from lavender.judge.residuals import residual
 from lavender.judge.states import States, linear_of, states_of
 from lavender.problem import Problem, check_problem
@@ -21,23 +21,37 @@ from lavender.problem.derived import cached_property
 from lavender_ext.core.problem import rows_velocity
 from lavender_ext.derivative.linear import CASES, Linear, wrench
 
-ACCEPTED = 1e-8  # relative residual of an answer that is differentiated, or its floor
-UNMOVED = 1e-6  # of the largest entry of a probe, up to which one is rounding
-CONTRADICTS = 1e-3  # of the lengths of a change and of a probe: what the two have in common
-MANY = 10.0  # errors of the answer within which a switch counts as one: they are estimates of first order
-U = 2.0**-53
+# Solutions with a larger relative residual (without the part that rounding explains) are not differentiated.
+MAX_ACCEPTED_RESIDUAL = 1e-8
+MAX_NULL_ENTRY = 1e-6  # Entries of a null vector up to this fraction of the largest are rounding.
+MAX_NULL_COSINE = 1e-3  # A right-hand side whose cosine with a null vector of G^T is larger has no solution.
+# Blocks within this many estimated errors of another state are reported by `switching`; the estimate is of first order.
+SWITCHING_ERRORS = 10.0
+UNIT_ROUNDOFF = 2.0**-53
 
 Flags = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
 class Unique:
-    """What of an answer, and of its derivative, the problem determines. `str()` says what it does not."""
+    """Uniqueness of a solution and of its derivative. `str()` lists the rows that are not unique.
 
-    impulse: Flags  # (m,) the row's impulse
-    slack: Flags  # (m,) the row's slack, and velocity along it
-    velocity: bool  # every body's; of a matrix that of all slacks
-    target: Flags  # (m,) whether b of this row may change alone with no block changing its state
+    Parameters
+    ----------
+    impulse : (m,) bool
+        Whether the impulse of the row is unique.
+    slack : (m,) bool
+        Whether the slack of the row, and the velocity along it, is unique.
+    velocity : bool
+        Whether the velocities of all bodies are unique; for a matrix, whether all slacks are.
+    target : (m,) bool
+        Whether b of this row alone can change without a change of state of any block.
+    """
+
+    impulse: Flags
+    slack: Flags
+    velocity: bool
+    target: Flags
     _problem: Problem = field(repr=False)
 
     def __bool__(self) -> bool:
@@ -46,60 +60,68 @@ class Unique:
     def __str__(self) -> str:
         lines = []
         for name, flags in (("impulse", self.impulse), ("slack", self.slack), ("target", self.target)):
-            off = np.flatnonzero(~flags)
-            if len(off):
-                some = ", ".join(self._problem.row_name(int(i)) for i in off[:3])
-                lines.append(f"{name}: not of {len(off)} rows ({some}{', ...' if len(off) > 3 else ''})")
+            rows = np.flatnonzero(~flags)
+            if len(rows):
+                names = ", ".join(self._problem.row_name(int(i)) for i in rows[:3])
+                lines.append(f"{name}: not of {len(rows)} rows ({names}{', ...' if len(rows) > 3 else ''})")
         return "; ".join(lines) or "all of it is unique"
 
 
 @dataclass(frozen=True, eq=False)
 class Tangent:
-    """How a solution changes along a change of the data: `Derivative.jvp`."""
+    """Change of a solution along a change of the data, computed by `Derivative.jvp`.
 
-    slack: FloatArray  # (m,) m/s, of w
+    Parameters
+    ----------
+    slack : (m,), m/s
+        Change of w, per unit of the change.
+    """
+
+    slack: FloatArray
     _velocity: FloatArray | None
     _impulse: FloatArray
-    _of: Derivative = field(repr=False)
+    _derivative: Derivative = field(repr=False)
 
     @property
     def impulse(self) -> FloatArray:
-        """(m,) N s; CapabilityError where rows repeat others, so that it is not unique."""
-        if not self._of.unique.impulse.all():
-            raise CapabilityError(f"impulses are not unique here: {self._of.unique}; slack and velocity are")
+        """Change of the impulses (m,) [N s]; CapabilityError if they are not unique (linearly dependent rows)."""
+        unique = self._derivative.unique
+        if not unique.impulse.all():
+            raise CapabilityError(f"impulses are not unique here: {unique}; slack and velocity are")
         return self._impulse
 
     @property
     def velocity(self) -> FloatArray:
-        """v+ (nv,) or (n, 6) [m/s, rad/s]; CapabilityError of a matrix."""
+        """Change of v+ (nv,) or (n, 6) [m/s, rad/s]; CapabilityError for a problem given as a matrix."""
         if self._velocity is None:
             raise CapabilityError("this problem was given as a matrix; velocities need J and M")
         return self._velocity
 
 
 class Derivative:
-    """The derivative of a solution, prepared once: gradients by `vjp`, directions by `jvp`, and whether it exists.
+    """Derivative of a solution: gradients by `vjp`, directional derivatives by `jvp`, checks of existence.
 
-    Made by `lavender.derivative`.
+    It is factor_dense by `lavender.derivative`.
     """
 
     def __init__(self, problem: Problem, linear: Linear) -> None:
         self.problem, self._linear, self.m = problem, linear, problem.m
-        if not linear.tried and linear.rows <= SMALL:
-            prepared(problem.disk, linear)
-        regular = linear.regular if linear.rows <= SMALL else self._system.of_kernel
+        if not linear.tried and linear.rows <= MAX_KERNEL_ROWS:
+            factor_dense(problem.disk, linear)
+        regular = linear.regular if linear.rows <= MAX_KERNEL_ROWS else self._system.of_kernel
         general = problem.generalized
-        # The kernel has all that `vjp` needs, in the order given.
-        self._plain = regular and not problem.cones.has_ellipse and (general is None or general.order is None)
+        # Whether the kernel can compute `vjp`: it has a factor, and its rows and velocities are in the original order.
+        in_order = general is None or general.order is None
+        self._uses_kernel = regular and not problem.cones.has_ellipse and in_order
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Copied or pickled it is prepared anew."""
+        """Pickle problem and impulse; a copy is factor_dense again."""
         return derivative, (self.problem, self._impulse)
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """Names of the data that this problem has, by which there are gradients."""
-        return tuple(name for name, of in INPUTS.items() if self.problem.operator in of)
+        """Names of this problem's data by which there are gradients."""
+        return tuple(name for name, operators in INPUTS.items() if self.problem.operator in operators)
 
     @cached_property
     def _system(self) -> System:
@@ -121,11 +143,12 @@ class Derivative:
         return w / self.problem.cones.stretch if self.problem.cones.has_ellipse else w
 
     @cached_property
-    def _places(self) -> Any:
+    def _system_rows(self) -> Any:
+        """Rows in which G is not the identity."""
         return np.flatnonzero(self._linear.place >= 0)
 
-    def _velocities(self) -> tuple[int, ...]:
-        """Shape of the velocities; CapabilityError of a matrix."""
+    def _velocity_shape(self) -> tuple[int, ...]:
+        """Return the shape of the velocities; raise CapabilityError for a problem given as a matrix."""
         p = self.problem
         if p.generalized is not None:
             return (p.generalized.nv,)
@@ -135,8 +158,8 @@ class Derivative:
 
     # -- products --------------------------------------------------------------------------------
 
-    def _through_mass(self, y: FloatArray) -> FloatArray:
-        """M^-1 y (nv,)."""
+    def _apply_inverse_mass(self, y: FloatArray) -> FloatArray:
+        """Compute M^-1 y (nv,)."""
         p = self.problem
         if p.generalized is not None:
             return p.generalized.solve(y)
@@ -147,8 +170,8 @@ class Derivative:
         out[:, 3:] = np.einsum("ijk,ik->ij", rows.inv_inertia, y[:, 3:])
         return out.ravel()
 
-    def _along(self, v: FloatArray) -> FloatArray:
-        """J v (m,) of velocities (nv,)."""
+    def _apply_jacobian(self, v: FloatArray) -> FloatArray:
+        """Compute J v (m,) for velocities (nv,)."""
         p = self.problem
         if p.generalized is not None:
             return p.generalized.velocity_of(v)
@@ -156,8 +179,8 @@ class Derivative:
         rows_velocity(p.data, v.reshape(-1, 6), out)
         return out
 
-    def _wrench(self, x: FloatArray) -> FloatArray:
-        """J^T x (nv,)."""
+    def _apply_jacobian_transposed(self, x: FloatArray) -> FloatArray:
+        """Compute J^T x (nv,)."""
         p = self.problem
         if p.rows is None:
             return np.asarray(p.jacobian.T @ x)
@@ -165,171 +188,186 @@ class Derivative:
         wrench(p.data, np.ascontiguousarray(x), out)
         return out.ravel()
 
-    def _moved(self, x: FloatArray) -> FloatArray:
-        """M^-1 J^T x (nv,)."""
+    def _apply_mobility(self, x: FloatArray) -> FloatArray:
+        """Compute the velocity change M^-1 J^T x (nv,)."""
         if self.problem.generalized is not None:
             return self.problem.generalized.change(x)
-        return self._through_mass(self._wrench(x))
+        return self._apply_inverse_mass(self._apply_jacobian_transposed(x))
 
-    def _a(self, x: FloatArray, back: bool = False) -> FloatArray:
-        """A x, or A^T x."""
+    def _apply_a(self, x: FloatArray, transpose: bool = False) -> FloatArray:
+        """Compute A x or A^T x (m,)."""
         p = self.problem
         if p.matrix is not None:
-            return np.asarray((p.matrix.T if back else p.matrix) @ x)
+            return np.asarray((p.matrix.T if transpose else p.matrix) @ x)
         assert p.compliance is not None
-        return self._along(self._moved(x)) + p.compliance * x
+        return self._apply_jacobian(self._apply_mobility(x)) + p.compliance * x
 
     @cached_property
-    def _change(self) -> FloatArray:
-        return self._moved(self._impulse)
+    def _velocity_change(self) -> FloatArray:
+        return self._apply_mobility(self._impulse)
 
     @cached_property
     def _velocity(self) -> FloatArray:
         p = self.problem
         free = p.generalized.v_free if p.generalized is not None else p.rows.v_free.ravel()  # type: ignore[union-attr]
-        return free + self._change
+        return free + self._velocity_change
 
     @cached_property
-    def _parts(self) -> Parts:
-        return Parts(self.problem)
+    def _coefficient_rows(self) -> CoefficientRows:
+        return CoefficientRows(self.problem)
 
     @cached_property
-    def _acting(self) -> FloatArray:
-        # (2, m) how much lower and upper bounds act: of lower = upper, which move together, half each
+    def _bound_weights(self) -> FloatArray:
+        """Weights (2, m) of the gradients by lower and upper bounds: 1 if active; if lower = upper, 1/2 each."""
         case, c = self._linear.case, self.problem.cones
-        acts = np.array([case == CASES["low"], case == CASES["high"]], np.float64)
-        return np.where(acts.any(axis=0) & (c.lower == c.upper), 0.5, acts)
+        is_active = np.array([case == CASES["low"], case == CASES["high"]], np.float64)
+        return np.where(is_active.any(axis=0) & (c.lower == c.upper), 0.5, is_active)
 
     @cached_property
-    def _axes(self) -> tuple[Any, FloatArray, FloatArray]:
-        # Rows of ellipses, where root_j = c / e_j: what de_j changes in z and, through P, in y.
-        rows = np.flatnonzero(np.repeat(self._parts.ellipse, np.diff(self.problem.cones.ptr)))
+    def _ellipse_terms(self) -> tuple[Any, FloatArray, FloatArray]:
+        """Friction rows of ellipses, and derivatives of z and y by e_j, because D_j^1/2 is proportional to 1 / e_j."""
+        rows = np.flatnonzero(np.repeat(self._coefficient_rows.ellipse, np.diff(self.problem.cones.ptr)))
         rows = rows[self.problem.cones.friction_rows[rows]]
         root, e = self._root[rows], self.problem.cones.reach[rows]
         lam, w = self._impulse[rows], self._slack[rows]
-        live = e > 0.0
-        e = np.where(live, e, 1.0)
-        return rows, np.where(live, root * lam / e, 0.0), np.where(live, (root * lam + w / root) / e, 0.0)
+        has_friction = e > 0.0
+        e = np.where(has_friction, e, 1.0)
+        dz_de = np.where(has_friction, root * lam / e, 0.0)
+        return rows, dz_de, np.where(has_friction, (root * lam + w / root) / e, 0.0)
 
     @cached_property
-    def _bodies(self) -> Any:
-        return Bodies(self)
+    def _body_chain(self) -> Any:
+        return BodyChain(self)
 
-    def _solve(self, r: FloatArray, exactly: bool = False) -> FloatArray:
-        """G x = r of all rows; `exactly`: or an error where there is no x."""
-        out, at = r.copy(), self._places
-        out[at] = 0.0
-        known = self._linear.times(self._a(out / self._root) / self._root) if out.any() else 0.0
-        right = (r - known)[at]
-        if exactly and self._system.singular and self._contradicts(right):
-            self._refuse_alone("no derivative along this change exists")
-        out[at] = self._system.solve(right)
-        return out
+    def _solve(self, r: FloatArray, check: bool = False) -> FloatArray:
+        """Solve G x = r on all rows; with `check` raise CapabilityError if there is no solution."""
+        x, rows = r.copy(), self._system_rows
+        # On the other rows G is the identity: move their contribution to the right-hand side.
+        x[rows] = 0.0
+        fixed = self._linear.times(self._apply_a(x / self._root) / self._root) if x.any() else 0.0
+        rhs = (r - fixed)[rows]
+        if check and self._system.singular and self._is_inconsistent(rhs):
+            self._check_row_changes("no derivative along this change exists")
+        x[rows] = self._system.solve(rhs)
+        return x
 
-    def _contradicts(self, right: FloatArray) -> bool:
-        """Whether G x = r has no solution."""
-        size = CONTRADICTS * float(np.linalg.norm(right))
-        return any(abs(float(q @ right)) > size * float(np.linalg.norm(q)) for q in self._system.probes(True))
+    def _is_inconsistent(self, rhs: FloatArray) -> bool:
+        """Return whether G x = rhs has no solution."""
+        size = MAX_NULL_COSINE * float(np.linalg.norm(rhs))
+        return any(
+            abs(float(q @ rhs)) > size * float(np.linalg.norm(q)) for q in self._system.null_vectors(True)
+        )
 
-    def _refuse_alone(self, words: str) -> None:
-        """Of what changes one row of several that share a load."""
+    def _check_row_changes(self, message: str) -> None:
+        """Raise CapabilityError if data of single rows cannot change because other rows share their load."""
         if not self._system.singular:
             return
-        off = np.flatnonzero(~self.unique.target)
-        if len(off):
-            some = ", ".join(self.problem.row_name(int(i)) for i in off[:3])
+        rows = np.flatnonzero(~self.unique.target)
+        if len(rows):
+            names = ", ".join(self.problem.row_name(int(i)) for i in rows[:3])
             raise CapabilityError(
-                f"{words}: {some}{', ...' if len(off) > 3 else ''} share a load with other rows and cannot change "
-                "alone, where one of them would open. By v_free and masses there is one, under Coulomb's law by mu; "
+                f"{message}: {names}{', ...' if len(rows) > 3 else ''} share a load with other rows and cannot change "
+                "alone, because one of them would open. By v_free and masses there is one, under Coulomb's law by mu; "
                 "with a compliance on these rows by all data"
             )
 
-    def _refuse_reach(self, name: str) -> None:
-        """Of a coefficient: under the cone law w_n = mu |w_t| + mu r |w_s| + mu_r |w_r|, a target that it moves."""
+    def _check_coefficient_changes(self, name: str) -> None:
+        """Raise CapabilityError if a coefficient of one contact cannot change under the cone law.
+
+        There w_n = mu |w_t| + mu r |w_s| + mu_r |w_r|, so a change of a coefficient acts like a change of a target.
+        """
         if self.problem.law != "cone" or not self._system.singular:
             return
-        cones, at = self.problem.cones, self._places
-        all_at_once = np.ones(cones.n_blocks)
-        r = self._by_reach(self._parts.reaches(*(all_at_once if name == key else None for key in REACHES)))[
-            at
-        ]
-        block = np.repeat(np.arange(cones.n_blocks), np.diff(cones.ptr))[at]  # r is of each block's own reach
-        size = CONTRADICTS * np.sqrt(np.bincount(block, r * r))
-        for q in self._system.probes(True):
+        cones, rows = self.problem.cones, self._system_rows
+        ones = np.ones(cones.n_blocks)
+        changes = (ones if name == key else None for key in COEFFICIENT_INPUTS)
+        r = self._apply_coefficient_change(self._coefficient_rows.change_of_rows(*changes))[rows]
+        # Entries of r depend on the coefficient of their own block only.
+        block = np.repeat(np.arange(cones.n_blocks), np.diff(cones.ptr))[rows]
+        size = MAX_NULL_COSINE * np.sqrt(np.bincount(block, r * r))
+        for q in self._system.null_vectors(True):
             if (np.abs(np.bincount(block, q * r)) > size * float(np.linalg.norm(q))).any():
-                self._refuse_alone(f"no derivative by {name} of one contact exists here (jvp: of several)")
+                self._check_row_changes(
+                    f"no derivative by {name} of one contact exists here (jvp: of several)"
+                )
 
-    # -- both ways -------------------------------------------------------------------------------
+    # -- adjoint and forward products ------------------------------------------------------------
 
     def vjp(self, *, velocity: Any = None, impulse: Any = None, slack: Any = None) -> Gradient:
-        """Gradients of velocity . v+ + impulse . lambda + slack . w by all data, at the cost of one linear solve.
+        """Compute the gradients of velocity . v+ + impulse . lambda + slack . w by all data, by one linear solve.
 
         Parameters
         ----------
         velocity : (nv,) or (n, 6), optional
-            Cotangent of the velocities after the step, its unit the scalar's over m/s (rad/s).
+            Cotangent of the velocities after the step; its unit is the unit of the scalar over m/s (rad/s).
         impulse : (m,), optional
             Cotangent of the impulses, per N s.
         slack : (m,), optional
             Cotangent of w, per m/s.
 
+        Returns
+        -------
+        Gradient
+
         Raises
         ------
         InputError
-            A cotangent of another shape, not finite, or none at all.
+            A cotangent has another shape or is not finite, or there is none.
         CapabilityError
-            `velocity` of a matrix; an `impulse` that weighs what is not unique (`unique` says which rows).
+            `velocity` for a problem given as a matrix; a cotangent of impulses that are not unique (see `unique`).
         """
         p = self.problem
         if velocity is None and impulse is None and slack is None:
-            raise InputError("give velocity=, impulse= or slack=: what the scalar weighs of the solution")
-        made = self._linear.adjoint(velocity, impulse, slack) if self._plain else None
-        if made is not None:
-            return Gradient(self, made)
-        y = None if velocity is None else as_array("velocity", velocity, self._velocities()).reshape(-1)
+            raise InputError("give velocity=, impulse= or slack=, a cotangent of the solution")
+        adjoint = self._linear.adjoint(velocity, impulse, slack) if self._uses_kernel else None
+        if adjoint is not None:
+            return Gradient(self, adjoint)
+        y = None if velocity is None else as_array("velocity", velocity, self._velocity_shape()).reshape(-1)
         c = np.zeros(p.m) if impulse is None else as_array("impulse", impulse, (p.m,))
         x = None if slack is None else as_array("slack", slack, (p.m,))
-        return Gradient(self, (self._linear.adjoint if self._plain else self._adjoint)(y, c, x))
+        return Gradient(self, (self._linear.adjoint if self._uses_kernel else self._solve_adjoint)(y, c, x))
 
-    def _adjoint(self, y: FloatArray | None, c: FloatArray, x: FloatArray | None) -> FloatArray:
-        """(q, s (m), f (nv), c (m)) of (4), end to end, with f = y - J^T s; no f of a matrix."""
-        p, right = self.problem, c.copy()
+    def _solve_adjoint(self, y: FloatArray | None, c: FloatArray, x: FloatArray | None) -> FloatArray:
+        """Return q, s (m), f (nv), c (m) of (4), concatenated, with f = y - J^T s; without f for a matrix."""
+        p, rhs = self.problem, c.copy()
         if x is not None:
-            right += self._a(x, True)
+            rhs += self._apply_a(x, True)
         if y is not None:
-            right += self._along(self._through_mass(y))
-        scaled, q = (right / self._root)[self._places], np.zeros(p.m)
-        # Slacks and velocities are unique where A is that of bodies and the law is convex.
+            rhs += self._apply_jacobian(self._apply_inverse_mass(y))
+        scaled, q = (rhs / self._root)[self._system_rows], np.zeros(p.m)
+        # Slacks and velocities are unique if A comes from bodies and the law is convex.
         if p.matrix is not None or p.law == "coulomb" or c.any():
-            self._refuse_undetermined(scaled)
-        q[self._places] = self._system.solve(scaled, True)
+            self._check_unique(scaled)
+        q[self._system_rows] = self._system.solve(scaled, True)
         s = self._linear.times(q, True) / self._root
         if x is not None:
             s -= x
         if p.matrix is not None:
             return np.concatenate([q, s, c])
-        return np.concatenate([q, s, (0.0 if y is None else y) - self._wrench(s), c])
+        f = (0.0 if y is None else y) - self._apply_jacobian_transposed(s)
+        return np.concatenate([q, s, f, c])
 
-    def _refuse_undetermined(self, c: FloatArray) -> None:
+    def _check_unique(self, c: FloatArray) -> None:
+        """Raise CapabilityError if a scaled cotangent weighs a component of the solution that is not unique."""
         if not self._system.singular:
             return
         size = float(np.linalg.norm(c))
-        if any(abs(float(x @ c)) > UNMOVED * size for x in self._null):
+        if any(abs(float(x @ c)) > MAX_NULL_ENTRY * size for x in self._null_space):
             raise CapabilityError(
-                f"what is asked for is not unique here: {self.unique}. Ask for velocities, slacks, or sums of impulses "
-                "that are"
+                f"the requested gradient is not unique: {self.unique}. Use cotangents of velocities, slacks, or sums "
+                "of impulses that are"
             )
 
     def jvp(self, **changes: Any) -> Tangent:
-        """How the solution changes along changes of the data, at the cost of one solve.
+        """Compute the change of the solution along changes of the data, by one linear solve.
 
         Parameters
         ----------
         b, target, v_free, lower, upper, mu, patch_radius, rolling, compliance, A, J, M : array-like, optional
-            Changes of the data that bear these names, of their shapes; mu also (k, 2). b= is a change of b itself;
-            with target=, v_free= and J= b = target - J v* follows. M must be symmetric.
+            Changes of the data with these names, of the same shapes; mu also (k, 2). With b= the change of b itself is
+            given; with target=, v_free= and J= it is computed from b = target - J v*. M must be symmetric.
         jac, normal, tangent, arm_a, arm_b, inv_mass, inv_inertia : array-like, optional
-            Changes of the arrays of bodies, `Rows`.
+            Changes of the arrays of `Rows`.
 
         Returns
         -------
@@ -339,65 +377,70 @@ class Derivative:
         Raises
         ------
         InputError
-            A name that this problem has no data of, another shape, numbers that are not finite, or none at all.
+            The problem has no data of this name, a shape is wrong, a number is not finite, or there is no change.
+        CapabilityError
+            No derivative along this change exists.
         """
-        p, n = self.problem, self._linear
-        given = self._checked(changes)
-        r, push = np.zeros(p.m), np.zeros(p.m)  # push: dA lambda - db
+        p, linear = self.problem, self._linear
+        data = self._check_changes(changes)
+        r, dw = np.zeros(p.m), np.zeros(p.m)  # dw = dA lambda - db: change of w with fixed impulses
         for name in ("b", "target"):
-            push -= given.get(name, 0.0)
-        for name, acts in zip(("lower", "upper"), self._acting, strict=True):
-            r += acts * self._root * given.get(name, 0.0)
-        wanted = [given.get(name) for name in REACHES]
-        if any(x is not None for x in wanted):
-            r += self._by_reach(self._parts.reaches(*wanted))
+            dw -= data.get(name, 0.0)
+        for name, weight in zip(("lower", "upper"), self._bound_weights, strict=True):
+            r += weight * self._root * data.get(name, 0.0)
+        coefficients = [data.get(name) for name in COEFFICIENT_INPUTS]
+        if any(x is not None for x in coefficients):
+            r += self._apply_coefficient_change(self._coefficient_rows.change_of_rows(*coefficients))
         dv: Any = None if p.matrix is not None else np.zeros(self._velocity.shape)
-        if "A" in given:
-            push += given["A"] @ self._impulse
-        if "compliance" in given:
-            push += given["compliance"] * self._impulse
-        dj = self._bodies.jacobian(given) if p.rows is not None else given.get("J")
-        if p.rows is not None and "J" in given:
-            dj = given["J"] if dj is None else dj + given["J"]
-        pulled = None  # dJ^T lambda - dM v'
+        if "A" in data:
+            dw += data["A"] @ self._impulse
+        if "compliance" in data:
+            dw += data["compliance"] * self._impulse
+        dj = self._body_chain.change_of_jacobian(data) if p.rows is not None else data.get("J")
+        if p.rows is not None and "J" in data:
+            dj = data["J"] if dj is None else dj + data["J"]
+        momentum = None  # dJ^T lambda - dM v'
         if dj is not None:
-            push += dj @ self._velocity
-            pulled = dj.T @ self._impulse
-        if "M" in given:
-            pulled = (0.0 if pulled is None else pulled) - given["M"] @ self._change
-        if pulled is not None:
-            dv += self._through_mass(pulled)
-        if "inv_mass" in given or "inv_inertia" in given:
-            dv += self._bodies.through(given, self._wrench(self._impulse))
+            dw += dj @ self._velocity
+            momentum = dj.T @ self._impulse
+        if "M" in data:
+            momentum = (0.0 if momentum is None else momentum) - data["M"] @ self._velocity_change
+        if momentum is not None:
+            dv += self._apply_inverse_mass(momentum)
+        if "inv_mass" in data or "inv_inertia" in data:
+            force = self._apply_jacobian_transposed(self._impulse)
+            dv += self._body_chain.apply_change_of_inverse_mass(data, force)
         if dv is not None and dv.any():
-            push += self._along(dv)
-        if "v_free" in given:
-            free = given["v_free"].ravel()
-            push += self._along(free)
+            dw += self._apply_jacobian(dv)
+        if "v_free" in data:
+            free = data["v_free"].ravel()
+            dw += self._apply_jacobian(free)
             dv = dv + free
-        dz = self._solve(r - n.times(push / self._root), True)
+        dz = self._solve(r - linear.times(dw / self._root), True)
         impulse = dz / self._root
-        slack = self._a(impulse) + push
+        slack = self._apply_a(impulse) + dw
         if dv is not None:
-            dv = (dv + self._moved(impulse)).reshape(self._velocities())
+            dv = (dv + self._apply_mobility(impulse)).reshape(self._velocity_shape())
         return Tangent(slack, dv, impulse, self)
 
-    def _by_reach(self, de: FloatArray) -> FloatArray:
-        n = self._linear
+    def _apply_coefficient_change(self, de: FloatArray) -> FloatArray:
+        """Compute (dPi/de) de (m,) for changes de (m,) of the coefficients of rows; with ellipses also by D."""
+        linear = self._linear
         if not self.problem.cones.has_ellipse:
-            return n.times(de, False, True)
-        rows, own, through = self._axes
-        x, y, rest = np.zeros(len(de)), np.zeros(len(de)), de.copy()
-        x[rows], y[rows], rest[rows] = own * de[rows], through * de[rows], 0.0
-        return n.times(rest, False, True) + x - n.times(y)
+            return linear.times(de, False, True)
+        rows, dz_de, dy_de = self._ellipse_terms
+        dz, dy, others = np.zeros(len(de)), np.zeros(len(de)), de.copy()
+        dz[rows], dy[rows], others[rows] = dz_de * de[rows], dy_de * de[rows], 0.0
+        return linear.times(others, False, True) + dz - linear.times(dy)
 
-    def _checked(self, changes: dict[str, Any]) -> dict[str, Any]:
+    def _check_changes(self, changes: dict[str, Any]) -> dict[str, Any]:
+        """Convert the changes of data to arrays; raise InputError for invalid ones."""
         p, out = self.problem, {}
-        known = [name for name in self.inputs if name != "coefficients"]
+        names = [name for name in self.inputs if name != "coefficients"]
         for name, value in changes.items():
-            if name not in known:
+            if name not in names:
                 raise InputError(
-                    f"{name!r} is no data of this problem ({p.operator}): there are {', '.join(known)}"
+                    f"{name!r} is not among the data of this problem ({p.operator}): there are {', '.join(names)}"
                 )
             if name in MATRICES:
                 like = p.matrix if name == "A" else p.jacobian if name == "J" else p.generalized.mass  # type: ignore[union-attr]
@@ -406,7 +449,7 @@ class Derivative:
                     raise InputError(f"{name} has shape {out[name].shape}; {like.shape} is needed")
                 if name == "M" and abs(out[name] - out[name].T).max() > 1e-12 * abs(out[name]).max():
                     raise InputError("the change of M is not symmetric; M is: give both triangles")
-            elif name in REACHES:
+            elif name in COEFFICIENT_INPUTS:
                 shape: tuple[int, ...] = (p.n_blocks,)
                 out[name] = as_array(
                     name, value, (*shape, 2) if name == "mu" and np.ndim(value) == 2 else shape
@@ -417,58 +460,58 @@ class Derivative:
             else:
                 out[name] = as_array(name, value, (p.m,))
         if not out:
-            raise InputError(f"give a change of the data: {', '.join(known)}")
+            raise InputError(f"give a change of the data: {', '.join(names)}")
         return out
 
-    # -- whether it exists -----------------------------------------------------------------------
+    # -- existence -------------------------------------------------------------------------------
 
     @cached_property
-    def _null(self) -> FloatArray:
-        return self._system.probes(False)
+    def _null_space(self) -> FloatArray:
+        return self._system.null_vectors(False)
 
     @cached_property
     def unique(self) -> Unique:
-        """What is unique of the solution, row by row: rows that repeat others share their impulse in many ways."""
+        """Uniqueness of the solution by rows; linearly dependent rows can share a load in many ways."""
         p, m = self.problem, self.problem.m
         impulse, slack, target, velocity = np.ones((3, m), bool)[0], np.ones(m, bool), np.ones(m, bool), True
-        at = self._places
-        for z in self._null:
+        rows = self._system_rows
+        for z in self._null_space:
             x = np.zeros(m)
-            x[at] = z
-            size = np.abs(x).max()
-            moved = np.abs(self._a(x / self._root) / self._root)
-            impulse &= np.abs(x) <= UNMOVED * size
-            slack &= moved <= UNMOVED * size
-            velocity = velocity and bool(moved.max() <= UNMOVED * size)
-        for q in self._system.probes(True):
+            x[rows] = z
+            limit = MAX_NULL_ENTRY * np.abs(x).max()
+            slack_change = np.abs(self._apply_a(x / self._root) / self._root)
+            impulse &= np.abs(x) <= limit
+            slack &= slack_change <= limit
+            velocity = velocity and bool(slack_change.max() <= limit)
+        for q in self._system.null_vectors(True):
             x = np.zeros(m)
-            x[at] = q
-            target &= np.abs(self._linear.times(x, True)) <= UNMOVED * np.abs(x).max()
+            x[rows] = q
+            target &= np.abs(self._linear.times(x, True)) <= MAX_NULL_ENTRY * np.abs(x).max()
         return Unique(impulse, slack, velocity, target, p)
 
     @cached_property
     def states(self) -> States:
-        """What each block does, as `solution.states`, with a bound of the error that `distance_in_errors` estimates."""
+        """State of each block, as `solution.states`, with a bound of the error that `distance_in_errors` estimates."""
         return states_of(self.problem, self._impulse, self._linear)
 
     @cached_property
     def _estimated_error(self) -> FloatArray:
-        """(k,) N s: how far the next step of Newton's method would move each block, and rounding."""
-        n, p = self._linear, self.problem
+        """Estimated error of each block (k,) [N s]: the next step of Newton's method, and rounding."""
+        linear, p = self._linear, self.problem
         with np.errstate(all="ignore"):
-            size = np.abs(self._a_of_sizes()) + np.abs(p.b)
-            rounding = U * size / self._root * np.random.default_rng(0).choice([-1.0, 1.0], p.m)
+            size = np.abs(self._apply_abs_a()) + np.abs(p.b)
+            rounding = UNIT_ROUNDOFF * size / self._root * np.random.default_rng(0).choice([-1.0, 1.0], p.m)
             error = np.zeros(p.m)
-            for r in (-n.residual, n.times(rounding)):
+            for r in (-linear.residual, linear.times(rounding)):
                 dz = self._solve(r)
-                ds = self._a(dz / self._root) / self._root
+                ds = self._apply_a(dz / self._root) / self._root
                 error += np.abs(dz - ds) / self._root
-            error += 4.0 * U * size / self._root**2
+            error += 4.0 * UNIT_ROUNDOFF * size / self._root**2
         first = p.cones.ptr[:-1]
         return np.maximum.reduceat(np.nan_to_num(error, nan=np.inf), first) if len(first) else error
 
-    def _a_of_sizes(self) -> FloatArray:
-        """|A| |lambda|, or no less where A is not formed."""
+    def _apply_abs_a(self) -> FloatArray:
+        """Compute |A| |lambda| (m,), or an upper bound in generalised coordinates, which do not form A."""
         p, x = self.problem, np.abs(self._impulse)
         if p.matrix is not None or p.rows is not None:
             return np.asarray(abs(p.csr) @ x)
@@ -478,33 +521,35 @@ class Derivative:
 
     @property
     def distance(self) -> FloatArray:
-        """(k,) N s (N m s on angular rows): of each block to its nearest other state, inf without one."""
+        """Distance of each block (k,) [N s; N m s on angular rows] to its nearest other state; inf without one."""
         return self.states.margin
 
     @property
     def distance_in_errors(self) -> FloatArray:
-        """(k,) the same over an estimate of the solution's error there: one step of Newton's method, and rounding."""
+        """`distance` (k,) divided by the estimated error of the block: one step of Newton's method, and rounding."""
         with np.errstate(divide="ignore", invalid="ignore"):
-            found: FloatArray = np.where(self.distance == 0.0, 0.0, self.distance / self._estimated_error)
-        return found
+            distance: FloatArray = np.where(self.distance == 0.0, 0.0, self.distance / self._estimated_error)
+        return distance
 
     @cached_property
     def switching(self) -> tuple[int, ...]:
-        """Blocks within ten estimated errors of another state: there are several derivatives, this one is of
-        `states[i].name`.
+        """Blocks within ten estimated errors of another state.
+
+        If there are any, several derivatives exist; this one belongs to the present states (`states[i].name`).
         """
-        return tuple(int(i) for i in np.flatnonzero(self.distance_in_errors <= MANY))
+        return tuple(int(i) for i in np.flatnonzero(self.distance_in_errors <= SWITCHING_ERRORS))
 
     @property
     def exists(self) -> bool:
-        """No block is about to switch, and every target may change alone."""
+        """Whether the derivative exists: no block is about to switch, and each target can change separately."""
         return not self.switching and bool(self.unique.target.all())
 
     @property
     def motions(self) -> Any:
-        """The `SolutionSet` that solve this problem, as `lavender.find_solutions` finds them when first asked.
+        """The `SolutionSet` of this problem, computed by `lavender.find_solutions` at the first use.
 
-        Under Coulomb's law there may be several: a gradient is then of this one, whose choice it does not know.
+        Under Coulomb's law there may be several. The derivative is that of the given solution; it does not include a
+        change of the solver's choice.
         """
         return lazy_module("lavender.lab.motion").get_solutions(self.problem.disk)
 
@@ -512,36 +557,36 @@ class Derivative:
         return f"<Derivative of {self.m} rows: {self}>"
 
     def __str__(self) -> str:
-        words = [repr(self.states)]
+        notes = [repr(self.states)]
         if self.switching:
             names = ", ".join(
                 self.problem.row_name(int(self.problem.cones.ptr[i])) for i in self.switching[:3]
             )
-            words.append(f"{len(self.switching)} about to switch ({names}): one of several derivatives")
+            notes.append(f"{len(self.switching)} about to switch ({names}): one of several derivatives")
         if not self.unique:
-            words.append(f"not unique: {self.unique}")
-        return "; ".join(words)
+            notes.append(f"not unique: {self.unique}")
+        return "; ".join(notes)
 
 
 def derivative(problem: Problem, solution: Any) -> Derivative:
-    """The derivative of a problem's solution by all of its data, prepared once.
+    """Prepare the derivative of a problem's solution by all of its data.
 
     Parameters
     ----------
     problem : Problem
     solution : Solution, or (m,) N s
-        Any solver's answer, or an impulse; the judge must accept it to 1e-8, or to its floor.
+        Solution of any solver, or an impulse. Its relative residual must be at most 1e-8, or at the round-off floor.
 
     Returns
     -------
     Derivative
-        `.vjp(velocity=, impulse=)` gives gradients by all data, `.jvp(b=, mu=, ...)` changes of the answer; `.states`,
-        `.distance`, `.switching`, `.unique` and `.motions` say where it is one of several or does not exist.
+        `.vjp(velocity=, impulse=)` computes gradients by all data, `.jvp(b=, mu=, ...)` changes of the solution.
+        `.states`, `.distance`, `.switching`, `.unique` and `.motions` show whether the derivative exists and is unique.
 
     Raises
     ------
     InputError
-        An impulse of the wrong length, or an answer with a larger residual: of another problem, or not solved.
+        The impulse has the wrong length, or its residual is too large.
 
     References
     ----------
@@ -549,7 +594,7 @@ def derivative(problem: Problem, solution: Any) -> Derivative:
 
     Examples
     --------
-    A box of 1 kg slides and its friction takes mu times its weight: dv/dmu = -1 N s / 1 kg.
+    A box of 1 kg slides, with the friction mu times its weight: dv/dmu = -1 N s / 1 kg.
 
     >>> import numpy as np
     >>> import lavender as lv
@@ -561,14 +606,14 @@ def derivative(problem: Problem, solution: Any) -> Derivative:
     [-1.0]
     """
     check_problem(problem)
-    x = problem.impulse_array(getattr(solution, "impulse", solution))
-    linear = linear_of(problem, x, SMALL)
-    if not linear.above_floor <= ACCEPTED:
-        found = residual(problem, x, "float64")
-        if not (found.nothing_to_do and found.rounds):
+    impulse = problem.impulse_array(getattr(solution, "impulse", solution))
+    linear = linear_of(problem, impulse, MAX_KERNEL_ROWS)
+    if not linear.above_floor <= MAX_ACCEPTED_RESIDUAL:
+        error = residual(problem, impulse, "float64")
+        if not (error.nothing_to_do and error.rounds):
             raise InputError(
-                f"this is no solution of this problem: its relative residual is {found.relative:.2e}; a derivative "
-                f"needs {ACCEPTED:g} or the floor ({found.roundoff_floor:.1e}): solve with tol=1e-10, or give the "
-                "problem that it solves"
+                f"this is not a solution of this problem: its relative residual is {error.relative:.2e}; a derivative "
+                f"needs {MAX_ACCEPTED_RESIDUAL:g} or the floor ({error.roundoff_floor:.1e}): solve with tol=1e-10, or "
+                "give the problem that it solves"
             )
     return Derivative(problem, linear)

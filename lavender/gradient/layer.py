@@ -1,7 +1,7 @@
-"""One step's solve as a function of arrays, with its adjoint: what `lavender.torch` and `lavender.jax` call.
+"""The solve of one step as a function of arrays, with its adjoint, for `lavender.torch` and `lavender.jax`.
 
-Leading axes of any argument are a batch, as NumPy broadcasts them. Nothing is kept between the two ways: the adjoint
-takes the impulses that were found.
+Leading axes of the arguments are batch axes with NumPy's broadcasting. No state is stored between the two functions:
+the impulses of the solution are arguments of the adjoint.
 """
 
 from __future__ import annotations
@@ -21,110 +21,129 @@ from lavender.gradient import derivatives
 from lavender.problem import Problem
 from lavender.problem.cones import Cones
 
-NAMES = ("J", "M", "v_free", "mu", "target", "compliance")
-SIZES = (2, 2, 1, 1, 1, 1)  # axes of each that are no batch
+ARGUMENTS = ("J", "M", "v_free", "mu", "target", "compliance")
+ARGUMENT_AXES = (2, 2, 1, 1, 1, 1)  # number of axes of each argument without batch axes
 
 
 @dataclass(frozen=True)
 class Step:
-    """What is no array: bounds, law, who solves."""
+    """Settings of a step that are not arrays of numbers.
+
+    Parameters
+    ----------
+    cones : Cones
+        Its mu is not used.
+    bounds : tuple of bytes
+        Fields of `cones` without mu, for comparisons.
+    friction, solver : str
+    tol : float, -
+    """
 
     cones: Cones = field(compare=False)
-    bounds: tuple[bytes, ...]  # the cones' numbers without mu, which is not read
+    bounds: tuple[bytes, ...]
     friction: str
     solver: str
     tol: float
 
     def problems(self, arrays: Sequence[FloatArray]) -> Iterator[Problem]:
-        """One for each member of the batch, in C order."""
-        contacts = self.cones.is_contact
-        for jac, mass, free, mu, target, soft in zip(*arrays, strict=True):
+        """Yield the problem of each member of the batch, in C order."""
+        is_contact = self.cones.is_contact
+        for jac, mass, free, mu, target, compliance in zip(*arrays, strict=True):
             cones = self.cones
-            if contacts.any():
-                every = cones.mu.copy()
-                every[contacts] = mu
-                cones = replace(cones, mu=every)
+            if is_contact.any():
+                mu_of_block = cones.mu.copy()
+                mu_of_block[is_contact] = mu
+                cones = replace(cones, mu=mu_of_block)
             yield Problem.from_jacobian(
-                jac, mass, free, target=target, cones=cones, compliance=soft, friction=self.friction
+                jac, mass, free, target=target, cones=cones, compliance=compliance, friction=self.friction
             )
 
     def forward(self, *arrays: Any) -> tuple[FloatArray, FloatArray]:
-        """Velocities (..., nv) and impulses (..., m)."""
-        flat, batch = _flat(arrays)
+        """Compute velocities (..., nv) and impulses (..., m)."""
+        flat, batch = _flatten_batch(arrays)
         problems = list(self.problems(flat))
-        found = [s.raise_for_status() for s in solve_many(problems, self.solver, tol=self.tol)]
-        impulse = np.array([s.impulse for s in found]).reshape(*batch, self.cones.n_rows)
-        velocity = [p.velocity(s.impulse) for p, s in zip(problems, found, strict=True)]
+        solutions = [s.raise_for_status() for s in solve_many(problems, self.solver, tol=self.tol)]
+        impulse = np.array([s.impulse for s in solutions]).reshape(*batch, self.cones.n_rows)
+        velocity = [p.velocity(s.impulse) for p, s in zip(problems, solutions, strict=True)]
         return np.array(velocity).reshape(*batch, flat[0].shape[-1]), impulse
 
     def backward(self, needed: Any, *arrays: Any) -> tuple[FloatArray, ...]:
-        """Gradients by the arrays of `forward`, of these, impulses, and cotangents of velocities and impulses.
+        """Compute the gradients by the arrays of `forward`.
 
-        Zeros where `needed` is false: what is not asked for need not exist.
+        Parameters
+        ----------
+        needed : sequence of bool
+            Whether each gradient is computed. The others are zeros; they need not exist.
+        *arrays
+            Arrays of `forward`, impulses, cotangents of velocities, cotangents of impulses.
         """
-        given = arrays[: len(NAMES)]
-        flat, batch = _flat(given)
-        found: list[list[FloatArray]] = [[] for _ in NAMES]
+        arguments = arrays[: len(ARGUMENTS)]
+        flat, batch = _flatten_batch(arguments)
+        gradients: list[list[FloatArray]] = [[] for _ in ARGUMENTS]
         others = [
             np.broadcast_to(x, (*batch, x.shape[-1])).reshape(prod(batch), x.shape[-1])
-            for x in arrays[len(given) :]
+            for x in arrays[len(arguments) :]
         ]
         problems, (impulses, y, c) = list(self.problems(flat)), others
         for p, g in zip(problems, derivatives(problems, impulses).vjp(velocity=y, impulse=c), strict=True):
-            for to, name, need, like in zip(found, NAMES, needed, flat, strict=True):
-                if not need:
-                    to.append(np.zeros(like.shape[1:]))
+            for out, name, is_needed, like in zip(gradients, ARGUMENTS, needed, flat, strict=True):
+                if not is_needed:
+                    out.append(np.zeros(like.shape[1:]))
                 elif name == "mu":
-                    to.append(g.mu[p.cones.is_contact])
+                    out.append(g.mu[p.cones.is_contact])
                 else:
-                    to.append(g.full(name) if name in ("J", "M") else getattr(g, name))
-        made = (np.array(x).reshape(*batch, *like.shape[1:]) for x, like in zip(found, flat, strict=True))
-        return tuple(_summed(x, np.shape(like)) for x, like in zip(made, given, strict=True))
+                    out.append(g.full(name) if name in ("J", "M") else getattr(g, name))
+        batched = (
+            np.array(x).reshape(*batch, *like.shape[1:]) for x, like in zip(gradients, flat, strict=True)
+        )
+        return tuple(_sum_to_shape(x, np.shape(like)) for x, like in zip(batched, arguments, strict=True))
 
 
-def _flat(arrays: Sequence[Any]) -> tuple[list[FloatArray], tuple[int, ...]]:
-    """Every array with one leading axis over the batch, and the batch's shape."""
-    given = [np.asarray(x, np.float64) for x in arrays]
-    leads = [x.shape[: x.ndim - n] for x, n in zip(given, SIZES, strict=True)]
-    batch = np.broadcast_shapes(*leads)
-    count = prod(batch)  # of -1 NumPy cannot tell where an array has no rows
+def _flatten_batch(arrays: Sequence[Any]) -> tuple[list[FloatArray], tuple[int, ...]]:
+    """Return all arrays with a single leading batch axis, and the shape of the batch."""
+    arrays = [np.asarray(x, np.float64) for x in arrays]
+    batch_shapes = [x.shape[: x.ndim - n] for x, n in zip(arrays, ARGUMENT_AXES, strict=True)]
+    batch = np.broadcast_shapes(*batch_shapes)
+    count = prod(batch)  # `reshape` cannot infer it from -1 if an array has no rows.
     return [
         np.broadcast_to(x, (*batch, *x.shape[x.ndim - n :])).reshape(count, *x.shape[x.ndim - n :])
-        for x, n in zip(given, SIZES, strict=True)
+        for x, n in zip(arrays, ARGUMENT_AXES, strict=True)
     ], batch
 
 
-def _summed(x: FloatArray, shape: tuple[int, ...]) -> FloatArray:
-    """Over the axes along which an array of this shape was repeated."""
+def _sum_to_shape(x: FloatArray, shape: tuple[int, ...]) -> FloatArray:
+    """Sum over the axes along which an array of this shape was broadcast."""
     x = x.sum(axis=tuple(range(x.ndim - len(shape))))
     ones = tuple(i for i, n in enumerate(shape) if n == 1 and x.shape[i] != 1)
     return x.sum(axis=ones, keepdims=True) if ones else x
 
 
-def shapes(arrays: Sequence[Any]) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """Shapes of velocities and impulses; InputError where those of the arguments do not fit."""
-    sizes = [tuple(x.shape) for x in arrays]
-    for name, size, n in zip(NAMES, sizes, SIZES, strict=True):
-        if len(size) < n:
-            raise InputError(f"{name} has shape {size}; {n} axes are needed, and before them any of a batch")
-    m, nv = sizes[0][-2:]
-    wanted = ((m, nv), (nv, nv), (nv,), sizes[3][-1:], (m,), (m,))
-    for name, size, fits in zip(NAMES, sizes, wanted, strict=True):
-        if size[len(size) - len(fits) :] != fits:
+def result_shapes(arrays: Sequence[Any]) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Return the shapes of velocities and impulses; raise InputError if the shapes of the arguments disagree."""
+    shapes = [tuple(x.shape) for x in arrays]
+    for name, shape, n in zip(ARGUMENTS, shapes, ARGUMENT_AXES, strict=True):
+        if len(shape) < n:
+            raise InputError(f"{name} has shape {shape}; {n} axes are needed, and before them any of a batch")
+    m, nv = shapes[0][-2:]
+    required_shapes = ((m, nv), (nv, nv), (nv,), shapes[3][-1:], (m,), (m,))
+    for name, shape, required in zip(ARGUMENTS, shapes, required_shapes, strict=True):
+        if shape[len(shape) - len(required) :] != required:
             raise InputError(
-                f"{name} has shape {size}; (..., {', '.join(map(str, fits))}) is needed, as J is {sizes[0]}"
+                f"{name} has shape {shape}; (..., {', '.join(map(str, required))}) is needed, as J is {shapes[0]}"
             )
     try:
-        batch = np.broadcast_shapes(*(size[: len(size) - n] for size, n in zip(sizes, SIZES, strict=True)))
+        batch = np.broadcast_shapes(
+            *(shape[: len(shape) - n] for shape, n in zip(shapes, ARGUMENT_AXES, strict=True))
+        )
     except ValueError:
         raise InputError(
-            f"shapes {sizes} of {', '.join(NAMES)} have batches that do not fit each other"
+            f"shapes {shapes} of {', '.join(ARGUMENTS)} have batches that do not fit each other"
         ) from None
     return (*batch, nv), (*batch, m)
 
 
-def step(arrays: Sequence[Any], cones: Cones | None, friction: str, solver: str, tol: float) -> Step:
-    """The step of these arrays; without cones all rows are contacts, as many as mu has values."""
+def make_step(arrays: Sequence[Any], cones: Cones | None, friction: str, solver: str, tol: float) -> Step:
+    """Build the `Step` of these arrays; without cones, all rows are those of contacts, one for each value of mu."""
     m, k = arrays[0].shape[-2], arrays[3].shape[-1]
     if cones is None:
         if (m or k) and (k == 0 or m % k or not 1 <= m // k <= 3):
@@ -138,14 +157,17 @@ def step(arrays: Sequence[Any], cones: Cones | None, friction: str, solver: str,
             f"cones have {cones.n_rows} rows and {contacts} contacts; J has {m} rows and mu {k} values"
         )
     bounds = tuple(np.asarray(getattr(cones, f.name)).tobytes() for f in fields(cones) if f.name != "mu")
-    made = Step(cones, bounds, friction, solver, tol)
+    step = Step(cones, bounds, friction, solver, tol)
     try:
-        return _first_of_equals(made)
-    except TypeError:  # no name or no number, which has no hash: the solve refuses it
-        return made
+        return _reuse_equal(step)
+    except TypeError:  # An invalid solver or tolerance may not be hashable; the solve raises the error.
+        return step
 
 
 @lru_cache(maxsize=256)
-def _first_of_equals(made: Step) -> Step:
-    # JAX keeps what it compiles of a callback by the identity of its object: another one each call is compiled anew.
-    return made
+def _reuse_equal(step: Step) -> Step:
+    """Return an equal step of an earlier call, if there was one.
+
+    JAX caches compiled callbacks by the identity of their object, so a new object would be compiled in every call.
+    """
+    return step

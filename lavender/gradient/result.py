@@ -1,4 +1,4 @@
-"""Gradients by the data of a problem, each worked out when it is asked for."""
+"""Gradients by the data of a problem, each computed at its first use."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ from lavender.problem.derived import cached_property
 
 MATRICES = ("A", "J", "M")
 BODIES = ("jac", "normal", "tangent", "arm_a", "arm_b", "inv_mass", "inv_inertia")
-# What can be differentiated by, and how the problems are given that have it; of `jvp` mu= stands for coefficients, too.
+# Data by which solutions can be differentiated, and the forms of problems that have them (see `OPERATORS`). For `jvp`,
+# mu= also accepts coefficients (k, 2).
 INPUTS = {
     **dict.fromkeys(("b", "lower", "upper", "mu", "coefficients", "patch_radius", "rolling"), OPERATORS),
     "A": ("matrix",),
@@ -25,180 +26,193 @@ INPUTS = {
 }
 
 
-REACHES = ("mu", "patch_radius", "rolling")
-# A change of these at one of several rows that share a load contradicts the others.
-ALONE = ("b", "target", "compliance", "A", "J", "jac", "normal", "tangent", "arm_a", "arm_b")
+COEFFICIENT_INPUTS = ("mu", "patch_radius", "rolling")
+# If several linearly dependent rows share a load, a change of these data in one row contradicts the other rows.
+ROW_INPUTS = ("b", "target", "compliance", "A", "J", "jac", "normal", "tangent", "arm_a", "arm_b")
 
 
 class _Input:
-    """A gradient by one name, kept where it was worked out (its descriptor gives way to the instance's own)."""
+    """Descriptor that computes the gradient by one input and stores it as an attribute of the instance."""
 
     def __init__(self, name: str) -> None:
-        self.name, self.operators, self.alone = name, INPUTS[name], name in ALONE
-        self.work_out = None if name in BODIES else getattr(Gradient, f"_by_{name}")
+        self.name, self.operators, self.is_row_input = name, INPUTS[name], name in ROW_INPUTS
+        self.compute = None if name in BODIES else getattr(Gradient, f"_by_{name}")
 
     def __get__(self, gradient: Any, owner: Any = None) -> Any:
         if gradient is None:
             return self
-        name, of = self.name, gradient._of
-        if self.operators is not OPERATORS and of.problem.operator not in self.operators:
+        name, derivative = self.name, gradient._derivative
+        if self.operators is not OPERATORS and derivative.problem.operator not in self.operators:
             raise CapabilityError(
                 f"{name} is of problems given as {' or '.join(self.operators)}, and this one was given as "
-                f"{of.problem.operator}"
+                f"{derivative.problem.operator}"
             )
-        if self.alone and not of._plain:
-            of._refuse_alone(f"no derivative by {name} exists here")
-        if name in (*REACHES, "coefficients") and not of._plain:
-            of._refuse_reach("mu" if name == "coefficients" else name)
-        if self.work_out is None:
-            gradient.__dict__.update(of._bodies.back(gradient))
+        if self.is_row_input and not derivative._uses_kernel:
+            derivative._check_row_changes(f"no derivative by {name} exists here")
+        if name in (*COEFFICIENT_INPUTS, "coefficients") and not derivative._uses_kernel:
+            derivative._check_coefficient_changes("mu" if name == "coefficients" else name)
+        if self.compute is None:
+            gradient.__dict__.update(derivative._body_chain.pull_back(gradient))
             return gradient.__dict__[name]
-        found = gradient.__dict__[name] = self.work_out(gradient)
-        return found
+        value = gradient.__dict__[name] = self.compute(gradient)
+        return value
 
 
 class Gradient:
-    """Gradients of a scalar by the data of a problem, of cotangents of its solution: `Derivative.vjp`.
+    """Gradients of a scalar by the data of a problem, computed by `Derivative.vjp`.
 
-    Each is worked out when first asked for, and has the shape of the data; its unit is the scalar's over the data's.
-    What a problem has no data of is refused (CapabilityError), and where rows share a load in many ways
-    (`Derivative.unique.target`) what changes one of them alone: targets, J, arms, compliance; under the cone law, in
-    which a contact slides off at mu times its speed, coefficients of those that slide.
+    Each gradient is computed at its first use and has the shape of the data. Its unit is the unit of the scalar over
+    the unit of the data.
 
-        b, target            (m,): by b as it is given; by the target of a problem with J and M, the same
-        v_free               (nv,) or (n, 6): by v*, b = target - J v* following
-        lower, upper         (m,): by the bounds that act; of lower = upper, which move together, half of it each
+        b, target            (m,): by b of a matrix problem; by the target of a problem with J and M (same values)
+        v_free               (nv,) or (n, 6): by v*, with b = target - J v*
+        lower, upper         (m,): by the active bounds; if lower = upper, half of the sum for each
         mu, patch_radius, rolling   (k,): by the fields of `Cones`
-        coefficients         (k, 2): by mu_1 and mu_2 of ellipses and boxes; of other contacts by mu, 0
+        coefficients         (k, 2): by mu_1 and mu_2 of ellipses and boxes; (mu, 0) for other contacts
         compliance           (m,)
-        A                    (m, m): entry by entry; dense, or of a sparse A in its pattern
-        J, M                 (m, nv), (nv, nv), sparse, in their patterns; M as symmetric; `full` has them whole
+        A                    (m, m): by each entry; dense, or on the pattern of a sparse A
+        J, M                 (m, nv), (nv, nv): sparse, on their patterns; M symmetric; see `full`
         jac, normal, tangent, arm_a, arm_b, inv_mass, inv_inertia   as in `Rows`
 
-    By J, M and the arrays of bodies with target and v* given. Normals and tangents count as free vectors: of a turn
-    only the part along it does.
+    Gradients by J, M and the arrays of bodies are for fixed target and v*. Normals and tangents are treated as free
+    vectors: for a rotation, use the component along it.
+
+    Accessing a gradient raises CapabilityError if the problem has no such data. It also does so if linearly dependent
+    rows share a load (`Derivative.unique.target`) and the data belong to single rows: targets, J, arms, compliance.
+    Under the cone law, where a sliding contact separates at mu times its speed, this includes coefficients of sliding
+    contacts.
     """
 
-    def __init__(self, of: Any, made: FloatArray) -> None:
-        self._of, self._made = of, made  # q, s (m), f (nv), c (m)
+    def __init__(self, derivative: Any, adjoint: FloatArray) -> None:
+        self._derivative, self._adjoint = derivative, adjoint  # concatenated q, s (m), f (nv), c (m)
 
     @property
     def _q(self) -> FloatArray:
-        return self._made[: self._of.m]
+        return self._adjoint[: self._derivative.m]
 
     @property
     def _s(self) -> FloatArray:
-        m = self._of.m
-        return self._made[m : 2 * m]
+        m = self._derivative.m
+        return self._adjoint[m : 2 * m]
 
     @property
     def _f(self) -> FloatArray:
-        # y - J^T s
-        m = self._of.m
-        return self._made[2 * m : len(self._made) - m]
+        """f = y - J^T s."""
+        m = self._derivative.m
+        return self._adjoint[2 * m : len(self._adjoint) - m]
 
     @cached_property
     def _p(self) -> FloatArray:
-        return np.asarray(self._of._through_mass(self._f))
+        return np.asarray(self._derivative._apply_inverse_mass(self._f))
 
     @property
     def _c(self) -> FloatArray:
-        return self._made[len(self._made) - self._of.m :]
+        return self._adjoint[len(self._adjoint) - self._derivative.m :]
 
     def __repr__(self) -> str:
-        return f"<Gradient of {self._of.m} rows by {', '.join(self._of.inputs)}>"
+        return f"<Gradient of {self._derivative.m} rows by {', '.join(self._derivative.inputs)}>"
 
     def __getattr__(self, name: str) -> Any:
         raise AttributeError(f"a gradient has no {name!r}; it has {', '.join(INPUTS)}")
 
     def _by_b(self) -> FloatArray:
-        m = self._of.m
-        return self._made[m : 2 * m]
+        m = self._derivative.m
+        return self._adjoint[m : 2 * m]
 
     _by_target = _by_b
 
     def _by_v_free(self) -> FloatArray:
-        return self._f.reshape(self._of._velocities())
+        return self._f.reshape(self._derivative._velocity_shape())
 
     @cached_property
-    def _pull(self) -> FloatArray:
-        # by an impulse that is moved and held: c + A^T-part of what its push changes
-        o, matrix, compliance = self._of, self._of.problem.matrix, self._of.problem.compliance
+    def _by_fixed_impulse(self) -> FloatArray:
+        """Gradient (m,) by impulses at a bound: c and the effect of the impulse on w and v."""
+        derivative = self._derivative
+        matrix, compliance = derivative.problem.matrix, derivative.problem.compliance
         if matrix is not None:
             return np.asarray(self._c - matrix.T @ self._s)
         assert compliance is not None
-        return np.asarray(self._c + o._along(self._p) - compliance * self._s)
+        return np.asarray(self._c + derivative._apply_jacobian(self._p) - compliance * self._s)
 
     def _by_lower(self) -> FloatArray:
-        return self._of._acting[0] * self._pull
+        return self._derivative._bound_weights[0] * self._by_fixed_impulse
 
     def _by_upper(self) -> FloatArray:
-        return self._of._acting[1] * self._pull
+        return self._derivative._bound_weights[1] * self._by_fixed_impulse
 
     @cached_property
-    def _reach(self) -> FloatArray:
-        o = self._of
-        e = o._linear.times(self._q, True, True)
-        if o.problem.cones.has_ellipse:
-            rows, own, through = o._axes
-            e[rows] = own * self._q[rows] - through * o._linear.times(self._q, True)[rows]
+    def _by_row_coefficient(self) -> FloatArray:
+        """Gradient (m,) by the friction coefficient e of each row."""
+        derivative = self._derivative
+        e = derivative._linear.times(self._q, True, True)
+        if derivative.problem.cones.has_ellipse:
+            rows, dz_de, dy_de = derivative._ellipse_terms
+            e[rows] = dz_de * self._q[rows] - dy_de * derivative._linear.times(self._q, True)[rows]
         return e
 
     def _by_mu(self) -> FloatArray:
-        parts = self._of._parts
-        return parts.gather(self._reach, parts.first) + parts.radius * parts.gather(self._reach, parts.second)
+        rows, gradient = self._derivative._coefficient_rows, self._by_row_coefficient
+        return rows.gather(gradient, rows.first) + rows.radius * rows.gather(gradient, rows.second)
 
     def _by_coefficients(self) -> FloatArray:
-        parts = self._of._parts
-        second = np.where(parts.two, parts.gather(self._reach, parts.second), 0.0)
-        first = np.where(parts.two, parts.gather(self._reach, parts.first), self.mu)
+        rows, gradient = self._derivative._coefficient_rows, self._by_row_coefficient
+        second = np.where(rows.has_pair, rows.gather(gradient, rows.second), 0.0)
+        first = np.where(rows.has_pair, rows.gather(gradient, rows.first), self.mu)
         return np.stack([first, second], axis=1)
 
     def _by_patch_radius(self) -> FloatArray:
-        parts = self._of._parts
-        return parts.mu * parts.gather(self._reach, parts.second)
+        rows = self._derivative._coefficient_rows
+        return rows.mu * rows.gather(self._by_row_coefficient, rows.second)
 
     def _by_rolling(self) -> FloatArray:
-        parts = self._of._parts
-        return parts.gather(self._reach, parts.rolls)
+        rows = self._derivative._coefficient_rows
+        return rows.gather(self._by_row_coefficient, rows.rolling)
 
     def _by_compliance(self) -> FloatArray:
-        return -self._s * self._of._impulse
+        return -self._s * self._derivative._impulse
 
     def _by_A(self) -> Any:
-        o = self._of
-        if issparse(o.problem.matrix):
-            return _on(o.problem.matrix, (-self._s, o._impulse))
-        return -np.outer(self._s, o._impulse)
+        derivative = self._derivative
+        if issparse(derivative.problem.matrix):
+            return _sum_on_pattern(derivative.problem.matrix, (-self._s, derivative._impulse))
+        return -np.outer(self._s, derivative._impulse)
 
     def _pairs(self, name: str) -> list[tuple[FloatArray, FloatArray]]:
-        # (5) of A, J or M as a sum of u v^T
-        o = self._of
+        """Return the gradient (5) by A, J or M as pairs (u, v) of the sum of u v^T."""
+        derivative = self._derivative
         if name == "A":
-            return [(-self._s, o._impulse)]
+            return [(-self._s, derivative._impulse)]
         p = self._p
         if name == "J":
-            return [(o._impulse, p), (-self._s, o._velocity)]
-        return [(-0.5 * p, o._change), (-0.5 * o._change, p)]
+            return [(derivative._impulse, p), (-self._s, derivative._velocity)]
+        return [(-0.5 * p, derivative._velocity_change), (-0.5 * derivative._velocity_change, p)]
 
     def _by_J(self) -> sp.csr_array:
-        return _on(self._of.problem.jacobian, *self._pairs("J"))
+        return _sum_on_pattern(self._derivative.problem.jacobian, *self._pairs("J"))
 
     def _by_M(self) -> sp.csr_array:
-        general = self._of.problem.generalized
+        general = self._derivative.problem.generalized
         assert general is not None
-        return _on(general.mass, *self._pairs("M"))
+        return _sum_on_pattern(general.mass, *self._pairs("M"))
 
     def full(self, name: str) -> FloatArray:
-        """The whole of A, J or M, a dense array with entries outside its pattern, too."""
+        """Compute the gradient by A, J or M as a dense array, with entries outside of the pattern.
+
+        Raises
+        ------
+        InputError
+            `name` is not "A", "J" or "M".
+        CapabilityError
+            The problem has no such matrix, or the derivative does not exist.
+        """
         if name not in MATRICES:
-            raise InputError(f"full is of {', '.join(MATRICES)}; {name!r} is no matrix with a pattern")
-        getattr(self, name)  # refuses what is not there
+            raise InputError(f"full is of {', '.join(MATRICES)}; {name!r} is not a matrix with a pattern")
+        getattr(self, name)  # raises CapabilityError
         return np.asarray(sum(np.outer(u, v) for u, v in self._pairs(name)))
 
 
-def _on(pattern: Any, *pairs: tuple[FloatArray, FloatArray]) -> sp.csr_array:
-    """Sum of u v^T on the pattern of a matrix in compressed rows."""
+def _sum_on_pattern(pattern: Any, *pairs: tuple[FloatArray, FloatArray]) -> sp.csr_array:
+    """Compute the entries of the sum of u v^T on the pattern of a matrix in compressed rows."""
     row = np.repeat(np.arange(pattern.shape[0]), np.diff(pattern.indptr))
     data = sum(u[row] * v[pattern.indices] for u, v in pairs)
     return sp.csr_array((data, pattern.indices, pattern.indptr), shape=pattern.shape)

@@ -1,4 +1,4 @@
-"""The linear system of a derivative: its factor by what suits it, and what solves it where rows repeat others."""
+"""The linear system of a derivative: choice of its factorisation, and solves if it is singular."""
 
 from __future__ import annotations
 
@@ -17,112 +17,121 @@ from lavender.solvers.newton_systems.systems import is_full
 from lavender_ext.derivative.linear import Linear
 from lavender_ext.factor.sparse import SparsePanels, free_part
 
-SINGULAR = 1e-12  # least pivot over the largest, from which on rows count as repeating others
-SHIFT = 1e-11  # eps of (6)
-TURNS = 8  # of (6): what is 1e-11 of the diagonal is off by 2^-8 then, what is 1e-9 by 1e-16
-ENOUGH = 1e-14  # of the largest entry, below which a turn changes nothing
-PROBES = 2  # random vectors that show what is not determined
-SMALL = 64  # rows up to which the system is dense, whatever A is
-# rows up to which it is dense where A is no symmetric matrix with few entries, or a contact slides
-DENSE = 400
+MIN_PIVOT_RATIO = 1e-12  # If the smallest pivot over the largest is below this, G counts as singular.
+SHIFT_OF_SINGULAR = 1e-11  # eps of (6), relative to the diagonal
+# Steps of (6). Components whose pivot is 1e-11 of the diagonal then have an error of 2^-8, with 1e-9 an error of 1e-16.
+MAX_PROXIMAL_STEPS = 8
+MIN_PROXIMAL_CHANGE = 1e-14  # (6) ends if a step changes x by at most this fraction of its largest entry.
+NULL_VECTORS = 2  # Number of random vectors that are projected on the null space of G.
+MAX_KERNEL_ROWS = 64  # Systems of up to this many rows are factored as dense matrices by the kernel.
+# Systems of up to this many rows are also dense if A is not symmetric and sparse, or if a contact slides.
+MAX_DENSE_ROWS = 400
 
-Solve = Callable[[FloatArray, bool], FloatArray]
+Solve = Callable[[FloatArray, bool], FloatArray]  # arguments: right-hand side, transpose
 
 
-def prepared(problem: Problem, linear: Linear, shift: float = 0.0) -> bool:
-    """Whether the kernel has a dense factor."""
+def factor_dense(problem: Problem, linear: Linear, shift: float = 0.0) -> bool:
+    """Factor G + shift P as a dense matrix in the kernel; return whether it is regular."""
     data = problem.csr_data if problem.generalized is None else problem.metric
-    found: bool = linear.prepare(data, shift)
-    return found
+    is_regular: bool = linear.prepare(data, shift)
+    return is_regular
 
 
 class System:
-    """A factor of G on the rows that are not its identity; solves with it and with its transpose.
+    """A factor of G on the rows in which G is not the identity, with solves for G and G^T.
 
-    `of_kernel`: the factor is the kernel's own, and G is regular.
+    Attributes
+    ----------
+    singular : bool
+        Whether G is singular; solves then iterate by (6).
+    of_kernel : bool
+        Whether G is regular and the kernel has its factor.
     """
 
     def __init__(self, problem: Problem, linear: Linear) -> None:
         self.problem, self.linear, self.n = problem, linear, linear.rows
-        few = self.n > SMALL and not linear.slides and problem.is_symmetric
-        if few and not is_full(problem.csr.nnz, problem.m, True):
-            factor = self._panels
+        is_symmetric = self.n > MAX_KERNEL_ROWS and not linear.slides and problem.is_symmetric
+        if is_symmetric and not is_full(problem.csr.nnz, problem.m, True):
+            factor = self._factor_symmetric
         else:
-            factor = self._dense if self.n <= DENSE else self._superlu
-        # Of few rows `prepared` was tried.
-        tried = self.n <= SMALL
-        once = linear.solve if tried and linear.regular else None if tried else factor(0.0)
-        self.singular = once is None
-        self.of_kernel = once is not None and factor == self._dense
-        if once is None:
-            self.g: Any = linear.matrix() if factor == self._dense else self._matrix(0.0)
-            once = factor(SHIFT)
-        if once is None:
+            factor = self._factor_dense if self.n <= MAX_DENSE_ROWS else self._factor_lu
+        # `Derivative` has called `factor_dense` for small systems.
+        is_factored = self.n <= MAX_KERNEL_ROWS
+        solve = linear.solve if is_factored and linear.regular else None if is_factored else factor(0.0)
+        self.singular = solve is None
+        self.of_kernel = solve is not None and factor == self._factor_dense
+        if solve is None:
+            self.g: Any = linear.matrix() if factor == self._factor_dense else self._form_matrix(0.0)
+            solve = factor(SHIFT_OF_SINGULAR)
+        if solve is None:
             raise CapabilityError(
-                f"the equations of this solution's states have no factor, shifted by {SHIFT:g} of their diagonal "
-                "either: an A that is indefinite, or states that are wrong"
+                f"the equations of this solution's states have no factor, shifted by {SHIFT_OF_SINGULAR:g} of their "
+                "diagonal either: an A that is indefinite, or states that are wrong"
             )
-        self._once = once
+        self._solve_factored = solve
 
-    def _dense(self, shift: float) -> Solve | None:
-        return self.linear.solve if prepared(self.problem, self.linear, shift) else None
+    def _factor_dense(self, shift: float) -> Solve | None:
+        return self.linear.solve if factor_dense(self.problem, self.linear, shift) else None
 
-    def _h(self) -> tuple[Any, Any, FloatArray]:
-        # H on the rows of G in compressed rows
-        a, n = self.problem.csr, self.linear
-        indptr, indices, data = free_part(a.indptr, a.indices, a.data, n.place, self.n)
-        root = n.root[n.place >= 0]
+    def _form_h(self) -> tuple[Any, Any, FloatArray]:
+        """Form H on the rows of G, in compressed rows."""
+        a, linear = self.problem.csr, self.linear
+        indptr, indices, data = free_part(a.indptr, a.indices, a.data, linear.place, self.n)
+        root = linear.root[linear.place >= 0]
         return indptr, indices, data / (np.repeat(root, np.diff(indptr)) * root[indices])
 
-    def _panels(self, shift: float) -> Solve | None:
-        # G = H, symmetric
-        indptr, indices, data = self._h()
+    def _factor_symmetric(self, shift: float) -> Solve | None:
+        """Factor G = H, which is symmetric because no contact slides."""
+        indptr, indices, data = self._form_h()
         panels = SparsePanels(indptr, indices, False, WIDE)
-        lost = panels.factor(data, np.ones(self.n), shift, SINGULAR)
-        return None if lost else lambda r, back: panels.solve(r)
+        failed = panels.factor(data, np.ones(self.n), shift, MIN_PIVOT_RATIO)
+        return None if failed else lambda r, transpose: panels.solve(r)
 
-    def _matrix(self, shift: float) -> Any:
-        indptr, indices, data = self._h()
+    def _form_matrix(self, shift: float) -> Any:
+        """Form G + shift P = I - P + P (H + shift I) as a sparse matrix."""
+        indptr, indices, data = self._form_h()
         h = sp.csr_array((data, indices, indptr), shape=(self.n, self.n))
         c, one = self.problem.cones, sp.eye_array(self.n)
         block = np.repeat(np.arange(c.n_blocks), np.diff(c.ptr))
-        alone = ~c.is_contact[block]
-        ends = np.concatenate([[0], np.cumsum(np.where(alone, 1, np.diff(c.ptr)[block]))])
-        first = np.where(alone, np.arange(c.n_rows), c.ptr[block])
+        is_row = ~c.is_contact[block]
+        # P has one diagonal entry for a bounded row, and a dense block for a contact.
+        ends = np.concatenate([[0], np.cumsum(np.where(is_row, 1, np.diff(c.ptr)[block]))])
+        first = np.where(is_row, np.arange(c.n_rows), c.ptr[block])
         columns = np.arange(ends[-1]) + np.repeat(first - ends[:-1], np.diff(ends))
-        at = np.flatnonzero(self.linear.place >= 0)
-        p = sp.csr_array((self.linear.p, columns, ends), shape=(c.n_rows, c.n_rows))[at][:, at]
+        rows = np.flatnonzero(self.linear.place >= 0)
+        p = sp.csr_array((self.linear.p, columns, ends), shape=(c.n_rows, c.n_rows))[rows][:, rows]
         return sp.csc_array(one - p + p @ (h + shift * one))
 
-    def _superlu(self, shift: float) -> Solve | None:
+    def _factor_lu(self, shift: float) -> Solve | None:
+        """Factor G + shift P by SuperLU; None if it is singular."""
         try:
-            found = sparse_lu(self._matrix(shift))
+            lu = sparse_lu(self._form_matrix(shift))
         except RuntimeError:
             return None
-        pivots = np.abs(found.U.diagonal())
-        if not pivots.min() > SINGULAR * pivots.max():
+        pivots = np.abs(lu.U.diagonal())
+        if not pivots.min() > MIN_PIVOT_RATIO * pivots.max():
             return None
-        return lambda r, back: found.solve(r, trans="T" if back else "N")
+        return lambda r, transpose: lu.solve(r, trans="T" if transpose else "N")
 
-    def solve(self, r: FloatArray, back: bool = False) -> FloatArray:
-        """Solve G x = r, or G^T x = r."""
-        x = self._once(r, back)
+    def solve(self, r: FloatArray, transpose: bool = False) -> FloatArray:
+        """Solve G x = r or G^T x = r; if G is singular, by (6)."""
+        x = self._solve_factored(r, transpose)
         if self.singular:
-            g = self.g.T if back else self.g
-            for _ in range(TURNS):
-                more = self._once(r - g @ x, back)
-                x = x + more
-                if not np.abs(more).max() > ENOUGH * np.abs(x).max():
+            g = self.g.T if transpose else self.g
+            for _ in range(MAX_PROXIMAL_STEPS):
+                step = self._solve_factored(r - g @ x, transpose)
+                x = x + step
+                if not np.abs(step).max() > MIN_PROXIMAL_CHANGE * np.abs(x).max():
                     break
         return x
 
-    def probes(self, back: bool) -> FloatArray:
-        """(PROBES, n) vectors that G, or G^T, maps to rounding, of a random share; of a regular one none."""
+    def null_vectors(self, transpose: bool) -> FloatArray:
+        """Return random unit vectors (NULL_VECTORS, n) in the null space of G or G^T; none if G is regular."""
         if not self.singular:
             return np.zeros((0, self.n))
-        g, out = (self.g.T if back else self.g), []
-        for x in np.random.default_rng(0).standard_normal((PROBES, self.n)):
-            for _ in range(TURNS):
-                x = x - self._once(g @ x, back)
-            out.append(x / np.linalg.norm(x))
-        return np.stack(out)
+        g, vectors = (self.g.T if transpose else self.g), []
+        for x in np.random.default_rng(0).standard_normal((NULL_VECTORS, self.n)):
+            for _ in range(MAX_PROXIMAL_STEPS):
+                x = x - self._solve_factored(g @ x, transpose)
+            vectors.append(x / np.linalg.norm(x))
+        return np.stack(vectors)

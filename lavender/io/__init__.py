@@ -17,7 +17,7 @@ import os
 from collections.abc import Collection
 from typing import Any
 
-from lavender.base.arrays import FloatArray, several
+from lavender.base.arrays import FloatArray, check_sequence
 from lavender.base.errors import InputError
 from lavender.io import drake, efc, fclib, mujoco, npz
 from lavender.io.drake import from_drake
@@ -117,7 +117,7 @@ def save(
     CapabilityError
         The format cannot hold something of this problem; the message names it.
     """
-    path, drop = as_path(path), several("drop", drop, "names")
+    path, drop = as_path(path), check_sequence("drop", drop, "names")
     suffix = path.suffix.lower()
     if suffix == ".npz":
         if form is not None or drop:

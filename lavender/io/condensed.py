@@ -21,7 +21,7 @@ def condensed(
 ) -> tuple[sp.csr_array, FloatArray]:
     """A (m, m) and J M^-1 f (m,) of M (n, n), J^T (n, m) and f (n,); raises InputError where they take too much."""
     label = sp.csgraph.connected_components(mass, directed=False)[1]
-    budget.spend(ENTRY * most_entries(label, jt), "A = H^T M^-1 H")
+    budget.spend(ENTRY * max_entries(label, jt), "A = H^T M^-1 H")
     solve = _factor(mass, label, budget)
     m = jt.shape[1]
     step = max(1, CHUNK // max(1, *jt.shape))
@@ -35,7 +35,7 @@ def condensed(
     return a, j @ solve(f)
 
 
-def most_entries(label: np.ndarray, jt: sp.csr_array) -> int:
+def max_entries(label: np.ndarray, jt: sp.csr_array) -> int:
     """At most so many entries has J M^-1 J^T; `label` (n,) says which parts of M hang together.
 
     A row of J that touches a part meets there every row that touches it: a part with r rows makes at most r^2.

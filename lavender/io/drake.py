@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray, number
+from lavender.base.arrays import FloatArray, check_float
 from lavender.base.errors import CapabilityError, InputError
 from lavender.io.pinocchio import closing_speed, told
 from lavender.problem import Problem
@@ -105,10 +105,10 @@ def _problem(
         raise InputError(
             "the plant is continuous; one with a time step is needed (MultibodyPlant(time_step=dt))"
         )
-    dt = step if dt is None else number("dt", dt)
+    dt = step if dt is None else check_float("dt", dt)
     if not math.isclose(dt, step, rel_tol=1e-12):
         raise InputError(f"dt is {dt:g} s, the plant's own step {step:g} s; they must be one")
-    correction = number("correction", correction, low=0.0, high=1.0)
+    correction = check_float("correction", correction, low=0.0, high=1.0)
     if plant.num_constraints() > 0:
         raise CapabilityError(
             f"the plant has {plant.num_constraints()} constraints (couplers, distances, balls, welds); joints, "

@@ -22,14 +22,14 @@ from lavender.base.arrays import (
     FloatArray,
     as_array,
     as_floats,
-    number,
-    one_of,
+    check_choice,
+    check_float,
+    check_int,
     precision_of,
     shape_of,
-    whole_number,
 )
 from lavender.base.errors import CapabilityError, InputError
-from lavender.base.threads import together
+from lavender.base.threads import run_on_threads
 from lavender.batch.data import ERRORS, Batch, check_counts, check_triangle
 from lavender.io import mujoco as single
 from lavender.problem.cones import Cones, kinds_of
@@ -116,7 +116,7 @@ def from_efc(
     jac, before = as_floats("efc_J", efc_J), as_floats("qvel", qvel)
     # MJX and Warp hold the time step as an array of one number.
     is_one = np.prod(shape_of("timestep", timestep)) == 1
-    dt = number("timestep", np.asarray(timestep).item() if is_one else timestep, above=0.0)
+    dt = check_float("timestep", np.asarray(timestep).item() if is_one else timestep, above=0.0)
     if jac.ndim != 3:
         raise InputError(f"efc_J has shape {jac.shape}; (n, m, nv) is needed")
     n, m, nv = jac.shape
@@ -194,7 +194,7 @@ def from_mujoco_many(model: Any, states: Any, *, threads: int = 1, errors: str =
         raise CapabilityError(
             f"integrator={word!r} puts damping into M; {', '.join(map(repr, single.OF_M))} have M itself"
         )
-    one_of("errors", errors, ERRORS)
+    check_choice("errors", errors, ERRORS)
     given = np.ascontiguousarray(as_array("states", states, (None, None), finite=errors == "raise"))
     size = given.shape[1]
     kinds = {model.nq + model.nv: mj.mjtState.mjSTATE_QPOS | mj.mjtState.mjSTATE_QVEL}
@@ -207,7 +207,7 @@ def from_mujoco_many(model: Any, states: Any, *, threads: int = 1, errors: str =
     mass = np.zeros((n, len(model.M_colind)))
     mass[:, model.M_rowadr + model.M_rownnz - 1] = 1.0  # its diagonal, of a state that is not finite
     todo = iter(range(n))
-    threads = min(whole_number("threads", threads, 1, None), max(n, 1))
+    threads = min(check_int("threads", threads, 1, None), max(n, 1))
 
     def work(stop: bytearray) -> tuple[_Stretches, _Stretches]:
         data = mj.MjData(model)
@@ -238,7 +238,7 @@ def from_mujoco_many(model: Any, states: Any, *, threads: int = 1, errors: str =
         mj.mju_sparse2dense(jac, data.efc_J, data.efc_J_rownnz, data.efc_J_rowadr, data.efc_J_colind)
         return jac
 
-    parts = together(work, threads)
+    parts = run_on_threads(work, threads)
     rows, ptr = _in_order([of_rows for of_rows, _ in parts], n)
     contacts, contact_ptr = _in_order([of_contacts for _, of_contacts in parts], n)
     made = _gathered(model, rows, ptr, contacts, contact_ptr, mass, free, smooth)

@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray, as_array, one_of
+from lavender.base.arrays import FloatArray, as_array, check_choice
 from lavender.base.errors import CapabilityError, InputError
 from lavender.base.lazy_import import sparse as sp
 from lavender.io.condensed import ENTRY, condensed
@@ -420,7 +420,7 @@ def contents(
     if form is None:
         soft = problem.generalized is not None and np.any(problem.compliance)
         form = "local" if problem.matrix is not None or soft else "global"
-    one_of("form", form, ("local", "global"))
+    check_choice("form", form, ("local", "global"))
     unknown = sorted(set(drop) - {"names", "key", "precision"})
     if unknown:
         raise InputError(

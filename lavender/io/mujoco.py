@@ -57,7 +57,7 @@ from lavender.base.lazy_import import sparse as sp
 from lavender.problem import Names, Problem
 from lavender.problem.cones import Cones
 from lavender.problem.generalized import Generalized
-from lavender.problem.operators import USUAL
+from lavender.problem.operators import MAX_SAFE_ENTRY
 from lavender_ext.io import mujoco_rows
 
 ROUNDING = 2.0**-46  # 64 roundings: M a0 against the smooth force, which MuJoCo solved for by the same factor
@@ -138,7 +138,7 @@ def from_mujoco(model: Any, data: Any, *, name: str = "mujoco") -> Problem:
     jac = _rows(seen, model, data, m, scale)
     rhs, softness, v_free, sound, gap, gaps = mujoco_rows.numbers(
         *jac, scale, dt, _before(seen, data), smooth, data.efc_aref, data.efc_R, data.efc_D, data.efc_force,
-        _speed(model, data, m), data.efc_b, data.qfrc_constraint, data.qacc, USUAL,
+        _speed(model, data, m), data.efc_b, data.qfrc_constraint, data.qacc, MAX_SAFE_ENTRY,
     )  # fmt: skip
     _check_jacobian(*gaps)
     if not gap <= SAME:
@@ -147,7 +147,9 @@ def from_mujoco(model: Any, data: Any, *, name: str = "mujoco") -> Problem:
     general = Generalized.compressed(jac, mass, v_free, like=like)
     if like is None:
         seen.like = general.operator
-    made = Problem._of_engine if sound and not general.operator.is_beyond(USUAL) else Problem
+    made = (
+        Problem._from_engine_arrays if sound and not general.operator.is_beyond(MAX_SAFE_ENTRY) else Problem
+    )
     return made(
         b=rhs,
         cones=cones,
@@ -379,7 +381,7 @@ def _blocks(seen: _Model, data: Any, contacts: int, dt: float) -> tuple[Cones, F
     blocks, scale, key = found
     if blocks is None:
         raise InputError(f"efc_frictionloss or a contact's friction is no bound. {CHANGED}")
-    return Cones._of(blocks), scale, key
+    return Cones._from_blocks(blocks), scale, key
 
 
 def _words(mj: Any, model: Any, held: IntArray, m: int, joined: int = mujoco_rows.JOINED) -> list[str]:

@@ -22,7 +22,7 @@ from typing import IO, Any
 import numpy as np
 from numpy.lib import format as npy
 
-from lavender.base.arrays import FloatArray, as_array, whole_number
+from lavender.base.arrays import FloatArray, as_array, check_int
 from lavender.base.errors import InputError
 from lavender.base.lazy_import import issparse
 from lavender.base.lazy_import import sparse as sp
@@ -293,7 +293,7 @@ def _read_own(archive: Archive) -> Stored:
     cones = Cones(**{name.removeprefix("cones_"): archive[name] for name in given})
     problem = Problem(b, cones, friction=meta["friction"], names=meta["names"], name=meta["name"], **more)
     if "program" in meta:
-        n = whole_number("program", meta["program"], high=problem.m)
+        n = check_int("program", meta["program"], high=problem.m)
         problem = replace(problem, qp=program_of_matrix(problem.csr, problem.b, problem.cones, n), copy=False)
     return Stored(problem, "lavender", impulse=_vector(archive, "impulse", problem))
 

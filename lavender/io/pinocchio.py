@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from lavender.base.arrays import as_array, number
+from lavender.base.arrays import as_array, check_float
 from lavender.base.errors import CapabilityError, InputError, LavenderError
 from lavender.problem import Problem
 from lavender.problem.cones import Cones
@@ -145,7 +145,7 @@ def _check_given(models: Any, datas: Any, dt: Any, correction: Any) -> tuple[flo
             raise InputError(f"constraint {word}: got a {type(given).__name__}; a sequence is needed")
     if len(models) != len(datas):
         raise InputError(f"{len(datas)} constraint data for {len(models)} models; one for each is needed")
-    return number("dt", dt, above=0.0), number("correction", correction, low=0.0, high=1.0)
+    return check_float("dt", dt, above=0.0), check_float("correction", correction, low=0.0, high=1.0)
 
 
 def _mass_and_acceleration(pin: Any, model: Any, data: Any, q: Any, v: Any, tau: Any) -> tuple[Any, Any]:

@@ -14,13 +14,13 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray, as_array, number, one_of, whole_number
+from lavender.base.arrays import FloatArray, as_array, check_choice, check_float, check_int
 from lavender.base.errors import InputError, LavenderError
 from lavender.io import mujoco as adapter
 from lavender.io import npz
 from lavender.io.states import read_states
 from lavender.io.stored import ENGINE, as_path, first_bytes, folder_for_steps, write_text
-from lavender.judge.residuals import AT_FLOOR, ENOUGH, UNCONVERGED, WRONG, residual
+from lavender.judge.residuals import AT_FLOOR, DEFAULT_THRESHOLD, UNCONVERGED, WRONG, residual
 from lavender.problem import PRECISIONS, Problem
 
 CONTROLS = ("zero", "random")
@@ -37,7 +37,7 @@ class Recording:
     left_out: tuple[str, ...] = field(default=())  # why a step could not be exported, one line each
     above_floor: int = 0  # of MuJoCo's answers, those that rounding does not explain
     stopped: int = 0  # of these, those more than `threshold` off
-    threshold: float = ENOUGH  # m/s
+    threshold: float = DEFAULT_THRESHOLD  # m/s
     worst: str = ""  # verdict of the worst answer, by how much it is off, and where
 
     def __str__(self) -> str:
@@ -65,7 +65,7 @@ def record(
     states: Any = None,
     replace: bool = False,
     precision: str = "float64",
-    threshold: float = ENOUGH,
+    threshold: float = DEFAULT_THRESHOLD,
 ) -> Recording:
     """Step a MuJoCo simulation and keep the problem of every `every`-th step.
 
@@ -111,9 +111,9 @@ def record(
         that holds a recording; MuJoCo ends in an error (out of memory, what it does not support).
     """
     mj = adapter._mujoco(model, data)[0].mj
-    steps, every = whole_number("steps", steps, 1), whole_number("every", every, 1)
-    precision = one_of("precision", precision, PRECISIONS)
-    threshold = number("threshold", threshold, low=0.0)
+    steps, every = check_int("steps", steps, 1), check_int("every", every, 1)
+    precision = check_choice("precision", precision, PRECISIONS)
+    threshold = check_float("threshold", threshold, low=0.0)
     drive = drive_of(model, control, seed)
     starts = None if states is None else read_states(mj, model, states).take(steps)
     firsts = {} if starts is None else {steps * i // len(starts): i for i in range(len(starts))}
@@ -256,7 +256,7 @@ def drive_of(model: Any, control: Control, seed: int) -> Callable[[Any, int], Fl
             )
         if control == "zero":
             return lambda data, step: np.zeros(n)
-        rng = np.random.default_rng(whole_number("seed", seed, high=None))
+        rng = np.random.default_rng(check_int("seed", seed, high=None))
         limited = np.array(model.actuator_ctrllimited, bool)[:, None]
         low, high = np.where(limited, np.array(model.actuator_ctrlrange), [-1.0, 1.0]).T
         return lambda data, step: rng.uniform(low, high)

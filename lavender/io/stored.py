@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray, flag, whole_number
+from lavender.base.arrays import FloatArray, check_bool, check_int
 from lavender.base.errors import InputError
 from lavender.problem import Problem
 
@@ -70,7 +70,7 @@ def folder_for_steps(
     `replace` takes the problem files out that it holds; those of a recording that is `continued` stay. What an engine
     said of others goes in either case. Another recording into it is refused meanwhile.
     """
-    replace = flag("replace", replace)
+    replace = check_bool("replace", replace)
     with lock_output(path, folder=True) as folder:
         try:
             old = [p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES and p.is_file()]
@@ -358,7 +358,7 @@ class Budget:
     """Bytes that a file may still make; spent before anything is allocated."""
 
     def __init__(self, max_bytes: int) -> None:
-        self.limit = self.left = whole_number("max_bytes", max_bytes, high=None)
+        self.limit = self.left = check_int("max_bytes", max_bytes, high=None)
 
     def spend(self, count: int, what: str) -> None:
         """Take `count` bytes off for `what`."""

@@ -1,28 +1,30 @@
-"""Proofs that a problem has no solution, checked on its own data.
+"""Proofs that a problem has no solution, checked on the problem's own data.
 
-A certificate y (m,) is a direction in which the bounds never end: along free rows, up where there is no upper bound,
-in the cone of a contact (Coulomb: along its normal alone). There w.y >= 0 at every solution, so with z = A^T y
+A certificate y (m,) is a direction in the recession cone of the admissible impulses: nonzero on free rows, positive on
+rows without an upper bound, negative on rows without a lower bound, and in the cone of a contact (Coulomb: along its
+normal only). Every solution then has w.y >= 0, so with z = A^T y
 
-    0 <= w.y = z.lambda - b.y,    and none exists where   b.y > max z.lambda                      (1)
+    0 <= w.y = z.lambda - b.y,    and no solution exists if   b.y > max z.lambda                  (1)
 
-over all lambda within the bounds, for any A and every law. Where z pulls by s at most along what has no end,
+over all lambda within the bounds, for any A and every law. If |z| is at most s in the directions in which lambda is
+unbounded, and the support S is the maximum of z.lambda over the bounded rows,
 
-    every solution has   sum |lambda| >= (b.y - pull of the rows that end) / s                    (2)
+    every solution has   sum |lambda| >= (b.y - S) / s                                            (2)
 
-which is infinite where s is 0 in exact arithmetic. A slack s is a proof as well where no more than rounding of the data
-made it, in the metric of D = diag(d), k the rows of y:
+which is infinite if s is 0 in exact arithmetic. A slack s > 0 is accepted as a proof if rounding of the data explains
+it, in the metric of D = diag(d), with k the number of nonzeros of y:
 
     A given           |z_i| <= (k + 2) 2^-53 sqrt(d_i) sum_j sqrt(d_j) |y_j|                      (3)
     J, M and R given  |J^T y|_M^-1 <= (k + 2) 2^-53 sum_j sqrt(d_j) |y_j|,   R y = 0 exactly      (4)
-    bodies            the same, with J as float64 has it
+    bodies            as J, M and R, with J as rounded to float64
 
-and no solution with an impulse as large as (2) could be told from a failure: its floor would be above 1e-6. The error
-of any impulse (`lavender.judge.residuals`) is
+A solution with an impulse as large as (2) could then not be distinguished from a failure: its round-off floor would
+exceed 1e-6. The errors E and V of any impulse (`lavender.judge.residuals`) are
 
-    E >= net / (|y|_D + |z|_D^-1),    V >= net / sum sqrt(d / nu) |y|,    net = b.y - pull        (5)
+    E >= net / (|y|_D + |z|_D^-1),    V >= net / sum sqrt(d / nu) |y|,    net = b.y - S           (5)
 
-Where this is within tol, or within what rounding of target and J v* made of b, an answer may meet tol, and there is
-nothing to prove. So b of an empty row may be dust, and equations that are repeated may differ by dust.
+If these are within tol, or within the rounding of b as computed from target and J v*, an answer may meet tol, and y
+proves nothing. So b of an empty row may be rounding noise, and repeated equations may differ by rounding noise.
 """
 
 from __future__ import annotations
@@ -38,47 +40,70 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray
 from lavender.base.deadline import NEVER, Deadline, TooLate
-from lavender.judge.residuals import reference, relative_of
+from lavender.judge.residuals import divide_by_reference, get_reference
 from lavender.problem import Problem
 
-__all__ = ["Proof", "check_certificate", "fighting", "prove", "rounded_down"]
+__all__ = ["Proof", "check_certificate", "format_lower_bound", "list_conflicting_blocks", "prove"]
 
-UNIT = 2.0**-53
-SPLIT = 2.0**27 + 1.0
-FAR = 1e-10  # of b.y: what z may reach, so that the floor of a solution is above 1e-6
-SURE = 1e3  # times its rounding: a sum beyond is known well enough as it comes
-NEAR = 1e-6  # what z may reach, beside its terms, for a solver's rounding
-SIMPLE = 16  # rows of a certificate up to which numbers are looked for that make A^T y zero exactly
-TAKES_PART = 1e-6  # of the largest y in the metric of D: below, a row is not named
-NAMED = 6  # blocks of a kind that are named
-POLISHED = 1000  # rows of a certificate up to which it is polished, by dense least squares,
-LEAST_SQUARES = 6e-10  # s for each row, column, and once more the fewer of both
+UNIT_ROUNDOFF = 2.0**-53
+VELTKAMP_FACTOR = 2.0**27 + 1.0  # Splits a float64 into two halves of 26 bits.
+# |z| counts as rounding up to this fraction of b.y at most: the floor of a solution (2) is then above 1e-6.
+MAX_ROUNDING_SLACK = 1e-10
+SAFE_SUM_RATIO = 1e3  # A sum above this multiple of its rounding bound is not recomputed exactly.
+MAX_POLISHED_SLACK = (
+    1e-6  # |z| up to this fraction of its terms is a solver's rounding; larger z is not polished.
+)
+MAX_EXACT_ROWS = (
+    16  # Up to this many rows, a valid certificate is also polished in search of A^T y = 0 exactly.
+)
+MIN_NAMED_SHARE = 1e-6  # Rows below this fraction of the largest |y| in the metric of D are not named.
+MAX_NAMED_BLOCKS = 6  # Number of blocks of each kind that a message names.
+MAX_POLISHED_ROWS = (
+    1000  # Certificates with more rows are not polished: the dense least squares would be too large.
+)
+LEAST_SQUARES_TIME = (
+    6e-10  # s for each (row x column x smaller of both) of the dense least squares, measured.
+)
 
 
 @dataclass(frozen=True)
 class Proof:
-    """What a direction y proves."""
+    """Result of checking a direction y as a certificate of infeasibility.
 
-    y: FloatArray  # (m,), as given, or polished
-    impulse_bound: float  # N s, (2): of every solution; inf where none exists, 0 where y says nothing
-    reason: str = ""  # why y is no proof that nothing meets the tolerance; empty where it is one
-    fighting: str = ""  # blocks of y, by name, where it is a proof
-    skipped: float = 0.0  # s that polishing it would have taken, where they were not left
+    Parameters
+    ----------
+    y : (m,)
+        The direction, as given or polished.
+    impulse_bound : float, N s
+        Lower bound (2) of sum |lambda| over all solutions: inf if none exists, 0 if y implies no bound.
+    reason : str
+        Why y does not prove that no impulse meets the tolerance; empty if it does.
+    conflict : str
+        If y is a proof: names of the conflicting blocks.
+    skipped_time : float, s
+        Estimated time of polishing y, if the deadline did not allow it; else 0.
+    """
+
+    y: FloatArray
+    impulse_bound: float
+    reason: str = ""
+    conflict: str = ""
+    skipped_time: float = 0.0
 
     @property
-    def words(self) -> str:
-        """What is proved, and who fights."""
-        who = f": {self.fighting}" if self.fighting else ""
+    def message(self) -> str:
+        """The proved statement, with the names of the conflicting blocks."""
+        names = f": {self.conflict}" if self.conflict else ""
         if self.impulse_bound == math.inf:
-            return f"no solution, proved{who}"
+            return f"no solution, proved{names}"
         return (
             "no solution for data within rounding of yours; for yours every solution has an impulse of at least "
-            f"{rounded_down(self.impulse_bound)} N s{who}"
+            f"{format_lower_bound(self.impulse_bound)} N s{names}"
         )
 
 
-def rounded_down(bound: float) -> str:
-    """A lower bound to one digit, no larger than it is."""
+def format_lower_bound(bound: float) -> str:
+    """Format a lower bound with one digit, rounded down."""
     digits, power = f"{bound:.17e}".split("e")
     return f"{float(f'{digits[0]}e{power}'):.1g}"
 
@@ -86,172 +111,207 @@ def rounded_down(bound: float) -> str:
 def check_certificate(
     problem: Problem, y: Any, tol: float = 0.0, deadline: Deadline | None = None
 ) -> str | None:
-    """Why y (m,) does not prove that nothing meets `tol`; None where it does."""
+    """Return why y (m,) does not prove that no impulse meets `tol`; None if it does."""
     return prove(problem, y, tol, deadline).reason or None
 
 
 def prove(problem: Problem, y: Any, tol: float = 0.0, deadline: Deadline | None = None) -> Proof:
-    """What y (m,) proves: no solution, or a least impulse of every solution.
+    """Check whether y (m,) proves that no impulse meets `tol`, and bound the impulse of every solution.
 
-    Where y is off by rounding of a solver, the nearest direction on the same rows with A^T y = 0 takes its place, if
-    it is found before the deadline. The last answer is kept with the problem: a solver, and whoever checks its claim,
-    ask the same; one with a deadline asks anew what another had no time for.
+    If y fails only by a solver's rounding, it is replaced by the nearest direction on the same rows with A^T y = 0,
+    if that can be computed before the deadline. The last result is stored with the problem, because a solver and the
+    check of its claim make the same call. It is not reused if its polishing was skipped and there is time for it now.
+
+    Parameters
+    ----------
+    problem : Problem
+    y : (m,)
+        Direction in impulse space; its scale does not matter.
+    tol : float, -
+        Relative residual that no impulse may meet.
+    deadline : Deadline, optional
+        Limit of the time for polishing.
+
+    Returns
+    -------
+    Proof
     """
     y = np.array(y, float)
     y.setflags(write=False)
-    asked = tol, y.shape, y.tobytes()
-    last: tuple[Any, Proof] | None = problem.derived.cache.get(__name__)
-    if last is not None and last[0] == asked:
-        skipped = last[1].skipped
-        if not skipped or deadline is None or deadline.passed(skipped):
-            return last[1]
-    found = _prove(problem, y, tol, deadline or NEVER)
-    problem.derived.cache[__name__] = asked, found
-    return found
+    key = tol, y.shape, y.tobytes()
+    stored: tuple[Any, Proof] | None = problem.derived.cache.get(__name__)
+    if stored is not None and stored[0] == key:
+        skipped_time = stored[1].skipped_time
+        if not skipped_time or deadline is None or deadline.passed(skipped_time):
+            return stored[1]
+    proof = _prove(problem, y, tol, deadline or NEVER)
+    problem.derived.cache[__name__] = key, proof
+    return proof
 
 
 def _prove(problem: Problem, y: FloatArray, tol: float, deadline: Deadline) -> Proof:
-    with np.errstate(all="ignore"):  # what overflows proves nothing
+    """Check y, then polished directions near y if y fails by rounding or if an exact proof may be found."""
+    with np.errstate(all="ignore"):  # A number that overflows proves nothing.
         inner = problem.disk
         if y.shape != (problem.m,) or not np.isfinite(y).all() or not np.any(y):
             reason = f"certificate of shape {y.shape} must be {problem.m} finite numbers, not all zero"
             return Proof(y, 0.0, reason)
-        found = _proof(inner, problem.on_disk(y), tol)
-        if 0.0 < found.impulse_bound < math.inf and (found.reason or np.count_nonzero(y) <= SIMPLE):
+        proof = _check_direction(inner, problem.on_disk(y), tol)
+        if 0.0 < proof.impulse_bound < math.inf and (proof.reason or np.count_nonzero(y) <= MAX_EXACT_ROWS):
             try:
-                for nearer in _polished(inner, found.y, deadline):
-                    again = _proof(inner, nearer, tol)
-                    if not again.reason and (found.reason or again.impulse_bound == math.inf):
-                        found = again
+                for polished in _polish(inner, proof.y, deadline):
+                    candidate = _check_direction(inner, polished, tol)
+                    if not candidate.reason and (proof.reason or candidate.impulse_bound == math.inf):
+                        proof = candidate
                         break
             except TooLate as late:
-                found = replace(found, skipped=late.args[0])
+                proof = replace(proof, skipped_time=late.args[0])
         if inner is not problem:
-            found = replace(found, y=problem.cones.stretch * found.y)
-        return found if found.reason else replace(found, fighting=_told(problem, found.y))
+            proof = replace(proof, y=problem.cones.stretch * proof.y)
+        return proof if proof.reason else replace(proof, conflict=_describe_conflict(problem, proof.y))
 
 
-def fighting(problem: Problem, y: Any) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """Blocks that a direction y (m,) takes part in: joints and bounded rows, and contacts."""
+def list_conflicting_blocks(problem: Problem, y: Any) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Return the blocks in which a direction y (m,) is not negligible: joints and bounded rows, and contacts."""
     size = np.sqrt(problem.d) * np.abs(np.asarray(y, float))
-    rows = np.flatnonzero(size > TAKES_PART * size.max(initial=0.0))
-    contact = problem.cones.contact_rows
-    of = [
-        np.unique([problem.block_of(int(i)) for i in rows[contact[rows] == kind]]) for kind in (False, True)
-    ]
-    return tuple(map(int, of[0])), tuple(map(int, of[1]))
-
-
-def _told(problem: Problem, y: FloatArray) -> str:
-    """Who fights, by the blocks' names: "joints 7 and 9 against contact 11"."""
-    return " against ".join(
-        told for told in (_listed(problem, blocks) for blocks in fighting(problem, y)) if told
+    rows = np.flatnonzero(size > MIN_NAMED_SHARE * size.max(initial=0.0))
+    is_contact = problem.cones.contact_rows
+    joints, contacts = (
+        np.unique([problem.block_of(int(i)) for i in rows[is_contact[rows] == kind]])
+        for kind in (False, True)
     )
+    return tuple(map(int, joints)), tuple(map(int, contacts))
 
 
-def _listed(problem: Problem, blocks: tuple[int, ...]) -> str:
+def _describe_conflict(problem: Problem, y: FloatArray) -> str:
+    """Name the conflicting blocks, e.g. "joints 7 and 9 against contact 11"."""
+    sides = (_name_blocks(problem, blocks) for blocks in list_conflicting_blocks(problem, y))
+    return " against ".join(side for side in sides if side)
+
+
+def _name_blocks(problem: Problem, blocks: tuple[int, ...]) -> str:
+    """Return the names of blocks as one text, shortened if all are of one kind."""
     names = [problem.row_name(int(problem.cones.ptr[i])).rsplit(", ", 1)[0] for i in blocks]
-    names = list(dict.fromkeys(names))  # a joint's free rows are blocks of their own
-    parts = [re.fullmatch(r"(.*\S) (\d+)", name) for name in names[:NAMED]]
-    kinds = {part[1] for part in parts if part}
-    if len(names) > 1 and all(parts) and len(kinds) == 1:  # "joints 7 and 9"
-        return f"{kinds.pop()}s " + _joined([part[2] for part in parts if part], len(names))
-    return _joined(names[:NAMED], len(names))
+    names = list(dict.fromkeys(names))  # Each free row of a joint is a block with the joint's name.
+    matches = [re.fullmatch(r"(.*\S) (\d+)", name) for name in names[:MAX_NAMED_BLOCKS]]
+    kinds = {match[1] for match in matches if match}
+    if len(names) > 1 and all(matches) and len(kinds) == 1:  # "joints 7 and 9"
+        return f"{kinds.pop()}s " + _join_names([match[2] for match in matches if match], len(names))
+    return _join_names(names[:MAX_NAMED_BLOCKS], len(names))
 
 
-def _joined(names: list[str], count: int) -> str:
+def _join_names(names: list[str], count: int) -> str:
+    """Join the first of `count` names by commas and "and"."""
     if count > len(names):
         return f"{', '.join(names)} and {count - len(names)} more"
     return " and ".join(filter(None, (", ".join(names[:-1]), names[-1]))) if names else ""
 
 
-def _proof(problem: Problem, y: FloatArray, tol: float) -> Proof:
-    # Only the rows that y takes part in: others may have overflown.
+def _check_direction(problem: Problem, y: FloatArray, tol: float) -> Proof:
+    """Check y (m,) by (1) to (5) on a problem without ellipses."""
+    # Only rows with y != 0 are read, because others may have overflown.
     rows = np.flatnonzero(y)
     vanished = np.intersect1d(rows, problem.vanished_rows)
     if len(vanished):
         name = problem.row_name(int(vanished[0]))
         return Proof(y, 0.0, f"products of {name} vanish in float64: its row of A is not zero")
-    given, y = y, y / _power(y)
-    gain, most = float(problem.b @ y), float(np.abs(problem.b) @ np.abs(y))
+    unscaled, y = y, y / _power_of_two(y)
+    # b.y and the sum of the absolute values of its terms
+    gain, gain_size = float(problem.b @ y), float(np.abs(problem.b) @ np.abs(y))
     if not gain > 0.0:
         return Proof(y, 0.0, f"b.y = {gain:.2e} is not positive")
-    outside = _recession_violation(problem, y)
-    if outside:
-        return Proof(y, 0.0, outside)
-    low, high, size = _slack(problem, y, rows)
+    violation = _recession_violation(problem, y)
+    if violation:
+        return Proof(y, 0.0, violation)
+    low, high, size = _bound_z(problem, y, rows)
     if not (np.isfinite(low).all() and np.isfinite(high).all()):
         return Proof(y, 0.0, "A^T y overflows")
-    share = min((len(rows) + 2.0) * UNIT, FAR * gain / most)
-    pull, slack, zero = _pull(problem, low, high, share * size)
-    net, rounding = gain - float(pull.sum()), (len(rows) + 4.0) * UNIT
-    if not net > rounding * (most + float(np.abs(pull).sum())):
+    rounding_factor = min((len(rows) + 2.0) * UNIT_ROUNDOFF, MAX_ROUNDING_SLACK * gain / gain_size)
+    support, slack, rounding = _compute_support(problem, low, high, rounding_factor * size)
+    # (1)
+    net, sum_rounding = gain - float(support.sum()), (len(rows) + 4.0) * UNIT_ROUNDOFF
+    if not net > sum_rounding * (gain_size + float(np.abs(support).sum())):
         return Proof(y, 0.0, f"A^T y reaches {high.max():.2e}; impulses within the bounds can meet b.y")
-    over = float(slack.max())
-    bound = net / over if over > 0.0 else math.inf
-    if np.any(slack > zero):
-        words = f"A^T y reaches {over:.2e}, above rounding: impulses within the bounds can meet b.y"
-        return Proof(given, bound, f"{words}, of at least {rounded_down(bound)} N s")
-    least, rounded = _least(problem, net, y, np.where(slack > 0.0, 0.0, np.maximum(-low, high)))
-    if least > max(tol, rounded):
-        return Proof(given, bound)
-    return Proof(given, bound, f"no exact solution, but one to a relative residual of {least:.1g} may exist")
+    # (2)
+    max_slack = float(slack.max())
+    bound = net / max_slack if max_slack > 0.0 else math.inf
+    if np.any(slack > rounding):
+        reason = f"A^T y reaches {max_slack:.2e}, above rounding: impulses within the bounds can meet b.y"
+        return Proof(unscaled, bound, f"{reason}, of at least {format_lower_bound(bound)} N s")
+    # (5)
+    z = np.where(slack > 0.0, 0.0, np.maximum(-low, high))
+    min_residual, b_rounding = _compute_min_residual(problem, net, y, z)
+    if min_residual > max(tol, b_rounding):
+        return Proof(unscaled, bound)
+    reason = f"no exact solution, but one to a relative residual of {min_residual:.1g} may exist"
+    return Proof(unscaled, bound, reason)
 
 
-def _slack(problem: Problem, y: FloatArray, rows: Any) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Least and largest z (m,), its sums exact, and what rounding of the data is told by (m,): (3), (4)."""
+def _bound_z(problem: Problem, y: FloatArray, rows: Any) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return bounds of z (m,) from below and above, and the sizes (m,) whose rounding (3) or (4) allows.
+
+    The sums of z are exact. The sizes are 0 if R y is not exactly 0.
+    """
     length = np.sqrt(problem.d)
     size = length * float(length @ np.abs(y))
     if problem.matrix is not None:
-        z = _product(problem.csr[rows], y[rows])
+        z = _multiply_transposed(problem.csr[rows], y[rows])
         return z, z, size
-    r = _product(problem.jacobian[rows], y[rows])
+    r = _multiply_transposed(problem.jacobian[rows], y[rows])
     if problem.rows is None:
         x = problem.generalized.solve(r)  # type: ignore[union-attr]
     else:
         x = problem.rows.inverse_mass_matrix() @ r
-    # J x as well: an M^-1 of bodies that is not definite, by rounding, makes r.x no norm.
-    off = np.maximum(length * math.sqrt(max(0.0, float(r @ x))), np.abs(problem.jacobian @ x))
+    # Rounding can make an M^-1 of bodies indefinite: r.x is then not a squared norm, so |J x| is also a lower limit.
+    radius = np.maximum(length * math.sqrt(max(0.0, float(r @ x))), np.abs(problem.jacobian @ x))
     soft = problem.compliance * y  # type: ignore[operator]
-    return soft - off, soft + off, 0.0 * size if np.any(soft) else size
+    return soft - radius, soft + radius, 0.0 * size if np.any(soft) else size
 
 
-def _product(a: Any, y: FloatArray) -> FloatArray:
-    """A^T y of a CSR matrix (k, m): each sum that cancels rounded once, as products of halves of 26 bits are exact."""
+def _multiply_transposed(a: Any, y: FloatArray) -> FloatArray:
+    """Compute A^T y of a CSR matrix (k, m), with sums that cancel rounded only once.
+
+    Such sums are formed from products of 26-bit halves, which are exact.
+    """
     out, size = a.T @ y, abs(a).T @ np.abs(y)
-    cancels = np.flatnonzero((size > 0.0) & ~(np.abs(out) > SURE * (len(y) + 2.0) * UNIT * size))
+    safe_sum = SAFE_SUM_RATIO * (len(y) + 2.0) * UNIT_ROUNDOFF * size
+    cancels = np.flatnonzero((size > 0.0) & ~(np.abs(out) > safe_sum))
     if not len(cancels):
         return out
     columns = a[:, cancels].tocsc()
     halves = []
     for x in (columns.data, y[columns.indices]):
-        high = SPLIT * x - (SPLIT * x - x)  # of 26 bits, as the rest (Veltkamp)
+        high = VELTKAMP_FACTOR * x - (
+            VELTKAMP_FACTOR * x - x
+        )  # Veltkamp's splitting: both halves have 26 bits.
         halves.append((high, x - high))
     terms = np.array([p * q for p, q in product(*halves)]).T.ravel().tolist()
     out[cancels] = [math.fsum(terms[4 * at : 4 * end]) for at, end in pairwise(columns.indptr.tolist())]
     return out
 
 
-def _power(x: FloatArray) -> float:
-    """The power of two below the largest of |x|, not all 0: what divides exactly."""
+def _power_of_two(x: FloatArray) -> float:
+    """Return the largest power of two up to max |x|, for exact divisions; x must not be zero."""
     return float(2.0 ** np.floor(np.log2(np.abs(x).max())))
 
 
-def _rims(problem: Problem, x: FloatArray) -> tuple[Any, FloatArray, FloatArray]:
-    """Of what one bound holds together: its contact's normal row, the bound over the normal, and |x| of its rows."""
+def _compute_friction_norms(problem: Problem, x: FloatArray) -> tuple[Any, FloatArray, FloatArray]:
+    """Return the normal row, the friction coefficient and |x| (m,) over the rows of each friction component."""
     c = problem.cones
-    parts, reach = list(c.parts()), c.reach
-    normal = c.ptr[np.array([i for i, _ in parts], int)]
-    bound = np.array([reach[part[0]] for _, part in parts])
-    return normal, bound, np.array([np.hypot.reduce(x[part]) for _, part in parts])
+    components, coefficient_of_row = list(c.parts()), c.reach
+    normal = c.ptr[np.array([block for block, _ in components], int)]
+    coefficient = np.array([coefficient_of_row[rows[0]] for _, rows in components])
+    return normal, coefficient, np.array([np.hypot.reduce(x[rows]) for _, rows in components])
 
 
-def _pull(
-    problem: Problem, low: FloatArray, high: FloatArray, zero: FloatArray
+def _compute_support(
+    problem: Problem, low: FloatArray, high: FloatArray, rounding: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Largest z.lambda of each row where that ends; else the slack along lambda; and what of a slack may be rounding.
+    """Compute support, slack and rounding of the slack, all (m,), for low <= z <= high.
 
-    All (m,), low <= z <= high; of a contact's rows together, on its normal.
+    The support is the maximum of z_i lambda_i on bounded rows. The slack is |z_i| on rows where lambda_i is unbounded,
+    and on bounded rows with |z_i| within rounding, whose support counts as 0. A contact has one value for all of its
+    rows, at its normal row.
     """
     c, size = problem.cones, np.maximum(-low, high)
     corners = [
@@ -259,47 +319,55 @@ def _pull(
         for z in (low, high)
         for bound in (c.lower, c.upper)
     ]
-    pull = np.maximum.reduce(corners)
+    support = np.maximum.reduce(corners)
     first = c.normal_rows
-    normal, limit, rim = _rims(problem, size)
-    pull[c.contact_rows] = 0.0
-    most, zero = high.copy(), zero.copy()
-    np.add.at(most, normal, limit * rim)
-    np.add.at(zero, normal, limit * _rims(problem, zero)[2])
-    pull[first] = np.where(most[first] > 0.0, np.inf, 0.0)
-    size[first] = most[first]
-    endless = (pull > 0.0) & ((size <= zero) | np.isinf(pull))
-    return np.where(endless, 0.0, pull), np.where(endless, size, 0.0), zero
+    normal, coefficient, friction_norm = _compute_friction_norms(problem, size)
+    support[c.contact_rows] = 0.0
+    # along the cone: z_n + sum of a_g |z_g|
+    cone_max, rounding = high.copy(), rounding.copy()
+    np.add.at(cone_max, normal, coefficient * friction_norm)
+    np.add.at(rounding, normal, coefficient * _compute_friction_norms(problem, rounding)[2])
+    support[first] = np.where(cone_max[first] > 0.0, np.inf, 0.0)
+    size[first] = cone_max[first]
+    is_slack = (support > 0.0) & ((size <= rounding) | np.isinf(support))
+    return np.where(is_slack, 0.0, support), np.where(is_slack, size, 0.0), rounding
 
 
-def _least(problem: Problem, net: float, y: FloatArray, z: FloatArray) -> tuple[float, float]:
-    """The least relative residual (5) of any impulse, and what rounding of b, or of target and J v*, may leave."""
+def _compute_min_residual(problem: Problem, net: float, y: FloatArray, z: FloatArray) -> tuple[float, float]:
+    """Return the minimum relative residual (5) of any impulse, and the residual that rounding of b can cause.
+
+    If b was computed, its rounding is that of target and J v*.
+    """
     data, size = problem.metric, np.abs(problem.b)
-    reference(problem)
-    energy = net / (_energy(data, y * data.d) + _energy(data, z))
+    get_reference(problem)
+    energy = net / (_energy_norm(data, y * data.d) + _energy_norm(data, z))
     velocity = 0.0 if np.any(z) else net / np.sum(data.d * np.abs(y) / data.weight)
     if not energy + velocity < math.inf:
         return 0.0, 0.0
     if problem.matrix is None:
         free = problem.generalized.v_free if problem.rows is None else problem.rows.v_free  # type: ignore[union-attr]
         size = size + 2.0 * (abs(problem.jacobian) @ np.abs(free.ravel()))
-    off = 4.0 * UNIT * size
-    most = np.max(data.weight * off / data.d)
-    return relative_of(data, energy, velocity), relative_of(data, _energy(data, off), most)
+    b_rounding = 4.0 * UNIT_ROUNDOFF * size
+    max_velocity = np.max(data.weight * b_rounding / data.d)
+    return (
+        divide_by_reference(data, energy, velocity),
+        divide_by_reference(data, _energy_norm(data, b_rounding), max_velocity),
+    )
 
 
-def _energy(data: Any, w: FloatArray) -> Any:
-    """Norm of velocities w (m,) in the metric of D^-1 [sqrt J]."""
+def _energy_norm(data: Any, w: FloatArray) -> Any:
+    """Compute the norm of velocities w (m,) [m/s] in the metric of D^-1 [sqrt J]."""
     return np.sqrt(np.sum(w * w / data.d))
 
 
-def _polished(problem: Problem, y: FloatArray, deadline: Deadline) -> Iterator[FloatArray]:
-    """The nearest direction in the metric of D, on the rows of y, with A^T y = 0 where that is nearly so.
+def _polish(problem: Problem, y: FloatArray, deadline: Deadline) -> Iterator[FloatArray]:
+    """Yield the nearest direction in the metric of D, on the rows of y, with A^T y = 0 wherever it nearly is 0.
 
-    First to 26 bits: sums of halves and thirds of simple numbers may be 0 then.
+    The direction is yielded twice: rounded to 26 bits, with which sums of halves and thirds of simple numbers can be
+    exactly 0, and unrounded.
     """
     length = np.sqrt(problem.d)
-    kept = np.abs(y) * length > FAR * float(length @ np.abs(y))
+    is_used = np.abs(y) * length > MAX_ROUNDING_SLACK * float(length @ np.abs(y))
     if problem.matrix is not None:
         a, weight = problem.csr, 1.0 / length
     elif problem.rows is None:
@@ -307,42 +375,43 @@ def _polished(problem: Problem, y: FloatArray, deadline: Deadline) -> Iterator[F
     else:
         a, weight = problem.jacobian, np.sqrt(problem.rows.inverse_mass_matrix().diagonal())
     if problem.compliance is not None:
-        kept &= problem.compliance == 0.0
-    rows, y = np.flatnonzero(kept), np.where(kept, y, 0.0)
-    if not 0 < len(rows) <= POLISHED:
+        is_used &= problem.compliance == 0.0
+    rows, y = np.flatnonzero(is_used), np.where(is_used, y, 0.0)
+    if not 0 < len(rows) <= MAX_POLISHED_ROWS:
         return
-    a, own = a[rows], rows if problem.matrix is not None else slice(None)
+    a, required = a[rows], rows if problem.matrix is not None else slice(None)
     for _ in range(2):
-        z, size = weight * _product(a, y[rows]), float(length @ np.abs(y))
-        near = np.flatnonzero((z != 0.0) & (np.abs(z) <= NEAR * size))
-        if np.any(np.abs(z[own]) > NEAR * size) or len(near) * len(rows) > POLISHED**2:
+        z = weight * _multiply_transposed(a, y[rows])
+        max_z = MAX_POLISHED_SLACK * float(length @ np.abs(y))
+        columns = np.flatnonzero((z != 0.0) & (np.abs(z) <= max_z))
+        if np.any(np.abs(z[required]) > max_z) or len(columns) * len(rows) > MAX_POLISHED_ROWS**2:
             return
-        seconds = LEAST_SQUARES * len(near) * len(rows) * min(len(near), len(rows))
+        seconds = LEAST_SQUARES_TIME * len(columns) * len(rows) * min(len(columns), len(rows))
         if deadline.passed(seconds):
             raise TooLate(seconds)
-        system = (a[:, near].toarray() / length[rows][:, None] * weight[near]).T
-        y[rows] -= np.linalg.lstsq(system, z[near], rcond=1e-9)[0] / length[rows]
-    unit = 2.0**-25 * _power(y)
-    yield np.rint(y / unit) * unit
+        system = (a[:, columns].toarray() / length[rows][:, None] * weight[columns]).T
+        y[rows] -= np.linalg.lstsq(system, z[columns], rcond=1e-9)[0] / length[rows]
+    spacing = 2.0**-25 * _power_of_two(y)
+    yield np.rint(y / spacing) * spacing
     yield y
 
 
 def _recession_violation(problem: Problem, y: FloatArray) -> str | None:
+    """Return why y (m,) is not in the recession cone of the admissible impulses, or None if it is."""
     c = problem.cones
     bad = ((y > 0.0) & np.isfinite(c.upper)) | ((y < 0.0) & np.isfinite(c.lower))
     bad[c.contact_rows] = False
     if bad.any():
         i = int(np.flatnonzero(bad)[0])
         return f"y[{i}] = {y[i]:.2e} leaves the bounds of {problem.row_name(i)}"
-    normal, limit, size = _rims(problem, y)
+    normal, coefficient, size = _compute_friction_norms(problem, y)
     if problem.law == "coulomb":
-        across = normal[size > 0.0]
-        if len(across):
-            return (
-                f"y is not along the normal of {problem.row_name(int(across[0]))}, as Coulomb friction needs"
-            )
+        tangential = normal[size > 0.0]
+        if len(tangential):
+            name = problem.row_name(int(tangential[0]))
+            return f"y is not along the normal of {name}, as Coulomb friction needs"
     first = c.normal_rows
-    out = np.concatenate([first[y[first] < 0.0], normal[size > limit * y[normal] * (1 + 1e-12)]])
-    if len(out):
-        return f"y leaves the cone of {problem.row_name(int(out.min()))}"
+    outside = np.concatenate([first[y[first] < 0.0], normal[size > coefficient * y[normal] * (1 + 1e-12)]])
+    if len(outside):
+        return f"y leaves the cone of {problem.row_name(int(outside.min()))}"
     return None

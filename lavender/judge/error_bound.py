@@ -1,4 +1,4 @@
-"""A bound of the distance between an answer and an exact solution, or none if no bound is known.
+"""Bound the distance between an answer and an exact solution.
 
 In the metric of d, with z = D^1/2 lambda, s = D^-1/2 w, y = z - s, H = D^-1/2 A D^-1/2, Pi the projection of each
 block's law and P = dPi/dy (lavender_ext/derivative/natural.pxd), a solution z* = z + dz is a root of F(z) = z - Pi(y).
@@ -47,41 +47,64 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray, IntArray
 from lavender.problem import Problem
-from lavender.problem.ordering import rows_of_each
+from lavender.problem.ordering import rows_by_island
 from lavender_ext.derivative.linear import CASES, Linear
 
-U = 2.0**-53
+UNIT_ROUNDOFF = 2.0**-53
 MAX_ISLAND_ROWS = 600  # Larger islands have no bound: dense products of 600 rows take about 0.1 s.
-MAX_ENTRIES = 4e6  # Problems whose A has more entries than this have no bound: A is formed.
-MAX_ROUNDS = 8  # Every row counts as uncertain after this many rounds that each found further uncertain rows.
-MAX_STEPS = 8  # Steps of the iteration for (5), each of which doubles what it assumes of |dy|.
+MAX_MATRIX_ENTRIES = 4e6  # Problems whose A has more entries than this have no bound: A is formed.
+MAX_UNCERTAINTY_STEPS = (
+    8  # Every row counts as uncertain after this many rounds that each found further uncertain rows.
+)
+MAX_RADIUS_STEPS = 8  # Steps of the iteration for (5); each doubles the assumed bound of |dy|.
 MAX_INVERSE_ERROR = 0.1  # G counts as singular if ||I - G^-1 G|| may be larger.
 CONTRACTION_MARGIN = (
     1e-9  # (3) and (4) must contract by at least this much, which covers the rounding of their norms.
 )
-LARGE_NORM = 0.5  # A norm that is estimated by sums above this is computed by singular values.
-INFLATION = 1.0 + 1e-8  # Factor for the rounding of sums of bounds.
+LARGE_NORM = 0.5  # If the estimate of a norm by sums exceeds this, the norm is computed by singular values.
+SUM_ROUNDING_FACTOR = 1.0 + 1e-8  # Factor for the rounding of sums of bounds.
 
 
 @dataclass(frozen=True)
 class _Component:
-    """A friction component of a contact with a bound above 0."""
+    """A friction component of a contact, with a coefficient above 0.
 
-    rows: Any  # (n,) int, its rows
-    block: Any  # (n,) int, all rows of its contact, the normal first
-    reach: float  # a: |z_t| <= a z_n in scaled rows
+    Parameters
+    ----------
+    rows : (n,) int
+        Rows of the component.
+    block : (n,) int
+        All rows of its contact, the normal first.
+    coefficient : float
+        a of |z_t| <= a z_n in scaled rows.
+    """
+
+    rows: Any
+    block: Any
+    coefficient: float
 
 
 @dataclass
 class _Group:
-    """Columns of L and R in (1), and the radius of their part of E; None: by (5).
+    """Columns of L and R in (1), and the bound of their block of E.
 
-    With a component, E is bounded by that only where y_t keeps its direction: |dy_t| < |y_t| / 2.
+    Parameters
+    ----------
+    left_rows, right_rows : (n,) int
+        Rows of the entries of `left` and `right`.
+    left, right : (n, k)
+        Columns of L and R.
+    radius : float or None
+        Bound e; None if it is computed by (5).
+    component : _Component, optional
+        If given, the bound holds only if y_t keeps its direction: |dy_t| < |y_t| / 2.
+    is_uncertain : bool
+        Whether the component is uncertain: P0 then has kappa = 1 in (5).
     """
 
-    left_rows: Any  # (n,) int
+    left_rows: Any
     left: FloatArray
-    right_rows: Any  # (n,) int
+    right_rows: Any
     right: FloatArray
     radius: float | None
     component: _Component | None = None
@@ -89,27 +112,27 @@ class _Group:
 
 
 def bound_errors(problem: Problem, impulse: FloatArray, linear: Linear) -> tuple[FloatArray, FloatArray]:
-    """Bound the errors of an answer row by row; inf where no bound is known.
+    """Bound the errors of an answer row by row; inf on rows without a known bound.
 
     Parameters
     ----------
     problem : Problem
-    impulse : (m,) N s
+    impulse : (m,), N s
     linear : Linear
-        Of `problem.disk` at `problem.on_disk(impulse)`.
+        Derivative of `problem.disk` at `problem.on_disk(impulse)`.
 
     Returns
     -------
-    impulse_error, margin_error : (m,) N s (N m s on angular rows)
-        Of the impulses and of `linear.margin`, both in the rows of `problem.disk`.
+    impulse_error, margin_error : (m,), N s (N m s on angular rows)
+        Error bounds of the impulses and of `linear.margin`, both in the rows of `problem.disk`.
     """
     disk, m = problem.disk, problem.m
     impulse_error, margin_error = np.full(m, np.inf), np.full(m, np.inf)
-    if m == 0 or disk.most_entries > MAX_ENTRIES or not np.isfinite(linear.residual).all():
+    if m == 0 or disk.max_entries > MAX_MATRIX_ENTRIES or not np.isfinite(linear.residual).all():
         return impulse_error, margin_error
-    with np.errstate(all="ignore"):  # what overflows has no bound
+    with np.errstate(all="ignore"):  # An island with an overflow has no bound.
         scaled = _Scaled(problem, impulse, linear)
-        for rows in rows_of_each(disk, disk.cones.ptr):
+        for rows in rows_by_island(disk, disk.cones.ptr):
             if len(rows) > MAX_ISLAND_ROWS:
                 continue
             errors = _Island(scaled, rows).bound()
@@ -121,11 +144,11 @@ def bound_errors(problem: Problem, impulse: FloatArray, linear: Linear) -> tuple
 
 
 def bound_slack_rounding(problem: Problem, impulse: FloatArray) -> FloatArray:
-    """Bound the rounding (m,) [m/s] of w = A lambda - b as the judge computes it, but for that of a factor of M."""
+    """Bound the rounding (m,) [m/s] of w = A lambda - b as the judge computes it, without that of a factor of M."""
     x, b = np.abs(impulse), np.abs(problem.b)
     if problem.matrix is not None:
         operations: Any = np.diff(problem.csr.indptr) + 8.0
-        return np.asarray(U * operations * (abs(problem.csr) @ x + b))
+        return np.asarray(UNIT_ROUNDOFF * operations * (abs(problem.csr) @ x + b))
     assert problem.compliance is not None
     jac = abs(problem.jacobian)
     operations = 2.0 * np.diff(jac.indptr) + np.bincount(jac.indices, minlength=1).max() + 16.0
@@ -137,7 +160,7 @@ def bound_slack_rounding(problem: Problem, impulse: FloatArray) -> FloatArray:
         y = abs(problem.whitened)
         operations = operations + 2.0 * np.diff(y.indptr)
         terms = y @ (y.T @ x) + jac @ np.abs(problem.generalized.v_free)
-    return np.asarray(U * operations * (terms + problem.compliance * x + b))
+    return np.asarray(UNIT_ROUNDOFF * operations * (terms + problem.compliance * x + b))
 
 
 def bound_mass_rounding(problem: Problem) -> FloatArray:
@@ -145,7 +168,7 @@ def bound_mass_rounding(problem: Problem) -> FloatArray:
     general = problem.generalized
     if general is None:
         return np.zeros(problem.m)
-    of_tree = np.zeros(int(general.trees.max(initial=-1)) + 1)
+    rounding_of_tree = np.zeros(int(general.trees.max(initial=-1)) + 1)
     mass = general.mass
     if mass.nnz > general.nv:
         order = np.argsort(general.trees, kind="stable")
@@ -154,7 +177,7 @@ def bound_mass_rounding(problem: Problem) -> FloatArray:
             n = len(velocities)
             if n == 1:
                 continue
-            of_tree[tree] = np.inf
+            rounding_of_tree[tree] = np.inf
             if n > MAX_ISLAND_ROWS:
                 continue
             block = mass[velocities][:, velocities].toarray()
@@ -162,12 +185,14 @@ def bound_mass_rounding(problem: Problem) -> FloatArray:
             block = block / (root[:, None] * root)
             inverse = _invert(block)
             if inverse is not None:
-                of_tree[tree] = (n + 8) * U * _inf_norm(block) * _inf_norm(inverse)
-    of_tree += 8 * U
+                rounding_of_tree[tree] = (n + 8) * UNIT_ROUNDOFF * _inf_norm(block) * _inf_norm(inverse)
+    rounding_of_tree += 8 * UNIT_ROUNDOFF
     jac = general.jac
     out = np.zeros(problem.m)
     np.maximum.at(
-        out, np.repeat(np.arange(problem.m), np.diff(jac.indptr)), of_tree[general.trees[jac.indices]]
+        out,
+        np.repeat(np.arange(problem.m), np.diff(jac.indptr)),
+        rounding_of_tree[general.trees[jac.indices]],
     )
     return out
 
@@ -185,14 +210,14 @@ class _Scaled:
         z, w = self.root * linear.impulse, linear.slack
         s = w / self.root
         self.y, self.f, self.margin = z - s, linear.residual, self.root * linear.margin
-        self.normal_impulse = z - self.f  # at normal rows that of Pi(y)
+        self.normal_impulse = z - self.f  # At normal rows this is the impulse of Pi(y).
         self.power = linear.impulse * (w + disk.b)  # lambda_i (A lambda)_i
         rounding = bound_slack_rounding(problem, impulse)
         if problem is not disk:
-            rounding = problem.cones.stretch * rounding + 4 * U * np.abs(disk.b)
+            rounding = problem.cones.stretch * rounding + 4 * UNIT_ROUNDOFF * np.abs(disk.b)
         self.mass_rounding = bound_mass_rounding(disk)
-        self.y_rounding = rounding / self.root + 4 * U * (np.abs(z) + np.abs(s))
-        # Values of P, block by block: the diagonal of bounded rows, else row by row.
+        self.y_rounding = rounding / self.root + 4 * UNIT_ROUNDOFF * (np.abs(z) + np.abs(s))
+        # P is stored block by block: one diagonal entry for a bounded row, the rows of a square matrix for a contact.
         size = np.where(self.is_contact, np.diff(cones.ptr)[self.block_of], 1)
         first = np.where(self.is_contact, cones.ptr[self.block_of], np.arange(disk.m))
         self.p, self.p_ptr, self.p_columns = (
@@ -200,59 +225,64 @@ class _Scaled:
             np.append(0, np.cumsum(size)),
             _list_ranges(first, first + size),
         )
-        self.place = np.zeros(disk.m, np.intp)  # of each row in its island, for the island at hand
+        self.local_row = np.zeros(disk.m, np.intp)  # index of each row in its island; `_Island` fills it
         self.components: dict[int, list[_Component]] = {}
-        reach = cones.reach
+        coefficient = cones.reach
         for block, rows in cones.parts():
-            if reach[rows[0]] > 0.0:
-                whole = np.arange(cones.ptr[block], cones.ptr[block + 1])
-                a = float(reach[rows[0]] * self.root[rows[0]] / self.root[whole[0]])
-                self.components.setdefault(block, []).append(_Component(rows, whole, a))
+            if coefficient[rows[0]] > 0.0:
+                block_rows = np.arange(cones.ptr[block], cones.ptr[block + 1])
+                a = float(coefficient[rows[0]] * self.root[rows[0]] / self.root[block_rows[0]])
+                self.components.setdefault(block, []).append(_Component(rows, block_rows, a))
 
 
 class _Island:
-    """One island of an answer; all rows are its own, numbered from 0."""
+    """One island of an answer, with dense matrices and its rows numbered from 0."""
 
     def __init__(self, scaled: _Scaled, rows: IntArray) -> None:
-        n, place = len(rows), scaled.place
-        place[rows] = np.arange(n)
+        n, local_row = len(rows), scaled.local_row
+        local_row[rows] = np.arange(n)
         self.is_cone, self.root = scaled.is_cone, scaled.root[rows]
         a = scaled.disk.csr
         entries = _list_ranges(a.indptr[rows], a.indptr[rows + 1])
         row_of = np.repeat(np.arange(n), a.indptr[rows + 1] - a.indptr[rows])
         self.h = np.zeros((n, n))
-        self.h[row_of, place[a.indices[entries]]] = a.data[entries]
+        self.h[row_of, local_row[a.indices[entries]]] = a.data[entries]
         self.h /= self.root[:, None] * self.root
         self.f, self.y, self.case = scaled.f[rows], scaled.y[rows], scaled.case[rows]
         self.margin, self.normal_impulse = scaled.margin[rows], scaled.normal_impulse[rows]
         self.is_contact = scaled.is_contact[rows]
-        of_mass = float(scaled.mass_rounding[rows].max(initial=0.0))
+        mass_rounding = float(scaled.mass_rounding[rows].max(initial=0.0))
         energy = np.sqrt(max(float(scaled.power[rows].sum()), 0.0))
-        self.y_rounding = scaled.y_rounding[rows] + of_mass * energy
-        # Of H as it is formed: a matrix is given, products have |H_ij| <= 1 in their terms.
-        self.h_rounding = (4 * U) * np.abs(self.h)
+        self.y_rounding = scaled.y_rounding[rows] + mass_rounding * energy
+        # Rounding of H: entries of a given matrix are rounded by the scaling only; H formed by products of J and M
+        # has terms of size |H_ij| <= 1.
+        self.h_rounding = (4 * UNIT_ROUNDOFF) * np.abs(self.h)
         if scaled.disk.matrix is None:
-            self.h_rounding = self.h_rounding + (64 * U + of_mass)
+            self.h_rounding = self.h_rounding + (64 * UNIT_ROUNDOFF + mass_rounding)
         entries = _list_ranges(scaled.p_ptr[rows], scaled.p_ptr[rows + 1])
         row_of = np.repeat(np.arange(n), scaled.p_ptr[rows + 1] - scaled.p_ptr[rows])
         self.p = np.zeros((n, n))
-        self.p[row_of, place[scaled.p_columns[entries]]] = scaled.p[entries]
+        self.p[row_of, local_row[scaled.p_columns[entries]]] = scaled.p[entries]
         self.contacts, self.components = list[tuple[Any, list[_Component]]](), list[_Component]()
         self.f_rounding = self.y_rounding.copy()
         for block in np.unique(scaled.block_of[rows[self.is_contact]]).tolist():
-            whole = place[scaled.ptr[block] : scaled.ptr[block + 1]]
-            own = [_Component(place[c.rows], whole, c.reach) for c in scaled.components.get(block, [])]
-            self.contacts.append((whole, own))
-            self.components += own
-            # Pi of a contact is Lipschitz with 1 + a.
-            size = 1.0 + _norm([c.reach for c in own])
-            self.f_rounding[whole] += size * _norm(self.y_rounding[whole]) + 32 * U * _norm(self.y[whole])
+            block_rows = local_row[scaled.ptr[block] : scaled.ptr[block + 1]]
+            components = [
+                _Component(local_row[c.rows], block_rows, c.coefficient)
+                for c in scaled.components.get(block, [])
+            ]
+            self.contacts.append((block_rows, components))
+            self.components += components
+            # Pi of a contact has the Lipschitz constant 1 + a.
+            lipschitz = 1.0 + _norm([c.coefficient for c in components])
+            rounding = 32 * UNIT_ROUNDOFF * _norm(self.y[block_rows])
+            self.f_rounding[block_rows] += lipschitz * _norm(self.y_rounding[block_rows]) + rounding
 
     def bound(self) -> tuple[FloatArray, FloatArray] | None:
-        """Errors of impulses and of margins, (n,) N s each; None without a bound."""
+        """Compute error bounds of impulses and of margins, (n,) [N s] each; None if there is no bound."""
         possible = np.isfinite(self.margin)
         uncertain, x = np.zeros(len(self.f), bool), np.zeros(len(self.f))
-        for step in range(2 * MAX_ROUNDS):
+        for step in range(2 * MAX_UNCERTAINTY_STEPS):
             outcome = self._bound_with_uncertain(uncertain, x)
             if outcome is None:
                 return None
@@ -266,25 +296,25 @@ class _Island:
                 more = possible & ~uncertain & (self.margin <= margin_error)
                 if not more.any():
                     return errors / self.root, margin_error / self.root
-            uncertain = uncertain | (possible if step >= MAX_ROUNDS else more)
+            uncertain = uncertain | (possible if step >= MAX_UNCERTAINTY_STEPS else more)
         return None
 
     def _bound_margins(self, x: FloatArray) -> FloatArray:
         """Bound the change (n,) of scaled margins by x (n,) >= |dy|: their Lipschitz constants."""
         out = x.copy()
         for block, components in self.contacts:
-            whole, of_components = _norm(x[block]), 0.0
-            normal = whole if self.is_cone else x[block[0]]  # of the projection's normal
+            block_norm, friction = _norm(x[block]), 0.0
+            normal_change = block_norm if self.is_cone else x[block[0]]  # change of the projection's normal
             for c in components:
                 size = _norm(x[c.rows])
-                of_components += c.reach * size
-                out[c.rows] = size + c.reach * normal
+                friction += c.coefficient * size
+                out[c.rows] = size + c.coefficient * normal_change
             if self.is_cone:
-                out[block[0]] = max(whole, x[block[0]] + of_components)
+                out[block[0]] = max(block_norm, x[block[0]] + friction)
         return out
 
     def _choose_groups(self, uncertain: Any, x: FloatArray) -> tuple[FloatArray, list[_Group]]:
-        """P0 of (1), and the groups of L and R."""
+        """Choose P0 of (1), and the groups of L and R."""
         p, groups = self.p.copy(), list[_Group]()
         half = np.eye(1)
         for i in np.flatnonzero(uncertain & ~self.is_contact):
@@ -294,9 +324,9 @@ class _Island:
             )
         for block, components in self.contacts:
             unit = np.eye(len(block))
-            both = [c for c in components if uncertain[c.rows[0]]]
-            if uncertain[block[0]] or (self.is_cone and both and len(components) > 1):
-                a = _norm([c.reach for c in components])
+            has_uncertain = any(uncertain[c.rows[0]] for c in components)
+            if uncertain[block[0]] or (self.is_cone and has_uncertain and len(components) > 1):
+                a = _norm([c.coefficient for c in components])
                 radius = 0.5 if self.is_cone else 0.5 * (a + np.sqrt(a * a + 1.0))
                 p[np.ix_(block, block)] = 0.5 * unit
                 groups.append(_Group(left_rows=block, left=unit, right_rows=block, right=unit, radius=radius))
@@ -309,7 +339,7 @@ class _Island:
         return p, groups
 
     def _make_turning_group(self, c: _Component, is_uncertain: bool) -> _Group:
-        """Group of (5)."""
+        """Build the group of (5) of a sliding component."""
         if self.is_cone:
             unit = np.eye(len(c.block))
             return _Group(
@@ -333,9 +363,9 @@ class _Island:
         )
 
     def _make_stick_or_slide_groups(self, c: _Component, x: FloatArray, p: FloatArray) -> list[_Group]:
-        """Groups of a component that sticks or slides, its contact closed; P0 into p."""
-        t, a, unit = _norm(self.y[c.rows]), c.reach, np.eye(len(c.block))
-        if not _norm(x[c.rows]) < 0.5 * t:  # in no known direction
+        """Build the groups of a component that sticks or slides in a closed contact, and write P0 to p."""
+        t, a, unit = _norm(self.y[c.rows]), c.coefficient, np.eye(len(c.block))
+        if not _norm(x[c.rows]) < 0.5 * t:  # The direction of sliding is not known.
             if self.is_cone:
                 p[np.ix_(c.block, c.block)] = 0.5 * unit
                 return [_Group(left_rows=c.block, left=unit, right_rows=c.block, right=unit, radius=0.5)]
@@ -378,12 +408,12 @@ class _Island:
         ]
 
     def _compute_radius(self, group: _Group, x: FloatArray) -> float:
-        """Bound E of a group, |dy| <= x (n,), if need be by (5); inf if the direction of sliding is not known."""
+        """Bound E of a group for |dy| <= x (n,), by (5) if it has no radius; inf if y_t may change its direction."""
         c = group.component
         if c is None:
             assert group.radius is not None
             return group.radius
-        t, a, normal = _norm(self.y[c.rows]), c.reach, self.normal_impulse[c.block[0]]
+        t, a, normal = _norm(self.y[c.rows]), c.coefficient, self.normal_impulse[c.block[0]]
         x_t, x_n = _norm(x[c.rows]), _norm(x[c.block]) if self.is_cone else x[c.block[0]]
         if not x_t < 0.5 * t:
             return np.inf
@@ -397,13 +427,13 @@ class _Island:
     def _bound_with_uncertain(
         self, uncertain: Any, guess: FloatArray
     ) -> tuple[FloatArray | None, FloatArray, Any] | None:
-        """Bound |dz| and |dy| with these uncertain rows.
+        """Bound |dz| and |dy| if the rows `uncertain` (n,) are uncertain, starting from |dy| <= `guess` (n,).
 
         Returns
         -------
         errors, x, more
-            |dz| (n,) and |dy| (n,), or None and further rows that are uncertain, or None and None if nothing contracts.
-            None alone if G is singular.
+            Bounds of |dz| (n,) and |dy| (n,), and None. If further rows are uncertain: None, |dy| and those rows (n,).
+            If nothing contracts: None, |dy|, None. A single None if G is singular.
         """
         n = len(self.f)
         p, groups = self._choose_groups(uncertain, guess)
@@ -412,27 +442,27 @@ class _Island:
         if inverse is None:
             return None
         size = np.abs(inverse)
-        error = _inf_norm(np.eye(n) - inverse @ g) + (n + 4) * U * _inf_norm(size @ np.abs(g))
+        error = _inf_norm(np.eye(n) - inverse @ g) + (n + 4) * UNIT_ROUNDOFF * _inf_norm(size @ np.abs(g))
         error += _inf_norm(size @ (np.abs(p) @ self.h_rounding))
         if not error < MAX_INVERSE_ERROR:
             return None
         error /= 1.0 - error
-        of_y = np.eye(n) - self.h
-        t = of_y @ inverse
+        change_of_y = np.eye(n) - self.h
+        t = change_of_y @ inverse
         dz = np.abs(inverse @ self.f) + size @ self.f_rounding
         dy = np.abs(t @ self.f) + np.abs(t) @ self.f_rounding
         inverse_error = error * dz.max()  # of dz, by G^-1 as computed
         dz += inverse_error
-        dy += np.abs(of_y).sum(axis=1) * inverse_error + self.h_rounding @ dz
+        dy += np.abs(change_of_y).sum(axis=1) * inverse_error + self.h_rounding @ dz
         if not groups:
-            return dz * INFLATION, dy * INFLATION + self.y_rounding, None
+            return dz * SUM_ROUNDING_FACTOR, dy * SUM_ROUNDING_FACTOR + self.y_rounding, None
         left, left_ptr = _stack_columns(n, [(q.left_rows, q.left) for q in groups])
         right, right_ptr = _stack_columns(n, [(q.right_rows, q.right) for q in groups])
         on_y, on_z = t @ left, inverse @ left
         coupling, begin = right.T @ on_y, np.abs(right.T) @ dy
         coupling_error = float(np.sqrt(n)) * error * (1.0 + _inf_norm(self.h)) * _inf_norm(inverse)
         x = np.maximum(guess, 2.0 * (dy + self.y_rounding))
-        for _ in range(MAX_STEPS):
+        for _ in range(MAX_RADIUS_STEPS):
             radius = np.array([self._compute_radius(group, x) for group in groups])
             if not np.isfinite(radius).all():
                 # A component that is uncertain already gets a group without a direction, as x is that large.
@@ -446,9 +476,9 @@ class _Island:
                 return None, x, None
             step_z = _compute_group_norms(on_z, left_ptr) @ v
             step_y = _compute_group_norms(on_y, left_ptr) @ v
-            y = (dy + step_y + coupling_error * v.sum()) * INFLATION + self.y_rounding
+            y = (dy + step_y + coupling_error * v.sum()) * SUM_ROUNDING_FACTOR + self.y_rounding
             if (y <= x).all():
-                return (dz + step_z + coupling_error * v.sum()) * INFLATION, y, None
+                return (dz + step_z + coupling_error * v.sum()) * SUM_ROUNDING_FACTOR, y, None
             x = np.maximum(x, 2.0 * y)
         return None, x, None
 
@@ -473,7 +503,7 @@ def _bound_group_terms(
     q, own = (norms + coupling_error) * radius, np.sqrt(np.add.reduceat(begin**2, right_ptr[:-1]))
     system = (1.0 - CONTRACTION_MARGIN) * np.eye(len(radius)) - q
     try:
-        sizes = np.linalg.solve(system, own * INFLATION + np.finfo(float).tiny)
+        sizes = np.linalg.solve(system, own * SUM_ROUNDING_FACTOR + np.finfo(float).tiny)
     except np.linalg.LinAlgError:
         sizes = np.full(len(radius), np.nan)
     if (sizes > 0.0).all() and (system @ sizes >= own).all():
@@ -495,13 +525,13 @@ def _bound_group_terms(
 
 
 def _list_ranges(first: IntArray, end: IntArray) -> IntArray:
-    """All whole numbers from first[i] to end[i] - 1, one range after the other."""
+    """Concatenate the integers first[i], ..., end[i] - 1 of all ranges i."""
     size = end - first
     return np.asarray(np.repeat(first - (np.cumsum(size) - size), size) + np.arange(size.sum()))
 
 
 def _stack_columns(n: int, blocks: list[tuple[IntArray, FloatArray]]) -> tuple[FloatArray, IntArray]:
-    """Blocks of columns, each on its rows, side by side (n, all), and the first column of each with their number."""
+    """Return all columns of blocks (rows, values) as one matrix (n, all), and the offsets of the blocks in it."""
     ptr = np.cumsum([0, *(values.shape[1] for _, values in blocks)])
     out = np.zeros((n, int(ptr[-1])))
     for (rows, values), first, end in zip(blocks, ptr, ptr[1:], strict=False):
@@ -510,7 +540,7 @@ def _stack_columns(n: int, blocks: list[tuple[IntArray, FloatArray]]) -> tuple[F
 
 
 def _compute_group_norms(matrix: FloatArray, ptr: IntArray) -> FloatArray:
-    """Norm of each row's entries in each group of columns, (n, groups)."""
+    """Compute the norm of each row's entries in each group of columns, (n, groups)."""
     return np.asarray(np.sqrt(np.add.reduceat(matrix**2, ptr[:-1], axis=1)))
 
 

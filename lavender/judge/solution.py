@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray, one_of, read_only, table_of
+from lavender.base.arrays import FloatArray, check_choice, format_html_table, read_only
 from lavender.base.errors import SolveFailed
 from lavender.base.lazy_import import lazy_module
 from lavender.base.renamed import build_attribute_error
@@ -136,7 +136,7 @@ class History:
         against : {"iterations", "time"}
             Horizontal axis.
         """
-        one_of("against", against, ("iterations", "time"))
+        check_choice("against", against, ("iterations", "time"))
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
 
@@ -366,7 +366,7 @@ class Solution:
         }
         if self.claim_check != CONFIRMED:
             facts[self.claim_check] = self.status_conflict or self.status.name
-        return table_of(facts, self.solver.name)
+        return format_html_table(facts, self.solver.name)
 
     def __repr__(self) -> str:
         return f"<Solution {self}>"

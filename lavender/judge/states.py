@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray, whole_number
+from lavender.base.arrays import FloatArray, check_int
 from lavender.judge.error_bound import bound_errors
-from lavender.judge.residuals import reference
+from lavender.judge.residuals import get_reference
 from lavender.problem import Problem
 from lavender.problem.derived import cached_property
 from lavender_ext.derivative.linear import CASES, Linear, Linears
@@ -144,7 +144,7 @@ class States(Sequence[State]):
     def __getitem__(self, i: Any) -> Any:
         if isinstance(i, slice):
             return [self[j] for j in range(*i.indices(len(self)))]
-        i = whole_number("block", i + len(self) if isinstance(i, int) and i < 0 else i)
+        i = check_int("block", i + len(self) if isinstance(i, int) and i < 0 else i)
         if i >= len(self):
             raise IndexError(f"block {i}; there are {len(self)}")
         ptr = self._problem.cones.ptr
@@ -160,7 +160,7 @@ def linear_of(problem: Problem, impulse: FloatArray, most: int = 0) -> Linear:
     """Judge and linearise an impulse (m,) [N s]; ellipses are treated as disks. `most` is as in `Linears`."""
     data = problem.disk.metric
     if data.reference_energy < 0.0:
-        reference(problem.disk)
+        get_reference(problem.disk)
     return Linears([data], [problem.on_disk(impulse)], most).one(0)
 
 

@@ -26,7 +26,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray, number
+from lavender.base.arrays import FloatArray, check_float
 from lavender.base.errors import InputError, check_name
 from lavender.batch.data import Batch
 from lavender.batch.residuals import residual_many
@@ -35,7 +35,7 @@ from lavender.io.efc import from_mujoco_many
 from lavender.io.recording import Control
 from lavender.io.states import VECTOR
 from lavender.io.stored import folder_for_steps, write_arrays
-from lavender.judge.residuals import AT_FLOOR, CLOSE, ENOUGH, UNCONVERGED, WRONG
+from lavender.judge.residuals import AT_FLOOR, CLOSE, DEFAULT_THRESHOLD, UNCONVERGED, WRONG
 from lavender.judge.residuals import VERDICTS as JUDGED
 from lavender.lab.bench.running.runner import Event
 from lavender.lab.bench.running.workers import check_workers, connect_backend, map_unordered
@@ -194,7 +194,7 @@ class Audit:
         """
         some = divergence.world, slice(0, divergence.step + (not divergence.is_outside))
         verdict = self.verdict[some]
-        close = (verdict == VERDICTS.index(CLOSE)) & (self.numbers[0][some] <= ENOUGH)
+        close = (verdict == VERDICTS.index(CLOSE)) & (self.numbers[0][some] <= DEFAULT_THRESHOLD)
         return bool(np.all(close | (verdict == VERDICTS.index(AT_FLOOR))))
 
     @property
@@ -367,7 +367,7 @@ def audit(
     spread: float = 0.1,
     states: Any = None,
     precision: str | None = None,
-    threshold: float = ENOUGH,
+    threshold: float = DEFAULT_THRESHOLD,
     workers: int = -1,
     backend: str = "loky",
     watch: Callable[[Event], None] | None = None,
@@ -411,7 +411,7 @@ def audit(
         raise InputError(f"precision is {precision!r}; {' or '.join(PRECISIONS)}, of MuJoCo alone, is needed")
     check_workers(workers)
     runs = Runs(os.fspath(model), worlds, steps, control=control, seed=seed, spread=spread).start_from(states)
-    how = precision or "float64", number("threshold", threshold, low=0.0)
+    how = precision or "float64", check_float("threshold", threshold, low=0.0)
     numbers, verdict = np.full((len(NUMBERS), worlds, steps), np.nan), np.full((worlds, steps), -1, np.int8)
     rows, contacts = np.zeros((2, worlds, steps), int)
     result = Audit(

@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from lavender.base.arrays import several
-from lavender.base.errors import InputError, LavenderError, last_words
-from lavender.judge.residuals import FLOOR_MOST, WRONG
+from lavender.base.arrays import check_sequence
+from lavender.base.errors import InputError, LavenderError, format_error
+from lavender.judge.residuals import MAX_EXCUSED_RESIDUAL, WRONG
 from lavender.judge.solution import CONTRADICTED, NOT_PROVEN, Solution, Status, uninterrupted
 from lavender.lab.bench.running.worker import TaskFailed, Worker, solve_isolated
 from lavender.lab.motion.bound import separation
@@ -191,7 +191,7 @@ def cross_check(
         problem = replace(problem, guess=None, copy=False)
     if isinstance(solvers, str):
         solvers = [solvers]
-    names = available(problem) if solvers is None else several("solvers", solvers, "names")
+    names = available(problem) if solvers is None else check_sequence("solvers", solvers, "names")
     reasons = known(problem)
     for name in (reference, *names):
         if not isinstance(name, str) or name not in reasons:
@@ -223,7 +223,7 @@ def _row(
         if get(run).builtin:
             raise
         # a plug-in may raise anything: it costs its own row
-        return CrossCheckRow(name, NOT_SOLVED, note=last_words(error))
+        return CrossCheckRow(name, NOT_SOLVED, note=format_error(error))
     return replace(compare(problem, name, solution, optimum), ran="" if other is None else run)
 
 
@@ -252,10 +252,10 @@ def _reference(
         except Exception as error:
             if spec.builtin and not isinstance(error, LavenderError):
                 raise
-            failed.append(f"{name}: {last_words(error)}")
+            failed.append(f"{name}: {format_error(error)}")
             continue
         r = solution.residual
-        needed = max(REFERENCE_TOL, min(10.0 * r.roundoff_floor, FLOOR_MOST))
+        needed = max(REFERENCE_TOL, min(10.0 * r.roundoff_floor, MAX_EXCUSED_RESIDUAL))
         if r.relative <= needed:
             note = f"relative {r.relative:.1e}"
             return solution, name, note + (f" ({'; '.join(failed)})" if failed else "")

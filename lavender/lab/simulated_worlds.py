@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray, IntArray, number, whole_number
+from lavender.base.arrays import FloatArray, IntArray, check_float, check_int
 from lavender.base.errors import CapabilityError, InputError
 from lavender.batch.data import Batch
 from lavender.io.efc import from_efc
@@ -67,10 +67,10 @@ class Runs:
 
     def __post_init__(self) -> None:
         for name in ("worlds", "steps"):
-            whole_number(name, getattr(self, name), 1, None)
+            check_int(name, getattr(self, name), 1, None)
         object.__setattr__(self, "control", control_of(self.control))
-        whole_number("seed", self.seed, high=None)
-        number("spread", self.spread, low=0.0)
+        check_int("seed", self.seed, high=None)
+        check_float("spread", self.spread, low=0.0)
 
     def load(self) -> tuple[Any, Any]:
         """MuJoCo and the model; InputError where its problems cannot be read."""

@@ -29,13 +29,13 @@ from typing import Any
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray, number, whole_number
+from lavender.base.arrays import FloatArray, check_float, check_int
 from lavender.base.deadline import seconds
 from lavender.base.errors import InputError, reject_former_names
 from lavender.batch.residuals import residual_many
 from lavender.io.efc import from_mujoco_many
 from lavender.io.recording import Control
-from lavender.judge.residuals import ENOUGH
+from lavender.judge.residuals import DEFAULT_THRESHOLD
 from lavender.lab.audit import AT_ONCE
 from lavender.lab.bench.running.runner import Event
 from lavender.lab.report.figures import Curve, Figure
@@ -449,7 +449,7 @@ def tune(
     states: Any = None,
     horizon: int = 10,
     repeats: int = 5,
-    threshold: float = ENOUGH,
+    threshold: float = DEFAULT_THRESHOLD,
     watch: Callable[[Event], None] | None = None,
 ) -> Tuning:
     """Measure MuJoCo's settings on worlds of a model.
@@ -482,11 +482,11 @@ def tune(
     CapabilityError
         An integrator whose problem is not of M.
     """
-    own: dict[str, Any] = {"worlds": whole_number("worlds", worlds, 2, None), "steps": steps}
+    own: dict[str, Any] = {"worlds": check_int("worlds", worlds, 2, None), "steps": steps}
     runs = Runs(os.fspath(model), **own, control=control, seed=seed, spread=spread).start_from(states)
-    horizon = whole_number("horizon", horizon, 1, None)
-    repeats = whole_number("repeats", repeats, 1, None)
-    threshold = number("threshold", threshold, low=0.0)
+    horizon = check_int("horizon", horizon, 1, None)
+    repeats = check_int("repeats", repeats, 1, None)
+    threshold = check_float("threshold", threshold, low=0.0)
     if steps % horizon:
         raise InputError(f"steps is {steps} and horizon {horizon}; a multiple of it is needed")
     mj, made = runs.load()

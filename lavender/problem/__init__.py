@@ -1,4 +1,4 @@
-"""The constraint problem of one step: w = A lambda - b, and what bounds lambda.
+"""The constraint problem of one step: w = A lambda - b, with bounds of lambda.
 
     A = J M^-1 J^T + diag(compliance)  [1/kg],   b = target - J v*  [m/s],   w = A lambda - b  [m/s]
 
@@ -9,12 +9,12 @@ Files, each over the one before: `data.py` (fields and their checks), `operators
 `program.py` (quadratic programs), `builders.py` (ways to make one), `problem.py` (`Problem` and its other forms).
 """
 
-from lavender.problem.data import FRICTION, LAWS, OPERATORS, PRECISIONS, Names, check_problem
+from lavender.problem.data import FRICTION_LAWS, LAWS, OPERATORS, PRECISIONS, Names, check_problem
 from lavender.problem.problem import Problem, VelocityForm
 from lavender.problem.program import QPSolution
 
 __all__ = [
-    "FRICTION",
+    "FRICTION_LAWS",
     "LAWS",
     "OPERATORS",
     "PRECISIONS",

@@ -1,4 +1,4 @@
-"""Problems from a matrix, from rows of bodies, from J and M, and from the problem of another step."""
+"""Build problems from a matrix, from rows of bodies, from J and M, and from the problem of another step."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from lavender.base.arrays import (
 )
 from lavender.base.errors import InputError
 from lavender.problem.cones import Cones, kinds_of
-from lavender.problem.data import Names, checked_matrix
-from lavender.problem.findex import arrays_of, blocks_of, order_of
+from lavender.problem.data import Names, check_matrix
+from lavender.problem.findex import blocks_from_findex, findex_from_blocks, order_rows
 from lavender.problem.friction import check_shape
 from lavender.problem.generalized import Generalized
 from lavender.problem.operators import Operators
@@ -29,36 +29,59 @@ from lavender.problem.program import convert_program, unpack_program
 from lavender.problem.rows import Rows
 from lavender_ext.core.problem import rows_velocity
 
-P = TypeVar("P", bound="Builders")
+ProblemT = TypeVar("ProblemT", bound="Builders")
 
-#: What every method that makes a problem passes on to `Problem`.
-SHARED = ("name", "names", "key", "friction", "guess", "compliance", "precision", "copy")
-BOUNDS = ("lower", "upper", "mu", "tangents", "patch_radius", "rolling", "shape")  # of rows of bodies
+#: Keywords that every method which builds a problem passes on to `Problem`.
+PROBLEM_KEYWORDS = ("name", "names", "key", "friction", "guess", "compliance", "precision", "copy")
+#: Keywords of `from_rows` for the bounds of rows.
+ROW_BOUND_KEYWORDS = ("lower", "upper", "mu", "tangents", "patch_radius", "rolling", "shape")
 
 
-def check_keywords(method: str, given: Iterable[str], own: Sequence[str] = ()) -> None:
-    """Raise InputError at a keyword that `Problem.method` does not take; the message names those that it takes."""
-    for name in given:
-        if name not in SHARED:
-            takes = ", ".join(f"{word}=" for word in (*own, *SHARED))
-            raise InputError(f"Problem.{method} has no argument {name}=; it takes {takes}")
+def check_keywords(method: str, keywords: Iterable[str], own: Sequence[str] = ()) -> None:
+    """Raise InputError at a keyword that `Problem.method` does not have; the message lists its keywords."""
+    for name in keywords:
+        if name not in PROBLEM_KEYWORDS:
+            valid = ", ".join(f"{keyword}=" for keyword in (*own, *PROBLEM_KEYWORDS))
+            raise InputError(f"Problem.{method} has no argument {name}=; it takes {valid}")
 
 
 class Builders(Operators):
-    """Ways to make a problem."""
+    """Class methods that build a problem."""
 
     @classmethod
-    def linear(cls: type[P], A: Any, b: ArrayLike, **more: Any) -> P:
-        """A lambda = b: every row unbounded. A (m, m) [1/kg], b (m,) [m/s]."""
+    def linear(cls: type[ProblemT], A: Any, b: ArrayLike, **more: Any) -> ProblemT:
+        """Build the linear system A lambda = b, in which every row is unbounded.
+
+        Parameters
+        ----------
+        A : (m, m) 1/kg, array or sparse
+        b : (m,) m/s
+        **more
+            Keywords of `Problem`: name, names, ...
+        """
         check_keywords("linear", more)
         b = as_array("b", b, (None,), unit="m/s")
         return cls(b, Cones.free(len(b)), A, **more)
 
     @classmethod
     def lcp(
-        cls: type[P], A: Any, b: ArrayLike, lower: ArrayLike = 0.0, upper: ArrayLike = np.inf, **more: Any
-    ) -> P:
-        """Boxed LCP: lower <= lambda <= upper complementary to A lambda - b; bounds scalar or (m,) [N s]."""
+        cls: type[ProblemT],
+        A: Any,
+        b: ArrayLike,
+        lower: ArrayLike = 0.0,
+        upper: ArrayLike = np.inf,
+        **more: Any,
+    ) -> ProblemT:
+        """Build a boxed LCP: lower <= lambda <= upper complementary to w = A lambda - b.
+
+        Parameters
+        ----------
+        A : (m, m) 1/kg, array or sparse
+        b : (m,) m/s
+        lower, upper : scalar or (m,) N s
+        **more
+            Keywords of `Problem`: name, names, ...
+        """
         check_keywords("lcp", more, ("lower", "upper"))
         b = as_array("b", b, (None,), unit="m/s")
         bounds = [
@@ -69,7 +92,7 @@ class Builders(Operators):
 
     @classmethod
     def contact(
-        cls: type[P],
+        cls: type[ProblemT],
         A: Any,
         b: ArrayLike,
         mu: ArrayLike,
@@ -77,43 +100,45 @@ class Builders(Operators):
         *,
         rolling: ArrayLike | None = None,
         **more: Any,
-    ) -> P:
-        """Contacts only, m / k rows each: normal, up to two tangents, spin with `patch_radius`, two with `rolling`.
+    ) -> ProblemT:
+        """Build a problem of k contacts with m / k rows each: normal, up to two tangents, spin, rolling.
 
         Parameters
         ----------
         A : (m, m) 1/kg, array or sparse
         b : (m,) m/s
-            Normal first in every contact.
+            The normal is the first row of each contact.
         mu : scalar, (k,) or (k, 2)
-            One for each contact. A scalar stands for all of them, which then have two tangents, or for a single one.
-            Two: an ellipse, see `Cones.contacts`.
+            Coefficient of each contact. A scalar applies to all contacts, which then have two tangents, or to a single
+            contact. Two coefficients for each contact define an ellipse, see `Cones.contacts`.
         patch_radius : scalar or (k,) m, optional
-            Gives each contact a spin row.
+            If given, each contact has a spin row.
         rolling : scalar or (k,) m, optional
-            mu_r: gives each contact two rows that roll, after the others; two tangents are needed.
+            mu_r: if given, the last two rows of each contact are rolling rows; two tangents are needed.
+        **more
+            Keywords of `Problem`: name, names, ...
 
         Raises
         ------
         InputError
-            The rows do not part among the contacts; mu > 0 where contacts have no row for friction.
+            The number of rows does not fit the number of contacts; mu > 0 for contacts without friction rows.
         """
         check_keywords("contact", more, ("mu", "patch_radius", "rolling"))
         b = as_array("b", b, (None,), unit="m/s")
         check_unmasked("mu", mu)
         if len(shape_of("mu", mu)) > 1:
             return cls(b, Cones.contacts(mu, 2, patch_radius, rolling=rolling), A, **more)
-        turns = (patch_radius is not None) + 2 * (rolling is not None)
+        angular_rows = (patch_radius is not None) + 2 * (rolling is not None)
         if np.ndim(mu) == 0:
-            each = 3 + turns
-            mu = np.full(len(b) // each if len(b) % each == 0 else 1, mu)
+            contact_rows = 3 + angular_rows
+            mu = np.full(len(b) // contact_rows if len(b) % contact_rows == 0 else 1, mu)
         mu = as_array("mu", mu, (None,))
         if (len(mu) == 0) != (len(b) == 0) or (len(mu) and len(b) % len(mu)):
             raise InputError(
                 f"b has {len(b)} rows for {len(mu)} values of mu; the same number of rows for each "
                 "contact is needed"
             )
-        tangents = len(b) // len(mu) - 1 - turns if len(mu) else 2 * (rolling is not None)
+        tangents = len(b) // len(mu) - 1 - angular_rows if len(mu) else 2 * (rolling is not None)
         if not 0 <= tangents <= 2:
             raise InputError(
                 f"{len(b)} rows for {len(mu)} contacts; a contact has a normal, up to two tangents, "
@@ -130,34 +155,36 @@ class Builders(Operators):
 
     @classmethod
     def from_findex(
-        cls: type[P],
+        cls: type[ProblemT],
         A: Any,
         b: ArrayLike,
         lower: ArrayLike,
         upper: ArrayLike,
         findex: ArrayLike,
         **more: Any,
-    ) -> P:
-        """The arrays of engines (ODE, Bullet, DART), as they are: friction that follows its normal, tangent by tangent.
+    ) -> ProblemT:
+        """Build a problem from the arrays of ODE, Bullet and DART, with a separate bound for each tangent.
 
-        Where the normals do not stand right before the rows that follow them, the rows of the problem are those of the
-        arrays in another order, `Problem.findex_order(findex)`. A `guess` is in the order of the arrays; `key` and
-        `names` are of the problem's blocks.
+        Friction rows must directly follow their normal row. If they do not, the problem's rows are a permutation of
+        the arrays' rows, `Problem.findex_order(findex)`. `guess` is in the order of the arrays; `key` and `names` refer
+        to the problem's blocks.
 
         Parameters
         ----------
         A : (m, m) 1/kg, array or sparse
         b : (m,) m/s
         lower, upper : scalar or (m,) N s
-            Where findex < 0; where it is not, upper is mu [-] and lower, there -mu, is not read, as in these engines.
+            Bounds of rows with findex < 0. On other rows upper is mu [-] and lower is not read, as in these engines.
         findex : (m,) int
-            Row of the normal whose impulse bounds this one, |lambda_i| <= upper_i lambda_findex; -1: constant bounds.
+            Row of the normal whose impulse bounds this row, |lambda_i| <= upper_i lambda_findex; -1: constant bounds.
+        **more
+            Keywords of `Problem`: name, names, ...
 
         Raises
         ------
         InputError
-            A findex out of range, of its own row, or of a row that is no normal [0, inf]; more than two rows that
-            follow one; mu that is negative or not finite; lower > upper.
+            A findex is out of range, is its own row, or refers to a row with bounds other than [0, inf]; more than two
+            rows refer to one normal; mu is negative or not finite; lower > upper.
 
         Examples
         --------
@@ -170,9 +197,9 @@ class Builders(Operators):
         """
         check_keywords("from_findex", more, ("lower", "upper", "findex"))
         b = as_array("b", b, (None,), unit="m/s")
-        order, cones = blocks_of(lower, upper, findex, len(b))
+        order, cones = blocks_from_findex(lower, upper, findex, len(b))
         if (order[1:] < order[:-1]).any():
-            matrix = checked_matrix(A, len(b), True)
+            matrix = check_matrix(A, len(b), True)
             if more.get("guess") is not None:
                 more["guess"] = as_array("guess", more["guess"], (len(b),), unit="N s")[order]
             return cls(b[order], cones, matrix[order][:, order], **more)
@@ -180,23 +207,23 @@ class Builders(Operators):
 
     @staticmethod
     def findex_order(findex: ArrayLike) -> IntArray:
-        """(m,) row of the arrays given to `from_findex` for each row of its problem.
+        """Return the row of the arrays of `from_findex` for each row of its problem (m,).
 
         >>> import lavender as lv
-        >>> lv.Problem.findex_order([-1, -1, 0, 0, 1, 1]).tolist()  # all normals first, as Bullet has them
+        >>> lv.Problem.findex_order([-1, -1, 0, 0, 1, 1]).tolist()  # all normals first, as in Bullet
         [0, 2, 3, 1, 4, 5]
         """
-        return order_of(findex)
+        return order_rows(findex)
 
     def to_findex(self) -> tuple[Any, FloatArray, FloatArray, FloatArray, IntArray]:
-        """(A, b, lower, upper, findex) as ODE, Bullet and DART have them, of the rows in this problem's order.
+        """Return A, b, lower, upper and findex as ODE, Bullet and DART use them, in the order of this problem's rows.
 
         Raises
         ------
         InputError
-            A disk, or the law "cone": findex has neither.
+            The problem has a disk or the law "cone", which findex cannot express.
         """
-        lower, upper, findex = arrays_of(self.cones)
+        lower, upper, findex = findex_from_blocks(self.cones)
         if self.law == "cone":
             raise InputError(
                 "findex means Coulomb friction, not the law 'cone': pass problem.relaxed('coulomb')"
@@ -205,7 +232,7 @@ class Builders(Operators):
 
     @classmethod
     def from_rows(
-        cls: type[P],
+        cls: type[ProblemT],
         rows: Rows,
         target: ArrayLike = 0.0,
         *,
@@ -217,37 +244,38 @@ class Builders(Operators):
         rolling: ArrayLike | None = None,
         shape: str = "disk",
         **more: Any,
-    ) -> P:
-        """Problem of a step from factored rows: b = target - J v*.
+    ) -> ProblemT:
+        """Build the problem of a step from rows of bodies, with b = target - J v*.
 
         Parameters
         ----------
         rows : Rows
         target : scalar or (m,) m/s
-            Wanted relative velocity after the step: 0 holds, +depth/dt pushes out (depth positive inside), -e v_n
-            bounces off an approach v_n < 0. A gap is a negative depth.
+            Required relative velocity after the step: 0 stops the motion, +depth/dt removes a penetration (depth
+            positive inside), -e v_n is a bounce after an approach v_n < 0. A gap is a negative depth.
         lower, upper : scalar or (mj,) N s
             Bounds of the joint rows.
         mu : scalar or (c,)
         tangents : int or (c,), optional
-            Tangent rows of each contact, 0 to 2. Default: two where mu > 0.
+            Number of tangent rows of each contact, 0 to 2. Default: two if mu > 0, else none.
         patch_radius : scalar or (c,) m, optional
-            Gives each contact a spin row.
+            If given, each contact has a spin row.
         shape : {"disk", "box"}
-            Of friction in two tangents; see `Cones.contacts`. Two coefficients: replace(problem, cones=...).
+            Shape of friction in two tangents; see `Cones.contacts`. For two coefficients use
+            replace(problem, cones=...).
         rolling : scalar or (c,) m, optional
-            mu_r: gives each contact two rows that roll about its two tangents; all contacts need two.
+            mu_r: if given, each contact has two rows for rolling about its two tangents; all contacts need two.
         **more
-            As `Problem`: name, friction, ...; the example of `Rows` is a whole stack.
+            Keywords of `Problem`: name, friction, ...
 
         Raises
         ------
         InputError
-            mu > 0 at a contact without tangents and spin, which no row could feel.
+            mu > 0 for a contact without tangents and spin.
 
         Examples
         --------
-        A ball of 2 kg and 0.1 m, 0.01 m deep in the ground, is out of it after the step:
+        A ball of 2 kg and 0.1 m, 0.01 m deep in the ground, is out of it after the step (for a stack see `Rows`):
 
         >>> import numpy as np
         >>> import lavender as lv
@@ -267,26 +295,26 @@ class Builders(Operators):
         >>> round(float(v * dt), 6)  # m: it rises by its depth
         0.01
         """
-        check_keywords("from_rows", more, ("target", *BOUNDS))
+        check_keywords("from_rows", more, ("target", *ROW_BOUND_KEYWORDS))
         if not isinstance(rows, Rows):
             raise InputError(f"rows is a {type(rows).__name__}; a Rows is needed")
         mu = as_array("mu", mu, (rows.n_contacts,))
         if tangents is None:
             tangents = 2 * (mu > 0.0).astype(np.int32)
         tangents = as_array("tangents", tangents, mu.shape, dtype=np.int32)
-        contacts = _contacts(mu, tangents, patch_radius, rolling, check_shape("shape", shape))
-        joints = _joints(rows, lower, upper)
+        contacts = _make_contacts(mu, tangents, patch_radius, rolling, check_shape("shape", shape))
+        joints = _make_joints(rows, lower, upper)
         cones = joints + contacts if rows.n_joints else contacts
         m = cones.n_rows
         target = as_array("target", target, (m,), unit="m/s")
-        made, jv = cls(np.zeros(m), cones, rows=rows, **more), np.zeros(m + 1)
-        rows_velocity(made.data, rows.v_free, jv)
-        made._aim(target - jv[:m])
-        return made
+        problem, jv = cls(np.zeros(m), cones, rows=rows, **more), np.zeros(m + 1)
+        rows_velocity(problem.data, rows.v_free, jv)
+        problem._set_rhs(target - jv[:m])
+        return problem
 
     @classmethod
     def from_jacobian(
-        cls: type[P],
+        cls: type[ProblemT],
         J: Any,
         M: Any,
         v_free: ArrayLike,
@@ -298,45 +326,47 @@ class Builders(Operators):
         names: Sequence[str] | None = None,
         dof_names: Sequence[str] | None = None,
         **more: Any,
-    ) -> P:
-        """Problem of a step in generalised coordinates: w = J v+ - target + compliance lambda.
+    ) -> ProblemT:
+        """Build the problem of a step in generalised coordinates: w = J v+ - target + compliance lambda.
 
         Parameters
         ----------
         J : (m, nv) array or sparse
-            Rows in the order of `cones`, e.g. `Cones.free(6) + Cones.contacts(0.5, count=8)`; of a contact its normal,
-            then its two tangents.
+            Rows in the order of `cones`, e.g. `Cones.free(6) + Cones.contacts(0.5, count=8)`; each contact has its
+            normal first, then its two tangents.
         M : (nv, nv) array or sparse, or a sequence of square blocks, one for each kinematic tree
-            Mass matrix, symmetric positive definite. J and M are copied, whatever `copy` says.
+            Mass matrix, symmetric positive definite. J and M are always copied.
         v_free : (nv,) m/s, rad/s
             v*, the velocity after the step without constraint impulses.
         target : scalar or (m,) m/s
-            Wanted relative velocity after the step: 0 holds, +depth/dt pushes out (depth positive inside), -e v_n
-            bounces off an approach v_n < 0. A gap is a negative depth.
+            Required relative velocity after the step: 0 stops the motion, +depth/dt removes a penetration (depth
+            positive inside), -e v_n is a bounce after an approach v_n < 0. A gap is a negative depth.
         cones : Cones
         compliance : scalar or (m,) 1/kg, optional
         friction : {"coulomb", "cone"}
         precision : {"float64", "float32"}, optional
-            Default: float32 where J, M and v_free are arrays of float32; they are widened exactly.
+            Default: float32 if J, M and v_free are arrays of float32. They are converted to float64 exactly.
         names, dof_names : sequence of str (k,), (nv,), optional
             Names of blocks and of velocities.
+        **more
+            Keywords of `Problem`: name, guess, ...
 
         Examples
         --------
-        A cart of 2 kg with a pole of 1 kg and 0.5 m runs with its tip into a wall, friction 0.5 in one tangent:
+        A cart of 2 kg has a pole of 1 kg and 0.5 m. Its tip hits a wall, with friction 0.5 in one tangent:
 
         >>> import numpy as np
         >>> import lavender as lv
         >>> c, s = 0.5 * np.cos(0.3), 0.5 * np.sin(0.3)
-        >>> M = [[3.0, c], [c, 0.25]]  # of cart and hinge
-        >>> J = [[1.0, c], [0.0, s]]  # velocity of the tip off the wall, and along it
+        >>> M = [[3.0, c], [c, 0.25]]  # velocities of cart and hinge
+        >>> J = [[1.0, c], [0.0, s]]  # velocity of the tip away from the wall, and along it
         >>> cones = lv.Cones.contacts(0.5, tangents=1)
         >>> problem = lv.Problem.from_jacobian(J, M, v_free=[-1.0, 0.2], cones=cones)
         >>> solution = lv.solve(problem, tol=1e-9)
         >>> solution.impulse.round(3).tolist()  # N s: it slides, 0.579 = 0.5 x 1.158
         [1.158, -0.579]
 
-        The same with the tip 0.01 m inside the wall, and a step of 1/60 s:
+        With the tip 0.01 m inside the wall, and a step of 1/60 s:
 
         >>> inside = problem.updated(target=[0.01 * 60, 0.0])
         >>> pushed = lv.solve(inside, tol=1e-9)
@@ -356,7 +386,7 @@ class Builders(Operators):
         if compliance is not None:
             compliance = as_array("compliance", compliance, (m,), unit="1/kg")
         return cls(
-            generalized.bias(target),  # what is not finite, the problem refuses
+            generalized.bias(target),  # the class rejects entries that are not finite
             cones,
             friction=friction,
             compliance=compliance,
@@ -367,7 +397,7 @@ class Builders(Operators):
 
     @classmethod
     def from_qp(
-        cls: type[P],
+        cls: type[ProblemT],
         P: Any,
         q: ArrayLike | None = None,
         G: Any = None,
@@ -377,35 +407,35 @@ class Builders(Operators):
         lb: ArrayLike | None = None,
         ub: ArrayLike | None = None,
         **more: Any,
-    ) -> P:
-        """A convex quadratic program: min 1/2 x.P x + q.x subject to G x <= h, A x = b, lb <= x <= ub.
+    ) -> ProblemT:
+        """Build a convex quadratic program: min 1/2 x.P x + q.x subject to G x <= h, A x = b, lb <= x <= ub.
 
-        If P is positive definite, x are generalised velocities of the mass matrix P, and every solver of bounded rows
-        takes the problem. `lavender.solve_qp` gives x and the multipliers, or `problem.qp.solution(solution)` those of
-        a solution by `lavender.solve`.
+        If P is positive definite, x are generalised velocities with the mass matrix P, and every solver of bounded rows
+        accepts the problem. `lavender.solve_qp` returns x and the multipliers; `problem.qp.solution(solution)` computes
+        them from a solution of `lavender.solve`.
 
         Parameters
         ----------
-        P : (n, n) array or sparse, or a `qpsolvers.Problem`, which is given alone
+        P : (n, n) array or sparse, or a `qpsolvers.Problem` as the only argument
             Symmetric, both triangles, positive semidefinite. If it is singular (its Cholesky factor has a pivot of at
-            most 1e-13 of the diagonal entry), the problem has x and the multipliers as unknowns, and only solvers of
-            quadratic programs take it: `auto` selects piqp, clarabel or osqp, the first that is installed.
+            most 1e-13 of the diagonal entry), the unknowns of the problem are x and the multipliers, and only solvers
+            of quadratic programs accept it: `auto` selects the first installed one of piqp, clarabel and osqp.
         q : (n,)
         G, h : (mi, n) array or sparse, and (mi,), optional
-            Entries of h may be inf; from 1e20 on they are.
+            Entries of h from 1e20 on count as inf.
         A, b : (me, n) array or sparse, and (me,), optional
         lb, ub : (n,), optional
-            Entries may be infinite; from 1e20 on, in size, they are.
+            Entries of at least 1e20 in absolute value count as infinite.
         **more
-            As `Problem`: name, guess, ...
+            Keywords of `Problem`: name, guess, ...
 
-        Zeros are left out of dense matrices, which are then solved as sparse ones; all arrays are copied.
+        Zeros of dense matrices are dropped, and the problem is solved as a sparse one. All arrays are copied.
 
         Raises
         ------
         InputError
-            Shapes that do not fit, NaN, lb > ub; P not symmetric, or not positive semidefinite, with its least
-            eigenvalue.
+            The shapes disagree; an entry is NaN; lb > ub; P is not symmetric, or not positive semidefinite (the message
+            has its smallest eigenvalue).
 
         Examples
         --------
@@ -425,7 +455,7 @@ class Builders(Operators):
         return cls(**qp.problem_fields(), qp=qp, **more)
 
     def updated(
-        self: P,
+        self: ProblemT,
         *,
         J: Any = None,
         M: Any = None,
@@ -433,24 +463,25 @@ class Builders(Operators):
         b: ArrayLike | None = None,
         target: ArrayLike | None = None,
         guess: ArrayLike | None = None,
-    ) -> P:
-        """The same structure with new numbers: what is not given stays.
+    ) -> ProblemT:
+        """Return a problem of the same structure with new numbers; arguments that are omitted keep their values.
 
         Parameters
         ----------
         J, M, v_free : as in `from_jacobian`
-            Only in generalised coordinates; copied, so that a loop may fill the same arrays again.
+            Only in generalised coordinates. They are copied, so a loop may reuse its arrays.
         b : (m,) m/s, optional
-            The right-hand side itself; or
+            Right-hand side.
         target : scalar or (m,) m/s, optional
-            b = target - J v*.
+            Instead of b: b = target - J v*.
         guess : (m,) N s, optional
-            Default: none, as it belongs to other numbers.
+            Default: no guess, because the old guess belongs to the old numbers.
 
         Raises
         ------
         InputError
-            J, M, v_free or target without J and M; both b and target, or neither with a new J or v*.
+            J, M, v_free or target for a problem that is not in generalised coordinates; both b and target; neither b
+            nor target with a new J or v*.
         """
         general = self.generalized
         new = (J, M, v_free, target)
@@ -474,53 +505,55 @@ class Builders(Operators):
         if general is not None and general.m != self.m:
             raise InputError(f"J has {general.m} rows; {self.m} are needed, as the problem has")
         if target is not None and general is not None:
-            with np.errstate(over="ignore", invalid="ignore"):  # what is not finite, the problem refuses
+            # The class rejects entries that are not finite.
+            with np.errstate(over="ignore", invalid="ignore"):
                 b = as_array("target", target, (self.m,), unit="m/s") - general.velocity_of(general.v_free)
-        # Private here, so that nothing else is copied a second time.
-        given = self.b if b is None else as_array("b", b, (self.m,), unit="m/s")
-        warm = None if guess is None else as_array("guess", guess, (self.m,), unit="N s")
-        qp = self.qp.with_bias(given) if self.has_singular_program else None
-        return replace(self, generalized=general, b=given, guess=warm, qp=qp, copy=False)
+        # Arrays are copied here, so the new problem can use them with copy=False.
+        rhs = self.b if b is None else as_array("b", b, (self.m,), unit="m/s")
+        start = None if guess is None else as_array("guess", guess, (self.m,), unit="N s")
+        qp = self.qp.with_bias(rhs) if self.has_singular_program else None
+        return replace(self, generalized=general, b=rhs, guess=start, qp=qp, copy=False)
 
 
 def _names_of_program(n: int, m: int) -> list[str]:
+    """Return default names of the unknowns and constraints of a quadratic program."""
     return [f"variable {i}" for i in range(n)] + [f"constraint {i}" for i in range(m)]
 
 
-def _joints(rows: Rows, lower: ArrayLike, upper: ArrayLike) -> Cones:
-    """The joints' blocks with bounds of their rows (mj,) [N s]."""
+def _make_joints(rows: Rows, lower: ArrayLike, upper: ArrayLike) -> Cones:
+    """Build the joints' blocks with bounds of their rows (mj,) [N s]."""
     low, high = (
         as_array(name, x, (len(rows.jac),), finite=False, unit="N s")
         for name, x in (("lower", lower), ("upper", upper))
     )
-    none = np.zeros(rows.n_joints)
-    return Cones(rows.joint_ptr, none.astype(np.int32), low, high, mu=none, patch_radius=none)
+    zeros = np.zeros(rows.n_joints)
+    return Cones(rows.joint_ptr, zeros.astype(np.int32), low, high, mu=zeros, patch_radius=zeros)
 
 
-def _contacts(mu: FloatArray, tangents: IntArray, patch_radius: Any, rolling: Any, shape: str) -> Cones:
-    """Contacts of 0 to 2 tangents each (c,); with a radius all have a spin row, with mu_r two that roll."""
-    spin, rolls, c = patch_radius is not None, rolling is not None, len(mu)
-    least, most = (int(tangents.min()), int(tangents.max())) if c else (2, 2)
-    if least < 0 or most > 2:
+def _make_contacts(mu: FloatArray, tangents: IntArray, patch_radius: Any, rolling: Any, shape: str) -> Cones:
+    """Build contacts of 0 to 2 tangents (c,); all have spin if a radius is given, and rolling if mu_r is given."""
+    has_spin, has_rolling, c = patch_radius is not None, rolling is not None, len(mu)
+    min_tangents, max_tangents = (int(tangents.min()), int(tangents.max())) if c else (2, 2)
+    if min_tangents < 0 or max_tangents > 2:
         raise InputError("tangents must be 0, 1 or 2 for each contact")
-    if rolls and least < 2:
+    if has_rolling and min_tangents < 2:
         raise InputError(
-            f"contact {int(np.argmin(tangents))} has {least} tangents; rolling needs two, about which it "
+            f"contact {int(np.argmin(tangents))} has {min_tangents} tangents; rolling needs two, about which it "
             "rolls: give tangents=2"
         )
-    if least == 0 and not spin:
-        smooth = np.flatnonzero((mu > 0.0) & (tangents == 0))
-        if len(smooth):
+    if min_tangents == 0 and not has_spin:
+        bad = np.flatnonzero((mu > 0.0) & (tangents == 0))
+        if len(bad):
             raise InputError(
-                f"contact {smooth[0]} has mu {mu[smooth[0]]:g} and no tangent to feel it: give tangents=2, or mu 0"
+                f"contact {bad[0]} has mu {mu[bad[0]]:g} but no friction row: give tangents=2, or mu 0"
             )
-    if least == most:
-        return Cones.contacts(mu, most, patch_radius, rolling=rolling, shape=shape)
-    ptr = np.concatenate([[0], np.cumsum(1 + tangents + spin + 2 * rolls)]).astype(np.int32)
-    kind = kinds_of(np.ones(c, bool), spin=spin, rolls=rolls)
-    free, none = np.full(int(ptr[-1]), np.inf), np.zeros(c)
+    if min_tangents == max_tangents:
+        return Cones.contacts(mu, max_tangents, patch_radius, rolling=rolling, shape=shape)
+    ptr = np.concatenate([[0], np.cumsum(1 + tangents + has_spin + 2 * has_rolling)]).astype(np.int32)
+    kind = kinds_of(np.ones(c, bool), spin=has_spin, rolling=has_rolling)
+    infinite, zeros = np.full(int(ptr[-1]), np.inf), np.zeros(c)
     cones = Cones(
-        ptr=ptr, kind=kind, lower=-free, upper=free, mu=mu,
-        patch_radius=none if patch_radius is None else patch_radius, rolling=none if rolling is None else rolling,
+        ptr=ptr, kind=kind, lower=-infinite, upper=infinite, mu=mu,
+        patch_radius=zeros if patch_radius is None else patch_radius, rolling=zeros if rolling is None else rolling,
     )  # fmt: skip
     return cones.shaped("box") if shape == "box" else cones

@@ -1,19 +1,19 @@
-"""Blocks of a problem: which rows belong together and what bounds them.
+"""Blocks of a problem: the rows of each block and their bounds.
 
-A block is one or more bounded rows (`ROW`), or a contact: normal row, then 0 to 2 tangent rows, then
-perhaps one spin row, perhaps two rows that roll. With lambda [N s] the bounds are
+A block is one or more bounded rows (`ROW`), or a contact: a normal row, 0 to 2 tangent rows, optionally one spin row
+(torsional friction), optionally two rolling rows. With lambda [N s] the bounds are
 
     ROW           lower <= lambda_i <= upper on each of its rows
     CONTACT       0 <= lambda_n,  |lambda_t| <= mu lambda_n
-    CONTACT_SPIN  the same, and |lambda_s| <= mu r lambda_n, r = patch radius [m]
-    CONTACT_BOX   0 <= lambda_n,  |lambda_1| <= mu lambda_n,  |lambda_2| <= mu q lambda_n: two tangents, each by itself,
-                  as most engines have it; q = mu_2 / mu_1 stands in the place of the patch radius
-    CONTACT_ELLIPSE  0 <= lambda_n,  |(lambda_1 / mu, lambda_2 / (mu q))| <= lambda_n: the disk of tangents stretched
-                  by their share of the larger coefficient, in which it is solved and judged (`Problem.disk`)
-    ROUND         0 <= lambda_n, |lambda_T| <= mu lambda_n over three to five tangents together: two that slide, one
-                  that spins, two that roll; each row scaled by its own coefficient over mu, so that one mu bounds all
-    CONTACT_ROLLING  a contact of two tangents, perhaps with spin, and |lambda_r| <= mu_r lambda_n on the two that roll,
-                  mu_r [m] the arm by which rolling moves the normal force; each part bounded by itself
+    CONTACT_SPIN  as CONTACT, and |lambda_s| <= mu r lambda_n with the patch radius r [m]
+    CONTACT_BOX   0 <= lambda_n,  |lambda_1| <= mu lambda_n,  |lambda_2| <= mu q lambda_n: each of the two tangents has
+                  its own bound, as in many engines; q = mu_2 / mu_1 is stored as `patch_radius`
+    CONTACT_ELLIPSE  0 <= lambda_n,  |(lambda_1 / mu, lambda_2 / (mu q))| <= lambda_n. The problem is solved and judged
+                  in stretched tangents, in which the ellipse is a disk of the larger coefficient (`Problem.disk`)
+    ROUND         0 <= lambda_n, |lambda_T| <= mu lambda_n over three to five tangents in one cone: two sliding, one
+                  spin, two rolling; each row is scaled by its own coefficient over mu, so one mu bounds all of them
+    CONTACT_ROLLING  a contact of two tangents, optionally with spin, and |lambda_r| <= mu_r lambda_n on two rolling
+                  rows, mu_r [m] the arm by which rolling moves the normal force; each component has its own bound
 """
 
 from __future__ import annotations
@@ -29,26 +29,26 @@ from lavender.base.arrays import (
     ArrayLike,
     FloatArray,
     IntArray,
+    are_equal,
     as_array,
     check_inside,
+    check_int,
     check_not_nan,
     check_sizes,
-    equal,
-    places,
     read_only,
+    resolve_index,
     shape_of,
-    whole_number,
 )
 from lavender.base.errors import InputError
 from lavender.problem.derived import cached_property
 from lavender.problem.friction import (
-    LEAST_SHARE,
+    MIN_COEFFICIENT_RATIO,
     SHAPES,
-    axes_of,
-    check_parts,
+    check_coefficients,
+    check_combination,
     check_shape,
-    sides_of,
-    sizes_of,
+    convert_box_coefficients,
+    convert_ellipse_coefficients,
 )
 from lavender_ext.core import blocks as kernels
 from lavender_ext.core.checks import LEAST, MOST
@@ -69,10 +69,10 @@ __all__ = [
 
 ROW, CONTACT, CONTACT_SPIN, ROUND, CONTACT_BOX, CONTACT_ROLLING, CONTACT_ELLIPSE = kernels.KINDS
 
-FIELDS = ("ptr", "kind", "lower", "upper", "mu", "patch_radius", "rolling")
-REACH = "mu patch_radius (of boxes and ellipses mu_2)"
-# Of each kind of contact: least and most rows, what it is called, and what it may have.
-SIZES = {
+CONES_FIELDS = ("ptr", "kind", "lower", "upper", "mu", "patch_radius", "rolling")
+SPIN_COEFFICIENT_LABEL = "mu patch_radius (of boxes and ellipses mu_2)"  # name of the product in messages
+# For each kind of contact: minimum and maximum number of rows, its name, and its permitted rows.
+CONTACT_ROWS = {
     CONTACT: (1, 3, "a contact", "a normal and up to two tangents are known, and one spin row of CONTACT_SPIN"),
     CONTACT_SPIN: (2, 4, "a contact with spin", "a normal, up to two tangents and one spin row are known"),
     ROUND: (4, 6, "a round cone", "a normal and up to five tangents (two slide, one spins, two roll) are known"),
@@ -85,30 +85,30 @@ SIZES = {
 
 @dataclass(frozen=True, eq=False)
 class Cones:
-    """Bounds of k blocks with m rows. Made by `Cones.free`, `Cones.bounded` and `Cones.contacts`; `+` joins them.
+    """Bounds of k blocks with m rows, built by `Cones.free`, `Cones.bounded` and `Cones.contacts`, joined by `+`.
 
     Parameters
     ----------
     ptr : (k + 1,) int
         First row of each block, followed by m.
     kind : (k,) int
-        ROW, CONTACT, CONTACT_SPIN, ROUND, CONTACT_BOX, CONTACT_ROLLING or CONTACT_ELLIPSE of each block.
+        Kind of each block: ROW, CONTACT, CONTACT_SPIN, ROUND, CONTACT_BOX, CONTACT_ROLLING or CONTACT_ELLIPSE.
     lower, upper : (m,) N s
-        Bounds of the rows of ROW blocks, possibly infinite. Those of contacts are not read.
+        Bounds of the rows of ROW blocks, possibly infinite. The entries of contacts are not read.
     mu : (k,) -
         Coefficient of friction of each contact.
     patch_radius : (k,) m
-        Contacts with spin: r; their spin row is bounded by mu r lambda_n [N m s]. CONTACT_BOX and CONTACT_ELLIPSE:
+        Contacts with spin: r; the spin row is bounded by mu r lambda_n [N m s]. CONTACT_BOX and CONTACT_ELLIPSE:
         mu_2 / mu_1 [-].
     rolling : (k,) m, optional
-        mu_r of CONTACT_ROLLING: the rolling impulse is bounded by mu_r lambda_n [N m s]; default 0. Acary, Bourrier,
-        Viano 2023.
+        mu_r of CONTACT_ROLLING: the rolling impulse is bounded by mu_r lambda_n [N m s] (Acary, Bourrier, Viano 2023).
+        Default: 0.
 
     Raises
     ------
     InputError
-        Shapes that do not fit; lower > upper or NaN bounds; a negative mu, patch radius or mu_r; a contact with more
-        rows than its kind has; a round cone of more than five tangents.
+        Shapes disagree; lower > upper or NaN bounds; a negative mu, patch radius or mu_r; a contact has more rows than
+        its kind allows; a round cone has more than five tangents.
 
     Examples
     --------
@@ -118,22 +118,22 @@ class Cones:
     >>> cones = lv.Cones.free(5) + lv.Cones.bounded([-2.0], [2.0]) + lv.Cones.contacts(0.5, count=2)
     >>> cones.n_blocks, cones.n_rows
     (8, 12)
-    >>> cones.ptr.tolist()  # each free row is a block of its own
+    >>> cones.ptr.tolist()  # each free row is a separate block
     [0, 1, 2, 3, 4, 5, 6, 9, 12]
     >>> cones.mu[-2:].tolist(), cones.upper[5].item()
     ([0.5, 0.5], 2.0)
     """
 
-    ptr: IntArray  # (k + 1,) first row of each block, then m
-    kind: IntArray  # (k,) ROW | CONTACT | CONTACT_SPIN | ROUND | CONTACT_BOX | CONTACT_ROLLING | CONTACT_ELLIPSE
-    lower: FloatArray  # (m,) N s, read on ROW blocks, -inf allowed
-    upper: FloatArray  # (m,) N s, read on ROW blocks, +inf allowed
-    mu: FloatArray  # (k,) -, read on contacts
-    patch_radius: FloatArray  # (k,) m, read on contacts with spin; on boxes and ellipses mu_2 / mu_1
-    rolling: FloatArray = field(default_factory=tuple)  # type: ignore[arg-type]  # (k,) m, read on CONTACT_ROLLING; (): 0
-    _blocks: ClassVar[kernels.Blocks]  # of an instance: the same arrays, as kernels read them
+    ptr: IntArray
+    kind: IntArray
+    lower: FloatArray
+    upper: FloatArray
+    mu: FloatArray
+    patch_radius: FloatArray
+    rolling: FloatArray = field(default_factory=tuple)  # type: ignore[arg-type]  # (): zeros
+    _blocks: ClassVar[kernels.Blocks]  # set on each instance: the same arrays for the kernels
 
-    if TYPE_CHECKING:  # what may be given; fields are arrays
+    if TYPE_CHECKING:  # The parameters accept more types than the fields have.
 
         def __init__(
             self, ptr: ArrayLike, kind: ArrayLike, lower: ArrayLike, upper: ArrayLike, mu: ArrayLike,
@@ -141,43 +141,43 @@ class Cones:
         ) -> None: ...  # fmt: skip
 
     def __post_init__(self) -> None:
-        given: Any = self.rolling
-        if isinstance(given, tuple) and not given:
+        rolling: Any = self.rolling
+        if isinstance(rolling, tuple) and not rolling:
             self.__dict__["rolling"] = np.zeros(np.size(self.kind))
-        made = kernels.private(
+        blocks = kernels.private(
             self.ptr, self.kind, self.lower, self.upper, self.mu, self.patch_radius, self.rolling
         )
-        if made is None:
-            made = self._checked()
-        self._take(made)
+        if blocks is None:
+            blocks = self._convert_fields()
+        self._set_blocks(blocks)
 
-    def _take(self, made: kernels.Blocks) -> None:
+    def _set_blocks(self, blocks: kernels.Blocks) -> None:
         self.__dict__.clear()
-        self.__dict__["_blocks"] = made
+        self.__dict__["_blocks"] = blocks
 
     def __getattr__(self, name: str) -> Any:
-        # Views are cut when one is first asked for.
-        if name not in FIELDS:
+        # The arrays of the fields are created when one of them is first read.
+        if name not in CONES_FIELDS:
             raise AttributeError(f"Cones have no {name}")
-        self.__dict__.update(zip(FIELDS, self._blocks.arrays, strict=True))
+        self.__dict__.update(zip(CONES_FIELDS, self._blocks.arrays, strict=True))
         return self.__dict__[name]
 
     @classmethod
-    def _of(cls, made: kernels.Blocks) -> Cones:
+    def _from_blocks(cls, blocks: kernels.Blocks) -> Cones:
         cones = object.__new__(cls)
-        cones._take(made)
+        cones._set_blocks(blocks)
         return cones
 
     @classmethod
-    def _joined(cls, each: Iterable[Cones]) -> Cones:
-        """The blocks of each, one after the other."""
-        made = kernels.joined([cones._blocks for cones in each])
-        if made is None:
+    def _concatenate(cls, cones: Iterable[Cones]) -> Cones:
+        """Concatenate the blocks of several cones."""
+        blocks = kernels.joined([each._blocks for each in cones])
+        if blocks is None:
             raise InputError("together these have more rows than 32-bit numbers count")
-        return cls._of(made)
+        return cls._from_blocks(blocks)
 
-    def _checked(self) -> kernels.Blocks:
-        # The long way: what can be made to fit, and words for what cannot.
+    def _convert_fields(self) -> kernels.Blocks:
+        """Convert and check fields that the fast path rejected; raise InputError for invalid ones."""
         ptr = as_array("cones.ptr", self.ptr, (None,), dtype=np.int32)
         if len(ptr) == 0 or ptr[0] != 0 or np.any(np.diff(ptr) <= 0):
             raise InputError(
@@ -193,7 +193,7 @@ class Cones:
                 "known"
             )
         size = np.diff(ptr)
-        kind = _fitting(kind, size)
+        kind = _check_kinds(kind, size)
         lower = as_array("lower", self.lower, (m,), finite=False, unit="N s")
         upper = as_array("upper", self.upper, (m,), finite=False, unit="N s")
         check_not_nan("lower", lower)
@@ -209,31 +209,42 @@ class Cones:
                 "and a number between them"
             )
         if contact_rows.any():
-            # One spelling for rows whose bounds are never read, so that equal problems compare equal.
+            # Give rows whose bounds are not read fixed values, so that equal problems compare equal.
             lower, upper = lower.copy(), upper.copy()
             lower[contact_rows], upper[contact_rows] = -np.inf, np.inf
             normal = ptr[:-1][kind != ROW]
             lower[normal] = 0.0
             lower.flags.writeable = upper.flags.writeable = False
-        mu = sizes_of("mu", self.mu, k)
-        radius = sizes_of("patch_radius", self.patch_radius, k, "m")
-        wide = ~((radius >= LEAST_SHARE) & (radius <= 1.0 / LEAST_SHARE))
-        bad = np.flatnonzero((kind == CONTACT_ELLIPSE) & wide)
+        mu = check_coefficients("mu", self.mu, k)
+        radius = check_coefficients("patch_radius", self.patch_radius, k, "m")
+        out_of_range = ~((radius >= MIN_COEFFICIENT_RATIO) & (radius <= 1.0 / MIN_COEFFICIENT_RATIO))
+        bad = np.flatnonzero((kind == CONTACT_ELLIPSE) & out_of_range)
         if len(bad):
             raise InputError(
                 f"block {bad[0]} is an ellipse with mu_2 / mu_1 = {radius[bad[0]]:g} in the place of the patch radius; "
                 "1e-18 to 1e18 is needed"
             )
-        check_sizes(REACH, np.where(kind == ROW, 0.0, mu * radius), "m")
-        rolling = sizes_of("rolling", self.rolling, k, "m")
+        check_sizes(SPIN_COEFFICIENT_LABEL, np.where(kind == ROW, 0.0, mu * radius), "m")
+        rolling = check_coefficients("rolling", self.rolling, k, "m")
         return kernels.Blocks(ptr, kind, lower, upper, mu, radius, rolling)
 
     @classmethod
     def bounded(cls, lower: ArrayLike, upper: ArrayLike) -> Cones:
-        """One ROW block for each pair of bounds, lower <= lambda <= upper: arrays (m,) [N s], or upper inf for all."""
-        made = kernels.bounded_rows(lower, upper)
-        if made is not None:
-            return cls._of(made)
+        """Build one ROW block for each pair of bounds, lower <= lambda <= upper.
+
+        Parameters
+        ----------
+        lower : (m,), N s
+        upper : (m,) or scalar, N s
+
+        Raises
+        ------
+        InputError
+            The shapes differ, or no number lies between two bounds.
+        """
+        blocks = kernels.bounded_rows(lower, upper)
+        if blocks is not None:
+            return cls._from_blocks(blocks)
         low = as_array("lower", lower, (None,), finite=False, unit="N s")
         m = len(low)
         high = as_array("upper", upper, (m,), finite=False, unit="N s")
@@ -243,8 +254,8 @@ class Cones:
 
     @classmethod
     def free(cls, m: int) -> Cones:
-        """m unbounded rows, each its own block: a linear system."""
-        return cls._of(kernels.free_rows(whole_number("m", m, high=2**31 - 2)))
+        """Build m unbounded rows, each a separate block: a linear system."""
+        return cls._from_blocks(kernels.free_rows(check_int("m", m, high=2**31 - 2)))
 
     @classmethod
     def contacts(
@@ -257,27 +268,36 @@ class Cones:
         count: int | None = None,
         shape: str = "disk",
     ) -> Cones:
-        """Contacts only, the same rows for each: normal, `tangents`, with a radius a spin row, then what rolls.
+        """Build k contacts with the same rows: normal, tangents, spin if `patch_radius` is given, two rolling rows.
 
         Parameters
         ----------
-        mu : scalar, (k,) or (k, 2)
-            One for each contact, or one for each of its two tangents: of an ellipse,
-            |(lambda_1 / mu_1, lambda_2 / mu_2)| <= lambda_n, or of a box.
+        mu : scalar, (k,) or (k, 2), -
+            Coefficient of each contact, or of each of its two tangents: the semi-axes of an ellipse,
+            |(lambda_1 / mu_1, lambda_2 / mu_2)| <= lambda_n, or the half sides of a box.
         tangents : int, 0 to 5
-            More than two make one round cone (ROUND) and take no patch radius.
+            More than two form one round cone (ROUND), which has no patch radius.
         patch_radius : scalar or (k,) m, optional
         rolling : scalar or (k,) m, optional
-            mu_r: gives each contact two rows that roll about its two tangents, |lambda_r| <= mu_r lambda_n.
+            mu_r: adds two rows for rolling about the two tangents, |lambda_r| <= mu_r lambda_n.
         count : int, optional
-            k, where mu is a scalar; default 1.
+            k, if mu is a scalar. Default: 1.
         shape : {"disk", "box"}
-            What bounds two tangents: |lambda_t| <= mu lambda_n, or each by itself as in most engines,
-            |lambda_i| <= mu_i lambda_n, which grips up to sqrt(2) more on the diagonal.
+            Bound of two tangents: |lambda_t| <= mu lambda_n, or |lambda_i| <= mu_i lambda_n for each, as in many
+            engines, which permits up to sqrt(2) times the impulse on the diagonal.
+
+        Returns
+        -------
+        Cones
+
+        Raises
+        ------
+        InputError
+            A coefficient is negative, the shapes disagree, or this combination of rows has no kind.
 
         Examples
         --------
-        Four skates that glide along the first tangent and hold across, as ellipses and as boxes:
+        Four skates with little friction along the first tangent and much along the second, as ellipses and as boxes:
 
         >>> import lavender as lv
         >>> skates = lv.Cones.contacts([(0.02, 0.8)] * 4)
@@ -287,36 +307,34 @@ class Cones:
         True
         """
         if type(tangents) is not int or not 0 <= tangents <= 5:
-            tangents = whole_number("tangents", tangents, 0, 5)
-        box, pair = (
-            check_shape("shape", shape) == "box",
-            type(mu) is not float and len(shape_of("mu", mu)) > 1,
-        )
+            tangents = check_int("tangents", tangents, 0, 5)
+        is_box = check_shape("shape", shape) == "box"
+        is_pair = type(mu) is not float and len(shape_of("mu", mu)) > 1
         if patch_radius is not None or rolling is not None or tangents != 2:
-            check_parts(mu, tangents, patch_radius is not None, rolling is not None, box, pair)
-        ratio, sides = None, 0
-        if box and tangents == 2:
-            sides = CONTACT_BOX
-            mu, ratio = sides_of(mu)
-        elif pair and not box:
-            mu, ratio = axes_of(mu)
-            sides = 0 if ratio is None else CONTACT_ELLIPSE
-        given = 1 if type(mu) is float or np.ndim(mu) == 0 else shape_of("mu", mu)[0]
-        k = given if count is None else whole_number("count", count)
+            check_combination(mu, tangents, patch_radius is not None, rolling is not None, is_box, is_pair)
+        ratio, pair_kind = None, 0
+        if is_box and tangents == 2:
+            pair_kind = CONTACT_BOX
+            mu, ratio = convert_box_coefficients(mu)
+        elif is_pair and not is_box:
+            mu, ratio = convert_ellipse_coefficients(mu)
+            pair_kind = 0 if ratio is None else CONTACT_ELLIPSE
+        size_of_mu = 1 if type(mu) is float or np.ndim(mu) == 0 else shape_of("mu", mu)[0]
+        k = size_of_mu if count is None else check_int("count", count)
         if type(mu) is not float or not (mu == 0.0 or LEAST <= mu <= MOST):
-            mu = sizes_of("mu", mu, k)
+            mu = check_coefficients("mu", mu, k)
         if patch_radius is not None:
-            patch_radius = sizes_of("patch_radius", patch_radius, k, "m")
+            patch_radius = check_coefficients("patch_radius", patch_radius, k, "m")
         if rolling is not None:
-            rolling = sizes_of("rolling", rolling, k, "m")
+            rolling = check_coefficients("rolling", rolling, k, "m")
         if ratio is not None:
             patch_radius = np.ascontiguousarray(np.broadcast_to(ratio, (k,)))
-        made = kernels.contacts(k, tangents, mu, patch_radius, rolling, sides)
-        if made is None:
+        blocks = kernels.contacts(k, tangents, mu, patch_radius, rolling, pair_kind)
+        if blocks is None:
             if patch_radius is not None:
-                check_sizes(REACH, np.broadcast_to(mu, (k,)) * patch_radius, "m")
+                check_sizes(SPIN_COEFFICIENT_LABEL, np.broadcast_to(mu, (k,)) * patch_radius, "m")
             raise InputError(f"{k} contacts have more rows than 32-bit numbers count")
-        return cls._of(made)
+        return cls._from_blocks(blocks)
 
     @property
     def n_blocks(self) -> int:
@@ -330,66 +348,66 @@ class Cones:
 
     @property
     def is_contact(self) -> npt.NDArray[np.bool_]:
-        """(k,) whether a block is a contact: a normal and what it bounds; else it is bounded rows."""
+        """Whether each block (k,) is a contact; else it consists of bounded rows."""
         return np.asarray(self.kind != ROW)
 
     @property
     def is_free(self) -> bool:
-        """Every row is unbounded."""
+        """Whether every row is unbounded."""
         return bool(self._blocks.is_free)
 
     @property
     def is_bounded_rows(self) -> bool:
-        """Every row has constant bounds: ROW blocks and contacts of a normal alone."""
+        """Whether every row has constant bounds: ROW blocks and contacts with only a normal row."""
         return bool(self._blocks.is_bounded_rows)
 
     @property
     def has_round(self) -> bool:
-        """Some contact has more than two tangents in one cone."""
+        """Whether a contact has more than two tangents in one cone."""
         return bool(self._blocks.has_round)
 
     @property
     def has_rolling(self) -> bool:
-        """Some contact has two rows that roll, bounded by themselves."""
+        """Whether a contact has two rolling rows with a bound of their own (CONTACT_ROLLING)."""
         return bool(self._blocks.has_rolling)
 
     @property
     def has_more_parts(self) -> bool:
-        """Some contact has more than tangents and a row that spins, each with a bound of its own."""
+        """Whether a contact has friction components other than tangents and spin."""
         return self.has_rolling
 
     @property
     def is_box(self) -> npt.NDArray[np.bool_]:
-        """(k,) whether a contact bounds each of its two tangents by itself."""
+        """Whether each block (k,) is a contact with a separate bound for each of two tangents."""
         return np.asarray(self.kind == CONTACT_BOX)
 
     @property
     def has_box(self) -> bool:
-        """Some contact bounds each of its two tangents by itself."""
+        """Whether a contact has a separate bound for each of two tangents."""
         return bool(self.is_box.any())
 
     @property
     def is_ellipse(self) -> npt.NDArray[np.bool_]:
-        """(k,) whether a contact bounds its two tangents by an ellipse."""
+        """Whether each block (k,) is a contact that bounds its two tangents by an ellipse."""
         return np.asarray(self.kind == CONTACT_ELLIPSE)
 
     @property
     def has_ellipse(self) -> bool:
-        """Some contact bounds its two tangents by an ellipse."""
+        """Whether a contact bounds its two tangents by an ellipse."""
         return bool(self._blocks.has_ellipse)
 
     @property
     def stretch(self) -> FloatArray:
-        """(m,) length of each row where disks bound the same impulses: mu_i / max(mu_1, mu_2) on ellipses, else 1."""
-        out, at = np.ones(self.n_rows), np.flatnonzero(self.kind == CONTACT_ELLIPSE)
-        q = self.patch_radius[at]
-        out[self.ptr[at] + 1] = np.where(q > 1.0, 1.0 / q, 1.0)
-        out[self.ptr[at] + 2] = np.where(q > 1.0, 1.0, q)
-        return out
+        """Factor of each row (m,) with which the ellipse is a disk: mu_i / max(mu_1, mu_2) on ellipses, else 1."""
+        factor, ellipses = np.ones(self.n_rows), np.flatnonzero(self.kind == CONTACT_ELLIPSE)
+        q = self.patch_radius[ellipses]
+        factor[self.ptr[ellipses] + 1] = np.where(q > 1.0, 1.0 / q, 1.0)
+        factor[self.ptr[ellipses] + 2] = np.where(q > 1.0, 1.0, q)
+        return factor
 
     @property
     def disks(self) -> Cones:
-        """The same blocks with a disk of the larger coefficient for each ellipse."""
+        """These blocks, with each ellipse replaced by a disk of its larger coefficient."""
         ellipse = self.kind == CONTACT_ELLIPSE
         return replace(
             self,
@@ -400,105 +418,113 @@ class Cones:
 
     @property
     def is_polyhedral(self) -> bool:
-        """No bound is round: every row of friction is bounded by itself, so that Coulomb's law is an LCP."""
+        """Whether every friction row has a bound of its own, so that Coulomb's law is an LCP."""
         return not bool(np.any(self.n_together > 1))
 
     @property
     def n_together(self) -> IntArray:
-        """(k,) tangent rows of each block that mu lambda_n bounds by their norm, 0 on ROW."""
+        """Number of tangent rows of each block (k,) whose norm is bounded by mu lambda_n; 0 for ROW."""
         return self.n_tangents - (self.kind == CONTACT_BOX)
 
     @property
     def coefficients(self) -> FloatArray:
-        """(k, 2) mu of the first and of the second tangent: mu twice, but of a box or ellipse; 0 on ROW."""
+        """Coefficients (k, 2) of the first and second tangent; they differ for boxes and ellipses; 0 for ROW."""
         mu = np.where(self.kind == ROW, 0.0, self.mu)
         second = mu * np.where(np.isin(self.kind, (CONTACT_BOX, CONTACT_ELLIPSE)), self.patch_radius, 1.0)
-        return np.stack([np.where(mu <= LEAST_SHARE * second, 0.0, mu), second], axis=1)
+        return np.stack([np.where(mu <= MIN_COEFFICIENT_RATIO * second, 0.0, mu), second], axis=1)
 
     @cached_property
     def n_tangents(self) -> IntArray:
-        """(k,) tangent rows of each block, 0 on ROW; rows that spin or roll, each with a bound of its own, are none."""
-        own = np.diff(self.ptr) - 1 - (self.kind == CONTACT_SPIN)
-        own = np.where(self.kind == CONTACT_ROLLING, 2, own)
-        return read_only(np.where(self.kind == ROW, 0, own).astype(np.int32))
+        """Number of tangent rows of each block (k,), 0 for ROW; spin and rolling rows count only in a round cone."""
+        count = np.diff(self.ptr) - 1 - (self.kind == CONTACT_SPIN)
+        count = np.where(self.kind == CONTACT_ROLLING, 2, count)
+        return read_only(np.where(self.kind == ROW, 0, count).astype(np.int32))
 
     def shaped(self, shape: str) -> Cones:
-        """The same blocks with contacts of another shape, "disk" (of two coefficients an ellipse) or "box".
+        """Return these blocks with another shape of friction.
+
+        Parameters
+        ----------
+        shape : {"disk", "box"}
+            A box with two different coefficients becomes an ellipse with "disk".
 
         Raises
         ------
         UnknownName
-            No such shape.
+            There is no such shape.
         InputError
-            A contact of two tangents and spin, or a round cone, as a box; a box without friction along one tangent as a
-            disk.
+            "box" with a contact of two tangents and spin, or with a round cone; "disk" with a box that has no friction
+            along one tangent.
         """
-        kind, radius, two = self.kind.copy(), self.patch_radius.copy(), self.n_tangents > 1
+        kind, radius, has_pair = self.kind.copy(), self.patch_radius.copy(), self.n_tangents > 1
         if check_shape("shape", shape) == "box":
-            bad = np.flatnonzero(two & ~np.isin(self.kind, (CONTACT, CONTACT_BOX, CONTACT_ELLIPSE)))
+            bad = np.flatnonzero(has_pair & ~np.isin(self.kind, (CONTACT, CONTACT_BOX, CONTACT_ELLIPSE)))
             if len(bad):
                 raise InputError(
                     f"block {bad[0]} has more rows than a normal and two tangents; no box bounds its spin or rolling"
                 )
-            kind[two], radius[two & (self.kind == CONTACT)] = CONTACT_BOX, 1.0
+            kind[has_pair], radius[has_pair & (self.kind == CONTACT)] = CONTACT_BOX, 1.0
         else:
             box = np.flatnonzero(self.kind == CONTACT_BOX)
-            ratio = axes_of(self.coefficients[box])[1]
+            ratio = convert_ellipse_coefficients(self.coefficients[box])[1]
             kind[box] = CONTACT if ratio is None else np.where(ratio == 1.0, CONTACT, CONTACT_ELLIPSE)
             radius[box] = 0.0 if ratio is None else np.where(ratio == 1.0, 0.0, ratio)
         return replace(self, kind=kind, patch_radius=radius)
 
     @property
     def contact_rows(self) -> npt.NDArray[np.bool_]:
-        """(m,) whether a row is a contact's."""
+        """Whether each row (m,) belongs to a contact."""
         return np.repeat(self.kind != ROW, np.diff(self.ptr))
 
     @property
     def friction_rows(self) -> npt.NDArray[np.bool_]:
-        """(m,) whether a row is a contact's other than its normal."""
-        found = self.contact_rows
-        found[self.ptr[:-1]] = False
-        return found
+        """Whether each row (m,) is a friction row: a row of a contact other than its normal."""
+        mask = self.contact_rows
+        mask[self.ptr[:-1]] = False
+        return mask
 
     @property
     def normal_rows(self) -> IntArray:
-        """(c,) the normal row of each contact."""
+        """Normal row of each contact (c,)."""
         return np.asarray(self.ptr[:-1][self.kind != ROW])
 
     @cached_property
     def reach(self) -> FloatArray:
-        """(m,) largest impulse of each row over lambda_n: mu, mu r on `apart_rows`, mu_r on rolling; 0 on others."""
+        """Friction coefficient of each row (m,): mu, mu r on `apart_rows` [m], mu_r on rolling rows [m], else 0."""
         size = np.diff(self.ptr)
-        out = np.repeat(np.where(self.kind == ROW, 0.0, self.mu), size)
-        out[self.ptr[:-1]] = 0.0
-        apart, rolling = self.apart_rows >= 0, self.rolling_rows >= 0
+        coefficient = np.repeat(np.where(self.kind == ROW, 0.0, self.mu), size)
+        coefficient[self.ptr[:-1]] = 0.0
+        has_apart, has_rolling = self.apart_rows >= 0, self.rolling_rows >= 0
         ellipse = self.ptr[:-1][self.kind == CONTACT_ELLIPSE] + 2
-        out[ellipse] *= self.patch_radius[self.kind == CONTACT_ELLIPSE]
-        out[self.apart_rows[apart]] *= self.patch_radius[apart]
+        coefficient[ellipse] *= self.patch_radius[self.kind == CONTACT_ELLIPSE]
+        coefficient[self.apart_rows[has_apart]] *= self.patch_radius[has_apart]
         for k in (0, 1):
-            out[self.rolling_rows[rolling] + k] = self.rolling[rolling]
-        return read_only(out)
+            coefficient[self.rolling_rows[has_rolling] + k] = self.rolling[has_rolling]
+        return read_only(coefficient)
 
     @cached_property
     def spin_rows(self) -> IntArray:
-        """(k,) the spin row of each block, -1 where it has none."""
-        spins = (self.kind == CONTACT_SPIN) | ((self.kind == CONTACT_ROLLING) & (np.diff(self.ptr) == 6))
-        return read_only(np.where(spins, self.ptr[:-1] + 1 + self.n_tangents, -1).astype(np.int32))
+        """Spin row of each block (k,), -1 if it has none."""
+        has_spin = (self.kind == CONTACT_SPIN) | ((self.kind == CONTACT_ROLLING) & (np.diff(self.ptr) == 6))
+        return read_only(np.where(has_spin, self.ptr[:-1] + 1 + self.n_tangents, -1).astype(np.int32))
 
     @cached_property
     def apart_rows(self) -> IntArray:
-        """(k,) the row of each block that mu patch_radius lambda_n bounds (spin, second side of a box), -1 without."""
+        """Row of each block (k,) with the bound mu patch_radius lambda_n: spin, second tangent of a box; -1 if none."""
         return read_only(
             np.where(self.kind == CONTACT_BOX, self.ptr[1:] - 1, self.spin_rows).astype(np.int32)
         )
 
     @cached_property
     def rolling_rows(self) -> IntArray:
-        """(k,) the first of the two rows of each block that roll with a bound of their own, -1 where it has none."""
+        """First of the two rolling rows of each block (k,) with a bound of their own, -1 if it has none."""
         return read_only(np.where(self.kind == CONTACT_ROLLING, self.ptr[1:] - 2, -1).astype(np.int32))
 
     def parts(self) -> Iterator[tuple[int, IntArray]]:
-        """(block, rows of it that one bound holds together): tangents, then spin or second side, then what rolls."""
+        """Yield (block, rows) of each friction component: rows whose norm has one bound.
+
+        A contact has up to three: tangents, then spin or the second tangent of a box, then rolling.
+        """
         tangents, apart, rolling = self.n_together, self.apart_rows, self.rolling_rows
         for i in np.flatnonzero(self.kind != ROW).tolist():
             first = self.ptr[i] + 1
@@ -510,15 +536,25 @@ class Cones:
                 yield i, np.arange(rolling[i], rolling[i] + 2)
 
     def take(self, blocks: ArrayLike) -> Cones:
-        """Return these blocks, by number or by a mask, in this order; InputError at a number that no block has."""
+        """Return the selected blocks in the given order.
+
+        Parameters
+        ----------
+        blocks : int, sequence of int, or mask (k,)
+
+        Raises
+        ------
+        InputError
+            A block does not exist.
+        """
         try:
-            chosen = places(blocks, self.n_blocks, "block")
+            indices = resolve_index(blocks, self.n_blocks, "block")
         except IndexError as error:
             raise InputError(f"blocks: {error}") from None
-        return self._take_blocks(np.array(chosen if isinstance(chosen, list) else [chosen], np.int32))
+        return self._take_blocks(np.array(indices if isinstance(indices, list) else [indices], np.int32))
 
     def _take_blocks(self, blocks: IntArray) -> Cones:
-        """`take` of numbers that are known to be those of blocks."""
+        """Return the blocks with these indices, which are not checked."""
         size = np.diff(self.ptr)[blocks]
         ptr = np.concatenate([[0], np.cumsum(size)]).astype(np.int32)
         rows = np.arange(ptr[-1]) + np.repeat(self.ptr[:-1][blocks] - ptr[:-1], size)
@@ -533,19 +569,19 @@ class Cones:
         )
 
     def __add__(self, other: object) -> Cones:
-        """These blocks, then those of `other`."""
+        """Append the blocks of `other`."""
         if not isinstance(other, Cones):
             return NotImplemented
-        return Cones._joined((self, other))
+        return Cones._concatenate((self, other))
 
     def __radd__(self, other: object) -> Cones:
-        """What `sum` begins with is 0."""
+        """Support `sum`, which starts with 0."""
         return self if other == 0 else NotImplemented
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Cones):
             return NotImplemented
-        return all(map(equal, self._blocks.arrays, other._blocks.arrays))
+        return all(map(are_equal, self._blocks.arrays, other._blocks.arrays))
 
     __hash__ = None  # type: ignore[assignment]
 
@@ -555,48 +591,51 @@ class Cones:
 
 
 def kinds_of(
-    contact: Any, *, tangents: Any = 0, sides: Any = False, spin: Any = False, rolls: Any = False
+    is_contact: Any, *, tangents: Any = 0, box: Any = False, spin: Any = False, rolling: Any = False
 ) -> IntArray:
-    """The kind of each block (k,), by what it is: bounded rows where it is no contact.
+    """Return the kind of each block (k,); blocks that are not contacts are ROW.
 
     Parameters
     ----------
-    contact : (k,) bool
+    is_contact : (k,) bool
     tangents : int or (k,) int
-        In one cone; more than two make a round one.
-    sides, spin, rolls : bool or (k,) bool
-        Bounds each of two tangents by itself; has a spin row; has two that roll.
+        Number of tangents in one cone; more than two form a round cone.
+    box, spin, rolling : bool or (k,) bool
+        Whether each of two tangents has its own bound; whether the contact has a spin row; two rolling rows.
     """
     kind = np.where(np.asarray(spin), CONTACT_SPIN, np.where(np.asarray(tangents) > 2, ROUND, CONTACT))
-    kind = np.where(sides, CONTACT_BOX, np.where(rolls, CONTACT_ROLLING, kind))
-    return np.where(contact, kind, ROW).astype(np.int32)
+    kind = np.where(box, CONTACT_BOX, np.where(rolling, CONTACT_ROLLING, kind))
+    return np.where(is_contact, kind, ROW).astype(np.int32)
 
 
-def _fitting(kind: IntArray, size: IntArray) -> IntArray:
-    """The kinds, checked by their rows; a round cone of up to two tangents, or a box of one, is a contact."""
-    flat = ((kind == ROUND) & (size <= 3)) | ((kind == CONTACT_BOX) & (size <= 2))
-    if flat.any():
-        kind = np.where(flat, CONTACT, kind).astype(np.int32)
+def _check_kinds(kind: IntArray, size: IntArray) -> IntArray:
+    """Return the kinds of blocks after a check of their numbers of rows.
+
+    A round cone of up to two tangents, or a box of one, becomes a CONTACT.
+    """
+    is_disk = ((kind == ROUND) & (size <= 3)) | ((kind == CONTACT_BOX) & (size <= 2))
+    if is_disk.any():
+        kind = np.where(is_disk, CONTACT, kind).astype(np.int32)
         kind.flags.writeable = False
-    for known, (least, most, name, needed) in SIZES.items():
-        bad = np.flatnonzero((kind == known) & ((size < least) | (size > most)))
+    for contact_kind, (min_rows, max_rows, name, requirement) in CONTACT_ROWS.items():
+        bad = np.flatnonzero((kind == contact_kind) & ((size < min_rows) | (size > max_rows)))
         if len(bad):
-            raise InputError(f"block {bad[0]} is {name} of {size[bad[0]]} rows; {needed}")
+            raise InputError(f"block {bad[0]} is {name} of {size[bad[0]]} rows; {requirement}")
     return kind
 
 
 def project(cones: Cones, impulse: FloatArray) -> FloatArray:
-    """Nearest feasible normal and rows, then each part of a contact onto its reach times lambda_n; (m,) [N s].
+    """Project an impulse (m,) [N s] on the bounds, normal rows first.
 
-    This is the feasibility step of a sweep, not the projection onto the friction cone: the normal is
-    clipped first and keeps its value.
+    Bounded rows and normals are clipped. Then each friction component is projected radially on its coefficient times
+    the clipped normal impulse. This is the feasibility step of a sweep, not the projection on the friction cone.
     """
     if cones.has_ellipse:
         return cones.stretch * project(cones.disks, impulse / cones.stretch)
     out = np.clip(impulse, cones.lower, cones.upper)
-    reach = cones.reach
-    for i, rows in cones.parts():
-        bound, size = reach[rows[0]] * out[cones.ptr[i]], np.hypot.reduce(out[rows])
+    coefficient = cones.reach
+    for block, rows in cones.parts():
+        bound, size = coefficient[rows[0]] * out[cones.ptr[block]], np.hypot.reduce(out[rows])
         if len(rows) == 1:
             out[rows] = np.clip(out[rows], -bound, bound)
         elif size > bound:

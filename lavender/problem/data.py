@@ -1,4 +1,4 @@
-"""What a problem is given as: arrays checked once, sizes, names, equality."""
+"""Fields of a `Problem`: validation, sizes, names of blocks and rows, equality and pickling."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ import numpy as np
 from lavender.base.arrays import (
     ArrayLike,
     FloatArray,
+    are_equal,
     as_array,
     as_csr,
+    as_names,
+    check_choice,
     check_finite,
+    check_int,
     check_sizes,
     check_unmasked,
-    equal,
-    one_of,
+    format_html_table,
     read_only,
     shape_of,
-    table_of,
-    whole_number,
-    words_for,
 )
 from lavender.base.errors import InputError
 from lavender.base.lazy_import import issparse
@@ -36,44 +36,52 @@ from lavender_ext.core.problem import LAWS as FRICTION_NUMBER
 from lavender_ext.core.problem import general_data
 from lavender_ext.judge import measure
 
-FRICTION = tuple(FRICTION_NUMBER)
-# A solver that takes a law takes every law before it that it contains: linear < lcp < coulomb | cone.
+FRICTION_LAWS = tuple(FRICTION_NUMBER)
+# A solver that supports a law supports the laws that it contains: linear < lcp < coulomb | cone.
 LAWS = ("linear", "lcp", "coulomb", "cone")
-# How A is given.
+# Forms of A: rows of bodies, a matrix, or J and M in generalised coordinates.
 OPERATORS = ("rows", "matrix", "generalized")
-# In which the numbers of a problem were made, and answers to it are.
+# Precisions in which a problem's data were computed, and in which its solutions are computed.
 PRECISIONS = ("float64", "float32")
 
 
 class Names(Sequence[str]):
-    """Names of blocks that are made when they are first asked for; equal to a tuple of the same words."""
+    """Names of blocks that are created at their first use; equal to a tuple of the same names.
 
-    def __init__(self, count: int, make: Callable[[], Sequence[str]]) -> None:
-        self._count, self._make = count, make
+    Parameters
+    ----------
+    count : int
+        Number of names.
+    make_names : callable
+        Function that returns the names.
+    """
+
+    def __init__(self, count: int, make_names: Callable[[], Sequence[str]]) -> None:
+        self._count, self._make_names = count, make_names
 
     @cached_property
-    def _words(self) -> tuple[str, ...]:
-        return tuple(self._make())
+    def _names(self) -> tuple[str, ...]:
+        return tuple(self._make_names())
 
     def __len__(self) -> int:
         return self._count
 
     def __getitem__(self, i: Any) -> Any:
-        return self._words[i]
+        return self._names[i]
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, (Names, tuple)) and self._words == tuple(other)
+        return isinstance(other, (Names, tuple)) and self._names == tuple(other)
 
     def __hash__(self) -> int:
-        return hash(self._words)
+        return hash(self._names)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return tuple, (self._words,)
+        return tuple, (self._names,)
 
 
 @dataclass(frozen=True, eq=False)
 class ProblemData:
-    """The fields of a `Problem`, checked; what follows from them is worked out by the classes over this one."""
+    """Checked fields of a `Problem`; derived classes compute everything that follows from them."""
 
     b: FloatArray
     cones: Cones
@@ -91,7 +99,7 @@ class ProblemData:
     qp: Any = field(default=None, repr=False, compare=False)
     derived: Derived = field(init=False, repr=False)
 
-    if TYPE_CHECKING:  # what may be given; fields are arrays
+    if TYPE_CHECKING:  # The parameters accept more types than the fields have.
 
         def __init__(
             self, b: ArrayLike, cones: Cones, matrix: Any = ..., rows: Rows | None = ..., friction: str = ...,
@@ -112,10 +120,10 @@ class ProblemData:
         _check_rhs(self.b)
         if (self.matrix is None) + (self.rows is None) + (self.generalized is None) != 2:
             raise InputError("give matrix=, rows= or generalized=, one of them")
-        put(self, "friction", one_of("friction", self.friction, FRICTION))
+        put(self, "friction", check_choice("friction", self.friction, FRICTION_LAWS))
         if self.precision is None or (isinstance(self.precision, str) and not self.precision):
             put(self, "precision", getattr(self.rows, "precision", "float64"))
-        put(self, "precision", one_of("precision", self.precision, PRECISIONS))
+        put(self, "precision", check_choice("precision", self.precision, PRECISIONS))
         if self.friction != "cone" and self.cones.has_round:
             raise InputError(
                 "a round cone of more than two tangents has no Coulomb law here: give friction='cone'"
@@ -125,8 +133,10 @@ class ProblemData:
         elif self.generalized is not None:
             self._check_generalized(self.generalized, m)
         else:
-            put(self, "matrix", checked_matrix(self.matrix, m, self.copy))
-            if issparse(self.matrix):  # checked arrays; those of the object anybody may exchange
+            put(self, "matrix", check_matrix(self.matrix, m, self.copy))
+            if issparse(
+                self.matrix
+            ):  # the checked arrays, because callers can replace those of the matrix object
                 put(self, "_compressed", (self.matrix.indptr, self.matrix.indices, self.matrix.data))
             if self.compliance is not None:
                 raise InputError("compliance goes with rows; in a matrix it is already on the diagonal of A")
@@ -148,18 +158,24 @@ class ProblemData:
                 )
             put(self, "key", read_only(key.astype(np.uint64)))
         if self.names is not None and not (isinstance(self.names, Names) and len(self.names) == k):
-            put(self, "names", words_for("blocks", self.names, k))
+            put(self, "names", as_names("blocks", self.names, k))
         put(self, "name", str(self.name))
-        put(self, "copy", True)  # of what was given here: another problem made of this one says so itself
+        put(
+            self, "copy", True
+        )  # `copy` applies to this call only: a problem derived from this one copies by default
 
-    def _aim(self, b: FloatArray) -> None:
-        """Take b (m,) [m/s] where the zeros stood with which it was made, before anybody else has seen the problem."""
+    def _set_rhs(self, b: FloatArray) -> None:
+        """Replace the zeros of a new problem's right-hand side by b (m,) [m/s].
+
+        Allowed only before other code has access to the problem.
+        """
         self.b.setflags(write=True)
         self.b[:] = b
         as_array("b", self.b, (self.m,), unit="m/s", copy=False)
         _check_rhs(self.b)
 
     def _check_rows(self, rows: Rows, m: int, k: int) -> None:
+        """Raise InputError if the rows do not fit the cones of k blocks with m rows, or the compliance is invalid."""
         if not isinstance(rows, Rows):
             raise InputError(f"rows is a {type(rows).__name__}; a Rows is needed")
         self._check_compliance(m)
@@ -176,6 +192,7 @@ class ProblemData:
             raise InputError("cones.ptr and rows.joint_ptr disagree about the rows of the joints")
 
     def _check_generalized(self, generalized: Generalized, m: int) -> None:
+        """Raise InputError if J does not have m rows, or the compliance is invalid; set the view for kernels."""
         if not isinstance(generalized, Generalized):
             raise InputError(f"generalized is a {type(generalized).__name__}; a Generalized is needed")
         if generalized.m != m:
@@ -186,6 +203,7 @@ class ProblemData:
         )
 
     def _check_compliance(self, m: int) -> None:
+        """Convert the compliance to a checked array (m,) [1/kg]; the default is 0."""
         put = object.__setattr__
         if self.compliance is None:
             put(self, "compliance", read_only(np.zeros(m)))
@@ -202,7 +220,7 @@ class ProblemData:
 
     @property
     def operator(self) -> str:
-        """How A is given, of OPERATORS: "rows", "matrix" or "generalized"."""
+        """Form of A: "rows", "matrix" or "generalized" (see `OPERATORS`)."""
         return "rows" if self.rows is not None else "matrix" if self.generalized is None else "generalized"
 
     @property
@@ -217,68 +235,68 @@ class ProblemData:
 
     @cached_property
     def law(self) -> str:
-        """Problem class, from what the blocks hold: "linear", "lcp", "coulomb" or "cone"."""
+        """Problem class, determined by the blocks: "linear", "lcp", "coulomb" or "cone"."""
         if self.cones.is_free:
             return "linear"
         return "lcp" if self.cones.is_bounded_rows else self.friction
 
     def impulse_array(self, impulse: ArrayLike, name: str = "impulse") -> FloatArray:
-        """A writable private copy of `impulse`, checked: (m,) [N s], finite."""
+        """Return a writable copy of `impulse` (m,) [N s]; raise InputError if it has a wrong shape or is not finite."""
         if type(impulse) is np.ndarray and impulse.dtype == np.float64 and impulse.shape == self.b.shape:
-            own = impulse.copy()
-            if measure.all_finite(own):
-                return own
-        own = as_array(name, impulse, (self.m,), finite=False, unit="N s")
-        check_finite(f"{name} [N s]", own)
-        return own.copy()
+            copied = impulse.copy()
+            if measure.all_finite(copied):
+                return copied
+        array = as_array(name, impulse, (self.m,), finite=False, unit="N s")
+        check_finite(f"{name} [N s]", array)
+        return array.copy()
 
     # -- names -----------------------------------------------------------------------------------
 
     def block_of(self, row: int) -> int:
-        """Block that holds a row.
+        """Return the block of a row.
 
         Raises
         ------
         InputError
-            No such row.
+            The problem has no such row.
         """
-        row = whole_number("row", row, high=self.m - 1)
+        row = check_int("row", row, high=self.m - 1)
         return int(np.searchsorted(self.cones.ptr, row, side="right")) - 1
 
     def block_name(self, block: int) -> str:
-        """Name of a block, e.g. "hinge 7" or "contact 3".
+        """Return the name of a block, e.g. "hinge 7" or "contact 3".
 
         Raises
         ------
         InputError
-            No such block.
+            The problem has no such block.
         """
-        block = whole_number("block", block, high=self.n_blocks - 1)
+        block = check_int("block", block, high=self.n_blocks - 1)
         return (
             self.names[block] if self.names else self.row_name(int(self.cones.ptr[block])).rsplit(", ", 1)[0]
         )
 
     def row_name(self, row: int) -> str:
-        """Name of a row, e.g. "hinge 7, axis 2" or "contact 3, tangent 1".
+        """Return the name of a row, e.g. "hinge 7, axis 2" or "contact 3, tangent 1".
 
         Raises
         ------
         InputError
-            No such row.
+            The problem has no such row.
         """
-        i = self.block_of(row)
-        offset, size = row - int(self.cones.ptr[i]), int(np.diff(self.cones.ptr)[i])
-        spin, roll = self.cones.spin_rows[i], self.cones.rolling_rows[i]
-        if not self.cones.is_contact[i]:
-            name = self.names[i] if self.names else f"row {row}" if size == 1 else f"joint {i}"
+        block = self.block_of(row)
+        offset, size = row - int(self.cones.ptr[block]), int(np.diff(self.cones.ptr)[block])
+        spin, roll = self.cones.spin_rows[block], self.cones.rolling_rows[block]
+        if not self.cones.is_contact[block]:
+            name = self.names[block] if self.names else f"row {row}" if size == 1 else f"joint {block}"
             return name if size == 1 else f"{name}, axis {offset}"
         first_contact = 0 if self.rows is None else self.rows.n_joints
         if self.generalized is not None:
-            first_contact = i - int(np.count_nonzero(self.cones.is_contact[:i]))
-        name = self.names[i] if self.names else f"contact {i - first_contact}"
+            first_contact = block - int(np.count_nonzero(self.cones.is_contact[:block]))
+        name = self.names[block] if self.names else f"contact {block - first_contact}"
         if offset == 0:
             return f"{name}, normal"
-        if self.cones.n_together[i] > 2 and offset > 2:
+        if self.cones.n_together[block] > 2 and offset > 2:
             return f"{name}, spin" if offset == 3 else f"{name}, roll {offset - 3}"
         if 0 <= roll <= row:
             return f"{name}, roll {row - roll + 1}"
@@ -287,31 +305,31 @@ class ProblemData:
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, ProblemData):
             return NotImplemented
-        given = (f.name for f in fields(self) if f.init and f.compare and f.name not in ("matrix", "copy"))
-        if not all(equal(getattr(self, name), getattr(other, name)) for name in given):
+        compared = (f.name for f in fields(self) if f.init and f.compare and f.name not in ("matrix", "copy"))
+        if not all(are_equal(getattr(self, name), getattr(other, name)) for name in compared):
             return False
         if issparse(self.matrix) and issparse(other.matrix):
             return all(
-                equal(getattr(self.matrix, n), getattr(other.matrix, n))
+                are_equal(getattr(self.matrix, n), getattr(other.matrix, n))
                 for n in ("indptr", "indices", "data")
             )
-        return type(self.matrix) is type(other.matrix) and equal(self.matrix, other.matrix)
+        return type(self.matrix) is type(other.matrix) and are_equal(self.matrix, other.matrix)
 
     __hash__ = None  # type: ignore[assignment]
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # Copies and pickles hold what was given; derived numbers are made anew, arrays stay read-only.
+        # Copies and pickles hold the fields only: derived values are computed again, and arrays stay read-only.
         return type(self), tuple(f.name != "copy" and getattr(self, f.name) for f in fields(self) if f.init)
 
     def __repr__(self) -> str:
         kind = self.operator if self.matrix is None else "CSR" if issparse(self.matrix) else "dense"
         name = f"{self.name!r}, " if self.name else ""
         return (
-            f"<Problem {name}{self.law}, {_many(self.m, 'row')} in {_many(self.n_blocks, 'block')}, {kind}>"
+            f"<Problem {name}{self.law}, {_count(self.m, 'row')} in {_count(self.n_blocks, 'block')}, {kind}>"
         )
 
     def _repr_html_(self) -> str:
-        """For notebooks: what it is, as a small table."""
+        """Return a small HTML table of the problem for notebooks."""
         contacts = int(np.count_nonzero(self.cones.is_contact))
         facts = {
             "law": self.law,
@@ -320,36 +338,38 @@ class ProblemData:
             "other blocks": self.n_blocks - contacts,
             "given by": repr(self).rpartition(", ")[2].rstrip(">"),
         }
-        return table_of(facts, self.name or "Problem")
+        return format_html_table(facts, self.name or "Problem")
 
 
 def _check_rhs(b: FloatArray) -> None:
-    top = largest(b)
-    if 0.0 < top < LEAST:
+    """Raise InputError if the largest |b_i| [m/s] is not 0 but below LEAST."""
+    max_abs = largest(b)
+    if 0.0 < max_abs < LEAST:
         raise InputError(
-            f"b [m/s] is {top:g} at most, at [{int(np.argmax(np.abs(b)))}]; its largest must be 0 or at least "
+            f"b [m/s] is {max_abs:g} at most, at [{int(np.argmax(np.abs(b)))}]; its largest must be 0 or at least "
             f"{LEAST:g}: another unit of length or time brings it nearer to 1"
         )
 
 
-ProblemData.__init__.__qualname__ = "Problem.__init__"  # a TypeError then names the class that users call
+ProblemData.__init__.__qualname__ = "Problem.__init__"  # A TypeError then names the class that users call.
 
 
 def check_problem(problem: Any) -> None:
-    """Raise where what stands for a problem is none."""
+    """Raise InputError unless `problem` is a `Problem`."""
     if not isinstance(problem, ProblemData):
-        way = "make one by Problem.lcp(A, b), linear, contact, from_rows or from_jacobian"
-        if isinstance(getattr(problem, "problem", None), ProblemData):  # of a case, a file that was read
-            way = "give its .problem"
-        raise InputError(f"problem is a {type(problem).__name__}; a lavender.Problem is needed: {way}")
+        advice = "make one by Problem.lcp(A, b), linear, contact, from_rows or from_jacobian"
+        if isinstance(getattr(problem, "problem", None), ProblemData):  # a case, or a file that was read
+            advice = "give its .problem"
+        raise InputError(f"problem is a {type(problem).__name__}; a lavender.Problem is needed: {advice}")
 
 
-def _many(n: int, what: str) -> str:
-    return f"{n} {what}" if n == 1 else f"{n} {what}s"
+def _count(n: int, noun: str) -> str:
+    """Format a number with its noun: 1 row, 2 rows."""
+    return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
 
 
-def checked_matrix(matrix: Any, m: int, copy: bool) -> Any:
-    """A dense (m, m) array or canonical CSR of float64, read-only, every entry finite."""
+def check_matrix(matrix: Any, m: int, copy: bool) -> Any:
+    """Convert A to a read-only dense (m, m) array or canonical CSR matrix of float64, with finite entries only."""
     if not issparse(matrix):
         return as_array("A", matrix, (m, m), unit="1/kg", copy=copy)
     if matrix.shape != (m, m):

@@ -15,42 +15,51 @@ T = TypeVar("T")
 
 
 class Derived:
-    """Hold what is computed from a problem's data; copies of a problem do not share it.
+    """Values computed from a problem's data; copies of a problem do not share them.
 
-    Every entry is written whole and read once, so a thread that shares the problem sees a complete value or none; two
-    threads that find none compute the same bits.
+    Every entry is written complete by one assignment, so another thread reads a complete value or None. Two threads
+    that read None compute identical bits.
+
+    Attributes
+    ----------
+    lock : RLock
+        Held while a `once` property is computed in the process `process`.
+    view : Data or None
+        Arrays that kernels read in generalised coordinates, set with the problem.
+    start : (m,) or None, N s
+        The zero impulse clipped to the bounds.
+    cache : dict
+        Values of other modules; each key begins with the name of its module.
     """
 
     __slots__ = ("cache", "lock", "process", "start", "view")
 
     def __init__(self) -> None:
-        self.lock, self.process = RLock(), _process  # held while a `once` is computed in this process
-        self.view: Data | None = (
-            None  # arrays that kernels read in generalised coordinates, set with the problem
-        )
-        self.start: FloatArray | None = None  # (m,) N s, the zero impulse clipped to the bounds
-        self.cache: dict[
-            str, Any
-        ] = {}  # values of other modules; the key begins with the owner's module name
+        self.lock, self.process = RLock(), _process
+        self.view: Data | None = None
+        self.start: FloatArray | None = None
+        self.cache: dict[str, Any] = {}
 
 
-_process = object()  # another one in a fork's child, where no thread is left to give a lock back
+# Identity of this process. A forked process gets another one: the threads that hold locks do not exist in it.
+_process = object()
 
 
-def _forked() -> None:
+def _replace_process() -> None:
     global _process
     _process = object()
 
 
 if hasattr(os, "register_at_fork"):  # not on Windows
-    os.register_at_fork(after_in_child=_forked)
+    os.register_at_fork(after_in_child=_replace_process)
 
 
 class cached_property(Generic[T]):
-    """A property of an object, worked out at first use, then an attribute; two threads may do so, to the same bits.
+    """A property that is computed at its first use and then stored as an attribute of the object.
 
-    That of functools holds one lock for all objects before Python 3.12: threads wait for what others work out of
-    other problems, and a process that is forked meanwhile waits for ever.
+    Two threads may compute it at the same time, with identical bits. `functools.cached_property` holds one lock for all
+    objects before Python 3.12: threads wait for the properties of other problems, and a process that is forked
+    meanwhile waits forever.
     """
 
     def __init__(self, function: Callable[[Any], T]) -> None:
@@ -65,22 +74,23 @@ class cached_property(Generic[T]):
     def __get__(self, instance: object, owner: type) -> T: ...
 
     def __get__(self, instance: Any, owner: type) -> Any:
-        return self if instance is None else self._worked_out(instance)
+        return self if instance is None else self._compute(instance)
 
-    def _worked_out(self, instance: Any) -> T:
-        found: T = instance.__dict__.setdefault(self.name, self.function(instance))
-        return found
+    def _compute(self, instance: Any) -> T:
+        value: T = instance.__dict__.setdefault(self.name, self.function(instance))
+        return value
 
 
 class once(cached_property[T]):
-    """The same of an object with `derived`, worked out by one thread while the others wait."""
+    """A `cached_property` of an object with `derived`, which one thread computes while others wait."""
 
-    def _worked_out(self, instance: Any) -> T:
-        kept, derived = instance.__dict__, instance.derived
+    def _compute(self, instance: Any) -> T:
+        """Compute the property under the lock of the object, unless another thread has done so."""
+        attributes, derived = instance.__dict__, instance.derived
         if derived.process is not _process:
             derived.lock, derived.process = RLock(), _process
         with derived.lock:
-            if self.name not in kept:
-                kept[self.name] = self.function(instance)
-            found: T = kept[self.name]
-            return found
+            if self.name not in attributes:
+                attributes[self.name] = self.function(instance)
+            value: T = attributes[self.name]
+            return value

@@ -1,4 +1,4 @@
-"""What follows from a problem's data, worked out at first use and kept: A, J, the metric, velocities."""
+"""Quantities derived from a problem's data at their first use: A, J, the judge's metric, velocities."""
 
 from __future__ import annotations
 
@@ -20,56 +20,62 @@ from lavender_ext.core.problem import Data, general_data, zero_impulse
 from lavender_ext.factor import sparse
 from lavender_ext.judge import measure
 
-# A matrix counts as positive semidefinite where A + SHIFT D has a Cholesky factor, D = diag(d): entries that were
-# rounded leave negative eigenvalues of about m 2^-53.
-SHIFT = 1e-12
-USUAL = 1e15  # of J and M^-1: sums of their products stay below MOST
-MOST_ENTRIES = 2**31  # of A, from which on 32-bit indices do not reach them
+# A matrix counts as positive semidefinite if A + SEMIDEFINITE_SHIFT D has a Cholesky factor, D = diag(d). Rounding of
+# the entries causes negative eigenvalues of about -m 2^-53 in the metric of D.
+SEMIDEFINITE_SHIFT = 1e-12
+MAX_SAFE_ENTRY = (
+    1e15  # If entries of J and M^-1 are at most this, A_ii cannot exceed MOST and is not checked.
+)
+MAX_INDEXABLE_ENTRIES = 2**31  # A with this many entries or more is not formed: its indices have 32 bits.
 
 
 class Operators(ProblemData):
-    """A, J and what kernels and the judge read, of the problem's data."""
+    """A, J, and the arrays that kernels and the judge read, derived from the fields of a problem."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.matrix is None and self._is_extreme():
-            self.metric  # noqa: B018 - refused here, and not in a solve
+        if self.matrix is None and self._has_large_entries():
+            self.metric  # noqa: B018 - raises the error now, not in a solve
 
     @classmethod
-    def _of_engine(cls, **given: Any) -> Any:
-        """From read-only arrays that `export.numbers` has let in, over J and M; nothing is beyond USUAL: adopted."""
-        made, derived = object.__new__(cls), Derived()
-        given["derived"], given["precision"], given["copy"] = derived, "float64", True
-        derived.view = general_data(
-            given["cones"]._blocks, given["b"], given["generalized"].operator, given["compliance"],
-            FRICTION_NUMBER[given["friction"]],
-        )  # fmt: skip
-        object.__setattr__(made, "__dict__", given)
-        return made
+    def _from_engine_arrays(cls, **fields: Any) -> Any:
+        """Build a problem over J and M from fields that `export.numbers` has checked, without copies.
 
-    def _is_extreme(self) -> bool:
-        """Whether A_ii may be beyond MOST: numbers of J and M^-1 so large that A_ii must be formed to know."""
-        if self.compliance is not None and largest(self.compliance) > USUAL:
+        The arrays are read-only, and no entry of J and M^-1 exceeds `MAX_SAFE_ENTRY`.
+        """
+        problem, derived = object.__new__(cls), Derived()
+        fields["derived"], fields["precision"], fields["copy"] = derived, "float64", True
+        derived.view = general_data(
+            fields["cones"]._blocks, fields["b"], fields["generalized"].operator, fields["compliance"],
+            FRICTION_NUMBER[fields["friction"]],
+        )  # fmt: skip
+        object.__setattr__(problem, "__dict__", fields)
+        return problem
+
+    def _has_large_entries(self) -> bool:
+        """Return whether entries of J and M^-1 are so large that A_ii may exceed MOST."""
+        if self.compliance is not None and largest(self.compliance) > MAX_SAFE_ENTRY:
             return True
         if self.generalized is not None:
-            return bool(self.generalized.operator.is_beyond(USUAL))
+            return bool(self.generalized.operator.is_beyond(MAX_SAFE_ENTRY))
         r = self.rows
         return r is not None and any(
-            largest(x.reshape(-1)) > USUAL for x in (r.jac, r.arm_a, r.arm_b, r.inv_mass, r.inv_inertia)
+            largest(x.reshape(-1)) > MAX_SAFE_ENTRY
+            for x in (r.jac, r.arm_a, r.arm_b, r.inv_mass, r.inv_inertia)
         )
 
     @property
     def asymmetry(self) -> float:
-        """max |A - A^T| / max |A|; exactly 0 with J and M.
+        """Asymmetry max |A - A^T| / max |A| [-]; exactly 0 with J and M.
 
-        Where that is rounding (1e-14), and |A_ij - A_ji| / sqrt(d_i d_j) is none, more than 1e-10, its largest: beside
-        light bodies entries of heavy ones are small.
+        If this is rounding (at most 1e-14), but the maximum of |A_ij - A_ji| / sqrt(d_i d_j) is not (above 1e-10), the
+        value is that maximum: entries of heavy bodies are small compared with entries of light bodies.
         """
         return 0.0 if self.matrix is None else self._scan[2]
 
     @cached_property
     def bandwidth(self) -> tuple[int, int]:
-        """Lower and upper half bandwidth of A: the largest i - j and j - i of a stored entry."""
+        """Lower and upper half bandwidth of A: the maximum of i - j and of j - i over the stored entries."""
         if self.rows is None:
             return self._scan[:2]
         return sparse.bandwidth(*self._compressed[:2])
@@ -80,27 +86,27 @@ class Operators(ProblemData):
 
     @property
     def is_symmetric(self) -> bool:
-        """A = A^T up to rounding of its entries (1e-14 of the largest, and 1e-10 of sqrt(d_i d_j))."""
+        """Whether A = A^T up to rounding of its entries (1e-14 of the largest, and 1e-10 of sqrt(d_i d_j))."""
         return self.asymmetry <= 1e-14
 
     @cached_property
     def is_semidefinite(self) -> bool:
-        """A is symmetric and x.A x >= 0 for every x, to rounding; always with J and M."""
+        """Whether A is symmetric and x.A x >= 0 for every x, up to rounding; always True with J and M."""
         if self.matrix is None:
             return True
         if not self.is_symmetric:
             return False
-        with np.errstate(all="ignore"):  # what overflows warns nobody
+        with np.errstate(all="ignore"):  # no warning on overflow
             scale = sp.diags_array(1.0 / np.sqrt(self.d))
-            return semidefinite(scale @ self.csr @ scale)
+            return has_shifted_cholesky(scale @ self.csr @ scale)
 
     @once
     def data(self) -> Data:
-        """What kernels that sweep read: pointers, d, nu, steps. Of the rows where there are rows, else of A."""
+        """Arrays for sweep kernels: pointers, d, nu, steps, and the rows of bodies, or A if there are no rows."""
         if self.rows is None:
             return self.csr_data
         r = self.rows
-        made = self._data(
+        data = self._make_data(
             rows=(
                 r.jac,
                 r.joint_body,
@@ -114,13 +120,13 @@ class Operators(ProblemData):
                 self.compliance,
             )
         )
-        self._check_diagonal(made)
-        return made
+        self._check_diagonal(data)
+        return data
 
     @once
     def csr_data(self) -> Data:
-        """The same over A in compressed rows; forms A where J and M are given."""
-        data = self._data(csr=self._compressed)
+        """Arrays for sweep kernels over A in compressed rows; A is formed if J and M are given."""
+        data = self._make_data(csr=self._compressed)
         if self.rows is not None:
             data.weigh_as(self.metric)
         if self.generalized is not None and self.metric.reference_energy >= 0.0:
@@ -129,7 +135,7 @@ class Operators(ProblemData):
 
     @once
     def metric(self) -> Data:
-        """What the judge reads: `data`, or in generalised coordinates J and M as they are, d, Y = J L^-1 D^-1/2."""
+        """Arrays for the judge: `data`, or in generalised coordinates J, M, d and Y = J L^-1 D^-1/2."""
         view = self.derived.view
         if view is None:
             return self.data
@@ -141,6 +147,7 @@ class Operators(ProblemData):
         return view
 
     def _check_diagonal(self, data: Data) -> None:
+        """Raise InputError if an entry of A's diagonal exceeds MOST."""
         i = data.outside
         if i >= 0:
             raise InputError(
@@ -148,58 +155,64 @@ class Operators(ProblemData):
                 f"{MOST:g} is needed: another unit of mass, or of the row's velocity, brings it nearer to 1"
             )
 
-    def _data(self, **operator: Any) -> Data:
+    def _make_data(self, **operator: Any) -> Data:
         return Data(self.cones._blocks, self.b, FRICTION_NUMBER[self.friction], **operator)
 
     @once
     def csr(self) -> sp.csr_array:
-        """A in compressed rows (m, m), int32 indices, read-only."""
+        """A (m, m) in compressed rows with int32 indices, read-only."""
         if issparse(self.matrix):
             return self.matrix
         indptr, indices, data = self._compressed
         return sp.csr_array((data, indices, indptr), shape=(self.m, self.m))
 
     @once
-    def _meetings(self) -> float:
-        # Rows of bodies that meet, those that share both twice; counted once, as time limits ask it of every candidate.
+    def _n_couplings(self) -> float:
+        """Number of pairs of rows that share a body; pairs that share both bodies count twice.
+
+        It is stored because the estimated time of every solver depends on it.
+        """
         return float(assemble.bound(self.data)[0]) if self.rows is not None else 0.0
 
     @property
-    def most_entries(self) -> float:
-        """Entries that A has, or can have at most where it is not formed."""
+    def max_entries(self) -> float:
+        """Number of entries of A, or an upper bound if A is not formed."""
         if self.matrix is not None or "_compressed" in self.__dict__:
             return float(len(self._compressed[1]))
-        most = self._meetings if self.rows is not None else self.metric.entries_of_a
-        return min(float(most), float(self.m) ** 2)
+        bound = self._n_couplings if self.rows is not None else self.metric.entries_of_a
+        return min(float(bound), float(self.m) ** 2)
 
     @once
     def _compressed(self) -> tuple[IntArray, IntArray, FloatArray]:
-        # (indptr, indices, data) of A. Kernels and the judge read these: `csr` is an object whose arrays whoever
-        # has it may exchange.
+        """Arrays (indptr, indices, data) of A for kernels and the judge.
+
+        They are stored separately because callers can replace the arrays of the matrix object `csr`.
+        """
         if self.generalized is not None:
-            return self._product()
+            return self._form_generalized()
         if self.rows is not None:
-            most, start, blocks = assemble.bound(self.data)
-            most = min(most, self.m**2)  # blocks that share both bodies count twice
-            if most >= MOST_ENTRIES:
+            bound, start, blocks = assemble.bound(self.data)
+            bound = min(bound, self.m**2)  # Blocks that share both bodies count twice.
+            if bound >= MAX_INDEXABLE_ENTRIES:
                 raise TooLarge(
-                    f"A would have up to {most} entries, more than 32-bit indices reach: "
+                    f"A would have up to {bound} entries, more than 32-bit indices reach: "
                     "use a solver that reads rows"
                 )
-            indptr, indices, data = assemble.delassus(self.data, most, start, blocks)
+            indptr, indices, data = assemble.delassus(self.data, bound, start, blocks)
             return read_only(indptr), read_only(indices), read_only(data)
         return dense_to_csr(self.matrix)
 
-    def _product(self) -> tuple[IntArray, IntArray, FloatArray]:
-        # A = Y Y^T + diag(compliance): symmetric to the bit, as both triangles are summed in the same order.
-        most = min(self.metric.entries_of_a + self.m, self.m**2)  # rows of no velocity have their compliance
-        if most >= MOST_ENTRIES:
+    def _form_generalized(self) -> tuple[IntArray, IntArray, FloatArray]:
+        """Form A = Y Y^T + diag(compliance), bitwise symmetric: both triangles are summed in the same order."""
+        # Rows of J without entries have a diagonal entry: their compliance.
+        bound = min(self.metric.entries_of_a + self.m, self.m**2)
+        if bound >= MAX_INDEXABLE_ENTRIES:
             raise TooLarge(
-                f"A would have up to {most:.3g} entries, more than 32-bit indices reach: use a solver that takes "
+                f"A would have up to {bound:.3g} entries, more than 32-bit indices reach: use a solver that takes "
                 "J and M as they are (operator 'generalized')"
             )
         assert self.generalized is not None
-        y = self.metric.whitened()  # without SciPy, which a first solve under a limit has no time to load
+        y = self.metric.whitened()  # without SciPy: a first solve with a time limit has no time to import it
         indptr, indices, data = assemble.gram(*y, self.generalized.nv, self.compliance)
         return read_only(indptr), read_only(indices), read_only(data)
 
@@ -210,7 +223,7 @@ class Operators(ProblemData):
         Raises
         ------
         CapabilityError
-            The problem was given otherwise.
+            The problem is not in generalised coordinates.
         """
         if self.generalized is None:
             raise CapabilityError(
@@ -221,7 +234,7 @@ class Operators(ProblemData):
 
     @once
     def jacobian(self) -> sp.csr_array:
-        """J as CSR, read-only: (m, 6 n) with rows, (m, nv) in generalised coordinates.
+        """J as a read-only CSR matrix: (m, 6 n) with rows, (m, nv) in generalised coordinates.
 
         Raises
         ------
@@ -239,17 +252,19 @@ class Operators(ProblemData):
 
     @property
     def d(self) -> FloatArray:
-        """(m,) 1/kg: diagonal of A with fallbacks, the judge's metric."""
+        """Metric of the judge (m,) [1/kg]: the diagonal of A, with replacements for entries that are not positive."""
         return self.metric.d
 
     @once
     def vanished_rows(self) -> IntArray:
-        """Rows with A_ii = 0 only because products of small numbers vanish: J_i has an entry where M^-1 has one."""
+        """Rows with A_ii = 0 by underflow only: J_i M^-1 J_i^T has products of nonzero entries."""
         empty: IntArray = self.metric.empty
         if not len(empty):
             return empty
         if self.generalized is not None:
-            pattern = self.generalized.jac[empty]  # M is positive definite
+            pattern = self.generalized.jac[
+                empty
+            ]  # M is positive definite, so every nonzero row of J has A_ii > 0.
         elif self.rows is not None:
             inverse = self.rows.inverse_mass_matrix().astype(bool).astype(float)
             pattern = self.rows.jacobian(self.cones)[empty].astype(bool).astype(float) @ inverse
@@ -259,21 +274,23 @@ class Operators(ProblemData):
         return empty[np.diff(pattern.indptr) > 0]
 
     def delassus(self) -> Any:
-        """A (m, m) [1/kg]: the matrix as given, or J M^-1 J^T + diag(compliance) as CSR."""
+        """Return A (m, m) [1/kg]: the matrix of the problem, or J M^-1 J^T + diag(compliance) as CSR."""
         return self.csr if self.matrix is None else self.matrix
 
     def dense(self) -> FloatArray:
-        """A (m, m) [1/kg] as a new dense array."""
+        """Return A (m, m) [1/kg] as a new dense array."""
         return self.matrix.copy() if isinstance(self.matrix, np.ndarray) else self.csr.toarray()
 
     def slack(self, impulse: ArrayLike) -> FloatArray:
-        """w = A lambda - b (m,) [m/s], recomputed from the problem's data."""
+        """Compute w = A lambda - b (m,) [m/s] from the problem's data, for `impulse` (m,) [N s]."""
         w = np.empty(self.m)
         measure.slack(self.metric, self.impulse_array(impulse), w)
         return w
 
     def velocity(self, impulse: ArrayLike) -> FloatArray:
-        """v+ = v* + M^-1 J^T lambda [m/s, rad/s]: (n, 6) with rows, (nv,) in generalised coordinates.
+        """Compute v+ = v* + M^-1 J^T lambda [m/s, rad/s] for `impulse` (m,) [N s].
+
+        Its shape is (n, 6) with rows, (nv,) in generalised coordinates.
 
         Raises
         ------
@@ -292,25 +309,27 @@ class Operators(ProblemData):
         return self.rows.v_free + v
 
     def start(self) -> FloatArray:
-        """Pi(0) (m,) [N s]: doing nothing, clipped to the bounds; a new array."""
+        """Return Pi(0) (m,) [N s], the zero impulse clipped to the bounds, as a new array."""
         return self._start.copy()
 
     @property
     def _start(self) -> FloatArray:
-        kept = self.derived
-        if kept.start is None:
-            kept.start = zero_impulse(self.cones.lower, self.cones.upper)
-        return kept.start
+        """Pi(0) (m,) [N s], shared."""
+        derived = self.derived
+        if derived.start is None:
+            derived.start = zero_impulse(self.cones.lower, self.cones.upper)
+        return derived.start
 
 
 def _read_only(matrix: sp.csr_array) -> sp.csr_array:
-    for part in (matrix.data, matrix.indices, matrix.indptr):
-        read_only(part)
+    """Mark the arrays of a matrix read-only, and return it."""
+    for array in (matrix.data, matrix.indices, matrix.indptr):
+        read_only(array)
     return matrix
 
 
-def semidefinite(a: Any) -> bool:
-    """Return whether a sparse symmetric matrix of unit diagonal, plus SHIFT, has a Cholesky factor.
+def has_shifted_cholesky(a: Any) -> bool:
+    """Return whether A + SEMIDEFINITE_SHIFT I has a Cholesky factor, for a sparse symmetric A of unit diagonal.
 
     Raises
     ------
@@ -320,23 +339,28 @@ def semidefinite(a: Any) -> bool:
     n = a.shape[0]
     if n <= 400:
         try:
-            np.linalg.cholesky((a + SHIFT * sp.eye_array(n)).toarray())
+            np.linalg.cholesky((a + SEMIDEFINITE_SHIFT * sp.eye_array(n)).toarray())
         except np.linalg.LinAlgError:
             return False
         return True
-    panels, values = panels_of(a)
-    return bool(panels.factor(values, np.ones(n), SHIFT, 0.0) == 0)
+    panels, values = analyze_panels(a)
+    return bool(panels.factor(values, np.ones(n), SEMIDEFINITE_SHIFT, 0.0) == 0)
 
 
-def panels_of(a: Any) -> tuple[sparse.SparsePanels, FloatArray]:
-    """Analyse a sparse symmetric matrix with a full diagonal: what factors it as L L^T, and its entries.
+def analyze_panels(a: Any) -> tuple[sparse.SparsePanels, FloatArray]:
+    """Analyse a sparse symmetric matrix with a full diagonal for a supernodal factorisation L L^T.
+
+    Returns
+    -------
+    panels, values
+        The symbolic factorisation, and the entries that its `factor` needs.
 
     Raises
     ------
     TooLarge
         The factor would have 2^31 entries or more.
     """
-    a = sp.csr_array(0.5 * (a + a.T))  # entries that differ by rounding, and a symmetric pattern
+    a = sp.csr_array(0.5 * (a + a.T))  # makes pattern and rounded entries symmetric
     a.sort_indices()
     try:
         panels = sparse.SparsePanels(a.indptr.astype(np.int32), a.indices.astype(np.int32), False)

@@ -1,12 +1,12 @@
 """Sweep orders of blocks, by name, with their levels and colours.
 
-    given       as they stand                    bottom_up   by level from the ground, breadth first
-    reverse     backwards                        top_down    the levels backwards
-    symmetric   given, then reverse, in turn     colored     colour by colour, none sharing a moving body
-    random      shuffled before every sweep      local       blocks of near bodies near in the sweep
-                                                 an int array: that permutation of blocks
+    given       order of the problem             bottom_up   by level from the ground, breadth first
+    reverse     reversed                         top_down    levels in reverse
+    symmetric   given and reverse alternate      colored     colour by colour; blocks of a colour share no moving body
+    random      shuffled before every sweep      local       blocks of neighbouring bodies close together
+                                                 an int array: this permutation of blocks
 
-On a problem with rows, joints stay before contacts under every name.
+On a problem with rows, every named order has joints before contacts.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from lavender.base.arrays import IntArray, as_array, whole_number
+from lavender.base.arrays import IntArray, as_array, check_int
 from lavender.base.errors import CapabilityError, InputError, UnknownName
 from lavender.base.lazy_import import sparse as sp
 from lavender.problem import Problem
@@ -31,45 +31,66 @@ from lavender_ext.core.order import (
 )
 from lavender_ext.factor.graph import matrix_components
 
-# The engine makes its contacts in the order of its bodies; "local" is for problems from elsewhere.
+# The engine creates contacts in the order of its bodies, so it does not need "local".
 ENGINE_ORDERS = ("given", "reverse", "symmetric", "random", "colored", "bottom_up", "top_down")
-ORDERS = (*ENGINE_ORDERS, "local")
+SWEEP_ORDERS = (*ENGINE_ORDERS, "local")
 
 
 @dataclass
 class Order:
-    """A sweep order as the kernels take it; `blocks` and `rng` advance with the sweeps."""
+    """A sweep order for the kernels; `blocks` and `rng` change with every sweep.
 
-    blocks: IntArray  # (k,) the coming sweep's order, modified in place
-    split: int  # blocks[:split] and blocks[split:] are permuted apart: joints, contacts
-    mode: int  # given, symmetric or random
-    rng: np.ndarray  # (1,) uint64, state of the generator
-    is_given: bool = False  # every sweep runs over the blocks as they stand
+    Parameters
+    ----------
+    blocks : (k,) int
+        Order of the next sweep, modified in place.
+    split : int
+        blocks[:split] and blocks[split:] (joints and contacts) are permuted separately.
+    mode : int
+        GIVEN, SYMMETRIC or RANDOM.
+    rng : (1,) uint64
+        State of the random number generator.
+    is_given : bool
+        Whether every sweep uses the order of the problem.
+    """
+
+    blocks: IntArray
+    split: int
+    mode: int
+    rng: np.ndarray
+    is_given: bool = False
 
     @property
     def is_fixed(self) -> bool:
-        """Every sweep runs in the same order."""
+        """Whether every sweep uses the same order."""
         return self.mode == GIVEN
 
 
 def block_order(
     problem: Problem, order: str | Sequence[int] | Any = "given", *, seed: int = 0, ground: Any = None
 ) -> Order:
-    """Order of a problem's blocks.
+    """Compute the sweep order of a problem's blocks.
 
     Parameters
     ----------
+    problem : Problem
     order : str or int array (k,)
-    seed : int, only with "random"
-    ground : int array, only with "bottom_up" / "top_down" on a matrix
-        Blocks that touch the ground; with rows the static bodies are known.
+        Name of an order (see the module), or a permutation.
+    seed : int
+        Only with "random".
+    ground : int array, optional
+        Blocks that touch the ground, for "bottom_up" and "top_down" on a matrix. Rows contain the static bodies.
+
+    Returns
+    -------
+    Order
 
     Raises
     ------
     UnknownName
-        No such order.
+        There is no such order.
     InputError
-        Not a permutation; ground given where it is not used, or out of range.
+        The array is not a permutation; `ground` is out of range, or given with an order that does not use it.
     CapabilityError
         Levels of a matrix without `ground`.
     """
@@ -77,7 +98,7 @@ def block_order(
     split = 0 if problem.rows is None else problem.rows.n_joints
     if type(order) is str and order == "given" and ground is None and type(seed) is int and seed == 0:
         return Order(np.arange(k, dtype=np.int32), split, GIVEN, np.zeros(1, np.uint64), is_given=True)
-    rng = np.array([whole_number("seed", seed, high=None) % 2**64], np.uint64)
+    rng = np.array([check_int("seed", seed, high=None) % 2**64], np.uint64)
     if seed and not (isinstance(order, str) and order == "random"):
         raise InputError(f"seed={seed} goes with order='random'; no other order draws lots")
     if not isinstance(order, str):
@@ -87,8 +108,8 @@ def block_order(
         if not np.array_equal(np.sort(blocks), np.arange(k)):
             raise InputError(f"order must hold every block from 0 to {k - 1} once")
         return Order(blocks, k, GIVEN, rng)
-    if order not in ORDERS:
-        raise UnknownName("order", order, ORDERS)
+    if order not in SWEEP_ORDERS:
+        raise UnknownName("order", order, SWEEP_ORDERS)
     if ground is not None and order not in ("bottom_up", "top_down"):
         raise InputError(f"ground= goes with bottom_up and top_down, not with {order!r}")
     blocks = np.arange(k, dtype=np.int32)
@@ -110,13 +131,13 @@ def block_order(
 
 
 def _sort_by_key(key: IntArray, split: int) -> IntArray:
-    """Sort blocks (k,) by key: joints first, equal keys in the given order."""
+    """Sort blocks (k,) by key: joints first, equal keys in their present order."""
     is_contact = np.arange(len(key)) >= split
     return np.lexsort((key, is_contact)).astype(np.int32)
 
 
 def levels(problem: Problem, ground: Any = None) -> IntArray:
-    """Level (k,) of each block: distance from the static bodies, or from the blocks `ground` through A."""
+    """Compute the level (k,) of each block: its distance from static bodies, or in A's graph from `ground`."""
     k = problem.n_blocks
     if problem.rows is not None:
         if ground is not None:
@@ -144,31 +165,31 @@ def levels(problem: Problem, ground: Any = None) -> IntArray:
     return level
 
 
-# Mean difference of two body numbers up to which numbers count as near: velocities of 48 bytes each, so that those
-# in use stay in a second-level cache.
-NEAR = 4_096
+# Bodies are renumbered if the numbers of two touching bodies differ by more than this on average. Velocities take 48
+# bytes each: with smaller differences, the velocities in use fit into a second-level cache.
+MAX_MEAN_BODY_DISTANCE = 4_096
 
 
 def body_ranks(problem: Problem) -> IntArray:
-    """Place (n,) of each body in a numbering where bodies that touch are near.
+    """Return a numbering (n,) of bodies in which touching bodies have close numbers.
 
-    Their own numbers where these are near already, else reverse Cuthill-McKee.
+    It is the present numbering if that is close enough, else reverse Cuthill-McKee.
     """
     assert problem.rows is not None
     n = problem.rows.n_bodies
-    own = np.arange(n, dtype=np.int32)
+    numbers = np.arange(n, dtype=np.int32)
     pair = problem.rows.block_bodies
     pair = pair[(pair >= 0).all(axis=1)]
-    if not len(pair) or np.abs(pair[:, 0] - pair[:, 1]).mean() <= NEAR:
-        return own
+    if not len(pair) or np.abs(pair[:, 0] - pair[:, 1]).mean() <= MAX_MEAN_BODY_DISTANCE:
+        return numbers
     graph = sp.csr_array((np.ones(len(pair), np.int8), (pair[:, 0], pair[:, 1])), shape=(n, n))
     rank = np.empty(n, np.int32)
-    rank[sp.csgraph.reverse_cuthill_mckee(sp.csr_matrix(graph + graph.T), symmetric_mode=True)] = own
+    rank[sp.csgraph.reverse_cuthill_mckee(sp.csr_matrix(graph + graph.T), symmetric_mode=True)] = numbers
     return rank
 
 
 def local_order(problem: Problem) -> IntArray:
-    """Blocks (k,), joints first, by the bodies they touch, numbered by `body_ranks`; a matrix: by its graph."""
+    """Sort blocks (k,), joints first, by the `body_ranks` of their bodies; a matrix by reverse Cuthill-McKee."""
     if problem.rows is None:
         if problem.n_blocks == 0:
             return np.zeros(0, np.int32)
@@ -177,13 +198,13 @@ def local_order(problem: Problem) -> IntArray:
     rank = np.append(body_ranks(problem), np.int32(-1))
     pair = rank[problem.rows.block_bodies]
     low, high = pair.min(axis=1), pair.max(axis=1)
-    low = np.where(low < 0, high, low)  # on a static body: with the contacts of the other
+    low = np.where(low < 0, high, low)  # Contacts with a static body are sorted by the moving body.
     is_contact = np.arange(problem.n_blocks) >= problem.rows.n_joints
     return np.lexsort((high, low, is_contact)).astype(np.int32)
 
 
 def colors(problem: Problem) -> IntArray:
-    """Colour (k,) of each block, greedy in the given order.
+    """Compute the colour (k,) of each block by a greedy search in the order of the problem.
 
     Blocks of one colour share no moving body (rows), or no entry of A (matrix).
     """
@@ -199,28 +220,28 @@ def colors(problem: Problem) -> IntArray:
     )
 
 
-def rows_of_each(problem: Problem, ptr: IntArray) -> list[IntArray]:
-    """Rows of each island of A, in order; those from ptr[i] to ptr[i + 1] belong together whatever A says."""
-    part = np.repeat(np.arange(len(ptr) - 1, dtype=np.int32), np.diff(ptr))
+def rows_by_island(problem: Problem, ptr: IntArray) -> list[IntArray]:
+    """Return the rows of each island of A, in order; rows ptr[i] to ptr[i + 1] - 1 are never separated."""
+    group = np.repeat(np.arange(len(ptr) - 1, dtype=np.int32), np.diff(ptr))
     indptr, indices, _ = problem._compressed
-    count, label = matrix_components(ptr, part, indptr, indices)
-    return blocks_of_each(count, label[part])
+    count, label = matrix_components(ptr, group, indptr, indices)
+    return blocks_by_island(count, label[group])
 
 
-def blocks_of_each(count: int, label: IntArray) -> list[IntArray]:
-    """Blocks of each island, in order, from the island of each block (k,)."""
+def blocks_by_island(count: int, label: IntArray) -> list[IntArray]:
+    """Return the blocks of each of `count` islands, in order, from the island `label` (k,) of each block."""
     order = np.argsort(label, kind="stable").astype(np.int32)
     return np.split(order, np.searchsorted(label[order], np.arange(1, count)))[:count]
 
 
 def _block_graph(problem: Problem) -> sp.csr_array:
-    # Blocks that meet in A, as a symmetric pattern without the diagonal.
+    """Return the graph of blocks that A couples, as a symmetric pattern without the diagonal."""
     a = problem.csr
     block_of = np.repeat(np.arange(problem.n_blocks), np.diff(problem.cones.ptr))
     i = np.repeat(block_of, np.diff(a.indptr))
     j = block_of[a.indices]
-    keep = i != j
-    i, j = i[keep], j[keep]
+    off_diagonal = i != j
+    i, j = i[off_diagonal], j[off_diagonal]
     ones = np.ones(2 * len(i), np.int8)
     k = problem.n_blocks
     graph = sp.csr_array((ones, (np.concatenate([i, j]), np.concatenate([j, i]))), shape=(k, k))

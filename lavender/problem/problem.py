@@ -1,4 +1,4 @@
-"""`Problem`: the data, what follows from it, ways to make one, and its other forms."""
+"""`Problem`: the complete class, with warm starts from the step before, and conversions to other forms."""
 
 from __future__ import annotations
 
@@ -25,23 +25,33 @@ class VelocityForm:
         K y + diag(theta) z - g  is complementary to  z,     y = K^T z,
         K = D^-1/2 J M^-1/2,  theta = compliance / d,  g = D^-1/2 b,  lambda = D^-1/2 z
 
-    so that K K^T + diag(theta) = D^-1/2 A D^-1/2 and y is the mass-scaled change of velocity M^1/2 (v - v*).
+    Then K K^T + diag(theta) = D^-1/2 A D^-1/2, and y is the mass-scaled change of velocity M^1/2 (v - v*).
+
+    Parameters
+    ----------
+    jacobian : (m, 6 n) or (m, nv), CSR
+        K, with rows of norm 1.
+    rhs : (m,), sqrt J
+        g.
+    theta : (m,), -
+    scale : (m,), sqrt kg
+        D^-1/2.
     """
 
-    jacobian: sp.csr_array  # K (m, 6 n), unit rows
-    rhs: FloatArray  # g (m,) sqrt J
-    theta: FloatArray  # (m,) -
-    scale: FloatArray  # D^-1/2 (m,) sqrt kg
+    jacobian: sp.csr_array
+    rhs: FloatArray
+    theta: FloatArray
+    scale: FloatArray
 
     def impulse(self, multiplier: FloatArray) -> FloatArray:
-        """lambda (m,) [N s] of a multiplier z (m,) [sqrt J]."""
+        """Compute lambda (m,) [N s] from a multiplier z (m,) [sqrt J]."""
         return self.scale * multiplier
 
 
 class Problem(Builders):
     """A constraint problem: find impulses lambda (m,) [N s] with w = A lambda - b [m/s] complementary to them.
 
-    Usually made by `Problem.lcp`, `linear`, `contact`, `from_rows`, `from_jacobian` or `from_findex`.
+    Usually built by `Problem.lcp`, `linear`, `contact`, `from_rows`, `from_jacobian` or `from_findex`.
 
     Parameters
     ----------
@@ -50,7 +60,7 @@ class Problem(Builders):
     cones : Cones
         Blocks and bounds.
     matrix : (m, m) array or sparse, 1/kg
-        A, kept exactly as given (it may be asymmetric, indefinite or singular); or
+        A, stored without changes (it may be asymmetric, indefinite or singular); or
     rows : Rows
         J and M^-1 of bodies; A = J M^-1 J^T + diag(compliance) is formed only if needed; or
     generalized : Generalized
@@ -62,7 +72,7 @@ class Problem(Builders):
     guess : (m,) N s, optional
         Default warm start of every solve of this problem.
     key : (k,) uint64, optional
-        Identity of each block, by which it is found again in the next step.
+        Identity of each block, by which `carry` finds it in the problem of the next step.
     names : sequence of str (k,), optional
         Names of the blocks, e.g. "hinge 7"; see `row_name`.
     name : str
@@ -70,35 +80,40 @@ class Problem(Builders):
         True copies the arrays. False uses b, matrix, compliance and guess without a copy if their type fits; they are
         then shared with the caller and marked read-only.
     precision : {"float64", "float32"}, optional
-        Precision in which an engine computed these numbers and computes its answers; `lavender.residual` then knows
-        which error rounding alone explains. Default: that of `rows`. Problems are always solved in float64.
+        Precision in which an engine computed these numbers and computes its answers; `lavender.residual` derives from
+        it the error that rounding alone explains. Default: the precision of `rows`. Problems are always solved in
+        float64.
     qp : QuadraticProgram, optional
-        The program that `Problem.from_qp` made this problem of; files hold it if P is singular.
+        Quadratic program from which `Problem.from_qp` built this problem; files contain it only if P is singular.
 
     Raises
     ------
     InputError
-        Wrong shapes, NaN or infinity, none or several of matrix, rows and generalized, or nnz >= 2^31.
+        A wrong shape; NaN or infinity; none or several of matrix, rows and generalized; nnz >= 2^31.
     """
 
     def carry(self, previous: Any, keys: Any = None) -> FloatArray:
-        """Start (m,) [N s] from the impulses of the step before: each block's by its key, the others Pi(0).
+        """Build a start (m,) [N s] from the impulses of the previous step, which are assigned to blocks by their keys.
 
-        A block that has changed its kind or its number of rows starts anew. Where a problem has no keys,
-        impulses stay if both have the same blocks. Impulses of tangents are taken as they are: keep the directions of a
-        contact's tangents from step to step.
+        Blocks without a previous impulse, or with another kind or number of rows, start at Pi(0). If a problem has no
+        keys, the impulses are used if both problems have the same blocks. Tangent impulses are not rotated: use the
+        same tangent directions of a contact in every step.
 
         Parameters
         ----------
         previous : Solution, or (Problem, impulse)
-            Of the step before; its problem has keys.
+            Result of the previous step; its problem has keys.
         keys : (k,) unsigned int, optional
-            Of this problem's blocks; default: `key`.
+            Keys of this problem's blocks. Default: `key`.
+
+        Returns
+        -------
+        numpy.ndarray
 
         Raises
         ------
         InputError
-            No solution, keys of another length, or keys here and none before.
+            `previous` is not a solution; `keys` has another length; `keys` is given and `previous` has none.
 
         Examples
         --------
@@ -125,41 +140,43 @@ class Problem(Builders):
                 raise InputError("the problem of the step before has no keys: make it with key=")
             return replace(self, key=keys, copy=False).carry((before, impulse))
         start = self.start()
-        old, new = before.cones, self.cones
+        old_cones, new_cones = before.cones, self.cones
         if self.key is None or before.key is None:
-            if np.array_equal(old.ptr, new.ptr) and np.array_equal(old.kind, new.kind):
+            same_kind = np.array_equal(old_cones.kind, new_cones.kind)
+            if same_kind and np.array_equal(old_cones.ptr, new_cones.ptr):
                 start[:] = impulse
             return start
-        place = {key: i for i, key in enumerate(before.key.tolist())}
+        old_block_of = {key: block for block, key in enumerate(before.key.tolist())}
         for block, key in enumerate(self.key.tolist()):
-            i = place.get(key)
-            if i is None or old.kind[i] != new.kind[block]:
+            old_block = old_block_of.get(key)
+            if old_block is None or old_cones.kind[old_block] != new_cones.kind[block]:
                 continue
-            here, there = slice(new.ptr[block], new.ptr[block + 1]), slice(old.ptr[i], old.ptr[i + 1])
-            if here.stop - here.start == there.stop - there.start:
-                start[here] = impulse[there]
+            new_rows = slice(new_cones.ptr[block], new_cones.ptr[block + 1])
+            old_rows = slice(old_cones.ptr[old_block], old_cones.ptr[old_block + 1])
+            if new_rows.stop - new_rows.start == old_rows.stop - old_rows.start:
+                start[new_rows] = impulse[old_rows]
         return start
 
     # -- other forms -----------------------------------------------------------------------------
 
     def relaxed(self, friction: str = "cone") -> Problem:
-        """The same problem under another friction law: "cone" is the convex relaxation.
+        """Return the problem with another friction law: "cone" is the convex relaxation of "coulomb".
 
         Raises
         ------
         InputError
-            "coulomb" for round cones of more than two tangents.
+            "coulomb" with round cones of more than two tangents.
         """
         return replace(self, friction=friction, copy=False)
 
     @property
     def disk(self) -> Problem:
-        """The problem whose contacts are disks: this one, or where it has ellipses the same in stretched tangents.
+        """The problem itself, or if it has ellipses an equivalent one in stretched tangents, whose contacts are disks.
 
-        There mu is max(mu_1, mu_2), rows are `cones.stretch` as long and impulses those here over it. Both laws hold
-        here as they hold there: friction takes most energy from sliding, lambda_t = -mu^2 w_t lambda_n / |mu w_t| with
-        mu = diag(mu_1, mu_2). It is what solvers get and the judge measures; results come back in the
-        rows of this problem.
+        Its mu is max(mu_1, mu_2), its rows are multiplied by `cones.stretch` and its impulses divided by it. The
+        friction laws of both problems are equivalent: friction maximises dissipation,
+        lambda_t = -mu^2 w_t lambda_n / |mu w_t| with mu = diag(mu_1, mu_2). Solvers and the judge use the disks. Their
+        results are converted to the rows of this problem.
 
         Examples
         --------
@@ -169,7 +186,7 @@ class Problem(Builders):
         >>> import lavender as lv
         >>> problem = lv.Problem.contact(np.eye(3), [10.0, 9.0, 9.0], mu=[(0.5, 0.2)])
         >>> impulse = lv.solve(problem, tol=1e-9).impulse
-        >>> round(float(np.hypot(impulse[1] / 0.5, impulse[2] / 0.2) / impulse[0]), 6)  # it slides: on the rim
+        >>> round(float(np.hypot(impulse[1] / 0.5, impulse[2] / 0.2) / impulse[0]), 6)  # it slides: on the boundary
         1.0
         >>> problem.disk.cones.mu.tolist(), problem.disk.b.tolist()
         ([0.5], [10.0, 9.0, 3.6])
@@ -177,15 +194,15 @@ class Problem(Builders):
         return self._disk if self.cones.has_ellipse else self
 
     def on_disk(self, impulse: FloatArray) -> FloatArray:
-        """Impulses (m,) [N s] of this problem as those of `disk`."""
+        """Convert impulses (m,) [N s] of this problem to impulses of `disk`."""
         if not self.cones.has_ellipse:
             return impulse
-        with np.errstate(over="ignore"):  # an impulse may be as large as it likes
+        with np.errstate(over="ignore"):  # An impulse may have any size.
             return impulse / self.cones.stretch
 
     @once
     def _disk(self) -> Problem:
-        # A' = S A S,   b' = S b,   lambda = S lambda',   w' = S w,   S = diag(stretch), 1 but at tangents of ellipses
+        """Problem in stretched tangents: A' = S A S, b' = S b, lambda = S lambda', w' = S w with S = diag(stretch)."""
         s, cones = self.cones.stretch, self.cones.disks
         guess = None if self.guess is None else self.on_disk(self.guess)
         more: dict[str, Any] = {"guess": guess, "key": self.key, "names": self.names, "name": self.name}
@@ -194,31 +211,39 @@ class Problem(Builders):
             indptr, indices, data = self._compressed
             data = np.repeat(s, np.diff(indptr)) * data * s[indices]
             a = sp.csr_array((data, indices, indptr), shape=(self.m, self.m))
-            made = Problem(s * self.b, cones, a, copy=False, **more)
+            disk = Problem(s * self.b, cones, a, copy=False, **more)
         else:
             assert self.compliance is not None
-            soft = s * s * self.compliance
-            soft[soft < LEAST] = 0.0  # less than a compliance may have
+            compliance = s * s * self.compliance
+            compliance[compliance < LEAST] = 0.0  # A compliance must be 0 or at least LEAST.
             scaled = self.generalized.with_scaled_rows(s)
-            made = Problem(s * self.b, cones, generalized=scaled, compliance=soft, copy=False, **more)
+            disk = Problem(s * self.b, cones, generalized=scaled, compliance=compliance, copy=False, **more)
         if self.rows is not None:
-            made.metric.weigh_as(self.metric, True)
-        return made
+            disk.metric.weigh_as(self.metric, True)
+        return disk
 
     def boxed(self, normal_impulse: ArrayLike) -> Problem:
-        """Friction bounded by fixed normals: |lambda_t| <= mu N on each tangent alone: a square, not the disk.
+        """Return the problem with friction bounded by fixed normal impulses: |lambda_t| <= mu N on each tangent.
 
         Parameters
         ----------
         normal_impulse : scalar or (c,) N s
             N of each contact, in block order.
+
+        Returns
+        -------
+        Problem
+            An LCP; two tangents are bounded by a square instead of a disk.
         """
         c = self.cones
-        load = np.zeros(c.n_blocks)
-        load[c.is_contact] = n = as_array("normal_impulse", normal_impulse, (len(c.normal_rows),), unit="N s")
+        normal_of_block = np.zeros(c.n_blocks)
+        n = as_array("normal_impulse", normal_impulse, (len(c.normal_rows),), unit="N s")
+        normal_of_block[c.is_contact] = n
         check_not_negative("normal_impulse", n)
         with np.errstate(over="ignore"):
-            bound = as_array("mu N", c.reach * np.repeat(load, np.diff(c.ptr)), (self.m,), unit="N s")
+            bound = as_array(
+                "mu N", c.reach * np.repeat(normal_of_block, np.diff(c.ptr)), (self.m,), unit="N s"
+            )
         lower, upper = np.where(c.friction_rows, [-bound, bound], [c.lower, c.upper])
         names = None if self.names is None else [self.row_name(i) for i in range(self.m)]
         more: dict[str, Any] = {"matrix": self.csr} if self.generalized is None else {
@@ -236,7 +261,7 @@ class Problem(Builders):
         )
 
     def velocity_form(self) -> VelocityForm:
-        """The mass-scaled velocity form (see `VelocityForm`); not with a matrix.
+        """Compute the mass-scaled velocity form (see `VelocityForm`).
 
         Raises
         ------
@@ -250,7 +275,7 @@ class Problem(Builders):
             return VelocityForm(k, scale * self.b, self.compliance * scale**2, scale)  # type: ignore[operator]
         rows = self.rows
         assert rows is not None
-        # M^-1 = L L^T by blocks; a singular inverse inertia (a pinned axis) has a root but no Cholesky factor.
+        # M^-1 = L L^T by blocks. A singular inverse inertia (a fixed axis) has a square root but no Cholesky factor.
         value, vector = np.linalg.eigh(rows.inv_inertia)
         root = vector * np.sqrt(np.maximum(value, 0.0))[:, None, :]
         half = replace(
@@ -260,5 +285,5 @@ class Problem(Builders):
         return VelocityForm(k, scale * self.b, self.compliance * scale**2, scale)  # type: ignore[operator]
 
     def save(self, path: str | PathLike[str], **more: Any) -> None:
-        """Write the problem to a file; `lavender.io.save`, whose options `more` are."""
+        """Write the problem to a file by `lavender.io.save`; `more` are its options."""
         lazy_module("lavender.io").save(self, path, **more)

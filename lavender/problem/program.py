@@ -1,4 +1,4 @@
-"""Quadratic programs as constraint problems: a pure conversion, and the way back.
+"""Convert quadratic programs to constraint problems, and solutions of these to solutions of the programs.
 
     min 1/2 x.P x + q.x   subject to   A x = b,  G x <= h,  lb <= x <= ub                                 (1)
 
@@ -6,8 +6,8 @@ With the rows J x = target (the first ones) and J x >= target (the others),
 
     J = [A; I_f; -G; I_l; -I_u],   target = [b; lb_f; -h; lb_l; -ub_u]                                    (2)
 
-f: variables with lb = ub; l, u: other finite bounds; of G the rows with finite h. Numbers of 1e20 or more in size count
-as infinite. The multipliers lambda of the rows are free on the first ones, >= 0 on the others, and
+f: variables with lb = ub; l, u: other finite bounds; G without rows whose h is infinite. Numbers of at least 1e20 in
+absolute value count as infinite. The multipliers lambda of the rows are free on the first ones, >= 0 on the others, and
 
     P x + q + A^T y + G^T z + z_box = 0,   y = -lambda_A,  z = lambda_G,  z_box = lambda_u - lambda_l - lambda_f  (3)
 
@@ -15,13 +15,13 @@ P positive definite: (1) is the constraint problem of the generalised velocities
 
     M = P,   v* = -P^-1 q,   so that M (x - v*) = J^T lambda                                              (4)
 
-P singular, if its Cholesky factor has a pivot of at most SINGULAR times the diagonal entry: P has no inverse, and (1)
-is the constraint problem of x and lambda together, with x free,
+P singular (its Cholesky factor has a pivot of at most MAX_SINGULAR_PIVOT times the diagonal entry): P has no inverse,
+and (1) is the constraint problem of x and lambda together, with x free,
 
     w = [ P  -J^T ] [ x      ]  -  [ -q     ]                                                             (5)
         [ J   0   ] [ lambda ]     [ target ]
 
-whose matrix is not symmetric. Solvers of quadratic programs get P, q, J and target themselves.
+whose matrix is not symmetric. Solvers of quadratic programs receive P, q, J and target.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from lavender.base.arrays import (
     FloatArray,
     IntArray,
     as_array,
-    borrowed,
+    as_array_view,
     check_not_nan,
     check_sizes,
     read_only,
@@ -55,20 +55,21 @@ from lavender_ext.judge.measure import all_finite, program_residuals
 
 IntpArray = npt.NDArray[np.intp]
 
-SINGULAR = (
+MAX_SINGULAR_PIVOT = (
     1e-13  # P is singular if a pivot of its Cholesky factor is at most this share of the diagonal entry.
 )
-SHIFT = 1e-12  # P is semidefinite if P + SHIFT diag(P) has a Cholesky factor: rounding may leave negative eigenvalues.
-# If q is 0, all forces may vanish at the solution; they are then compared with this share of the terms of P x.
-SHARE_OF_CURVATURE = 1e-3
-INFINITE = 1e20  # A side or bound of this size counts as infinite, as in other packages.
-MAX_EIGENVALUE_SIZE = 1000  # Up to this size, the message about an indefinite P has its least eigenvalue.
-Given = tuple[Any, Any, Any, Any, Any, Any, Any, Any]  # P, q, G, h, A, b, lb, ub
+# P is semidefinite if P + SEMIDEFINITE_SHIFT diag(P) has a Cholesky factor: rounding may cause negative eigenvalues.
+SEMIDEFINITE_SHIFT = 1e-12
+# If q is 0, all forces may vanish at the solution. They are then compared with this share of the terms of P x.
+CURVATURE_SHARE = 1e-3
+INFINITE = 1e20  # A right-hand side or bound of this size counts as infinite, as in other packages.
+MAX_EIGENVALUE_SIZE = 1000  # Up to this size, the message about an indefinite P has its smallest eigenvalue.
+ProgramArrays = tuple[Any, Any, Any, Any, Any, Any, Any, Any]  # P, q, G, h, A, b, lb, ub
 
 
 @dataclass(frozen=True, eq=False)
 class QPSolution:
-    """x and the multipliers of a quadratic program, in the signs of OSQP and qpsolvers, and their errors.
+    """Solution of a quadratic program with multipliers in the signs of OSQP and qpsolvers, and its errors.
 
     P x + q + A^T y + G^T z + z_box = 0,  z >= 0,  z_box > 0 at ub and < 0 at lb.
 
@@ -78,16 +79,16 @@ class QPSolution:
     y : (me,), or None without A
         Multipliers of A x = b.
     z : (mi,), or None without G
-        Multipliers of G x <= h; 0 where h is infinite, from 1e20 on.
+        Multipliers of G x <= h; 0 if h is infinite (at least 1e20).
     z_box : (n,), or None without lb and ub
         Multipliers of the bounds.
     solution : Solution or None
-        Of the constraint problem: status, work, certificate.
+        Solution of the constraint problem: status, work, certificate.
     ray : (n,), or None
-        A direction in which the objective decreases without end, |ray| = 1 in its largest entry, if a point that
-        satisfies the constraints was found: the program is unbounded.
+        If the program is unbounded: a direction in which the objective decreases without limit, with a largest entry
+        of 1. It is given if a point that satisfies the constraints was found.
     tol : float
-        Error up to which the answer counts as found.
+        Largest error of a solution that counts as found.
     """
 
     x: FloatArray
@@ -123,20 +124,20 @@ class QPSolution:
 
     @cached_property
     def _residuals(self) -> tuple[float, ...]:
-        """r_p, r_d, gap, the three relative to their own terms, and the largest of these."""
-        qp, multipliers, least_force = self.qp, self.qp.of_rows(self.impulse), 0.0
+        """r_p, r_d, gap, the same three relative to their terms, and the largest relative one."""
+        qp, multipliers, min_force = self.qp, self.qp.of_rows(self.impulse), 0.0
         if largest(qp.q) == 0.0:
-            least_force = SHARE_OF_CURVATURE * float((abs(qp.hessian) @ np.abs(self.x)).max(initial=0.0))
+            min_force = CURVATURE_SHARE * float((abs(qp.hessian) @ np.abs(self.x)).max(initial=0.0))
         jac, order = qp.compressed_rows
         result: tuple[float, ...] = program_residuals(
             self.x, qp.q, self._curvature, qp.force(multipliers), qp.times_rows(self.x), qp.target, multipliers,
-            qp.free, jac, self.x if order is None else self.x[order], qp.sizes_without_rows, least_force,
+            qp.free, jac, self.x if order is None else self.x[order], qp.sizes_without_rows, min_force,
         )  # fmt: skip
         return result
 
     @property
     def objective(self) -> float:
-        """1/2 x.P x + q.x."""
+        """Objective 1/2 x.P x + q.x."""
         return float(0.5 * self.x @ self._curvature + self.qp.q @ self.x)
 
     @property
@@ -146,32 +147,37 @@ class QPSolution:
 
     @property
     def dual_residual(self) -> float:
-        """max |P x + q + A^T y + G^T z + z_box|, or the largest negative z if that is more."""
+        """Maximum of |P x + q + A^T y + G^T z + z_box| and of -z."""
         return self._residuals[1]
 
     @property
     def duality_gap(self) -> float:
-        """|x.P x + q.x + b.y + h.z + bounds.z_box|."""
+        """Duality gap |x.P x + q.x + b.y + h.z + bounds.z_box|."""
         return self._residuals[2]
 
     @property
     def error(self) -> float:
-        """The largest of the three residuals, each relative to its own terms; 0 is a solution.
+        """Largest of the three residuals, each relative to its own terms; 0 for an exact solution.
 
-        Primal: the violation of each row relative to the largest of |J_ij x_j| and |target_i| of this row, but at most
-        to the largest of |J x|, |target| and |x| over all acting rows, as in OSQP and Clarabel. If the row's terms
-        vanish, as in x >= 0, it is relative to what the acting rows make of its variables. Dual: relative to the
-        largest of |q|, |P x| and |J^T lambda|; if q is 0, to at least 1e-3 of the largest row of |P| |x|. Gap: relative
-        to |objective|, or to 1e-3 of the sum of its terms if these cancel further; gaps of rows with opposite signs are
-        added, not subtracted. A row that does not act enters no scale: one that is satisfied and has no multiplier, or
-        is far from its bound.
+        - Primal: the violation of each row relative to the maximum of |J_ij x_j| and |target_i| of this row, but at
+          most to the maximum of |J x|, |target| and |x| over all active rows, as in OSQP and Clarabel. If the row's
+          terms vanish, as in x >= 0, it is relative to the size of its variables in the active rows.
+        - Dual: relative to the maximum of |q|, |P x| and |J^T lambda|; if q is 0, to at least 1e-3 of the largest row
+          of |P| |x|.
+        - Gap: relative to |objective|, or to 1e-3 of the sum of its terms if these cancel further. Gaps of rows with
+          opposite signs are added, not subtracted.
+
+        Inactive rows do not contribute to these scales: rows that are satisfied and have no multiplier, and rows that
+        are far from their bound.
         """
         return self._residuals[6]
 
     @property
     def found(self) -> bool:
-        """Whether the error is at most `tol`, no ray or certificate shows that there is no solution, and the solver's
-        claim is not contradicted.
+        """Whether the program is solved.
+
+        The error is at most `tol`, no ray or certificate proves that there is no solution, and the solver's claim is
+        not contradicted.
         """
         if self.ray is not None or not self.error <= self.tol:
             return False
@@ -185,23 +191,23 @@ class QPSolution:
 
 @dataclass(frozen=True, eq=False)
 class QuadraticProgram:
-    """The program of a problem made by `Problem.from_qp` (`problem.qp`).
+    """Quadratic program of a problem built by `Problem.from_qp` (`problem.qp`).
 
     Parameters
     ----------
     q : (n,)
     target : (m,)
-        The right-hand sides of (2).
+        Right-hand sides of (2).
     free : int
-        Rows of A and of variables with lb = ub, which come first.
+        Number of rows of A and of variables with lb = ub, which are the first rows.
     generalized : Generalized or None
         J of (2) and M = P; None if P is singular.
     singular : (P, J) or None
         Both as (indptr, indices, data) if P is singular, P with both triangles.
     n_equalities, n_inequalities : int or None
-        Rows of A and of G as given; None without.
+        Number of rows of A and of G; None without A or G.
     kept : (mi,) int or None
-        Rows of G that are in J; None: all.
+        Rows of G that are in J; None if all are.
     fixed, lower, upper : (n_f,), (n_l,), (n_u,) int, or None without lb and ub
         Variables of the rows of bounds.
     """
@@ -220,7 +226,7 @@ class QuadraticProgram:
 
     @property
     def is_singular(self) -> bool:
-        """Whether P is singular: the problem is (5), which solvers of quadratic programs take."""
+        """Whether P is singular: the problem is (5), which only solvers of quadratic programs accept."""
         return self.generalized is None
 
     def problem_fields(self) -> dict[str, Any]:
@@ -266,28 +272,28 @@ class QuadraticProgram:
 
     @property
     def compressed_rows(self) -> tuple[Compressed, IntArray | None]:
-        """J as (indptr, indices, data), and the variable of each of its columns; None: in order."""
+        """J as (indptr, indices, data), and the variable of each of its columns (None: in order)."""
         if self.generalized is not None:
             return self.generalized.operator.jac, self.generalized.order
         assert self.singular is not None
         return self.singular[1], None
 
     def times_hessian(self, x: FloatArray) -> FloatArray:
-        """P x (n,)."""
+        """Compute P x (n,)."""
         return self.hessian @ x if self.generalized is None else self.generalized.momentum_of(x)
 
     def times_rows(self, x: FloatArray) -> FloatArray:
-        """J x (m,)."""
+        """Compute J x (m,)."""
         return self.jacobian @ x if self.generalized is None else self.generalized.velocity_of(x)
 
     def force(self, multipliers: FloatArray) -> FloatArray:
-        """J^T lambda (n,) of multipliers (m,)."""
+        """Compute J^T lambda (n,) for multipliers (m,)."""
         if self.generalized is None:
             return self.jacobian.T @ multipliers
         return self.generalized.force(multipliers)
 
     def sizes_without_rows(self) -> FloatArray:
-        """(n,) Size of each variable without rows, |q_i| / P_ii or else |v*_i|, in the order of J's columns."""
+        """Compute the size of each variable (n,) without rows, |q_i| / P_ii or |v*_i|, in the order of J's columns."""
         general = self.generalized
         if general is None:
             diagonal = self.hessian.diagonal()
@@ -301,41 +307,41 @@ class QuadraticProgram:
         return out
 
     def variables(self, impulse: FloatArray) -> FloatArray:
-        """x (n,) of the impulses (m,) of the constraint problem, or (n + m,) if P is singular."""
+        """Compute x (n,) from the impulses (m,) of the constraint problem, or (n + m,) if P is singular."""
         if self.generalized is None:
             return impulse[: len(self.q)].copy()
         return self.generalized.v_free + self.generalized.change(impulse)
 
     def of_rows(self, impulse: FloatArray) -> FloatArray:
-        """The multipliers lambda (m,) of the rows in impulses (m,) or (n + m,)."""
+        """Return the multipliers lambda (m,) of the rows from impulses (m,) or (n + m,)."""
         return impulse[len(impulse) - len(self.target) :]
 
     def multipliers(
         self, impulse: FloatArray
     ) -> tuple[FloatArray | None, FloatArray | None, FloatArray | None]:
-        """Return (y, z, z_box) of impulses, or of a certificate the proof that the program has no feasible point.
+        """Return (y, z, z_box) of impulses (m,), or (n + m,) if P is singular.
 
-        `impulse` is (m,), or (n + m,) if P is singular. Of a certificate, A^T y + G^T z + z_box = 0 and
+        From a certificate they prove that the program has no feasible point: A^T y + G^T z + z_box = 0 and
         b.y + h.z + (ub or lb).z_box < 0.
         """
         y = z = box = None
         impulse = self.of_rows(impulse)
-        at, end = self.n_equalities or 0, len(impulse)
+        n_equalities, end = self.n_equalities or 0, len(impulse)
         if self.n_equalities is not None:
-            y = -impulse[:at]
+            y = -impulse[:n_equalities]
         if self.fixed is not None and self.lower is not None and self.upper is not None:
             box = np.zeros(len(self.q))
             box[self.upper] = impulse[end - len(self.upper) :]
             end -= len(self.upper)
             box[self.lower] -= impulse[end - len(self.lower) : end]
             end -= len(self.lower)
-            box[self.fixed] = -impulse[at : self.free]
+            box[self.fixed] = -impulse[n_equalities : self.free]
         if self.n_inequalities is not None:
             z = impulse[self.free : end]
             if self.kept is not None:
-                every = np.zeros(self.n_inequalities)
-                every[self.kept] = z
-                z = every
+                z_of_all_rows = np.zeros(self.n_inequalities)
+                z_of_all_rows[self.kept] = z
+                z = z_of_all_rows
         return y, z, box
 
     def solution(self, solution: Any, tol: float = 1e-6) -> QPSolution:
@@ -355,21 +361,22 @@ class QuadraticProgram:
         )  # fmt: skip
 
 
-@lru_cache(maxsize=8)  # programs of one controller have the same
+@lru_cache(maxsize=8)  # All programs of one controller have the same cones.
 def _one_sided(free: int, m: int) -> Cones:
+    """Return cones of m rows, the first ones free and the others nonnegative."""
     low = np.zeros(m)
     low[:free] = -np.inf
     return Cones.bounded(low, np.inf)
 
 
-def convert_program(given: Given) -> QuadraticProgram:
-    """The program of P, q, G, h, A, b, lb, ub as a constraint problem; see `Problem.from_qp`."""
-    P, q, G, h, A, b, lb, ub = given
+def convert_program(arrays: ProgramArrays) -> QuadraticProgram:
+    """Check the arrays P, q, G, h, A, b, lb, ub and convert them to a program; see `Problem.from_qp`."""
+    P, q, G, h, A, b, lb, ub = arrays
     q = as_array("q", q, (None,))
     n = len(q)
-    lower = _hessian(P, n)
-    rows = _Rows(n)
-    n_a, _ = rows.given("A", A, "b", b)
+    lower = _convert_hessian(P, n)
+    rows = _RowStack(n)
+    n_a, _ = rows.add_matrix("A", A, "b", b)
     fixed = low = up = None
     if lb is not None or ub is not None:
         lb, ub = (
@@ -381,18 +388,18 @@ def convert_program(given: Given) -> QuadraticProgram:
         fixed, low, up = (
             np.flatnonzero(on) for on in (equal, (lb > -INFINITE) > equal, (ub < INFINITE) > equal)
         )
-        rows.bounds(fixed, lb, 1.0)
+        rows.add_bounds(fixed, lb, 1.0)
     free = rows.m
-    n_g, kept = rows.given("G", G, "h", h)
+    n_g, finite_rows = rows.add_matrix("G", G, "h", h)
     if low is not None and up is not None:
-        rows.bounds(low, lb, 1.0)
-        rows.bounds(up, ub, -1.0)
+        rows.add_bounds(low, lb, 1.0)
+        rows.add_bounds(up, ub, -1.0)
     jac, target = rows.stacked
-    general = _definite(lower, jac, q)
+    general = _factor_definite(lower, jac, q)
     return QuadraticProgram(
         q=q, target=read_only(target), free=free, generalized=general,
         singular=None if general is not None else (mirrored(*lower), jac), n_equalities=n_a, n_inequalities=n_g,
-        kept=kept, fixed=fixed, lower=low, upper=up,
+        kept=finite_rows, fixed=fixed, lower=low, upper=up,
     )  # fmt: skip
 
 
@@ -404,7 +411,7 @@ def program_of_matrix(matrix: sp.csr_array, b: FloatArray, cones: Cones, n: int)
     Raises
     ------
     InputError
-        They do not have the form (5), or P is not positive semidefinite.
+        The arrays do not have the form (5), or P is not positive semidefinite.
     """
     jac, hessian = sp.csr_array(matrix[n:, :n]), sp.csr_array(matrix[:n, :n])
     free = int(np.count_nonzero(np.isneginf(cones.lower[n:])))
@@ -412,7 +419,7 @@ def program_of_matrix(matrix: sp.csr_array, b: FloatArray, cones: Cones, n: int)
         raise InputError(f"the problem is not that of a quadratic program of {n} variables")
     lower = lower_of("P", hessian, "give both triangles")
     rows = compressed("J", jac)
-    _definite(lower, rows, -b[:n])
+    _factor_definite(lower, rows, -b[:n])
     return QuadraticProgram(
         q=read_only(-b[:n]), target=read_only(b[n:].copy()), free=free, generalized=None,
         singular=(mirrored(*lower), rows), n_equalities=free, n_inequalities=len(b) - n - free, kept=None, fixed=None,
@@ -420,100 +427,114 @@ def program_of_matrix(matrix: sp.csr_array, b: FloatArray, cones: Cones, n: int)
     )  # fmt: skip
 
 
-# -- what is given ------------------------------------------------------------------------------------
+# -- conversion of arguments --------------------------------------------------------------------------
 
 
-def unpack_program(given: Given) -> Given:
-    """The eight arrays; the first may be a `qpsolvers.Problem`, or another object with these eight attributes."""
-    P = given[0]
-    if given[1] is not None and not hasattr(P, "ub"):
-        return given
+def unpack_program(arguments: ProgramArrays) -> ProgramArrays:
+    """Return the eight arrays; the first argument may be a `qpsolvers.Problem`, or an object with its attributes."""
+    P = arguments[0]
+    if arguments[1] is not None and not hasattr(P, "ub"):
+        return arguments
     names = ("P", "q", "G", "h", "A", "b", "lb", "ub")
     if not all(hasattr(P, name) for name in names):
         raise InputError(
             f"P is a {type(P).__name__}, q None; P and q are needed, or a qpsolvers.Problem alone"
         )
-    if any(x is not None for x in given[1:]):
+    if any(x is not None for x in arguments[1:]):
         raise InputError("a qpsolvers.Problem holds all arrays: give it alone")
     return tuple(getattr(P, name) for name in names)
 
 
-def _matrix(name: str, given: Any, n: int, sign: float) -> Compressed:
-    """Rows of a dense or sparse matrix of n columns times a sign, without zeros, checked; one dimension is one row."""
-    sparse = issparse(given)
+def _convert_matrix(name: str, matrix: Any, n: int, sign: float) -> Compressed:
+    """Convert a dense or sparse matrix of n columns times a sign to checked compressed rows without zeros.
+
+    A one-dimensional array is a single row.
+    """
+    sparse = issparse(matrix)
     if not sparse:
-        dense = borrowed(name, given, (None,) * max(1, len(shape_of(name, given))))
-        given = dense[None] if dense.ndim == 1 else dense
-    if len(given.shape) != 2 or given.shape[1] != n:
-        raise InputError(f"{name} has shape {given.shape}; (any, {n}) is needed, as q has {n} entries")
-    return compressed(name, given, sign) if sparse else dense_to_csr(given, sign)
+        dense = as_array_view(name, matrix, (None,) * max(1, len(shape_of(name, matrix))))
+        matrix = dense[None] if dense.ndim == 1 else dense
+    if len(matrix.shape) != 2 or matrix.shape[1] != n:
+        raise InputError(f"{name} has shape {matrix.shape}; (any, {n}) is needed, as q has {n} entries")
+    return compressed(name, matrix, sign) if sparse else dense_to_csr(matrix, sign)
 
 
-def _hessian(P: Any, n: int) -> Compressed:
-    """P's lower triangle with its diagonal."""
+def _convert_hessian(P: Any, n: int) -> Compressed:
+    """Return the lower triangle of P with its diagonal."""
     if shape_of("P", P) != (n, n):
         raise InputError(f"P has shape {shape_of('P', P)}; ({n}, {n}) is needed, as q has {n} entries")
     return lower_of("P", P, "give both triangles, or (P + P^T) / 2, which has the same x.P x")
 
 
-class _Rows:
-    """J and target of (2), put together from above."""
+class _RowStack:
+    """Builder of J and target of (2) from consecutive groups of rows."""
 
     def __init__(self, n: int) -> None:
         self.n, self.m = n, 0
-        self.parts = list[Compressed]()
+        self.groups = list[Compressed]()
         self.targets = list[FloatArray]()
 
-    def put(self, rows: Compressed, target: FloatArray) -> None:
-        self.parts.append(rows)
+    def add(self, rows: Compressed, target: FloatArray) -> None:
+        """Add a group of rows."""
+        self.groups.append(rows)
         self.targets.append(target)
         self.m += len(target)
 
     @property
     def stacked(self) -> tuple[Compressed, FloatArray]:
-        """J and target, all parts one under another."""
-        if len(self.parts) == 1:
-            return self.parts[0], self.targets[0]
-        parts = [(*rows, False, 1.0, len(rows[0]) - 1) for rows in self.parts]
-        return stacked(self.n, parts), np.concatenate([np.zeros(0), *self.targets])
+        """J and target of all groups."""
+        if len(self.groups) == 1:
+            return self.groups[0], self.targets[0]
+        groups = [(*rows, False, 1.0, len(rows[0]) - 1) for rows in self.groups]
+        return stacked(self.n, groups), np.concatenate([np.zeros(0), *self.targets])
 
-    def bounds(self, at: IntpArray, bound: FloatArray, sign: float) -> None:
-        """sign x_i >= sign bound_i of these variables."""
-        k = len(at)
-        rows = np.arange(k + 1, dtype=np.int32), at.astype(np.int32), np.full(k, sign)
-        self.put(rows, sign * bound[at])
+    def add_bounds(self, variables: IntpArray, bound: FloatArray, sign: float) -> None:
+        """Add the rows sign x_i >= sign bound_i of these variables."""
+        k = len(variables)
+        rows = np.arange(k + 1, dtype=np.int32), variables.astype(np.int32), np.full(k, sign)
+        self.add(rows, sign * bound[variables])
 
-    def given(self, name: str, matrix: Any, side: str, vector: Any) -> tuple[int | None, IntpArray | None]:
-        """A or G; how many rows were given, and which of them are put here: None, all; not those with h infinite."""
-        if (matrix is None) != (vector is None):
-            missing = name if matrix is None else side
-            raise InputError(f"{missing} is missing: {name} and {side} go together")
+    def add_matrix(
+        self, name: str, matrix: Any, rhs_name: str, rhs: Any
+    ) -> tuple[int | None, IntpArray | None]:
+        """Add the rows of A, or the rows of G with finite h.
+
+        Returns
+        -------
+        n_rows, finite_rows
+            Number of rows of the matrix (None without it), and the indices of the added rows (None if all are added).
+        """
+        if (matrix is None) != (rhs is None):
+            missing = name if matrix is None else rhs_name
+            raise InputError(f"{missing} is missing: {name} and {rhs_name} go together")
         if matrix is None:
             return None, None
-        rows = _matrix(name, matrix, self.n, 1.0 if name == "A" else -1.0)
+        rows = _convert_matrix(name, matrix, self.n, 1.0 if name == "A" else -1.0)
         m = len(rows[0]) - 1
         if name == "A":
-            self.put(rows, as_array(side, vector, (m,)))
+            self.add(rows, as_array(rhs_name, rhs, (m,)))
             return m, None
-        right, kept = as_array(side, vector, (m,), finite=False), None
-        if not (all_finite(right) and (right < INFINITE).all()):
-            check_not_nan(side, right)
-            kept = np.flatnonzero(right < INFINITE)
-            rows, right = _picked(rows, kept), right[kept]
-            if not all_finite(right):
-                raise InputError(f"h is -inf at [{kept[np.argmin(right)]}]: no x is below it")
-        self.put(rows, -right)
-        return m, kept
+        h, finite_rows = as_array(rhs_name, rhs, (m,), finite=False), None
+        if not (all_finite(h) and (h < INFINITE).all()):
+            check_not_nan(rhs_name, h)
+            finite_rows = np.flatnonzero(h < INFINITE)
+            rows, h = _select_rows(rows, finite_rows), h[finite_rows]
+            if not all_finite(h):
+                raise InputError(f"h is -inf at [{finite_rows[np.argmin(h)]}]: no x is below it")
+        self.add(rows, -h)
+        return m, finite_rows
 
 
-def _picked(rows: Compressed, kept: IntpArray) -> Compressed:
+def _select_rows(rows: Compressed, selected: IntpArray) -> Compressed:
+    """Return the selected rows of a matrix."""
     ptr, idx, val = rows
     size = np.diff(ptr)
-    on = np.repeat(np.isin(np.arange(len(size)), kept), size)
-    return np.concatenate([[0], np.cumsum(size[kept])]).astype(np.int32), idx[on], val[on]
+    entries = np.repeat(np.isin(np.arange(len(size)), selected), size)
+    return np.concatenate([[0], np.cumsum(size[selected])]).astype(np.int32), idx[entries], val[entries]
 
 
 def _check_bounds(lb: FloatArray, ub: FloatArray) -> None:
+    """Raise InputError unless a finite number is within the bounds of each variable."""
     bad = np.flatnonzero(~((lb <= ub) & (lb < np.inf) & (ub > -np.inf)))
     if len(bad):
         i = bad[0]
@@ -522,10 +543,10 @@ def _check_bounds(lb: FloatArray, ub: FloatArray) -> None:
         )
 
 
-# -- P that is singular -------------------------------------------------------------------------------
+# -- definiteness of P --------------------------------------------------------------------------------
 
 
-def _definite(lower: Compressed, jac: Compressed, q: FloatArray) -> Generalized | None:
+def _factor_definite(lower: Compressed, jac: Compressed, q: FloatArray) -> Generalized | None:
     """Return J and M = P of (4), or None if P is singular.
 
     Raises
@@ -533,20 +554,20 @@ def _definite(lower: Compressed, jac: Compressed, q: FloatArray) -> Generalized 
     InputError
         P is not positive semidefinite.
     """
-    momentum, unfactored = -q, Generalized.laid_out(jac, lower)
-    definite = _shifted(unfactored, np.zeros(len(q)), momentum)
-    if definite is not None and definite.operator.least_pivot > SINGULAR:
+    momentum, unfactored = -q, Generalized.from_validated(jac, lower)
+    definite = _factor_shifted(unfactored, np.zeros(len(q)), momentum)
+    if definite is not None and definite.operator.least_pivot > MAX_SINGULAR_PIVOT:
         return definite
     diagonal = lower[2][lower[0][1:] - 1]
-    zero = diagonal == 0.0
-    shift = np.where(zero, diagonal.max(initial=0.0) or 1.0, SHIFT * diagonal)
-    if not _rows_are_empty(lower, zero) or _shifted(unfactored, shift, momentum) is None:
+    is_zero = diagonal == 0.0
+    shift = np.where(is_zero, diagonal.max(initial=0.0) or 1.0, SEMIDEFINITE_SHIFT * diagonal)
+    if not _are_rows_empty(lower, is_zero) or _factor_shifted(unfactored, shift, momentum) is None:
         check_sizes("the diagonal of P", np.abs(diagonal))
-        raise InputError(f"P is not positive semidefinite: {_least_eigenvalue(lower, diagonal)}")
+        raise InputError(f"P is not positive semidefinite: {_describe_indefinite(lower, diagonal)}")
     return None
 
 
-def _shifted(unfactored: Generalized, d: FloatArray, momentum: FloatArray) -> Generalized | None:
+def _factor_shifted(unfactored: Generalized, d: FloatArray, momentum: FloatArray) -> Generalized | None:
     """Return J and P + diag(d), or None if that is not positive definite."""
     try:
         return unfactored.shifted(d, momentum)
@@ -554,20 +575,24 @@ def _shifted(unfactored: Generalized, d: FloatArray, momentum: FloatArray) -> Ge
         return None
 
 
-def _rows_are_empty(lower: Compressed, zero: FloatArray) -> bool:
+def _are_rows_empty(lower: Compressed, is_zero: FloatArray) -> bool:
     """Return whether rows and columns with a zero diagonal have no entries; otherwise P is indefinite."""
     ptr, idx, val = lower
-    beside = (zero[idx] | np.repeat(zero, np.diff(ptr))) & (val != 0.0)
-    return not beside.any()
+    is_entry = (is_zero[idx] | np.repeat(is_zero, np.diff(ptr))) & (val != 0.0)
+    return not is_entry.any()
 
 
-def _least_eigenvalue(lower: Compressed, diagonal: FloatArray) -> str:
+def _describe_indefinite(lower: Compressed, diagonal: FloatArray) -> str:
+    """Describe an indefinite P by its extreme eigenvalues, or if it is large by its smallest diagonal entry."""
     n = len(diagonal)
     if n <= MAX_EIGENVALUE_SIZE:
         ptr, idx, val = lower
         dense = np.zeros((n, n))
         dense[np.repeat(np.arange(n), np.diff(ptr)), idx] = val
-        value = np.linalg.eigvalsh(dense)  # which reads the lower triangle
-        return f"its least eigenvalue is {value[0]:.3g}, its largest {value[-1]:.3g}"
+        value = np.linalg.eigvalsh(dense)  # reads only the lower triangle
+        return f"its smallest eigenvalue is {value[0]:.3g}, its largest {value[-1]:.3g}"
     i = int(np.argmin(diagonal))
-    return f"P + {SHIFT:g} diag(P) has no Cholesky factor; the least diagonal entry is P[{i}, {i}] = {diagonal[i]:.3g}"
+    return (
+        f"P + {SEMIDEFINITE_SHIFT:g} diag(P) has no Cholesky factor; the smallest diagonal entry is P[{i}, {i}] = "
+        f"{diagonal[i]:.3g}"
+    )

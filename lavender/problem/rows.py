@@ -1,4 +1,4 @@
-"""The factored operator: J and M^-1 of bodies of six velocities, in the layout that sweeps want."""
+"""Rows of rigid bodies: J and M^-1 with six velocities for each body, in the memory layout that sweeps read."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from lavender.base.arrays import (
     ArrayLike,
     FloatArray,
     IntArray,
+    are_equal,
     as_array,
     check_sizes,
-    equal,
     precision_of,
     read_only,
     shape_of,
@@ -23,19 +23,21 @@ from lavender.base.lazy_import import sparse as sp
 from lavender.problem.cones import Cones
 from lavender_ext.core import checks
 
-EXACT = 1e-9  # above rounding of what was normalised in float64
+# Unit vectors and inertias that are off by at most this are not corrected; rounding in float64 causes less.
+MAX_UNCORRECTED_ERROR = 1e-9
+# Unit vectors and inertias that are off by more than this raise an error; float32 with several rotations causes less.
+MAX_CORRECTED_ERROR = 1e-5
 UNITS = {
     "inv_mass": "1/kg", "inv_inertia": "1/(kg m^2)", "v_free": "m/s, rad/s", "jac": "-", "normal": "-", "tangent": "-",
     "arm_a": "m", "arm_b": "m",
 }  # fmt: skip
-ROUNDED = 1e-5  # above what float32 leaves after some turns, below anything meant otherwise
 
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """Bodies, joints and contacts: J and M^-1 in the layout that sweeps read, without forming A.
+    """Bodies, joints and contacts of one step: J and M^-1, from which A is not formed.
 
-    Bodies are numbered 0 to n - 1; -1 stands for the static world. The blocks of the problem are the kj joints,
+    Bodies are numbered 0 to n - 1; -1 is the static world. The blocks of the problem are the kj joints,
     followed by the c contacts. A contact between bodies a and b has the normal n from a to b, the tangents t1 and
     t2 = n x t1, and arms from the bodies' centres to the contact point. Its rows are
 
@@ -48,7 +50,7 @@ class Rows:
     Parameters
     ----------
     inv_mass : array-like (n,), 1/kg
-        0: a kinematic body, which moves with `v_free` whatever the impulses.
+        0: a kinematic body, whose velocity is `v_free` with any impulses.
     inv_inertia : array-like (n, 3, 3), 1/(kg m^2)
         In world axes, symmetric, positive semidefinite.
     v_free : array-like (n, 6), m/s and rad/s
@@ -71,7 +73,7 @@ class Rows:
         True copies the arrays. False uses arrays without a copy if their type fits; they are then shared with the
         caller and marked read-only, and inertias are not symmetrised.
 
-    An empty list stands for no joints, contacts or bodies. float32 arrays are converted to float64. Normals and
+    An empty list means no joints, contacts or bodies. float32 arrays are converted to float64. Normals and
     tangents that differ from orthogonal unit vectors by up to 1e-5 are corrected, and so are inertias that are
     asymmetric by as much. If all arrays of numbers are float32, the `precision` of the rows and of their problems is
     "float32".
@@ -79,9 +81,9 @@ class Rows:
     Raises
     ------
     InputError
-        Shapes that do not fit; a body that does not exist; a row between a body and itself or between two static ones;
-        a negative inverse mass; an inertia that is not positive semidefinite; a normal or tangent that is not a unit
-        vector, or tangents that are not orthogonal to the normal.
+        The shapes disagree; a body does not exist; a row joins a body to itself, or two static bodies; an inverse mass
+        is negative; an inertia is not positive semidefinite; a normal or tangent is not a unit vector; a tangent is not
+        orthogonal to its normal.
 
     Examples
     --------
@@ -110,25 +112,21 @@ class Rows:
     True
     """
 
-    inv_mass: FloatArray  # (n,) 1/kg
-    inv_inertia: FloatArray  # (n, 3, 3) 1/(kg m^2), world axes, symmetric
-    v_free: FloatArray  # (n, 6) m/s, rad/s: v*, the velocity without constraint impulses
-    jac: FloatArray = field(
-        default_factory=lambda: np.zeros((0, 12))
-    )  # (mj, 12) linear, angular of a, then of b
-    joint_ptr: IntArray = field(
-        default_factory=lambda: np.zeros(1, np.int32)
-    )  # (kj + 1,) first row of each joint
-    joint_body: IntArray = field(default_factory=lambda: np.zeros((0, 2), np.int32))  # (kj, 2)
-    normal: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))  # (c, 3) unit, from a to b
-    tangent: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))  # (c, 3) unit, orthogonal to normal
-    arm_a: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))  # (c, 3) m
-    arm_b: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))  # (c, 3) m
-    contact_body: IntArray = field(default_factory=lambda: np.zeros((0, 2), np.int32))  # (c, 2)
-    copy: bool = field(default=True, repr=False)  # False: adopt arrays that fit, and mark them read-only
-    precision = "float64"  # of the numbers given, no field; an instance of float32 has its own
+    inv_mass: FloatArray
+    inv_inertia: FloatArray
+    v_free: FloatArray
+    jac: FloatArray = field(default_factory=lambda: np.zeros((0, 12)))
+    joint_ptr: IntArray = field(default_factory=lambda: np.zeros(1, np.int32))
+    joint_body: IntArray = field(default_factory=lambda: np.zeros((0, 2), np.int32))
+    normal: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
+    tangent: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
+    arm_a: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
+    arm_b: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
+    contact_body: IntArray = field(default_factory=lambda: np.zeros((0, 2), np.int32))
+    copy: bool = field(default=True, repr=False)
+    precision = "float64"  # Not a field: instances made from float32 have an attribute of this name.
 
-    if TYPE_CHECKING:  # what may be given; fields are arrays
+    if TYPE_CHECKING:  # The parameters accept more types than the fields have.
 
         def __init__(
             self, inv_mass: ArrayLike, inv_inertia: ArrayLike, v_free: ArrayLike, jac: ArrayLike = ...,
@@ -150,12 +148,12 @@ class Rows:
             "normal": (c, 3), "tangent": (c, 3), "arm_a": (c, 3), "arm_b": (c, 3),
         }  # fmt: skip
         object.__setattr__(self, "joint_ptr", ptr)
-        given = []
+        nonempty = []
         for name, shape in shapes.items():
-            x = getattr(self, name)
-            object.__setattr__(self, name, as_array(name, x, shape, copy=self.copy, unit=UNITS[name]))
-            given += [x] if getattr(self, name).size else []
-        if precision_of(*given) == "float32":
+            value = getattr(self, name)
+            object.__setattr__(self, name, as_array(name, value, shape, copy=self.copy, unit=UNITS[name]))
+            nonempty += [value] if getattr(self, name).size else []
+        if precision_of(*nonempty) == "float32":
             object.__setattr__(self, "precision", "float32")
         for name, shape in (("joint_body", (len(ptr) - 1, 2)), ("contact_body", (c, 2))):
             body = as_array(name, getattr(self, name), shape, dtype=np.int32, copy=self.copy)
@@ -163,49 +161,48 @@ class Rows:
             if checks.are_pairs(body, len(self.inv_mass), name == "contact_body"):
                 continue
             if body.size and (body.min() < -1 or body.max() >= len(self.inv_mass)):
-                stray = body.max() if body.max() >= len(self.inv_mass) else body.min()
+                invalid = body.max() if body.max() >= len(self.inv_mass) else body.min()
                 raise InputError(
-                    f"{name} names body {stray}; there are {len(self.inv_mass)} bodies, and -1 is static"
+                    f"{name} names body {invalid}; there are {len(self.inv_mass)} bodies, and -1 is static"
                 )
             same = np.flatnonzero((body[:, 0] == body[:, 1]) & (body[:, 0] >= 0))
             if len(same):
                 raise InputError(f"{name}[{same[0]}] joins body {body[same[0], 0]} to itself")
-            nobody = np.flatnonzero((body < 0).all(axis=1))
+            static = np.flatnonzero((body < 0).all(axis=1))
             raise InputError(
-                f"{name}[{nobody[0]}] = [-1, -1]: both are static, and no impulse moves them; leave it out"
+                f"{name}[{static[0]}] = [-1, -1]: both are static, and no impulse moves them; leave it out"
             )
         check_sizes("inv_mass", self.inv_mass, UNITS["inv_mass"])
         check_sizes("largest entry of inv_inertia", tensor_size(self.inv_inertia), UNITS["inv_inertia"])
         if self.copy:
             object.__setattr__(self, "inv_inertia", check_inertia("inv_inertia", self.inv_inertia))
         if not checks.are_frames(self.normal, self.tangent):
-            self._take_frames()
-        object.__setattr__(self, "copy", True)  # of what was given here
+            self._correct_frames()
+        object.__setattr__(self, "copy", True)  # `copy` applies to this call only
 
-    def _take_frames(self) -> None:
-        # What float32 leaves of unit vectors is made whole; what is meant otherwise is told.
+    def _correct_frames(self) -> None:
+        """Orthonormalise normals and tangents that float32 has rounded; raise InputError for larger errors."""
         n, t = self.normal, self.tangent
         with np.errstate(over="ignore", invalid="ignore"):
-            along = np.einsum("ij,ij->i", n, t)
-            parts = [np.linalg.norm(n, axis=1) - 1.0, np.linalg.norm(t, axis=1) - 1.0, along]
-            off = np.nan_to_num(
-                np.abs(np.stack(parts)).max(axis=0), nan=np.inf, posinf=np.inf
-            )  # inf - inf is far off, too
-        if off.max() > ROUNDED:
-            i = int(np.argmax(off))
+            cosine = np.einsum("ij,ij->i", n, t)
+            errors = [np.linalg.norm(n, axis=1) - 1.0, np.linalg.norm(t, axis=1) - 1.0, cosine]
+            # NaN comes from inf - inf.
+            error = np.nan_to_num(np.abs(np.stack(errors)).max(axis=0), nan=np.inf, posinf=np.inf)
+        if error.max() > MAX_CORRECTED_ERROR:
+            i = int(np.argmax(error))
             raise InputError(
                 f"contact {i}: normal {n[i]} and tangent {t[i]} must be orthogonal unit vectors; they are off by "
-                f"{off[i]:.2g}, and up to {ROUNDED:g} (float32 leaves 1e-7) is made whole: divide each by its length, "
-                "after the part along the normal was taken out of the tangent"
+                f"{error[i]:.2g}, and up to {MAX_CORRECTED_ERROR:g} (float32 leaves 1e-7) is corrected: divide each by "
+                "its length, after the part along the normal was taken out of the tangent"
             )
-        if off.max() <= EXACT:
+        if error.max() <= MAX_UNCORRECTED_ERROR:
             return
         n = n / np.linalg.norm(n, axis=1)[:, None]
         t = t - np.einsum("ij,ij->i", n, t)[:, None] * n
         t /= np.linalg.norm(t, axis=1)[:, None]
-        rough = (off > EXACT)[:, None]
-        object.__setattr__(self, "normal", read_only(np.where(rough, n, self.normal)))
-        object.__setattr__(self, "tangent", read_only(np.where(rough, t, self.tangent)))
+        is_corrected = (error > MAX_UNCORRECTED_ERROR)[:, None]
+        object.__setattr__(self, "normal", read_only(np.where(is_corrected, n, self.normal)))
+        object.__setattr__(self, "tangent", read_only(np.where(is_corrected, t, self.tangent)))
 
     @property
     def n_bodies(self) -> int:
@@ -214,25 +211,25 @@ class Rows:
 
     @property
     def n_joints(self) -> int:
-        """Number of joints, kj: the first blocks."""
+        """Number of joints, kj; the joints are the first blocks."""
         return len(self.joint_body)
 
     @property
     def n_contacts(self) -> int:
-        """Number of contacts, c: the blocks after the joints."""
+        """Number of contacts, c; the contacts are the blocks after the joints."""
         return len(self.contact_body)
 
     @property
     def block_bodies(self) -> IntArray:
-        """(k, 2) bodies of each block, joints first; -1 is static."""
+        """Bodies of each block (k, 2), joints first; -1 is static."""
         if self.n_joints == 0:
             return self.contact_body
         return np.concatenate([self.joint_body, self.contact_body])
 
     def jacobian(self, cones: Cones) -> sp.csr_array:
-        """J as CSR (m, 6 n); the columns of body i are 6 i .. 6 i + 5, linear then angular."""
-        fits = isinstance(cones, Cones) and cones.n_blocks == self.n_joints + self.n_contacts
-        if not fits or cones.ptr[self.n_joints] != len(self.jac):
+        """Compute J as a CSR matrix (m, 6 n); columns 6 i to 6 i + 5 are body i, linear then angular."""
+        is_valid = isinstance(cones, Cones) and cones.n_blocks == self.n_joints + self.n_contacts
+        if not is_valid or cones.ptr[self.n_joints] != len(self.jac):
             raise InputError(
                 f"cones is {cones!r:.60}; the Cones of {self.n_joints} joints and {self.n_contacts} contacts are needed"
             )
@@ -245,26 +242,30 @@ class Rows:
         dense[:mj] = self.jac
         body[:mj] = np.repeat(self.joint_body, np.diff(self.joint_ptr), axis=0)
         body[mj:] = np.repeat(self.contact_body, np.diff(cones.ptr[self.n_joints :]), axis=0)
+        # normal and tangent rows
         t2 = np.cross(self.normal, self.tangent)
         for axis, row in ((self.normal, 0), (self.tangent, 1), (t2, 2)):
-            has = np.flatnonzero(tangents >= row)
-            with np.errstate(over="ignore", invalid="ignore"):  # arms at the edge of float64
-                turn_a, turn_b = np.cross(self.arm_a[has], axis[has]), np.cross(self.arm_b[has], axis[has])
-            dense[first[has] + row] = np.hstack([-axis[has], -turn_a, axis[has], turn_b])
-        turning, rolling = cones.spin_rows[self.n_joints :], cones.rolling_rows[self.n_joints :]
-        for axis, at in ((self.normal, turning), (self.tangent, rolling), (t2, rolling + (rolling >= 0))):
-            has = np.flatnonzero(at >= 0)
-            dense[at[has]] = 0.0
-            dense[at[has], 3:6], dense[at[has], 9:12] = -axis[has], axis[has]
-        keep = np.repeat(body >= 0, 6, axis=1) & (dense != 0.0)
+            contacts = np.flatnonzero(tangents >= row)
+            with np.errstate(over="ignore", invalid="ignore"):  # arms near the largest float64
+                angular_a = np.cross(self.arm_a[contacts], axis[contacts])
+                angular_b = np.cross(self.arm_b[contacts], axis[contacts])
+            dense[first[contacts] + row] = np.hstack([-axis[contacts], -angular_a, axis[contacts], angular_b])
+        # spin and rolling rows
+        spin, rolling = cones.spin_rows[self.n_joints :], cones.rolling_rows[self.n_joints :]
+        for axis, rows in ((self.normal, spin), (self.tangent, rolling), (t2, rolling + (rolling >= 0))):
+            contacts = np.flatnonzero(rows >= 0)
+            dense[rows[contacts]] = 0.0
+            dense[rows[contacts], 3:6], dense[rows[contacts], 9:12] = -axis[contacts], axis[contacts]
+        # entries that are not zero, without those of static bodies
+        is_stored = np.repeat(body >= 0, 6, axis=1) & (dense != 0.0)
         columns = (6 * body[:, [0, 1], None] + np.arange(6)).reshape(m, 12)
-        indptr = np.concatenate([[0], np.cumsum(keep.sum(axis=1))])
-        jac = sp.csr_array((dense[keep], columns[keep], indptr), shape=(m, 6 * self.n_bodies))
+        indptr = np.concatenate([[0], np.cumsum(is_stored.sum(axis=1))])
+        jac = sp.csr_array((dense[is_stored], columns[is_stored], indptr), shape=(m, 6 * self.n_bodies))
         jac.sort_indices()
         return jac
 
     def inverse_mass_matrix(self) -> sp.csr_array:
-        """M^-1 as CSR (6 n, 6 n)."""
+        """Compute M^-1 as a CSR matrix (6 n, 6 n)."""
         n = self.n_bodies
         diagonal = np.repeat(np.arange(n) * 6, 3) + np.tile(np.arange(3), n)
         block = np.repeat(np.arange(n) * 6 + 3, 9)
@@ -277,7 +278,7 @@ class Rows:
         if not isinstance(other, Rows):
             return NotImplemented
         return all(
-            equal(getattr(self, f.name), getattr(other, f.name)) for f in fields(self) if f.name != "copy"
+            are_equal(getattr(self, f.name), getattr(other, f.name)) for f in fields(self) if f.name != "copy"
         )
 
     __hash__ = None  # type: ignore[assignment]
@@ -288,28 +289,37 @@ class Rows:
 
 
 def tensor_size(tensors: FloatArray) -> FloatArray:
-    """Largest entry of each tensor (n, 3, 3)."""
+    """Return the largest absolute entry of each tensor (n, 3, 3)."""
     return np.abs(tensors).max(axis=(1, 2), initial=0.0)
 
 
 def check_inertia(name: str, tensors: FloatArray) -> FloatArray:
-    """Tensors (n, 3, 3) that bodies have, made whole where float32 left symmetry or eigenvalues of 0 a little off."""
+    """Return inverse inertias (n, 3, 3), made symmetric positive semidefinite if they are not by rounding to float32.
+
+    Raises
+    ------
+    InputError
+        A tensor differs by more than `MAX_CORRECTED_ERROR` of its largest entry.
+    """
     if checks.are_definite(tensors):
         return tensors
     size = np.abs(tensors).max(axis=(1, 2))
     skew = np.abs(tensors - tensors.transpose(0, 2, 1)).max(axis=(1, 2))
     with np.errstate(divide="ignore", invalid="ignore"):
         scaled = np.where(size[:, None, None] > 0.0, tensors / size[:, None, None], 0.0)
-    least = np.linalg.eigvalsh(scaled)[:, 0]
-    for wrong, what in ((skew > ROUNDED * size, "symmetric"), (least < -ROUNDED, "positive semidefinite")):
-        if wrong.any():
-            i = int(np.argmax(wrong))
+    min_eigenvalue = np.linalg.eigvalsh(scaled)[:, 0]
+    for is_bad, requirement in (
+        (skew > MAX_CORRECTED_ERROR * size, "symmetric"),
+        (min_eigenvalue < -MAX_CORRECTED_ERROR, "positive semidefinite"),
+    ):
+        if is_bad.any():
+            i = int(np.argmax(is_bad))
             raise InputError(
-                f"{name}[{i}] is not {what}: {tensors[i].tolist()}; an inverse inertia, world axes, is needed"
+                f"{name}[{i}] is not {requirement}: {tensors[i].tolist()}; an inverse inertia, world axes, is needed"
             )
-    rough = (skew > EXACT * size) | (least < -EXACT)
-    if not rough.any():
+    is_corrected = (skew > MAX_UNCORRECTED_ERROR * size) | (min_eigenvalue < -MAX_UNCORRECTED_ERROR)
+    if not is_corrected.any():
         return tensors
     value, axes = np.linalg.eigh(0.5 * (scaled + scaled.transpose(0, 2, 1)))
-    whole = size[:, None, None] * ((axes * np.maximum(value, 0.0)[:, None, :]) @ axes.transpose(0, 2, 1))
-    return read_only(np.where(rough[:, None, None], 0.5 * (whole + whole.transpose(0, 2, 1)), tensors))
+    new = size[:, None, None] * ((axes * np.maximum(value, 0.0)[:, None, :]) @ axes.transpose(0, 2, 1))
+    return read_only(np.where(is_corrected[:, None, None], 0.5 * (new + new.transpose(0, 2, 1)), tensors))

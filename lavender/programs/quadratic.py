@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from lavender.base.arrays import number, read_only
+from lavender.base.arrays import check_float, read_only
 from lavender.base.errors import InputError
 from lavender.base.lazy_import import sparse as sp
 from lavender.judge.solution import CONFIRMED, CONVERGED, Claim, Solution, Status, summed
@@ -93,7 +93,7 @@ def solve_qp(
             "constraint problem alone"
         )
     begun = perf_counter()
-    tol, end = number("tol", tol, low=0.0), begun + seconds_of(time_limit)
+    tol, end = check_float("tol", tol, low=0.0), begun + seconds_of(time_limit)
     start = options.pop("impulse", None)
     is_auto = isinstance(solver, str) and solver == "auto"
     if is_auto and tol > 0.0 and not options and not qp.is_singular:

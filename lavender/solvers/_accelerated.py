@@ -112,5 +112,5 @@ def _entries(problem: Problem) -> int | None:
     rows = problem.rows
     if rows is None or problem.law != "lcp" or rows.n_joints or problem.m > problem.n_blocks:
         return None
-    entries = int(problem._meetings)
+    entries = int(problem._n_couplings)
     return entries if entries <= min(NEIGHBOURS * problem.m, ENTRIES) else None

@@ -23,7 +23,7 @@ from lavender.base.deadline import Deadline, Stopwatch, TooLate
 from lavender.base.errors import BREAKDOWN, InputError
 from lavender.base.lazy_import import import_numerics
 from lavender.base.lazy_import import sparse as sp
-from lavender.judge.residuals import reference
+from lavender.judge.residuals import get_reference
 from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
 from lavender.solvers._accelerated import LARGEST_MEMORY
@@ -72,7 +72,7 @@ class AdmmState:
     """Scaled problem, factorisation for the current rho, and the vectors of the run, which `open` makes."""
 
     def __init__(self, problem: Problem, memory: int, relaxation: float) -> None:
-        reference(problem)
+        get_reference(problem)
         self.problem, self.memory, self.relaxation = problem, memory, relaxation
         self.deadline = Deadline()  # nothing is begun that is expected to end later
         self.factorisations = self.reported = 0  # factors: all, and those that an earlier run has told
@@ -191,7 +191,7 @@ def _scaling(problem: Problem) -> float:
     """What scaling is expected to take [s]."""
     if _is_over_bodies(problem):
         return 3.0 * CALLS + LAID_OUT * _JACOBIAN * problem.m  # J, the root of M^-1, and their product
-    entries, formed = problem.most_entries, forming(problem)
+    entries, formed = problem.max_entries, forming(problem)
     if problem.generalized is not None and entries == float(problem.m) ** 2:  # one product of dense matrices
         formed = min(formed, START + WHOLE * entries + DENSE * float(problem.metric.products_of_a))
     return START + formed + compared(problem) + _SCALED * entries

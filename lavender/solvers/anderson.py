@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from lavender.base.arrays import whole_number
+from lavender.base.arrays import check_int
 from lavender.solvers._accelerated import CONVEX_OPTION, LARGEST_MEMORY, SWEEP_OPTION, Accelerated
 from lavender.solvers.registry import SolverSpec
 
@@ -23,7 +23,7 @@ class Anderson(Accelerated):
     memory: int = 5
 
     def __post_init__(self) -> None:
-        whole_number("memory", self.memory, 1, LARGEST_MEMORY)
+        check_int("memory", self.memory, 1, LARGEST_MEMORY)
 
     @property
     def _memory(self) -> int:

@@ -44,7 +44,7 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray
 from lavender.base.deadline import NEVER, Deadline, seconds
-from lavender.base.errors import BREAKDOWN, last_words
+from lavender.base.errors import BREAKDOWN, format_error
 from lavender.judge.residuals import best_of_islands
 from lavender.judge.solution import Claim, Status
 from lavender.problem import OPERATORS, Problem
@@ -299,7 +299,7 @@ class Auto(Solver):
         deadline, failed = Deadline(time_limit), list[tuple[str, Claim]]()
         if problem.has_singular_program:
             return run_backends(problem, impulse, max_iter, tol, deadline)
-        if max_iter >= ONE_CALL and call_ends_within(problem, deadline.left()):
+        if max_iter >= ONE_CALL and call_ends_within(problem, deadline.remaining()):
             share = 1.0 if problem.m <= SMALL_ROWS else QUARTER
             found, counts = AUTO.attempt(problem, impulse, tol, share * deadline.nanoseconds())
             if found is not None and found.relative <= tol:
@@ -327,7 +327,7 @@ class Auto(Solver):
         except KeyboardInterrupt:
             log.interrupted = True  # the best impulse goes back all the same
         except BREAKDOWN as error:
-            log.failure = last_words(error)
+            log.failure = format_error(error)
         if log.best > tol and log.result is not None:
             impulse[:] = best_of_islands(problem, (impulse,), (log.result,), tol)
         else:
@@ -370,7 +370,7 @@ def run_backends(
     except KeyboardInterrupt:
         log.interrupted = True
     except BREAKDOWN as failure:
-        log.failure = last_words(failure)
+        log.failure = format_error(failure)
     claim = log.claim()
     if log.best <= tol:
         impulse[:] = log.impulse

@@ -25,11 +25,11 @@ from lavender.base.arrays import FloatArray, IntArray
 from lavender.base.deadline import Deadline
 from lavender.base.errors import InputError
 from lavender.base.lazy_import import sparse as sp
-from lavender.judge.certificates import Proof, fighting, prove
+from lavender.judge.certificates import Proof, list_conflicting_blocks, prove
 from lavender.judge.residuals import residual
 from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
-from lavender.problem.ordering import blocks_of_each
+from lavender.problem.ordering import blocks_by_island
 from lavender.solvers.islands import islands, restrict, rows_of
 from lavender.solvers.newton_systems import general
 from lavender.solvers.registry import get
@@ -80,10 +80,10 @@ def conflict_of(problem: Problem, tol: float, deadline: Deadline | None = None) 
     proof = prove(inner, claim.certificate, tol, deadline)
     if proof.reason:
         return None
-    joints, contacts = fighting(problem, proof.y)
+    joints, contacts = list_conflicting_blocks(problem, proof.y)
     soft, first, last = joints or contacts, problem.cones.ptr[:-1], problem.cones.ptr[1:]
     tries = [
-        (np.concatenate([np.arange(first[i], last[i]) for i in soft]), proof.fighting.split(" against ")[0])
+        (np.concatenate([np.arange(first[i], last[i]) for i in soft]), proof.conflict.split(" against ")[0])
     ]
     if contacts:  # others may fight as well, of which this proof says nothing
         tries.append((np.flatnonzero(problem.cones.contact_rows), "all contacts"))
@@ -112,7 +112,7 @@ def _newton(
     problem: Problem, steps: int, tol: float, deadline: Deadline | None
 ) -> tuple[float, Claim | None]:
     """Relative residual and claim of Newton's method from nothing; inf, None where it does not take the problem."""
-    spec, left = get("newton"), None if deadline is None else deadline.left()
+    spec, left = get("newton"), None if deadline is None else deadline.remaining()
     if spec.refuses(problem) is not None or (left is not None and left <= 0.0):
         return np.inf, None
     solver, impulse = spec.load()(), problem.start()
@@ -223,7 +223,7 @@ def _parts(log: SolveLog) -> Any:
     if count <= 1:
         yield problem, slice(None)
         return
-    blocks = blocks_of_each(count, label)
+    blocks = blocks_by_island(count, label)
     for i in sorted(_wrong(log, label), key=lambda i: len(blocks[i])):
         rows = rows_of(problem, blocks[i])
         yield restrict(problem, blocks[i], rows), rows
@@ -275,7 +275,7 @@ def find_direction(problem: Problem, deadline: Deadline) -> FloatArray | None:
     gain = np.concatenate([scale * problem.b, np.zeros(rim.shape[1])])
     options: dict[str, Any] = {"maxiter": CERTIFICATE_STEPS * problem.m}
     if deadline.is_set:
-        options["time_limit"] = deadline.left(1e-3)
+        options["time_limit"] = deadline.remaining(1e-3)
     found = linprog(
         -gain, A_ub=above, b_ub=np.zeros(above.shape[0]), A_eq=level, b_eq=np.zeros(level.shape[0]),
         bounds=np.stack([low, high], 1), method="highs", options=options,
@@ -305,7 +305,7 @@ def check_infeasible(
     """
     if claim.certificate is not None and not prove(problem, claim.certificate, tol, deadline).reason:
         return claim, True, ""
-    spec, left = get("auto"), deadline.left()
+    spec, left = get("auto"), deadline.remaining()
     if problem.m > CERTIFICATE_ROWS or (left is not None and left <= 0.0):
         return claim, False, ""
     solver, impulse = spec.load()(), problem.start()

@@ -28,8 +28,8 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray
 from lavender.base.deadline import Deadline
-from lavender.judge.certificates import NEAR, check_certificate
-from lavender.judge.residuals import FLOOR_MOST, judged, remember
+from lavender.judge.certificates import MAX_POLISHED_SLACK, check_certificate
+from lavender.judge.residuals import MAX_EXCUSED_RESIDUAL, judge_impulse, store_result
 from lavender.judge.solution import Claim, Status, summed
 from lavender.problem import Problem
 from lavender.solvers.factors import SMALL_SIZE, GeneralFactor, PanelsLU
@@ -175,7 +175,7 @@ class _Run:
 
     def judge(self, x: FloatArray) -> float:
         """Relative residual of x, which must not change any more; the best becomes the result."""
-        found = judged(self.problem, x)
+        found = judge_impulse(self.problem, x)
         self.keep(found)
         relative: float = found.relative
         return relative
@@ -191,7 +191,7 @@ class _Run:
 
     @property
     def floor(self) -> float:
-        return 0.0 if self.kept is None else self.kept.floor
+        return 0.0 if self.kept is None else self.kept.roundoff_floor
 
     def put_best(self) -> None:
         pivot = self.state.pivot
@@ -199,10 +199,10 @@ class _Run:
             self.keep(pivot.rows.best)  # an error, or Ctrl-C, ended it between two rounds
         if self.kept is not None:
             self.impulse[:] = self.kept.impulse
-            remember(self.problem, self.kept)
+            store_result(self.problem, self.kept)
 
     def good(self) -> bool:
-        return self.best <= max(self.least, min(self.floor, FLOOR_MOST))
+        return self.best <= max(self.least, min(self.floor, MAX_EXCUSED_RESIDUAL))
 
     def at_floor(self) -> bool:
         return self.kept is not None and self.kept.above_floor <= self.tol
@@ -358,7 +358,7 @@ class _Run:
         y[np.abs(y) < 1e-13] = 0.0
         length = np.sqrt(self.problem.d)
         pull = self.problem.csr @ y if self.problem.is_symmetric else np.zeros(1)
-        if np.any(np.sign(y) * pull > NEAR * (length @ np.abs(y)) * length):
+        if np.any(np.sign(y) * pull > MAX_POLISHED_SLACK * (length @ np.abs(y)) * length):
             return None  # an impulse without an end meets b.y there, beyond what a solver rounds
         if check_certificate(self.problem, y, self.tol, self.deadline) is not None:
             return None

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from lavender.base.arrays import number
+from lavender.base.arrays import check_float
 from lavender.problem import Problem
 from lavender.problem.ordering import block_order
 from lavender.solvers.registry import SolverSpec
@@ -34,7 +34,7 @@ class Jacobi(Swept):
 
     def __post_init__(self) -> None:
         if self.omega is not None:
-            number("omega", self.omega, above=0.0)
+            check_float("omega", self.omega, above=0.0)
 
     def setup_time(self, problem: Problem) -> float:
         """What `prepare` takes [s], as counted."""

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from lavender.base.arrays import FloatArray, IntArray
-from lavender.problem import FRICTION, Problem
+from lavender.problem import FRICTION_LAWS, Problem
 from lavender.problem.ordering import Order, body_ranks
 from lavender_ext.core.blocks import Blocks
 from lavender_ext.core.problem import Data
@@ -76,7 +76,7 @@ def lay_out(problem: Problem, blocks: IntArray, before: Layout | None = None) ->
         r.arm_b[contact], rank[r.contact_body[contact]], r.inv_mass[body], r.inv_inertia[body],
         problem.compliance[rows],
     )  # fmt: skip
-    data = Data(Blocks(*given[:7]), given[7], FRICTION.index(problem.friction), rows=tuple(given[8:]))
+    data = Data(Blocks(*given[:7]), given[7], FRICTION_LAWS.index(problem.friction), rows=tuple(given[8:]))
     return Layout(data, rows, place, ranks)
 
 

@@ -19,7 +19,7 @@ import numpy as np
 from lavender.base.arrays import FloatArray
 from lavender.base.deadline import CHUNK_TIME, Deadline
 from lavender.judge.certificates import check_certificate
-from lavender.judge.residuals import remember
+from lavender.judge.residuals import store_result
 from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
 from lavender.solvers.certify import CERTIFICATE_ROWS, LINEAR_PROGRAM, find_direction
@@ -89,7 +89,7 @@ class Lemke(Solver):
             found = state.rows.best
             if found is not None:
                 impulse[:] = found.impulse
-                remember(state.problem, found)
+                store_result(state.problem, found)
 
     def _follow(
         self, state: PivotState, paths: lemke.Lemke, max_iter: int, tol: float, deadline: Deadline, chunk: int

@@ -15,8 +15,15 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray
 from lavender.base.deadline import CHUNK_TIME, Deadline, Stopwatch
-from lavender.base.errors import BREAKDOWN, last_words
-from lavender.judge.residuals import Residual, best_of_islands, judged, remember, remembered, residual
+from lavender.base.errors import BREAKDOWN, format_error
+from lavender.judge.residuals import (
+    Residual,
+    best_of_islands,
+    find_stored,
+    judge_impulse,
+    residual,
+    store_result,
+)
 from lavender.judge.solution import (
     INTERRUPTED,
     MAX_ITERATIONS,
@@ -69,7 +76,7 @@ class Loop:
         watch = Stopwatch()
         try:
             try:
-                claim = self.call(max_iter, self.deadline.left(LEAST))
+                claim = self.call(max_iter, self.deadline.remaining(LEAST))
             finally:
                 self.time = watch.seconds
             if not self.broken:
@@ -86,7 +93,7 @@ class Loop:
             return self.solver.run(self.state, self.impulse, max_iter, self.tol, time_limit)
         except BREAKDOWN as error:
             self.broken = True
-            return Claim(NUMERICAL_ERROR, 0, {}, last_words(error))
+            return Claim(NUMERICAL_ERROR, 0, {}, format_error(error))
 
     def run(self, max_iter: int) -> Claim:
         """In chunks; the result is the best of what was checked."""
@@ -142,7 +149,7 @@ class Loop:
         return max(1, min(8 * n, int(n * self._aim() / max(elapsed, 1e-7))))
 
     def _aim(self) -> float:
-        left = self.deadline.left()
+        left = self.deadline.remaining()
         return CHUNK_TIME if left is None else min(CHUNK_TIME, SHARE * left)
 
     def not_worse(self, start: FloatArray, or_zero: bool = True) -> None:
@@ -151,10 +158,10 @@ class Loop:
         A result that meets tol stays as it is.
         """
         problem = self.problem
-        found = remembered(problem, self.impulse) or judged(problem, self.impulse.copy())
+        found = find_stored(problem, self.impulse) or judge_impulse(problem, self.impulse.copy())
         if found.relative > self.tol:
             found = best_of(problem, found, start, self.tol, or_zero)
-        remember(problem, found)
+        store_result(problem, found)
         self.impulse[:] = found.impulse
 
     def _keep_best(self) -> None:
@@ -170,9 +177,9 @@ class Loop:
         best = getattr(state, "best", None)
         if best is None or best[1] is None:
             return
-        last = remembered(self.problem, self.impulse) or judged(self.problem, self.impulse.copy())
+        last = find_stored(self.problem, self.impulse) or judge_impulse(self.problem, self.impulse.copy())
         if last.relative <= self.tol:
-            remember(self.problem, last)  # for the result
+            store_result(self.problem, last)  # for the result
         else:
             self.impulse[:] = best_of_islands(self.problem, (best[1],), (self.impulse,), self.tol)
 
@@ -211,4 +218,4 @@ def best_of(problem: Problem, found: Any, start: FloatArray | None, tol: float, 
     if not np.allclose(inside, own, rtol=BOUND_ROUNDING, atol=0.0):
         own = inside
     best = best_of_islands(problem, (first, problem._start) if or_zero else (first,), (own,), tol)
-    return found if same_bits(best, found.impulse) else judged(problem, best)
+    return found if same_bits(best, found.impulse) else judge_impulse(problem, best)

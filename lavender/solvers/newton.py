@@ -33,11 +33,11 @@ from typing import Any
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray, one_of
+from lavender.base.arrays import FloatArray, check_choice
 from lavender.base.deadline import Deadline, Stopwatch, TooLate
 from lavender.base.errors import CapabilityError, InputError
 from lavender.judge.certificates import check_certificate
-from lavender.judge.residuals import quick
+from lavender.judge.residuals import compute_relative
 from lavender.judge.solution import Claim, Status, counted, summed
 from lavender.problem import OPERATORS, Problem
 from lavender.solvers.costs import SOFT, STEPS, Count, factorisations, newton_cost
@@ -136,7 +136,7 @@ class Newton(Solver):
         bodies = problem.rows is not None and problem.rows.n_bodies > 0 and self.form != "impulse"
         if bodies:
             return over_bodies(problem)
-        few = not is_dense(problem.most_entries, problem.m, problem.law == "cone")
+        few = not is_dense(problem.max_entries, problem.m, problem.law == "cone")
         return over_rows(problem) + (analysed(problem) if few else 0.0)
 
     def prepare(self, problem: Problem) -> NewtonState:
@@ -145,7 +145,7 @@ class Newton(Solver):
 
     @np.errstate(all="ignore")  # what overflows is judged
     def _prepare(self, problem: Problem, like: System | None) -> NewtonState:
-        one_of("form", self.form, FORMS)
+        check_choice("form", self.form, FORMS)
         if self.form == "velocity" and problem.matrix is not None:
             raise InputError(
                 "form='velocity' needs a problem with J and M (Problem.from_rows, Problem.from_jacobian); this one "
@@ -235,7 +235,7 @@ class Newton(Solver):
         if bodies is None and (self.form == "velocity" or problem.m > ROWS or problem.cones.has_round):
             return claim
         w, e = np.empty(problem.m), np.empty(problem.m)
-        best, above = quick(problem, impulse, w, e, True)
+        best, above = compute_relative(problem, impulse, w, e, True)
         if above <= tol:
             return claim
         before = impulse.copy()
@@ -243,9 +243,9 @@ class Newton(Solver):
             impulse[:] = problem.start()
         system = make_system(problem, "impulse" if bodies is None else "velocity", bodies=bodies)
         more = self._run_system(
-            problem, system if system.solve.m else None, impulse, left, tol, deadline.left(1e-3)
+            problem, system if system.solve.m else None, impulse, left, tol, deadline.remaining(1e-3)
         )
-        if not quick(problem, impulse, w, e)[0] <= best:
+        if not compute_relative(problem, impulse, w, e)[0] <= best:
             impulse[:] = before
         work = summed((claim.work, more.work))
         form = f"{claim.form}, then {more.form or 'impulse'}"
@@ -321,7 +321,7 @@ def _stages(
         while True:
             before = solve.done
             most = WATCHED / max(system.seconds, 1e-6)
-            left, watch = deadline.left(), Stopwatch()
+            left, watch = deadline.remaining(), Stopwatch()
             if left is not None:
                 # Of the first the pace is only counted.
                 most = min(most, TIME_SHARE * left / max(system.seconds, 1e-9)) if solve.done else 1.0

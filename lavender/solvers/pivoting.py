@@ -7,7 +7,7 @@ import numpy as np
 from lavender.base.arrays import FloatArray, IntArray
 from lavender.base.deadline import Deadline, Stopwatch
 from lavender.base.lazy_import import import_numerics
-from lavender.judge.residuals import reference
+from lavender.judge.residuals import get_reference
 from lavender.problem import Problem
 from lavender.solvers.factors import (
     BAND,
@@ -79,7 +79,7 @@ class PivotState:
         #: The factor takes a matrix of few entries.
         self.is_sparse = self.form == "sparse" or (isinstance(factor, LUFactor) and factor.sparse)
         self.outside = None if factor is None else Timed(factor, self._expected())
-        reference(problem)
+        get_reference(problem)
         # Of one round [s], all rows free, where the factor is compiled; then as long as the last took.
         self.seconds = 1e-9 * BAND * problem.m * (band + 1.0) ** 2 + SWEEP * problem.csr_data.work
         self.rows = Pivoting(
@@ -116,7 +116,7 @@ class PivotState:
         (int, bool)
             Code of `Pivoting.advance`, and whether no round fits.
         """
-        left, before, watch = deadline.left(), self.rows.n_rounds, Stopwatch()
+        left, before, watch = deadline.remaining(), self.rows.n_rounds, Stopwatch()
         if left is None or self.outside is not None:  # which asks the clock itself
             return self.rows.advance(most), most == 0
         n = int(left / self.seconds)

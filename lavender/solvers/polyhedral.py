@@ -26,7 +26,7 @@ from lavender.base.deadline import Deadline
 from lavender.base.errors import InputError
 from lavender.base.lazy_import import sparse as sp
 from lavender.judge.certificates import check_certificate
-from lavender.judge.residuals import quick
+from lavender.judge.residuals import compute_relative
 from lavender.judge.solution import Claim, Status, summed
 from lavender.problem import Problem
 from lavender.problem.cones import project
@@ -187,7 +187,7 @@ class ThroughRows(Solver):
         if claim.status in (Status.CONVERGED, Status.ROUNDOFF_LIMIT):
             return claim
         room = np.empty_like(given), np.empty_like(given)
-        before, after = (quick(held.form.problem, x, *room)[0] for x in (given, impulse))
+        before, after = (compute_relative(held.form.problem, x, *room)[0] for x in (given, impulse))
         if before < after:
             impulse[:] = given
         return replace(claim, status=Status.CONVERGED, certificate=None) if before <= tol else claim
@@ -206,7 +206,11 @@ class ThroughRows(Solver):
             return claim
         z = form.start(impulse)
         more = self._judged(
-            form, path.run(path.prepare(form.rows), z, max_iter, tol, deadline.left(1e-3)), z, impulse, tol
+            form,
+            path.run(path.prepare(form.rows), z, max_iter, tol, deadline.remaining(1e-3)),
+            z,
+            impulse,
+            tol,
         )
         work = summed((claim.work, more.work))
         words = f"{claim.message or 'no exchange helped'}, then complementary pivots"
@@ -218,7 +222,9 @@ class ThroughRows(Solver):
         if not np.isfinite(found).all():
             return replace(claim, status=Status.NUMERICAL_ERROR, certificate=None, dual=None)
         impulse[:] = found
-        relative, above = quick(form.problem, impulse, np.empty_like(found), np.empty_like(found), floor=True)
+        relative, above = compute_relative(
+            form.problem, impulse, np.empty_like(found), np.empty_like(found), floor=True
+        )
         status, words, proof = claim.status, claim.message, None
         if relative <= tol:
             status = Status.CONVERGED

@@ -14,9 +14,9 @@ from dataclasses import dataclass, field
 from functools import cache
 from typing import Any, Protocol
 
-from lavender.base.arrays import FloatArray, flag, whole_number
+from lavender.base.arrays import FloatArray, check_bool, check_int
 from lavender.base.deadline import Deadline
-from lavender.base.errors import InputError, SolverUnavailable, UnknownName, check_name, last_words
+from lavender.base.errors import InputError, SolverUnavailable, UnknownName, check_name, format_error
 from lavender.base.lazy_import import import_lock, import_locked
 from lavender.judge.solution import Claim, Status
 from lavender.problem import LAWS, OPERATORS, Problem, check_problem
@@ -266,8 +266,8 @@ class SolverSpec:
         for name, kind in self.__dataclass_fields__.items():
             value = getattr(self, name)
             if kind.type == "bool" and not isinstance(value, bool):  # as __future__ leaves annotations
-                flag(f"{name} of solver {self.name!r}", value)
-        object.__setattr__(self, "max_iter", whole_number(f"max_iter of solver {self.name!r}", self.max_iter))
+                check_bool(f"{name} of solver {self.name!r}", value)
+        object.__setattr__(self, "max_iter", check_int(f"max_iter of solver {self.name!r}", self.max_iter))
         if not self.resumable:
             object.__setattr__(self, "callback", False)
             object.__setattr__(self, "history", False)
@@ -352,7 +352,7 @@ class SolverSpec:
         except Exception as error:
             if self.builtin:
                 raise
-            return f"cannot say whether it takes the problem: {last_words(error)}"
+            return f"cannot say whether it takes the problem: {format_error(error)}"
 
     def standing_in(self, problem: Problem) -> SolverSpec | None:
         """Return the variant of this method with bounds if this one refuses the problem only for its bounds."""
@@ -376,7 +376,7 @@ class SolverSpec:
             return getattr(import_locked(module), attribute)
         except Exception as error:
             raise SolverUnavailable(
-                f"solver {self.name!r} cannot be imported from {self.factory!r}: {last_words(error)}"
+                f"solver {self.name!r} cannot be imported from {self.factory!r}: {format_error(error)}"
             ) from error
 
 
@@ -459,7 +459,7 @@ def register(spec: SolverSpec, *, replace: bool = False) -> None:
         `spec` is not a SolverSpec, or the name is in use.
     """
     load()
-    _add(spec, flag("replace", replace))
+    _add(spec, check_bool("replace", replace))
 
 
 def _add(spec: SolverSpec, replace: bool) -> None:
@@ -541,7 +541,7 @@ def available(problem: Problem | None = None, *, law: str | None = None, **capab
     if law is not None:
         check_name("law", law, LAWS)
     for name, value in capabilities.items():
-        flag(name, value)
+        check_bool(name, value)
     table = specs()
     return [
         name

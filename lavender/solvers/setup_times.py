@@ -44,7 +44,7 @@ def formed_once(problem: Problem) -> float:
     if problem.rows is None:
         entries = PRODUCT * float(problem.metric.products_of_a)
     else:
-        entries = FORMED * problem.most_entries
+        entries = FORMED * problem.max_entries
     return START + EACH * problem.m + entries
 
 
@@ -58,7 +58,7 @@ def estimate_disk_time(problem: Problem) -> float:
     if problem.generalized is not None:
         of_j = len(problem.generalized.operator.jac[1])
         return DISK_J + DISK_J_ROW * problem.m + DISK_J_ENTRY * of_j
-    entries = problem.most_entries if problem.matrix is None else problem.matrix.size
+    entries = problem.max_entries if problem.matrix is None else problem.matrix.size
     made = DISK_A + DISK_A_ROW * problem.m + DISK_A_ENTRY * entries
     return made + forming(problem) + loading("scipy.sparse")
 
@@ -67,7 +67,7 @@ def estimate_refusal_time(problem: Problem, spec: SolverSpec) -> float:
     """Estimate the time [s] of `SolverSpec.refusal`: adapters of other packages read a whole matrix."""
     if not spec.external or problem.matrix is None or "_scan" in problem.__dict__:
         return 0.0
-    return residuals.setup_time(problem) + residuals.READ * float(problem.matrix.size)
+    return residuals.setup_time(problem) + residuals.READ_TIME_PER_ENTRY * float(problem.matrix.size)
 
 
 def loading(*modules: str) -> float:
@@ -78,12 +78,12 @@ def loading(*modules: str) -> float:
 def compared(problem: Problem) -> float:
     """Whether A is symmetric, where it is not known yet."""
     known = problem.matrix is None or "_scan" in problem.__dict__
-    return 0.0 if known else residuals.READ * problem.most_entries
+    return 0.0 if known else residuals.READ_TIME_PER_ENTRY * problem.max_entries
 
 
 def over_rows(problem: Problem) -> float:
     """A, whether it is symmetric, and a matrix that a solver makes of it."""
-    entries = problem.most_entries
+    entries = problem.max_entries
     loaded = loading(*SCIPY) if problem.m > SMALL_ROWS else 0.0
     full = entries == float(problem.m) ** 2
     laid_out = WHOLE * entries if full else CALLS + LAID_OUT * entries
@@ -92,7 +92,7 @@ def over_rows(problem: Problem) -> float:
 
 def analysed(problem: Problem) -> float:
     """An order of elimination of A, and what it fills; rows of one block are one node."""
-    entries, m = problem.most_entries, float(problem.m)
+    entries, m = problem.max_entries, float(problem.m)
     if entries == m * m:
         return PANEL * entries
     is_known = problem.matrix is not None or "_compressed" in problem.__dict__
@@ -102,12 +102,12 @@ def analysed(problem: Problem) -> float:
 
 def summed(problem: Problem) -> float:
     """A, and sums of its rows by SciPy."""
-    return forming(problem) + SUMMED * problem.most_entries + START + loading("scipy.sparse")
+    return forming(problem) + SUMMED * problem.max_entries + START + loading("scipy.sparse")
 
 
 def factored(problem: Problem) -> float:
     """The same with its first factor, of all rows."""
-    return over_rows(problem) + first_factor(problem.m, problem.most_entries)
+    return over_rows(problem) + first_factor(problem.m, problem.max_entries)
 
 
 def dense_work(m: int) -> float:

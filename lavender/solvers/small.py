@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from lavender.base.arrays import FloatArray
-from lavender.judge.residuals import judged, reference
+from lavender.judge.residuals import get_reference, judge_impulse
 from lavender.judge.solution import Claim, SolverStage, Status, counted, summed
 from lavender.problem import Problem
 from lavender.solvers.costs import RATES, SOFT, STEPS, SWEEPS, factorisations, sweep_cost
@@ -98,7 +98,7 @@ def _make(problem: Problem) -> Small | None:
         count, label = islands(problem)
         if count == 1 or np.bincount(label, np.diff(cones.ptr)).max() > ISLAND:
             return None
-    reference(problem)
+    get_reference(problem)
     data = problem.metric
     if len(data.empty) or data.relative_at_zero < 0.0:
         return None
@@ -270,7 +270,7 @@ def _stages(problem: Problem, ran: Ran, start: FloatArray | None, after: float) 
     if start is None or np.array_equal(start, problem._start):
         before = float(problem.metric.relative_at_zero)
     else:
-        before = float(judged(problem, start.copy()).relative)
+        before = float(judge_impulse(problem, start.copy()).relative)
     at = [before, *(len(ran) - 1) * [nan], after]
     return tuple(SolverStage(*of, *at[i : i + 2]) for i, of in enumerate(ran))
 

@@ -9,7 +9,14 @@ import numpy as np
 from lavender.base.arrays import FloatArray
 from lavender.base.deadline import NEVER, Deadline
 from lavender.judge.certificates import check_certificate
-from lavender.judge.residuals import FLOOR_MOST, best_of_islands, judged, known, remember, remembered
+from lavender.judge.residuals import (
+    MAX_EXCUSED_RESIDUAL,
+    best_of_islands,
+    find_known_relative,
+    find_stored,
+    judge_impulse,
+    store_result,
+)
 from lavender.judge.solution import Claim, SolverStage, Status, summed
 from lavender.problem import Problem
 from lavender.solvers.small import NO_TIME, NOTHING, told
@@ -39,12 +46,12 @@ class SolveLog:
 
     def offer(self, impulse: FloatArray) -> None:
         """Judge an impulse (m,) and keep it in the islands where it is the best, also for the final judgement."""
-        relative = known(self.problem, impulse)
+        relative = find_known_relative(self.problem, impulse)
         if relative is None:
-            last = judged(self.problem, impulse.copy())
+            last = judge_impulse(self.problem, impulse.copy())
             relative, impulse = float(last.relative), last.impulse
             if relative < self.best:
-                remember(self.problem, last)
+                store_result(self.problem, last)
         if relative < self.best:
             self.best, self.impulse = relative, impulse.copy()
         if self.best > self.tol:
@@ -74,7 +81,7 @@ class SolveLog:
     @property
     def time_left(self) -> float | None:
         """s until the time limit, for a solver's `time_limit`."""
-        return self.deadline.left(1e-5)
+        return self.deadline.remaining(1e-5)
 
     def ends_late(self, cost: float) -> bool:
         """Whether a step of this counted cost [ns] would end after the deadline."""
@@ -90,9 +97,9 @@ class SolveLog:
         return self.status not in (Status.STALLED, Status.NUMERICAL_ERROR)
 
     def at_floor(self) -> bool:
-        if self.best > FLOOR_MOST:
+        if self.best > MAX_EXCUSED_RESIDUAL:
             return False
-        last = remembered(self.problem, self.impulse) or judged(self.problem, self.impulse)
+        last = find_stored(self.problem, self.impulse) or judge_impulse(self.problem, self.impulse)
         return bool(last.above_floor <= self.tol)
 
     @property
@@ -128,6 +135,8 @@ class SolveLog:
         if self.conflict is None or self.best <= self.tol:
             return []
         told = (
-            [] if self.certificate is not None else ["of the convex relaxation, " + self.conflict.proof.words]
+            []
+            if self.certificate is not None
+            else ["of the convex relaxation, " + self.conflict.proof.message]
         )
         return [*told, self.conflict.advice]

@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from lavender.base.arrays import number
+from lavender.base.arrays import check_float
 from lavender.base.errors import InputError
 from lavender.problem import Problem
 from lavender.problem.ordering import Order
@@ -30,7 +30,7 @@ class SOR(Sweeping):
     omega: float = 1.5
 
     def __post_init__(self) -> None:
-        if not 0.0 < number("omega", self.omega) < 2.0:
+        if not 0.0 < check_float("omega", self.omega) < 2.0:
             raise InputError(f"omega is {self.omega}; 0 < omega < 2 is needed, outside it SOR diverges")
 
     def _state(self, problem: Problem, order: Order, before: Any) -> SweepState:

@@ -10,7 +10,7 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray
 from lavender.base.deadline import Deadline
-from lavender.base.errors import BREAKDOWN, last_words
+from lavender.base.errors import BREAKDOWN, format_error
 from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
 from lavender.solvers._accelerated import as_given
@@ -81,7 +81,7 @@ class Step:
         try:
             claim = self.advance(int(min(max(n, 1.0), log.left, MOST)))
         except BREAKDOWN as error:
-            log.failure, self.over = last_words(error), True
+            log.failure, self.over = format_error(error), True
             claim = Claim(Status.NUMERICAL_ERROR, 0)
         self.over = self.over or claim.status is not Status.MAX_ITERATIONS
         self.late = claim.status is Status.TIME_LIMIT
@@ -132,7 +132,7 @@ class Iterations(Step):
     share = 1.0  # of the time left, that a turn may take
 
     def advance(self, n: int) -> Claim:
-        log, left = self.log, self.log.deadline.left()
+        log, left = self.log, self.log.deadline.remaining()
         if self.state is None:
             self.begin()
         loop = Loop(

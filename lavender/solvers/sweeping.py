@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from lavender.base.arrays import FloatArray
-from lavender.judge.residuals import reference
+from lavender.judge.residuals import get_reference
 from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
 from lavender.problem.ordering import Order, block_order
@@ -44,7 +44,7 @@ class SweepState:
         self.problem = problem
         self.data = data  # lavender_ext.core.problem.Data that the kernel sweeps over, and that checks read
         self.order = self.plan = order  # `plan` is of the problem's own blocks
-        reference(problem)
+        get_reference(problem)
         data.share_reference(problem.metric)  # residuals in any form are relative to the judge's reference
         self.watch = watch_over(problem, data, patience)
         # What the kernel runs over, a `lavender_ext.sweep.serial.Sweeps`; of blocks as they stand, relaxed, by default.

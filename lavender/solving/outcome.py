@@ -11,8 +11,8 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import InputError
-from lavender.judge.certificates import prove, rounded_down
-from lavender.judge.residuals import Residual, best_of_islands, reference, relative_of, residual
+from lavender.judge.certificates import format_lower_bound, prove
+from lavender.judge.residuals import Residual, best_of_islands, divide_by_reference, get_reference, residual
 from lavender.judge.solution import (
     CONFIRMED,
     CONTRADICTED,
@@ -71,7 +71,7 @@ def finish(
     if (
         status in (CONVERGED, STALLED)
         and tol < relative == judged.roundoff_floor
-        and relative_of(problem.metric, judged.energy, judged.velocity) <= tol
+        and divide_by_reference(problem.metric, judged.energy, judged.velocity) <= tol
     ):
         status = DIVERGED
         message = _joined(message, "beside such impulses float64 loses b")
@@ -109,13 +109,15 @@ def finish(
         proof = prove(problem, certificate, tol)
         certificate, bound = proof.y, proof.impulse_bound or None
         if status is INFEASIBLE and not proof.reason:
-            message = _joined(message, proof.words)
+            message = _joined(message, proof.message)
         elif bound == math.inf:
             status, message = STALLED, _joined(message, proof.reason)
         elif status is INFEASIBLE:
             unproven = proof.reason
         elif bound is not None and bound > max(np.abs(impulse).sum(), _contradicting_impulse(problem)):
-            message = _joined(message, f"every solution has an impulse of at least {rounded_down(bound)} N s")
+            message = _joined(
+                message, f"every solution has an impulse of at least {format_lower_bound(bound)} N s"
+            )
     if unproven:
         message = _joined(message, f"not proven: {unproven}")
         status_conflict = f"says INFEASIBLE, {refutation}" if refutation else ""
@@ -213,7 +215,7 @@ def _holds_as_formed(problem: Problem, impulse: FloatArray, tol: float) -> bool:
         formed = problem.csr_data
     except InputError:  # too large to be formed: no solver has
         return False
-    reference(problem)
+    get_reference(problem)
     formed.share_reference(problem.metric)
     return bool(Judged(formed, impulse).above_floor <= tol)
 

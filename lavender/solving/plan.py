@@ -8,10 +8,10 @@ from itertools import islice
 from math import inf
 from typing import Any
 
-from lavender.base.arrays import number
+from lavender.base.arrays import check_float
 from lavender.base.deadline import seconds
 from lavender.base.errors import CapabilityError, InputError
-from lavender.judge.residuals import reference
+from lavender.judge.residuals import get_reference
 from lavender.problem import Problem
 from lavender.solvers.auto import Stage, Tree, program_backends
 from lavender.solvers.registry import get
@@ -89,7 +89,7 @@ def explain(problem: Problem, tol: float = 1e-6) -> Plan:
     """
     if not isinstance(problem, Problem):
         raise InputError(f"problem is a {type(problem).__name__}; a lavender.Problem is needed")
-    tol = number("tol", tol, above=0.0)
+    tol = check_float("tol", tol, above=0.0)
     if problem.m == 0:
         raise InputError("the problem has no rows: there is nothing to plan")
     reason = get("auto").refuses(problem)
@@ -103,7 +103,7 @@ def explain(problem: Problem, tol: float = 1e-6) -> Plan:
             stages=stages, in_turn=(),
         )  # fmt: skip
     problem = problem.disk  # where it has ellipses
-    reference(problem)
+    get_reference(problem)
     tree, small = Tree(problem), who(problem)
     tree.tried = problem.generalized is not None and bool(small)
     stages = tuple(islice(tree, LINES))

@@ -12,22 +12,30 @@ from typing import Any
 
 import numpy as np
 
-from lavender.base.arrays import ArrayLike, FloatArray, equal, flag, number, read_only, whole_number
+from lavender.base.arrays import (
+    ArrayLike,
+    FloatArray,
+    are_equal,
+    check_bool,
+    check_float,
+    check_int,
+    read_only,
+)
 from lavender.base.deadline import NEVER, Deadline, Stopwatch
-from lavender.base.errors import BREAKDOWN, CapabilityError, InputError, InUse, UnknownName, last_words
+from lavender.base.errors import BREAKDOWN, CapabilityError, InputError, InUse, UnknownName, format_error
 from lavender.base.lazy_import import import_numerics
 from lavender.external.foreign import Foreign
 from lavender.judge.certificates import prove
 from lavender.judge.residuals import (
     Residual,
     best_of_islands,
+    convert_from_disk,
+    find_known_relative,
+    get_reference,
     judging_time,
-    known,
-    reference,
+    make_residual,
     residual,
     setup_time,
-    told,
-    unstretched,
 )
 from lavender.judge.solution import (
     CONFIRMED,
@@ -273,7 +281,7 @@ class Prepared:
             given = self._given if problem is None else problem
             plain = max_iter is None and callback is None and history is False
             if plain and self.spec.delegates and not self.options:
-                made = solve_small(given, self.spec, impulse, tol, deadline.left(LEAST) or math.inf)
+                made = solve_small(given, self.spec, impulse, tol, deadline.remaining(LEAST) or math.inf)
                 if made is not None:
                     self._take(problem)
                     return made
@@ -292,7 +300,7 @@ class Prepared:
                 if deadline.passed(setup_time(asked) + last) and not self.spec.external:
                     self._take(problem)
                     return unjudged(given, self.spec, self.options, impulse, tol, JUDGE_LATE)
-                deadline.keep(last)
+                deadline.reserve(last)
             if self.solver is None:
                 self._take(problem)
                 self._begin(deadline)
@@ -317,11 +325,11 @@ class Prepared:
             callback = _in_rows_of(given, given.cones.stretch, callback)
         if lam is None:
             lam = problem.start() if problem.guess is None else problem.guess.copy()
-        left = deadline.left()
+        left = deadline.remaining()
         if left is not None and not self._late and not self._broken:
             watch = Stopwatch()
             self.solver.start_workers(self.state, left)
-            deadline.keep(-watch.seconds)
+            deadline.reserve(-watch.seconds)
             self.setup_time += watch.seconds
         records: list[Record] | None = [] if history else None
         return Loop(
@@ -341,7 +349,7 @@ class Prepared:
             claim = Claim(NUMERICAL_ERROR, 0, {}, self._broken)
         elif self._late or (loop.deadline.passed() and not spec.external):
             # A start that does nothing is not weighed beside another, and the judge is for who asks.
-            nothing = known(problem, loop.impulse)
+            nothing = find_known_relative(problem, loop.impulse)
             if nothing is not None and nothing > loop.tol and loop.records is None and loop.deadline.passed():
                 start = loop.impulse if self._given is problem else self._given.cones.stretch * loop.impulse
                 words = f"{SET_UP_LATE}: the start, unjudged"
@@ -396,7 +404,7 @@ class Prepared:
         except InputError:  # All other numbers of b are below the smallest that a problem may have.
             return claim
         found = others.solve(
-            impulse=start, tol=loop.tol, max_iter=max_iter, time_limit=loop.deadline.left(LEAST)
+            impulse=start, tol=loop.tol, max_iter=max_iter, time_limit=loop.deadline.remaining(LEAST)
         )
         loop.impulse[:] = best_of_islands(self.problem, (loop.impulse,), (found.impulse,), loop.tol)
         loop.time += found.setup_time + found.solve_time
@@ -424,7 +432,7 @@ class Prepared:
     def _set_up(self, problem: Problem, anew: bool, deadline: Deadline) -> None:
         """Prepare, or update the state of a problem of the same structure, if that is counted to end in time."""
         if problem.metric.reference_energy < 0.0:
-            reference(problem)  # of the judge, before any solver has the problem in its hands
+            get_reference(problem)  # of the judge, before any solver has the problem in its hands
         anew, self._broken = anew or bool(self._broken), ""
         if deadline.is_set:
             self._late = deadline.passed(self.solver.setup_time(problem))
@@ -432,7 +440,7 @@ class Prepared:
                 # As processes are started: else no call within the limit would ever have what it needs.
                 watch = Stopwatch()
                 import_numerics()
-                deadline.keep(-watch.seconds)
+                deadline.reserve(-watch.seconds)
                 self._late = deadline.passed(self.solver.setup_time(problem))
             if self._late:
                 self.state = None
@@ -445,7 +453,7 @@ class Prepared:
         except InputError:
             raise  # before the start
         except BREAKDOWN as error:
-            self.state, self._broken = None, last_words(error)
+            self.state, self._broken = None, format_error(error)
 
 
 def unjudged(
@@ -468,7 +476,7 @@ def _in_rows_of(given: Problem, stretch: FloatArray, callback: Callback) -> Call
     """A callback of a problem with ellipses, for what is solved in its place."""
 
     def call(done: int, impulse: FloatArray, found: Residual) -> Any:
-        return callback(done, stretch * impulse, unstretched(given, found))
+        return callback(done, stretch * impulse, convert_from_disk(given, found))
 
     return call
 
@@ -494,25 +502,25 @@ def _make(spec: SolverSpec, options: dict[str, Any]) -> Solver:
 
 def same_structure(p: Problem, q: Problem) -> bool:
     """Same blocks, same kind of operator, same bodies or same pattern of J and M or of A."""
-    if not (equal(p.cones.ptr, q.cones.ptr) and equal(p.cones.kind, q.cones.kind)) or p.law != q.law:
+    if not (are_equal(p.cones.ptr, q.cones.ptr) and are_equal(p.cones.kind, q.cones.kind)) or p.law != q.law:
         return False
     if p.rows is not None and q.rows is not None:
         return (
             p.rows.n_bodies == q.rows.n_bodies
-            and equal(p.rows.joint_body, q.rows.joint_body)
-            and equal(p.rows.contact_body, q.rows.contact_body)
+            and are_equal(p.rows.joint_body, q.rows.joint_body)
+            and are_equal(p.rows.contact_body, q.rows.contact_body)
         )
     if p.operator != q.operator:
         return False
     if p.generalized is not None and q.generalized is not None:
         return all(
-            equal(x, y)
+            are_equal(x, y)
             for of in ("jac", "mass")
             for x, y in zip(
                 getattr(p.generalized.operator, of)[:2], getattr(q.generalized.operator, of)[:2], strict=True
             )
         )
-    return equal(p.csr.indptr, q.csr.indptr) and equal(p.csr.indices, q.csr.indices)
+    return are_equal(p.csr.indptr, q.csr.indptr) and are_equal(p.csr.indices, q.csr.indices)
 
 
 def judged_later(
@@ -590,7 +598,7 @@ def rest_of(
     else:
         claim = spec.small.claim(problem, counts, given, judged.relative, status)
     return {
-        "residual": told(problem, judged),
+        "residual": make_residual(problem, judged),
         "iterations": claim.iterations,
         "work": MappingProxyType(dict(claim.work)),
         "solver": SolverRun(spec.name, {}, claim.form),
@@ -632,7 +640,7 @@ def comes_too_late(problem: Problem, spec: SolverSpec, deadline: Deadline) -> bo
     if needed > 0.0 and problem.generalized is None and deadline.passed(needed) and loading("scipy.sparse"):
         watch = Stopwatch()
         import_numerics()
-        deadline.keep(
+        deadline.reserve(
             -watch.seconds
         )  # as processes are started: else no call within the limit would ever have it
         needed = estimate_disk_time(problem) + estimate_refusal_time(problem, spec)
@@ -651,7 +659,7 @@ def seconds_of(time_limit: Any) -> float:
         return time_limit
     if time_limit is None or (isinstance(time_limit, np.floating) and time_limit == np.inf):
         return math.inf
-    return number("time_limit", time_limit, above=0.0)
+    return check_float("time_limit", time_limit, above=0.0)
 
 
 def _deadline(spec: SolverSpec, limit: float, begun: float | None = None) -> Deadline:
@@ -673,14 +681,14 @@ def check_budget(spec: SolverSpec, tol: float, max_iter: int | None) -> tuple[fl
     InputError
         A wrong one.
     """
-    tol = number("tol", tol, low=0.0)
-    return tol, whole_number("max_iter", spec.max_iter if max_iter is None else max_iter)
+    tol = check_float("tol", tol, low=0.0)
+    return tol, check_int("max_iter", spec.max_iter if max_iter is None else max_iter)
 
 
 def _check_records(spec: SolverSpec, history: bool, callback: Callback | None) -> None:
     if callback is not None and not callable(callback):
         raise InputError(f"callback is {callback!r}; a function of (iterations, impulse, residual) is needed")
-    if (callback is not None and not spec.callback) or (flag("history", history) and not spec.history):
+    if (callback is not None and not spec.callback) or (check_bool("history", history) and not spec.history):
         raise CapabilityError(
             f"solver {spec.name!r} runs in one call; it takes no callback and records no history"
         )

@@ -24,7 +24,7 @@ from random_problems import CONTACTS, FORMS, as_matrix, random_contact_problem, 
 import lavender as lv
 from benchmarks.core_problems import fresh, stacks
 from lavender import registry
-from lavender.judge.residuals import reference
+from lavender.judge.residuals import get_reference
 from lavender.solvers.auto import Tree, make
 from lavender.solvers.newton_systems import general
 from lavender.solvers.pivoting import PivotState
@@ -199,7 +199,7 @@ def run_over_velocities(problem, sizes):
 
 def run_step_of_auto(problem, sizes, kind):
     """What a step remembers between its turns is not computed anew from the best impulse."""
-    reference(problem)
+    get_reference(problem)
     log = SolveLog(problem, 1e-14, 10**6)
     log.offer(problem.start())
     step = make(kind, log, Tree(problem))

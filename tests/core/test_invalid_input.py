@@ -250,10 +250,10 @@ NOT_CALLED = {
         "a result: the package makes it",
     ),
     **dict.fromkeys(
-        ("Batch.worlds", "Generalized.compressed", "Generalized.laid_out", "Generalized.restrict",
+        ("Batch.worlds", "Generalized.compressed", "Generalized.from_validated", "Generalized.restrict",
          "Generalized.shifted", "Generalized.with_scaled_rows", "Batch.start", "Solutions.mark_late",
-         "Problem.on_disk", "Residuals.keep", "Solution.late", "Solution.of", "Solution.unstretched",
-         "Solutions.keep", "Solutions.late", "Solutions.start", "Batch.rows_of"),
+         "Problem.on_disk", "Residuals.store", "Solution.late", "Solution.of", "Solution.unstretched",
+         "Solutions.store", "Solutions.store_late", "Solutions.start", "Batch.rows_of"),
         "for the package's own use, with arrays that it has checked",
     ),
     **dict.fromkeys(("Batch.count", "Batch.index", "Solutions.count", "Solutions.index"), "a sequence of Python"),

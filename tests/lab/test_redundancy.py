@@ -254,7 +254,7 @@ def test_entries_of_a_are_counted_once(monkeypatch):
     jac = np.zeros((40, 30))
     jac[:, -1] = rng.normal(size=40)  # M^-1 J^T is full
     mass = np.eye(30) + 0.4 * (np.eye(30, k=1) + np.eye(30, k=-1))
-    monkeypatch.setattr(operators, "MOST_ENTRIES", 40 * 40 + 1)
+    monkeypatch.setattr(operators, "MAX_INDEXABLE_ENTRIES", 40 * 40 + 1)
     free = lv.Cones.free(40)
     problem = lv.Problem.from_jacobian(jac, mass, np.ones(30), cones=free)
     assert np.allclose(problem.dense(), jac @ np.linalg.inv(mass) @ jac.T)
@@ -263,6 +263,6 @@ def test_entries_of_a_are_counted_once(monkeypatch):
         np.hstack([jac, -jac]), np.kron(np.eye(2), mass), np.ones(60), cones=free
     )
     assert twins.metric.entries_of_a == 40 * 40  # rows on two trees, too
-    monkeypatch.setattr(operators, "MOST_ENTRIES", 40 * 40)
+    monkeypatch.setattr(operators, "MAX_INDEXABLE_ENTRIES", 40 * 40)
     with pytest.raises(lv.InputError, match="J and M as they are"):
         lv.Problem.from_jacobian(jac, mass, np.ones(30), cones=free).delassus()

@@ -10,7 +10,7 @@ from worked import after
 
 import lavender as lv
 from lavender import suite
-from lavender.judge.certificates import fighting
+from lavender.judge.certificates import list_conflicting_blocks
 from lavender.solvers.certify import conflict_of
 
 SCENES = {
@@ -254,7 +254,7 @@ def test_who_fights_is_named_and_the_compliance_that_is_advised_gives_an_answer(
     for name in ("auto",) if law == "coulomb" else ("auto", "newton"):
         solution = lv.solve(problem, name)
         assert solution.status is lv.Status.INFEASIBLE
-        joints, contacts = fighting(problem, solution.certificate)
+        joints, contacts = list_conflicting_blocks(problem, solution.certificate)
         assert joints == (0,) and contacts == (1,)  # blocks
         assert f"row 0 against {problem.row_name(1).split(',')[0]}" in solution.message
     (found,) = (s for s in lv.diagnose(problem) if s.kind == "conflict")

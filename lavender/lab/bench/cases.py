@@ -18,10 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lavender import io
-from lavender.base.arrays import FloatArray, flag, several, whole_number
+from lavender.base.arrays import FloatArray, check_bool, check_int, check_sequence
 from lavender.base.errors import InputError, SolverUnavailable
 from lavender.io.stored import ENGINE, SUFFIXES, whole_file
-from lavender.judge.residuals import ENOUGH, Residual, nothing_to_do, residual
+from lavender.judge.residuals import DEFAULT_THRESHOLD, Residual, is_solved_by_zero, residual
 from lavender.lab import suite
 from lavender.lab.bench.record import CaseInfo, file_name, printable
 from lavender.lab.diagnostics import diagnose
@@ -62,7 +62,7 @@ class Item:
         """The problem; loading errors come from here."""
         return self.load()
 
-    def judged(self, precision: str | None = None, threshold: float = ENOUGH) -> Residual | None:
+    def judged(self, precision: str | None = None, threshold: float = DEFAULT_THRESHOLD) -> Residual | None:
         """The answer stored beside the problem, judged; None where there is none, or one of another problem."""
         impulse = self.stored()
         if impulse is None or impulse.shape != (self.problem.m,):
@@ -106,11 +106,13 @@ def resolve(words: Source | Iterable[Source], sequences: bool | None = None) -> 
         A case that the suite does not have.
     """
     if sequences is not None:
-        flag("sequences", sequences)
+        check_bool("sequences", sequences)
     items: list[Item] = []
     read: set[Path] = set()  # folders, which a link in one of them may lead back to
     words = (
-        [words] if isinstance(words, Source) else several("cases", words, "files, folders, names or problems")
+        [words]
+        if isinstance(words, Source)
+        else check_sequence("cases", words, "files, folders, names or problems")
     )
     if not words:
         items = [_from_case(case, case.name) for case in suite.default()]
@@ -171,13 +173,13 @@ def expand_seeds(words: Iterable[str], n: int, first: int = 0) -> list[str]:
     UnknownName, InputError
         A name that the suite does not have; more than `MAX_SEEDS` seeds.
     """
-    n, first = whole_number("n", n, high=None), whole_number("first", first, high=None)
+    n, first = check_int("n", n, high=None), check_int("first", first, high=None)
     if n > MAX_SEEDS:
         raise InputError(
             f"{n} seeds are asked for; at most {MAX_SEEDS} in one run: give A:B, part after part"
         )
     out = []
-    for word in several("cases", words, "names"):
+    for word in check_sequence("cases", words, "names"):
         if not isinstance(word, str):
             raise InputError(f"case {word!r:.60} is no name of the suite")
         if is_path(word) or word.startswith("@"):
@@ -198,7 +200,7 @@ def sequence(problems: Iterable[Problem], name: str) -> list[Item]:
     if not isinstance(name, str):
         raise InputError(f"name of a sequence is {name!r:.60}; a text is needed")
     items = []
-    for i, problem in enumerate(several("problems", problems, "Problems")):
+    for i, problem in enumerate(check_sequence("problems", problems, "Problems")):
         check_problem(problem)
         items.append(Item(f"{name}[{i}]", name, _constant(problem), sequence=name, step=i, given=problem))
     return items
@@ -382,7 +384,7 @@ def describe(item: Item, run: str) -> CaseInfo:
         step=item.step,
         stored=math.nan if answer is None else answer.relative,
         stored_verdict=answer.verdict_in_words if answer and answer.rounding else "",
-        nothing_to_do=nothing_to_do(p),
+        nothing_to_do=is_solved_by_zero(p),
         diagnostics=tuple(map(str, diagnose(p))),
         guess=_guess_of(item),
         condition=condition(p),

@@ -29,7 +29,7 @@ import numpy as np
 from lavender.batch.solve import solve_many
 from lavender.io import mujoco as adapter
 from lavender.io.recording import drive_of
-from lavender.judge.residuals import reference, residual
+from lavender.judge.residuals import get_reference, residual
 from lavender.judge.solution import Solution
 from lavender.lab.bench.running.runner import carry
 from lavender.problem import Problem
@@ -140,7 +140,7 @@ def measure(mj: Any, path: Path, steps: int, every: int) -> list[Step]:
     model = mj.MjModel.from_xml_path(os.fspath(path))
     out: list[Step] = []
     for step, data, problem in _problems(mj, path, model, 20 * steps * every, every):
-        if problem is None or reference(problem)[1] < 1e-9:
+        if problem is None or get_reference(problem)[1] < 1e-9:
             continue
         tolerance, engine, engine_residual = engine_time(mj, model, data, problem)
         ours, many, found = our_times(problem)
@@ -187,7 +187,7 @@ def measure_warm(mj: Any, path: Path, steps: int) -> list[WarmStep]:
         start = problem.start() if before is None else carry(*before, problem)
         ours, solution = one_call(problem, start)
         before = problem, solution.impulse
-        if reference(problem)[1] < 1e-9:
+        if get_reference(problem)[1] < 1e-9:
             continue
         out.append(
             WarmStep(

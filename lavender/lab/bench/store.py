@@ -16,7 +16,7 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
-from lavender.base.arrays import table_of
+from lavender.base.arrays import format_html_table
 from lavender.base.errors import InputError
 from lavender.io.stored import (
     MAX_BYTES,
@@ -158,7 +158,7 @@ class Records:
         """Return a table of the numbers of runs and cases, for notebooks."""
         solvers = sorted({r.solver for r in self.records})
         facts = {"runs": len(self.records), "cases": len(self.cases), "solvers": ", ".join(solvers)}
-        return table_of(facts, self.source or "Records")
+        return format_html_table(facts, self.source or "Records")
 
     def frame(self) -> Any:
         """Return `rows()` as a pandas frame.

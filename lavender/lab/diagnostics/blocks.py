@@ -146,7 +146,7 @@ def conflict(p: Problem) -> Iterator[Diagnostic]:
     proof = conflict_of(p, CONFLICT_TOL)
     if proof is not None:
         law = "Of the convex relaxation, " if p.law == "coulomb" else ""
-        reason = law + proof.proof.words + (f"; {proof.advice}" if proof.advice else "")
+        reason = law + proof.proof.message + (f"; {proof.advice}" if proof.advice else "")
         soft = [p.row_name(i) for i in proof.soft_rows]
         yield make_diagnostic(
             p, "conflict", reason, proof.blocks, compliance=proof.compliance, soft_rows=soft

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from lavender.base.arrays import FloatArray, as_array, number
+from lavender.base.arrays import FloatArray, as_array, check_float
 from lavender.base.errors import InputError
 from lavender.lab.diagnostics.bodies import MAX_DENSE_VELOCITIES, bodies_of, free_bodies
 from lavender.lab.diagnostics.diagnostic import Diagnostic, make_diagnostic
@@ -161,7 +161,7 @@ def state_before(
         if dt is None:
             raise InputError("gap [m] is compared with targets [m/s] by the step size: give dt [s], too")
         gap = as_array("gap", gap, (int(np.count_nonzero(p.cones.is_contact)),), unit="m")
-    return velocity, gap, 0.0 if dt is None else number("dt [s]", dt, above=0.0)
+    return velocity, gap, 0.0 if dt is None else check_float("dt [s]", dt, above=0.0)
 
 
 def check_state(p: Problem, velocity: Any, gap: Any, dt: float) -> Iterator[Diagnostic]:

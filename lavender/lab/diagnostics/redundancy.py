@@ -19,14 +19,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from lavender.base.arrays import FloatArray, number
+from lavender.base.arrays import FloatArray, check_float
 from lavender.base.errors import CapabilityError, InputError
 from lavender.base.lazy_import import lapack
 from lavender.base.lazy_import import sparse as sp
 from lavender.problem import Problem, check_problem
 from lavender.problem.derived import cached_property
-from lavender.problem.operators import panels_of, semidefinite
-from lavender.problem.ordering import rows_of_each
+from lavender.problem.operators import analyze_panels, has_shifted_cholesky
+from lavender.problem.ordering import rows_by_island
 from lavender_ext.pivot.direct import Pivoting
 
 # Smallest share of a row's direction that differs from rounding of A: A has the squares of shares, and rounding of its
@@ -129,7 +129,7 @@ def redundancy(problem: Problem, *, tol: float = 1e-12) -> Redundancy:
         Asymmetric or indefinite A with an island of more than 1,200 rows; numbers whose products are beyond float64.
     """
     check_problem(problem)
-    if not number("tol", tol, low=0.0) < 1.0:
+    if not check_float("tol", tol, low=0.0) < 1.0:
         raise InputError(f"tol is {tol}; a share from 0 to 1 is needed")
     if problem.precision == "float32":
         tol = max(tol, SHARE_OF_FLOAT32)
@@ -147,9 +147,9 @@ def redundancy(problem: Problem, *, tol: float = 1e-12) -> Redundancy:
         raise CapabilityError(
             "the rank cannot be told: rows of unit size are beyond float64 (give the problem in other units)"
         )
-    for island in rows_of_each(problem, np.arange(m + 1, dtype=np.int32)):
+    for island in rows_by_island(problem, np.arange(m + 1, dtype=np.int32)):
         a = scaled[island][:, island]
-        sound = problem.is_semidefinite or (problem.is_symmetric and semidefinite(a))
+        sound = problem.is_semidefinite or (problem.is_symmetric and has_shifted_cholesky(a))
         if problem.is_symmetric and len(island) <= DENSE:
             found, limit, words = _dense_island(a.toarray(), [root[island] for root in roots], tol, sound)
             used = max(used, limit)
@@ -297,7 +297,7 @@ def _by_sparse_cholesky(a: sp.csr_array, limit: float) -> Places:
     Products with random z show in which rows S is not zero; their block of S is factored with pivoting.
     """
     n = a.shape[0]
-    panels, values = panels_of(a)
+    panels, values = analyze_panels(a)
 
     def product(z: FloatArray) -> FloatArray:
         y = a @ z

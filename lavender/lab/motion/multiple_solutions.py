@@ -14,7 +14,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lavender.base.arrays import ArrayLike, FloatArray, flag, one_of, places, several, whole_number
+from lavender.base.arrays import (
+    ArrayLike,
+    FloatArray,
+    check_bool,
+    check_choice,
+    check_int,
+    check_sequence,
+    resolve_index,
+)
 from lavender.base.errors import CapabilityError, InputError, LavenderError
 from lavender.judge.residuals import residual
 from lavender.judge.solution import uninterrupted
@@ -104,7 +112,7 @@ class SolutionSet:
 
     def __getitem__(self, i: Any) -> Any:
         """Motion i, or a list of several."""
-        i = places(i, len(self.motions), "motion")
+        i = resolve_index(i, len(self.motions), "motion")
         return [self.motions[j] for j in i] if isinstance(i, list) else self.motions[i]
 
     def select(self, choice: str, impulse: Any = None) -> Motion:
@@ -124,7 +132,7 @@ class SolutionSet:
         InputError
             No such choice, a wrong impulse, or no motion to choose from.
         """
-        choice = one_of("choice", choice, CHOICES)
+        choice = check_choice("choice", choice, CHOICES)
         if not self.motions:
             raise InputError("no run ended at a solution; there is nothing to choose from")
         if choice == "dissipation":
@@ -156,7 +164,7 @@ class SolutionSet:
         """
         p = self.problem
         out: dict[str, Pick | None] = {}
-        for name in available(p) if solvers is None else several("solvers", solvers, "names"):
+        for name in available(p) if solvers is None else check_sequence("solvers", solvers, "names"):
             try:
                 budget = max_iter if get(name).resumable else None
                 found = uninterrupted(solve(p, name, tol=tol, max_iter=budget))
@@ -211,7 +219,7 @@ def find_solutions(problem: Problem, n: int = RUNS, seed: int = 0, *, always: bo
         `n` or `seed` is no whole number, or negative; `always` is neither True nor False.
     """
     check_problem(problem)
-    n, seed, always = whole_number("n", n), whole_number("seed", seed, high=None), flag("always", always)
+    n, seed, always = check_int("n", n), check_int("seed", seed, high=None), check_bool("always", always)
     proof = uniqueness(problem)
     own = reference_of(problem)
     found = [(own, "auto")] if own.accepted else []

@@ -49,7 +49,7 @@ from lavender.base.arrays import FloatArray, IntArray
 from lavender.lab.motion.reference import kept, reference
 from lavender.problem import Problem
 from lavender.problem.cones import Cones
-from lavender.problem.ordering import rows_of_each
+from lavender.problem.ordering import rows_by_island
 
 LARGEST = 600  # rows of an island up to which (1) is looked for, dense
 UNCOUPLED = 1e-14  # of sqrt(d_t d_n): A_tn that is nothing but rounding
@@ -89,7 +89,7 @@ def uniqueness(problem: Problem) -> Uniqueness:
     if not friction.any():
         return Uniqueness(True, "no contact has friction", 0.0)
     reasons, kappa = [], 0.0
-    for island in rows_of_each(problem, c.ptr):
+    for island in rows_by_island(problem, c.ptr):
         if not friction[island].any():
             continue
         reason, k = _island(problem, island, friction[island])

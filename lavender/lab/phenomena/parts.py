@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray, number, whole_number
+from lavender.base.arrays import FloatArray, check_float, check_int
 from lavender.base.errors import InputError, UnknownName
 from lavender.sim.scene import Scene
 
@@ -100,9 +100,9 @@ class Phenomenon:
             label = f"{name} of {self.name!r} ({p.text})"
             x = given.get(name, p.default)
             if isinstance(p.default, int):
-                found[name] = whole_number(label, x, int(p.low), int(p.high))
+                found[name] = check_int(label, x, int(p.low), int(p.high))
             else:
-                found[name] = number(label, x, low=p.low, high=p.high)
+                found[name] = check_float(label, x, low=p.low, high=p.high)
         return found
 
     def scene(self, given: Mapping[str, Any] | None = None, **more: Any) -> Scene:

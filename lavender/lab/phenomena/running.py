@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 from lavender.base import subprocesses
-from lavender.base.arrays import number, several
+from lavender.base.arrays import check_float, check_sequence
 from lavender.base.errors import CapabilityError, InputError, UnknownName, check_name
 from lavender.base.subprocesses import ProcessBackend, ProcessEnded, RemoteError
 from lavender.lab.phenomena.engines import ENGINE_VARIANTS, EngineVariant, follow, make
@@ -81,7 +81,7 @@ def chosen(names: Sequence[str] = ()) -> list[Phenomenon]:
     UnknownName
         There is no such phenomenon.
     """
-    names = several("names", names, "phenomena")
+    names = check_sequence("names", names, "phenomena")
     for name in names:
         check_name("phenomenon", name, PHENOMENA)
     return [PHENOMENA[name] for name in dict.fromkeys(names or PHENOMENA)]
@@ -148,7 +148,7 @@ def run(
         A parameter or limit outside its range, or neither stepper nor engine; nothing has run.
     """
     if limit != math.inf:
-        limit = number("limit", limit, above=0.0)
+        limit = check_float("limit", limit, above=0.0)
     plan = [
         (p, case)
         for p in chosen(names)

@@ -121,7 +121,7 @@ def _infeasible(problem: Problem, certificate: FloatArray) -> Enclosure:
     """Check a certificate (m,) on the problem's numbers as exact ones."""
     proof = certificates.prove(problem, certificate)
     holds = not proof.reason and proof.impulse_bound == math.inf
-    return Enclosure(False, reason=proof.reason or proof.words, infeasible=holds)
+    return Enclosure(False, reason=proof.reason or proof.message, infeasible=holds)
 
 
 def _searched(problem: Problem, start: FloatArray, given: FloatArray) -> Enclosure:

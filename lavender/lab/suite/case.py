@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Any, ParamSpec
 
-from lavender.base.arrays import FloatArray, number
+from lavender.base.arrays import FloatArray, check_float
 from lavender.base.errors import InputError, UnknownName
 from lavender.problem import Problem
 from lavender.problem.derived import cached_property
@@ -134,7 +134,7 @@ def _check(name: str, parameter: inspect.Parameter, value: Any) -> Any:
         if not isinstance(value, str):
             raise InputError(f"{what}; a word is needed")
         return value
-    found = number(f"{name}: {parameter.name}", value)
+    found = check_float(f"{name}: {parameter.name}", value)
     if wanted is int:
         if found != int(found) or not 0 <= found <= MAX_SIZE:
             raise InputError(f"{what}; a whole number from 0 to {MAX_SIZE} is needed")

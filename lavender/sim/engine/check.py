@@ -115,7 +115,7 @@ def _check_contacts(new: State) -> None:
     contact = np.arange(kj + c) >= kj
     size = np.concatenate([np.ones(kj, np.int64), blocks])
     sides = np.concatenate([np.zeros(kj, bool), box])
-    if c and (b["kind"][: kj + c] != kinds_of(contact, sides=sides, spin=size == 4, rolls=size > 4)).any():
+    if c and (b["kind"][: kj + c] != kinds_of(contact, box=sides, spin=size == 4, rolling=size > 4)).any():
         raise _damaged("kind holds what is no such block")
     pair = b["contact_pair"][:c]
     if c and (pair.min() < 0 or pair.max() >= n or not np.array_equal(b["contact_body"][:c], b["dyn"][pair])):

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray, number, whole_number
+from lavender.base.arrays import FloatArray, check_float, check_int
 from lavender.base.errors import InputError
 from lavender.io.stored import as_path, write_atomically, write_figure
 from lavender.sim.engine.film import Film
@@ -67,9 +67,9 @@ def save_picture(
     films = film if isinstance(film, Mapping) else {"": film}
     if not films or not all(len(one) for one in films.values()):
         raise InputError("the film has no frames; step first")
-    frames, rate = whole_number("frames", frames, 1), number("rate [1/s]", rate, above=0.0)
-    size = number("size [inch]", size, low=0.5, high=50.0)
-    turn, tilt = number("turn [rad]", turn), number("tilt [rad]", tilt)
+    frames, rate = check_int("frames", frames, 1), check_float("rate [1/s]", rate, above=0.0)
+    size = check_float("size [inch]", size, low=0.5, high=50.0)
+    turn, tilt = check_float("turn [rad]", turn), check_float("tilt [rad]", tilt)
     stages = [Stage(one, turn, tilt, name) for name, one in films.items()]
     ends = np.array([stage.bounds for stage in stages])
     for stage in stages:  # one scale for all

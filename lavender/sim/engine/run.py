@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray, whole_number
+from lavender.base.arrays import FloatArray, check_int
 from lavender.io.stored import folder_for_steps, write_figure, write_text
 from lavender.sim.engine.simulation import Simulation
 from lavender.sim.engine.stepping import sweep_order
@@ -87,7 +87,7 @@ def run(
     `record`: a folder for the problem of every step; `replace` takes the problems of another recording out of it, which
     is refused otherwise. `watch(step, observation, info)` is called after every step.
     """
-    steps = whole_number("steps", steps, 1)
+    steps = check_int("steps", steps, 1)
     recorded = 0
     solver, depth, cost, time = np.zeros((steps, 8)), np.zeros(steps), np.zeros(steps), np.zeros(steps)
     lost, done, stopped = "", 0, False

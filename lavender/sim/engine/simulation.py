@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from lavender import io
-from lavender.base.arrays import read_only, whole_number
+from lavender.base.arrays import check_int, read_only
 from lavender.base.errors import InputError, LavenderError, check_name
 from lavender.base.lazy_import import lazy_module
 from lavender.io.stored import folder_for_steps
@@ -146,7 +146,7 @@ class Simulation(Stepping):
             FCLIB cannot hold the rows of the next step, which is not done; files of the steps before it stay.
         """
         check_name("form", form, ("npz", "fclib"))
-        steps = whole_number("steps", steps, 1)
+        steps = check_int("steps", steps, 1)
         folder = Path(folder)
         digits, written = len(str(self._steps + steps)), []
         with folder_for_steps(folder, continued=folder.resolve() == self._recorded):
@@ -181,7 +181,7 @@ class Simulation(Stepping):
         Film
             steps + 1 frames; `save` writes a file that `lavender view` opens.
         """
-        steps = whole_number("steps", steps, 1)
+        steps = check_int("steps", steps, 1)
         film = self.start_film()
         try:
             for _ in range(steps):

@@ -13,8 +13,8 @@ from typing import Any, Concatenate, ParamSpec, TypeVar
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray, as_array, whole_number
-from lavender.base.arrays import flag as checked
+from lavender.base.arrays import FloatArray, as_array, check_int
+from lavender.base.arrays import check_bool as checked
 from lavender.base.errors import InputError, LavenderError, SolveFailed, UnknownName
 from lavender.judge.solution import Solution, order_name, uninterrupted
 from lavender.problem import Problem
@@ -161,7 +161,7 @@ class Stepping:
             Not a whole number of 4 to 64 for sequential_impulses (1 to 64 under other steppers than "impulses"), of at
             least 1 for other solvers.
         """
-        self.state.head[HEAD["iterations"]] = whole_number("solver_iterations", n, *self._sweeps)
+        self.state.head[HEAD["iterations"]] = check_int("solver_iterations", n, *self._sweeps)
 
     @alone
     def set_warm_start(self, flag: bool) -> None:
@@ -207,7 +207,7 @@ class Stepping:
 
     def _body_number(self, body: int | str) -> int:
         if not isinstance(body, str):
-            return whole_number("body", body, 0, len(self._names) - 1)
+            return check_int("body", body, 0, len(self._names) - 1)
         if body not in self._names:
             raise UnknownName("body", body, self._names)
         if self._names.count(body) > 1:
@@ -227,7 +227,7 @@ class Stepping:
         """
         sweeps, warm = self.solver_iterations, self.warm_start
         if seed is not None:
-            self.scene = self.scene.with_parameters(seed=whole_number("seed", seed))
+            self.scene = self.scene.with_parameters(seed=check_int("seed", seed))
         self._load(self.scene)
         self.state.head[HEAD["iterations"]] = sweeps
         self.state.head[HEAD["warm_start"]] = warm

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from lavender.base.arrays import number, whole_number
+from lavender.base.arrays import check_float, check_int
 from lavender.base.errors import check_name
 from lavender.sim.scene.arithmetic import frame_quaternion, norm, sine_cosine, turned
 from lavender.sim.scene.parts import quaternion, rotation
@@ -26,8 +26,8 @@ def stack(scene: Scene, n: int = 6, size: float = 1.0, mass: float = 1.0) -> Non
 
     Six unit boxes: 7 bodies, 24 contacts, 24 rows without friction and 72 with.
     """
-    whole_number("n", n, 1)
-    size = number("size", size, above=0.0)
+    check_int("n", n, 1)
+    size = check_float("size", size, above=0.0)
     scene.add_plane()
     for i in range(n):
         scene.add_box((size, size, size), mass, position=(0.0, 0.0, (i + 0.5) * size))
@@ -40,8 +40,8 @@ def pyramid(scene: Scene, base: int = 10, size: float = 1.0, mass: float = 1.0, 
     base 10: 55 boxes, 400 contacts; base 20: 210 boxes, 1,600 contacts. `gap` is the room between neighbours
     as a share of their size.
     """
-    whole_number("base", base, 1)
-    size, pitch = number("size", size, above=0.0), size * (1.0 + number("gap", gap, low=0.0))
+    check_int("base", base, 1)
+    size, pitch = check_float("size", size, above=0.0), size * (1.0 + check_float("gap", gap, low=0.0))
     scene.add_plane()
     for row in range(base):
         for i in range(base - row):
@@ -55,8 +55,8 @@ def card_house(scene: Scene, levels: int = 2, lean: float = 0.3) -> None:
 
     2 levels: 3 pairs, 1 card across, 7 cards; 3 levels: 15 cards. `lean` is the angle from upright.
     """
-    whole_number("levels", levels, 1)
-    lean = number("lean", lean, low=0.05, high=0.7)
+    check_int("levels", levels, 1)
+    lean = check_float("lean", lean, low=0.05, high=0.7)
     thick, width, tall, mass = 0.04, 0.7, 1.0, 0.2
     s, c = sine_cosine(lean)
     reach = tall * s + thick * c  # half the foot of a pair
@@ -90,8 +90,8 @@ def pile(scene: Scene, n: int = 100, kind: str = "spheres", size: float = 0.5, w
 
     1,000 spheres: some 2,500 contacts when they have come down. `seed` shakes the start.
     """
-    whole_number("n", n, 1)
-    size = number("size", size, above=0.0)
+    check_int("n", n, 1)
+    size = check_float("size", size, above=0.0)
     check_name("kind of pile", kind, ("spheres", "boxes", "mixed"))
     side = next(k for k in range(1, n + 1) if 5 * k**3 >= 4 * n)  # a quarter more high than wide
     pitch = 1.15 * size if kind == "spheres" else 1.5 * size
@@ -119,8 +119,8 @@ def chain(scene: Scene, n: int = 20, tip_mass: float = 1.0, length: float = 0.25
 
     3 n rows. `angle` is that of the straight chain from the vertical, at the start.
     """
-    whole_number("n", n, 1)
-    length = number("length", length, above=0.0)
+    check_int("n", n, 1)
+    length = check_float("length", length, above=0.0)
     s, c = sine_cosine(angle)
     down = np.array([s, 0.0, -c])
     turn = quaternion((0.0, 1.0, 0.0), np.pi - angle)
@@ -144,7 +144,7 @@ def bridge(scene: Scene, n: int = 16, load: float = 10.0) -> None:
 
     5 (n + 1) joint rows and the contacts of the load.
     """
-    whole_number("n", n, 2)
+    check_int("n", n, 2)
     planks = []
     for i in range(n):
         planks.append(
@@ -164,8 +164,8 @@ def heavy_on_light(scene: Scene, ratio: float = 100.0, n: int = 2) -> None:
 
     n = 2: 8 contacts.
     """
-    whole_number("n", n, 2)
-    ratio = number("ratio", ratio, above=0.0)
+    check_int("n", n, 2)
+    ratio = check_float("ratio", ratio, above=0.0)
     scene.add_plane()
     for i in range(n):
         scene.add_box(mass=ratio if i == n - 1 else 1.0, position=(0.0, 0.0, i + 0.5))
@@ -177,7 +177,7 @@ def table(scene: Scene, legs: int = 9, top_mass: float = 10.0) -> None:
 
     9 legs: 10 bodies, 72 contacts. `legs` stand on a square grid, row by row.
     """
-    whole_number("legs", legs, 3)
+    check_int("legs", legs, 3)
     side = int(np.ceil(np.sqrt(legs)))
     pitch = 0.8
     scene.add_plane()
@@ -194,7 +194,7 @@ def ramp(scene: Scene, angle: float = 0.35, size: float = 1.0) -> None:
 
     2 bodies, 4 contacts.
     """
-    angle, size = number("angle", angle, low=-1.5, high=1.5), number("size", size, above=0.0)
+    angle, size = check_float("angle", angle, low=-1.5, high=1.5), check_float("size", size, above=0.0)
     turn = quaternion((0.0, 1.0, 0.0), angle)
     normal = rotation(turn)[:, 2]
     scene.add_plane(normal, 0.0)
@@ -208,7 +208,9 @@ def spinner(scene: Scene, spin: float = 20.0, radius: float = 0.5) -> None:
     2 bodies, 1 contact of 4 rows.
     """
     scene.add_plane()
-    scene.add_sphere(radius, position=(0.0, 0.0, radius), angular_velocity=(0.0, 0.0, number("spin", spin)))
+    scene.add_sphere(
+        radius, position=(0.0, 0.0, radius), angular_velocity=(0.0, 0.0, check_float("spin", spin))
+    )
 
 
 @named_scene(restitution=1.0, friction=0.0, restitution_threshold=0.01, dt=1.0 / 240.0, substeps=4)
@@ -217,8 +219,8 @@ def newtons_cradle(scene: Scene, n: int = 5, lifted: int = 1, angle: float = 0.6
 
     2 n rows of strings. `gap` separates the balls, so that impacts come in turn.
     """
-    whole_number("n", n, 2)
-    whole_number("lifted", lifted, 0, n)
+    check_int("n", n, 2)
+    check_int("lifted", lifted, 0, n)
     radius, string, apart = 0.25, 2.0, 0.5
     drop = np.sqrt(string * string - apart * apart)
     for i in range(n):

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray, as_array, number, shape_of
+from lavender.base.arrays import FloatArray, as_array, check_float, shape_of
 from lavender.base.errors import InputError
 from lavender.sim.scene.arithmetic import norm, sine_cosine, turned_back
 from lavender_ext.core.checks import LEAST, MOST
@@ -25,7 +25,7 @@ class Plane:
 
     def __post_init__(self) -> None:
         _put(self, "normal", tuple(unit("normal of a plane", self.normal).tolist()))
-        _put(self, "offset", number("offset of a plane [m]", self.offset))
+        _put(self, "offset", check_float("offset of a plane [m]", self.offset))
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Sphere:
     radius: float  # m
 
     def __post_init__(self) -> None:
-        _put(self, "radius", number("radius of a sphere [m]", self.radius, above=0.0))
+        _put(self, "radius", check_float("radius of a sphere [m]", self.radius, above=0.0))
 
     def inertia(self, mass: float) -> FloatArray:
         """Inertia (3, 3) [kg m^2] of a solid ball."""

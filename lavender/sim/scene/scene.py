@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray, check_sizes, flag, number, shape_of, whole_number
+from lavender.base.arrays import FloatArray, check_bool, check_float, check_int, check_sizes, shape_of
 from lavender.base.errors import InputError, UnknownName, check_name
 from lavender.problem.friction import check_shape
 from lavender.problem.ordering import ENGINE_ORDERS
@@ -86,12 +86,12 @@ class Parameters:
     def __post_init__(self) -> None:
         put = object.__setattr__
         for name, allowed in RANGES.items():
-            put(self, name, number(name, getattr(self, name), **allowed))
+            put(self, name, check_float(name, getattr(self, name), **allowed))
         for name in ("friction", "patch_radius", "rolling_radius"):
             check_sizes(name, np.array([getattr(self, name)]))
         gravity: Any = self.gravity
         if shape_of("gravity", gravity) == ():
-            size = number("gravity", gravity)
+            size = check_float("gravity", gravity)
             if size < 0.0:  # of who has the sign of z in mind: everything would fly upwards
                 raise InputError(
                     f"gravity is {size:g}; a number points downwards and is at least 0: give {-size:g}, or a vector, "
@@ -110,9 +110,9 @@ class Parameters:
         longest: Any = self.max_substep
         if longest is None:
             longest = MAX_SUBSTEP if own else self.dt
-        put(self, "max_substep", number("max_substep", longest, above=0.0))
+        put(self, "max_substep", check_float("max_substep", longest, above=0.0))
         put(self, "substeps", self._count_of_substeps())
-        put(self, "warm_start", flag("warm_start", self.warm_start))
+        put(self, "warm_start", check_bool("warm_start", self.warm_start))
         order: Any = self.order
         if order is None:
             put(self, "order", stepper.order if own else "given")
@@ -128,12 +128,12 @@ class Parameters:
         projections: Any = self.position_iterations
         if projections is None:
             projections = stepper.position_iterations
-        put(self, "position_iterations", whole_number("position_iterations", projections, 0, 1000))
+        put(self, "position_iterations", check_int("position_iterations", projections, 0, 1000))
         if self.position_iterations and not stepper.position_iterations:
             raise InputError(
                 f"position_iterations is {projections}; stepper {stepper.name!r} has no position projection"
             )
-        put(self, "seed", whole_number("seed", self.seed))
+        put(self, "seed", check_int("seed", self.seed))
         check_name("on_failure", self.on_failure, ON_FAILURE)
 
     def _sweeps(self, spec: SolverSpec, stepper: StepperSpec) -> int:
@@ -143,13 +143,13 @@ class Parameters:
                 raise InputError(
                     f"stepper {stepper.name!r} takes no solver {self.solver!r}; leave solver= out, or take 'impulses'"
                 )
-            return whole_number("solver_iterations", spec.max_iter if given is None else given, 1)
+            return check_int("solver_iterations", spec.max_iter if given is None else given, 1)
         if self.solver_options:
             raise InputError(
                 f"solver_options {sorted(self.solver_options)} are for other solvers; sequential_impulses "
                 "takes order= and seed= of the scene"
             )
-        return 16 if given is None else whole_number("solver_iterations", given, *stepper.sweeps)
+        return 16 if given is None else check_int("solver_iterations", given, *stepper.sweeps)
 
     def _count_of_substeps(self) -> int:
         given: Any = self.substeps
@@ -161,7 +161,7 @@ class Parameters:
                     "give a shorter dt, a longer max_substep, or substeps= if that many are meant"
                 )
             given = max(1, math.ceil(ratio))
-        return whole_number("substeps", given, 1)
+        return check_int("substeps", given, 1)
 
 
 COMMON = tuple(f.name for f in fields(Parameters))
@@ -361,8 +361,8 @@ class Scene:
             raise InputError(f"name is {name!r}; a string is needed")
         if shape is not None and not isinstance(shape, (Plane, Sphere, Box)):
             raise InputError(f"shape of {label} is {shape!r}; a Plane, Sphere or Box is needed")
-        static = flag(f"static of {label}", static) or isinstance(shape, Plane)
-        mass = 0.0 if static else number(f"mass of {label} [kg]", mass)
+        static = check_bool(f"static of {label}", static) or isinstance(shape, Plane)
+        mass = 0.0 if static else check_float(f"mass of {label} [kg]", mass)
         if mass < 0.0 or (mass == 0.0 and not static):
             raise InputError(f"mass of {label} is {mass:g} kg; a positive mass is needed, or static=True")
         q = numbers(f"quaternion of {label}", quaternion, 4)
@@ -481,11 +481,11 @@ class Scene:
             axis_a=world_axis if a < 0 else self.bodies[a].direction_to_local(world_axis),
             axis_b=world_axis if b < 0 else self.bodies[b].direction_to_local(world_axis),
             length=length,
-            hertz=number(f"hertz of {label}", hertz, low=0.0),
-            damping=number(f"damping of {label}", damping, low=0.0),
+            hertz=check_float(f"hertz of {label}", hertz, low=0.0),
+            damping=check_float(f"damping of {label}", damping, low=0.0),
             motor_speed=_given(f"motor_speed of {label} [rad/s]", motor_speed),
             motor_torque=_given(f"motor_torque of {label} [N m]", motor_torque, low=0.0) or 0.0,
-            collide=flag(f"collide of {label}", collide),
+            collide=check_bool(f"collide of {label}", collide),
         )
         self.joints.append(joint)
         return len(self.joints) - 1
@@ -512,7 +512,7 @@ class Scene:
         pa, pb = (self._anchor(label, *given) for given in zip("ab", bodies, (a, b), strict=True))
         with np.errstate(over="ignore"):
             far = arithmetic.norm(pb - pa)
-        length = number(f"length of {label} [m]", far if length is None else length, low=0.0)
+        length = check_float(f"length of {label} [m]", far if length is None else length, low=0.0)
         if length == 0.0:
             raise InputError(f"{label} has length 0; use a ball joint")
         return pa, pb, length
@@ -556,7 +556,7 @@ class Scene:
 
 
 def _given(what: str, value: Any, **allowed: float) -> float | None:
-    return None if value is None else number(what, value, **allowed)
+    return None if value is None else check_float(what, value, **allowed)
 
 
 def _common_point(

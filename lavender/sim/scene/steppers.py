@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from lavender.base.arrays import number, whole_number
+from lavender.base.arrays import check_float, check_int
 from lavender.base.errors import InputError, UnknownName
 
 
@@ -60,9 +60,9 @@ class StepperSpec:
             x = given.get(name, option.default)
             label = f"{name} of stepper {self.name!r}"
             if option.is_whole:
-                found[name] = whole_number(label, x, int(option.low), int(option.high))
+                found[name] = check_int(label, x, int(option.low), int(option.high))
             else:
-                found[name] = number(label, x, low=option.low, high=option.high)
+                found[name] = check_float(label, x, low=option.low, high=option.high)
         return found
 
     def check(self, spin: bool, restitution: bool, rolling: bool) -> None:

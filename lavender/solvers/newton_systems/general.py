@@ -10,7 +10,7 @@ from typing import Any
 
 from lavender.base.arrays import FloatArray
 from lavender.base.deadline import Deadline, Stopwatch
-from lavender.judge.residuals import judged, reference, remember
+from lavender.judge.residuals import get_reference, judge_impulse, store_result
 from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
 from lavender_ext.core.method import OUTCOMES
@@ -40,7 +40,7 @@ _WORDS = ("factorisations", "Coulomb rounds", "line evaluations")
 
 def prepare(problem: Problem, work: float = inf) -> Driver | None:
     """Islands and room for them; None where N of one is too large to be kept, or seen to need more multiply-adds."""
-    reference(problem)
+    get_reference(problem)
     kernel = Driver(problem.metric, MAX_MATRIX_ENTRIES, work)
     return kernel if kernel.fits else None
 
@@ -90,7 +90,7 @@ def run(
         if status is not Status.MAX_ITERATIONS:
             break
         last, now = now, watch.seconds
-        left = deadline.left()
+        left = deadline.remaining()
         if left is not None and left <= 0.0:
             status = Status.TIME_LIMIT
             break
@@ -102,8 +102,8 @@ def run(
 
 def confirmed(problem: Problem, impulse: FloatArray, tol: float) -> bool:
     """Whether the judge finds what the kernel found; his pass is kept for the one who returns the impulse."""
-    found = judged(problem, impulse.copy())
-    remember(problem, found)
+    found = judge_impulse(problem, impulse.copy())
+    store_result(problem, found)
     return bool(found.relative <= tol)
 
 

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 from lavender.base.arrays import IntArray
 from lavender.base.deadline import Deadline
 from lavender.base.lazy_import import sparse as sp
-from lavender.judge.residuals import reference
+from lavender.judge.residuals import get_reference
 from lavender.problem import Problem
 from lavender.solvers.factors import DENSE_LIMIT, WIDE
 from lavender.solvers.newton_systems.augmented import Augmented
@@ -144,7 +144,7 @@ def make_system(
     problem: Problem, form: str, like: System | None = None, bodies: Bodies | None = None
 ) -> System:
     """The system of a problem; form "velocity", of its `bodies`, or "impulse". `like`: one of the same structure."""
-    reference(problem)
+    get_reference(problem)
     if form == "impulse":
         return MatrixSystem(problem)
     bodies = bodies or bodies_of(problem)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import lavender as lv
-from lavender.gradient.layer import step
+from lavender.gradient.layer import make_step
 
 
 def arrays(seed, contacts=2, tangents=2, nv=5):
@@ -22,7 +22,7 @@ def arrays(seed, contacts=2, tangents=2, nv=5):
 
 
 def is_smooth(given):
-    made = step(given, None, "coulomb", "auto", 1e-12)
+    made = make_step(given, None, "coulomb", "auto", 1e-12)
     _, impulse = made.forward(*given)
     problem = next(made.problems([x[None] for x in given]))
     return float(lv.derivative(problem, impulse).distance.min()) > 1e-2
@@ -35,7 +35,7 @@ EVERY = (True,) * 6
 
 def test_the_adjoint_is_summed_over_what_was_repeated():
     jac, mass, free, mu, target, soft = GIVEN[0]
-    made = step((jac, mass, free, mu, target, soft), None, "coulomb", "auto", 1e-12)
+    made = make_step((jac, mass, free, mu, target, soft), None, "coulomb", "auto", 1e-12)
     frees = np.stack([free, free + 1e-3])
     velocity, impulse = made.forward(jac, mass, frees, mu, target, soft)
     assert velocity.shape == (2, 5) and impulse.shape == (2, 6)
@@ -54,7 +54,7 @@ def test_a_step_without_contacts_is_free_and_its_gradient_goes_to_the_free_veloc
     shapes = (0, 3), (3, 3), (3,), (0,), (0,), (0,)
     given = [np.zeros((*lead, *shape)) for shape in shapes]
     given[1], given[2] = given[1] + np.eye(3), given[2] + [1.0, 2.0, 3.0]
-    made = step(given, None, "coulomb", "auto", 1e-12)
+    made = make_step(given, None, "coulomb", "auto", 1e-12)
     velocity, impulse = made.forward(*given)
     assert np.array_equal(velocity, given[2]) and impulse.shape == (*lead, 0)
     found = made.backward(EVERY, *given, impulse, 7.0 * np.ones_like(velocity), impulse)
@@ -73,7 +73,7 @@ def twice(by_mu):
 def test_what_is_not_asked_for_need_not_exist():
     def by_mu(*given):
         given = (*given, np.zeros(6), np.zeros(6))
-        made = step(given, None, "coulomb", "auto", 1e-12)
+        made = make_step(given, None, "coulomb", "auto", 1e-12)
         _, impulse = made.forward(*given)
         needed = [len(x) == 2 for x in given]
         by_jac, *_, mu, _, _ = made.backward(needed, *given, impulse, np.eye(3)[0], np.zeros(6))
@@ -87,8 +87,8 @@ def test_what_is_not_asked_for_need_not_exist():
 
 def test_a_step_made_again_is_the_same_object_for_which_jax_keeps_what_it_compiled():
     given, contacts = GIVEN[0], lv.Cones.contacts
-    made = step(given, None, "coulomb", "auto", 1e-10)
-    assert step(given, contacts(0.7, 2, count=2), "coulomb", "auto", 1e-10) is made  # mu is an array's
+    made = make_step(given, None, "coulomb", "auto", 1e-10)
+    assert make_step(given, contacts(0.7, 2, count=2), "coulomb", "auto", 1e-10) is made  # mu is an array's
     for cones, *others in (
         (None, "cone", "auto", 1e-10),
         (None, "coulomb", "newton", 1e-10),
@@ -96,8 +96,8 @@ def test_a_step_made_again_is_the_same_object_for_which_jax_keeps_what_it_compil
         (contacts(0.5, 1, count=2) + lv.Cones.bounded([0.0, 0.0], [1.0, 1.0]), "coulomb", "auto", 1e-10),
         (contacts(0.5, 1, count=2) + lv.Cones.bounded([0.0, 0.0], [1.0, 2.0]), "coulomb", "auto", 1e-10),
     ):
-        other = step(given, cones, *others)
-        assert other is not made and other is step(given, cones, *others)
+        other = make_step(given, cones, *others)
+        assert other is not made and other is make_step(given, cones, *others)
         made = other
 
 

@@ -128,7 +128,7 @@ def test_of_rows_that_repeat_others_velocities_are_told_and_impulses_refused():
     total = d.vjp(impulse=np.ones(4))  # their sum is unique: the weight
     assert total.v_free == pytest.approx([-1.0, 0.0, 0.0], abs=1e-9)
     with pytest.raises(
-        lv.CapabilityError, match=r"not unique here: impulse: not of 4 rows \(row 0, row 1, row 2, ..."
+        lv.CapabilityError, match=r"gradient is not unique: impulse: not of 4 rows \(row 0, row 1, row 2, ..."
     ):
         d.vjp(impulse=[1.0, 0.0, 0.0, 0.0])
     t = d.jvp(v_free=[0.3, 0.2, 0.1])
@@ -167,7 +167,7 @@ def test_refusals_say_what_came_and_what_to_do():
     ):
         lv.derivative(p, solution.impulse * 0.99)
     other = lv.Problem.contact(np.eye(3), [9.0, 6.0, 0.0], mu=[0.5])
-    with pytest.raises(lv.InputError, match="no solution of this problem"):
+    with pytest.raises(lv.InputError, match="not a solution of this problem"):
         lv.derivative(other, solution)
     with pytest.raises(lv.InputError, match=r"impulse \[N s\] has shape \(3,\); \(2,\)"):
         lv.derivative(lv.Problem.lcp(np.eye(2), [1.0, 1.0]), solution)
@@ -180,7 +180,7 @@ def test_refusals_say_what_came_and_what_to_do():
         d.vjp()
     with pytest.raises(lv.InputError, match="give a change of the data: b, lower"):
         d.jvp()
-    with pytest.raises(lv.InputError, match="'J' is no data of this problem"):
+    with pytest.raises(lv.InputError, match="'J' is not among the data of this problem"):
         d.jvp(J=np.eye(3))
     with pytest.raises(lv.CapabilityError, match="given as a matrix"):
         d.vjp(velocity=np.ones(3))
@@ -257,7 +257,7 @@ def test_a_stacked_batch_and_solutions_of_other_problems():
     for i, g in enumerate(found):
         alone = lv.derivative(batch[i], solutions[i]).vjp(velocity=np.ones(7))
         assert np.array_equal(g.b, alone.b) and np.array_equal(found.v_free[7 * i : 7 * i + 7], alone.v_free)
-    with pytest.raises(lv.InputError, match="problem 0: this is no solution"):
+    with pytest.raises(lv.InputError, match="problem 0: this is not a solution"):
         lv.derivatives(batch[::-1], solutions)
     others = [drawn(seed, "free", "cone", "generalized") for seed in range(3)]
     with pytest.raises(lv.InputError, match=r"problem 0: impulse .* has shape"):
@@ -269,7 +269,7 @@ def test_batches_of_another_length_are_refused():
     s = solved(p)
     with pytest.raises(lv.InputError, match="1 solutions for 2 problems"):
         lv.derivatives([p, p], [s])
-    with pytest.raises(lv.InputError, match="problem 1: this is no solution"):
+    with pytest.raises(lv.InputError, match="problem 1: this is not a solution"):
         lv.derivatives([p, p], [s, 1.1 * s.impulse])
     with pytest.raises(lv.InputError, match="velocity has 2 cotangents for 1 problems"):
         lv.derivatives([p], [s]).vjp(velocity=[1, 2])
@@ -278,7 +278,7 @@ def test_batches_of_another_length_are_refused():
     found = lv.derivatives([p], [s]).vjp(impulse=[np.ones(p.m)])
     with pytest.raises(AttributeError, match=r"gradients have no 'M' of all problems; \[i\]"):
         found.M  # noqa: B018 - read
-    with pytest.raises(lv.InputError, match="full is of A, J, M; 'mu' is no matrix"):
+    with pytest.raises(lv.InputError, match="full is of A, J, M; 'mu' is not a matrix"):
         found[0].full("mu")
     assert len(lv.derivatives([], [])) == 0 and lv.derivatives([], []).vjp(impulse=[]).b.tolist() == []
 
@@ -322,9 +322,9 @@ def test_every_factor_gives_the_same_gradients(kind, operator, monkeypatch):
     found = []
     # dense by the kernel, sparse by panels or SuperLU, and the adjoint of the kernel in Python
     for small, dense, few in ((64, 400, 0.4), (0, 0, 2.0), (0, 0, 0.0)):
-        monkeypatch.setattr("lavender.gradient.system.SMALL", small)
-        monkeypatch.setattr(sys.modules["lavender.gradient.derivative"], "SMALL", small)
-        monkeypatch.setattr("lavender.gradient.system.DENSE", dense)
+        monkeypatch.setattr("lavender.gradient.system.MAX_KERNEL_ROWS", small)
+        monkeypatch.setattr(sys.modules["lavender.gradient.derivative"], "MAX_KERNEL_ROWS", small)
+        monkeypatch.setattr("lavender.gradient.system.MAX_DENSE_ROWS", dense)
         monkeypatch.setattr("lavender.gradient.system.is_full", lambda nnz, m, cones, few=few: few == 0.0)
         d = lv.derivative(p, solution)
         found.append(d.vjp(**weights))

@@ -136,8 +136,10 @@ def test_a_solver_of_others_is_not_handed_a_box_it_knows_nothing_of():
     spec = registry.SolverSpec("theirs", lambda: None, frozenset({"coulomb"}), "no boxes")
     assert "takes no boxes" in spec.refuses(free(1))
     assert spec.refuses(replace(free(1), cones=lv.Cones.contacts(0.5, count=4))) is None
-    with pytest.raises(lv.InputError, match="boxes"):
-        registry.SolverSpec("theirs", lambda: None, frozenset({"coulomb"}), "", boxes=frozenset({"lcp"}))
+    with pytest.raises(lv.InputError, match="box_friction_laws"):
+        registry.SolverSpec(
+            "theirs", lambda: None, frozenset({"coulomb"}), "", box_friction_laws=frozenset({"lcp"})
+        )
 
 
 # -- ellipses --------------------------------------------------------------------------------------------------------

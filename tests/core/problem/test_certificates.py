@@ -56,7 +56,7 @@ def test_what_is_proved_is_said(name):
 def test_a_direction_is_not_polished_where_that_ends_after_the_deadline():
     problem, y = opposed(0.0), np.array([1.0, 1.0 + 1e-9])
     late = prove(problem, y, 1e-6, Deadline(1e-12))
-    assert late.reason and late.skipped > 0.0
+    assert late.reason and late.skipped_time > 0.0
     assert prove(problem, y, 1e-6) is late  # whoever checks the claim takes no time for it either
     assert prove(problem, y, 1e-6, Deadline(1e-12)) is late
     assert not prove(problem, y, 1e-6, NEVER).reason  # one who has it does

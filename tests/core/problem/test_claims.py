@@ -122,12 +122,12 @@ def test_every_array_of_a_problem_is_read_only(form):
 
 
 def test_a_verdict_on_another_problem_is_not_taken(plug_in):
-    from lavender.judge.residuals import judged, remember
+    from lavender.judge.residuals import judge_impulse, store_result
 
     def run(problem, impulse):
         easy = lv.Problem.lcp(problem.delassus(), np.zeros(problem.m) - 1.0)
         impulse[:] = 0.0
-        remember(problem, judged(easy, impulse.copy()))
+        store_result(problem, judge_impulse(easy, impulse.copy()))
         return says(lv.Status.CONVERGED)
 
     problem = random_lcp(9)
@@ -224,7 +224,9 @@ def test_a_liar_is_caught_in_every_form_and_law(form, status, plug_in):
                 impulse[:] = told
                 return says(status)
 
-            liar = plug_in(run, operators={"matrix"}, parts=True, boxes={"coulomb", "cone"})
+            liar = plug_in(
+                run, operators={"matrix"}, supports_rolling=True, box_friction_laws={"coulomb", "cone"}
+            )
             solution = lv.solve(problem, liar)
             assert solution.claim_check == "contradicted", (problem, name, str(solution))
     assert seen == {"linear", "lcp", "coulomb", "cone"}

@@ -66,7 +66,7 @@ def test_an_order_that_fills_in_is_left_before_its_factor_is_made(monkeypatch):
     jac = sp.csr_array((np.ones(1), [0], [0, 1]), shape=(1, n))
     looked_at = lv.Generalized(jac, mass, np.zeros(n))
     # Its lower triangle has 2.5 n entries, its factor about 4 n.
-    monkeypatch.setattr(coordinates, "FULL", 3 * n)
+    monkeypatch.setattr(coordinates, "MAX_FACTOR_ENTRIES", 3 * n)
     other = lv.Generalized(jac, mass, np.zeros(n))
     assert other.order is not None
     for made in (looked_at, other):
@@ -74,7 +74,7 @@ def test_an_order_that_fills_in_is_left_before_its_factor_is_made(monkeypatch):
 
 
 def test_the_factor_of_a_tree_hardly_fills_in_whatever_the_order_of_its_velocities(monkeypatch):
-    monkeypatch.setattr(coordinates, "FACTORS", np.inf)  # whatever the search costs
+    monkeypatch.setattr(coordinates, "EXPECTED_FACTORIZATIONS", np.inf)  # whatever the search costs
     rng = np.random.default_rng(1)
     parent = random_tree(rng, 30)
     mass = tree_mass(rng, parent)

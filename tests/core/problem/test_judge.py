@@ -23,7 +23,7 @@ import lavender as lv
 from lavender.judge import residuals
 from lavender.judge.certificates import check_certificate
 from lavender.judge.measures import natural_map, qp_residual, siconos_error
-from lavender.judge.residuals import judged, known, remember
+from lavender.judge.residuals import find_known_relative, judge_impulse, store_result
 
 # -- the twin --------------------------------------------------------------------------------------
 
@@ -279,7 +279,7 @@ def test_a_remembered_result_serves_its_own_impulse_alone():
     other = first.copy()
     other[-1] = np.nextafter(other[-1], 2.0)
     fresh = [lv.residual(problem, x) for x in (first, other)]
-    remember(problem, judged(problem, first.copy()))
+    store_result(problem, judge_impulse(problem, first.copy()))
     for x, expected in ((other, fresh[1]), (first, fresh[0])):
         found = lv.residual(problem, x)
         assert (found.relative, found.roundoff_floor, found.worst_row) == (
@@ -287,10 +287,10 @@ def test_a_remembered_result_serves_its_own_impulse_alone():
         )  # fmt: skip
         np.testing.assert_array_equal(found.error, expected.error)
         np.testing.assert_array_equal(found.slack, expected.slack)
-    assert known(problem, problem.start()) == lv.residual(problem, problem.start()).relative
-    assert known(problem, other) is None
-    remember(problem, judged(problem, other))
-    assert known(problem, other) == fresh[1].relative
+    assert find_known_relative(problem, problem.start()) == lv.residual(problem, problem.start()).relative
+    assert find_known_relative(problem, other) is None
+    store_result(problem, judge_impulse(problem, other))
+    assert find_known_relative(problem, other) == fresh[1].relative
 
 
 # -- nothing to do ----------------------------------------------------------------------------------
@@ -305,12 +305,12 @@ def test_where_doing_nothing_is_right_nobody_solves_and_nobody_fails():
         ([1.0, 0.0], False),
     ):
         p = lv.Problem.lcp(a, b)
-        assert residuals.nothing_to_do(p) is nothing
+        assert residuals.is_solved_by_zero(p) is nothing
         assert lv.residual(p, [0.0, 0.0]).nothing_to_do is nothing
     # In the unit of speed, whatever the masses: V0 is a velocity.
-    assert residuals.nothing_to_do(lv.Problem.lcp(1e12 * a, [1e-10, -1.0]))
-    assert not residuals.nothing_to_do(lv.Problem.lcp(1e-12 * a, [2e-9, -1.0]))
+    assert residuals.is_solved_by_zero(lv.Problem.lcp(1e12 * a, [1e-10, -1.0]))
+    assert not residuals.is_solved_by_zero(lv.Problem.lcp(1e-12 * a, [2e-9, -1.0]))
     # Doing nothing is zero clipped to the bounds.
-    assert residuals.nothing_to_do(lv.Problem.lcp(a, [0.0, 0.0], lower=1.0))
-    assert not residuals.nothing_to_do(lv.Problem.lcp(a, [0.0, 5.0], lower=1.0))
-    assert residuals.nothing_to_do(lv.Problem.lcp(np.zeros((0, 0)), []))
+    assert residuals.is_solved_by_zero(lv.Problem.lcp(a, [0.0, 0.0], lower=1.0))
+    assert not residuals.is_solved_by_zero(lv.Problem.lcp(a, [0.0, 5.0], lower=1.0))
+    assert residuals.is_solved_by_zero(lv.Problem.lcp(np.zeros((0, 0)), []))

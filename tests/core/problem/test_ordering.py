@@ -6,12 +6,12 @@ from hypothesis import given, settings
 from random_problems import as_matrix, random_contact_problem, random_lcp, seeds, sweeps, touching
 
 import lavender as lv
-from lavender.problem.ordering import ORDERS, block_order, body_ranks, colors, levels
+from lavender.problem.ordering import SWEEP_ORDERS, block_order, body_ranks, colors, levels
 
 
 @settings(max_examples=10)
 @given(seed=seeds)
-@pytest.mark.parametrize("order", ORDERS)
+@pytest.mark.parametrize("order", SWEEP_ORDERS)
 def test_named_orders_are_permutations_with_joints_first(order, seed):
     problem = random_contact_problem(seed)
     o = block_order(problem, order, seed=seed if order == "random" else 0)

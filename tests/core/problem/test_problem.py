@@ -102,15 +102,17 @@ def test_rows_have_names():
 # -- friction: defaults with a meaning ------------------------------------------------------------------------
 
 
-def test_mu_alone_means_two_tangents_and_a_mu_that_nothing_feels_is_refused():
+def test_mu_alone_means_two_tangents_and_a_mu_without_friction_rows_is_refused():
     made = touching([[-1, 0], [0, 1]])
     problem = lv.Problem.from_rows(made, mu=0.5)
     assert (problem.m, problem.law) == (6, "coulomb")
     mixed = lv.Problem.from_rows(made, mu=[0.0, 0.5])
     assert mixed.cones.n_tangents.tolist() == [0, 2]
     assert lv.Problem.from_rows(made).m == 2
-    assert lv.Problem.from_rows(made, mu=0.5, tangents=0, patch_radius=0.1).m == 4  # a spin row feels it
-    with pytest.raises(lv.InputError, match=r"contact 0 has mu 0\.5 and no tangent"):
+    assert (
+        lv.Problem.from_rows(made, mu=0.5, tangents=0, patch_radius=0.1).m == 4
+    )  # a spin row is a friction row
+    with pytest.raises(lv.InputError, match=r"contact 0 has mu 0\.5 but no friction row"):
         lv.Problem.from_rows(made, mu=0.5, tangents=0)
 
 

@@ -12,7 +12,7 @@ from random_problems import conditioned, seeds
 
 import lavender as lv
 from lavender import registry
-from lavender.judge.residuals import judged
+from lavender.judge.residuals import judge_impulse
 from lavender.problem.generalized import Generalized
 
 CONDITIONS = (1e2, 1e8, 1e10, 1e12)
@@ -125,7 +125,7 @@ def test_sweeps_end_where_float64_loses_the_residual(name):
             if spec.refuses(problem) is not None:
                 continue
             solution = lv.solve(problem, name, tol=1e-9, max_iter=300_000)
-            if judged(problem, solution.impulse).relative <= 1e-9 < solution.residual.relative:
+            if judge_impulse(problem, solution.impulse).relative <= 1e-9 < solution.residual.relative:
                 assert solution.status is lv.Status.ROUNDOFF_LIMIT, (seed, law, str(solution))
                 assert solution.residual.relative <= 2.0 * solution.residual.roundoff_floor <= 1e-4
                 assert solution.iterations < 300_000
@@ -181,7 +181,7 @@ def test_a_refined_slack_is_exact_to_the_last_bits(condition, seed):
 def test_the_floor_bounds_what_the_first_pass_loses(seed, condition):
     problem = ill_problem(seed, condition)
     lam = lv.solve(problem, tol=1e-13).impulse
-    first, found = judged(problem, lam), lv.residual(problem, lam, tol=0.0)
+    first, found = judge_impulse(problem, lam), lv.residual(problem, lam, tol=0.0)
     # Of errors: rows that their slack holds at a bound have none, whatever is lost of it.
     lost = np.sqrt(np.sum(problem.metric.d * (first.error - found.error) ** 2))
     assert lost <= found.floor_energy
@@ -193,7 +193,7 @@ def test_a_well_conditioned_m_is_not_refined():
         problem = ill_problem(seed, 1e2)
         solution = lv.solve(problem, tol=1e-9)
         for found in (solution.residual, lv.residual(problem, solution.impulse)):
-            first = judged(problem, solution.impulse)
+            first = judge_impulse(problem, solution.impulse)
             assert (found.relative, found.roundoff_floor) == (first.relative, first.roundoff_floor)
             assert first.refine(1e-9) is first
 

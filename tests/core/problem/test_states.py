@@ -259,7 +259,7 @@ def test_large_islands_and_wild_answers_have_no_bound(monkeypatch):
     for bad in (np.nan, np.inf, 1e200):
         states = states_of(problem, np.full(5, bad))
         assert len(states.names) == 5 and not set(range(5)) - set(states.unknown) - set(states.boundary)
-    for name, limit in (("MAX_ISLAND_ROWS", 4), ("MAX_ENTRIES", 24.0)):
+    for name, limit in (("MAX_ISLAND_ROWS", 4), ("MAX_MATRIX_ENTRIES", 24.0)):
         with monkeypatch.context() as patch:
             patch.setattr(error_bound, name, limit)
             assert states_of(problem, good.impulse).unknown == (0, 1, 2, 3, 4)

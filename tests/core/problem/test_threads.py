@@ -128,11 +128,11 @@ def test_a_fork_has_threads_of_its_own():
     """Two calls of `work` that wait for each other: a child's is not left to a thread that it has not."""
     script = """if True:
         import os, threading
-        from lavender.base.threads import together
+        from lavender.base.threads import run_on_threads
 
         def both():
             each = threading.Barrier(2, timeout=20.0)
-            return len(together(lambda stop: each.wait(), 2))
+            return len(run_on_threads(lambda stop: each.wait(), 2))
 
         assert both() == 2
         child = os.fork()
@@ -157,20 +157,20 @@ def test_an_error_of_one_thread_stops_the_others():
         told.append(stop[0])
 
     with pytest.raises(ZeroDivisionError, match="planted"):
-        threads.together(work, 2)
+        threads.run_on_threads(work, 2)
     assert told == [1]
 
 
 def test_threads_that_ask_for_threads_do_not_wait_for_each_other(monkeypatch):
     """All that are kept are busy with calls that want more: what nobody begins is nobody's."""
-    monkeypatch.setattr(threads, "MOST", 1)
-    threads.helpers.cache_clear()
+    monkeypatch.setattr(threads, "MAX_THREADS", 1)
+    threads.thread_pool.cache_clear()
     two, inner = threading.Barrier(2, timeout=10.0), []
 
     def work(stop):
         two.wait()
-        inner.append(threads.together(lambda stop: None, 3))
+        inner.append(threads.run_on_threads(lambda stop: None, 3))
 
-    threads.together(work, 2)
-    threads.helpers.cache_clear()
+    threads.run_on_threads(work, 2)
+    threads.thread_pool.cache_clear()
     assert len(inner) == 2 and min(map(len, inner)) == 1

@@ -626,12 +626,12 @@ INVALID_PROBLEM = [
     ({"P": sp.csc_matrix([[1.0, 0.5], [0.0, 1.0]])}, r"P is not symmetric: at .*0\.5"),
     (
         {"P": np.array([[1.0, 2.0], [2.0, 1.0]])},
-        r"P is not positive semidefinite: its least eigenvalue is -1,",
+        r"P is not positive semidefinite: its smallest eigenvalue is -1,",
     ),
-    ({"P": np.diag([1.0, -0.25])}, r"P is not positive semidefinite: its least eigenvalue is -0\.25"),
+    ({"P": np.diag([1.0, -0.25])}, r"P is not positive semidefinite: its smallest eigenvalue is -0\.25"),
     (
         {"P": np.array([[0.0, 1.0], [1.0, 5.0]])},
-        r"P is not positive semidefinite: its least eigenvalue is -0\.19",
+        r"P is not positive semidefinite: its smallest eigenvalue is -0\.19",
     ),
     ({"P": 1e-70 * EYE}, r"the diagonal of P must be 0 or at least 1e-60; entry \[0\]"),
     ({"P": np.array([[1.0, 0.5], [0.5 + 1e-9, 1.0]])}, r"not symmetric: at \(1, 0\) .*0\.500000001"),

@@ -475,7 +475,7 @@ def test_auto_goes_on_with_the_others_where_one_breaks_down(limit, error, monkey
 
 @pytest.mark.parametrize("name", OURS)
 def test_an_a_that_is_too_large_is_told_before_the_start_or_not_needed(name, monkeypatch):
-    monkeypatch.setattr(operators, "MOST_ENTRIES", 4000)  # J and M have 2,700
+    monkeypatch.setattr(operators, "MAX_INDEXABLE_ENTRIES", 4000)  # J and M have 2,700
     spec = registry.get(name)
     rng = np.random.default_rng(4)
     jac, mass = rng.normal(size=(90, 15)), np.diag(rng.uniform(1.0, 2.0, 15))

@@ -38,7 +38,7 @@ loaded("jacobi", lambda: lv.solve(bounded, "jacobi", time_limit=0.01))
 loaded("pgs", lambda: lv.solve(small, "pgs"))
 names = list(lv.registry.specs())
 loaded("listing", lambda: [lv.known(), lv.available(law="lcp")])
-print(json.dumps([{name: sorted(of) for name, of in seen.items()}, names, lv.registry.get("jacobi").own]))
+print(json.dumps([{name: sorted(of) for name, of in seen.items()}, names, lv.registry.get("jacobi").builtin]))
 """
 
 #: Backends and what draws, reads files or prints: what a listing must not load.

@@ -472,7 +472,7 @@ def test_bodies_whose_rows_differ_between_worlds_are_told_so():
         ({"M": (np.ones((4, 18)), np.arange(18)[::-1], np.arange(19))}, "ascend to a last entry on the diagonal"),
         ({"M": (np.ones((4, 18)), np.arange(18), np.arange(18))}, "ascend to a last entry on the diagonal"),
         ({"cones": lv.Cones.contacts(0.5, count=5)}, "48 of all worlds are needed"),
-        ({"count": [12, 9, 0, 3]}, "24 of all worlds are needed, without what pads them; .* give a list"),
+        ({"count": [12, 9, 0, 3]}, "24 of all worlds are needed, without padding rows; .* give a list"),
         ({"cones": [DISKS] * 3}, "one for each of 4 worlds"),
         ({"count": [12, 13, 0, 1]}, "count of world 1 is 13"),
         ({"friction": "wet"}, "friction is 'wet'"),

@@ -45,7 +45,7 @@ def test_specs_are_copied_and_pickled(again):
         {"laws": "lcp"},
         {"laws": None},
         {"laws": [["lcp"], 3]},
-        {"boxes": "cone"},
+        {"box_friction_laws": "cone"},
         {"summary": None},
         {"requires": "numpy"},
         {"options": ["omega"]},
@@ -116,7 +116,7 @@ def test_more_iterations_than_were_asked_for_are_no_result(plug_in):
     name = plug_in(lambda problem, impulse: lv.Claim(lv.Status.MAX_ITERATIONS, 7, {}))
     solution = lv.solve(TINY, name, max_iter=5)
     assert solution.status is lv.Status.NUMERICAL_ERROR
-    assert "claims 7 iterations, where 5 were asked for at most" in solution.message
+    assert "claims 7 iterations, more than the limit of 5" in solution.message
     assert lv.solve(TINY, name, max_iter=7).iterations == 7
 
 

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from random_problems import CONTACTS, FORMS, random_contact_problem, random_lcp, seeds, sweeps
 
 import lavender as lv
-from lavender.problem.ordering import ORDERS
+from lavender.problem.ordering import SWEEP_ORDERS
 from lavender_ext.sweep import serial
 
 
@@ -28,7 +28,7 @@ def test_a_sweep_is_the_update_written_densely_in_every_form(kind, seed):
         np.testing.assert_allclose(sweeps(given_by(problem), "pgs", 5), lam, atol=atol, rtol=0)
 
 
-@pytest.mark.parametrize("order", ORDERS)
+@pytest.mark.parametrize("order", SWEEP_ORDERS)
 @settings(max_examples=8)
 @given(seed=seeds)
 def test_sequential_impulses_equal_pgs_on_every_order(order, seed):

@@ -23,7 +23,7 @@ def pile():
 @pytest.mark.parametrize("order", ORDERS)
 def test_writing_out_changes_no_bit(order, pile, monkeypatch):
     """Cold start: v = 0 in any numbering, and every block then reads the same values in the same order."""
-    monkeypatch.setattr("lavender.problem.ordering.NEAR", 0)
+    monkeypatch.setattr("lavender.problem.ordering.MAX_MEAN_BODY_DISTANCE", 0)
     plain = sweeps(pile, NAME, 7, order=order)
     monkeypatch.setattr(layout, "LARGE", 1)
     state = lv.prepare(pile, "sequential_impulses", order=order).state
@@ -34,7 +34,7 @@ def test_writing_out_changes_no_bit(order, pile, monkeypatch):
 @pytest.mark.parametrize("seed", range(5))
 def test_writing_out_keeps_joints_spin_and_warm_starts(seed, monkeypatch):
     problem = random_contact_problem(seed, bodies=12, joints=5, contacts=30)
-    monkeypatch.setattr("lavender.problem.ordering.NEAR", 0)
+    monkeypatch.setattr("lavender.problem.ordering.MAX_MEAN_BODY_DISTANCE", 0)
     start = sweeps(problem, NAME, 3)
     plain = {o: sweeps(problem, NAME, 20, order=o, impulse=start) for o in ORDERS}
     monkeypatch.setattr(layout, "LARGE", 1)
@@ -95,7 +95,7 @@ def test_orders_within_a_colour_have_the_same_bits(name, large, pile, monkeypatc
 
 def test_local_brings_bodies_that_touch_together(pile, monkeypatch):
     """A lattice whose bodies and contacts were shuffled: the differences of numbers shrink by more than half."""
-    monkeypatch.setattr("lavender.problem.ordering.NEAR", 0)
+    monkeypatch.setattr("lavender.problem.ordering.MAX_MEAN_BODY_DISTANCE", 0)
     body = pile.rows.contact_body
     moving = (body >= 0).all(axis=1)
     rank = body_ranks(pile)
@@ -116,7 +116,7 @@ def test_local_takes_a_matrix_too(pile):
 
 @pytest.mark.parametrize("order", ("given", *ORDERS, "symmetric", "random"))
 def test_update_keeps_what_comes_from_the_structure(order, pile, monkeypatch):
-    monkeypatch.setattr("lavender.problem.ordering.NEAR", 0)
+    monkeypatch.setattr("lavender.problem.ordering.MAX_MEAN_BODY_DISTANCE", 0)
     monkeypatch.setattr(layout, "LARGE", 1)
     other = replace(pile, b=pile.b * 1.25)
     prepared = lv.prepare(pile, "sequential_impulses", order=order)

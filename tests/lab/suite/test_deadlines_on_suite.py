@@ -195,6 +195,6 @@ def test_the_judge_begins_only_what_he_can_end(name, clock):
 def test_what_sweeps_over_j_and_m_waits_for_no_a(name, clock, monkeypatch):
     """A was counted, and so nothing begun, for sweeps that never read it."""
     problem = PROBLEMS["J and M, dense"]()
-    residuals.reference(problem)
+    residuals.get_reference(problem)
     monkeypatch.setattr("lavender.problem.operators.assemble.gram", None)  # which A = Y Y^T is formed by
     assert lv.solve(problem, name, time_limit=2.0 * judging_time(problem), max_iter=3).iterations == 3

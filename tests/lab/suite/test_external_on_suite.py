@@ -82,7 +82,7 @@ def test_more_iterations_than_were_asked_for_are_told(name):
     for case in ("box_stack(n=10)", "boxed_friction(n=4)"):
         for most in (1, 5):
             solution = lv.solve(suite.case(case).problem, name, max_iter=most)
-            told = f"{solution.iterations} iterations, where {most} were asked for at most"
+            told = f"{solution.iterations} iterations, more than the limit of {most}"
             assert (told in solution.message) == (solution.iterations > most)
 
 

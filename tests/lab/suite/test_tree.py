@@ -15,7 +15,7 @@ import lavender as lv
 from benchmarks.core_problems import fresh
 from lavender import registry, suite
 from lavender.base.deadline import Deadline
-from lavender.judge.residuals import reference
+from lavender.judge.residuals import get_reference
 from lavender.solvers import costs
 from lavender.solvers.auto import Tree, solve, tree_goes_on
 from lavender.solvers.certify import certify
@@ -92,7 +92,7 @@ def test_each_line_is_reached_and_named(name):
 @pytest.mark.parametrize("name", FIRST)
 def test_the_tail_doubles(name):
     tree = Tree(FIRST[name][0]())
-    reference(tree.problem)
+    get_reference(tree.problem)
     stages = list(tree)
     in_turn = stages[next(i for i, stage in enumerate(stages) if stage.why.startswith("in turn")) :]
     last = {}
@@ -110,7 +110,7 @@ def test_the_tail_doubles(name):
 
 def test_sweeps_use_up_a_limit_where_who_factors_had_no_time_and_not_where_they_ended():
     problem = suite.pyramid(k=4, friction="coulomb").problem
-    reference(problem)
+    get_reference(problem)
     tree = Tree(problem, Deadline(60.0))
     steps = {name: Newton(name, SolveLog(problem, 1e-6, 10)) for name in tree.states}
     assert steps and tree_goes_on(tree, steps, 1.0)
@@ -124,7 +124,7 @@ def test_sweeps_use_up_a_limit_where_who_factors_had_no_time_and_not_where_they_
 
 def test_turns_end_where_nobody_gains():
     problem = suite.granular(n=4, friction="coulomb").problem
-    reference(problem)
+    get_reference(problem)
     tree = Tree(problem)
     tree.best = 0.5
     turns = [stage.solver for stage in tree if stage.why.startswith("in turn")]
@@ -174,7 +174,7 @@ def test_every_step_goes_on_and_the_best_of_all_is_returned(monkeypatch):
     problem = suite.stack(n=200).problem
     solved = lv.solve(problem, tol=1e-9).impulse
     found = [0.5, 0.99, 0.9, 0.7, 0.999, 1.0 - 1e-9]
-    reference(problem)
+    get_reference(problem)
     log = SolveLog(problem, 1e-7, 10**6)
     log.offer(problem.start())
     made, tree = {}, Tree(problem)
@@ -194,7 +194,7 @@ def test_every_step_goes_on_and_the_best_of_all_is_returned(monkeypatch):
 @pytest.mark.parametrize("sweeps, from_nothing", [(2, True), (200, False)])
 def test_newton_under_friction_begins_from_nothing_where_much_is_left(sweeps, from_nothing):
     problem = suite.pyramid(k=4, friction="coulomb").problem
-    reference(problem)
+    get_reference(problem)
     log = SolveLog(problem, 1e-13, 10**6)
     log.offer(lv.solve(problem, "anderson", max_iter=sweeps, tol=1e-13).impulse)
     step = Newton("newton", log)
@@ -205,7 +205,7 @@ def test_newton_under_friction_begins_from_nothing_where_much_is_left(sweeps, fr
 
 def test_sweeps_that_promise_little_give_way():
     problem = suite.case("pyramidF(k=8, mass_ratio=1e6)").problem
-    reference(problem)
+    get_reference(problem)
     log = SolveLog(problem, 1e-12, 10**6)
     log.offer(problem.start())
     sweeps = Sweeps("anderson", log)
@@ -222,7 +222,7 @@ def test_sweeps_that_promise_little_give_way():
 def test_what_would_not_end_in_time_is_neither_counted_nor_begun(make):
     """With the least of time sweeps have all of it."""
     problem = make().problem
-    reference(problem)
+    get_reference(problem)
     tree = Tree(problem, Deadline(1e-4))
     assert tree.is_late and not tree.states
     log = SolveLog(problem, 1e-12, 10**6, tree.deadline)

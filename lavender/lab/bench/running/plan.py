@@ -8,12 +8,12 @@ from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Any
 
-from lavender.base.arrays import flag, number, several, whole_number
+from lavender.base.arrays import check_bool, check_float, check_int, check_sequence
 from lavender.base.errors import InputError, UnknownName, reject_former_names
 from lavender.lab.bench.record import RENAMED_FIELDS, CaseInfo, Record
 from lavender.lab.bench.running.timing import Ask, Task
 from lavender.problem import Problem
-from lavender.problem.ordering import ORDERS
+from lavender.problem.ordering import SWEEP_ORDERS
 from lavender.solvers.registry import SolverSpec
 
 # A motion error is reached by solves to tighter and tighter residuals: the first, the last, and their maximum number.
@@ -78,7 +78,7 @@ class Plan:
 
     def __post_init__(self) -> None:
         for name in ("tolerances", "budgets", "orders", "velocity_tolerances", "times", "sweeps"):
-            given = several(name, getattr(self, name), "words" if name == "orders" else "numbers")
+            given = check_sequence(name, getattr(self, name), "words" if name == "orders" else "numbers")
             object.__setattr__(self, name, tuple(given))
         for name, values in (
             ("tolerance", self.tolerances),
@@ -86,18 +86,18 @@ class Plan:
             ("time budget", self.times),
         ):
             for value in values:
-                number(name, value, above=0.0)
+                check_float(name, value, above=0.0)
         if not self.tolerances and not self.budgets:
             raise InputError("nothing to run: give tolerances, budgets or both")
-        whole_number("repeats", self.repeats, 1)
-        number("time_limit", self.time_limit, above=0.0)
-        number("sequence_time_limit", self.sequence_time_limit, above=0.0)
+        check_int("repeats", self.repeats, 1)
+        check_float("time_limit", self.time_limit, above=0.0)
+        check_float("sequence_time_limit", self.sequence_time_limit, above=0.0)
         for name in ("warm", "campaign", "motion", "prove"):
-            flag(name, getattr(self, name))
+            check_bool(name, getattr(self, name))
         for word in self.orders:
             name, _, seed = str(word).partition(":")
-            if name not in ORDERS:
-                raise UnknownName("order", name, ORDERS)
+            if name not in SWEEP_ORDERS:
+                raise UnknownName("order", name, SWEEP_ORDERS)
             if seed and not (name == "random" and seed.isdecimal()):
                 raise InputError(f"order {word!r}: only random takes a seed, a whole number: random:3")
         # each once: what stands twice would be run twice, and move the middle
@@ -106,7 +106,7 @@ class Plan:
                 self, name, tuple(sorted({float(x) for x in getattr(self, name)}, reverse=True))
             )
         for name in ("budgets", "sweeps"):
-            counts = {whole_number("budget", n, 1) for n in getattr(self, name)}
+            counts = {check_int("budget", n, 1) for n in getattr(self, name)}
             object.__setattr__(self, name, tuple(sorted(counts)))
         object.__setattr__(self, "times", tuple(sorted({float(t) for t in self.times})))
         object.__setattr__(self, "orders", tuple(dict.fromkeys(self.orders)))

@@ -18,7 +18,7 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-from lavender.base.arrays import FloatArray, several
+from lavender.base.arrays import FloatArray, check_sequence
 from lavender.base.errors import InputError, LavenderError, reject_former_names
 from lavender.judge.solution import CONTRADICTED
 from lavender.judge.states import states_of
@@ -127,7 +127,7 @@ def solver_names(names: str | Sequence[str] | None) -> list[str]:
     UnknownName, SolverUnavailable
     """
     if names is not None and not isinstance(names, str):
-        names = several("solvers", names, "names")
+        names = check_sequence("solvers", names, "names")
     if names:
         names = [names] if isinstance(names, str) else names
         for name in names:

@@ -22,7 +22,7 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray
 from lavender.base.lazy_import import import_numerics
-from lavender.judge.residuals import reference
+from lavender.judge.residuals import get_reference
 from lavender.judge.solution import Claim, Solution, Status, uninterrupted
 from lavender.lab.bench import machine
 from lavender.lab.bench.record import ERROR, CaseInfo, Record, measurement_key
@@ -335,7 +335,7 @@ def _prepare_and_solve(problem: Problem, task: Task, impulse: Any) -> Solution:
     more = {"isolate": False} if "isolate" in registry.get(task.solver).accepts else {}
     # a run has processes of its own for these
     prepared = prepare(fresh, task.solver, **{**more, **task.options})
-    reference(fresh)  # E0, V0: the judge's, outside the clocks
+    get_reference(fresh)  # E0, V0: the judge's, outside the clocks
     if task.start == "cold":
         impulse = fresh.start()
     elif task.start == "warm":

@@ -6,13 +6,13 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import CapabilityError
-from lavender.external.running import quiet
+from lavender.external.running import capture_output
 from lavender.lab.phenomena.engines import Stepping
 from lavender.lab.phenomena.engines.tree import collision_shape, parents, relative, xyzw
 from lavender.sim.scene import Body, Joint, Plane, Scene, Sphere
 from lavender.sim.scene.parts import rotation
 
-with quiet(noisy=True):  # it greets
+with capture_output(noisy=True):  # it greets
     import pybullet
 
 
