@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from lavender.cli.options import PATH, parameters_of, refuse_unused
-from lavender.io.stored import writable, write_text
+from lavender.io.stored import check_writable, write_text
 
 if TYPE_CHECKING:
     from lavender.lab.phenomena import Record
@@ -72,7 +72,7 @@ def phenomena(
         click.echo(tables.described(chosen(names)))
         return
     if out is not None:
-        writable(out)
+        check_writable(out)
     case = parameters_of(parameters) if parameters else None
     found: list[Record] = []
 

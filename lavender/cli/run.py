@@ -12,7 +12,7 @@ import click
 
 from lavender.base.errors import InputError
 from lavender.cli.options import PATH, end_stopped, going_on, parameters_of, refuse_unused, say
-from lavender.io.stored import check_figure, destination, writable
+from lavender.io.stored import check_figure_path, check_writable, destination
 
 
 @click.command()
@@ -85,14 +85,14 @@ def run(
     if record is None:
         refuse_unused(context, ["replace"], "without --record")
     if plot is not None:
-        plot = check_figure(plot)
+        plot = check_figure_path(plot)
     files = {
         name: path for name, path in (("trace", trace), ("figure", plot), ("film", film)) if path is not None
     }
     if len({destination(path) for path in files.values()}) < len(files):
         raise InputError(f"{', '.join(map(str, files.values()))}: a file can hold one of these; name several")
     for path in files.values():
-        writable(path)
+        check_writable(path)
     drawn = film is not None and film.suffix.lower() in PICTURES
     if film is not None and drawn:
         picture_suffix(film)

@@ -9,7 +9,7 @@ from pathlib import Path
 import lavender_ext
 from lavender.base.errors import InputError, LavenderError
 from lavender.export.amalgamate import ExtractionError, amalgamate, source_hash
-from lavender.io.stored import kept, make_folder, writable, write_bytes
+from lavender.io.stored import check_writable, load_or_make, make_folder, write_bytes
 
 HERE = Path(__file__).resolve().parent
 ROOT = Path(lavender_ext.__file__).resolve().parent.parent  # the folder that holds lavender_ext
@@ -36,7 +36,7 @@ def source() -> str:
                 "install a wheel, or Cython"
             ) from None
 
-    return kept(HERE / "c" / "lavender.c", lambda text: wanted in text[:1000], make).decode()
+    return load_or_make(HERE / "c" / "lavender.c", lambda text: wanted in text[:1000], make).decode()
 
 
 def _files(folder: Path) -> Iterator[Path]:
@@ -69,7 +69,7 @@ def write(out: Path, *, more: Mapping[str, str | bytes] | None = None, replace: 
     LavenderError
         As `source`.
     """
-    writable(out, folder=True)
+    check_writable(out, folder=True)
     folder = HERE / "c"
     made = {p.relative_to(folder).as_posix(): p.read_text(encoding="utf-8") for p in _files(folder)}
     made["lavender.c"] = source()

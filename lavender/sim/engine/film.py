@@ -15,7 +15,7 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import InputError
-from lavender.io.stored import framed, unframed, whole_file, write_bytes
+from lavender.io.stored import pack_header, read_whole_file, unpack_header, write_bytes
 from lavender.sim.engine.layout import HEAD, JOINT
 from lavender.sim.engine.state import State
 from lavender.sim.scene import Scene
@@ -112,14 +112,14 @@ class Film:
 
     def to_bytes(self) -> bytes:
         """The bytes of a file."""
-        return framed(MAGIC, {"version": VERSION, **self.header}) + self.frames().astype("<f4").tobytes()
+        return pack_header(MAGIC, {"version": VERSION, **self.header}) + self.frames().astype("<f4").tobytes()
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> Film:
         """Read a file written by `save`."""
-        data = whole_file(path, "the film")
+        data = read_whole_file(path, "the film")
         try:
-            header, end = unframed(data, MAGIC, MOST_HEADER)
+            header, end = unpack_header(data, MAGIC, MOST_HEADER)
             if header.pop("version") != VERSION:
                 raise ValueError
             _check(header)

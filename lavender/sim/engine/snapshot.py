@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from lavender.base.errors import InputError
-from lavender.io.stored import framed, unframed, whole_file, write_atomically
+from lavender.io.stored import pack_header, read_whole_file, unpack_header, write_atomically
 from lavender.sim.engine.check import well_formed
 from lavender_ext.engine.arrays import lengths
 
@@ -46,14 +46,14 @@ class Snapshot:
         arrays = [np.ascontiguousarray(getattr(self, name), code).tobytes() for name, code in ARRAYS]
         header = {name: getattr(self, name) for name in WORDS}
         lengths_of = [len(getattr(self, name)) for name, _ in ARRAYS]
-        body = framed(MAGIC, {"version": VERSION, **header, "lengths": lengths_of}) + b"".join(arrays)
+        body = pack_header(MAGIC, {"version": VERSION, **header, "lengths": lengths_of}) + b"".join(arrays)
         checksum = hashlib.sha256(body).digest()
         write_atomically(path, lambda part: _write(part, body + checksum))
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> Snapshot:
         """Read a file written by `save`."""
-        data = whole_file(path, "the snapshot")
+        data = read_whole_file(path, "the snapshot")
         if not data.startswith(MAGIC):
             raise InputError(f"{str(path)!r} is not a lavender snapshot")
         body, checksum = data[:-32], data[-32:]
@@ -69,7 +69,7 @@ class Snapshot:
 
     @classmethod
     def _parsed(cls, body: bytes) -> Snapshot:
-        header, end = unframed(body, MAGIC, MOST_HEADER)
+        header, end = unpack_header(body, MAGIC, MOST_HEADER)
         if header["version"] != VERSION:
             raise InputError(f"it has version {str(header['version'])[:40]}; {VERSION} is read here")
         arrays: dict[str, Any] = {}

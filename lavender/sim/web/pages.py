@@ -17,7 +17,7 @@ from typing import Any
 
 import lavender_ext
 from lavender.base.errors import InputError, LavenderError
-from lavender.io.stored import kept, make_folder, writable, write_bytes, write_text
+from lavender.io.stored import check_writable, load_or_make, make_folder, write_bytes, write_text
 from lavender.sim.web import compile as wasm
 from lavender.sim.web.scenes import page_scenes
 
@@ -28,7 +28,7 @@ SHIPPED = HERE  # the folder of the modules that come with the package
 
 def build_module(out: Path, name: str = "lavender") -> wasm.Built:
     """Compile the kernels to a WebAssembly module: "lavender", which stands alone, or "newton" beside it."""
-    writable(out)
+    check_writable(out)
     part = wasm.PARTS[name]
     try:
         return wasm.build(out, ROOT, part.modules, beside=part.beside)
@@ -53,12 +53,12 @@ def module(say: Callable[[str], Any] = lambda text: None, name: str = "lavender"
             build_module(out, name)
             return out.read_bytes()
 
-    return kept(shipped, lambda _: wasm.is_current(shipped, ROOT, wasm.PARTS[name]), make)
+    return load_or_make(shipped, lambda _: wasm.is_current(shipped, ROOT, wasm.PARTS[name]), make)
 
 
 def write_page(folder: Path, say: Callable[[str], Any] = lambda text: None) -> Path:
     """Write the page into a folder for any file server; nothing in it needs Python or a network. Returns index.html."""
-    make_folder(writable(folder, folder=True))
+    make_folder(check_writable(folder, folder=True))
     modules = {name: module(say, name) for name in wasm.PARTS}
     try:
         shutil.copytree(HERE / "page", folder, copy_function=_copy, dirs_exist_ok=True)
