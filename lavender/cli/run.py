@@ -79,7 +79,7 @@ def run(
     from lavender.sim.engine import Simulation
     from lavender.sim.engine import run as stepped
     from lavender.sim.engine.picture import PICTURES, picture_suffix, save_picture
-    from lavender.sim.engine.run import line
+    from lavender.sim.engine.run import format_step
     from lavender.sim.scene import Scene
 
     if record is None:
@@ -113,7 +113,7 @@ def run(
 
         def watch(step: int, observation: dict[str, Any], info: dict[str, Any]) -> None:
             if step % every == 0 or step == steps or "lost_body" in info:
-                show(line(step, observation, info))
+                show(format_step(step, observation, info))
             if viewer is not None:  # no faster than it would go
                 sleep(max(0.0, info["time"] - (perf_counter() - begun)))
 
