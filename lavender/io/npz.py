@@ -289,9 +289,8 @@ def _read_own(archive: Archive) -> Stored:
     b, ptr = archive["b"], archive["cones_ptr"]
     if b.ndim != 1:
         raise InputError(f"b has shape {b.shape}; one dimension is needed")
-    if (
-        ptr.ndim != 1 or len(ptr) == 0 or ptr[-1] != len(b)
-    ):  # Checked before bounds of this many rows are allocated.
+    # This is checked before bounds of as many rows are allocated.
+    if ptr.ndim != 1 or len(ptr) == 0 or ptr[-1] != len(b):
         raise InputError(f"b has shape {b.shape}; cones.ptr must end with the number of its rows")
     optional_parts: dict[str, Any] = {name: archive[name] for name in ("guess", "key") if name in archive}
     optional_parts["precision"] = meta.get("precision", "float64")

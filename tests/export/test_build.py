@@ -256,7 +256,7 @@ double lav_pong(double x) { return lav_round(x); }
 """
 
 
-@pytest.mark.parametrize("used, sign", [("k_bad()", "Python's side"), ("k_round(1)", "comes round")])
+@pytest.mark.parametrize("used, sign", [("k_bad()", "the Python part"), ("k_round(1)", "is a cycle")])
 def test_a_cut_that_needs_python_or_itself_is_refused(used, sign):
     with pytest.raises(extract_c.ExtractionError, match=sign):
         extract_c.extract_c([("a", KERNEL)], f"double lav_use(double x) {{ {used}; return x; }}")
