@@ -36,6 +36,6 @@ def export(
     if records is None:
         refuse_unused(context, ["solver"], "without --for")
     context.with_resource(lock_output(folder, folder=True))  # before the vectors are solved for
-    more = vectors.made(records, solver, VECTORS) if records is not None else {}
+    more = vectors.make_files(records, solver, VECTORS) if records is not None else {}
     written = library.write(folder, more=more, replace=replace)
     say(f"{len(written)} files in {folder}: {', '.join(p.name for p in written)}")

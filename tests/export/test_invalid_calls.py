@@ -228,7 +228,8 @@ def test_newton_rejects_more_bodies_than_its_factor_can_hold(library):
     problem, options, workspace = library.problem(stack_of(1501)), library.options("newton"), ct.c_uint64()
     assert ERRORS[library.c.lav_takes(ct.byref(problem), ct.byref(options))] == "LAV_ERROR_BODIES"
     assert (
-        ERRORS[library.c.lav_workspace_size(ct.byref(problem), ct.byref(options), ct.byref(workspace))] == "LAV_ERROR_BODIES"
+        ERRORS[library.c.lav_workspace_size(ct.byref(problem), ct.byref(options), ct.byref(workspace))]
+        == "LAV_ERROR_BODIES"
     )
 
 

@@ -82,7 +82,7 @@ SIGNS = {"libm": "symbol: sin", "a parallel loop": "PyEval_SaveThread"}  # else:
 def test_a_kernel_that_needs_more_does_not_link(tmp_path, kind):
     path = tmp_path / "bad.pyx"
     path.write_text(HEAD + BAD[kind])
-    with pytest.raises(wasm.BuildFailed, match=SIGNS.get(kind, "Python's side")):
+    with pytest.raises(wasm.BuildFailed, match=SIGNS.get(kind, "the Python part")):
         wasm.build(tmp_path / "bad.wasm", ROOT, [path])
     assert not (tmp_path / "bad.wasm").exists()
 
@@ -143,11 +143,11 @@ def test_without_compiler_a_missing_or_stale_module_says_what_to_do(tmp_path, mo
         LavenderError, match="lavender is not in this installation and cannot be built: no compiler"
     ):
         pages.module()
-    other = b"\0asm\1\0\0\0" + wasm.section(wasm.SECTION, b"0" * 64)
+    other = b"\0asm\1\0\0\0" + wasm.section(wasm.SOURCES_SECTION, b"0" * 64)
     (tmp_path / "lavender.wasm").write_bytes(other)
     with pytest.raises(LavenderError, match="is of other kernels"):
         pages.module()
-    fresh = b"\0asm\1\0\0\0" + wasm.section(wasm.SECTION, wasm.source_hash(ROOT).encode())
+    fresh = b"\0asm\1\0\0\0" + wasm.section(wasm.SOURCES_SECTION, wasm.source_hash(ROOT).encode())
     (tmp_path / "lavender.wasm").write_bytes(fresh)
     assert pages.module() == fresh
 
