@@ -40,7 +40,7 @@ MODE = os.environ.get("LAVENDER_DEBUG", "")
 DEBUG = MODE not in ("", "0")
 OPTIONS = runpy.run_path("lavender_ext/build_options.py")
 WASM = runpy.run_path("lavender/sim/web/compile.py")
-put = WASM["put"]
+put = WASM["write_atomically"]
 LIBRARY = runpy.run_path("lavender/export/amalgamate.py")
 DIRECTIVES = OPTIONS["directives"](debug=DEBUG)
 #: Holds what Cython would otherwise write into every module (memoryviews): half of all that is compiled.
@@ -191,11 +191,11 @@ class BuildWasm(Command):
             if WASM["is_current"](here, Path(), part):
                 out.write_bytes(here.read_bytes())
                 continue
-            reason = WASM["why_not"]()
+            reason = WASM["missing_requirement"]()
             if reason:
                 self.announce(f"no WebAssembly module {name}: {reason}", level=logging.INFO)
             else:
-                WASM["build"](out, Path().resolve(), part.modules, beside=part.beside)
+                WASM["build"](out, Path().resolve(), part.modules, imports_memory=part.imports_memory)
 
     def get_outputs(self):
         """The modules, where they could be built."""
@@ -267,11 +267,11 @@ class ReproducibleArchive(sdist):
         for name, part in WASM["PARTS"].items():
             path = Path("lavender", "sim", "web", f"{name}.wasm")
             if not WASM["is_current"](path, Path(), part):
-                if reason := WASM["why_not"]():
+                if reason := WASM["missing_requirement"]():
                     raise CompileError(
                         f"a source distribution contains {path}, which cannot be built here: {reason}"
                     )
-                WASM["build"](path, Path().resolve(), part.modules, beside=part.beside)
+                WASM["build"](path, Path().resolve(), part.modules, imports_memory=part.imports_memory)
         super().run()
 
     def make_archive(self, base_name, format, root_dir=None, base_dir=None, owner=None, group=None):  # noqa: A002

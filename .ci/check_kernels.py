@@ -139,7 +139,7 @@ def check(work: Path) -> tuple[list[str], str]:
             breaches += [f"{name}: {text}" for text in found]
     told = f"{len(modules)} modules are strict C11"
     try:
-        made = web["build"](work / "core.wasm", ROOT, modules, largest=2**24)
+        made = web["build"](work / "core.wasm", ROOT, modules, max_bytes=2**24)
         told += f"; {len(made.functions)} core functions stand alone, in {made.size} bytes of WebAssembly"
     except web["BuildFailed"] as error:
         breaches.append(str(error))

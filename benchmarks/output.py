@@ -10,7 +10,7 @@ from typing import Any
 
 import click
 
-from lavender.io.stored import writable, write_text
+from lavender.io.stored import check_writable, write_text
 from lavender.lab.bench import machine
 
 
@@ -26,7 +26,7 @@ def out_option(text: str, name: str = "--out") -> Callable[[Callable[..., Any]],
     """`--out FILE`, which a command gets as a path that it may write, or None."""
 
     def checked(context: click.Context, option: click.Parameter, path: Path | None) -> Path | None:
-        return None if path is None else writable(path)
+        return None if path is None else check_writable(path)
 
     return click.option(name, type=click.Path(path_type=Path), callback=checked, help=text)
 

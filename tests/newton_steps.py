@@ -28,7 +28,7 @@ class NewtonSteps:
         """One step; the eight values of the solver after it."""
         for _ in range(self.substeps):
             while self.state.kernel.prepare() == NEED_ROOM:
-                self._take(self.state.grown())
+                self._take(self.state.with_larger_buffers())
             self.state.kernel.solve(False)
             self.told = self.solver.solve(self.tol)
             self.ended.append(self.told[0])

@@ -200,7 +200,7 @@ def _engine(scene: str, seconds: float, **parameters: Any) -> list[Row]:
     best = dict.fromkeys(calls, float("inf"))
     begun = perf_counter()
     while best["finish"] == float("inf") or perf_counter() - begun < seconds:
-        state.take(simulation.state)
+        state.copy_from(simulation.state)
         for name, call in calls.items():
             start = process_time_ns()
             call()

@@ -10,7 +10,7 @@ import click
 
 from lavender.base.errors import InputError, LavenderError
 from lavender.cli.options import EXIT_UNMET, PATH, echo, one_thread
-from lavender.io.stored import writable, write_text
+from lavender.io.stored import check_writable, write_text
 
 
 @click.group()
@@ -49,7 +49,7 @@ def mujoco(models: tuple[Path, ...], steps: int, every: int, warm: int, out: Pat
     """
     one_thread()
     if out is not None:
-        writable(out)
+        check_writable(out)
     from lavender.io.mujoco import package
     from lavender.lab.bench.machine import cpu_name, versions
     from lavender.lab.bench.simulators import Step, WarmStep, measure, measure_warm

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from lavender.cli.options import PATH, parse_parameters, reject_unused_options
-from lavender.io.stored import writable, write_text
+from lavender.io.stored import check_writable, write_text
 
 if TYPE_CHECKING:
     from lavender.lab.phenomena import Record
@@ -72,7 +72,7 @@ def phenomena(
         click.echo(tables.described(chosen(names)))
         return
     if out is not None:
-        writable(out)
+        check_writable(out)
     case = parse_parameters(parameters) if parameters else None
     records: list[Record] = []
 

@@ -19,7 +19,7 @@ from lavender.cli.options import (
     parse_parameters,
     reject_unused_options,
 )
-from lavender.io.stored import check_figure, destination, writable
+from lavender.io.stored import check_figure_path, check_writable, destination
 
 
 @click.command()
@@ -88,20 +88,20 @@ def run(
     from lavender.sim.engine import Simulation
     from lavender.sim.engine import run as run_simulation
     from lavender.sim.engine.picture import PICTURES, picture_suffix, save_picture
-    from lavender.sim.engine.run import line
+    from lavender.sim.engine.run import format_step
     from lavender.sim.scene import Scene
 
     if record is None:
         reject_unused_options(context, ["replace"], "without --record")
     if plot is not None:
-        plot = check_figure(plot)
+        plot = check_figure_path(plot)
     files = {
         name: path for name, path in (("trace", trace), ("figure", plot), ("film", film)) if path is not None
     }
     if len({destination(path) for path in files.values()}) < len(files):
         raise InputError(f"{', '.join(map(str, files.values()))}: each needs a file of its own")
     for path in files.values():
-        writable(path)
+        check_writable(path)
     drawn = film is not None and film.suffix.lower() in PICTURES
     if film is not None and drawn:
         picture_suffix(film)
@@ -124,7 +124,7 @@ def run(
 
         def show_step(step: int, observation: dict[str, Any], info: dict[str, Any]) -> None:
             if step % every == 0 or step == steps or "lost_body" in info:
-                show(line(step, observation, info))
+                show(format_step(step, observation, info))
             if viewer is not None:  # Not faster than real time.
                 sleep(max(0.0, info["time"] - (perf_counter() - begun)))
 

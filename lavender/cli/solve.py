@@ -9,7 +9,7 @@ import click
 
 from lavender.base.errors import InputError
 from lavender.cli.options import EXIT_INFEASIBLE, EXIT_INTERRUPTED, EXIT_UNMET, PATH, echo, one_thread
-from lavender.io.stored import writable, write_atomically
+from lavender.io.stored import check_writable, write_atomically
 
 #: Fields of the residual that --output writes.
 SAVED_RESIDUAL_FIELDS = ("error", "relative", "energy", "velocity", "roundoff_floor")
@@ -54,7 +54,7 @@ def solve(
 
     one_thread()
     if output is not None:
-        writable(output)
+        check_writable(output)
     (item, *more) = bench.resolve([file])
     if more:
         raise InputError(f"{file} holds {len(more) + 1} problems; give one file")

@@ -1,7 +1,7 @@
-"""The way out: the kernels as a C library with one header, for engines that are not written in Python.
+"""Export the kernels as a C library with one header, for engines that are not written in Python.
 
-`lavender export c DIR` writes it. From Python `write`, `source`, `HEADER`, and `engine_image`, a simulation as
-`lav_engine_open` reads it.
+The command `lavender export c DIR` writes the library; from Python, `write` does. `source` returns lavender.c, `HEADER`
+is the path of the header, and `engine_image` returns a simulation in the format of `lav_engine_open`.
 """
 
 from lavender.export.library import HEADER, source, write

@@ -1,6 +1,6 @@
-"""lavender.c: the kernels that the functions of lavender.h use, then those functions (capi/).
+"""Build lavender.c: the kernels that the functions of lavender.h use, followed by those functions (capi/).
 
-Only the standard library is imported, so that setup.py can run this before anything is built.
+Only the standard library is imported, so that setup.py can run this file before anything is built.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any
 HERE = Path(__file__).resolve().parent
 EXTRACT_C: dict[str, Any] = runpy.run_path(str(HERE.parent / "sim" / "web" / "extract_c.py"))
 ExtractionError: type[Exception] = EXTRACT_C["ExtractionError"]
-#: Modules of lavender_ext that the library reaches into.
+#: Modules of lavender_ext whose functions the library uses.
 MODULES = (
     "core.assemble",
     "core.generalized",
@@ -46,12 +46,12 @@ FRONT = [
 
 
 def source_hash(root: Path) -> str:
-    """Hash of everything that the library is made of."""
+    """Return a hash of all files from which the library is built."""
     return str(EXTRACT_C["source_hash"](root, MODULES, [HEADER, Path(__file__), *FRONT]))
 
 
-def words(header: str) -> str:
-    """`lav_text`, `lav_name` and `lav_outcome`, of the header's enums and what it says behind each error."""
+def name_functions(header: str) -> str:
+    """Return C code of `lav_text`, `lav_name` and `lav_outcome` from the header's enums and its comments on errors."""
     errors, methods, outcomes = re.findall(r"enum \{ /\*[^*]*\*/\n(.*?)\n\};", header, re.DOTALL)
     texts = re.findall(r"(LAV_\w+) = -?\d+,?\s*/\* (.*?) \*/", errors)
     lists = {"lav_text(int32_t code)": (texts, '"no such code"')}
@@ -59,15 +59,22 @@ def words(header: str) -> str:
         names = re.findall(r"(LAV_\w+) = ", body)
         lists[call] = ([(name, name.removeprefix("LAV_").lower()) for name in names], "NULL")
     out = []
-    for call, (said, otherwise) in lists.items():
-        cases = "".join(f'    case {name}: return "{text}";\n' for name, text in said)
+    for call, (texts_by_name, default) in lists.items():
+        cases = "".join(f'    case {name}: return "{text}";\n' for name, text in texts_by_name)
         out.append(f"\nconst char *{call} {{\n  switch ({call[:-1].split()[-1]}) {{\n{cases}")
-        out.append(f"    default: return {otherwise};\n  }}\n}}\n")
+        out.append(f"    default: return {default};\n  }}\n}}\n")
     return "".join(out)
 
 
-def amalgamate(root: Path, made: Path | None = None) -> str:
-    """lavender.c, from the sources of lavender_ext below `root`; `made`: translations of an ordinary build.
+def amalgamate(root: Path, cache: Path | None = None) -> str:
+    """Return lavender.c.
+
+    Parameters
+    ----------
+    root : Path
+        Folder that contains lavender_ext with its sources.
+    cache : Path, optional
+        Folder of translations of an ordinary build.
 
     Raises
     ------
@@ -75,12 +82,12 @@ def amalgamate(root: Path, made: Path | None = None) -> str:
         The kernels cannot be translated, or need Python.
     """
     front = "".join(path.read_text(encoding="utf-8") for path in FRONT)
-    front += words(HEADER.read_text(encoding="utf-8"))
+    front += name_functions(HEADER.read_text(encoding="utf-8"))
     version = runpy.run_path(str(HERE.parent / "_version.py"))["__version__"]
     with tempfile.TemporaryDirectory() as work:
-        kernels = EXTRACT_C["extract_c"](EXTRACT_C["translate"](root, MODULES, Path(work), made), front)
+        kernels = EXTRACT_C["extract_c"](EXTRACT_C["translate"](root, MODULES, Path(work), cache), front)
     return (
         f"/* liblavender of lavender {version}: the kernels without Python, then the functions of lavender.h.\n"
-        f" * Made, not written: changes belong into the kernels. Sources {source_hash(root)}\n */\n"
+        f" * This file is generated: change the kernels instead. Sources {source_hash(root)}\n */\n"
         f'#include "lavender.h"\n\n{kernels}'
     )

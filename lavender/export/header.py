@@ -1,4 +1,4 @@
-"""lavender.h read: its constants, and structs field by field."""
+"""Read lavender.h: its constants, and the fields of its structs."""
 
 from __future__ import annotations
 
@@ -11,27 +11,35 @@ def strip_comments(header: str) -> str:
 
 
 def constants(header: str) -> dict[str, int]:
-    """Numbers of the enums by name."""
-    found: dict[str, int] = {}
+    """Return the numbers of all enums by name."""
+    numbers: dict[str, int] = {}
     for body in re.findall(r"enum \{(.*?)\};", strip_comments(header), re.DOTALL):
-        found |= {name: int(value) for name, value in re.findall(r"(\w+)\s*=\s*(-?\d+)", body)}
-    return found
+        numbers |= {name: int(value) for name, value in re.findall(r"(\w+)\s*=\s*(-?\d+)", body)}
+    return numbers
 
 
 def struct_fields(header: str, name: str) -> list[tuple[str, str]]:
-    """Fields of a struct in order: ("int32_t", "n_rows"), a pointer ("const double *", "b"), a function ("(*)", .)."""
+    """Return (type, name) of the fields of a struct in order.
+
+    Examples are ("int32_t", "n_rows"), ("const double *", "b"), and ("(*)", "clock") for a pointer to a function.
+
+    Raises
+    ------
+    ValueError
+        The header has no such struct.
+    """
     body = re.search(rf"typedef struct {name} \{{(.*?)\}} {name};", header, re.DOTALL)
     if body is None:
         raise ValueError(f"the header has no struct {name}")
-    found = []
+    pairs = []
     for line in strip_comments(body[1]).split(";"):
-        words = " ".join(line.split())
-        pointer = re.match(r"(.*?)\(\*(\w+)\)\(", words)
+        declaration = " ".join(line.split())
+        pointer = re.match(r"(.*?)\(\*(\w+)\)\(", declaration)
         if pointer:
-            found.append(("(*)", pointer[2]))
+            pairs.append(("(*)", pointer[2]))
             continue
-        match = re.match(r"((?:const )?\w+) (.+)", words)
+        match = re.match(r"((?:const )?\w+) (.+)", declaration)
         for part in match[2].split(",") if match else ():
             assert match is not None
-            found.append((match[1] + (" *" if "*" in part else ""), part.replace("*", "").strip()))
-    return found
+            pairs.append((match[1] + (" *" if "*" in part else ""), part.replace("*", "").strip()))
+    return pairs

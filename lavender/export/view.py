@@ -1,4 +1,4 @@
-"""What the library reads: a problem as `lav_problem` has it, settings by number, a simulation as bytes."""
+"""Convert problems, options and simulations to the formats of the C library."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from lavender.sim.engine.simulation import Simulation
 from lavender.solvers import registry
 
 _HEADER = HEADER.read_text(encoding="utf-8")
-#: Arrays in the order of the struct, with what they hold.
+#: Arrays of `lav_problem` in the order of the struct, with their types.
 ARRAYS: dict[str, Any] = {
     name: np.dtype({"double": "f8", "int32_t": "i4", "uint64_t": "u8"}[kind.split()[1]])
     for kind, name in struct_fields(_HEADER, "lav_problem")
@@ -28,39 +28,47 @@ METHODS = {
     for name, spec in registry.specs().items()
     if spec.builtin and not spec.external and not spec.delegates
 }
-#: Those whose factor is another in the package, or which stand for steps of others: other bits, the same judge.
+#: Solvers whose bits differ: the package uses another factorisation, or the solver is a sequence of others.
 OTHER_BITS = ("admm", "auto")
 ORDERS = {"given": 0, "symmetric": 1, "random": 2, "reverse": 3}
 SWEEPS = {None: 0, "pgs": 1, "blocks": 2}
-#: Forms (1 a matrix, 2 bodies, 3 J and M) of those that do not take all of them.
+#: Forms (1 a matrix, 2 bodies, 3 J and M) of the methods that do not support all of them.
 FORMS = {"sequential_impulses": (2,), "pgs": (1, 3), "direct": (1, 2), "lemke": (1, 2), "admm": (1, 2)}
 FORMS |= dict.fromkeys(("sor", "gauss_seidel", "jacobi"), (1,))
-MAGIC = b"LAVIMG1\0"  # of what `lav_engine_open` reads and `lav_engine_image` writes
+MAGIC = b"LAVIMG1\0"  # Magic word of the images that `lav_engine_open` reads and `lav_engine_image` writes.
 
 
-class NotTaken(InputError):
-    """The library does not take this; the message says what."""
+class NotSupported(InputError):
+    """The C library does not support a problem, solver or option; the message names it."""
 
 
 @dataclass(frozen=True)
-class View:
-    """form, law, blocks, rows, entries, bodies, joints, velocities, entries of M; arrays, None for null."""
+class ProblemView:
+    """The contents of a `lav_problem`.
+
+    Parameters
+    ----------
+    counts : tuple of int
+        Form, law, and numbers of blocks, rows, entries, bodies, joints, velocities and entries of M.
+    arrays : mapping of str to array or None
+        Arrays by name; None for a null pointer.
+    """
 
     counts: tuple[int, ...]
     arrays: dict[str, Any]
 
 
-def view(problem: Problem) -> View:
-    """The problem in the library's words; its start is a guess that came with it, or none.
+def problem_view(problem: Problem) -> ProblemView:
+    """Return the contents of the `lav_problem` of a problem; its start is the problem's guess, if there is one.
 
     Raises
     ------
-    NotTaken
-        Ellipses; generalised velocities in an order of lavender's own.
+    NotSupported
+        The problem has ellipses, or its generalised velocities have been reordered.
     """
     c = problem.cones
     if c.has_ellipse:
-        raise NotTaken("the library has no ellipses: give it the same in longer rows, `problem.disk`")
+        raise NotSupported("the library has no ellipses: give it the same in longer rows, `problem.disk`")
     arrays: dict[str, Any] = dict.fromkeys(ARRAYS)
     arrays |= {"block_ptr": c.ptr, "kind": c.kind, "lower": c.lower, "upper": c.upper, "mu": c.mu}
     arrays |= {"patch_radius": c.patch_radius, "b": problem.b, "impulse": problem.guess, "rolling": c.rolling}
@@ -73,8 +81,8 @@ def view(problem: Problem) -> View:
     elif problem.generalized is not None:
         g, form = problem.generalized, 3
         if g.order is not None:
-            raise NotTaken(
-                "velocities stand in an order of lavender's own: M's pattern is not that of a tree"
+            raise NotSupported(
+                "the generalised velocities were reordered, because M does not have the pattern of a tree"
             )
         arrays |= zip(("index_ptr", "index", "value"), g.operator.jac, strict=True)
         arrays |= zip(("mass_ptr", "mass_index", "mass_value"), g.operator.mass, strict=True)
@@ -89,11 +97,13 @@ def view(problem: Problem) -> View:
         if values is not None:
             arrays[key] = np.ascontiguousarray(values, ARRAYS[key])
     law = int(problem.friction == "cone")
-    return View((form, law, problem.n_blocks, problem.m, entries, bodies, joints, velocities, mass), arrays)
+    return ProblemView(
+        (form, law, problem.n_blocks, problem.m, entries, bodies, joints, velocities, mass), arrays
+    )
 
 
-def takes(problem: Problem, solver: str) -> bool:
-    """Whether the library's method takes a problem that the package's solver takes, as `lav_takes` says it."""
+def accepts(problem: Problem, solver: str) -> bool:
+    """Return whether the library's method accepts a problem that the package's solver accepts, as `lav_takes` does."""
     form = 2 if problem.rows is not None else 3 if problem.generalized is not None else 1
     c = problem.cones
     if form not in FORMS.get(solver, (1, 2, 3)):
@@ -103,37 +113,39 @@ def takes(problem: Problem, solver: str) -> bool:
     return solver != "newton" or form == 3 or not (c.has_round or c.has_more_parts)
 
 
-def choices(solver: str, options: Mapping[str, Any]) -> tuple[tuple[int, ...], float]:
-    """(order, memory, sweep, convex, keeps) and omega of the options of a solver.
+def option_numbers(solver: str, options: Mapping[str, Any]) -> tuple[tuple[int, ...], float]:
+    """Return (order, memory, sweep, convex, keeps) and omega for the options of a solver.
 
     Raises
     ------
-    NotTaken
-        An option that the library does not have.
+    NotSupported
+        The library does not have the solver or the option.
     """
-    left = dict(options)
-    order = left.pop("order", "given")
-    sweep, restart = left.pop("sweep", None), left.pop("restart", "growth")
+    remaining = dict(options)
+    order = remaining.pop("order", "given")
+    sweep, restart = remaining.pop("sweep", None), remaining.pop("restart", "growth")
     numbers = (
-        left.pop("memory", 10 if solver == "admm" else 5),
+        remaining.pop("memory", 10 if solver == "admm" else 5),
         SWEEPS.get(sweep, -1),
-        left.pop("convex", 0),
+        remaining.pop("convex", 0),
         int(restart == "against"),
     )
-    omega = left.pop("omega", {"sor": 1.5, "gauss_seidel": 1.0}.get(solver)) or 0.0
-    if left or order not in ORDERS or solver not in METHODS:
-        what = ", ".join(left) or (f"order={order!r}" if order not in ORDERS else solver)
-        raise NotTaken(f"{what}: not in the library")
+    omega = remaining.pop("omega", {"sor": 1.5, "gauss_seidel": 1.0}.get(solver)) or 0.0
+    if remaining or order not in ORDERS or solver not in METHODS:
+        unsupported = ", ".join(remaining) or (f"order={order!r}" if order not in ORDERS else solver)
+        raise NotSupported(f"{unsupported}: not in the library")
     return (ORDERS[order], *numbers), float(omega)
 
 
 def engine_image(simulation: Simulation) -> bytes:
-    """The next substep's state: a magic word, a hash, sizes (10) int32, then reals, int32 padded to 8 bytes, keys.
+    """Return the state of a simulation as an image for `lav_engine_open`.
+
+    The image contains a magic word, a hash, sizes (10) int32, reals, int32 padded to 8 bytes, and keys.
 
     Parameters
     ----------
     simulation : Simulation
-        Of any scene; its stepper, sweeps and orders go with it.
+        A simulation of any scene; the image includes its stepper, sweeps and order.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""Problems in files: `load`, `save`, and `read` for the solution and guesses that come with a problem.
+"""Read and write problems: `load`, `save`, and `read` for a problem with its stored solution and guesses.
 
 | suffix | format | written |
 |---|---|---|
@@ -6,9 +6,9 @@
 | `.npz` | plain box problems: A, b, lo, hi, friction cones | no |
 | `.hdf5`, `.h5` | FCLIB, local (W, q, mu) and global (M, H, f, w, mu), 2D, 3D; extra `fclib` | yes |
 
-What a format cannot hold is refused by name. `docs/formats.md` lists every entry. Not from a file but from another
-engine's memory: `from_mujoco`, `from_pinocchio`, `from_drake`, many worlds at once by `from_mujoco_many` and
-`from_efc`, and `record` for a folder of steps.
+An error names everything that a format cannot hold. `docs/formats.md` lists every entry. Problems can also be built
+from the data of another engine: `from_mujoco`, `from_pinocchio`, `from_drake`; `from_mujoco_many` and `from_efc` for
+many worlds at once; `record` writes the steps of a simulation to a folder.
 """
 
 from __future__ import annotations
@@ -48,42 +48,46 @@ __all__ = [
 
 
 def read(path: str | os.PathLike[str], *, max_bytes: int = MAX_BYTES) -> Stored:
-    """Everything a file holds: the problem, its stored solution, guesses, and what may be compared.
+    """Read everything that a file holds: the problem, its stored solution, guesses, and the quantities to compare.
 
-    The format is told by the content, not by the suffix.
+    The format is determined from the content, not from the suffix.
 
     Parameters
     ----------
     path : path
     max_bytes : int, default 2^31
-        Refuse files that would make more than this many bytes of arrays, before any is made. What counts is
-        the size in memory, with numbers as float64 and a global FCLIB problem condensed; while an entry is
-        converted, it is there twice.
+        Limit of the total size of the arrays. A file that needs more is rejected before any array is allocated. The
+        size in memory counts, with numbers as float64 and a global FCLIB problem condensed. While an entry is
+        converted, two copies of it exist.
+
+    Returns
+    -------
+    Stored
 
     Raises
     ------
     InputError
-        Not there, truncated, of another format, inconsistent; or HDF5 without h5py.
+        The file does not exist, is truncated, inconsistent or of another format; or h5py is needed and not installed.
     """
     start = first_bytes(path)
     if start[:2] == b"PK":
         return npz.read(path, max_bytes=max_bytes)
     if start == b"\x89HDF\r\n\x1a\n":
         return fclib.read(path, max_bytes=max_bytes)
-    what = f"starts with {start!r}" if start else "is empty"
+    content = f"starts with {start!r}" if start else "is empty"
     needed = "an .npz archive or an HDF5 file is needed"
     if os.fspath(path).lower().endswith(".xml"):
         needed += " (of a MuJoCo model, `lavender record` writes such files)"
-    raise InputError(f"{path} {what}; {needed}")
+    raise InputError(f"{path} {content}; {needed}")
 
 
 def load(path: str | os.PathLike[str], *, max_bytes: int = MAX_BYTES) -> Problem:
-    """The problem in a file; see `read`."""
+    """Return the problem in a file; see `read`."""
     return read(path, max_bytes=max_bytes).problem
 
 
 def load_solution(path: str | os.PathLike[str], *, max_bytes: int = MAX_BYTES) -> FloatArray | None:
-    """The solution stored beside a problem (m,) [N s], or None; see `read`."""
+    """Return the solution (m,) [N s] stored with a problem, or None; see `read`."""
     return read(path, max_bytes=max_bytes).impulse
 
 
@@ -95,7 +99,7 @@ def save(
     form: str | None = None,
     drop: Collection[str] = (),
 ) -> None:
-    """Write a problem; the suffix chooses the format. An existing file is replaced at once or not at all.
+    """Write a problem; the suffix selects the format. An existing file is replaced atomically.
 
     Parameters
     ----------
@@ -103,12 +107,12 @@ def save(
     path : path
         `.npz` (our own format) or `.hdf5`, `.h5` (FCLIB).
     impulse : (m,) N s, optional
-        Stored beside the problem as its solution.
+        Stored with the problem as its solution.
     form : {"local", "global"}, optional
-        FCLIB only: W and q, or M, H, f and w (problems with rows). Default: what the problem has.
+        FCLIB only: W and q, or M, H, f and w (problems with rows). Default: the form in which the problem was given.
     drop : names, optional
-        FCLIB only: "names" (of blocks and velocities), "key" and "precision" (float32) may be left out; otherwise a
-        problem that has them is refused.
+        FCLIB only: parts of the problem to leave out, of "names" (of blocks and velocities), "key" and "precision"
+        (float32). FCLIB cannot hold them: a problem that has one of them is rejected unless `drop` names it.
 
     Raises
     ------

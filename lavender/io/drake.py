@@ -1,19 +1,19 @@
-"""A discrete MultibodyPlant of Drake as a problem in generalised coordinates: point contact and joint limits.
+"""Convert a discrete Drake MultibodyPlant to a problem in generalised coordinates: point contacts and joint limits.
 
     w = J v+ - target + compliance lambda,   v+ = v* + A^-1 J^T lambda
     A = M(q0) + dt D,   A (v* - v0) = dt (tau - C(q0, v0) - D v0)
 
-with D the joints' viscous damping, which SAP (Castro et al. 2022) integrates implicitly, and tau gravity, springs,
-actuation and applied forces. In one step of dt
+D is the viscous damping of the joints, which SAP (Castro et al. 2022) integrates implicitly; tau contains gravity,
+springs, actuation and applied forces. For one step dt:
 
     contacts       Coulomb's cone, normal first, J at the point between both surfaces, target = correction depth / dt
-    joint limits   lambda >= 0, target = -gap / dt, `correction` of it where gap < 0
+    joint limits   lambda >= 0, target = -gap / dt, times `correction` if gap < 0
 
-SAP's own contacts are softer than that: stiffness, dissipation and a regularisation of friction, which it derives from
-materials and from diag(J A^-1 J^T) and does not publish. What it answers is nevertheless here: `impulse` has its
-impulses, which give, under this A and J, its next velocity, or the problem is refused. On a box, a cart and an arm
-that come to rest in steps of 2 ms the velocities of the rigid problem differ from SAP's by 1.2e-4 m/s in the median
-(0.6 % of what contact changes; 1.3e-9 with the "lagged" approximation), at the moment of an impact by up to 0.1 m/s.
+SAP's own contacts are softer: it derives a stiffness, a dissipation and a regularisation of friction from the materials
+and from diag(J A^-1 J^T), and does not publish them. `impulse` returns SAP's impulses nevertheless: with this A and J
+they give SAP's next velocity; otherwise the plant is rejected. For a box, a cart and an arm that come to rest in steps
+of 2 ms, the velocities of the rigid problem differ from SAP's by 1.2e-4 m/s in the median (0.6 % of the change that
+contact causes; 1.3e-9 with the "lagged" approximation), and by up to 0.1 m/s during an impact.
 """
 
 from __future__ import annotations
@@ -26,12 +26,15 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray, check_float
 from lavender.base.errors import CapabilityError, InputError
-from lavender.io.pinocchio import closing_speed, told
+from lavender.io.pinocchio import closing_speed, wrap_engine_errors
 from lavender.problem import Problem
 from lavender.problem.cones import Cones
 
-REACH = 4.0  # steps at the present speed within which a joint limit may push
-UNSEEN = 1e-6  # -, of |A| |v+ - v*| + |J|^T |lambda| in SAP's own norm: above what its tolerance leaves of its momentum
+# A joint limit may push only if it is reached within this many steps at the present speed.
+LIMIT_HORIZON_STEPS = 4.0
+# Largest accepted error of A (v+ - v*) = J^T lambda, as a fraction of |A| |v+ - v*| + |J|^T |lambda| in SAP's norm [-].
+# SAP's own tolerance leaves less than this; above it, something acts on the plant that this module does not know.
+MOMENTUM_TOLERANCE = 1e-6
 
 
 def from_drake(
@@ -44,43 +47,45 @@ def from_drake(
     correction: float = 0.0,
     name: str = "drake",
 ) -> Problem:
-    """The constraint problem of the next step of a discrete MultibodyPlant.
+    """Return the constraint problem of the next step of a discrete MultibodyPlant.
 
     Parameters
     ----------
     plant : pydrake.multibody.plant.MultibodyPlant
         Discrete, finalised, with its scene graph connected.
     context : pydrake.systems.framework.Context
-        Of the plant, inside the diagram's.
+        The plant's context within the context of its diagram.
     dt : float, optional, s
-        The plant's own time step; another is refused, since impulses and v* are of that step.
+        The plant's own time step. Another value is rejected, because impulses and v* belong to that step.
     friction : {"coulomb", "cone"}
     compliance : scalar or (m,) 1/kg, optional
         Default: none.
     correction : float, default 0
-        Share of a depth that the step takes back. SAP's contacts rest at a depth and take nothing back.
+        Fraction of a penetration depth that the step corrects. SAP's contacts rest at a depth and correct nothing.
 
     Returns
     -------
     Problem
-        Without a start: SAP's own impulses are an answer, `impulse(plant, context)`.
+        Without an initial guess: SAP's impulses are an answer to be judged, see `impulse`.
 
     Raises
     ------
     InputError
-        Drake cannot be imported, or what is given does not fit.
+        Drake cannot be imported, or an argument has the wrong type or value.
     CapabilityError
-        What the plant holds beside joints, contacts at points and joint limits; momentum that does not add up.
+        The plant has something other than joints, point contacts and joint limits, or SAP's impulses do not explain
+        its next velocity.
     """
-    return _solved(plant, context, dt, friction, compliance, correction, name)[0]
+    return _convert(plant, context, dt, friction, compliance, correction, name)[0]
 
 
 def impulse(plant: Any, context: Any) -> FloatArray:
-    """SAP's own answer as impulses (m,) [N s] of the problem's rows: what `lavender.residual` judges."""
-    return _solved(plant, context, None, "coulomb", None, 0.0, "")[1]
+    """Return SAP's own answer as impulses (m,) [N s] of the problem's rows, for `lavender.residual`."""
+    return _convert(plant, context, None, "coulomb", None, 0.0, "")[1]
 
 
-def _solved(plant: Any, context: Any, *how: Any) -> tuple[Problem, FloatArray]:
+def _convert(plant: Any, context: Any, *options: Any) -> tuple[Problem, FloatArray]:
+    """Check the types and return the problem and SAP's impulses (m,) [N s]; errors of Drake become InputError."""
     try:
         from pydrake.multibody.plant import MultibodyPlant_
         from pydrake.systems.framework import Context_
@@ -90,16 +95,17 @@ def _solved(plant: Any, context: Any, *how: Any) -> tuple[Problem, FloatArray]:
         raise InputError(
             f"got a {type(plant).__name__} and a {type(context).__name__}; a MultibodyPlant and its Context are needed"
         )
-    with told(
+    with wrap_engine_errors(
         "Drake",
         "Give a finalised plant with its scene graph connected, and its own context of finite numbers",
     ):
-        return _problem(plant, context, *how)
+        return _build_problem(plant, context, *options)
 
 
-def _problem(
+def _build_problem(
     plant: Any, context: Any, dt: Any, friction: str, compliance: Any, correction: Any, name: str
 ) -> tuple[Problem, FloatArray]:
+    """Build the problem and SAP's impulses (m,) [N s]; raise an error for a plant that cannot be converted."""
     step = float(plant.time_step())
     if not step > 0.0:
         raise InputError(
@@ -125,9 +131,9 @@ def _problem(
     cones = Cones.contacts(np.array([c.mu for c in contacts])) if contacts else Cones.free(0)
     if limits:
         cones = cones + Cones.bounded(np.zeros(len(limits)), np.full(len(limits), np.inf))
-    own = np.concatenate([np.zeros(0), *(dt * c.force for c in contacts), np.zeros(len(limits))])
-    _complete(plant, context, dynamics, v_free, jac, own, limits, 3 * len(contacts), dt)
-    made = Problem.from_jacobian(
+    impulses = np.concatenate([np.zeros(0), *(dt * c.force for c in contacts), np.zeros(len(limits))])
+    _complete_impulses(plant, context, dynamics, v_free, jac, impulses, limits, 3 * len(contacts), dt)
+    problem = Problem.from_jacobian(
         jac,
         dynamics,
         v_free,
@@ -139,11 +145,14 @@ def _problem(
         dof_names=list(plant.GetVelocityNames(always_add_suffix=True)),
         name=name,
     )
-    return made, own
+    return problem, impulses
 
 
 def _refuse_locked(plant: Any, context: Any) -> None:
-    """Drake takes the velocities of locked joints out of its step, and fails by a signal where they carry contacts."""
+    """Raise CapabilityError for locked joints.
+
+    Drake removes their velocities from its step, and the process is killed by a signal if they carry contacts.
+    """
     from pydrake.multibody.tree import JointIndex
 
     joints = [plant.get_joint(JointIndex(int(i))) for i in plant.GetJointIndices()]
@@ -154,30 +163,65 @@ def _refuse_locked(plant: Any, context: Any) -> None:
 
 @dataclass(frozen=True)
 class _Contact:
+    """One point contact.
+
+    Parameters
+    ----------
+    name : str
+    jac : (3, nv)
+        Jacobian of the normal and two tangential velocities of body B relative to body A.
+    depth : float, m
+    mu : float, -
+    force : (3,) N
+        SAP's own contact force.
+    """
+
     name: str
-    jac: FloatArray  # (3, nv) normal, two tangents, of B against A
-    depth: float  # m
+    jac: FloatArray
+    depth: float
     mu: float
-    force: FloatArray  # (3,) N, SAP's own
+    force: FloatArray
 
 
 @dataclass(frozen=True)
 class _Limit:
+    """One limit of a joint.
+
+    Parameters
+    ----------
+    name : str
+    jac : (1, nv)
+    gap : float, m or rad
+        Distance to the limit; negative if it is violated.
+    velocity : int
+        Index of the joint's velocity.
+    sign : float
+        1 for a lower limit, -1 for an upper limit.
+    """
+
     name: str
-    jac: FloatArray  # (1, nv)
-    gap: float  # m or rad
-    at: int  # velocity
+    jac: FloatArray
+    gap: float
+    velocity: int
     sign: float
 
 
 def free_motion(plant: Any, context: Any, dt: float) -> tuple[FloatArray, FloatArray]:
-    """A (nv, nv) and v* (nv,) of SAP."""
+    """Return A (nv, nv) and v* (nv,) of SAP's discretisation (see the module).
+
+    Raises
+    ------
+    CapabilityError
+        An actuator has a PD controller.
+    """
     from pydrake.multibody.tree import JacobianWrtVariable, JointActuatorIndex, JointIndex, MultibodyForces_
 
     nv = int(plant.num_velocities())
     forces = MultibodyForces_[float](plant)
     plant.CalcForceElementsContribution(context, forces)
-    push = -np.array(plant.CalcInverseDynamics(context, np.zeros(nv), forces))  # the joints' damping is in it
+    force = -np.array(
+        plant.CalcInverseDynamics(context, np.zeros(nv), forces)
+    )  # This includes joint damping.
     if plant.num_actuators():
         for i in plant.GetJointActuatorIndices():
             actuator = plant.get_joint_actuator(JointActuatorIndex(int(i)))
@@ -186,29 +230,32 @@ def free_motion(plant: Any, context: Any, dt: float) -> tuple[FloatArray, FloatA
                     f"actuator {actuator.name()} has a PD controller, which SAP integrates implicitly; that is not "
                     "known here"
                 )
-        push += plant.MakeActuationMatrix() @ plant.get_net_actuation_output_port().Eval(context)
+        force += plant.MakeActuationMatrix() @ plant.get_net_actuation_output_port().Eval(context)
     applied = plant.get_applied_generalized_force_input_port()
     if applied.HasValue(context):
-        push += applied.Eval(context)
+        force += applied.Eval(context)
     spatial = plant.get_applied_spatial_force_input_port()
     world = plant.world_frame()
-    for one in spatial.Eval(context) if spatial.HasValue(context) else ():
-        frame = plant.get_body(one.body_index).body_frame()
+    for applied_force in spatial.Eval(context) if spatial.HasValue(context) else ():
+        frame = plant.get_body(applied_force.body_index).body_frame()
         jac = plant.CalcJacobianSpatialVelocity(
-            context, JacobianWrtVariable.kV, frame, one.p_BoBq_B, world, world
+            context, JacobianWrtVariable.kV, frame, applied_force.p_BoBq_B, world, world
         )
-        push += jac.T @ np.concatenate([one.F_Bq_W.rotational(), one.F_Bq_W.translational()])
+        force += jac.T @ np.concatenate(
+            [applied_force.F_Bq_W.rotational(), applied_force.F_Bq_W.translational()]
+        )
     damping = np.zeros(nv)
     for i in plant.GetJointIndices():
         joint = plant.get_joint(JointIndex(int(i)))
-        first = joint.velocity_start()
-        damping[first : first + joint.num_velocities()] = joint.GetDampingVector(context)
+        start = joint.velocity_start()
+        damping[start : start + joint.num_velocities()] = joint.GetDampingVector(context)
     mass = np.array(plant.CalcMassMatrix(context))
     dynamics = 0.5 * (mass + mass.T) + dt * np.diag(damping)
-    return dynamics, np.array(plant.GetVelocities(context)) + dt * np.linalg.solve(dynamics, push)
+    return dynamics, np.array(plant.GetVelocities(context)) + dt * np.linalg.solve(dynamics, force)
 
 
 def _contacts(plant: Any, context: Any) -> list[_Contact]:
+    """Return the point contacts of the plant; raise CapabilityError for sampled ports or hydroelastic contacts."""
     from pydrake.multibody.tree import JacobianWrtVariable
 
     if hasattr(plant, "has_sampled_output_ports") and plant.has_sampled_output_ports():
@@ -226,7 +273,7 @@ def _contacts(plant: Any, context: Any) -> list[_Contact]:
             "(plant.set_contact_model(ContactModel.kPoint))"
         )
     inspector = port.Eval(context).inspector()
-    world, found = plant.world_frame(), []
+    world, contacts = plant.world_frame(), []
     for i in range(results.num_point_pair_contacts()):
         info = results.point_pair_contact_info(i)
         pair = info.point_pair()
@@ -244,7 +291,7 @@ def _contacts(plant: Any, context: Any) -> list[_Contact]:
             inspector.GetProximityProperties(x).GetProperty("material", "coulomb_friction").dynamic_friction()
             for x in (pair.id_A, pair.id_B)
         ]
-        found.append(
+        contacts.append(
             _Contact(
                 f"{bodies[0].name()} {bodies[1].name()} {i}",
                 axes @ (jac[1] - jac[0]),
@@ -253,68 +300,79 @@ def _contacts(plant: Any, context: Any) -> list[_Contact]:
                 axes @ np.array(info.contact_force()),
             )
         )
-    return found
+    return contacts
 
 
 def _tangents(normal: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return two unit vectors (3,) orthogonal to the unit vector `normal` and to each other."""
     axis = np.zeros(3)
     axis[int(np.argmin(np.abs(normal)))] = 1.0
-    first = np.cross(normal, axis)
-    first /= np.linalg.norm(first)
-    return first, np.cross(normal, first)
+    first_axis = np.cross(normal, axis)
+    first_axis /= np.linalg.norm(first_axis)
+    return first_axis, np.cross(normal, first_axis)
 
 
 def _limits(plant: Any, context: Any) -> list[_Limit]:
-    """Of joints of one velocity, as SAP knows them."""
+    """Return the finite limits of joints with one velocity, the only ones that SAP supports."""
     from pydrake.multibody.tree import JointIndex
 
-    found = []
+    limits = []
     nv = int(plant.num_velocities())
     for i in plant.GetJointIndices():
         joint = plant.get_joint(JointIndex(int(i)))
         if joint.num_velocities() != 1 or joint.num_positions() != 1:
             continue
-        at = joint.velocity_start()
+        velocity = joint.velocity_start()
         q = float(plant.GetPositions(context)[joint.position_start()])
         low, high = float(joint.position_lower_limits()[0]), float(joint.position_upper_limits()[0])
         for word, sign, gap in (("lower", 1.0, q - low), ("upper", -1.0, high - q)):
             if math.isfinite(gap):
                 row = np.zeros((1, nv))
-                row[0, at] = sign
-                found.append(_Limit(f"{joint.name()} {word}", row, gap, at, sign))
-    return found
+                row[0, velocity] = sign
+                limits.append(_Limit(f"{joint.name()} {word}", row, gap, velocity, sign))
+    return limits
 
 
-def _complete(
+def _complete_impulses(
     plant: Any,
     context: Any,
     dynamics: FloatArray,
     v_free: FloatArray,
     jac: FloatArray,
-    own: FloatArray,
+    impulses: FloatArray,
     limits: list[_Limit],
-    first: int,
+    first_limit_row: int,
     dt: float,
 ) -> None:
-    """Check A (v+ - v*) = J^T lambda against Drake's own next step; limits, whose impulses it hides, take the rest."""
+    """Check A (v+ - v*) = J^T lambda against Drake's own next step.
+
+    Drake does not publish the impulses of joint limits. They are set in `impulses` to the momentum that the contacts
+    do not explain, if the limit is close enough to act and the sign fits.
+
+    Raises
+    ------
+    CapabilityError
+        The remaining error exceeds `MOMENTUM_TOLERANCE`.
+    """
     nv = len(v_free)
     state = np.array(plant.EvalUniquePeriodicDiscreteUpdate(context).value())
     change = state[-nv:] - v_free
-    left = dynamics @ change - jac.T @ own
-    size = np.abs(dynamics) @ np.abs(change) + np.abs(jac).T @ np.abs(own)
+    momentum_error = dynamics @ change - jac.T @ impulses
+    size = np.abs(dynamics) @ np.abs(change) + np.abs(jac).T @ np.abs(impulses)
     size += np.abs(dynamics @ v_free).max(initial=0.0)
     speed = np.maximum(np.abs(v_free), np.abs(plant.GetVelocities(context)))
     for k, limit in enumerate(limits):
-        if limit.gap > REACH * dt * speed[limit.at]:
-            continue  # too far away to push
-        if limit.sign * left[limit.at] > UNSEEN * size[limit.at]:
-            own[first + k] = limit.sign * left[limit.at]
-            left[limit.at] = 0.0
-    weight = 1.0 / np.sqrt(np.diag(dynamics))  # what SAP weighs momenta by when it ends
-    if not np.linalg.norm(weight * left) <= UNSEEN * np.linalg.norm(weight * size):
-        worst = int(np.argmax(weight * np.abs(left)))
+        i = limit.velocity
+        if limit.gap > LIMIT_HORIZON_STEPS * dt * speed[i]:
+            continue  # The limit is too far away to act.
+        if limit.sign * momentum_error[i] > MOMENTUM_TOLERANCE * size[i]:
+            impulses[first_limit_row + k] = limit.sign * momentum_error[i]
+            momentum_error[i] = 0.0
+    weight = 1.0 / np.sqrt(np.diag(dynamics))  # SAP uses these weights in its stopping test.
+    if not np.linalg.norm(weight * momentum_error) <= MOMENTUM_TOLERANCE * np.linalg.norm(weight * size):
+        worst = int(np.argmax(weight * np.abs(momentum_error)))
         raise CapabilityError(
-            f"A (v+ - v*) of Drake's own next step is not J^T times its impulses: {left[worst]:.3g} of "
+            f"A (v+ - v*) of Drake's own next step is not J^T times its impulses: {momentum_error[worst]:.3g} of "
             f"{size[worst]:.3g} is left at {plant.GetVelocityNames(always_add_suffix=True)[worst]}; something acts "
             "on the plant that is not known here"
         )

@@ -1,15 +1,15 @@
-"""MuJoCo's constraint problems by the thousand: as its own loop makes them, and as MJX and MuJoCo Warp hold them.
+"""Convert many MuJoCo constraint problems at once, from MuJoCo states or from the arrays of MJX and MuJoCo Warp.
 
     imported = lavender.io.from_mujoco_many(model, states)
     many = lavender.solve_many(imported.batch)
-    lavender.residual_many(imported.batch, imported.impulse).verdict        # of MuJoCo's own answers
+    lavender.residual_many(imported.batch, imported.impulse).verdict        # judge MuJoCo's own answers
 
-The problem is that of `lavender.io.mujoco`, with the same rows in the same order; in arrays, dt the time step:
+The problem is the one of `lavender.io.mujoco`, with the same rows in the same order. In arrays, with the time step dt:
 
     v* = qvel + dt a0      target = dt aref + J qvel      compliance = 1 / D      lambda = dt f
 
-Tangents of an elliptic contact are scaled by friction[j] / friction[0]. Numbers in float32 are widened exactly, and the
-judge's floor is that of float32. Rows of zeros, with which MJX and Warp pad, are soft and ask nothing.
+Tangents of an elliptic contact are scaled by friction[j] / friction[0]. float32 numbers are converted exactly, and the
+judge uses the round-off floor of float32. MJX and Warp pad with rows of zeros; these are soft and have no effect.
 """
 
 from __future__ import annotations
@@ -35,29 +35,38 @@ from lavender.io import mujoco as single
 from lavender.problem.cones import Cones, kinds_of
 from lavender_ext.judge.measure import all_finite
 
-# Values of mjtConstraint: an equality, friction loss, the first and the last one. Rows of all others only push.
+# Values of mjtConstraint: an equality, friction loss of a joint and of a tendon, an elliptic contact (the largest
+# value). Rows of all other types only push.
 EQUALITY, FRICTION, ELLIPTIC = 0, (1, 2), 7
 MAX_CONTACT_ROWS = 6  # The largest condim: a contact has a normal and up to five friction rows.
-# What is read of each row, beside efc_J, and of each contact: type and shape.
-OF_ROWS: dict[str, Any] = dict.fromkeys(
+# Arrays that are read for each row, in addition to efc_J, and for each contact: type and shape.
+ROW_FIELDS: dict[str, Any] = dict.fromkeys(
     ("efc_D", "efc_aref", "efc_force", "efc_frictionloss", "efc_vel"), (float, ())
 ) | dict.fromkeys(("efc_type", "efc_id"), (np.int32, ()))
-OF_CONTACTS: dict[str, Any] = {
+CONTACT_FIELDS: dict[str, Any] = {
     "efc_address": (np.int32, ()), "dim": (np.int32, ()), "geom": (np.int32, (2,)), "friction": (float, (5,)),
 }  # fmt: skip
-CHUNK = 2**21  # entries of J that are widened at once
-# M a0 beside the smooth force, of their size: 64 roundings, in float64 and in float32, where factors are rounded, too.
-ROUNDING = {"float64": single.ROUNDING, "float32": 2.0**-14}
+CHUNK_ENTRIES = 2**21  # Entries of J that are converted to float64 at once.
+# Largest accepted difference of M a0 and the smooth force, relative to their size: 64 roundings in float64; more in
+# float32, in which the factors of M are rounded, too.
+MASS_TOLERANCES = {"float64": single.MASS_TOLERANCE, "float32": 2.0**-14}
 
 
 class Imported(NamedTuple):
-    """Problems of many worlds, and the engine's own answers to them."""
+    """Problems of many worlds, and the engine's own answers.
+
+    Parameters
+    ----------
+    batch : Batch
+    impulse : array or None, N s
+        dt efc_force in the rows and in the shape of the batch.
+    """
 
     batch: Batch
-    impulse: FloatArray | None  # N s, in the batch's shape: dt efc_force in the batch's rows
+    impulse: FloatArray | None
 
 
-@np.errstate(divide="ignore", over="ignore", invalid="ignore")  # of rows that do not count
+@np.errstate(divide="ignore", over="ignore", invalid="ignore")  # Unused rows may hold any numbers.
 def from_efc(
     *,
     efc_J: Any,
@@ -74,7 +83,7 @@ def from_efc(
     efc_force: Any = None,
     qfrc_smooth: Any = None,
 ) -> Imported:
-    """Constraint problems from stacked arrays, n worlds with room for m rows each, in float32 or float64.
+    """Build constraint problems from stacked arrays of n worlds with at most m rows each, in float32 or float64.
 
     Parameters
     ----------
@@ -83,7 +92,7 @@ def from_efc(
     efc_type : (n, m) or (m,) int
         Values of mjtConstraint, 0 to 7.
     M : (n, nv, nv)
-        Mass matrix, both triangles. Or its lower triangles in compressed rows, as MuJoCo Warp holds them: (values
+        Mass matrix, both triangles. Or its lower triangles in compressed rows, as MuJoCo Warp stores them: (values
         (n, entries), indices, indptr).
     qvel, qacc_smooth : (n, nv)
         Velocity before the step and unconstrained acceleration.
@@ -91,254 +100,268 @@ def from_efc(
     efc_frictionloss : scalar, (n, m) or (m,)
         Read on rows of friction loss.
     nefc : (n,) int, optional
-        Rows that count, 0 to m; default m. The numbers of the rows behind them are not read.
+        Number of rows in use, 0 to m; default m. The rows behind them are not read.
     contacts : (world, efc_address, dim, friction), optional
-        Of contacts: (c,), (c,), (c,) int and (c, 5). Those that begin at an elliptic row that counts are read, and
-        must name each of these rows once. All others are ignored.
+        Arrays of the contacts: (c,), (c,), (c,) int and (c, 5). Contacts that begin at an elliptic row in use are
+        read, and must name each of these rows once. All others are ignored.
     efc_force : (n, m), optional
         The engine's answer.
     qfrc_smooth : (n, nv), optional
-        To be checked against M qacc_smooth, to the precision of the data.
+        Compared with M qacc_smooth, to the precision of the data.
 
     Returns
     -------
     Imported
-        The batch, under the law "cone", and `impulse` where `efc_force` was given.
+        The batch, with the law "cone", and `impulse` if `efc_force` was given.
 
     Raises
     ------
     InputError
-        Shapes that do not fit; an efc_type that is no value of mjtConstraint; a D that is not above 0; a friction loss
-        below 0; elliptic rows that no contact names, or several.
+        Shapes do not fit; an efc_type is not a value of mjtConstraint; a D is not above 0; a friction loss is below 0;
+        an elliptic row is named by no contact or by several.
     CapabilityError
-        M qacc_smooth is not the smooth force: another matrix has made the problem.
+        M qacc_smooth is not the smooth force: the problem was built with another matrix.
     """
     jac, before = as_floats("efc_J", efc_J), as_floats("qvel", qvel)
-    # MJX and Warp hold the time step as an array of one number.
+    # MJX and Warp store the time step as an array of one number.
     is_one = np.prod(shape_of("timestep", timestep)) == 1
     dt = check_float("timestep", np.asarray(timestep).item() if is_one else timestep, above=0.0)
     if jac.ndim != 3:
         raise InputError(f"efc_J has shape {jac.shape}; (n, m, nv) is needed")
     n, m, nv = jac.shape
-    stiff = as_array("efc_D", efc_D, (n, m), finite=False)
-    goal = dt * as_array("efc_aref", efc_aref, (n, m), finite=False)
+    inv_compliance = as_array("efc_D", efc_D, (n, m), finite=False)
+    target = dt * as_array("efc_aref", efc_aref, (n, m), finite=False)
     smooth = as_array("qacc_smooth", qacc_smooth, (n, nv), finite=False)
-    of, loss = _of_rows("efc_type", efc_type, n, m), _of_rows("efc_frictionloss", efc_frictionloss, n, m)
+    row_type, loss = (
+        _per_row("efc_type", efc_type, n, m),
+        _per_row("efc_frictionloss", efc_frictionloss, n, m),
+    )
     count = np.full(n, m) if nefc is None else check_counts("nefc", nefc, n, m)
-    counted = np.arange(m) < count[:, None]
+    used_rows = np.arange(m) < count[:, None]
     _check_rows(
         "efc_type",
-        of,
-        counted & ~((of >= 0.0) & (of <= ELLIPTIC) & (of == np.rint(of))),
+        row_type,
+        used_rows & ~((row_type >= 0.0) & (row_type <= ELLIPTIC) & (row_type == np.rint(row_type))),
         "a value of mjtConstraint, 0 to 7,",
     )
-    _check_rows("efc_D", stiff, counted & (stiff <= 0.0), "above 0")
-    held = counted & ((of == FRICTION[0]) | (of == FRICTION[1]))
-    _check_rows("efc_frictionloss", loss, held & ~((loss >= 0.0) & (loss < np.inf)), "a finite number from 0")
+    _check_rows("efc_D", inv_compliance, used_rows & (inv_compliance <= 0.0), "above 0")
+    has_loss = used_rows & ((row_type == FRICTION[0]) | (row_type == FRICTION[1]))
+    _check_rows(
+        "efc_frictionloss", loss, has_loss & ~((loss >= 0.0) & (loss < np.inf)), "a finite number from 0"
+    )
     mass = _mass(M, n, nv)
     precision = precision_of(jac, mass, before)
     before = as_array("qvel", before, (n, nv), finite=False)
     if qfrc_smooth is not None:
         _check_mass(mass, smooth, as_array("qfrc_smooth", qfrc_smooth, (n, nv), finite=False), precision)
     free = before + dt * smooth
-    step = max(1, CHUNK // max(1, m * nv))
+    step = max(1, CHUNK_ENTRIES // max(1, m * nv))
     for i in range(0, n, step):
-        goal[i : i + step] += np.einsum("nij,nj->ni", jac[i : i + step].astype(float), before[i : i + step])
-    soft = np.where(counted, 1.0 / stiff, 0.0)
-    cones, scale = _blocks(of, loss, counted, contacts, dt)
+        target[i : i + step] += np.einsum("nij,nj->ni", jac[i : i + step].astype(float), before[i : i + step])
+    compliance = np.where(used_rows, 1.0 / inv_compliance, 0.0)
+    cones, scale = _blocks(row_type, loss, used_rows, contacts, dt)
     if scale is not None:
         jac = jac * scale[:, :, None].astype(jac.dtype)
-        goal, soft = goal * scale, soft * scale * scale
-    batch = Batch(jac, mass, free, target=goal, cones=cones, compliance=soft, friction="cone", count=count)
+        target, compliance = target * scale, compliance * scale * scale
+    batch = Batch(
+        jac, mass, free, target=target, cones=cones, compliance=compliance, friction="cone", count=count
+    )
     batch.precision = precision
     if efc_force is None:
         return Imported(batch, None)
-    lam = np.where(counted, dt * as_array("efc_force", efc_force, (n, m), finite=False), 0.0)
+    lam = np.where(used_rows, dt * as_array("efc_force", efc_force, (n, m), finite=False), 0.0)
     return Imported(batch, lam if scale is None else lam / scale)
 
 
 def from_mujoco_many(model: Any, states: Any, *, threads: int = 1, errors: str = "raise") -> Imported:
-    """The problems of many states of one MuJoCo model, by `mj_forward` on each, and MuJoCo's own answers.
+    """Call `mj_forward` on many states of one MuJoCo model; return the problems and MuJoCo's own answers.
 
     Parameters
     ----------
     model : mujoco.MjModel
-        Its options (solver, tolerance, iterations, jacobian, ...) make the answers.
+        Its options (solver, tolerance, iterations, jacobian, ...) determine the answers.
     states : (n, nq + nv), or (n, size) of mjSTATE_FULLPHYSICS or mjSTATE_INTEGRATION
-        qpos and qvel, or what `mj_getState` gives.
+        qpos and qvel, or the result of `mj_getState`.
     threads : int
-        `mj_forward` at the same time; the results do not depend on it.
+        Number of threads; the results do not depend on it.
     errors : {"raise", "status"}
-        Of a state that is not finite: raise, or make it a world without rows whose v_free is NaN, which `solve_many`
-        and `residual_many` refuse by its number, or pass with the same word.
+        Treatment of a state that is not finite: raise an error, or convert it to a world without rows whose v_free is
+        NaN. `solve_many` and `residual_many` reject such a world by its number, or accept it with errors="status".
 
     Returns
     -------
     Imported
-        `batch[i]` is the problem that `from_mujoco` makes of state i, to rounding, each row of an equality a block.
-        After `noslip_iterations` `impulse` is no solution of it.
+        `batch[i]` is the problem that `from_mujoco` builds for state i, to rounding, with a block for each row of an
+        equality. With `noslip_iterations`, `impulse` is not a solution of the problem.
 
     Raises
     ------
     InputError
-        Another model, states of another size, one that is not finite, or one at which MuJoCo ends in an error.
+        `model` is not an MjModel, states have the wrong size, a state is not finite, or MuJoCo raises an error.
     CapabilityError
-        An integrator whose constraint problem is not of M.
+        The integrator's constraint problem uses a matrix other than M.
     """
     import mujoco as mj
 
     if not isinstance(model, mj.MjModel):
         raise InputError(f"model is a {type(model).__name__}; a mujoco.MjModel is needed")
     word = mj.mjtIntegrator(model.opt.integrator).name.removeprefix("mjINT_").lower()
-    if word not in map(str.lower, single.OF_M):
+    if word not in map(str.lower, single.MASS_MATRIX_INTEGRATORS):
         raise CapabilityError(
-            f"integrator={word!r} puts damping into M; {', '.join(map(repr, single.OF_M))} have M itself"
+            f"integrator={word!r} puts damping into M; "
+            f"{', '.join(map(repr, single.MASS_MATRIX_INTEGRATORS))} have M itself"
         )
     check_choice("errors", errors, ERRORS)
-    given = np.ascontiguousarray(as_array("states", states, (None, None), finite=errors == "raise"))
-    size = given.shape[1]
+    values = np.ascontiguousarray(as_array("states", states, (None, None), finite=errors == "raise"))
+    size = values.shape[1]
     kinds = {model.nq + model.nv: mj.mjtState.mjSTATE_QPOS | mj.mjtState.mjSTATE_QVEL}
     for kind in (mj.mjtState.mjSTATE_FULLPHYSICS, mj.mjtState.mjSTATE_INTEGRATION):
         kinds.setdefault(mj.mj_stateSize(model, kind), kind)
     if size not in kinds:
         raise InputError(f"states have {size} numbers each; one of {sorted(kinds)} is needed")
-    n, nv, sparse = len(given), model.nv, bool(mj.mj_isSparse(model))
+    n, nv, sparse = len(values), model.nv, bool(mj.mj_isSparse(model))
     free, smooth = np.full((n, nv), np.nan), np.zeros((n, nv))
     mass = np.zeros((n, len(model.M_colind)))
-    mass[:, model.M_rowadr + model.M_rownnz - 1] = 1.0  # its diagonal, of a state that is not finite
-    todo = iter(range(n))
+    mass[:, model.M_rowadr + model.M_rownnz - 1] = 1.0  # The diagonal of M, for states that are not finite.
+    pending = iter(range(n))
     threads = min(check_int("threads", threads, 1, None), max(n, 1))
 
-    def work(stop: bytearray) -> tuple[_Stretches, _Stretches]:
+    def work(stop: bytearray) -> tuple[_RowBuffer, _RowBuffer]:
         data = mj.MjData(model)
-        rows = _Stretches(n // threads, efc_J=(float, (nv,)), **OF_ROWS)
-        contacts = _Stretches(n // threads, **OF_CONTACTS)
-        for i in todo:
+        rows = _RowBuffer(n // threads, efc_J=(float, (nv,)), **ROW_FIELDS)
+        contacts = _RowBuffer(n // threads, **CONTACT_FIELDS)
+        for i in pending:
             if stop[0]:
                 break
-            if not all_finite(given[i]):
+            if not all_finite(values[i]):
                 continue
-            mj.mj_setState(model, data, given[i], kinds[size])
+            mj.mj_setState(model, data, values[i], kinds[size])
             try:
                 mj.mj_forward(model, data)
             except mj.FatalError as error:
                 raise InputError(f"state {i}: MuJoCo ends in an error, {error}") from None
             free[i], smooth[i], mass[i] = data.qvel, data.qacc_smooth, data.M
-            mj.mj_mulJacVec(model, data, data.efc_vel, data.qvel)  # MuJoCo's has the speeds of surfaces, too
-            rows.take(i, data, data.nefc, efc_J=jacobian(data))
+            # MuJoCo's own efc_vel also contains the velocities of moving surfaces.
+            mj.mj_mulJacVec(model, data, data.efc_vel, data.qvel)
+            rows.append(i, data, data.nefc, efc_J=jacobian(data))
             if data.ncon:
-                contacts.take(i, data.contact, data.ncon)
+                contacts.append(i, data.contact, data.ncon)
         return rows, contacts
 
     def jacobian(data: Any) -> FloatArray:
         m = data.nefc
-        if not sparse:  # there is room behind it where rows of zeros were counted and left out
+        if not sparse:  # The array is longer than m nv if MuJoCo counted rows of zeros and left them out.
             return np.reshape(data.efc_J[: m * nv], (m, nv))
         jac = np.empty((m, nv))
         mj.mju_sparse2dense(jac, data.efc_J, data.efc_J_rownnz, data.efc_J_rowadr, data.efc_J_colind)
         return jac
 
     parts = run_on_threads(work, threads)
-    rows, ptr = _in_order([of_rows for of_rows, _ in parts], n)
-    contacts, contact_ptr = _in_order([of_contacts for _, of_contacts in parts], n)
-    made = _gathered(model, rows, ptr, contacts, contact_ptr, mass, free, smooth)
-    of_row = rows["efc_type"], rows["efc_id"]
-    of_contact = contacts["dim"], contacts["geom"]
+    rows, ptr = _merge_buffers([row_buffer for row_buffer, _ in parts], n)
+    contacts, contact_ptr = _merge_buffers([contact_buffer for _, contact_buffer in parts], n)
+    imported = _import_states(model, rows, ptr, contacts, contact_ptr, mass, free, smooth)
+    row_arrays = rows["efc_type"], rows["efc_id"]
+    contact_arrays = contacts["dim"], contacts["geom"]
 
-    def words(i: int) -> Any:
-        here, there = slice(ptr[i], ptr[i + 1]), slice(contact_ptr[i], contact_ptr[i + 1])
-        held = np.concatenate([*(x[here] for x in of_row), *(x[there].ravel() for x in of_contact)])
-        return single._words(mj, model, held, int(ptr[i + 1] - ptr[i]), 1)
+    def block_names(i: int) -> Any:
+        own_rows, own_contacts = slice(ptr[i], ptr[i + 1]), slice(contact_ptr[i], contact_ptr[i + 1])
+        ints = np.concatenate(
+            [*(x[own_rows] for x in row_arrays), *(x[own_contacts].ravel() for x in contact_arrays)]
+        )
+        return single._block_names(mj, model, ints, int(ptr[i + 1] - ptr[i]), 1)
 
-    made.batch.names_of = words
+    imported.batch.names_of = block_names
     world = np.repeat(np.arange(n), np.diff(contact_ptr))
-    made.batch.contact_counts = np.bincount(world[contacts["efc_address"] >= 0], minlength=n)
-    return made
+    imported.batch.contact_counts = np.bincount(world[contacts["efc_address"] >= 0], minlength=n)
+    return imported
 
 
-class _Stretches:
-    """Arrays of many states one after the other, as they come, in room that grows to what `states` will need."""
+class _RowBuffer:
+    """Arrays of many states, one state after the other in the order of arrival.
+
+    The allocated size grows to the size that `states` states are expected to need.
+    """
 
     def __init__(self, states: int, **kinds: tuple[type, tuple[int, ...]]) -> None:
         self.arrays: dict[str, Any] = {
             name: np.empty((0, *shape), dtype) for name, (dtype, shape) in kinds.items()
         }
-        self.states, self.n, self.room = states, 0, 0
-        self.of: list[int] = []  # which state each stretch is of,
-        self.counts: list[int] = []  # and its length
+        self.states, self.n, self.capacity = states, 0, 0
+        self.state_numbers: list[int] = []  # The state of each appended range,
+        self.counts: list[int] = []  # and the number of its entries.
 
-    def take(self, i: int, source: Any, count: int, **given: FloatArray) -> None:
-        """Those of state i by their names, of the source where they are not given."""
+    def append(self, i: int, source: Any, count: int, **values: FloatArray) -> None:
+        """Append `count` entries of state i to each array, from `values` or else from attributes of `source`."""
         begin, end = self.n, self.n + count
-        self.of.append(i)
+        self.state_numbers.append(i)
         self.counts.append(count)
-        if end > self.room:
-            self.room = int(end * min(4.0, 1.25 * max(1.0, self.states / len(self.of)))) + 1
+        if end > self.capacity:
+            self.capacity = int(end * min(4.0, 1.25 * max(1.0, self.states / len(self.counts)))) + 1
             for name, x in self.arrays.items():
-                self.arrays[name] = np.empty((self.room, *x.shape[1:]), x.dtype)
+                self.arrays[name] = np.empty((self.capacity, *x.shape[1:]), x.dtype)
                 self.arrays[name][:begin] = x[:begin]
         for name, x in self.arrays.items():
-            x[begin:end] = given[name] if name in given else getattr(source, name)
+            x[begin:end] = values[name] if name in values else getattr(source, name)
         self.n = end
 
 
-def _in_order(parts: list[_Stretches], n: int) -> tuple[dict[str, Any], Any]:
-    """Arrays of all n states in their order, and where each begins (n + 1,)."""
+def _merge_buffers(parts: list[_RowBuffer], n: int) -> tuple[dict[str, Any], Any]:
+    """Return the arrays of all n states in their order, and the first entry of each state (n + 1,)."""
     count, ptr = np.zeros(n, np.int64), np.zeros(n + 1, np.int64)
-    own = [(np.array(part.of, np.int64), np.array(part.counts, np.int64)) for part in parts]
-    for of, counts in own:
-        count[of] = counts
+    ranges = [(np.array(part.state_numbers, np.int64), np.array(part.counts, np.int64)) for part in parts]
+    for numbers, counts in ranges:
+        count[numbers] = counts
     np.cumsum(count, out=ptr[1:])
     if len(parts) == 1:
         return {name: x[: ptr[-1]] for name, x in parts[0].arrays.items()}, ptr
     out = {name: np.empty((ptr[-1], *x.shape[1:]), x.dtype) for name, x in parts[0].arrays.items()}
-    for part, (of, counts) in zip(parts, own, strict=True):
-        to = np.repeat(ptr[of] - (np.cumsum(counts) - counts), counts) + np.arange(part.n)
+    for part, (numbers, counts) in zip(parts, ranges, strict=True):
+        destination = np.repeat(ptr[numbers] - (np.cumsum(counts) - counts), counts) + np.arange(part.n)
         for name, x in part.arrays.items():
-            out[name][to] = x[: part.n]
+            out[name][destination] = x[: part.n]
     return out, ptr
 
 
-def _gathered(
+def _import_states(
     model: Any, rows: Any, ptr: Any, contact: Any, contact_ptr: Any, mass: Any, before: Any, smooth: Any
 ) -> Imported:
-    """Of the rows and contacts of all states, one after the other."""
-    dt, jac, of, contacts = float(model.opt.timestep), rows["efc_J"], rows["efc_type"], None
-    if (of == ELLIPTIC).any():
+    """Build the batch and the impulses from the rows and contacts of all states, one state after the other."""
+    dt, jac, row_type, contacts = float(model.opt.timestep), rows["efc_J"], rows["efc_type"], None
+    if (row_type == ELLIPTIC).any():
         address = contact["efc_address"]
         address = np.where(address < 0, -1, address + np.repeat(ptr[:-1], np.diff(contact_ptr)))
         contacts = (np.zeros(len(address), int), address, contact["dim"], contact["friction"])
     cones, scale = _blocks(
-        of[None], rows["efc_frictionloss"][None], np.ones((1, len(of)), bool), contacts, dt
+        row_type[None], rows["efc_frictionloss"][None], np.ones((1, len(row_type)), bool), contacts, dt
     )
-    goal = dt * rows["efc_aref"] + rows["efc_vel"]
-    soft, lam = 1.0 / rows["efc_D"], dt * rows["efc_force"]
+    target = dt * rows["efc_aref"] + rows["efc_vel"]
+    compliance, lam = 1.0 / rows["efc_D"], dt * rows["efc_force"]
     if scale is not None:
         s = scale[0]
         jac *= s[:, None]
-        goal, soft, lam = goal * s, soft * s * s, lam / s
+        target, compliance, lam = target * s, compliance * s * s, lam / s
     batch = Batch(
         jac,
         (mass, model.M_colind, np.append(model.M_rowadr, len(model.M_colind))),
         before + dt * smooth,
-        target=goal,
+        target=target,
         cones=cones,
-        compliance=soft,
+        compliance=compliance,
         friction="cone",
         row_ptr=ptr,
     )
     return Imported(batch, lam)
 
 
-def _of_rows(name: str, given: Any, n: int, m: int) -> FloatArray:
-    """Numbers of all rows (n, m), of (n, m), (m,) or one number."""
-    if len(shape_of(name, given)) == 2:
-        return as_array(name, given, (n, m), finite=False)
-    return np.broadcast_to(as_array(name, given, (m,), finite=False), (n, m))
+def _per_row(name: str, values: Any, n: int, m: int) -> FloatArray:
+    """Return the numbers of all rows (n, m), given as (n, m), (m,) or one number."""
+    if len(shape_of(name, values)) == 2:
+        return as_array(name, values, (n, m), finite=False)
+    return np.broadcast_to(as_array(name, values, (m,), finite=False), (n, m))
 
 
 def _check_rows(name: str, numbers: FloatArray, wrong: Any, needed: str) -> None:
-    """Raise InputError at the first row of a world that is wrong."""
+    """Raise InputError with the first row of a world that is `wrong` (n, m)."""
     if wrong.any():
         at = np.argwhere(wrong)
         i, row = at[0]
@@ -347,9 +370,9 @@ def _check_rows(name: str, numbers: FloatArray, wrong: Any, needed: str) -> None
         )
 
 
-def _mass(given: Any, n: int, nv: int) -> Any:
-    """M (n, nv, nv), also of its lower triangles in compressed rows."""
-    values, *pattern = given if isinstance(given, tuple) and given else (given,)
+def _mass(values: Any, n: int, nv: int) -> Any:
+    """Return M (n, nv, nv), given as full matrices or as lower triangles in compressed rows."""
+    values, *pattern = values if isinstance(values, tuple) and values else (values,)
     values = as_floats("M", values)
     if not pattern:
         if values.ndim == 2:
@@ -360,17 +383,17 @@ def _mass(given: Any, n: int, nv: int) -> Any:
     if values.ndim != 2 or len(values) != n:
         raise InputError(f"values of M have shape {values.shape}; ({n}, entries) is needed")
     ptr, col = check_triangle(pattern, np.full(n, nv), values)
-    row, whole = np.repeat(np.arange(nv), np.diff(ptr)), np.zeros((n, nv, nv), values.dtype)
-    whole[:, row, col] = values
-    whole[:, col, row] = values
-    return whole
+    row, full = np.repeat(np.arange(nv), np.diff(ptr)), np.zeros((n, nv, nv), values.dtype)
+    full[:, row, col] = values
+    full[:, col, row] = values
+    return full
 
 
 def _check_mass(mass: Any, smooth: FloatArray, force: FloatArray, precision: str) -> None:
-    """M a0 must be the smooth force, of the size of its terms."""
+    """Raise CapabilityError if M a0 differs from the smooth force, relative to the size of its terms."""
     gap = np.abs(np.einsum("nij,nj->ni", mass.astype(float), smooth) - force).max(axis=1, initial=0.0)
     size = np.einsum("nij,nj->ni", np.abs(mass.astype(float)), np.abs(smooth)).max(axis=1, initial=0.0)
-    bad = np.flatnonzero(gap > ROUNDING[precision] * size)
+    bad = np.flatnonzero(gap > MASS_TOLERANCES[precision] * size)
     if len(bad):
         i = bad[0]
         raise CapabilityError(
@@ -426,12 +449,14 @@ def _elliptic_contacts(contacts: Any, elliptic: Any) -> tuple[Any, ...]:
     return world, address, dim, rub
 
 
-def _blocks(of: Any, loss: Any, counted: Any, contacts: Any, dt: float) -> tuple[Cones, FloatArray | None]:
-    """Blocks of all rows that count, one world after the other, and the factor of each row (n, m), None: 1."""
-    n, m = of.shape
+def _blocks(
+    row_type: Any, loss: Any, used_rows: Any, contacts: Any, dt: float
+) -> tuple[Cones, FloatArray | None]:
+    """Return the blocks of all used rows, world after world, and the factor of each row (n, m) or None if all are 1."""
+    n, m = row_type.shape
     begins, tangents, mu = np.ones((n, m), bool), np.zeros((n, m), np.int32), np.zeros((n, m))
     scale = None
-    elliptic = (of == ELLIPTIC) & counted
+    elliptic = (row_type == ELLIPTIC) & used_rows
     if elliptic.any() and contacts is None:
         raise InputError("efc_type has rows of elliptic contacts; contacts= is needed, with their friction")
     if contacts is not None:
@@ -444,15 +469,15 @@ def _blocks(of: Any, loss: Any, counted: Any, contacts: Any, dt: float) -> tuple
             factor[world[at], address[at] + j] = rub[at, j - 1] / rub[at, 0]
         if (factor != 1.0).any():
             scale = factor
-    free = of == EQUALITY
-    held = np.isin(of, FRICTION)
-    upper = np.where(held, dt * loss, np.inf)[counted]
-    lower = np.where(held, -dt * loss, np.where(free, -np.inf, 0.0))[counted]
-    first = begins[counted]
+    free = row_type == EQUALITY
+    has_loss = np.isin(row_type, FRICTION)
+    upper = np.where(has_loss, dt * loss, np.inf)[used_rows]
+    lower = np.where(has_loss, -dt * loss, np.where(free, -np.inf, 0.0))[used_rows]
+    first = begins[used_rows]
     ptr = np.append(np.flatnonzero(first), len(first)).astype(np.int32)
     none = np.zeros(len(ptr) - 1)
-    tangents = tangents[counted][first]
+    tangents = tangents[used_rows][first]
     kinds = kinds_of(tangents > 0, tangents=tangents)
     return Cones(
-        ptr=ptr, kind=kinds, lower=lower, upper=upper, mu=mu[counted][first], patch_radius=none
+        ptr=ptr, kind=kinds, lower=lower, upper=upper, mu=mu[used_rows][first], patch_radius=none
     ), scale

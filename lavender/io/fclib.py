@@ -1,9 +1,9 @@
-"""FCLIB files (HDF5): friction contact problems in 2D and 3D, in 3D also with rolling friction, local and global.
+"""Read and write FCLIB files (HDF5): local and global friction problems in 2D and 3D, in 3D also rolling friction.
 
     local     u = W r + q                                         A = W, b = -q, lambda = r, w = u
     global    M v = H r + f,  u = H^T v + w                       A = H^T M^-1 H,  b = -(w + H^T M^-1 f)
-    with equations (V, R, s or G, b): free rows after the contacts, w = 0 there
-    rolling   five rows a contact, |r_T| <= mu r_N and |r_R| <= mu_r r_N on the last two: a contact that rolls
+    equations (V, R, s or G, b) become free rows after the contacts, on which w = 0
+    rolling   five rows per contact, |r_T| <= mu r_N, and |r_R| <= mu_r r_N on the last two
 
 FCLIB's vector `w` is an offset of the velocity, not our slack. Format: Acary, Bremond, Huber et al.,
 "FCLIB: a collection of discrete 3D frictional contact problems", Inria RT-444, 2014.
@@ -23,68 +23,98 @@ import numpy as np
 from lavender.base.arrays import FloatArray, as_array, check_choice
 from lavender.base.errors import CapabilityError, InputError
 from lavender.base.lazy_import import sparse as sp
-from lavender.io.condensed import ENTRY, condensed
-from lavender.io.npz import compressed
-from lavender.io.stored import MAX_BYTES, NUMBER, Budget, Stored, write_bytes
+from lavender.io.condensed import SPARSE_ENTRY_BYTES, condense
+from lavender.io.npz import checked_csr
+from lavender.io.stored import MAX_BYTES, NUMBER_BYTES, Budget, Stored, write_bytes
 from lavender.problem import Problem
 from lavender.problem.cones import Cones
 from lavender.problem.generalized import Generalized
 
 LOCAL, GLOBAL = "fclib_local", "fclib_global"
-ROLLING = "_rolling"  # behind either
-ROLLING_ROWS = 5  # normal, two tangents, two that roll
-# Shapes of what a form holds: m rows of c contacts, p equations, n velocities.
+ROLLING = "_rolling"  # Suffix of both group names.
+ROLLING_ROWS = 5  # Normal, two tangents, two rolling rows.
+# Shapes of the arrays of a form: m rows of c contacts, p equations, n velocities.
 PARTS = {
     LOCAL: {"W": "mm", "V": "mp", "R": "pp", "q": "m", "s": "p", "mu": "c", "mu_r": "c"},
     GLOBAL: {"H": "nm", "M": "nn", "G": "np", "f": "n", "w": "m", "b": "p", "mu": "c", "mu_r": "c"},
 }
-BLOCK = 64  # bytes of the bounds of a row: Cones, b
-CHUNK_OF_ONE = 2**17  # most numbers in the chunk of a single number
+BOUNDS_ROW_BYTES = 64  # Bytes per row in `Cones` and b.
+MAX_SCALAR_CHUNK_NUMBERS = 2**17  # A single number whose chunk holds more numbers than this is rejected.
 
 
 @dataclass(frozen=True, eq=False)
 class Contents:
-    """An FCLIB file as it is: nothing condensed, rescaled or symmetrised.
+    """The unchanged contents of an FCLIB file: nothing is condensed, rescaled or symmetrised.
 
-    Local: W, q (and V, R, s). Global: M, H, f, w (and G, b). Matrices as (rows, columns) of SciPy, CSR.
+    The local form has W and q (and V, R, s), the global form M, H, f and w (and G, b). Matrices are CSR arrays of
+    SciPy, (rows, columns).
+
+    Parameters
+    ----------
+    spacedim : int
+        Rows of each contact, normal first: 2, 3, or 5 with rolling friction.
+    mu : (c,), -
+    mu_r : (c,) m, optional
+        With rolling friction.
+    W : (m, m), optional
+    q : (m,), optional
+    V : (m, p), optional
+    R : (p, p), optional
+    s : (p,), optional
+    M : (n, n), optional
+    H : (n, m), optional
+    f : (n,), optional
+    w : (m,), optional
+    G : (n, p), optional
+    b : (p,), optional
+    solution : mapping
+        The stored solution: "r" and "u" (m,), "v" (n,), "l" (p,).
+    guesses : tuple of mapping
+        Guesses with the entries of `solution`.
+    info : mapping of str to str
+        "title", "description", "math_info".
+    compare : str
+        Not part of FCLIB: "r,u", "u" or "error" if the file has a group `reference`.
     """
 
-    spacedim: int  # 2 or 3 rows of each contact, normal first; 5 with rolling friction
-    mu: FloatArray  # (c,)
-    mu_r: FloatArray | None = None  # (c,) m, with rolling friction
-    W: sp.csr_array | None = None  # (m, m)
-    q: FloatArray | None = None  # (m,)
-    V: sp.csr_array | None = None  # (m, p)
-    R: sp.csr_array | None = None  # (p, p)
-    s: FloatArray | None = None  # (p,)
-    M: sp.csr_array | None = None  # (n, n)
-    H: sp.csr_array | None = None  # (n, m)
-    f: FloatArray | None = None  # (n,)
-    w: FloatArray | None = None  # (m,)
-    G: sp.csr_array | None = None  # (n, p)
-    b: FloatArray | None = None  # (p,)
-    solution: Mapping[str, FloatArray] = field(default_factory=dict)  # "r", "u" (m,), "v" (n,), "l" (p,)
-    guesses: tuple[Mapping[str, FloatArray], ...] = ()  # as solution
-    info: Mapping[str, str] = field(default_factory=dict)  # "title", "description", "math_info"
-    compare: str = ""  # not FCLIB: "r,u", "u" or "error" where the file has a group `reference`
+    spacedim: int
+    mu: FloatArray
+    mu_r: FloatArray | None = None
+    W: sp.csr_array | None = None
+    q: FloatArray | None = None
+    V: sp.csr_array | None = None
+    R: sp.csr_array | None = None
+    s: FloatArray | None = None
+    M: sp.csr_array | None = None
+    H: sp.csr_array | None = None
+    f: FloatArray | None = None
+    w: FloatArray | None = None
+    G: sp.csr_array | None = None
+    b: FloatArray | None = None
+    solution: Mapping[str, FloatArray] = field(default_factory=dict)
+    guesses: tuple[Mapping[str, FloatArray], ...] = ()
+    info: Mapping[str, str] = field(default_factory=dict)
+    compare: str = ""
 
     @property
     def form(self) -> str:
-        """Which form: "local" or "global"."""
+        """Form of the problem: "local" or "global"."""
         return "local" if self.W is not None else "global"
 
     @property
     def group(self) -> str:
-        """Name of its group in the file."""
+        """Name of the problem's group in the file."""
         return (LOCAL if self.form == "local" else GLOBAL) + ("" if self.mu_r is None else ROLLING)
 
     def problem(self, name: str = "", *, max_bytes: int = MAX_BYTES) -> Problem:
-        """The problem: a global one in generalised coordinates (J = H^T), condensed where M is no mass matrix.
+        """Return the problem.
+
+        A global problem is returned in generalised coordinates (J = H^T); it is condensed if M is not a mass matrix.
 
         Raises
         ------
         InputError
-            M is singular, parts do not fit each other, or A may take more than `max_bytes`.
+            M is singular, array sizes do not agree, or A may need more than `max_bytes`.
         """
         general = self._general(max_bytes) if self.form == "global" else None
         if general is not None:
@@ -99,6 +129,7 @@ class Contents:
         return Problem(b, cones, a, guess=guess, name=name, generalized=general)
 
     def _local(self) -> tuple[sp.csr_array, FloatArray]:
+        """Return A (m + p, m + p) and b (m + p,) of the local form."""
         assert self.q is not None
         if self.V is None or self.s is None:
             return self.W, -self.q
@@ -114,38 +145,41 @@ class Contents:
         return self.w if self.b is None else np.concatenate([self.w, self.b])
 
     def _general(self, max_bytes: int) -> Generalized | None:
-        # None where M is no mass matrix of bodies: asymmetric, not definite, or of a size that is no part's.
+        """Return the generalised form, or None if M is not a mass matrix of bodies.
+
+        M is not one if it is asymmetric or not definite, or if a connected component is too large to factor.
+        """
         assert self.M is not None
         n = self.M.shape[0]
         if n == 0:
             return None
         size = np.bincount(sp.csgraph.connected_components(self.M, directed=False)[1]).astype(float)
-        if 4 * ENTRY * float(size @ size) > max_bytes:
+        if 4 * SPARSE_ENTRY_BYTES * float(size @ size) > max_bytes:
             return None
         try:
-            made = Generalized(self._columns().T.tocsr(), self.M, np.zeros(n))
-            return made.with_jacobian(v_free=made.solve(self.f))
+            general = Generalized(self._columns().T.tocsr(), self.M, np.zeros(n))
+            return general.with_jacobian(v_free=general.solve(self.f))
         except InputError:
             return None
 
     def _condensed(self, budget: Budget) -> tuple[sp.csr_array, FloatArray]:
-        # J = [H G]^T: contact rows and equations alike.
+        """Return A and b of the global form with J = [H G]^T, which contains the contact rows and the equations."""
         assert self.M is not None
         jt, offset = self._columns(), self._offset()
         if self.M.shape[0] == 0:
             return sp.csr_array((len(offset), len(offset))), -offset
-        a, pushed = condensed(self.M, jt, np.asarray(self.f), budget)
-        return a, -(offset + pushed)
+        a, free_velocity = condense(self.M, jt, np.asarray(self.f), budget)
+        return a, -(offset + free_velocity)
 
     def _impulse(self, point: Mapping[str, FloatArray]) -> FloatArray:
         return np.concatenate([point["r"], point["l"]]) if "l" in point else point["r"]
 
     def impulse(self) -> FloatArray | None:
-        """The stored solution (m + p,) [N s], or None."""
+        """Return the stored solution (m + p,) [N s], or None."""
         return self._impulse(self.solution) if "r" in self.solution else None
 
     def slack(self) -> FloatArray | None:
-        """The stored u, zero on equations (m + p,) [m/s], or None."""
+        """Return the stored u (m + p,) [m/s], zero on equations, or None."""
         if "u" not in self.solution:
             return None
         return np.concatenate([self.solution["u"], np.zeros(len(self.solution.get("l", ())))])
@@ -155,14 +189,15 @@ class Contents:
 
 
 def read(path: str | os.PathLike[str], *, max_bytes: int = MAX_BYTES) -> Stored:
-    """Problem, solution and guesses of an FCLIB file.
+    """Read the problem, the solution and the guesses of an FCLIB file.
 
-    A file that holds both forms is read in its local form; the first guess becomes `problem.guess`.
+    A file with both forms is read in its local form. The first guess becomes `problem.guess`.
 
     Raises
     ------
     InputError
-        Not an FCLIB file, truncated, inconsistent, with and without rolling friction at once; or h5py is not installed.
+        The file is not an FCLIB file, is truncated or inconsistent, or holds a problem with and one without rolling
+        friction; or h5py is not installed.
     """
     file = read_contents(path, max_bytes=max_bytes)
     try:
@@ -182,7 +217,7 @@ def read(path: str | os.PathLike[str], *, max_bytes: int = MAX_BYTES) -> Stored:
 
 
 def read_contents(path: str | os.PathLike[str], *, max_bytes: int = MAX_BYTES) -> Contents:
-    """The matrices and vectors of an FCLIB file, as they stand there; raises as `read`."""
+    """Read the matrices and vectors of an FCLIB file without changing them; raises the errors of `read`."""
     h5py = _h5py()
     try:
         with h5py.File(path, "r") as file:
@@ -196,13 +231,13 @@ def read_contents(path: str | os.PathLike[str], *, max_bytes: int = MAX_BYTES) -
 
 
 class _Reader:
-    """Datasets of one HDF5 file; follows no link out of it and allocates no more than allowed."""
+    """Reader of the datasets of one HDF5 file; it follows no links out of the file and respects the memory limit."""
 
     def __init__(self, h5py: Any, file: Any, max_bytes: int) -> None:
         self.h5py, self.file, self.budget = h5py, file, Budget(max_bytes)
 
     def node(self, path: str) -> Any:
-        """Group or dataset at a path, or None."""
+        """Return the group or dataset at a path, or None."""
         node = self.file
         for part in path.split("/"):
             if not isinstance(node, self.h5py.Group):
@@ -218,18 +253,19 @@ class _Reader:
         return node
 
     def has(self, path: str) -> bool:
+        """Return whether the path exists."""
         return self.node(path) is not None
 
     def spend(self, paths: Iterable[str]) -> None:
-        """Take what these datasets make, where they are there, off the budget."""
+        """Subtract the memory that these datasets need, if they exist, from the budget."""
         for path in paths:
             data = self.node(path)
             if isinstance(data, self.h5py.Dataset) and data.shape is not None:
                 chunk = _chunk(data) * data.dtype.itemsize
-                self.budget.spend(data.size * max(NUMBER, data.dtype.itemsize) + chunk, path)
+                self.budget.spend(data.size * max(NUMBER_BYTES, data.dtype.itemsize) + chunk, path)
 
     def dataset(self, path: str, kinds: str, count: int | None = None) -> Any:
-        """A dataset of `count` numbers (None: any), not yet read."""
+        """Return a dataset of `count` numbers (None: any number) without reading it."""
         data = self.node(path)
         if not isinstance(data, self.h5py.Dataset):
             raise InputError(f"{path} is missing or not a dataset")
@@ -243,12 +279,13 @@ class _Reader:
         return data
 
     def array(self, path: str, kinds: str, count: int | None = None) -> np.ndarray:
-        """A dataset as a flat array of `count` numbers (None: any)."""
+        """Read a dataset as a flat array of `count` numbers (None: any number)."""
         return np.asarray(self.dataset(path, kinds, count)[()]).reshape(-1)
 
-    def whole(self, path: str) -> int:
+    def integer(self, path: str) -> int:
+        """Read a single 32-bit integer."""
         data = self.dataset(path, "iu", 1)
-        if _chunk(data) > CHUNK_OF_ONE:
+        if _chunk(data) > MAX_SCALAR_CHUNK_NUMBERS:
             raise InputError(f"{path} is one number in a chunk of {_chunk(data)}")
         value = int(np.asarray(data[()]).reshape(-1)[0])
         if not -(2**31) <= value < 2**31:
@@ -256,28 +293,30 @@ class _Reader:
         return value
 
     def vector(self, path: str, count: int) -> FloatArray:
+        """Read `count` finite numbers as float64."""
         return as_array(path, self.array(path, "iuf", count), (count,))
 
     def text(self, path: str) -> str:
+        """Read a text; return an empty one if the dataset does not exist or is not a short single text."""
         data = self.node(path)
         if not isinstance(data, self.h5py.Dataset) or data.size != 1 or data.nbytes > 2**20:
             return ""
-        if _chunk(data) > CHUNK_OF_ONE:
+        if _chunk(data) > MAX_SCALAR_CHUNK_NUMBERS:
             return ""
         value = data[()]
         value = value.flat[0] if isinstance(value, np.ndarray) else value
         return value.decode("utf-8", "replace").rstrip("\0") if isinstance(value, bytes) else str(value)
 
     def shape(self, path: str) -> tuple[int, int]:
-        """Rows and columns that a matrix announces."""
-        m, n = (self.whole(f"{path}/{name}") for name in ("m", "n"))
+        """Return the numbers of rows and columns that a matrix declares."""
+        m, n = (self.integer(f"{path}/{name}") for name in ("m", "n"))
         if min(m, n) < 0:
             raise InputError(f"{path}: m {m}, n {n}; sizes are not negative")
         return m, n
 
     def matrix(self, path: str, shape: tuple[int | None, int | None]) -> sp.csr_array:
         """nz = -2 compressed rows, -1 compressed columns, >= 0 triplets (p columns, i rows)."""
-        (m, n), nz, nzmax = self.shape(path), self.whole(f"{path}/nz"), self.whole(f"{path}/nzmax")
+        (m, n), nz, nzmax = self.shape(path), self.integer(f"{path}/nz"), self.integer(f"{path}/nzmax")
         if nzmax < 0 or nz < -2 or nz > nzmax:
             raise InputError(f"{path}: m {m}, n {n}, nz {nz}, nzmax {nzmax}; nz is -2, -1 or 0 to nzmax")
         if any(want is not None and have != want for have, want in zip((m, n), shape, strict=True)):
@@ -287,9 +326,9 @@ class _Reader:
         i, p = self.array(f"{path}/i", "iu"), self.array(f"{path}/p", "iu")
         try:
             if nz == -2:
-                a = compressed(p, i, x, m, n)
+                a = checked_csr(p, i, x, m, n)
             elif nz == -1:
-                a = sp.csr_array(compressed(p, i, x, n, m).T)
+                a = sp.csr_array(checked_csr(p, i, x, n, m).T)
             else:
                 a = _triplets(p, i, x, nz, m, n)
         except InputError as error:
@@ -299,16 +338,20 @@ class _Reader:
 
 
 def _chunk(data: Any) -> int:
-    """Numbers that are unpacked at a time, however few are read."""
+    """Return how many numbers HDF5 unpacks at a time, even if fewer are read."""
     return math.prod(data.chunks) if data.chunks else 0
 
 
 def _is_cut_off(chunk: Any) -> bool | None:
-    """Whether a chunk has less than a checksum of 4 bytes: HDF5 would read on from there. None: ask the next one."""
+    """Return True if a chunk is shorter than its checksum of 4 bytes, else None, which continues the iteration.
+
+    HDF5 would read beyond the end of such a chunk.
+    """
     return True if chunk.size < 4 else None
 
 
 def _triplets(p: np.ndarray, i: np.ndarray, x: np.ndarray, nz: int, m: int, n: int) -> sp.csr_array:
+    """Return the matrix (m, n) of nz triplets: columns p, rows i, values x."""
     if min(len(p), len(i), len(x)) < nz:
         raise InputError(f"{nz} triplets are announced; p has {len(p)}, i {len(i)}, x {len(x)}")
     p, i, x = p[:nz], i[:nz], x[:nz]
@@ -318,30 +361,31 @@ def _triplets(p: np.ndarray, i: np.ndarray, x: np.ndarray, nz: int, m: int, n: i
 
 
 def _read_file(r: _Reader) -> Contents:
-    there = [name for name in (LOCAL, GLOBAL, LOCAL + ROLLING, GLOBAL + ROLLING) if r.has(name)]
-    if not there:
+    """Read an open file; check all lengths and the memory limit before reading numbers."""
+    present = [name for name in (LOCAL, GLOBAL, LOCAL + ROLLING, GLOBAL + ROLLING) if r.has(name)]
+    if not present:
         found = ", ".join(list(r.file)[:8]) or "nothing"
         raise InputError(
             f"holds {found}; an FCLIB file has a group {LOCAL} or {GLOBAL}, with {ROLLING} behind it where contacts "
             "resist rolling"
         )
-    group, rolling = there[0], there[0].endswith(ROLLING)
-    if there[-1].endswith(ROLLING) != rolling:
+    group, rolling = present[0], present[0].endswith(ROLLING)
+    if present[-1].endswith(ROLLING) != rolling:
         raise InputError(
-            f"holds {' and '.join(there)}: one problem with rolling friction and one without; keep one of them"
+            f"holds {' and '.join(present)}: one problem with rolling friction and one without; keep one of them"
         )
-    spacedim = r.whole(f"{group}/spacedim")
+    spacedim = r.integer(f"{group}/spacedim")
     if spacedim not in ((ROLLING_ROWS,) if rolling else (2, 3)):
         needed = f"{ROLLING_ROWS}, as rolling friction has," if rolling else "2 or 3"
         raise InputError(f"{group}/spacedim is {spacedim}; {needed} is needed")
     vectors = f"{group}/vectors"
     local = group.startswith(LOCAL)
-    first = r.shape(f"{group}/{'W' if local else 'H'}")
+    first_shape = r.shape(f"{group}/{'W' if local else 'H'}")
     more = f"{group}/{'V' if local else 'G'}"
     has_equations = r.has(more) or (local and r.has(f"{group}/R"))
-    n, m, p = 0 if local else first[0], first[1], r.shape(more)[1] if has_equations else 0
-    if local and first != (m, m):
-        raise InputError(f"{group}/W is {first[0]} x {m}; a square matrix is needed")
+    n, m, p = 0 if local else first_shape[0], first_shape[1], r.shape(more)[1] if has_equations else 0
+    if local and first_shape != (m, m):
+        raise InputError(f"{group}/W is {first_shape[0]} x {m}; a square matrix is needed")
     if m % spacedim:
         raise InputError(f"{m} rows are not a multiple of spacedim = {spacedim}")
     size = {"m": m, "n": n, "p": p, "c": m // spacedim}
@@ -349,11 +393,12 @@ def _read_file(r: _Reader) -> Contents:
     parts = {name: shape for name, shape in PARTS[LOCAL if local else GLOBAL].items() if name not in absent}
     shapes: dict[str, Any] = {name: tuple(size[x] for x in shape) for name, shape in parts.items()}
     matrices, names = ([name for name in shapes if len(shapes[name]) == k] for k in (2, 1))
-    for name in names:  # lengths, then bytes, then numbers
+    # Check lengths first, then the memory limit, then read the numbers.
+    for name in names:
         r.dataset(f"{vectors}/{name}", "iuf", shapes[name][0])
-    r.budget.spend(BLOCK * (m + p), f"{m + p} rows")
+    r.budget.spend(BOUNDS_ROW_BYTES * (m + p), f"{m + p} rows")
     for name in matrices:
-        r.budget.spend(NUMBER * (shapes[name][0] + 1), f"{group}/{name}")
+        r.budget.spend(NUMBER_BYTES * (shapes[name][0] + 1), f"{group}/{name}")
         r.spend(f"{group}/{name}/{part}" for part in ("p", "i", "x"))
     r.spend(f"{vectors}/{name}" for name in names)
     guesses = _guesses(r)
@@ -371,6 +416,7 @@ def _read_file(r: _Reader) -> Contents:
 
 
 def _point(r: _Reader, group: str, n: int, m: int, p: int) -> dict[str, FloatArray]:
+    """Read a solution or guess: r, and u, v, l if present; l is required if there are equations."""
     point = {"r": r.vector(f"{group}/r", m)}
     for name, size in (("u", m), ("v", n), ("l", p)):
         if size and r.has(f"{group}/{name}"):
@@ -381,10 +427,10 @@ def _point(r: _Reader, group: str, n: int, m: int, p: int) -> dict[str, FloatArr
 
 
 def _guesses(r: _Reader) -> list[str]:
-    """Groups of the guesses."""
+    """Return the names of the groups of the guesses."""
     if not r.has("guesses"):
         return []
-    count = r.whole("guesses/number_of_guesses")
+    count = r.integer("guesses/number_of_guesses")
     if count < 0 or count > len(r.node("guesses")):
         raise InputError(f"guesses/number_of_guesses is {count}; there are {len(r.node('guesses')) - 1}")
     return [f"guesses/{i + 1}" for i in range(count)]
@@ -414,21 +460,21 @@ def write(
 def contents(
     problem: Problem, *, impulse: Any = None, form: str | None = None, drop: Collection[str] = ()
 ) -> Contents:
-    """What an FCLIB file of this problem holds; raises as `write`."""
+    """Return the contents of an FCLIB file of this problem; raises the errors of `write`."""
     if not isinstance(problem, Problem):
         raise InputError(f"problem is a {type(problem).__name__}; a lavender.Problem is needed")
     if form is None:
-        soft = problem.generalized is not None and np.any(problem.compliance)
-        form = "local" if problem.matrix is not None or soft else "global"
+        is_soft = problem.generalized is not None and np.any(problem.compliance)
+        form = "local" if problem.matrix is not None or is_soft else "global"
     check_choice("form", form, ("local", "global"))
     unknown = sorted(set(drop) - {"names", "key", "precision"})
     if unknown:
         raise InputError(
             f"drop names {', '.join(unknown)}; only 'names', 'key' and 'precision' may be left out"
         )
-    reasons = _cannot_hold(problem, form, drop)
-    if reasons:
-        text = "; ".join(reasons)
+    obstacles = _cannot_hold(problem, form, drop)
+    if obstacles:
+        text = "; ".join(obstacles)
         raise CapabilityError(f"FCLIB's {form} form cannot hold {text}. An .npz holds everything")
     mu = problem.cones.mu
     mu_r = problem.cones.rolling if problem.cones.has_rolling else None
@@ -455,7 +501,7 @@ def contents(
 
 
 def _mass(problem: Problem) -> tuple[sp.csr_array, FloatArray]:
-    """M (n, n) and v* (n,) of a problem that has them."""
+    """Return M (n, n) and v* (n,) of a problem in generalised coordinates or of bodies."""
     if problem.generalized is not None:
         return problem.generalized.mass, problem.generalized.v_free
     rows = problem.rows
@@ -470,68 +516,70 @@ def _mass(problem: Problem) -> tuple[sp.csr_array, FloatArray]:
 
 
 def _cannot_hold(problem: Problem, form: str, drop: Collection[str]) -> list[str]:
+    """Return everything of the problem that FCLIB's form cannot hold, each as a phrase for the error message."""
     c = problem.cones
-    reasons = []
+    obstacles = []
     if np.any(~c.is_contact):
         free = np.isneginf(c.lower) & np.isposinf(c.upper)
         rows = ~c.contact_rows
-        what = "free rows" if np.all(free[rows]) else "bounded rows"
-        reasons.append(f"blocks of bounded rows ({int(rows.sum())} {what}; contacts only)")
+        kind = "free rows" if np.all(free[rows]) else "bounded rows"
+        obstacles.append(f"blocks of bounded rows ({int(rows.sum())} {kind}; contacts only)")
     if c.has_ellipse:
-        reasons.append("ellipses (give problem.disk, whose impulses are problem.on_disk of those here)")
+        obstacles.append("ellipses (give problem.disk, whose impulses are problem.on_disk of those here)")
     if c.has_box:
-        reasons.append("boxes (its friction is a disk: give cones.shaped('disk'), which is another law)")
+        obstacles.append("boxes (its friction is a disk: give cones.shaped('disk'), which is another law)")
     if np.any(c.spin_rows >= 0) or c.has_round:
-        reasons.append("spin rows")
+        obstacles.append("torsional friction")
     rolls = np.count_nonzero(c.rolling_rows >= 0)
     contacts = c.n_tangents[c.is_contact]
     if 0 < rolls < len(contacts):
-        reasons.append(f"contacts with rolling beside others ({rolls} of {len(contacts)}; all, or none)")
+        obstacles.append(f"contacts with rolling beside others ({rolls} of {len(contacts)}; all, or none)")
     if problem.n_blocks == 0:
-        reasons.append("a problem without contacts")
+        obstacles.append("a problem without contacts")
     elif len(contacts) and (contacts.min() != contacts.max() or contacts[0] == 0):
         sizes = sorted({int(t) + 1 for t in contacts})
-        reasons.append(f"contacts of {', '.join(map(str, sizes))} rows (all 2, or all 3)")
+        obstacles.append(f"contacts of {', '.join(map(str, sizes))} rows (all 2, or all 3)")
     if problem.friction != "coulomb":
-        reasons.append("the 'cone' law (it means Coulomb friction: pass problem.relaxed('coulomb'))")
+        obstacles.append("the 'cone' law (it means Coulomb friction: pass problem.relaxed('coulomb'))")
     if problem.names is not None and "names" not in drop:
-        reasons.append("names of blocks (drop=('names',) leaves them out)")
+        obstacles.append("names of blocks (drop=('names',) leaves them out)")
     if problem.key is not None and "key" not in drop:
-        reasons.append("keys of blocks (drop=('key',) leaves them out)")
+        obstacles.append("keys of blocks (drop=('key',) leaves them out)")
     if problem.generalized is not None and problem.generalized.names is not None and "names" not in drop:
-        reasons.append("names of velocities (drop=('names',) leaves them out)")
+        obstacles.append("names of velocities (drop=('names',) leaves them out)")
     if problem.precision != "float64" and "precision" not in drop:
-        reasons.append(f"the precision {problem.precision!r} (drop=('precision',) leaves it out)")
+        obstacles.append(f"the precision {problem.precision!r} (drop=('precision',) leaves it out)")
     if any("\ud800" <= letter <= "\udfff" for letter in problem.name):
-        reasons.append("half a surrogate pair in its name (give it another)")
+        obstacles.append("half a surrogate pair in its name (give it another)")
     if "\0" in problem.name:
-        reasons.append("a NUL character in its name, which ends a text there (give it another)")
+        obstacles.append("a NUL character in its name, which ends a text there (give it another)")
     if form == "global":
-        reasons += _no_global_form(problem)
-    return reasons
+        obstacles += _no_global_form(problem)
+    return obstacles
 
 
 def _no_global_form(problem: Problem) -> list[str]:
+    """Return the reasons why the problem has no global form, each as a phrase for the error message."""
     if problem.matrix is not None:
         return ["a problem given as a matrix (form='local' holds it)"]
-    reasons = []
+    obstacles = []
     if problem.compliance is not None and np.any(problem.compliance):
-        reasons.append("compliance (form='local' holds it, added to the diagonal of W)")
+        obstacles.append("compliance (form='local' holds it, added to the diagonal of W)")
     rows = problem.rows
     if rows is None:
-        return reasons
+        return obstacles
     heavy = np.flatnonzero(rows.inv_mass == 0.0)
     if len(heavy):
-        reasons.append(f"an infinite mass (body {heavy[0]}; form='local' holds it)")
+        obstacles.append(f"an infinite mass (body {heavy[0]}; form='local' holds it)")
     value = np.linalg.eigvalsh(rows.inv_inertia) if rows.n_bodies else np.ones((0, 3))
     stiff = np.flatnonzero(value[:, 0] <= 1e-14 * value[:, 2])
     if len(stiff):
-        reasons.append(f"an infinite inertia (body {stiff[0]}; form='local' holds it)")
-    return reasons
+        obstacles.append(f"an infinite inertia (body {stiff[0]}; form='local' holds it)")
+    return obstacles
 
 
 def write_contents(file: Contents, path: str | os.PathLike[str]) -> None:
-    """Write matrices and vectors as FCLIB lays them out, compressed rows, to the bit.
+    """Write matrices and vectors bit for bit in FCLIB's layout, with matrices in compressed rows.
 
     Raises
     ------
@@ -539,7 +587,7 @@ def write_contents(file: Contents, path: str | os.PathLike[str]) -> None:
         The path cannot be written, or h5py is not installed.
     """
     h5py = _h5py()
-    # In memory: where a disk is full, HDF5 ends the process by a signal.
+    # The file is built in memory first, because HDF5 ends the process by a signal if the disk is full.
     with h5py.File("in memory", "w", driver="core", backing_store=False) as out:
         _write_file(out, file)
         out.flush()
@@ -548,6 +596,7 @@ def write_contents(file: Contents, path: str | os.PathLike[str]) -> None:
 
 
 def _write_file(out: Any, file: Contents) -> None:
+    """Write all groups of the file."""
     group = out.create_group(file.group)
     _put(group, "spacedim", np.array([file.spacedim], np.int32))
     vectors = group.create_group("vectors")
@@ -561,7 +610,7 @@ def _write_file(out: Any, file: Contents) -> None:
         info = group.create_group("info")
         for name in ("title", "description", "math_info"):
             text = file.info.get(name, "").encode()
-            _put(info, name, np.array(text, f"S{len(text) + 1}"))  # FCLIB reads strings up to their NUL
+            _put(info, name, np.array(text, f"S{len(text) + 1}"))  # FCLIB reads strings up to the NUL.
     if file.solution:
         _write_point(out.create_group("solution"), file.solution)
     if file.guesses:
@@ -584,7 +633,7 @@ def _write_point(group: Any, point: Mapping[str, FloatArray]) -> None:
 
 
 def _put(group: Any, name: str, value: Any) -> None:
-    """Write an array with a checksum, by which a damaged file is no other problem; HDF5 has none for a scalar."""
+    """Write an array with a checksum, so that damage is detected; HDF5 has no checksum for scalars."""
     value = np.asarray(value)
     group.create_dataset(name, data=value, fletcher32=bool(value.ndim and value.size))
 

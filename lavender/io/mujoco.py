@@ -1,45 +1,47 @@
-"""MuJoCo's constraint problem as a `Problem`: what `mj_forward` left in the `efc_*` arrays.
+"""Convert MuJoCo's constraint problem, the `efc_*` arrays after `mj_forward`, to a `Problem`.
 
-MuJoCo looks for forces f [N, N m] and accelerations; with its Jacobian J, mass matrix M, regularisation R > 0,
+MuJoCo solves for forces f [N, N m] and accelerations. With its Jacobian J, mass matrix M, regularisation R > 0,
 unconstrained acceleration a0 and reference acceleration aref it minimises
 
     1/2 f.(J M^-1 J^T + R) f + f.(J a0 - aref)     over its friction cones and bounds
 
     mujoco.mj_forward(model, data)
     problem = lavender.io.from_mujoco(model, data)
-    lavender.residual(problem, lavender.io.mujoco.impulse(model, data)).relative    # of MuJoCo's own answer
+    lavender.residual(problem, lavender.io.mujoco.impulse(model, data)).relative    # judge MuJoCo's own answer
 
-One step dt turns that into impulses and velocities, without changing it:
+Multiplication by the time step dt gives the same problem in impulses and velocities:
 
     lambda = dt f      A = J M^-1 J^T + diag(R)      b = dt (aref - J a0)      w = A lambda - b = dt (J a + R f - aref)
 
-The problem holds J and M as they are (`Problem.generalized`), R as its compliance. Rows keep MuJoCo's order; what
-becomes what:
+The problem holds J and M unchanged (`Problem.generalized`), and R as its compliance. Rows keep MuJoCo's order. The
+constraints become these blocks:
 
-| MuJoCo | here |
+| MuJoCo | block |
 |---|---|
-| equality | one ROW block of its 1 to 6 rows, unbounded; a flex: a block for each edge |
+| equality | one ROW block of its 1 to 6 rows, unbounded; for a flex, one block for each edge |
 | friction loss of a joint or tendon | ROW, abs(lambda) <= dt frictionloss |
-| limit of a joint or tendon; `condim="1"` | ROW, or a contact of a normal alone: lambda >= 0 |
+| limit of a joint or tendon; `condim="1"` | ROW, or a contact with only a normal row: lambda >= 0 |
 | elliptic cone, `condim="3"` | CONTACT: normal (from geom 1 to geom 2), two tangents, mu = friction[0] |
-| elliptic cone, `condim="4"`, `"6"` | ROUND: normal, two tangents, spin, then two that roll, in one cone |
+| elliptic cone, `condim="4"`, `"6"` | ROUND: normal, two tangents, torsion, then two rolling rows, in one cone |
 | pyramidal cone, any condim | its edges as ROWs with lambda >= 0: MuJoCo's own linear complementarity problem |
 
-Coefficients of friction that differ make an ellipsoid; rows of tangents are scaled by friction[j] / friction[0], which
-makes it round without changing the problem: `scaling(model, data)` has the factors, `impulse` heeds them.
+If the friction coefficients of a contact differ, its cone is an ellipsoid. Rows of tangents are then scaled by
+friction[j] / friction[0], which makes the cone round without changing the problem. `scaling(model, data)` returns the
+factors; `impulse` uses them.
 
-Differences to know:
+Differences from rigid contact with Coulomb friction:
 
-- MuJoCo's constraints are soft: R is compliance, and no row is rigid. `solref` and `solimp` are inside R and aref.
-- Its friction is the convex relaxation, so the law is "cone". `problem.relaxed("coulomb")` asks for Coulomb's where no
-  contact has more than two tangents.
-- It evaluates accelerations at the start of the step: v + dt a is the velocity after the step only for the Euler
-  integrator without implicit damping. The pass of `noslip_iterations` comes after the problem and is not in it.
+- MuJoCo's constraints are soft: R is compliance, and no row is rigid. `solref` and `solimp` are contained in R and
+  aref.
+- MuJoCo's friction is the convex relaxation, so the law is "cone". `problem.relaxed("coulomb")` returns the problem
+  with Coulomb's law if no contact has more than two tangents.
+- MuJoCo evaluates accelerations at the start of the step: v + dt a is the velocity after the step only for the Euler
+  integrator without implicit damping. The pass of `noslip_iterations` follows the solve and is not part of the problem.
 
-What MuJoCo holds is checked against itself: every index before it is followed; M a0 must be its smooth force, 1 / R its
-efc_D; and J must be the matrix that made its efc_vel, efc_b and qfrc_constraint. Data of another problem than M's are
-refused, with the option that makes them. What its solver answered is in no check: if it stopped before convergence,
-`impulse` is further off, and the judge says by how much.
+The data are checked for consistency: every index before it is used; M a0 must equal the smooth force and 1 / R must
+equal efc_D; J must reproduce efc_vel, efc_b and qfrc_constraint. Data of a problem with a matrix other than M are
+rejected; the error names the option that causes it. The checks do not depend on the answer of MuJoCo's solver: if the
+solver stopped before convergence, the judge reports the error of `impulse`.
 """
 
 from __future__ import annotations
@@ -60,17 +62,23 @@ from lavender.problem.generalized import Generalized
 from lavender.problem.operators import MAX_SAFE_ENTRY
 from lavender_ext.io import mujoco_rows
 
-ROUNDING = 2.0**-46  # 64 roundings: M a0 against the smooth force, which MuJoCo solved for by the same factor
-SAME = 1e-9  # -, R D - 1
-# of the terms' size: sums of 1,000 of them in another order; what was changed is off by far more
-SUMMED = 2.0**-40
-ALIKE = 1e-10  # -, least share of a joint's axis that those before it in its body leave, to tell their velocities apart
-# Bytes of MuJoCo's memory that a row (12 numbers and more), a contact and an entry of efc_J with its column take.
+# Largest accepted difference of M a0 and the smooth force, relative to their size: 64 roundings. MuJoCo computed a0
+# with a factor of the same matrix.
+MASS_TOLERANCE = 2.0**-46
+COMPLIANCE_TOLERANCE = 1e-9  # Largest accepted |R D - 1| [-].
+# Largest accepted difference of two sums, relative to the size of their terms: 1,000 terms added in another order stay
+# below it, and data that were changed exceed it by far.
+SUM_TOLERANCE = 2.0**-40
+# The velocity before the step is recovered from the velocities of bodies only if each joint's axis has at least this
+# fraction that is independent of the joints before it in the same body [-].
+MIN_INDEPENDENT_AXIS_FRACTION = 1e-10
+# Bytes of MuJoCo's memory for a row (12 numbers and more), a contact, and an entry of efc_J with its column.
 ROW_BYTES, CONTACT_BYTES, ENTRY_BYTES = 128, 512, 12
-CHANGED = "MjData was changed since its forward pass, or is of another model: run mj_forward"
-OF_M = ("Euler", "RK4", "implicit", "implicitfast")  # integrators whose constraint problem is of M
-LAYOUT = "(also where opt.jacobian, which says how efc_J is laid out, was changed)"
-OTHER_MODEL = "The model was changed, or MjData is of another one: give a model and data made from it"
+CHANGED_ADVICE = "MjData was changed since its forward pass, or is of another model: run mj_forward"
+# Integrators whose constraint problem uses M itself.
+MASS_MATRIX_INTEGRATORS = ("Euler", "RK4", "implicit", "implicitfast")
+LAYOUT_NOTE = "(also if opt.jacobian, which determines the layout of efc_J, was changed)"
+OTHER_MODEL_ADVICE = "The model was changed, or MjData is of another one: give a model and data made from it"
 NO_TRIANGLE = (np.zeros(1, np.int32), np.zeros(0, np.int32))
 NO_CONTACT = SimpleNamespace(
     dim=np.zeros(0, np.int32), geom=np.zeros((0, 2), np.int32), friction=np.zeros((0, 5))
@@ -87,74 +95,77 @@ _CODES = (
 )
 
 
-class _Model:
-    """What a model keeps while it lives: its counts, and where its arrays are; what they hold is read anew."""
+class _ModelCache:
+    """Cached counts and views of the arrays of a model. The contents of the arrays are read again at every call."""
 
     def __init__(self, mj: Any, model: Any) -> None:
         self.mj, self.n = mj, int(model.nv)
-        self.most = model.neq, self.n, model.ntendon, model.njnt, model.ntendon
+        self.type_counts = model.neq, self.n, model.ntendon, model.njnt, model.ntendon
         self.tree = model.body_parentid, model.dof_bodyid
         self.mass = model.M_rowadr, model.M_rownnz, model.M_colind
-        self.like: Any = None  # its operator made first, whose pattern is compared before use
+        # The first operator of this model. Its sparsity pattern is compared before it is reused.
+        self.first_operator: Any = None
 
 
-_SEEN: WeakKeyDictionary[Any, _Model] = WeakKeyDictionary()
+_MODELS: WeakKeyDictionary[Any, _ModelCache] = WeakKeyDictionary()
 
 
 def from_mujoco(model: Any, data: Any, *, name: str = "mujoco") -> Problem:
-    """The constraint problem that MuJoCo solved last, in impulses and velocities; see the module.
+    """Return the constraint problem that MuJoCo solved last, in impulses and velocities; see the module.
 
     Parameters
     ----------
     model : mujoco.MjModel
     data : mujoco.MjData
-        After `mj_forward` or `mj_step`; v* is of the velocities before the step.
+        After `mj_forward` or `mj_step`; v* belongs to the velocities before the step.
     name : str
-        Name of the problem; "(noslip)" is added where `noslip_iterations` moved MuJoCo's impulses off its solution.
+        Name of the problem; "(noslip)" is added if `noslip_iterations` moved MuJoCo's impulses away from the solution.
 
     Returns
     -------
     Problem
         In generalised coordinates, with v* and keys of blocks (geoms and number of a contact, joint, tendon,
-        equality). Law "cone" with elliptic friction cones, "lcp" with pyramidal ones or without friction, "linear"
-        with equalities alone. MuJoCo's own impulses are its answer, no start: `impulse(model, data)` has them.
+        equality). The law is "cone" with elliptic friction cones, "lcp" with pyramidal cones or without friction,
+        "linear" with only equalities. The problem has no initial guess; `impulse(model, data)` returns MuJoCo's answer.
 
     Raises
     ------
     InputError
-        Not a model and its data, or before `mj_forward`; a step that is no time; numbers that are not finite; indices
-        (`efc_id`, `contact.dim`, `efc_J_colind`, ...) that name what is not there.
+        The arguments are not a model and its data; `mj_forward` was not called; the time step is not above 0; numbers
+        are not finite; indices (`efc_id`, `contact.dim`, `efc_J_colind`, ...) are out of range.
     CapabilityError
-        The data belong to another problem than J, M and R: an integrator that treats damping inside M
-        (`integrator="discrete"`), a Jacobian that is not the one of the forward pass (`opt.jacobian` changed since),
-        or a copy that lacks what the problem needs; after `mj_step`, joints of one body that move it alike. Never
-        because MuJoCo's solver stopped before convergence: the problem does not depend on its answer.
+        The data belong to a problem other than that of J, M and R: the integrator adds damping to M
+        (`integrator="discrete"`), `opt.jacobian` changed since the forward pass, a copy lacks needed arrays, or, after
+        `mj_step`, joints of one body have dependent axes. It is not raised if MuJoCo's solver stopped before
+        convergence: the problem does not depend on the answer.
     """
-    seen, m, contacts, smooth = _mujoco(model, data)
-    opt, like = model.opt, seen.like
+    seen, m, contacts, smooth = _checked_model(model, data)
+    opt, like = model.opt, seen.first_operator
     dt = _timestep(opt)
     mass = _mass(seen, model, data, smooth, NO_TRIANGLE if like is None else like.mass[:2])
     cones, scale, key = _blocks(seen, data, contacts, dt)
     jac = _rows(seen, model, data, m, scale)
-    rhs, softness, v_free, sound, gap, gaps = mujoco_rows.numbers(
-        *jac, scale, dt, _before(seen, data), smooth, data.efc_aref, data.efc_R, data.efc_D, data.efc_force,
-        _speed(model, data, m), data.efc_b, data.qfrc_constraint, data.qacc, MAX_SAFE_ENTRY,
+    rhs, compliance, v_free, is_finite, gap, gaps = mujoco_rows.numbers(
+        *jac, scale, dt, _velocity_before(seen, data), smooth, data.efc_aref, data.efc_R, data.efc_D, data.efc_force,
+        _expected_velocity(model, data, m), data.efc_b, data.qfrc_constraint, data.qacc, MAX_SAFE_ENTRY,
     )  # fmt: skip
     _check_jacobian(*gaps)
-    if not gap <= SAME:
-        softness, sound = _compliance(data) * scale * scale, False
-    names = Names(cones.n_blocks, lambda: _words(seen.mj, model, cones._blocks.ints[2 * m + 1 :], m))
+    if not gap <= COMPLIANCE_TOLERANCE:
+        compliance, is_finite = _compliance(data) * scale * scale, False
+    names = Names(cones.n_blocks, lambda: _block_names(seen.mj, model, cones._blocks.ints[2 * m + 1 :], m))
     general = Generalized.compressed(jac, mass, v_free, like=like)
     if like is None:
-        seen.like = general.operator
-    made = (
-        Problem._from_engine_arrays if sound and not general.operator.is_beyond(MAX_SAFE_ENTRY) else Problem
+        seen.first_operator = general.operator
+    build = (
+        Problem._from_engine_arrays
+        if is_finite and not general.operator.is_beyond(MAX_SAFE_ENTRY)
+        else Problem
     )
-    return made(
+    return build(
         b=rhs,
         cones=cones,
         generalized=general,
-        compliance=softness,
+        compliance=compliance,
         friction="cone",
         key=key,
         names=names,
@@ -165,9 +176,9 @@ def from_mujoco(model: Any, data: Any, *, name: str = "mujoco") -> Problem:
 
 @np.errstate(over="ignore", invalid="ignore")
 def impulse(model: Any, data: Any) -> FloatArray:
-    """MuJoCo's own answer as impulses of the problem's rows (m,) [N s]: dt efc_force over `scaling`.
+    """Return MuJoCo's own answer as impulses of the problem's rows (m,) [N s]: dt efc_force divided by `scaling`.
 
-    After `noslip_iterations` it is no solution of the problem.
+    With `noslip_iterations`, it is not a solution of the problem.
     """
     scale = scaling(model, data)
     force = _timestep(model.opt) * data.efc_force
@@ -175,37 +186,38 @@ def impulse(model: Any, data: Any) -> FloatArray:
 
 
 def scaling(model: Any, data: Any) -> FloatArray:
-    """Factor of each row (m,) of the problem: row of the problem = factor times MuJoCo's row.
+    """Return the factor of each row (m,): row of the problem = factor times MuJoCo's row.
 
-    1, and friction[j] / friction[0] on the tangents of an elliptic cone. Impulses are MuJoCo's over it.
+    The factor is friction[j] / friction[0] on tangents of an elliptic cone and 1 on all other rows. Impulses are
+    MuJoCo's divided by the factor.
     """
-    seen, _, contacts, _ = _mujoco(model, data)
+    seen, _, contacts, _ = _checked_model(model, data)
     scale: FloatArray = _blocks(seen, data, contacts, _timestep(model.opt))[1]
     return scale
 
 
 def acceleration(model: Any, data: Any, impulse: Any) -> FloatArray:
-    """MuJoCo's `qacc` (nv,) under impulses (m,) [N s] of the problem's rows: a0 + M^-1 J^T lambda / dt."""
-    seen, m, _, smooth = _mujoco(model, data)
+    """Return MuJoCo's `qacc` (nv,) for impulses (m,) [N s] of the problem's rows: a0 + M^-1 J^T lambda / dt."""
+    seen, m, _, smooth = _checked_model(model, data)
     lam = as_array("impulse", impulse, (m,), unit="N s")
-    push = (jacobian(model, data).T @ (scaling(model, data) * lam))[None, :] / _timestep(model.opt)
-    change = np.zeros_like(push)
-    seen.mj.mj_solveM(model, data, change, np.ascontiguousarray(push))
+    force = (jacobian(model, data).T @ (scaling(model, data) * lam))[None, :] / _timestep(model.opt)
+    change = np.zeros_like(force)
+    seen.mj.mj_solveM(model, data, change, np.ascontiguousarray(force))
     return np.array(smooth, float) + change[0]
 
 
 def jacobian(model: Any, data: Any) -> sp.csr_array:
-    """J (m, nv) of all constraints, from either way in which MuJoCo stores it."""
-    seen, m, _, _ = _mujoco(model, data)
+    """Return J (m, nv) of all constraints, whether MuJoCo stores it densely or sparsely."""
+    seen, m, _, _ = _checked_model(model, data)
     indptr, indices, values = _rows(seen, model, data, m, np.ones(m))
     return sp.csr_array((values, indices, indptr), shape=(m, seen.n))
 
 
-def _mujoco(model: Any, data: Any) -> tuple[_Model, int, int, Any]:
-    """What is kept of the model, rows, contacts, and the unconstrained acceleration, of a model and data that fit."""
+def _checked_model(model: Any, data: Any) -> tuple[_ModelCache, int, int, Any]:
+    """Check a model and its data; return the model's cache, the numbers of rows and contacts, and a0 (nv,)."""
     try:
-        seen = _SEEN.get(model)
-    except TypeError:  # of no model: nothing that has weak references
+        seen = _MODELS.get(model)
+    except TypeError:  # The object does not support weak references, so it is not a model.
         seen = None
     mj = package() if seen is None else seen.mj
     if (seen is None and not isinstance(model, mj.MjModel)) or not isinstance(data, mj.MjData):
@@ -214,22 +226,28 @@ def _mujoco(model: Any, data: Any) -> tuple[_Model, int, int, Any]:
             "are needed"
         )
     if seen is None:
-        seen = _SEEN[model] = _Model(mj, model)
+        seen = _MODELS[model] = _ModelCache(mj, model)
     smooth = data.qacc_smooth
     if len(smooth) != seen.n:
         raise InputError(f"the data has {len(smooth)} degrees of freedom, the model {seen.n}")
     m, contacts, entries = data.nefc, data.ncon, data.nJ
     needed = m * ROW_BYTES + contacts * CONTACT_BYTES + entries * ENTRY_BYTES
-    if min(m, contacts, entries) < 0 or needed > data.parena:  # where its arrays end, for whoever reads them
+    if min(m, contacts, entries) < 0 or needed > data.parena:  # The arrays would exceed the allocated memory.
         raise InputError(
             f"nefc = {m}, ncon = {contacts}, nJ = {entries}: what this MjData has allocated ({data.parena} bytes) does "
-            f"not hold as many. {CHANGED}"
+            f"not hold as many. {CHANGED_ADVICE}"
         )
     return seen, m, contacts, smooth
 
 
 def package() -> Any:
-    """MuJoCo, which whoever holds a model has; InputError where it is not there, or too old."""
+    """Return the module mujoco.
+
+    Raises
+    ------
+    InputError
+        MuJoCo is not installed, or is too old.
+    """
     try:
         import mujoco
     except ImportError:
@@ -253,64 +271,80 @@ def _timestep(opt: Any) -> float:
     return dt
 
 
-def _mass(seen: _Model, model: Any, data: Any, smooth: Any, like: Any) -> Any:
-    """(indptr, indices, data) of M's lower triangle, the first two those of `like` where they are the same.
+def _mass(seen: _ModelCache, model: Any, data: Any, smooth: Any, like: Any) -> Any:
+    """Return (indptr, indices, data) of M's lower triangle; the first two are those of `like` if they are equal.
 
-    M a0 must be the smooth force: otherwise another matrix than M has made a0, and made the problem.
+    Raises
+    ------
+    CapabilityError
+        M a0 is not the smooth force: a0 and the problem were computed with a matrix other than M.
     """
-    made = mujoco_rows.lower(*seen.mass, data.M, smooth, data.qfrc_smooth, ROUNDING, like)
-    if made is None:
-        raise InputError(f"M_rowadr, M_rownnz and M_colind are no lower triangle of M. {OTHER_MODEL}")
-    mass, gap = made
-    if not gap <= ROUNDING:
+    result = mujoco_rows.lower(*seen.mass, data.M, smooth, data.qfrc_smooth, MASS_TOLERANCE, like)
+    if result is None:
+        raise InputError(f"M_rowadr, M_rownnz and M_colind are no lower triangle of M. {OTHER_MODEL_ADVICE}")
+    mass, gap = result
+    if not gap <= MASS_TOLERANCE:
         number = int(model.opt.integrator)
-        found = [name for name, value in seen.mj.mjtIntegrator.__members__.items() if int(value) == number]
-        word = found[0].removeprefix("mjINT_").lower() if found else str(number)
-        why = f"integrator={word!r} puts damping into it; {', '.join(map(repr, OF_M))} have M itself"
+        names = [name for name, value in seen.mj.mjtIntegrator.__members__.items() if int(value) == number]
+        word = names[0].removeprefix("mjINT_").lower() if names else str(number)
+        why = f"integrator={word!r} puts damping into it; {', '.join(map(repr, MASS_MATRIX_INTEGRATORS))} have M itself"
         raise CapabilityError(
             f"M qacc_smooth differs from qfrc_smooth by {gap:.1e} of their size: these data are not those of M. "
-            f"{CHANGED if word in map(str.lower, OF_M) else why}"
+            f"{CHANGED_ADVICE if word in map(str.lower, MASS_MATRIX_INTEGRATORS) else why}"
         )
     return mass
 
 
-def _rows(seen: _Model, model: Any, data: Any, m: int, scale: FloatArray) -> Any:
-    """(indptr, indices, data) of J, scaled by row."""
+def _rows(seen: _ModelCache, model: Any, data: Any, m: int, scale: FloatArray) -> Any:
+    """Return (indptr, indices, data) of J, each row times `scale` (m,).
+
+    Raises
+    ------
+    InputError
+        The arrays of efc_J have the wrong size or indices out of range.
+    """
     values, n = data.efc_J, seen.n
     values = values if values.ndim == 1 else np.ravel(values)
     if not seen.mj.mj_isSparse(model):
         if len(values) < m * n:
             raise InputError(
-                f"efc_J holds {len(values)} numbers; {m} x {n} are needed where opt.jacobian says dense. {CHANGED}"
+                f"efc_J holds {len(values)} numbers; {m} x {n} are needed if opt.jacobian is dense. {CHANGED_ADVICE}"
             )
         return mujoco_rows.rows_of_dense(values, m, n, scale)
     count, first, columns = data.efc_J_rownnz, data.efc_J_rowadr, data.efc_J_colind
     columns = columns if columns.ndim == 1 else np.ravel(columns)
     if not len(count) == len(first) == m:
         raise InputError(
-            f"efc_J_rownnz and efc_J_rowadr hold {len(count)} and {len(first)} of {m} rows. {CHANGED} {LAYOUT}"
+            f"efc_J_rownnz and efc_J_rowadr hold {len(count)} and {len(first)} of {m} rows. {CHANGED_ADVICE} "
+            f"{LAYOUT_NOTE}"
         )
-    found = mujoco_rows.rows_of_sparse(values, count, first, columns, scale, n)
-    if isinstance(found, int):
+    result = mujoco_rows.rows_of_sparse(values, count, first, columns, scale, n)
+    if isinstance(result, int):  # The number of the first invalid row.
         raise InputError(
-            f"row {found} of efc_J has {count[found]} entries from place {first[found]} of {len(columns)}, in columns "
-            f"of {n}: it names what is not there. {CHANGED} {LAYOUT}"
+            f"row {result} of efc_J has {count[result]} entries from position {first[result]} of {len(columns)}, in "
+            f"columns of {n}: an index is out of range. {CHANGED_ADVICE} {LAYOUT_NOTE}"
         )
-    if found is None:
+    if result is None:  # Rows with unsorted or repeated columns.
         indptr = np.concatenate([[0], np.cumsum(count, dtype=np.int64)])
-        at = np.arange(indptr[-1]) + np.repeat(first - indptr[:-1], count)
-        whole = sp.csr_array((values[at] * np.repeat(scale, count), columns[at], indptr), shape=(m, n))
-        whole.sum_duplicates()
-        found = (whole.indptr.astype(np.int32), whole.indices.astype(np.int32), whole.data)
-    return found
+        source = np.arange(indptr[-1]) + np.repeat(first - indptr[:-1], count)
+        jac = sp.csr_array((values[source] * np.repeat(scale, count), columns[source], indptr), shape=(m, n))
+        jac.sum_duplicates()
+        result = (jac.indptr.astype(np.int32), jac.indices.astype(np.int32), jac.data)
+    return result
 
 
 @np.errstate(over="ignore", invalid="ignore")
 def _compliance(data: Any) -> FloatArray:
-    """R (m,) [1/kg] where efc_R and 1 / efc_D are not the same: the latter where a copy did not fill the former."""
+    """Return R (m,) [1/kg] if efc_R and 1 / efc_D differ: 1 / efc_D on rows that a copy of the data did not fill.
+
+    Raises
+    ------
+    CapabilityError
+        They differ on a row with a nonzero efc_R, or an efc_D is not above 0.
+    """
     r, inverse = data.efc_R, data.efc_D
     empty = r == 0.0
-    if np.any(inverse <= 0.0) or np.any(np.abs(r * inverse - 1.0)[~empty] > SAME):
+    if np.any(inverse <= 0.0) or np.any(np.abs(r * inverse - 1.0)[~empty] > COMPLIANCE_TOLERANCE):
         raise CapabilityError(
             "efc_R and 1 / efc_D disagree: the softness of these constraints is not known. Run mj_forward on "
             "this MjData, or copy both from where the step ran"
@@ -318,110 +352,144 @@ def _compliance(data: Any) -> FloatArray:
     return np.where(empty, 1.0 / inverse, r)
 
 
-def _before(seen: _Model, data: Any) -> FloatArray:
-    """Velocities (nv,) of the forward pass: qvel, or after a step what those of bodies, made before it, tell."""
+def _velocity_before(seen: _ModelCache, data: Any) -> FloatArray:
+    """Return the velocities (nv,) of the forward pass.
+
+    They are qvel, or after a step they are recovered from the velocities of bodies, which were computed before it.
+
+    Raises
+    ------
+    InputError
+        The body tree is invalid.
+    CapabilityError
+        The velocities cannot be recovered, because joints of one body have dependent axes or the data were changed.
+    """
     parent, bodies = seen.tree
     axis, spatial, v = data.cdof, data.cvel, data.qvel
     gap, size = mujoco_rows.motion_gap(parent, bodies, axis, spatial, v)
     if gap < 0.0:
-        raise InputError(f"dof_bodyid and body_parentid are no tree of these bodies. {OTHER_MODEL}")
-    if gap <= SUMMED * size or (not np.any(spatial) and np.any(data.efc_vel)):  # not filled by a copy
+        raise InputError(f"dof_bodyid and body_parentid are no tree of these bodies. {OTHER_MODEL_ADVICE}")
+    if gap <= SUM_TOLERANCE * size or (
+        not np.any(spatial) and np.any(data.efc_vel)
+    ):  # A copy may not fill cvel.
         return v
-    v = mujoco_rows.motion_before(parent, bodies, axis, spatial, ALIKE)
-    if v is None or not mujoco_rows.motion_gap(parent, bodies, axis, spatial, v)[0] <= SUMMED * size:
+    v = mujoco_rows.motion_before(parent, bodies, axis, spatial, MIN_INDEPENDENT_AXIS_FRACTION)
+    if v is None or not mujoco_rows.motion_gap(parent, bodies, axis, spatial, v)[0] <= SUM_TOLERANCE * size:
         raise CapabilityError(
-            "the velocity before the step cannot be told from cvel and cdof: joints of one body move it alike, or "
+            "the velocity before the step cannot be computed from cvel and cdof: joints of one body move it alike, or "
             "MjData was changed since its forward pass: run mj_forward"
         )
     return v
 
 
-def _speed(model: Any, data: Any, m: int) -> FloatArray:
-    """What J v is held to: efc_vel; nothing (zeros) where the speeds of geoms' surfaces are in it, too."""
+def _expected_velocity(model: Any, data: Any, m: int) -> FloatArray:
+    """Return efc_vel (m,), which J v must equal, or zeros (no check) if it contains velocities of moving surfaces."""
     speed: FloatArray = np.zeros(m) if getattr(model, "flg_surfacevel", False) else data.efc_vel
     return speed
 
 
 def _check_jacobian(velocity: float, row: float, push: float, finite: float) -> None:
-    """J must be the matrix that made what MuJoCo made by it, as far as rounding lets it be: whatever its solver did."""
+    """Raise an error if J does not reproduce MuJoCo's products with it, to rounding.
+
+    Parameters
+    ----------
+    velocity, row, push : float, -
+        Relative differences of J qvel from efc_vel, of J a0 - aref from efc_b, and of J^T f from qfrc_constraint.
+    finite : float
+        0 if all numbers are finite.
+    """
     if finite != 0.0:
         raise InputError(
             "qacc holds numbers that are not finite: the simulation has diverged, or was changed"
         )
-    for found, words in (
+    for difference, names in (
         (velocity, "J qvel and efc_vel"),
         (row, "J qacc_smooth - efc_aref and efc_b"),
         (push, "J^T efc_force and qfrc_constraint"),
     ):
-        if not found <= SUMMED:
+        if not difference <= SUM_TOLERANCE:
             raise CapabilityError(
-                f"{words} differ by {found:.1e} of their size: efc_J is not the Jacobian of this forward pass. "
-                f"{CHANGED} {LAYOUT}"
+                f"{names} differ by {difference:.1e} of their size: efc_J is not the Jacobian of this forward pass. "
+                f"{CHANGED_ADVICE} {LAYOUT_NOTE}"
             )
 
 
-def _blocks(seen: _Model, data: Any, contacts: int, dt: float) -> tuple[Cones, FloatArray, Any]:
-    """Cones, factor of each row, key of each block."""
+def _blocks(seen: _ModelCache, data: Any, contacts: int, dt: float) -> tuple[Cones, FloatArray, Any]:
+    """Return the cones, the factor of each row and the key of each block.
+
+    Raises
+    ------
+    CapabilityError
+        A row has an unknown type.
+    InputError
+        An index is out of range, or a friction loss or coefficient is not a bound.
+    """
     contact = data.contact if contacts else NO_CONTACT
-    most = (*seen.most, contacts, contacts, contacts)
+    type_counts = (*seen.type_counts, contacts, contacts, contacts)
     types, ids, dims, codes = data.efc_type, data.efc_id, contact.dim, _codes(seen.mj)
-    found = mujoco_rows.blocks(
-        types, ids, codes, most, dims, contact.friction, contact.geom, data.efc_frictionloss, dt
+    result = mujoco_rows.blocks(
+        types, ids, codes, type_counts, dims, contact.friction, contact.geom, data.efc_frictionloss, dt
     )
-    if isinstance(found, int):
-        of, which, known = int(types[found]), int(ids[found]), codes.tolist()
-        if of not in known:
-            raise CapabilityError(f"constraint row {found} is of type {of}, which is not known here")
-        there = most[known.index(of)]
-        dim = f", of condim {dims[which]}" if known.index(of) > 4 and 0 <= which < there else ""
+    if isinstance(result, int):  # The number of the first invalid row.
+        kind, which, known = int(types[result]), int(ids[result]), codes.tolist()
+        if kind not in known:
+            raise CapabilityError(f"constraint row {result} is of type {kind}, which is not known here")
+        count = type_counts[known.index(kind)]
+        dim = f", of condim {dims[which]}" if known.index(kind) > 4 and 0 <= which < count else ""
         raise InputError(
-            f"constraint row {found} of {len(types)} is of type {of} and names number {which} of {there}{dim}: "
-            f"that is not there, or has not so many rows. {CHANGED}"
+            f"constraint row {result} of {len(types)} is of type {kind} and names number {which} of {count}{dim}: "
+            f"that is not there, or has not so many rows. {CHANGED_ADVICE}"
         )
-    blocks, scale, key = found
+    blocks, scale, key = result
     if blocks is None:
-        raise InputError(f"efc_frictionloss or a contact's friction is no bound. {CHANGED}")
+        raise InputError(f"efc_frictionloss or a contact's friction is no bound. {CHANGED_ADVICE}")
     return Cones._from_blocks(blocks), scale, key
 
 
-def _words(mj: Any, model: Any, held: IntArray, m: int, joined: int = mujoco_rows.JOINED) -> list[str]:
-    types, ids, contacts = held[:m].tolist(), held[m : 2 * m].tolist(), (len(held) - 2 * m) // 3
-    dim = held[2 * m : 2 * m + contacts]
-    geom = held[2 * m + contacts : 2 * m + 3 * contacts].reshape(-1, 2)
+def _block_names(mj: Any, model: Any, ints: IntArray, m: int, joined: int = mujoco_rows.JOINED) -> list[str]:
+    """Return the names of the blocks of m rows.
+
+    `ints` holds efc_type (m,), efc_id (m,), and dim (c,) and geom (c, 2) of the contacts. An equality of more than
+    `joined` rows has a block for each row.
+    """
+    types, ids, contacts = ints[:m].tolist(), ints[m : 2 * m].tolist(), (len(ints) - 2 * m) // 3
+    dim = ints[2 * m : 2 * m + contacts]
+    geom = ints[2 * m + contacts : 2 * m + 3 * contacts].reshape(-1, 2)
     kinds = mj.mjtConstraint
     names: list[str] = []
     i = 0
     while i < len(types):
-        of, which = types[i], ids[i]
+        row_type, which = types[i], ids[i]
         size = 1
-        if of == kinds.mjCNSTR_EQUALITY:
-            while i + size < len(types) and types[i + size] == of and ids[i + size] == which:
+        if row_type == kinds.mjCNSTR_EQUALITY:
+            while i + size < len(types) and types[i + size] == row_type and ids[i + size] == which:
                 size += 1
             name = _name(mj, model, "EQUALITY", which, "equality")
             names += [name] if size <= joined else [f"{name}, edge {edge}" for edge in range(size)]
-        elif of == kinds.mjCNSTR_FRICTION_DOF:
+        elif row_type == kinds.mjCNSTR_FRICTION_DOF:
             joint = int(model.dof_jntid[which])
             axis = which - int(model.jnt_dofadr[joint])
-            turns = int(model.jnt_type[joint]) < int(mj.mjtJoint.mjJNT_SLIDE)
-            names.append(f"friction of {_name(mj, model, 'JOINT', joint, 'joint')}{f', axis {axis}' * turns}")
-        elif of == kinds.mjCNSTR_FRICTION_TENDON:
+            is_rotational = int(model.jnt_type[joint]) < int(mj.mjtJoint.mjJNT_SLIDE)
+            suffix = f", axis {axis}" if is_rotational else ""
+            names.append(f"friction of {_name(mj, model, 'JOINT', joint, 'joint')}{suffix}")
+        elif row_type == kinds.mjCNSTR_FRICTION_TENDON:
             names.append(f"friction of {_name(mj, model, 'TENDON', which, 'tendon')}")
-        elif of in (kinds.mjCNSTR_LIMIT_JOINT, kinds.mjCNSTR_LIMIT_TENDON):
-            word = "joint" if of == kinds.mjCNSTR_LIMIT_JOINT else "tendon"
+        elif row_type in (kinds.mjCNSTR_LIMIT_JOINT, kinds.mjCNSTR_LIMIT_TENDON):
+            word = "joint" if row_type == kinds.mjCNSTR_LIMIT_JOINT else "tendon"
             names.append(f"limit of {_name(mj, model, word.upper(), which, word)}")
         else:
             sides = [_name(mj, model, "GEOM", g, "geom") if g >= 0 else "flex" for g in geom[which].tolist()]
             name = f"contact {which} ({', '.join(side.removeprefix('geom ') for side in sides)})"
-            if of == kinds.mjCNSTR_CONTACT_PYRAMIDAL:
+            if row_type == kinds.mjCNSTR_CONTACT_PYRAMIDAL:
                 size = 2 * (int(dim[which]) - 1)
                 names += [f"{name}, edge {edge}" for edge in range(size)]
             else:
-                size = int(dim[which]) if of == kinds.mjCNSTR_CONTACT_ELLIPTIC else 1
+                size = int(dim[which]) if row_type == kinds.mjCNSTR_CONTACT_ELLIPTIC else 1
                 names.append(name)
         i += size
     return names
 
 
 def _name(mj: Any, model: Any, kind: str, which: int, word: str) -> str:
-    given = mj.mj_id2name(model, getattr(mj.mjtObj, f"mjOBJ_{kind}"), which)
-    return f"{word} {given or which}"
+    own_name = mj.mj_id2name(model, getattr(mj.mjtObj, f"mjOBJ_{kind}"), which)
+    return f"{word} {own_name or which}"

@@ -1,8 +1,8 @@
-"""Problems in NumPy archives (.npz): our own format, the plain box format, the benchmark generator's.
+"""Read and write problems in NumPy archives (.npz).
 
-Nothing in an archive is executed or unpickled. What all entries take in memory is added up from their headers
-before the first is read, and the parts are checked against each other before a kernel sees them. `docs/formats.md`
-describes each entry.
+Three formats are read: our own, the plain box format, and that of a benchmark generator. Nothing in an archive is
+executed or unpickled. The memory for all entries is computed from their headers before the first entry is read, and
+the arrays are checked against each other before a kernel uses them. `docs/formats.md` describes each entry.
 """
 
 from __future__ import annotations
@@ -26,27 +26,30 @@ from lavender.base.arrays import FloatArray, as_array, check_int
 from lavender.base.errors import InputError
 from lavender.base.lazy_import import issparse
 from lavender.base.lazy_import import sparse as sp
-from lavender.io.stored import MAX_BYTES, NUMBER, Budget, Stored, write_arrays
+from lavender.io.stored import MAX_BYTES, NUMBER_BYTES, Budget, Stored, write_arrays
 from lavender.problem import PRECISIONS, Problem, check_problem
 from lavender.problem.cones import Cones, kinds_of
 from lavender.problem.generalized import Generalized
 from lavender.problem.program import program_of_matrix
 from lavender.problem.rows import Rows
 
-VERSION = 1
-MAX_HEADER = 10_000  # bytes of a .npy header: 100 are usual
-MAX_ENTRIES = 1000  # of an archive: a problem has at most 30
-JSON_GROWTH = 40  # bytes of Python objects that a byte of JSON text can make; nested empty lists make 24
-PACKED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # what NumPy writes; others choose the memory they take
+FORMAT_VERSION = 1
+MAX_NPY_HEADER_BYTES = 10_000  # Longest accepted .npy header; 100 bytes are usual.
+MAX_ARCHIVE_ENTRIES = 1000  # Largest accepted number of entries in an archive; a problem has at most 30.
+# Upper bound of the bytes of Python objects per byte of JSON text; nested empty lists need 24.
+JSON_BYTES_PER_BYTE = 40
+# Compression methods that NumPy writes. With other methods, the archive determines how much memory they use.
+ACCEPTED_COMPRESSION = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 CONES = tuple(f"cones_{f.name}" for f in fields(Cones) if f.name != "rolling")
 ROWS = tuple(f"rows_{f.name}" for f in fields(Rows) if f.name != "copy")
-GENERAL = (
+GENERALIZED = (
     *(f"general_{name}_{part}" for name in ("jac", "mass") for part in ("data", "indices", "indptr")),
     "general_v_free",
 )
 CSR = ("A_data", "A_indices", "A_indptr", "A_shape")
 OPTIONAL = ("cones_rolling", "guess", "key", "impulse")
-BROKEN = (
+#: Exceptions that zipfile and NumPy raise for damaged archives.
+READ_ERRORS = (
     zipfile.BadZipFile,
     zlib.error,
     struct.error,
@@ -66,7 +69,7 @@ BROKEN = (
 
 @dataclass(frozen=True)
 class _Header:
-    """What the beginning of a .npy says, and the stream behind it."""
+    """Header of a .npy entry, and the stream of its data."""
 
     stream: IO[bytes]
     dtype: np.dtype[Any]
@@ -75,9 +78,11 @@ class _Header:
 
     @property
     def count(self) -> int:
+        """Number of elements."""
         return math.prod(self.shape)
 
     def read(self) -> np.ndarray:
+        """Read the array; raise EOFError if the stream is too short or too long."""
         size = self.count * self.dtype.itemsize
         raw = self.stream.read(size)
         if len(raw) != size or self.stream.read(1):
@@ -86,7 +91,7 @@ class _Header:
 
 
 class Archive(Mapping[str, np.ndarray]):
-    """Arrays of an .npz by name, each read once when asked for."""
+    """Arrays of an .npz by name; each is read once, at its first access."""
 
     def __init__(self, path: str | os.PathLike[str], max_bytes: int = MAX_BYTES) -> None:
         self.path = path
@@ -95,7 +100,7 @@ class Archive(Mapping[str, np.ndarray]):
         budget = Budget(max_bytes)
         try:
             self._zip = zipfile.ZipFile(path)
-        except BROKEN as error:
+        except READ_ERRORS as error:
             raise InputError(f"{path} is not a complete .npz archive ({error}); save it again") from None
         try:
             self._open_entries(budget)
@@ -104,9 +109,10 @@ class Archive(Mapping[str, np.ndarray]):
             raise
 
     def _open_entries(self, budget: Budget) -> None:
+        """Read the headers of all entries and subtract their sizes in memory from the budget."""
         entries = self._zip.infolist()
-        if len(entries) > MAX_ENTRIES:
-            raise InputError(f"{self.path} holds {len(entries)} entries, more than {MAX_ENTRIES}")
+        if len(entries) > MAX_ARCHIVE_ENTRIES:
+            raise InputError(f"{self.path} holds {len(entries)} entries, more than {MAX_ARCHIVE_ENTRIES}")
         for entry in entries:
             name = entry.filename.removesuffix(".npy")
             if name == entry.filename or name in self._headers:
@@ -114,15 +120,15 @@ class Archive(Mapping[str, np.ndarray]):
                     f"{self.path} holds {entry.filename!r}; an .npz holds one .npy under each name"
                 )
             try:
-                if entry.compress_type not in PACKED:
+                if entry.compress_type not in ACCEPTED_COMPRESSION:
                     raise ValueError(f"it is packed by method {entry.compress_type}; deflate is read")
                 self._headers[name] = _npy_header(self._zip.open(entry), entry.file_size)
-            except BROKEN as error:
+            except READ_ERRORS as error:
                 raise InputError(f"{self.path}: entry {name!r} cannot be read: {error}") from None
         for name, header in self._headers.items():
             width = header.dtype.itemsize
             if header.dtype.kind in "buif":
-                width = JSON_GROWTH if name == "meta" else max(width, NUMBER)
+                width = JSON_BYTES_PER_BYTE if name == "meta" else max(width, NUMBER_BYTES)
             budget.spend(header.count * width, f"{self.path}: entry {name!r}")
 
     def __getitem__(self, name: str) -> np.ndarray:
@@ -135,7 +141,7 @@ class Archive(Mapping[str, np.ndarray]):
             try:
                 with header.stream:
                     self._arrays[name] = header.read()
-            except BROKEN as error:
+            except READ_ERRORS as error:
                 raise InputError(f"{self.path}: entry {name!r} cannot be read: {error}") from None
         return self._arrays[name]
 
@@ -149,13 +155,13 @@ class Archive(Mapping[str, np.ndarray]):
         return len(self._headers)
 
     def close(self) -> None:
-        """No entry is read any more."""
+        """Close the archive; no entry can be read afterwards."""
         for header in self._headers.values():
             header.stream.close()
         self._zip.close()
 
     def scalar(self, name: str) -> Any:
-        """The one value of an entry."""
+        """Return the single value of an entry."""
         value = self[name]
         if value.size != 1:
             raise InputError(f"{self.path}: entry {name!r} has shape {value.shape}; one value is needed")
@@ -163,10 +169,10 @@ class Archive(Mapping[str, np.ndarray]):
 
 
 def _npy_header(stream: IO[bytes], size: int) -> _Header:
-    """Of an array of numbers or text; `size` is what the archive declares for header and data together."""
-    if npy.read_magic(stream) != (1, 0):  # later versions are for long names of fields
+    """Read the header of an array of numbers or text; `size` [bytes] is the declared size of header and data."""
+    if npy.read_magic(stream) != (1, 0):  # Later versions are for long field names.
         raise ValueError("it is a record array, or none at all; plain numbers (.npy, version 1.0) are needed")
-    shape, fortran, dtype = npy.read_array_header_1_0(stream, max_header_size=MAX_HEADER)
+    shape, fortran, dtype = npy.read_array_header_1_0(stream, max_header_size=MAX_NPY_HEADER_BYTES)
     if dtype.kind not in "buifUS":
         raise ValueError(
             f"it has dtype {dtype}; objects are never read from a file, plain numbers are needed"
@@ -178,7 +184,13 @@ def _npy_header(stream: IO[bytes], size: int) -> _Header:
 
 
 def read(path: str | os.PathLike[str], *, max_bytes: int = MAX_BYTES) -> Stored:
-    """A problem from an .npz archive of any layout that `docs/formats.md` lists."""
+    """Read a problem from an .npz archive of any layout that `docs/formats.md` lists.
+
+    Raises
+    ------
+    InputError
+        The archive is damaged, of another layout, or larger than `max_bytes` in memory.
+    """
     archive = Archive(path, max_bytes)
     try:
         if "lavender_format" in archive:
@@ -202,12 +214,12 @@ def read(path: str | os.PathLike[str], *, max_bytes: int = MAX_BYTES) -> Stored:
 
 
 def write(problem: Problem, path: str | os.PathLike[str], *, impulse: Any = None) -> None:
-    """Save a problem in our own format, and beside it an impulse (m,) [N s], e.g. its solution.
+    """Write a problem in our own format, optionally with an impulse (m,) [N s], for example its solution.
 
     `read(path).problem == problem`, bit for bit.
     """
     check_problem(problem)
-    arrays: dict[str, Any] = {"lavender_format": np.int64(VERSION), "b": problem.b}
+    arrays: dict[str, Any] = {"lavender_format": np.int64(FORMAT_VERSION), "b": problem.b}
     for name in CONES:
         arrays[name] = getattr(problem.cones, name.removeprefix("cones_"))
     if problem.cones.has_rolling:
@@ -256,17 +268,18 @@ def write(problem: Problem, path: str | os.PathLike[str], *, impulse: Any = None
 
 
 def _read_own(archive: Archive) -> Stored:
+    """Read a problem in our own format."""
     version = archive.scalar("lavender_format")
-    if version != VERSION or isinstance(version, bool):
+    if version != FORMAT_VERSION or isinstance(version, bool):
         raise InputError(
-            f"lavender_format is {version!r}; this lavender reads {VERSION}: update it, or save again"
+            f"lavender_format is {version!r}; this lavender reads {FORMAT_VERSION}: update it, or save again"
         )
     meta = _meta(archive)
     operator = {
         "dense": ("A",),
         "csr": CSR,
         "rows": (*ROWS, "compliance"),
-        "generalized": (*GENERAL, "compliance"),
+        "generalized": (*GENERALIZED, "compliance"),
     }[meta["operator"]]
     needed = ("lavender_format", "meta", "b", *CONES, *operator)
     _check_entries(archive, needed, OPTIONAL)
@@ -276,22 +289,25 @@ def _read_own(archive: Archive) -> Stored:
     b, ptr = archive["b"], archive["cones_ptr"]
     if b.ndim != 1:
         raise InputError(f"b has shape {b.shape}; one dimension is needed")
-    if ptr.ndim != 1 or len(ptr) == 0 or ptr[-1] != len(b):  # before bounds of as many rows are made
+    # This is checked before bounds of as many rows are allocated.
+    if ptr.ndim != 1 or len(ptr) == 0 or ptr[-1] != len(b):
         raise InputError(f"b has shape {b.shape}; cones.ptr must end with the number of its rows")
-    more: dict[str, Any] = {name: archive[name] for name in ("guess", "key") if name in archive}
-    more["precision"] = meta.get("precision", "float64")
+    optional_parts: dict[str, Any] = {name: archive[name] for name in ("guess", "key") if name in archive}
+    optional_parts["precision"] = meta.get("precision", "float64")
     if meta["operator"] == "rows":
         parts: dict[str, Any] = {name.removeprefix("rows_"): archive[name] for name in ROWS}
-        more["rows"] = Rows(**parts)
-        more["compliance"] = archive["compliance"]
+        optional_parts["rows"] = Rows(**parts)
+        optional_parts["compliance"] = archive["compliance"]
     elif meta["operator"] == "generalized":
-        more["generalized"] = _generalized(archive, meta["dof_names"])
-        more["compliance"] = archive["compliance"]
+        optional_parts["generalized"] = _generalized(archive, meta["dof_names"])
+        optional_parts["compliance"] = archive["compliance"]
     else:
-        more["matrix"] = _matrix(archive)
-    given = [*CONES, *(["cones_rolling"] if "cones_rolling" in archive else [])]
-    cones = Cones(**{name.removeprefix("cones_"): archive[name] for name in given})
-    problem = Problem(b, cones, friction=meta["friction"], names=meta["names"], name=meta["name"], **more)
+        optional_parts["matrix"] = _matrix(archive)
+    entries = [*CONES, *(["cones_rolling"] if "cones_rolling" in archive else [])]
+    cones = Cones(**{name.removeprefix("cones_"): archive[name] for name in entries})
+    problem = Problem(
+        b, cones, friction=meta["friction"], names=meta["names"], name=meta["name"], **optional_parts
+    )
     if "program" in meta:
         n = check_int("program", meta["program"], high=problem.m)
         problem = replace(problem, qp=program_of_matrix(problem.csr, problem.b, problem.cones, n), copy=False)
@@ -299,6 +315,7 @@ def _read_own(archive: Archive) -> Stored:
 
 
 def _meta(archive: Archive) -> dict[str, Any]:
+    """Read and check the entry 'meta', a JSON object."""
     try:
         meta = json.loads(archive["meta"].astype(np.uint8, casting="safe").tobytes())
     except (ValueError, TypeError, RecursionError) as error:
@@ -324,10 +341,11 @@ def _meta(archive: Archive) -> dict[str, Any]:
 
 
 def _generalized(archive: Archive, names: list[str] | None) -> Generalized:
+    """Build the generalised form from its entries."""
     v_free = archive["general_v_free"]
     n, m = v_free.size, archive["b"].size
     jac, mass = (
-        compressed(
+        checked_csr(
             archive[f"general_{name}_indptr"],
             archive[f"general_{name}_indices"],
             archive[f"general_{name}_data"],
@@ -344,19 +362,20 @@ def _is_names(value: Any) -> bool:
 
 
 def _check_entries(archive: Archive, needed: Collection[str], optional: Collection[str]) -> None:
+    """Raise InputError if entries are missing or unknown."""
     missing = [name for name in needed if name not in archive]
     if missing:
         raise InputError(f"entries {', '.join(missing)} are missing; the file is not complete")
     unknown = [name for name in archive if name not in needed and name not in optional]
     if unknown:
-        raise InputError(f"entries {', '.join(unknown)} do not belong to format {VERSION}")
+        raise InputError(f"entries {', '.join(unknown)} do not belong to format {FORMAT_VERSION}")
 
 
 # -- plain box format and the benchmark generator's -----------------------------------------------
 
 
 def _read_box(archive: Archive) -> Stored:
-    """w = A l - b, lo <= l <= hi complementary to w; rows of a friction cone are one contact."""
+    """Read the box format: w = A l - b, lo <= l <= hi complementary to w; the rows of a friction cone are a contact."""
     b = archive["b"]
     if b.ndim != 1:
         raise InputError(f"b has shape {b.shape}; one dimension is needed")
@@ -373,13 +392,15 @@ def _read_box(archive: Archive) -> Stored:
 
 
 def _box_cones(archive: Archive, m: int) -> Cones:
+    """Build the cones of the box format from bounds and, if given, contacts of 1 to 3 rows."""
     lower, upper = (as_array(f"entry {name!r}", archive[name], (m,), finite=False) for name in ("lo", "hi"))
     if "cone_start" not in archive or archive["cone_start"].size == 0:
         return Cones.bounded(lower, upper)
-    whole = {name: archive[name] for name in ("cone_start", "cone_dim")}
-    count = whole["cone_start"].size
+    integers = {name: archive[name] for name in ("cone_start", "cone_dim")}
+    count = integers["cone_start"].size
     start, size = (
-        as_array(f"entry {name!r}", x, (count,), dtype=np.int32).astype(np.int64) for name, x in whole.items()
+        as_array(f"entry {name!r}", x, (count,), dtype=np.int32).astype(np.int64)
+        for name, x in integers.items()
     )
     mu = as_array("entry 'cone_mu'", archive["cone_mu"], (count,))
     order = np.argsort(start)
@@ -389,7 +410,7 @@ def _box_cones(archive: Archive, m: int) -> Cones:
         raise InputError(
             f"cone_start and cone_dim must name cones of 1 to 3 rows that do not overlap, within the {m} rows"
         )
-    inside = np.zeros(m, bool)  # rows that do not begin a block
+    inside = np.zeros(m, bool)  # Rows that do not begin a block.
     for s, e in zip(start, end, strict=True):
         inside[s + 1 : e] = True
     first = np.flatnonzero(~inside)
@@ -407,7 +428,7 @@ def _box_cones(archive: Archive, m: int) -> Cones:
 
 
 def _read_generated(archive: Archive) -> Stored:
-    """Layout of a benchmark generator: A, b, and `kind` lcp (l >= 0), free, or cone (3 rows per contact)."""
+    """Read the layout of a benchmark generator: A, b, and `kind` lcp (l >= 0), free, or cone (3 rows per contact)."""
     kind = archive.scalar("kind")
     b = archive["b"]
     name = Path(archive.path).stem
@@ -429,22 +450,28 @@ def _vector(archive: Archive, name: str, problem: Problem) -> FloatArray | None:
 
 
 def _matrix(archive: Archive) -> Any:
-    """Dense `A`, or compressed rows whose every index has been checked."""
+    """Return the dense `A`, or compressed rows with checked indices."""
     if "A" in archive:
         return archive["A"]
     m = archive["b"].size
     shape = tuple(archive["A_shape"].ravel().tolist())
     if shape != (m, m):
         raise InputError(f"A_shape is {shape}; ({m}, {m}) is needed, as b has {m} rows")
-    return compressed(archive["A_indptr"], archive["A_indices"], archive["A_data"], m, m)
+    return checked_csr(archive["A_indptr"], archive["A_indices"], archive["A_data"], m, m)
 
 
-def compressed(indptr: np.ndarray, indices: np.ndarray, data: np.ndarray, m: int, n: int) -> sp.csr_array:
-    """CSR matrix (m, n) of arrays from a file; `data` may be longer than the pointers say."""
-    for what, x, kinds in (("pointers", indptr, "iu"), ("indices", indices, "iu"), ("values", data, "buif")):
+def checked_csr(indptr: np.ndarray, indices: np.ndarray, data: np.ndarray, m: int, n: int) -> sp.csr_array:
+    """Build a CSR matrix (m, n) from arrays of a file, with checked indices; `data` may be longer than needed.
+
+    Raises
+    ------
+    InputError
+        An array has the wrong type or length, or an index is out of range.
+    """
+    for name, x, kinds in (("pointers", indptr, "iu"), ("indices", indices, "iu"), ("values", data, "buif")):
         if x.ndim != 1 or x.dtype.kind not in kinds:
             raise InputError(
-                f"the {what} of a compressed matrix have dtype {x.dtype} and shape {x.shape}; "
+                f"the {name} of a compressed matrix have dtype {x.dtype} and shape {x.shape}; "
                 f"one dimension of {'whole ' if kinds == 'iu' else ''}numbers is needed"
             )
     if len(indptr) != m + 1 or indptr[0] != 0 or np.any(indptr[1:] < indptr[:-1]):

@@ -1,12 +1,12 @@
-"""Pinocchio's model and constraint models as a problem in generalised coordinates.
+"""Convert a Pinocchio model and its constraint models to a problem in generalised coordinates.
 
     w = J v+ - target + compliance lambda,   v+ = v* + M^-1 J^T lambda,   v* = v + dt aba(q, v, tau)
 
-M is `crba`'s, J each constraint's own Jacobian, rows in the order of the constraint models. In one step of dt
+M is computed by `crba`, J by each constraint model; rows are in the order of the constraint models. For one step dt:
 
-    anchors (point, frame)   all rows free,           target = -correction error / dt + their desired velocity
-    point contacts           Coulomb's cone, z first, target = -gap / dt along z, `correction` of it where gap < 0,
-                             + its desired velocity
+    anchors (point, frame)   all rows free,           target = -correction error / dt + desired velocity
+    point contacts           Coulomb's cone, z first, target = -gap / dt along z, times `correction` if gap < 0,
+                             + desired velocity
     joint limits             lambda >= 0,             the same with the distance to the limit
     joint friction           |lambda| <= dt times the model's limits, target = 0
 
@@ -26,9 +26,12 @@ from lavender.base.errors import CapabilityError, InputError, LavenderError
 from lavender.problem import Problem
 from lavender.problem.cones import Cones
 
-OTHER_MODEL = "A model was changed, or the data are of another one: give data made from this model"
-UNIT = 1e-6  # -, by which quaternions may be off: J of another is no velocity's
-UNSEEN = 1e-9  # -, of |M| |a| + |tau - h|: M a must be what aba solved for
+OTHER_MODEL_ADVICE = "A model was changed, or the data are of another one: give data made from this model"
+# Largest accepted deviation of a quaternion from unit length and of a matrix from a rotation [-]. With a larger one,
+# J does not map joint velocities to velocities.
+ROTATION_TOLERANCE = 1e-6
+# Largest accepted difference of M a and tau - h, relative to |M| |a| + |tau - h| [-]. Above it, aba used another M.
+ACCELERATION_TOLERANCE = 1e-9
 
 
 def from_pinocchio(
@@ -46,16 +49,16 @@ def from_pinocchio(
     correction: float = 0.2,
     name: str = "pinocchio",
 ) -> Problem:
-    """The constraint problem of one step of a Pinocchio model.
+    """Return the constraint problem of one step of a Pinocchio model.
 
     Parameters
     ----------
     model : pinocchio.Model
     data : pinocchio.Data
-        Computed anew at q and v.
+        It is recomputed at q and v.
     constraint_models, constraint_datas : sequence
-        Of Pinocchio 4: anchors, contacts, joint limits, joint friction, plain or as `ConstraintModel`; calculated anew,
-        in data of their own.
+        Anchors, contacts, joint limits and joint friction of Pinocchio 4, plain or as `ConstraintModel`. They are
+        evaluated in new data.
     dt : float, s
     q : (nq,)
     v : (nv,) m/s, rad/s
@@ -64,9 +67,9 @@ def from_pinocchio(
         Joint efforts; default: none.
     friction : {"coulomb", "cone"}
     compliance : scalar or (m,) 1/kg, optional
-        Default: none. What Pinocchio's constraint models hold of their own is not read.
+        Default: none. The compliance of Pinocchio's constraint models is not read.
     correction : float, default 0.2
-        Share of a position error that the step takes back.
+        Fraction of a position error that the step corrects.
 
     Returns
     -------
@@ -75,29 +78,29 @@ def from_pinocchio(
     Raises
     ------
     InputError
-        Pinocchio cannot be imported, or what is given does not fit.
+        Pinocchio cannot be imported, or an argument has the wrong type, size or value.
     CapabilityError
-        A constraint model of another kind; accelerations that are not those of M.
+        A constraint model of another kind, or accelerations that do not belong to M.
     """
     try:
         import pinocchio as pin
     except ImportError:
         raise InputError("pinocchio cannot be imported: pip install pin; a model comes from it") from None
-    dt, correction = _check_given(constraint_models, constraint_datas, dt, correction)
+    dt, correction = _check_arguments(constraint_models, constraint_datas, dt, correction)
     _check_model(pin, model, data)
     nv = int(model.nv)
     q = np.array(as_array("q", q, (int(model.nq),)))
     v = np.array(as_array("v", v, (nv,), unit="m/s, rad/s"))
     tau = np.array(as_array("tau", 0.0 if tau is None else tau, (nv,), unit="N, N m"))
-    if not pin.isNormalized(model, q, UNIT):
+    if not pin.isNormalized(model, q, ROTATION_TOLERANCE):
         raise InputError(
             "q holds a rotation that is none: pinocchio.normalize(model, q) makes quaternions unit ones"
         )
     mass, a = _mass_and_acceleration(pin, model, data, q, v, tau)
-    with told("Pinocchio", OTHER_MODEL):
+    with wrap_engine_errors("Pinocchio", OTHER_MODEL_ADVICE):
         pin.forwardKinematics(model, data, q, v)
         pin.computeJointJacobians(model, data, q)
-        data.q_in = q  # where joint limits are measured; no algorithm sets it
+        data.q_in = q  # Joint limits are evaluated at q_in, and no algorithm sets it.
     pairs = zip(constraint_models, constraint_datas, strict=True)
     rows, target, cones, names = _constraints(model, data, pairs, dt, correction)
     return Problem.from_jacobian(
@@ -116,45 +119,48 @@ def from_pinocchio(
 def _constraints(
     model: Any, data: Any, pairs: Iterable[Any], dt: float, correction: float
 ) -> tuple[Any, Any, Cones, list[str]]:
-    """J (m, nv), targets (m,), blocks and their names of all constraints, one after the other."""
+    """Return J (m, nv), targets (m,), the blocks and their names of all constraints, one after the other."""
     nv = int(model.nv)
     rows: list[Any] = [np.zeros((0, nv))]
     targets: list[Any] = [np.zeros(0)]
     cones, names = Cones.free(0), []
-    for i, (wrapped, kept) in enumerate(pairs):
-        model_of = _plain(wrapped)
-        _check_constraint(i, model, model_of, _plain(kept))
-        with told("Pinocchio", OTHER_MODEL):
-            data_of = model_of.createData()  # of this model's sizes, whatever came with it
+    for i, (wrapped_model, wrapped_data) in enumerate(pairs):
+        model_of = _unwrap(wrapped_model)
+        _check_constraint(i, model, model_of, _unwrap(wrapped_data))
+        with wrap_engine_errors("Pinocchio", OTHER_MODEL_ADVICE):
+            data_of = model_of.createData()  # New data have the sizes of this model.
             model_of.calc(model, data, data_of)
             jac = np.array(model_of.jacobian(model, data, data_of)).reshape(-1, nv)
-        more, target, order = _constraint(model_of, data_of, len(jac), dt, correction)
+        own_cones, target, order = _constraint(model_of, data_of, len(jac), dt, correction)
         if hasattr(model_of, "desired_constraint_velocity"):
             target = target + np.array(model_of.desired_constraint_velocity)[order]
         rows.append(jac[order])
         targets.append(target)
-        cones = cones + more
+        cones = cones + own_cones
         word = f"{type(model_of).__name__.removesuffix('ConstraintModel')} {i}"
-        names += [word] if more.n_blocks == 1 else [f"{word}, row {k}" for k in range(more.n_blocks)]
+        blocks = own_cones.n_blocks
+        names += [word] if blocks == 1 else [f"{word}, row {k}" for k in range(blocks)]
     return np.concatenate(rows), np.concatenate(targets), cones, names
 
 
-def _check_given(models: Any, datas: Any, dt: Any, correction: Any) -> tuple[float, float]:
-    for word, given in (("models", models), ("data", datas)):
-        if not (hasattr(given, "__len__") and hasattr(given, "__iter__")):
-            raise InputError(f"constraint {word}: got a {type(given).__name__}; a sequence is needed")
+def _check_arguments(models: Any, datas: Any, dt: Any, correction: Any) -> tuple[float, float]:
+    """Check the sequences of constraints; return dt and the correction as floats."""
+    for word, sequence in (("models", models), ("data", datas)):
+        if not (hasattr(sequence, "__len__") and hasattr(sequence, "__iter__")):
+            raise InputError(f"constraint {word}: got a {type(sequence).__name__}; a sequence is needed")
     if len(models) != len(datas):
         raise InputError(f"{len(datas)} constraint data for {len(models)} models; one for each is needed")
     return check_float("dt", dt, above=0.0), check_float("correction", correction, low=0.0, high=1.0)
 
 
 def _mass_and_acceleration(pin: Any, model: Any, data: Any, q: Any, v: Any, tau: Any) -> tuple[Any, Any]:
-    with told("Pinocchio", OTHER_MODEL):
+    """Return M (nv, nv) and the free acceleration (nv,); raise CapabilityError if they do not belong together."""
+    with wrap_engine_errors("Pinocchio", OTHER_MODEL_ADVICE):
         a = np.array(pin.aba(model, data, q, v, tau))
         force = tau - np.array(pin.nle(model, data, q, v))
         upper = np.triu(np.array(pin.crba(model, data, q)))
     mass = upper + np.triu(upper, 1).T
-    if np.abs(mass @ a - force).max(initial=0.0) > UNSEEN * float(
+    if np.abs(mass @ a - force).max(initial=0.0) > ACCELERATION_TOLERANCE * float(
         (np.abs(mass) @ np.abs(a) + np.abs(force)).max(initial=0.0)
     ):
         raise CapabilityError(
@@ -164,32 +170,40 @@ def _mass_and_acceleration(pin: Any, model: Any, data: Any, q: Any, v: Any, tau:
 
 
 @contextmanager
-def told(engine: str, advice: str) -> Iterator[None]:
-    """What an engine raises about data that do not fit, as an error of ours."""
+def wrap_engine_errors(engine: str, advice: str) -> Iterator[None]:
+    """Convert errors that an engine raises about unsuitable data to InputError with `advice`."""
     try:
         yield
     except LavenderError:
         raise
     except (RuntimeError, ValueError, TypeError, IndexError) as error:
-        words = " ".join(str(error).split())
-        raise InputError(f"{engine} cannot take these: {words:.300}. {advice}") from None
+        message = " ".join(str(error).split())
+        raise InputError(f"{engine} cannot take these: {message:.300}. {advice}") from None
 
 
 def _check_model(pin: Any, model: Any, data: Any) -> None:
-    """A model and its data, and every joint's place before Pinocchio follows it: its library checks nothing."""
+    """Check a model, its data and the indices of every joint, because Pinocchio does not check them.
+
+    Raises
+    ------
+    InputError
+        Types, sizes or indices do not agree, or a placement is not a rotation.
+    CapabilityError
+        The model has mimicking joints.
+    """
     if not isinstance(model, pin.Model) or not isinstance(data, pin.Data):
         raise InputError(
             f"got a {type(model).__name__} and a {type(data).__name__}; a pinocchio.Model and its Data are needed"
         )
     if len(model.mimicking_joints):
         raise CapabilityError(
-            f"{len(model.mimicking_joints)} joints mimic others, of which Pinocchio's aba knows nothing"
+            f"{len(model.mimicking_joints)} joints mimic others, which Pinocchio's aba does not support"
         )
     n, nv, nq = int(model.njoints), int(model.nv), int(model.nq)
     lists = ("joints", "parents", "idx_vs", "nvs", "idx_qs", "nqs", "inertias", "jointPlacements")
     short = [name for name in lists if len(getattr(model, name)) != n]
     if short or n < 1:
-        raise InputError(f"{n} joints, and another number of {', '.join(short)}. {OTHER_MODEL}")
+        raise InputError(f"{n} joints, and another number of {', '.join(short)}. {OTHER_MODEL_ADVICE}")
     at_v = at_q = 0
     for i in range(1, n):
         joint = model.joints[i]
@@ -201,7 +215,7 @@ def _check_model(pin: Any, model: Any, data: Any) -> None:
         ):
             raise InputError(
                 f"joint {i} has parent {model.parents[i]} and (idx_v, nv, idx_q, nq) = {places}; a parent before it "
-                f"and ({at_v}, {joint.nv}, {at_q}, {joint.nq}) are needed. {OTHER_MODEL}"
+                f"and ({at_v}, {joint.nv}, {at_q}, {joint.nq}) are needed. {OTHER_MODEL_ADVICE}"
             )
         if not _is_rotation(model.jointPlacements[i].rotation):
             raise InputError(f"the placement of joint {i} holds a rotation that is none")
@@ -209,17 +223,25 @@ def _check_model(pin: Any, model: Any, data: Any) -> None:
     sizes = {len(data.oMi), len(data.v), len(data.f)}
     if (at_v, at_q) != (nv, nq) or sizes != {n} or np.shape(data.M) != (nv, nv):
         raise InputError(
-            f"the data hold {len(data.oMi)} joints, the model {n} of {nv} velocities. {OTHER_MODEL}"
+            f"the data hold {len(data.oMi)} joints, the model {n} of {nv} velocities. {OTHER_MODEL_ADVICE}"
         )
     if not model.check(data):
         raise InputError(
             "Pinocchio's own check of the model and its data fails: the joints of a subtree must follow one another. "
-            f"{OTHER_MODEL}"
+            f"{OTHER_MODEL_ADVICE}"
         )
 
 
 def _check_constraint(i: int, model: Any, constraint: Any, data: Any) -> None:
-    """A constraint's joints are those of this model, and its data of its kind."""
+    """Check that the joints of constraint i belong to this model and its data to its kind.
+
+    Raises
+    ------
+    InputError
+        They do not, or a placement is not a rotation.
+    CapabilityError
+        A frame anchor has a desired offset.
+    """
     kind = type(constraint).__name__
     if not hasattr(constraint, "createData") or not hasattr(constraint, "calc"):
         raise InputError(f"constraint model {i} is a {kind}; one of Pinocchio's is needed")
@@ -237,28 +259,34 @@ def _check_constraint(i: int, model: Any, constraint: Any, data: Any) -> None:
         if hasattr(constraint, name):
             joints += list(getattr(constraint, name)())
     velocities = list(constraint.getActiveDofs()) if hasattr(constraint, "getActiveDofs") else []
-    of = int(getattr(constraint, "nv", model.nv))
+    n_velocities = int(getattr(constraint, "nv", model.nv))
     if (
         any(not 0 <= j < model.njoints for j in joints)
         or any(not 0 <= k < model.nv for k in velocities)
-        or of != model.nv
+        or n_velocities != model.nv
     ):
         raise InputError(
-            f"constraint {i}, a {kind}, is of joints {joints} and {of} velocities; the model has {model.njoints} and "
-            f"{model.nv}. {OTHER_MODEL}"
+            f"constraint {i}, a {kind}, is of joints {joints} and {n_velocities} velocities; the model has "
+            f"{model.njoints} and {model.nv}. {OTHER_MODEL_ADVICE}"
         )
 
 
 def _is_rotation(r: Any) -> bool:
-    return bool(np.abs(r @ r.T - np.eye(3)).max() <= UNIT and np.linalg.det(r) > 0.0)
+    return bool(np.abs(r @ r.T - np.eye(3)).max() <= ROTATION_TOLERANCE and np.linalg.det(r) > 0.0)
 
 
-def _plain(given: Any) -> Any:
-    return given.extract() if hasattr(given, "extract") else given
+def _unwrap(constraint: Any) -> Any:
+    return constraint.extract() if hasattr(constraint, "extract") else constraint
 
 
 def _constraint(model: Any, data: Any, n: int, dt: float, correction: float) -> tuple[Cones, Any, list[int]]:
-    """Cones, target (n,) and order of one constraint's rows."""
+    """Return the cones, the target (n,) [m/s, rad/s] and the order of the rows of one constraint.
+
+    Raises
+    ------
+    CapabilityError
+        The kind of constraint is not supported.
+    """
     kind = type(model).__name__
     order = list(range(n))
     if kind in ("PointAnchorConstraintModel", "FrameAnchorConstraintModel"):
@@ -278,5 +306,8 @@ def _constraint(model: Any, data: Any, n: int, dt: float, correction: float) -> 
 
 
 def closing_speed(gap: Any, dt: float, correction: float) -> Any:
-    """What is apart may come as near as it is in one step; what is too near moves apart by a share."""
+    """Return the target velocity for a gap: -gap / dt if it is open, -correction gap / dt if it is negative.
+
+    An open gap may close within one step; a fraction `correction` of a penetration is removed.
+    """
     return -np.where(gap > 0.0, 1.0, correction) * gap / dt

@@ -1,4 +1,4 @@
-"""Steps of a MuJoCo simulation as a folder of problems, with the engine's own answer beside each."""
+"""Record the steps of a MuJoCo simulation as a folder of problems, each with the engine's own answer."""
 
 from __future__ import annotations
 
@@ -29,27 +29,45 @@ Control = str | Callable[[Any, Any, int], Any] | Any
 
 @dataclass(frozen=True)
 class Recording:
-    """What `record` wrote; `str()` says it in a line."""
+    """Summary of the files that `record` wrote; `str()` formats it.
+
+    Parameters
+    ----------
+    folder : path
+    files : tuple of str
+        Names of the problem files.
+    without : int
+        Selected steps without constraints.
+    left_out : tuple of str
+        Reasons why steps could not be exported, one line each.
+    above_floor : int
+        MuJoCo's answers whose error exceeds the round-off floor.
+    stopped : int
+        Of these, the answers with a velocity error above `threshold`.
+    threshold : float, m/s
+    worst : str
+        Verdict, velocity error and row of the worst answer.
+    """
 
     folder: Path
     files: tuple[str, ...]
-    without: int  # steps looked at that had no constraint
-    left_out: tuple[str, ...] = field(default=())  # why a step could not be exported, one line each
-    above_floor: int = 0  # of MuJoCo's answers, those that rounding does not explain
-    stopped: int = 0  # of these, those more than `threshold` off
-    threshold: float = DEFAULT_THRESHOLD  # m/s
-    worst: str = ""  # verdict of the worst answer, by how much it is off, and where
+    without: int
+    left_out: tuple[str, ...] = field(default=())
+    above_floor: int = 0
+    stopped: int = 0
+    threshold: float = DEFAULT_THRESHOLD
+    worst: str = ""
 
     def __str__(self) -> str:
-        more = f", {self.without} steps without constraints" if self.without else ""
-        lost = f", {len(self.left_out)} left out: {self.left_out[0]}" if self.left_out else ""
-        made = f"{len(self.files)} problems in {self.folder}{more}{lost}"
+        unconstrained = f", {self.without} steps without constraints" if self.without else ""
+        failed = f", {len(self.left_out)} left out: {self.left_out[0]}" if self.left_out else ""
+        written = f"{len(self.files)} problems in {self.folder}{unconstrained}{failed}"
         if not self.above_floor:
-            return made
-        far = f"; the worst {self.worst}" if self.stopped else ""
+            return written
+        worst = f"; the worst {self.worst}" if self.stopped else ""
         return (
-            f"{made}\nMuJoCo's own answers: {self.above_floor} above their floor, {self.stopped} more than "
-            f"{self.threshold:g} m/s off{far}"
+            f"{written}\nMuJoCo's own answers: {self.above_floor} above their floor, {self.stopped} more than "
+            f"{self.threshold:g} m/s off{worst}"
         )
 
 
@@ -67,36 +85,36 @@ def record(
     precision: str = "float64",
     threshold: float = DEFAULT_THRESHOLD,
 ) -> Recording:
-    """Step a MuJoCo simulation and keep the problem of every `every`-th step.
+    """Step a MuJoCo simulation and write the problem of every `every`-th step to a file.
 
-    Each file holds the problem with keys of its blocks and MuJoCo's own impulse. `engine.jsonl` has a line for each:
-    file, step, rows, the engine's iterations, the time of its constraint solver [s] and, by our judge, its
-    residual, velocity error [m/s] and worst row, the floor of its precision and the verdict. A step in which MuJoCo's
-    solver stopped before convergence has that verdict and is kept like any other. A step that cannot be exported has no
-    file, and `left_out` in its line says why: whatever is measured on the others names it.
+    Each file holds the problem with keys of its blocks and MuJoCo's own impulse. `engine.jsonl` has a line for each
+    file: file, step, rows, the engine's iterations, the time of its constraint solver [s], and the judge's result:
+    residual, velocity error [m/s], worst row, round-off floor of the precision, and verdict. A step in which MuJoCo's
+    solver stopped before convergence is written with that verdict. A step that cannot be exported has no file; its
+    line holds the reason as `left_out`, which is reported with every measurement of the other steps.
 
     Parameters
     ----------
     model : mujoco.MjModel
     data : mujoco.MjData
-        Stepped on, from where it stands.
+        Initial state; it is advanced by the steps.
     folder : path
-        Made where it is not.
+        Created if it does not exist.
     steps : int
         Steps of the simulation.
     every : int
     control : {"random", "zero"}, array (any, nu), or callable (model, data, step)
-        "random" draws uniformly within the ranges of the actuators. An array is played row by row, again from its
-        start where it ends. What a callable returns is written to `data.ctrl`, unless it is None.
+        "random" draws uniformly within the ranges of the actuators. An array is played row by row and repeated from
+        its start. The result of a callable is written to `data.ctrl`, unless it is None.
     seed : int
-        Of "random".
+        Seed of "random".
     states : path of an .npz, "keyframes", or arrays, optional
         Start states (`lavender.io.states`): the steps are divided evenly among them. The first step from a state uses
         its controls, if it has any. Default: `data` as it is.
     replace : bool
-        Take the problem files of another recording out of the folder, which is refused otherwise.
+        Remove the problem files of another recording from the folder. Without it, such a folder is an error.
     precision : {"float64", "float32"}
-        In which this MuJoCo computes (`mjtNum`); written with each problem.
+        Precision in which this MuJoCo computes (`mjtNum`); written with each problem.
     threshold : float, m/s
         Velocity error up to which MuJoCo's answer is close enough.
 
@@ -107,23 +125,23 @@ def record(
     Raises
     ------
     InputError
-        Not a model and its data, `steps` or `every` below 1, another control, precision or threshold, a folder
-        that holds a recording; MuJoCo ends in an error (out of memory, what it does not support).
+        The arguments are not a model and its data; `steps` or `every` is below 1; the control, precision or threshold
+        is invalid; the folder holds a recording; MuJoCo raises an error (out of memory, an unsupported feature).
     """
-    mj = adapter._mujoco(model, data)[0].mj
+    mj = adapter._checked_model(model, data)[0].mj
     steps, every = check_int("steps", steps, 1), check_int("every", every, 1)
     precision = check_choice("precision", precision, PRECISIONS)
     threshold = check_float("threshold", threshold, low=0.0)
-    drive = drive_of(model, control, seed)
-    starts = None if states is None else read_states(mj, model, states).take(steps)
+    control_at = make_controller(model, control, seed)
+    starts = None if states is None else read_states(mj, model, states).subset(steps)
     firsts = {} if starts is None else {steps * i // len(starts): i for i in range(len(starts))}
-    kept: list[dict[str, Any]] = []
+    records: list[dict[str, Any]] = []
     left_out: list[dict[str, Any]] = []
     without = 0
     width = len(str(steps))
     with folder_for_steps(folder, replace) as folder:
         for step in range(steps):
-            ctrl = drive(data, step)
+            ctrl = control_at(data, step)
             if starts is not None and step in firsts:
                 i = firsts[step]
                 mj.mj_setState(model, data, starts.vectors[i], mj.mjtState.mjSTATE_INTEGRATION)
@@ -139,37 +157,37 @@ def record(
                 raise InputError(f"step {step + 1}: MuJoCo ends in an error, {error}") from None
             file = folder / f"step_{step + 1:0{width}d}.npz"
             try:
-                found = _solved(mj, model, data, f"step {step + 1}", precision, threshold)
+                result = _solve_step(mj, model, data, f"step {step + 1}", precision, threshold)
             except LavenderError as error:
                 left_out.append({"file": file.name, "step": step + 1, "left_out": str(error)})
                 continue
-            if found is None:
+            if result is None:
                 without += 1
                 continue
-            problem, own, told = found
-            npz.write(problem, file, impulse=own)
-            kept.append({"file": file.name, "step": step + 1, **told})
-        write_text(folder / ENGINE, "".join(f"{json.dumps(line)}\n" for line in (*kept, *left_out)))
-    far = [line for line in kept if line["verdict"] in (UNCONVERGED, WRONG)]
-    worst = max(far, key=lambda line: float(line["velocity"]), default=None)
+            problem, impulse, facts = result
+            npz.write(problem, file, impulse=impulse)
+            records.append({"file": file.name, "step": step + 1, **facts})
+        write_text(folder / ENGINE, "".join(f"{json.dumps(line)}\n" for line in (*records, *left_out)))
+    above_threshold = [line for line in records if line["verdict"] in (UNCONVERGED, WRONG)]
+    worst = max(above_threshold, key=lambda line: float(line["velocity"]), default=None)
     verdict = UNCONVERGED if worst and worst["verdict"] == UNCONVERGED else f"is {WRONG}"
     short = worst and f"{verdict}, {worst['velocity']:.2g} m/s off at {worst['worst']} (step {worst['step']})"
     return Recording(
         folder=folder,
-        files=tuple(line["file"] for line in kept),
+        files=tuple(line["file"] for line in records),
         without=without,
         left_out=tuple(f"step {line['step']}: {line['left_out']}" for line in left_out),
-        above_floor=sum(line["verdict"] != AT_FLOOR for line in kept),
-        stopped=len(far),
+        above_floor=sum(line["verdict"] != AT_FLOOR for line in records),
+        stopped=len(above_threshold),
         threshold=threshold,
         worst=short or "",
     )
 
 
-def _solved(
+def _solve_step(
     mj: Any, model: Any, data: Any, name: str, precision: str, threshold: float
 ) -> tuple[Problem, FloatArray, dict[str, Any]] | None:
-    """The problem of a step, MuJoCo's impulse, and what is told of both; None without constraints."""
+    """Solve a step with MuJoCo; return the problem, MuJoCo's impulse and their record, or None without constraints."""
     start = perf_counter()
     mj.mj_fwdConstraint(model, data)
     seconds = perf_counter() - start
@@ -177,15 +195,15 @@ def _solved(
         return None
     problem = adapter.from_mujoco(model, data, name=name)
     problem = dataclasses.replace(problem, precision=precision, copy=False)
-    own = adapter.impulse(model, data)
-    judged = residual(problem, own, threshold=threshold)
-    told = {
+    impulse = adapter.impulse(model, data)
+    judged = residual(problem, impulse, threshold=threshold)
+    facts = {
         "rows": problem.m, "iterations": int(np.sum(data.solver_niter)), "seconds": seconds,
         "relative": judged.relative, "velocity": judged.velocity, "worst": judged.worst_name,
         "floor": judged.roundoff_floor, "verdict": judged.verdict, "precision": precision, "threshold": threshold,
         "solver": mj.mjtSolver(int(model.opt.solver)).name.removeprefix("mjSOL_"),
     }  # fmt: skip
-    return problem, own, told
+    return problem, impulse, facts
 
 
 def record_file(
@@ -196,17 +214,23 @@ def record_file(
     control: Control = "random",
     **options: Any,
 ) -> Recording:
-    """`record` of a model by its file (MJCF); an array of controls may be given by its file (.npy), too."""
-    mj, made = model_of(path)
-    found = record(made, mj.MjData(made), folder, steps, control=control_of(control), **options)
-    if not found.files:
-        why = f" ({found.left_out[0]})" if found.left_out else ": more steps, or other controls"
+    """Call `record` for a model file (MJCF); an array of controls may also be given as a file (.npy).
+
+    Raises
+    ------
+    InputError
+        As `record`, or no step had a constraint that could be exported.
+    """
+    mj, model = load_model(path)
+    result = record(model, mj.MjData(model), folder, steps, control=load_controls(control), **options)
+    if not result.files:
+        why = f" ({result.left_out[0]})" if result.left_out else ": more steps, or other controls"
         raise InputError(f"{path}: no step had a constraint that could be kept{why}")
-    return found
+    return result
 
 
-def model_of(path: str | os.PathLike[str]) -> tuple[Any, Any]:
-    """MuJoCo, and the model of a file (MJCF).
+def load_model(path: str | os.PathLike[str]) -> tuple[Any, Any]:
+    """Return the module mujoco and the model of a file (MJCF).
 
     Raises
     ------
@@ -216,37 +240,38 @@ def model_of(path: str | os.PathLike[str]) -> tuple[Any, Any]:
     mj, path = adapter.package(), str(as_path(path))
     try:
         return mj, mj.MjModel.from_xml_path(path)
-    except ValueError as error:  # MuJoCo's word about a file that it cannot read
+    except ValueError as error:  # MuJoCo raises it for a file that it cannot read.
         raise InputError(f"{path}: {error}") from None
 
 
-def control_of(control: Control) -> Control:
-    """Controls as `record` takes them, of a file (.npy) its array."""
+def load_controls(control: Control) -> Control:
+    """Return controls for `record`: the array of a file (.npy), or `control` unchanged."""
     return _controls(control) if isinstance(control, str) and control not in CONTROLS else control
 
 
 def _controls(path: str) -> Any:
+    """Return the array of a .npy file; raise InputError if it cannot be read or holds several arrays."""
     try:
-        first_bytes(path)  # of a regular file
-        # as long as the file is, whatever its head says
-        found = np.load(path, mmap_mode="r", allow_pickle=False)
+        first_bytes(path)  # Checks that it is a regular file.
+        # A memory map cannot be longer than the file, whatever size the header declares.
+        result = np.load(path, mmap_mode="r", allow_pickle=False)
     except (OSError, ValueError, EOFError, BadZipFile) as error:
         raise InputError(f"controls {path}: {error}; {', '.join(CONTROLS)}, or a .npy file") from None
-    if not isinstance(found, np.ndarray):
-        found.close()
+    if not isinstance(result, np.ndarray):
+        result.close()
         raise InputError(f"controls {path}: an archive of several arrays; a .npy file of one is needed")
-    return found
+    return result
 
 
-def drive_of(model: Any, control: Control, seed: int) -> Callable[[Any, int], FloatArray | None]:
-    """What sets the controls of (data, step); see `record`."""
+def make_controller(model: Any, control: Control, seed: int) -> Callable[[Any, int], FloatArray | None]:
+    """Return a function (data, step) -> controls (nu,) or None; see `record`."""
     n = int(model.nu)
     if callable(control):
         call: Callable[[Any, Any, int], Any] = control
 
         def called(data: Any, step: int) -> FloatArray | None:
-            given = call(model, data, step)
-            return None if given is None else as_array(f"control of step {step}", given, (n,))
+            values = call(model, data, step)
+            return None if values is None else as_array(f"control of step {step}", values, (n,))
 
         return called
     if isinstance(control, str):

@@ -1,11 +1,11 @@
-"""Start states of a MuJoCo simulation, from a file, from arrays, or from the model's keyframes.
+"""Read start states of a MuJoCo simulation from a file, from arrays, or from the model's keyframes.
 
     starts = read_states(mujoco, model, "lavender-audit/states.npz")    # or "keyframes"
     mujoco.mj_setState(model, data, starts.vectors[0], mujoco.mjtState.mjSTATE_INTEGRATION)
 
-A file holds `state`, a vector of mjSTATE_INTEGRATION in each row, or arrays by their names in MjData, of which qpos and
-qvel are needed. Only the vector has everything that a step depends on: warm start, controls, mocap bodies, applied
-forces, the state of plug-ins. What arrays leave out begins as in a new MjData.
+A file holds `state`, with a vector of mjSTATE_INTEGRATION in each row, or arrays with the names of MjData, of which
+qpos and qvel are required. Only the vector contains everything that a step depends on: warm start, controls, mocap
+bodies, applied forces, the state of plug-ins. Quantities without an array have the values of a new MjData.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ OPTIONAL = (
     "act", "ctrl", "qacc_warmstart", "time", "mocap_pos", "mocap_quat", "userdata", "eq_active", "qfrc_applied",
     "xfrc_applied",
 )  # fmt: skip
-LABELS = ("world", "step")  # `lavender audit` also writes where each state comes from.
+LABELS = ("world", "step")  # Arrays that `lavender audit` also writes: the origin of each state.
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +51,7 @@ class StartStates:
     def __len__(self) -> int:
         return len(self.vectors)
 
-    def take(self, count: int) -> StartStates:
+    def subset(self, count: int) -> StartStates:
         """Return at most `count` of the states, evenly spaced."""
         if len(self) <= count:
             return self
@@ -83,7 +83,7 @@ def read_states(mj: Any, model: Any, source: Any) -> StartStates:
     if isinstance(source, str) and source == KEYFRAMES:
         return _read_keyframes(mj, model)
     if isinstance(source, (str, os.PathLike)):
-        first_bytes(source)  # of a regular file
+        first_bytes(source)  # Checks that it is a regular file.
         with closing(Archive(source)) as archive:
             return _read_arrays(mj, model, dict(archive), f"states {os.fspath(source)}")
     arrays = source if isinstance(source, Mapping) else {VECTOR: source}
@@ -91,38 +91,42 @@ def read_states(mj: Any, model: Any, source: Any) -> StartStates:
 
 
 def _read_keyframes(mj: Any, model: Any) -> StartStates:
+    """Return the model's keyframes; raise InputError if it has none."""
     if not model.nkey:
         raise InputError("states are 'keyframes', and the model has none; an .npz of states is needed")
-    data, found = mj.MjData(model), []
+    data, vectors = mj.MjData(model), []
     for key in range(model.nkey):
         mj.mj_resetDataKeyframe(model, data, key)
-        found.append(_vector_of(mj, model, data))
-    return StartStates(np.array(found), np.array(model.key_ctrl, float).reshape(model.nkey, model.nu))
+        vectors.append(_vector_of(mj, model, data))
+    return StartStates(np.array(vectors), np.array(model.key_ctrl, float).reshape(model.nkey, model.nu))
 
 
-def _read_arrays(mj: Any, model: Any, arrays: Mapping[str, Any], what: str) -> StartStates:
+def _read_arrays(mj: Any, model: Any, arrays: Mapping[str, Any], source: str) -> StartStates:
+    """Build states from arrays by name; `source` begins the error messages."""
     known = (VECTOR, *NEEDED, *OPTIONAL, *LABELS)
     unknown = [name for name in arrays if name not in known]
     if unknown:
-        raise InputError(f"{what}: {unknown[0]!r} is no part of a state; known are {', '.join(known)}")
+        raise InputError(f"{source}: {unknown[0]!r} is no part of a state; known are {', '.join(known)}")
     if VECTOR in arrays:
-        return _read_vectors(mj, model, arrays[VECTOR], what)
+        return _read_vectors(mj, model, arrays[VECTOR], source)
     missing = [name for name in NEEDED if name not in arrays]
     if missing:
-        raise InputError(f"{what}: {' and '.join(missing)} missing; {VECTOR!r}, or qpos and qvel, are needed")
+        raise InputError(
+            f"{source}: {' and '.join(missing)} missing; {VECTOR!r}, or qpos and qvel, are needed"
+        )
     data = mj.MjData(model)
     parts: dict[str, FloatArray] = {}
     for name in (*NEEDED, *OPTIONAL):
         if name in arrays:
             shape = np.shape(getattr(data, name))
-            given = np.asarray(arrays[name])
-            given = given[None] if given.ndim == len(shape) else given
-            parts[name] = as_array(f"{what}: {name}", given, (None, *shape))
+            values = np.asarray(arrays[name])
+            values = values[None] if values.ndim == len(shape) else values
+            parts[name] = as_array(f"{source}: {name}", values, (None, *shape))
     counts = {name: len(x) for name, x in parts.items()}
     n = counts["qpos"]
     if n == 0 or set(counts.values()) != {n}:
-        told = ", ".join(f"{count} of {name}" for name, count in counts.items())
-        raise InputError(f"{what}: {told}; as many of each, and at least one, are needed")
+        sizes = ", ".join(f"{count} of {name}" for name, count in counts.items())
+        raise InputError(f"{source}: {sizes}; as many of each, and at least one, are needed")
     vectors = []
     for i in range(n):
         data = mj.MjData(model)
@@ -135,25 +139,26 @@ def _read_arrays(mj: Any, model: Any, arrays: Mapping[str, Any], what: str) -> S
     return StartStates(np.array(vectors), parts.get("ctrl"))
 
 
-def _read_vectors(mj: Any, model: Any, given: Any, what: str) -> StartStates:
-    whole = mj.mjtState.mjSTATE_INTEGRATION
+def _read_vectors(mj: Any, model: Any, states: Any, source: str) -> StartStates:
+    """Build states from vectors (n, size) of mjSTATE_PHYSICS, mjSTATE_FULLPHYSICS or mjSTATE_INTEGRATION."""
+    integration = mj.mjtState.mjSTATE_INTEGRATION
     kinds = {mj.mj_stateSize(model, kind): kind for kind in
-             (mj.mjtState.mjSTATE_PHYSICS, mj.mjtState.mjSTATE_FULLPHYSICS, whole)}  # fmt: skip
-    given = np.asarray(given)
-    given = as_array(f"{what}: {VECTOR}", given[None] if given.ndim == 1 else given, (None, None))
-    n, size = given.shape
+             (mj.mjtState.mjSTATE_PHYSICS, mj.mjtState.mjSTATE_FULLPHYSICS, integration)}  # fmt: skip
+    states = np.asarray(states)
+    states = as_array(f"{source}: {VECTOR}", states[None] if states.ndim == 1 else states, (None, None))
+    n, size = states.shape
     if size not in kinds or n == 0:
         raise InputError(
-            f"{what}: {VECTOR} has shape {given.shape}; (n, {mj.mj_stateSize(model, whole)}) of mjSTATE_INTEGRATION is "
-            "needed for this model"
+            f"{source}: {VECTOR} has shape {states.shape}; (n, {mj.mj_stateSize(model, integration)}) of "
+            "mjSTATE_INTEGRATION is needed for this model"
         )
     vectors, controls = [], []
-    for state in given:
+    for state in states:
         data = mj.MjData(model)
         mj.mj_setState(model, data, state, kinds[size])
         vectors.append(_vector_of(mj, model, data))
         controls.append(np.array(data.ctrl))
-    return StartStates(np.array(vectors), np.array(controls) if kinds[size] == whole else None)
+    return StartStates(np.array(vectors), np.array(controls) if kinds[size] == integration else None)
 
 
 def _vector_of(mj: Any, model: Any, data: Any) -> FloatArray:

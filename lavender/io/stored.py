@@ -1,4 +1,4 @@
-"""What a file of any format holds, and how files are written."""
+"""The contents of a problem file of any format, and functions that write files and lock outputs."""
 
 from __future__ import annotations
 
@@ -24,35 +24,53 @@ from lavender.base.errors import InputError
 from lavender.problem import Problem
 
 HDF5 = (".hdf5", ".h5", ".hdf")
-SUFFIXES = (".npz", *HDF5)  # of problem files
-ENGINE = "engine.jsonl"  # beside recorded problems: what the engine itself said of each
+SUFFIXES = (".npz", *HDF5)  # Suffixes of problem files.
+ENGINE = "engine.jsonl"  # File of the engine's own results, in the folder of recorded problems.
 
-MAX_BYTES = 2**31  # of what a file makes in memory; a megabyte can declare a terabyte
-PART_OF_NAME = 40  # characters, at most four bytes each, of the 255 that a name may have
-FOLDER_LOCK = (
-    ".lavender.lock"  # The lock file of an output folder; that of an output file is FILE.lock beside it.
-)
+MAX_BYTES = (
+    2**31
+)  # Default limit of the memory for the arrays of a file; a file of a megabyte can declare a terabyte.
+# Characters of the file's name in the name of its temporary file. A name may have 255 bytes, four per character.
+TEMPORARY_NAME_CHARACTERS = 40
+# Name of the lock file of an output folder. The lock of an output file is FILE.lock.
+FOLDER_LOCK = ".lavender.lock"
 # An output is written without a lock if its file system answers with one of these errors: it has no locks.
 WITHOUT_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP)
-LOCK_TIMEOUT = (
-    0.2  # s until an output counts as held: long enough for a second try if its holder ends meanwhile.
-)
-NUMBER = 8  # bytes of a number once it is read: float64, or an index before it is checked
-PART = re.compile(r"\..*\.(\d+)\.\d+\.part(\.\w+)?")  # names of files that are not whole yet
-FORGOTTEN = 86400.0  # s, after which a part is of a writer that was killed: none takes that long
+# Time [s] after which an output counts as locked: long enough for a second try if the other command ends meanwhile.
+LOCK_TIMEOUT = 0.2
+NUMBER_BYTES = 8  # Bytes of a number in memory: float64, or an index before it is checked.
+TEMPORARY_NAME = re.compile(r"\..*\.(\d+)\.\d+\.part(\.\w+)?")  # Names of files that are not complete yet.
+# Age [s] above which a temporary file is removed: its writer was killed, because no write takes this long.
+MAX_TEMPORARY_AGE = 86400.0
 
 
 @dataclass(frozen=True, eq=False)
 class Stored:
-    """A problem as a file gives it, with the solution and guesses that came with it."""
+    """A problem from a file, with the stored solution and guesses.
+
+    Parameters
+    ----------
+    problem : Problem
+    format : str
+        "lavender", "box", "generated", "fclib_local" or "fclib_global", the last two also with the suffix "_rolling".
+    impulse : (m,) N s, optional
+        Stored solution.
+    slack : (m,) m/s, optional
+        Stored slack of that solution.
+    compare : str
+        Unique quantities of the solution, if the file names them: "l,w", "r,u", "w", "u", "error", "no solution".
+    guesses : tuple of (m,) N s
+    info : mapping of str to str
+        Texts of the file: title, description, ...
+    """
 
     problem: Problem
-    format: str  # "lavender", "box", "generated", "fclib_local" or "fclib_global"
-    impulse: FloatArray | None = None  # (m,) N s, the stored solution
-    slack: FloatArray | None = None  # (m,) m/s, of that solution, as stored
-    compare: str = ""  # what is unique, where the file says: "l,w", "r,u", "w", "u", "error", "no solution"
-    guesses: tuple[FloatArray, ...] = ()  # (m,) N s each
-    info: Mapping[str, str] = field(default_factory=dict)  # title, description, ... as text
+    format: str
+    impulse: FloatArray | None = None
+    slack: FloatArray | None = None
+    compare: str = ""
+    guesses: tuple[FloatArray, ...] = ()
+    info: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "info", MappingProxyType(dict(self.info)))
@@ -65,10 +83,16 @@ class Stored:
 def folder_for_steps(
     path: str | os.PathLike[str], replace: bool = False, continued: bool = False
 ) -> Iterator[Path]:
-    """A folder, made where it is not, that holds no problem file: steps of two recordings are no sequence.
+    """Lock a folder for recorded problems, create it if necessary, and return its path until the block ends.
 
-    `replace` takes the problem files out that it holds; those of a recording that is `continued` stay. What an engine
-    said of others goes in either case. Another recording into it is refused meanwhile.
+    The folder must not hold problem files, because the steps of two recordings are not one sequence. `replace` removes
+    the problem files and the engine's results; with `continued`, the files belong to this recording and stay. Another
+    recording to the same folder is an error meanwhile.
+
+    Raises
+    ------
+    InputError
+        The folder holds problem files, is locked, or cannot be cleared or written.
     """
     replace = check_bool("replace", replace)
     with lock_output(path, folder=True) as folder:
@@ -90,22 +114,22 @@ def folder_for_steps(
 def lock_output(path: str | os.PathLike[str], folder: bool = False) -> Iterator[Path]:
     """Hold the lock of an output, a file or a folder, until the block ends, and return its path.
 
-    The lock is the operating system's: a process that dies holds nothing. A folder is made if it is not there, and
-    removed at the end if it is still empty then.
+    The operating system releases the lock of a process that dies. A folder is created if it does not exist, and
+    removed at the end if it is still empty.
 
     Raises
     ------
     InputError
         Another command or another thread holds the lock, or the output cannot be written.
     """
-    from filelock import FileLock, Timeout  # takes 30 ms, which commands that write nothing need not pay
+    from filelock import FileLock, Timeout  # The import takes 30 ms; commands that write nothing skip it.
 
-    path = writable(path, folder)
-    place = _behind_links(path) if folder else destination(path)  # one lock for all names of an output
-    is_new = folder and not place.exists()
+    path = check_writable(path, folder)
+    target = _resolve_links(path) if folder else destination(path)  # All names of an output share one lock.
+    is_new = folder and not target.exists()
     if folder:
-        make_folder(place)
-    lock = FileLock(place / FOLDER_LOCK if folder else f"{place}.lock", thread_local=False)
+        make_folder(target)
+    lock = FileLock(target / FOLDER_LOCK if folder else f"{target}.lock", thread_local=False)
     try:
         lock.acquire(timeout=LOCK_TIMEOUT)
     except Timeout:
@@ -123,70 +147,77 @@ def lock_output(path: str | os.PathLike[str], folder: bool = False) -> Iterator[
         yield path
     finally:
         if lock.is_locked:
-            with contextlib.suppress(OSError):  # an open file cannot be removed on Windows
-                os.unlink(
-                    lock.lock_file
-                )  # before its lock goes: FileLock rejects a file that has lost its name
+            # The file is removed before the lock is released: FileLock rejects a file without a name. Windows cannot
+            # remove an open file.
+            with contextlib.suppress(OSError):
+                os.unlink(lock.lock_file)
             lock.release()
         if is_new:
             with contextlib.suppress(OSError):
-                place.rmdir()
+                target.rmdir()
 
 
-def _behind_links(path: Path) -> Path:
+def _resolve_links(path: Path) -> Path:
+    """Return the path without symbolic links; raise InputError if it cannot be resolved."""
     try:
         return Path(os.path.realpath(path))
     except (OSError, ValueError) as error:
-        what = "the working directory is gone" if isinstance(error, FileNotFoundError) else error
-        raise InputError(f"cannot write {path}: {what}; give a path that can be written") from None
+        reason = "the working directory is gone" if isinstance(error, FileNotFoundError) else error
+        raise InputError(f"cannot write {path}: {reason}; give a path that can be written") from None
 
 
 def destination(path: str | os.PathLike[str]) -> Path:
-    """Where a file of that path is written: behind its symbolic links, a regular file or a new one.
+    """Return the path at which a file is written: the target of symbolic links, a regular file or a new one.
 
-    InputError for a folder, a pipe, a socket or a device, which is never replaced, and for links without end.
+    Raises
+    ------
+    InputError
+        The path is a folder, a pipe, a socket or a device, which are never replaced, or its links form a cycle.
     """
     path = as_path(path)
-    target = _behind_links(path)
+    target = _resolve_links(path)
     try:
-        found = os.stat(path)
+        status = os.stat(path)
     except (OSError, ValueError) as error:
         if isinstance(error, FileNotFoundError):
             return target
-        what = getattr(error, "strerror", None) or error
-        raise InputError(f"cannot write {path}: {what}; give a path that can be written") from None
-    if not stat.S_ISREG(found.st_mode):
-        what = "a folder" if stat.S_ISDIR(found.st_mode) else "a pipe, a socket or a device"
-    elif target.exists() and os.path.samestat(found, target.stat()):
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(f"cannot write {path}: {reason}; give a path that can be written") from None
+    if not stat.S_ISREG(status.st_mode):
+        kind = "a folder" if stat.S_ISDIR(status.st_mode) else "a pipe, a socket or a device"
+    elif target.exists() and os.path.samestat(status, target.stat()):
         return target
     else:
-        what = "a file that has lost its name"  # of an open descriptor
-    raise InputError(f"cannot write {path}: it is {what}, which is not replaced; give the name of a file")
+        kind = "a file that has lost its name"  # A path of an open descriptor, as /dev/fd/3.
+    raise InputError(f"cannot write {path}: it is {kind}, which is not replaced; give the name of a file")
 
 
-def writable(path: str | os.PathLike[str], folder: bool = False) -> Path:
-    """`path`, refused before the work where its file could not be written after it; a `folder` may have to be made.
+def check_writable(path: str | os.PathLike[str], folder: bool = False) -> Path:
+    """Return `path` if its file (or `folder`, with its parents) can be written later; nothing is opened or created.
 
-    Nothing is opened or made: another process may be writing there.
+    Raises
+    ------
+    InputError
+        It cannot be written.
     """
     path = as_path(path)
-    place = _behind_links(path) if folder else destination(path).parent
+    parent = _resolve_links(path) if folder else destination(path).parent
     try:
-        while folder and place != place.parent and not place.exists():
-            place = place.parent
-        mode = place.stat().st_mode
+        while folder and parent != parent.parent and not parent.exists():
+            parent = parent.parent
+        mode = parent.stat().st_mode
     except OSError as error:
-        raise InputError(f"cannot write {path}: {_why(error, place)}") from None
+        raise InputError(f"cannot write {path}: {_write_failure(error, parent)}") from None
     if not stat.S_ISDIR(mode):
-        raise InputError(f"cannot write {path}: {place} is no folder; give a path in one")
-    own = [path] if not folder and path.exists() else []
-    if not all(os.access(x, os.W_OK) for x in (place, *own)):
+        raise InputError(f"cannot write {path}: {parent} is no folder; give a path in one")
+    existing = [path] if not folder and path.exists() else []
+    if not all(os.access(x, os.W_OK) for x in (parent, *existing)):
         raise InputError(f"cannot write {path}: you may not write there; give a path that you may write to")
     return path
 
 
 def make_folder(path: str | os.PathLike[str]) -> Path:
-    """The folder of that path, made with those above it where it is not there; InputError where it cannot be."""
+    """Create a folder and its parents if they do not exist, and return its path; InputError if that fails."""
     folder = as_path(path)
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -197,47 +228,59 @@ def make_folder(path: str | os.PathLike[str]) -> Path:
     return folder
 
 
-def _why(error: OSError, place: Path) -> str:
-    """What keeps a file from being written, and what to do."""
-    if isinstance(error, FileNotFoundError) and not place.is_dir():
-        return f"the folder {place} is not there; make it first"
-    room = error.errno in (errno.ENOSPC, errno.EDQUOT)
-    return f"{error.strerror or error}; {'make room' if room else 'give a path that can be written'}"
+def _write_failure(error: OSError, folder: Path) -> str:
+    """Return the reason why a file could not be written, and advice."""
+    if isinstance(error, FileNotFoundError) and not folder.is_dir():
+        return f"the folder {folder} is not there; make it first"
+    disk_full = error.errno in (errno.ENOSPC, errno.EDQUOT)
+    return f"{error.strerror or error}; {'make room' if disk_full else 'give a path that can be written'}"
 
 
 def write_atomically(path: str | os.PathLike[str], write: Callable[[Path], Any]) -> None:
-    """Call `write` with a path beside `path`, then rename: readers see the old file or the new one.
+    """Call `write` with a temporary path in the same folder, then rename: readers see the old file or the new one.
 
-    Symbolic links are followed: the file behind them is replaced, they stay. Who may read a file stays, too.
+    Symbolic links are followed: their target is replaced, the links stay. The permissions of the file stay, too.
+
+    Raises
+    ------
+    InputError
+        The file cannot be written.
     """
     target = destination(path)
-    short = target.name[:PART_OF_NAME]  # the whole could leave no room for the rest
+    short = target.name[:TEMPORARY_NAME_CHARACTERS]
     temporary = target.with_name(f".{short}.{os.getpid()}.{get_native_id()}.part")
-    _clear(target.parent)
+    _remove_old_temporaries(target.parent)
     try:
         write(temporary)
-        with contextlib.suppress(OSError):  # of no file yet, or where modes mean nothing
+        with contextlib.suppress(OSError):  # The file may be new, or the file system may have no modes.
             temporary.chmod(stat.S_IMODE(target.stat().st_mode))
         os.replace(temporary, target)
     except OSError as error:
-        raise InputError(f"cannot write {path}: {_why(error, target.parent)}") from None
+        raise InputError(f"cannot write {path}: {_write_failure(error, target.parent)}") from None
     finally:
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
 
 
 @lru_cache
-def _clear(folder: Path) -> None:
-    """Remove what writers that were killed have left in a folder; once in a process, since folders can be large."""
+def _remove_old_temporaries(folder: Path) -> None:
+    """Remove temporary files of killed writers from a folder; once per process, since folders can be large."""
     with contextlib.suppress(OSError):
         for entry in os.scandir(folder):
-            part = PART.fullmatch(entry.name)
-            if part and time.time() - entry.stat().st_mtime > FORGOTTEN and not _runs(int(part[1])):
+            part = TEMPORARY_NAME.fullmatch(entry.name)
+            if (
+                part
+                and time.time() - entry.stat().st_mtime > MAX_TEMPORARY_AGE
+                and not _is_running(int(part[1]))
+            ):
                 os.unlink(entry)
 
 
-def _runs(process: int) -> bool:
-    """A process of this machine: a clock that was set makes its part look old. Windows keeps what is open by itself."""
+def _is_running(process: int) -> bool:
+    """Return whether a process of this machine exists: a changed clock makes its temporary file look old.
+
+    It is False on Windows, which does not remove open files.
+    """
     if os.name != "posix":
         return False
     try:
@@ -250,37 +293,37 @@ def _runs(process: int) -> bool:
 
 
 def write_bytes(path: str | os.PathLike[str], data: bytes) -> None:
-    """`write_atomically` of bytes."""
+    """Write bytes to a file with `write_atomically`."""
     write_atomically(path, lambda part: part.write_bytes(data))
 
 
 def write_text(path: str | os.PathLike[str], text: str) -> None:
-    """`write_atomically` of a text."""
+    """Write a text to a file with `write_atomically`, in UTF-8."""
     write_bytes(path, text.encode())
 
 
-def kept(path: Path, is_current: Callable[[bytes], bool], make: Callable[[], bytes]) -> bytes:
-    """What a file holds where that is current; else what is made now, and kept there if that place may be written."""
-    if path.exists() and is_current(found := path.read_bytes()):
-        return found
-    made = make()
+def load_or_make(path: Path, is_current: Callable[[bytes], bool], make: Callable[[], bytes]) -> bytes:
+    """Return the content of a file if it is current, else make it, and write it to the file if that is possible."""
+    if path.exists() and is_current(content := path.read_bytes()):
+        return content
+    content = make()
     with contextlib.suppress(OSError, InputError):
-        write_bytes(path, made)
-    return made
+        write_bytes(path, content)
+    return content
 
 
 def write_arrays(path: str | os.PathLike[str], arrays: Mapping[str, Any]) -> None:
-    """`write_atomically` of an archive of arrays (.npz)."""
+    """Write an archive of arrays (.npz) with `write_atomically`."""
 
     def write_to(temporary: Path) -> None:
         with open(temporary, "xb") as stream:
-            np.savez_compressed(stream, **arrays)  # NumPy before 2.1 would keep allow_pickle as an entry
+            np.savez_compressed(stream, **arrays)  # NumPy before 2.1 would write allow_pickle as an entry.
 
     write_atomically(path, write_to)
 
 
-def check_figure(path: str | os.PathLike[str]) -> Path:
-    """The file of a figure, .png without a suffix; InputError for a format that matplotlib does not write."""
+def check_figure_path(path: str | os.PathLike[str]) -> Path:
+    """Return the path of a figure, with .png if it has no suffix; InputError if matplotlib cannot write the format."""
     path = as_path(path)
     path = path if path.suffix else path.with_name(path.name + ".png")
     from matplotlib.backend_bases import FigureCanvasBase
@@ -292,14 +335,22 @@ def check_figure(path: str | os.PathLike[str]) -> Path:
     return path
 
 
-def write_figure(canvas: Any, path: str | os.PathLike[str], **how: Any) -> None:
-    """`write_atomically` of a figure of matplotlib, whose format the suffix says; png without one."""
-    path = check_figure(path)
+def write_figure(canvas: Any, path: str | os.PathLike[str], **options: Any) -> None:
+    """Write a figure of matplotlib with `write_atomically`; the suffix selects the format (default: png).
+
+    Raises
+    ------
+    InputError
+        matplotlib cannot write the format, or the file cannot be written.
+    """
+    path = check_figure_path(path)
     from matplotlib import rc_context
 
     try:
-        with rc_context({"pdf.fonttype": 42}):  # TrueType: publishers refuse Type 3
-            write_atomically(path, lambda part: canvas.savefig(part, format=path.suffix[1:].lower(), **how))
+        with rc_context({"pdf.fonttype": 42}):  # TrueType fonts: publishers reject Type 3.
+            write_atomically(
+                path, lambda part: canvas.savefig(part, format=path.suffix[1:].lower(), **options)
+            )
     except (ValueError, OverflowError) as error:
         if isinstance(error, InputError):
             raise
@@ -307,7 +358,7 @@ def write_figure(canvas: Any, path: str | os.PathLike[str], **how: Any) -> None:
 
 
 def as_path(path: str | os.PathLike[str]) -> Path:
-    """A path; numbers, which the operating system takes for open files, are refused."""
+    """Return a Path; raise InputError for numbers, which the operating system would treat as open files."""
     if not isinstance(path, (str, os.PathLike)) or not isinstance(os.fspath(path), str):
         raise InputError(f"path is {path!r} ({type(path).__name__}); the path of a file as text is needed")
     if "\0" in os.fspath(path):
@@ -315,17 +366,30 @@ def as_path(path: str | os.PathLike[str]) -> Path:
     return Path(path)
 
 
-def first_bytes(path: str | os.PathLike[str], count: int = 8, what: str = "") -> bytes:
-    """The first bytes of a regular file, all of them with `count` -1; reading a pipe would wait."""
+def first_bytes(path: str | os.PathLike[str], count: int = 8, role: str = "") -> bytes:
+    """Return the first `count` bytes of a regular file, or all bytes if `count` is -1.
+
+    Parameters
+    ----------
+    path : path
+    count : int
+    role : str
+        Name of the file's role for error messages.
+
+    Raises
+    ------
+    InputError
+        The file is not a regular file (reading a pipe would block), is larger than 2 GiB, or cannot be read.
+    """
     path = as_path(path)
-    named = f"{what} {str(path)!r}" if what else path
+    named = f"{role} {str(path)!r}" if role else path
     try:
-        found = os.stat(path)
-        if not stat.S_ISREG(found.st_mode):
-            kind = "a folder" if stat.S_ISDIR(found.st_mode) else "a pipe, a socket or a device"
+        status = os.stat(path)
+        if not stat.S_ISREG(status.st_mode):
+            kind = "a folder" if stat.S_ISDIR(status.st_mode) else "a pipe, a socket or a device"
             raise InputError(f"cannot read {named}: it is no file but {kind}; a file is needed")
-        if count < 0 and found.st_size > MAX_BYTES:
-            raise InputError(f"cannot read {named}: it holds {found.st_size} bytes, more than {MAX_BYTES}")
+        if count < 0 and status.st_size > MAX_BYTES:
+            raise InputError(f"cannot read {named}: it holds {status.st_size} bytes, more than {MAX_BYTES}")
         with open(path, "rb") as stream:
             return stream.read(count)
     except (OSError, ValueError) as error:
@@ -334,37 +398,43 @@ def first_bytes(path: str | os.PathLike[str], count: int = 8, what: str = "") ->
         raise InputError(f"cannot read {named}: {getattr(error, 'strerror', None) or error}") from None
 
 
-def whole_file(path: str | os.PathLike[str], what: str) -> bytes:
-    """All bytes of a regular file of at most 2 GiB."""
-    return first_bytes(path, -1, what)
+def read_whole_file(path: str | os.PathLike[str], role: str) -> bytes:
+    """Return all bytes of a regular file of at most 2 GiB; it raises the errors of `first_bytes`."""
+    return first_bytes(path, -1, role)
 
 
-def framed(magic: bytes, header: Mapping[str, Any]) -> bytes:
-    """The beginning of a file: a magic word, the length of a JSON header (8 bytes, little-endian), the header."""
+def pack_header(magic: bytes, header: Mapping[str, Any]) -> bytes:
+    """Return the beginning of a file: magic word, length of the JSON header (8 bytes, little-endian), header."""
     head = json.dumps(header).encode()
     return magic + len(head).to_bytes(8, "little") + head
 
 
-def unframed(data: bytes, magic: bytes, most: int) -> tuple[Any, int]:
-    """The header of such a file, of at most `most` bytes, and where the rest begins; ValueError where there is none."""
+def unpack_header(data: bytes, magic: bytes, max_bytes: int) -> tuple[Any, int]:
+    """Return the header of a file that `pack_header` began, and the position behind it.
+
+    Raises
+    ------
+    ValueError
+        The file has another magic word, or the header is incomplete or longer than `max_bytes`.
+    """
     start = len(magic) + 8
     end = start + int.from_bytes(data[len(magic) : start], "little")
-    if not data.startswith(magic) or not start < end <= min(len(data), start + most):
+    if not data.startswith(magic) or not start < end <= min(len(data), start + max_bytes):
         raise ValueError("header")
     return json.loads(data[start:end]), end
 
 
 class Budget:
-    """Bytes that a file may still make; spent before anything is allocated."""
+    """Memory [bytes] that reading a file may still use; it is subtracted before anything is allocated."""
 
     def __init__(self, max_bytes: int) -> None:
-        self.limit = self.left = check_int("max_bytes", max_bytes, high=None)
+        self.limit = self.remaining = check_int("max_bytes", max_bytes, high=None)
 
-    def spend(self, count: int, what: str) -> None:
-        """Take `count` bytes off for `what`."""
-        self.left -= count
-        if self.left < 0:
+    def spend(self, count: int, name: str) -> None:
+        """Subtract `count` bytes for the object `name`; raise InputError if the limit is exceeded."""
+        self.remaining -= count
+        if self.remaining < 0:
             raise InputError(
-                f"{what} would take {self.limit - self.left} bytes of memory with what comes before, more than "
+                f"{name} would take {self.limit - self.remaining} bytes of memory with what comes before, more than "
                 f"{self.limit}; pass max_bytes= if the file is meant to be that large"
             )

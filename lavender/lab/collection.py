@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from lavender.base.errors import CapabilityError, InputError
-from lavender.io.stored import whole_file, write_text
+from lavender.io.stored import read_whole_file, write_text
 from lavender.judge.solution import CONFIRMED, Status
 from lavender.lab import suite
 from lavender.lab.bench.cases import condition, fingerprint, is_path, resolve
@@ -138,7 +138,7 @@ def load(path: Path | str = MANIFEST) -> list[Entry]:
     """
     known = {f.name for f in fields(Entry)}
     try:
-        lines: list[dict[str, Any]] = json.loads(whole_file(path, "the manifest"))
+        lines: list[dict[str, Any]] = json.loads(read_whole_file(path, "the manifest"))
         return [Entry(**{k: v for k, v in line.items() if k in known}) for line in lines]
     except (ValueError, TypeError, AttributeError) as error:
         raise InputError(f"{path} is no manifest of problems: {error}") from None

@@ -24,7 +24,7 @@ from lavender.base.arrays import FloatArray, IntArray, check_float, check_int
 from lavender.base.errors import CapabilityError, InputError
 from lavender.batch.data import Batch
 from lavender.io.efc import from_efc
-from lavender.io.recording import Control, control_of, drive_of, model_of
+from lavender.io.recording import Control, load_controls, load_model, make_controller
 from lavender.io.states import StartStates, read_states
 from lavender.lab.report.table import Table
 from lavender.lab.report.text import format_percent
@@ -68,21 +68,21 @@ class Runs:
     def __post_init__(self) -> None:
         for name in ("worlds", "steps"):
             check_int(name, getattr(self, name), 1, None)
-        object.__setattr__(self, "control", control_of(self.control))
+        object.__setattr__(self, "control", load_controls(self.control))
         check_int("seed", self.seed, high=None)
         check_float("spread", self.spread, low=0.0)
 
     def load(self) -> tuple[Any, Any]:
         """MuJoCo and the model; InputError where its problems cannot be read."""
-        mj, model = model_of(self.model)
-        drive_of(model, self.control, self.seed)
+        mj, model = load_model(self.model)
+        make_controller(model, self.control, self.seed)
         return mj, model
 
     def start_from(self, states: Any) -> Runs:
         """Return these runs with start states of any source that `read_states` takes; None leaves the model's own."""
         if states is None:
             return self
-        return replace(self, starts=read_states(*self.load(), states).take(self.worlds))
+        return replace(self, starts=read_states(*self.load(), states).subset(self.worlds))
 
     def start(self, mj: Any, model: Any, world: int) -> Any:
         """MjData as this world begins."""
@@ -97,7 +97,7 @@ class Runs:
 
     def drive(self, model: Any, world: int) -> Any:
         """The controls of a world by (data, step)."""
-        drive = drive_of(model, self.control, self.seed + world)
+        drive = make_controller(model, self.control, self.seed + world)
         if self.starts is None or self.starts.controls is None:
             return drive
         first = self.starts.controls[world % len(self.starts)]

@@ -26,7 +26,14 @@ from worked import python
 
 import lavender as lv
 from lavender import bench, cli, io
-from lavender.io.stored import FOLDER_LOCK, PART, folder_for_steps, lock_output, write_atomically, write_text
+from lavender.io.stored import (
+    FOLDER_LOCK,
+    TEMPORARY_NAME,
+    folder_for_steps,
+    lock_output,
+    write_atomically,
+    write_text,
+)
 from lavender.lab import collection
 from lavender.lab.bench import machine
 from lavender.lab.bench.record import KINDS, Skip, file_name, printable, to_json
@@ -296,7 +303,7 @@ def test_the_temporary_file_of_a_killed_writer_is_removed_later(kind, tmp_path):
     python("-c", WRITE_AND_DIE, kind, cwd=tmp_path, status=-signal.SIGKILL)
     assert (tmp_path / "a.txt").read_bytes() == BEFORE
     (part,) = (p for p in tmp_path.iterdir() if p.name != "a.txt")
-    assert PART.fullmatch(part.name)
+    assert TEMPORARY_NAME.fullmatch(part.name)
     write_text(tmp_path / "a.txt", "of another")
     assert part.exists()  # Its writer may be alive, on another machine.
     os.utime(part, (0.0, 0.0))
@@ -452,7 +459,7 @@ def test_every_command_writes_files_under_temporary_names_first(tmp_path):
     script = """if True:
         import os, sys
         from lavender import cli
-        from lavender.io.stored import PART
+        from lavender.io.stored import TEMPORARY_NAME
         from lavender.lab.bench.running import alternating
         from lavender.sim.web import pages
         alternating.MAX_REPETITIONS = 1
@@ -462,7 +469,8 @@ def test_every_command_writes_files_under_temporary_names_first(tmp_path):
         def watch(event, given):
             if event == "open" and isinstance(given[0], (str, os.PathLike)) and given[2] & (os.O_WRONLY | os.O_RDWR):
                 path = os.path.abspath(given[0])
-                if path.startswith(here) and not (os.path.isdir(path) or PART.fullmatch(os.path.basename(path))):
+                temporary = os.path.isdir(path) or TEMPORARY_NAME.fullmatch(os.path.basename(path))
+                if path.startswith(here) and not temporary:
                     opened.add(os.path.relpath(path, here))
 
         sys.addaudithook(watch)

@@ -9,7 +9,7 @@ import numpy as np
 
 from lavender.export import HEADER
 from lavender.export.header import strip_comments, struct_fields
-from lavender.export.view import METHODS, view
+from lavender.export.view import METHODS, problem_view
 
 STRUCTS = ("lav_problem", "lav_options", "lav_budget", "lav_verdict", "lav_motion", "lav_result")
 SWEEPS = ("sequential_impulses", "pgs", "block_gauss_seidel", "anderson", "nncg")  # under friction too
@@ -79,7 +79,7 @@ class Library:
 
     def problem(self, given, **more):
         """A problem of the package as the library takes it, with the arrays that it points to."""
-        found, made = view(given), Problem()
+        found, made = problem_view(given), Problem()
         made.size = ct.sizeof(Problem)
         for key, value in zip(COUNTS, found.counts, strict=True):
             setattr(made, key, value)

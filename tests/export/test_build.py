@@ -153,7 +153,7 @@ def write_vectors(out):
         (rp.random_lcp(3, m=8), "lemke", {}), (rp.random_lcp(3, m=8), "newton", {}),
     ]  # fmt: skip
     packed = [vectors.pack(problem, solver, 1e-6, 500, options)[0] for problem, solver, options in given]
-    (out / "vectors.bin").write_bytes(vectors.file_of(packed))
+    (out / "vectors.bin").write_bytes(vectors.join_vectors(packed))
     return len(packed)
 
 
@@ -226,13 +226,13 @@ def test_what_auto_did_is_steps_with_their_work_that_c_runs(folder, shared, comp
     plan = bench.Plan(tolerances=(1e-3, 1e-6, 1e-9), budgets=(), repeats=1)
     sizes = ("granularF(n=3)", "granular(n=3)", "granularF(n=6)")  # the last under the cone law first
     bench.run(sizes, ["auto"], plan, records)
-    made = vectors.made(records, None, 2)
+    made = vectors.make_files(records, None, 2)
     header = made["chosen.h"]
     assert "to a relative residual of 1e-06" in header and "1e-09" not in header
     assert all(step in header for step in ("LAV_ANDERSON", "LAV_NNCG"))
     for name, text in made.items():
         (tmp_path / name).write_bytes(text if isinstance(text, bytes) else text.encode())
-    (tmp_path / "vectors.bin").write_bytes(vectors.made(records, None, 3)["vectors.bin"])
+    (tmp_path / "vectors.bin").write_bytes(vectors.make_files(records, None, 3)["vectors.bin"])
     (tmp_path / "use.cpp").write_text(
         '#include "chosen.h"\nint main() { return lav_chosen[0].options.convex; }\n'
     )
@@ -256,7 +256,7 @@ double lav_pong(double x) { return lav_round(x); }
 """
 
 
-@pytest.mark.parametrize("used, sign", [("k_bad()", "Python's side"), ("k_round(1)", "comes round")])
+@pytest.mark.parametrize("used, sign", [("k_bad()", "the Python part"), ("k_round(1)", "is a cycle")])
 def test_a_cut_that_needs_python_or_itself_is_refused(used, sign):
     with pytest.raises(extract_c.ExtractionError, match=sign):
         extract_c.extract_c([("a", KERNEL)], f"double lav_use(double x) {{ {used}; return x; }}")

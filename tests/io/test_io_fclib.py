@@ -279,8 +279,8 @@ def test_what_fclib_cannot_hold_is_named(tmp_path):
     cases = [
         (lv.Problem.lcp(np.eye(2), [1.0, 1.0]), {}, ["blocks of bounded rows .*2 bounded rows"]),
         (lv.Problem.linear(np.eye(2), [1.0, 1.0]), {}, ["blocks of bounded rows .*2 free rows"]),
-        (random_contact_problem(0), {}, ["blocks of bounded rows", "spin rows", "contacts of"]),
-        (lv.Problem.contact(np.eye(4), np.ones(4), [0.5], patch_radius=[0.1]), {}, ["spin rows"]),
+        (random_contact_problem(0), {}, ["blocks of bounded rows", "torsional friction", "contacts of"]),
+        (lv.Problem.contact(np.eye(4), np.ones(4), [0.5], patch_radius=[0.1]), {}, ["torsional friction"]),
         (lv.Problem.contact(np.eye(2), np.ones(2), [0.0, 0.0]), {}, ["contacts of 1 rows"]),
         (lv.Problem.contact(np.eye(3), np.ones(3), [0.5], friction="cone"), {}, ["'cone' law"]),
         (lv.Problem.contact(np.zeros((0, 0)), [], []), {}, ["without contacts"]),
@@ -345,7 +345,7 @@ def test_files_that_mix_kinds_or_miss_a_moment_are_told(tmp_path):
     with pytest.raises(lv.CapabilityError, match="rolling beside others"):
         lavender.io.save(side_by_side([plain, rolls]), path)
     with_spin = random_contact_problem(5, rolling=True, joints=0)
-    with pytest.raises(lv.CapabilityError, match="spin rows"):
+    with pytest.raises(lv.CapabilityError, match="torsional friction"):
         lavender.io.save(with_spin, path)
 
 

@@ -689,7 +689,7 @@ def test_more_contacts_than_memory_holds_are_rejected():
     sim = lv.Simulation(lv.Scene("stack", n=2))
     sim.state.head[HEAD["need_contacts"]] = 2**28
     with pytest.raises(lv.InputError, match="GiB"):
-        sim.state.grown()
+        sim.state.with_larger_buffers()
 
 
 # -- numbers at the edge of float64 --------------------------------------------------------------------

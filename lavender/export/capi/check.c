@@ -1,4 +1,4 @@
-/* Does this build have what the report measured? Every test vector solved again and compared to the last bit. */
+/* Check that this build reproduces the measured results: solve every test vector again and compare all bits. */
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -53,14 +53,14 @@ static void read_problem(lav_problem *q) {
   q->law = (int32_t)whole(), q->n_blocks = (int32_t)whole(), q->n_rows = (int32_t)whole(), q->n_entries = (int32_t)whole();
   q->n_bodies = (int32_t)whole(), q->n_joints = (int32_t)whole(), q->n_velocities = (int32_t)whole();
   q->n_mass_entries = (int32_t)whole();
-  at = (const void **)(void *)&q->block_ptr, end = (const void **)(void *)(q + 1); /* pointers to the end */
+  at = (const void **)(void *)&q->block_ptr, end = (const void **)(void *)(q + 1); /* The rest of the struct are pointers. */
   for (; at < end; at++) {
     const int64_t size = whole();
     *at = size < 0 ? NULL : array(size);
   }
 }
 
-/* A solver with a problem, in memory of its own that grows as it asks. */
+/* Open a solver with a problem, in its own memory, which is enlarged if the solver requests it. */
 static int set(const lav_options *options, const lav_problem *q, void **memory, lav_solver **solver) {
   uint64_t bytes;
   int32_t code = LAV_ERROR_WORKSPACE;
@@ -76,7 +76,7 @@ static int set(const lav_options *options, const lav_problem *q, void **memory, 
   return 0;
 }
 
-/* One step on a problem, from q->impulse where it is not null, into found. */
+/* Run one step on a problem, from q->impulse if it is not null, and store the result in found. */
 static int run_step(const step_t *s, const lav_problem *q, double *found, lav_result *result, void **memory) {
   lav_solver *solver = NULL;
   lav_budget budget = s->budget;
@@ -97,7 +97,7 @@ static int solve_one(void) {
   int is_met, same;
   for (i = 0; i < n; i++) steps[i] = read_step();
   read_problem(&q);
-  is_met = (int)whole(), relative = real(); /* a residual to be met, or bits */
+  is_met = (int)whole(), relative = real(); /* Either the residual must be reached, or all bits must be equal. */
   if (!is_met) impulse = (double *)array(8 * (int64_t)q.n_rows);
   found = (double *)calloc((size_t)q.n_rows + 1, 8);
   memset(&result, 0, sizeof result);

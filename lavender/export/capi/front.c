@@ -1,4 +1,4 @@
-/* -- from here on: the functions of lavender.h over the kernels above ------------------------------------------------- */
+/* -- the functions of lavender.h, which use the kernels above --------------------------------------------------------- */
 
 typedef struct core_parts_blocks_t blocks_t;
 typedef struct core_view_csr_t csr_t;
@@ -7,16 +7,16 @@ typedef struct core_view_generalized_t general_t;
 typedef struct judge_score_score_t score_t;
 typedef void (*sweep_t)(void *, double *, int32_t, int32_t);
 
-typedef struct where_t { /* what is refused: an array or a count, and the place in it */
+typedef struct where_t { /* A rejected array or count, and the index of the rejected entry. */
   const char *array;
   int32_t index;
 } where_t;
 
 enum { MAGIC = 0x4C415631, PATIENCE = 64, LONG_PATIENCE = 500, SPLIT_PATIENCE = 5000 };
-/* Above rounding of what was normalised in float64; above what float32 leaves of unit vectors and tensors after some turns. */
+/* Tolerances of unit vectors and tensors: EXACT exceeds rounding to float64, ROUNDED that to float32 after some rotations. */
 static const double EXACT = 1e-9, ROUNDED = 1e-5;
 
-typedef struct kept_t { /* impulses of the problem before, by key */
+typedef struct kept_t { /* Impulses of the previous problem, by key. */
   int32_t n_blocks, n_rows, most_blocks, most_rows;
   uint64_t *key;
   int32_t *ptr, *kind;
@@ -26,56 +26,56 @@ typedef struct kept_t { /* impulses of the problem before, by key */
 struct lav_solver {
   uint32_t magic;
   int32_t busy;
-  where_t refused;  /* of the last lav_set */
-  int32_t ready;    /* a problem is set */
-  int32_t begun;    /* its method has run */
+  where_t refused;  /* Rejected by the last lav_set. */
+  int32_t ready;    /* A problem is set. */
+  int32_t begun;    /* The method has run on it. */
   char *base;
-  uint64_t bytes, used, peak, begin, needed; /* of memory: all, taken, at most, by `kept`, asked for */
+  uint64_t bytes, used, peak, begin, needed; /* Memory [bytes]: total, in use, largest use, end of `kept`, needed. */
   lav_options options;
   kept_t kept;
-  int32_t form, has_keys, is_short, n_v; /* n_v: numbers of v */
-  int32_t in_rows; /* every block is one row, and they are swept as they stand */
+  int32_t form, has_keys, is_short, n_v; /* n_v: number of velocities. */
+  int32_t in_rows; /* Every block has one row, and the sweep uses the given order. */
   blocks_t p;
   csr_t a;
   rows_t r;
   general_t g;
   uint64_t *key;
   double *impulse, *v_free, *score_workspace, *compare;
-  double start[3]; /* E0 [sqrt J], V0 [m/s], relative residual of the zero impulse */
+  double start[3]; /* Reference energy E0 [sqrt J] and velocity V0 [m/s], relative residual of the zero impulse. */
   struct core_parts_islands_t islands;
-  double *reference; /* E0, V0 of each island */
+  double *reference; /* E0 and V0 of each island. */
   int32_t *order, *empty, *marks, *island_marks;
   int32_t split, mode;
   uint64_t rng;
-  struct core_view_view_t read; /* as the judge reads it */
+  struct core_view_view_t read; /* The problem for the judge. */
   struct judge_watch_watch_t watch;
   struct sweep_serial_sweeping_t swept;
-  double deadline;  /* by the clock of the budget */
+  double deadline;  /* Time on the clock of the budget. */
 #ifndef LAV_SWEEPS_ONLY
   struct accelerate_accelerated_sweep_data_t fast;
-  struct core_view_view_t view; /* as newton does: over rows of A where these were formed */
+  struct core_view_view_t view; /* The problem for newton: rows of A if A was formed. */
   struct core_method_options_t newton_options;
   struct core_method_room_t drive;
-  int32_t driven;              /* Newton's method has begun, as `newton_options` says */
-  blocks_t q;                  /* with d, nu and step of A, where a method goes over A */
+  int32_t driven;              /* Newton's method has begun with `newton_options`. */
+  blocks_t q;                  /* Blocks with d, nu and step of A, for methods that use A. */
   struct pivot_direct_direct_t direct;
   struct pivot_lemke_lemke_t lemke;
-  double *table;               /* Lemke's dictionary, or the matrix of admm and its factor */
+  double *table;               /* Lemke's dictionary, or the matrix of admm and its factor. */
   struct accelerate_admm_admm_t splitting;
   struct accelerate_admm_factor_t factor;
   int32_t factors, is_broken;
 #endif
 };
 
-enum { FREE_ROWS = 1, ROWS_ALONE, COULOMB_ALONE, EVERY_LAW }; /* blocks that a method takes */
+enum { FREE_ROWS = 1, ROWS_ALONE, COULOMB_ALONE, EVERY_LAW }; /* Blocks that a method supports. */
 
 typedef struct method_t {
-  int32_t forms, rolling, round; /* 1 << form of those it takes: at all, with parts that roll, with round cones */
-  int32_t blocks, patience;      /* checks without a gain before it stalls */
-  sweep_t sweep;                 /* where it is one after the other */
-  int64_t (*workspace)(const lav_problem *, const lav_options *, int32_t n_v); /* doubles beside the problem */
-  int32_t (*start)(lav_solver *);                                         /* a problem is set */
-  void (*step)(lav_solver *, const lav_budget *, lav_result *);           /* on from where it is */
+  int32_t forms, rolling, round; /* Bits 1 << form: supported forms, those with rolling friction, those with round cones. */
+  int32_t blocks, patience;      /* patience: checks without progress before it stalls. */
+  sweep_t sweep;                 /* NULL if the method has no sweep. */
+  int64_t (*workspace)(const lav_problem *, const lav_options *, int32_t n_v); /* Doubles in addition to the problem. */
+  int32_t (*start)(lav_solver *);                                         /* Prepare the method for a new problem. */
+  void (*step)(lav_solver *, const lav_budget *, lav_result *);           /* Continue from the present impulse. */
 } method_t;
 
 static const method_t *row_of(int32_t method);
@@ -88,7 +88,7 @@ static int32_t is_accelerated(const lav_options *o) { return o->method == LAV_AN
     if (code_ != LAV_OK) return code_;                              \
   } while (0)
 
-/* -- words ------------------------------------------------------------------------------------------------------------ */
+/* -- names ------------------------------------------------------------------------------------------------------------ */
 
 uint32_t lav_version(void) { return (uint32_t)LAV_VERSION_MAJOR << 16 | LAV_VERSION_MINOR; }
 
@@ -134,10 +134,10 @@ static uint64_t hash_bytes(const void *from, uint64_t bytes, uint64_t seed) {
 
 uint64_t lav_hash(const double *x, int32_t n, uint64_t seed) { return hash_bytes(x, x && n > 0 ? 8 * (uint64_t)n : 0, seed); }
 
-/* -- what is asked for, checked --------------------------------------------------------------------------------------- */
+/* -- checks of arguments ---------------------------------------------------------------------------------------------- */
 
 static int32_t are_finite(const double *x, int64_t n) {
-  double sum = 0.0; /* stays 0, or becomes NaN */
+  double sum = 0.0; /* 0, or NaN if a number is not finite. */
   int64_t i;
   for (i = 0; i < n; i++) sum += 0.0 * x[i];
   return sum == 0.0;
@@ -173,7 +173,7 @@ static int32_t check_options(const lav_options *o) {
   return LAV_OK;
 }
 
-/* Bounds that no other impulse moves. */
+/* Return whether all blocks are rows, whose bounds do not depend on other impulses. */
 static int32_t are_rows(const lav_problem *q) {
   int32_t i;
   for (i = 0; q->kind && i < q->n_blocks; i++)
@@ -181,7 +181,7 @@ static int32_t are_rows(const lav_problem *q) {
   return 1;
 }
 
-/* As far as counts tell. */
+/* Check whether the method supports the form and the counts of a problem, without reading arrays. */
 static int32_t takes_counts(const lav_problem *q, const lav_options *o) {
   if (!(row_of(o->method)->forms >> q->form & 1)) return LAV_ERROR_UNSUPPORTED;
 #ifdef LAV_SWEEPS_ONLY
@@ -268,7 +268,7 @@ static int32_t check_columns(const int32_t *ptr, const int32_t *index, int32_t r
   return LAV_OK;
 }
 
-/* Bodies of joints or contacts, none with itself; a contact is of one body at least. */
+/* Check the pairs of bodies of joints or contacts: no body with itself; a contact needs at least one body. */
 static int32_t check_pairs(const int32_t *body, int32_t n, int32_t n_bodies, int32_t moves, const char *name, where_t *at) {
   int32_t i;
   if (n > 0 && !body) return refuse(at, LAV_ERROR_NULL, name, 0);
@@ -289,11 +289,11 @@ static int32_t check_numbers(const double *x, int64_t n, int32_t is_needed, cons
 #define OPTIONAL(name, n) GIVE_BACK(check_numbers(q->name, (n), 0, #name, at))
 #define NEEDED(name, n) GIVE_BACK(check_numbers(q->name, (n), 1, #name, at))
 
-/* How far normals and tangents are from orthogonal unit vectors, the worst of a contact. */
+/* Return the largest deviation of a contact's normal and tangent from orthogonal unit vectors. */
 static double off_frame(const double *n, const double *t) {
   double nn = core_rows_dot3(n, n), tt = core_rows_dot3(t, t), most;
   const double nt = fabs(core_rows_dot3(n, t));
-  if (core_door_is_frame(n, t, EXACT)) return 0.0; /* most are, without a root */
+  if (core_door_is_frame(n, t, EXACT)) return 0.0; /* The usual case, which needs no square root. */
   nn = fabs(sqrt(nn) - 1.0), tt = fabs(sqrt(tt) - 1.0);
   most = nn > tt ? nn : tt;
   return most > nt ? most : nt;
@@ -344,7 +344,7 @@ static int32_t check_problem(const lav_problem *q, where_t *at) {
   OPTIONAL(b, m);
   OPTIONAL(target, m);
   OPTIONAL(compliance, m);
-  for (i = 0; q->impulse && i < m; i++) /* as large as it likes: the judge measures it */
+  for (i = 0; q->impulse && i < m; i++) /* The size is not limited: the judge measures it. */
     if (!isfinite(q->impulse[i])) return refuse(at, LAV_ERROR_NUMBER, "impulse", i);
   for (i = 0; q->compliance && i < m; i++) {
     if (q->compliance[i] < 0.0) return refuse(at, LAV_ERROR_MASS, "compliance", i);

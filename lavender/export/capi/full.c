@@ -16,7 +16,7 @@ int32_t lav_islands(lav_solver *solver, int32_t *label, int32_t n) {
 
 /* -- the engine ------------------------------------------------------------------------------------------------------- */
 
-typedef struct image_t { /* then 10 sizes, reals, int32 (padded to 8 bytes), keys */
+typedef struct image_t { /* It is followed by 10 sizes, reals, int32 (padded to 8 bytes), keys. */
   uint64_t magic, hash;
 } image_t;
 
@@ -105,7 +105,7 @@ int32_t lav_engine_image(lav_engine *engine, void *out, uint64_t out_bytes, uint
   k_engine_lengths(size, count);
   if (count[0] < 0 || count[1] < 0 || count[2] < 0) return LAV_ERROR_COUNT;
   *bytes = image_bytes_of(count);
-  if (!out) return LAV_OK; /* asks how many */
+  if (!out) return LAV_OK; /* Only the size is requested. */
   if ((uintptr_t)out % 8 != 0 || out_bytes < *bytes) return LAV_ERROR_WORKSPACE;
   memset(out, 0, (size_t)*bytes);
   at = (unsigned char *)out + sizeof(image_t);
@@ -152,7 +152,7 @@ int32_t lav_engine_image(lav_engine *engine, void *out, uint64_t out_bytes, uint
 int32_t lav_engine_places(const lav_engine *engine, int32_t *n_bodies, double *out, int32_t n) { return engine || n_bodies || out || n ? LAV_ERROR_UNSUPPORTED : LAV_ERROR_NULL; }
 #endif
 
-/* -- does this build have the bits of the package? -------------------------------------------------------------------- */
+/* -- self-test: compare this build with the bits of the package ------------------------------------------------------- */
 
 enum { TEST_BODIES = 3, TEST_CONTACTS = 12 };
 static const uint64_t TEST_HASH = 0x55045c0a444e3c2cu;

@@ -1,5 +1,5 @@
 
-/* -- judging ---------------------------------------------------------------------------------------------------------- */
+/* -- judge ------------------------------------------------------------------------------------------------------------ */
 
 #ifndef LAV_SWEEPS_ONLY
 static const general_t *general_of(const lav_solver *s) { return s->form == LAV_VELOCITIES ? &s->g : NULL; }
@@ -7,7 +7,8 @@ static const general_t *general_of(const lav_solver *s) { return s->form == LAV_
 static const general_t *general_of(const lav_solver *s) { return (void)s, (const general_t *)NULL; }
 #endif
 
-/* tol: the residual that an ill-conditioned M must not hide; INFINITY: as the first pass finds it. Returns the residual of the first pass, or NAN if it was not refined. */
+/* Judge an impulse. The pass is refined if M is so ill-conditioned that its rounding may hide a residual of tol; with tol =
+ * INFINITY it is never refined. Return the residual of the first pass, or NAN if it was not refined. */
 static double judge(lav_solver *s, const double *impulse, int32_t floor, double tol, lav_verdict *out) {
   score_t t = judge_score_new_score();
   double first = NAN, found;
@@ -30,7 +31,8 @@ static double judge(lav_solver *s, const double *impulse, int32_t floor, double 
   return first;
 }
 
-/* Relative residual of an impulse, which is kept in the islands where it is better; a start if tol is negative. */
+/* Return the relative residual of an impulse, and store it in `best` for the islands that it improves. A negative tol marks a
+ * start. */
 static double see(lav_solver *s, struct judge_best_best_t *best, const double *impulse, double tol) {
   score_t t = judge_score_new_score();
   double relative;
@@ -79,7 +81,7 @@ int32_t lav_judge(lav_solver *solver, const double *impulse, int32_t n, double *
   return leave(solver, LAV_OK);
 }
 
-/* v = M^-1 J^T x of bodies or generalised velocities. */
+/* Compute v = M^-1 J^T x of bodies or generalised velocities. */
 static void change_of(lav_solver *s, const double *x, double *v) {
   if (s->n_v > 0) memset(v, 0, (size_t)s->n_v * sizeof(double));
   if (s->n_v == 0 || s->p.n_rows == 0) return;
@@ -93,10 +95,10 @@ static void change_of(lav_solver *s, const double *x, double *v) {
   core_velocity_rows_velocity(&s->p, &s->r, x, v);
 }
 
-/* Of a sum that rounding may leave below 0, or overflow leave without a value. */
+/* Return an energy from a sum that rounding may have made negative (0) or overflow NaN (INFINITY). */
 static double energy_from(double sum) { return sum < 0.0 ? 0.0 : sum < INFINITY ? sum : INFINITY; }
 
-/* A x into out (m); 1/2 x.A x is an energy [J], without what compliance stores the `kinetic` one of v = change_of(x). */
+/* Compute A x into out (m) and the energy 1/2 x.A x [J]; `kinetic` is the energy of v = change_of(x) without compliance. */
 static double energy_of(lav_solver *s, const double *x, double *v, double *out, double *kinetic) {
   double whole = 0.0, moving = 0.0;
   int32_t i;

@@ -2,7 +2,7 @@
 /* -- sweeps, accelerated or not --------------------------------------------------------------------------------------- */
 
 #ifndef LAV_SWEEPS_ONLY
-/* Some contact has more than its normal: the law counts, and which sweeps know it, however rough the contacts are. */
+/* Return whether a contact has friction rows: then the law and the supported sweeps matter, even if mu is 0. */
 static int32_t has_tangents(const blocks_t *p) {
   int32_t i;
   for (i = 0; i < p->n_blocks; i++)
@@ -64,7 +64,7 @@ static int32_t is_late(const lav_solver *s, const lav_budget *budget) {
   return is_timed(budget) && !(budget->clock(budget->clock_data) < s->deadline);
 }
 
-/* Sweeps until a check, the budget or the clock ends them. */
+/* Run sweeps until a check, the budget or the clock ends them. */
 static void run_sweeps(lav_solver *s, const lav_budget *budget, lav_result *out) {
   const double begin = is_timed(budget) ? budget->clock(budget->clock_data) : 0.0;
   double now = begin, left;
@@ -90,17 +90,17 @@ static void run_sweeps(lav_solver *s, const lav_budget *budget, lav_result *out)
         out->outcome = LAV_TIME_LIMIT;
         break;
       }
-      left = 0.5 * left * out->iterations / (now > begin ? now - begin : 1e-7); /* iterations that half of it is for */
+      left = 0.5 * left * out->iterations / (now > begin ? now - begin : 1e-7); /* Iterations for half of the remaining time. */
       n = left < 1.0 ? 1 : left > 4.0 * n ? (n < 250000000 ? 4 * n : n) : (int32_t)left;
     }
   }
-  if (status != judge_watch_RUNNING) out->outcome = status; /* numbered alike */
+  if (status != judge_watch_RUNNING) out->outcome = status; /* Both enums have the same numbers. */
   out->sweeps = out->iterations;
 #ifndef LAV_SWEEPS_ONLY
   out->restarts = restarts_of(s) - before;
   if (s->mode == core_order_SYMMETRIC && is_accelerated(&s->options)) out->sweeps *= 2;
 #endif
-  if (budget->tol > 0.0 && s->watch.best_at >= 0 && out->outcome != LAV_CONVERGED) { /* a residual may rise: the best counts */
+  if (budget->tol > 0.0 && s->watch.best_at >= 0 && out->outcome != LAV_CONVERGED) { /* The residual may have risen: return the best iterate. */
     if (see(s, &s->watch.best, s->impulse, budget->tol) > budget->tol) {
       COPY(s->impulse, s->watch.best.impulse, s->p.n_rows);
       sweep_serial_form_velocity(&s->swept.c, s->impulse);
@@ -109,7 +109,7 @@ static void run_sweeps(lav_solver *s, const lav_budget *budget, lav_result *out)
 }
 
 #ifndef LAV_SWEEPS_ONLY
-/* -- methods over A: of bodies it is formed first --------------------------------------------------------------------- */
+/* -- methods that use A; of bodies, A is formed first ----------------------------------------------------------------- */
 
 static int32_t form_matrix(lav_solver *s) {
   const int64_t m = s->p.n_rows, k = s->p.n_blocks;
@@ -147,7 +147,7 @@ static int32_t form_matrix(lav_solver *s) {
 
 static const double CLOSEST = 1e-2;
 
-/* On the impulse as it stands; rows of a formed A where it does not go over bodies. */
+/* Start Newton's method at the present impulse, over bodies or over the rows of A if A was formed. */
 static int32_t begin_newton(lav_solver *s, double tol, int32_t budget) {
   s->newton_options.tol = tol;
   s->newton_options.budget = budget;
@@ -177,17 +177,17 @@ static int32_t start_newton(lav_solver *s) {
     s->drive.index = TAKE(s, int32_t, s->drive.n_index);
     s->drive.real = TAKE(s, double, s->drive.n_real);
     if (s->is_short) return LAV_ERROR_WORKSPACE;
-    how = s->view.a ? core_method_MORE : begin_newton(s, s->newton_options.tol, s->newton_options.budget); /* as the last run: it tells the workspace */
+    how = s->view.a ? core_method_MORE : begin_newton(s, s->newton_options.tol, s->newton_options.budget); /* Starting with the last options gives the workspace size. */
   }
   s->driven = s->view.a == NULL;
   return LAV_OK;
 }
 
-/* Of a run that its budget ended: in each island the better of its result, the start and the zero impulse. */
+/* After a run that did not converge, keep in each island the best of its result, its start and the zero impulse. */
 static void keep_better(lav_solver *s, const double *begin, double tol) {
   struct judge_best_best_t best;
   judge_best_bind_best(&best, &s->p, s->score_workspace);
-  double *zero = s->compare + s->p.n_rows; /* behind `begin` */
+  double *zero = s->compare + s->p.n_rows; /* `begin` is stored before it. */
   judge_measure_do_nothing(&s->p, zero, s->watch.w);
   see(s, &best, begin, -1.0);
   see(s, &best, zero, -1.0);
@@ -208,7 +208,7 @@ static void run_newton(lav_solver *s, const lav_budget *budget, lav_result *out)
     out->iterations = before + said.work;
     if (how == core_method_SPENT) break;
     if (how == core_method_REACHED) {
-      judge(s, s->impulse, 1, INFINITY, &now); /* over velocities sums are rounded in another order, and vanish where squares do */
+      judge(s, s->impulse, 1, INFINITY, &now); /* Confirm it: the velocity form rounds sums in another order, and its squares may underflow. */
       if (now.relative <= budget->tol) out->outcome = LAV_CONVERGED;
       else if (closer <= CLOSEST || budget->iterations <= out->iterations) out->outcome = LAV_STALLED;
       else {
@@ -230,7 +230,7 @@ static void run_newton(lav_solver *s, const lav_budget *budget, lav_result *out)
 
 static const double FIRST_RHO = 0.1, RELAXATION = 1.6;
 
-/* L L^T = D^-1/2 A D^-1/2 + rho, behind that matrix; 0 where a pivot is not positive. */
+/* Compute L of L L^T = D^-1/2 A D^-1/2 + rho, stored behind that matrix; return 0 if a pivot is not positive. */
 static int32_t factor_shifted(lav_solver *s) {
   const int32_t m = s->p.n_rows;
   const double *root = s->splitting.root;
@@ -250,7 +250,7 @@ static void admm_step(void *context, double *lam, int32_t first, int32_t n) {
   lav_solver *s = (lav_solver *)context;
   struct accelerate_admm_admm_t *c = &s->splitting;
   int32_t i;
-  if (first) { /* at a solution the first iteration stays there */
+  if (first) { /* At a solution, the first iteration does not change it. */
     for (i = 0; i < s->p.n_rows; i++) c->x[i] = core_csr_csr_dot(&s->a, i, lam) - s->p.b[i];
     k_admm_start(c, lam, c->x);
   }
@@ -269,7 +269,7 @@ static int32_t start_admm(lav_solver *s) {
   int32_t bands[2];
   GIVE_BACK(form_matrix(s));
   if (m > 0 && s->a.indptr[m] > 0 && core_csr_scan_entries(&s->a, s->p.d, (int32_t)m, s->marks, bands) > 1e-14)
-    return LAV_ERROR_UNSUPPORTED; /* L L^T alone: A is not symmetric */
+    return LAV_ERROR_UNSUPPORTED; /* A is not symmetric; the factorisation needs it. */
   s->table = TAKE(s, double, m * m + factor_dense_cholesky_workspace_size(s->p.n_rows));
   x = TAKE(s, double, numbers);
   if (s->is_short) return LAV_ERROR_WORKSPACE;

@@ -2,7 +2,7 @@
 #ifndef LAV_SWEEPS_ONLY
 /* -- direct and lemke: pivots on bounded rows ------------------------------------------------------------------------- */
 
-enum { GUESS_SWEEPS = 2, BATCH = 32 }; /* rounds or pivots between two checks of the clock */
+enum { GUESS_SWEEPS = 2, BATCH = 32 }; /* BATCH: exchanges or pivots between two checks of the clock. */
 static const double TINY_PIVOT = 1e-13;
 
 static int32_t start_pivots(lav_solver *s) {
@@ -35,7 +35,7 @@ static int32_t start_pivots(lav_solver *s) {
   return LAV_OK;
 }
 
-/* Rounds until the next check of the clock, within the budget. */
+/* Return the number of exchanges until the next check of the clock, within the budget. */
 static int32_t rounds_left(const lav_solver *s, const lav_budget *budget) {
   const int32_t left = budget->iterations - s->direct.s.n_rounds;
   return left < BATCH ? left : BATCH;
@@ -46,7 +46,7 @@ static int32_t pivot_all(lav_solver *s, const lav_budget *budget) {
   do {
     code = pivot_direct_direct_turn(&s->direct, rounds_left(s, budget));
     if (code == pivot_principal_SOLVED) return LAV_CONVERGED;
-    if (code == pivot_principal_INDEFINITE) return LAV_FAILED; /* the package goes on with LAPACK */
+    if (code == pivot_principal_INDEFINITE) return LAV_FAILED; /* The package continues with LAPACK. */
     if (code == pivot_direct_SPENT || code == pivot_direct_CIRCLES) return LAV_STALLED;
   } while (rounds_left(s, budget) > 0 && !is_late(s, budget));
   return rounds_left(s, budget) <= 0 ? LAV_MAX_ITERATIONS : LAV_TIME_LIMIT;

@@ -3,7 +3,7 @@
 
 static void *take(lav_solver *s, int64_t count, size_t size) {
   const uint64_t at = (s->used + 15) & ~(uint64_t)15;
-  s->used = at + (uint64_t)(count + 1) * size; /* one more than none, so that every array has an address */
+  s->used = at + (uint64_t)(count + 1) * size; /* One additional entry, so that an empty array has an address, too. */
   if (s->used > s->peak) s->peak = s->used;
   if (s->used <= s->bytes) return s->base + at;
   s->is_short = 1;
@@ -21,7 +21,7 @@ static void take_kept(lav_solver *s, const lav_problem *q) {
   s->kept.impulse = TAKE(s, double, q->n_rows);
 }
 
-/* What every problem has. */
+/* Allocate the arrays of every problem. */
 static void take_blocks(lav_solver *s, const lav_problem *q) {
   const int64_t k = q->n_blocks, m = q->n_rows, n = q->n_bodies, nv = q->n_velocities;
   s->p.n_blocks = q->n_blocks;
@@ -42,7 +42,7 @@ static void take_blocks(lav_solver *s, const lav_problem *q) {
   s->impulse = TAKE(s, double, m);
   s->order = TAKE(s, int32_t, k);
   s->empty = TAKE(s, int32_t, m);
-  s->marks = TAKE(s, int32_t, 4 * ((int64_t)s->kept.most_blocks + k) + m + 2 * n + 4 * nv + 16); /* scratch */
+  s->marks = TAKE(s, int32_t, 4 * ((int64_t)s->kept.most_blocks + k) + m + 2 * n + 4 * nv + 16); /* Scratch. */
   s->island_marks = TAKE(s, int32_t, 4 * k + 1 + (q->form == LAV_VELOCITIES ? 2 * nv : q->form == LAV_BODIES ? n : m));
   s->reference = TAKE(s, double, 2 * k);
   s->score_workspace = TAKE(s, double, judge_watch_watch_workspace_size(m, k + 1));
@@ -55,7 +55,7 @@ static void take_blocks(lav_solver *s, const lav_problem *q) {
   s->watch.v = TAKE(s, double, q->form == LAV_BODIES ? 12 * n : q->form == LAV_VELOCITIES ? 6 * nv + 2 * m : 0);
 }
 
-/* Rows of joints, and of contacts, of bodies: as block_ptr says, else so many at most. */
+/* Numbers of rows of joints and of contacts of bodies, from block_ptr, or else the largest possible numbers. */
 static int32_t joint_rows(const lav_problem *q) {
   const int32_t most = q->n_rows - (q->n_blocks - q->n_joints);
   if (q->n_joints == 0) return 0;
@@ -112,7 +112,7 @@ static void take_form(lav_solver *s, const lav_problem *q) {
   memset((void *)(uintptr_t)s->r.swing, 0, 6 * (size_t)(mc + 1) * sizeof(double));
 }
 
-/* -- the problem copied ----------------------------------------------------------------------------------------------- */
+/* -- copy of the problem ---------------------------------------------------------------------------------------------- */
 
 #define COPY(to, from, n) copy_bytes((to), (from), (size_t)(n) * sizeof *(to))
 
@@ -161,7 +161,7 @@ static int32_t fill_blocks(lav_solver *s, const lav_problem *q) {
   return LAV_OK;
 }
 
-/* Rows of a matrix, of a dense one what is not zero; `lower`: up to the diagonal, which is kept. */
+/* Copy a matrix to compressed rows; of a dense one, only nonzero entries. `lower`: the lower triangle and every diagonal entry. */
 static void fill_matrix(const int32_t *to_ptr, const int32_t *to_index, const double *to_value, const int32_t *ptr,
                         const int32_t *index, const double *value, int32_t rows, int32_t columns, int32_t entries,
                         int32_t lower) {
@@ -184,7 +184,7 @@ static void fill_matrix(const int32_t *to_ptr, const int32_t *to_index, const do
   }
 }
 
-/* Frames that float32 left a little off, made whole: n / |n|, then t without its part along n, over its length. */
+/* Copy the frames of contacts; correct those that are only accurate to float32: n / |n|, then t orthogonalised and normalised. */
 static void fill_frames(lav_solver *s, const lav_problem *q) {
   double *normal = (double *)(uintptr_t)s->r.normal, *tangent = (double *)(uintptr_t)s->r.tangent, size, along;
   int32_t i, k;
@@ -226,7 +226,7 @@ static void fill_bodies(lav_solver *s, const lav_problem *q) {
 }
 
 #ifndef LAV_SWEEPS_ONLY
-/* M, its factor L^T D L and its condition. */
+/* Copy M, factor it as L^T D L, and estimate its condition. */
 static int32_t factor_mass(lav_solver *s, const lav_problem *q) {
   const int32_t n = q->n_velocities;
   const int64_t most = (int64_t)n * n / 2 + 1;
@@ -252,7 +252,7 @@ static int32_t factor_mass(lav_solver *s, const lav_problem *q) {
     return LAV_ERROR_MASS;
   for (i = 0; i < n; i++) pivot[i] = sqrt(s->g.inv_pivot[i]);
   s->g.mptr = mptr, s->g.midx = midx, s->g.mval = mval;
-  s->used = from; /* L behind M, no longer than it must be */
+  s->used = from; /* Move L directly behind M, with its final size. */
   s->g.lidx = lidx = TAKE(s, int32_t, count);
   s->g.lval = lval = TAKE(s, double, count);
   memmove(lidx, columns, (size_t)count * sizeof *lidx);
@@ -261,7 +261,7 @@ static int32_t factor_mass(lav_solver *s, const lav_problem *q) {
   return LAV_OK;
 }
 
-/* L of M and Y of J and M. */
+/* Copy J and M, factor M, and compute Y of J and M. */
 static int32_t fill_velocities(lav_solver *s, const lav_problem *q) {
   const int32_t n = q->n_velocities, m = q->n_rows, k = q->n_blocks;
   int32_t *columns, *pcol, *pval, *home, n_columns = 0, i, j;
@@ -290,7 +290,7 @@ static int32_t fill_velocities(lav_solver *s, const lav_problem *q) {
   }
   if (values >= 2147483647.0) return LAV_ERROR_COUNT;
   s->used = from;
-  s->g.cols = TAKE(s, int32_t, n_columns); /* where it is, no longer than it must be */
+  s->g.cols = TAKE(s, int32_t, n_columns); /* The same place, with its final size. */
   s->g.y = TAKE(s, double, (int64_t)values);
   if (s->is_short) return LAV_ERROR_WORKSPACE;
   for (i = j = 0; i < k; i++) {
@@ -303,7 +303,7 @@ static int32_t fill_velocities(lav_solver *s, const lav_problem *q) {
 }
 #endif
 
-/* What follows from the numbers: b, and A_ii of J and M, which core/door.pxd bounds as well. */
+/* Check the range of computed numbers: b, and A_ii of J and M. */
 static int32_t check_derived(lav_solver *s, const lav_problem *q) {
   const int64_t m = q->n_rows;
   const double top = core_door_largest(s->p.b, m);

@@ -13,7 +13,7 @@ static void keep_impulses(lav_solver *s) {
   kept->n_rows = s->p.n_rows;
 }
 
-/* Impulses that are carried, in arrays for a larger problem: these move towards its end, the last one first. */
+/* Enlarge the arrays of stored impulses for a larger problem. They move to higher addresses, so the last array moves first. */
 static int32_t grow_kept(lav_solver *s, const lav_problem *q) {
   const kept_t old = s->kept;
   const uint64_t used = s->used;
@@ -43,11 +43,11 @@ static uint32_t place_of(uint64_t key, uint32_t mask) {
   return (uint32_t)(key ^ key >> 31) & mask;
 }
 
-/* Impulses of blocks of the same key, kind and rows; of equal keys the first. */
+/* Copy the stored impulses of blocks with the same key, kind and number of rows; of equal keys, the first one. */
 static void carry(lav_solver *s) {
   const kept_t *kept = &s->kept;
   uint32_t size = 1, at;
-  int32_t i, j, *table = s->marks; /* twice the number of blocks before, and a power of two */
+  int32_t i, j, *table = s->marks; /* Hash table: a power of two, at least twice the number of stored blocks. */
   if (!s->has_keys || kept->n_blocks == 0) return;
   while (size < 2u * (uint32_t)kept->n_blocks) size *= 2;
   for (at = 0; at < size; at++) table[at] = -1;
@@ -66,7 +66,7 @@ static void carry(lav_solver *s) {
   }
 }
 
-/* -- workspace: numbers that a method has beside the problem; what depends on arrays is guessed ----------------------------- */
+/* -- workspace of a method in addition to the problem [doubles]; sizes that depend on arrays are estimated ----------------- */
 
 static int64_t sweeps_workspace_size(const lav_problem *q, const lav_options *o, int32_t n_v) {
   int64_t numbers = n_v + 76;
@@ -102,14 +102,14 @@ static int64_t newton_workspace_size(const lav_problem *q, const lav_options *o,
   return workspace.n_index / 2 + workspace.n_real + 16;
 }
 
-/* A of bodies, which is formed first. */
+/* Workspace to form A of bodies. */
 static int64_t formed_workspace_size(const lav_problem *q) {
   return (q->form == LAV_BODIES ? 90 * (int64_t)q->n_rows + 6 * (int64_t)q->n_blocks + q->n_bodies : 0) + 64;
 }
 
 static int64_t pivots_workspace_size(const lav_problem *q, const lav_options *o, int32_t n_v) {
   const int64_t m = q->n_rows, each = q->form == LAV_MATRIX && m > 0 ? q->n_entries / m : 0, band = each > 64 ? each : 64;
-  const int64_t table = o->method == LAV_LEMKE ? 4 * m * m + 9 * m : 0; /* two places in the dictionary for each row */
+  const int64_t table = o->method == LAV_LEMKE ? 4 * m * m + 9 * m : 0; /* Each row has two columns in the dictionary. */
   (void)n_v;
   return 22 * m + (q->form == LAV_BODIES ? 12 * (int64_t)q->n_bodies : 0) + m * (m < band ? m : band) + table + formed_workspace_size(q);
 }
@@ -127,7 +127,7 @@ static const method_t *row_of(int32_t method) {
   enum { A = 1 << LAV_MATRIX, B = 1 << LAV_BODIES, V = 1 << LAV_VELOCITIES, ALL = A | B | V };
   static const method_t table[LAV_ADMM + 1] = {
     {0, 0, 0, 0, 0, NULL, NULL, NULL, NULL},
-    /* forms, where parts roll, with round cones; blocks, patience; a sweep; workspace, start, step */
+    /* forms, with rolling friction, with round cones; blocks, patience; sweep; workspace, start, step */
     {B, B, 0, COULOMB_ALONE, PATIENCE, sweep_serial_sweep_step, sweeps_workspace_size, start_sweeps, run_sweeps},
     {A | V, A | V, 0, COULOMB_ALONE, PATIENCE, sweep_serial_sweep_step, sweeps_workspace_size, start_sweeps, run_sweeps},
     {A, 0, 0, FREE_ROWS, PATIENCE, sweep_serial_sor_step, sweeps_workspace_size, start_sweeps, run_sweeps},
@@ -149,7 +149,7 @@ static const method_t *row_of(int32_t method) {
 /* -- the calls -------------------------------------------------------------------------------------------------------- */
 
 int32_t lav_workspace_size(const lav_problem *problem, const lav_options *options, uint64_t *bytes) {
-  lav_solver s; /* of no memory: it only counts */
+  lav_solver s; /* It has no memory and only counts bytes. */
   int64_t m, k, n, nv, numbers;
   if (!problem || !options || !bytes) return LAV_ERROR_NULL;
   GIVE_BACK(check_counts(problem));
@@ -163,7 +163,7 @@ int32_t lav_workspace_size(const lav_problem *problem, const lav_options *option
   take_blocks(&s, problem);
   take_form(&s, problem);
   numbers = 0;
-  if (problem->form == LAV_VELOCITIES) { /* M's factor without fill, Y with a quarter more than J, its columns once a block */
+  if (problem->form == LAV_VELOCITIES) { /* Assume that the factor of M has no fill, and Y has 1.25 times the entries of J. */
     const int64_t filled = (int64_t)problem->n_entries + problem->n_entries / 4 + 256;
     numbers += 2 * nv + 4 * (int64_t)problem->n_mass_entries + 2 * k + problem->n_entries / 4 + (m * nv < filled ? m * nv : filled);
   }
@@ -211,7 +211,7 @@ int32_t lav_move(lav_solver *solver, void *memory, uint64_t bytes, lav_solver **
   if (bytes < skip + s->begin) return leave(s, LAV_ERROR_WORKSPACE);
   keep_impulses(s);
   to = (lav_solver *)(void *)((char *)memory + skip);
-  memcpy(to, s, s->begin); /* what is carried lies behind the struct */
+  memcpy(to, s, s->begin); /* The stored impulses are behind the struct. */
   to->base = (char *)to;
   to->bytes = bytes - skip;
   MOVED(key, uint64_t), MOVED(ptr, int32_t), MOVED(kind, int32_t), MOVED(impulse, double);
@@ -233,7 +233,7 @@ uint64_t lav_needed(const lav_solver *solver) {
 static int32_t set_problem(lav_solver *s, const lav_problem *q) {
   int32_t code = LAV_OK;
   keep_impulses(s);
-  s->ready = s->begun = 0; /* whatever is wrong below: no answer of the problem before passes for this one's */
+  s->ready = s->begun = 0; /* If an error follows, results of the previous problem must not be returned for this one. */
   s->refused.array = NULL;
   GIVE_BACK(check_problem(q, &s->refused));
   GIVE_BACK(takes(q, &s->options));
@@ -283,7 +283,7 @@ int32_t lav_set(lav_solver *solver, const lav_problem *problem) {
   code = set_problem(solver, problem);
   if (code == LAV_ERROR_WORKSPACE) {
     if (lav_workspace_size(problem, &solver->options, &wanted) != LAV_OK) wanted = 0;
-    if (solver->used + solver->used / 2 > wanted) wanted = solver->used + solver->used / 2; /* what comes after is not known yet */
+    if (solver->used + solver->used / 2 > wanted) wanted = solver->used + solver->used / 2; /* The sizes of later arrays are not known yet. */
   }
   solver->needed = code == LAV_ERROR_WORKSPACE ? wanted + 32 : solver->peak + 32;
   return leave(solver, code);
@@ -291,7 +291,7 @@ int32_t lav_set(lav_solver *solver, const lav_problem *problem) {
 
 static int32_t run(lav_solver *s, const lav_budget *budget, lav_result *out) {
   const method_t *row = row_of(s->options.method);
-  double first; /* residual of the answer before it was refined */
+  double first; /* Residual of the result before refinement. */
   if (!s->ready) return LAV_ERROR_NO_PROBLEM;
   if (budget->size != sizeof *budget || out->size != sizeof *out) return LAV_ERROR_VERSION;
   if (budget->iterations < 0 || !(budget->tol >= 0.0 && budget->tol < INFINITY)) return LAV_ERROR_OPTION;
@@ -311,8 +311,8 @@ static int32_t run(lav_solver *s, const lav_budget *budget, lav_result *out) {
   first = judge(s, s->impulse, 1, budget->tol, &out->verdict);
   if (budget->tol > 0.0 && out->verdict.relative <= budget->tol
       && (out->outcome == LAV_MAX_ITERATIONS || out->outcome == LAV_TIME_LIMIT || out->outcome == LAV_STALLED))
-    out->outcome = LAV_CONVERGED; /* between two checks of its own */
-  if (budget->tol > 0.0 && budget->tol < out->verdict.relative /* a claim that held in float64 alone */
+    out->outcome = LAV_CONVERGED; /* The tolerance was reached between two checks of the method. */
+  if (budget->tol > 0.0 && budget->tol < out->verdict.relative /* The claim was correct only before refinement. */
       && (out->outcome == LAV_ROUNDOFF_LIMIT ? first == first
           : first <= budget->tol && (out->outcome == LAV_CONVERGED || out->outcome == LAV_STALLED
                                      || out->outcome == LAV_MAX_ITERATIONS || out->outcome == LAV_TIME_LIMIT)))

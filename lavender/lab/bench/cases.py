@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from lavender import io
 from lavender.base.arrays import FloatArray, check_bool, check_int, check_sequence
 from lavender.base.errors import InputError, SolverUnavailable
-from lavender.io.stored import ENGINE, SUFFIXES, whole_file
+from lavender.io.stored import ENGINE, SUFFIXES, read_whole_file
 from lavender.judge.residuals import DEFAULT_THRESHOLD, Residual, is_solved_by_zero, residual
 from lavender.lab import suite
 from lavender.lab.bench.record import CaseInfo, file_name, printable
@@ -254,7 +254,7 @@ def _check_one_recording(folder: Path, paths: list[Path]) -> None:
 def _told(folder: Path) -> list[dict[str, Any]]:
     """What an engine said of the steps in a folder, each with its "file"; nothing if a line of it cannot be read."""
     try:
-        text = whole_file(folder / ENGINE, "the engine's answers").decode(errors="replace")
+        text = read_whole_file(folder / ENGINE, "the engine's answers").decode(errors="replace")
         lines = [dict(json.loads(line)) for line in text.splitlines()]
         return lines if all("file" in line for line in lines) else []
     except (ValueError, TypeError, RecursionError):

@@ -28,7 +28,7 @@ import numpy as np
 
 from lavender.batch.solve import solve_many
 from lavender.io import mujoco as adapter
-from lavender.io.recording import drive_of
+from lavender.io.recording import make_controller
 from lavender.judge.residuals import get_reference, residual
 from lavender.judge.solution import Solution
 from lavender.lab.bench.running.runner import carry
@@ -125,7 +125,7 @@ def our_times(problem: Problem) -> tuple[float, float, float]:
 
 def _problems(mj: Any, path: Path, model: Any, steps: int, every: int) -> Iterator[Any]:
     """Number, data and problem of each `every`-th step under random controls; None for a problem without a row."""
-    data, drive = mj.MjData(model), drive_of(model, "random", 0)
+    data, drive = mj.MjData(model), make_controller(model, "random", 0)
     for step in range(steps):
         data.ctrl[:] = drive(data, step)
         mj.mj_step(model, data)

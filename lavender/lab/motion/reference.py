@@ -17,7 +17,7 @@ import numpy as np
 from lavender.base.arrays import FloatArray, read_only
 from lavender.base.errors import CapabilityError, InputError
 from lavender.io import npz
-from lavender.io.stored import writable, write_bytes
+from lavender.io.stored import check_writable, write_bytes
 from lavender.judge.residuals import Residual, residual
 from lavender.judge.solution import Solution, uninterrupted
 from lavender.lab.motion import operator as operators
@@ -151,7 +151,7 @@ def save_reference(
 
     If none is kept, it is solved for. InputError where nothing solved the problem: then there is nothing to keep.
     """
-    out = writable(_beside(path))
+    out = check_writable(_beside(path))
     if impulse is not None:
         kept(problem.disk).reference = judged(problem.disk, impulse, source)
     found = reference(problem.disk)

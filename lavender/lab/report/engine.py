@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lavender.io.stored import ENGINE, SUFFIXES, whole_file
+from lavender.io.stored import ENGINE, SUFFIXES, read_whole_file
 from lavender.judge.residuals import AT_FLOOR, UNCONVERGED, VERDICTS_OF_OLD, WRONG
 from lavender.lab.bench.recommendation import Choice
 from lavender.lab.bench.record import printable
@@ -63,7 +63,7 @@ def _read_folder(folder: Path) -> EngineAnswers | None:
     if not path.is_file():
         return None
     entries, left_out, answers = [], 0, {}
-    for line in whole_file(path, "the engine's answers").decode(errors="replace").splitlines():
+    for line in read_whole_file(path, "the engine's answers").decode(errors="replace").splitlines():
         try:
             entry = json.loads(line)
             left_out += "left_out" in entry

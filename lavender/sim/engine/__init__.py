@@ -1,4 +1,4 @@
-"""LavenderSim (not PyPI's `lavendersim`): the step loop over the compiled substep, and the problems inside it."""
+"""LavenderSim (not PyPI's `lavendersim`): the step loop over the compiled substep, and its constraint problems."""
 
 from lavender.sim.engine.film import Film
 from lavender.sim.engine.run import Trace, run

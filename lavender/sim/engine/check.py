@@ -1,13 +1,13 @@
-"""What a snapshot must hold before the kernels may trust it.
+"""Checks of a snapshot before the kernels use it.
 
-The kernels check nothing: an index of one array is used in another as it stands. So every array is one of
+The kernels do not check indices that they read from arrays. Every array therefore belongs to one of four groups:
 
     given      by the scene: equal to the simulation's own, bit for bit
     carried    from one substep to the next: finite, in range, in order
-    judged     the last substep's problem, which `Simulation.residual` reads: whole and in range
+    judged     the problem of the last substep, which `Simulation.residual` reads: complete and in range
     scratch    written before it is read
 
-and the pair list is made anew.
+The list of pairs is not restored; it is built again.
 """
 
 from __future__ import annotations
@@ -27,23 +27,30 @@ CARRIED = (
 )  # fmt: skip
 GIVEN = tuple(name for name in KEPT if name not in (*CARRIED, "head", "setting", "ptr"))
 FIXED_HEAD = ("position_iterations", "order", "seed", "stepper", "relaxing", "friction_shape")
-WRITTEN = {"out": 8, "depth": 1, "joint_error": 1}  # entries of `setting` that the engine writes
-UNIT = 1e-9  # -, quaternions are normalised in every substep
+WRITTEN_SETTINGS = {"out": 8, "depth": 1, "joint_error": 1}  # Entries of `setting` that the engine writes.
+# Largest accepted deviation of a squared quaternion norm from 1 [-]; quaternions are normalised in every substep.
+QUATERNION_TOLERANCE = 1e-9
 
 
-def same_scene(own: State, size: np.ndarray) -> None:
-    """Raise where sizes other than the capacities differ from the simulation's."""
+def check_sizes(own: State, size: np.ndarray) -> None:
+    """Raise InputError if sizes other than the capacities differ from those of the simulation."""
     free = (CAP_PAIR, CAP_CONTACT)
     fixed = [k for k in range(N_SIZES) if k not in free]
     if not np.array_equal(size[fixed], own.size[fixed]) or size[list(free)].min() < 0:
         raise _damaged("its sizes are not those of this scene")
 
 
-def whole_state(own: State, new: State, sweeps: tuple[int, int], lost: bool) -> None:
-    """Raise where `new`, of the sizes that `same_scene` has let pass, is no state of the scene of `own`.
+def check_state(own: State, new: State, sweeps: tuple[int, int], is_lost: bool) -> None:
+    """Raise InputError if `new`, whose sizes passed `check_sizes`, is not a state of the scene of `own`.
 
-    `sweeps`: least and largest budget. `lost`: the state is said to be not finite; numbers may be anything then, for no
-    step follows.
+    Parameters
+    ----------
+    own, new : State
+        State of the simulation and state to check.
+    sweeps : (int, int)
+        Smallest and largest sweep budget.
+    is_lost : bool
+        The state claims not to be finite. Its numbers are then not checked, because no step follows.
     """
     a, b = own.a, new.a
     for name in GIVEN:
@@ -53,17 +60,18 @@ def whole_state(own: State, new: State, sweeps: tuple[int, int], lost: bool) -> 
     if not np.array_equal(a["ptr"][: kj + 1], b["ptr"][: kj + 1]):
         raise _damaged("the rows of the joints are not those of this scene")
     settings = np.ones(len(own.setting), bool)
-    for name, width in WRITTEN.items():
+    for name, width in WRITTEN_SETTINGS.items():
         settings[SETTING[name] : SETTING[name] + width] = False
     if own.setting[settings].tobytes() != new.setting[settings].tobytes():
         raise _damaged("setting is not that of this scene")
-    _check_head(own, new, sweeps, lost)
+    _check_head(own, new, sweeps, is_lost)
     _check_contacts(new)
-    if not lost:
+    if not is_lost:
         _check_numbers(own, new)
 
 
-def _check_head(own: State, new: State, sweeps: tuple[int, int], lost: bool) -> None:
+def _check_head(own: State, new: State, sweeps: tuple[int, int], is_lost: bool) -> None:
+    """Check the counters and the settings in `head`."""
     n, top = int(own.size[SIZE["bodies"]]), 2**31 - 1
     contacts = int(new.size[CAP_CONTACT])
     per = int(own.size[SIZE["rows_per_contact"]])
@@ -81,7 +89,7 @@ def _check_head(own: State, new: State, sweeps: tuple[int, int], lost: bool) -> 
         "need_contacts": (0, top),
         "rebuilds": (0, top),
         "projected": (0, top),
-        "lost": (0, n - 1) if lost else (-1, -1),
+        "lost": (0, n - 1) if is_lost else (-1, -1),
         "solved": (0, 1),
     }
     for name, (low, high) in ranges.items():
@@ -93,6 +101,7 @@ def _check_head(own: State, new: State, sweeps: tuple[int, int], lost: bool) -> 
 
 
 def _check_contacts(new: State) -> None:
+    """Check the contact cache and the rows and blocks of the last substep's contacts."""
     b, size = new.a, new.size
     kj, mj = int(size[SIZE["joints"]]), int(size[SIZE["joint_rows"]])
     c, rows = int(new.head[HEAD["contacts"]]), int(new.head[HEAD["contact_rows"]])
@@ -106,23 +115,24 @@ def _check_contacts(new: State) -> None:
     blocks = np.diff(ptr)
     friction = b["mu"][kj : kj + c] > 0.0
     box = friction & bool(new.head[HEAD["friction_shape"]])
-    most = np.where(box, 3, np.where(friction, 6, 1))
+    max_rows = np.where(box, 3, np.where(friction, 6, 1))
     if (
         ptr[0] != mj or ptr[-1] != mj + rows
-        or (blocks < np.where(friction, 3, 1)).any() or (blocks > most).any() or blocks.max(initial=1) > per
+        or (blocks < np.where(friction, 3, 1)).any() or (blocks > max_rows).any() or blocks.max(initial=1) > per
     ):  # fmt: skip
         raise _damaged("the rows of its contacts do not add up")
     contact = np.arange(kj + c) >= kj
     size = np.concatenate([np.ones(kj, np.int64), blocks])
-    sides = np.concatenate([np.zeros(kj, bool), box])
-    if c and (b["kind"][: kj + c] != kinds_of(contact, box=sides, spin=size == 4, rolling=size > 4)).any():
-        raise _damaged("kind holds what is no such block")
+    is_box = np.concatenate([np.zeros(kj, bool), box])
+    if c and (b["kind"][: kj + c] != kinds_of(contact, box=is_box, spin=size == 4, rolling=size > 4)).any():
+        raise _damaged("kind does not match the rows of a block")
     pair = b["contact_pair"][:c]
     if c and (pair.min() < 0 or pair.max() >= n or not np.array_equal(b["contact_body"][:c], b["dyn"][pair])):
         raise _damaged("contact_pair names bodies that the scene does not have")
 
 
 def _check_numbers(own: State, new: State) -> None:
+    """Check that numbers are finite, quaternions are normalised, and inertias belong to the scene."""
     b, cached = new.a, int(new.head[HEAD["cached"]])
     for name in ("x", "v", "joint_impulse", "inv_inertia"):
         if not np.isfinite(b[name]).all():
@@ -131,8 +141,8 @@ def _check_numbers(own: State, new: State) -> None:
         if not np.isfinite(b[name][:cached]).all():
             raise _damaged(f"{name} is not finite")
     with np.errstate(over="ignore", invalid="ignore"):
-        if not (np.abs((b["q"] ** 2).sum(axis=1) - 1.0) <= UNIT).all():
-            raise _damaged("q holds what is no unit quaternion")
+        if not (np.abs((b["q"] ** 2).sum(axis=1) - 1.0) <= QUATERNION_TOLERANCE).all():
+            raise _damaged("q holds a quaternion that is not of length 1")
     static = b["dyn"] < 0
     if b["v"][static].any():
         raise _damaged("v gives a static body a velocity")
@@ -141,12 +151,12 @@ def _check_numbers(own: State, new: State) -> None:
         raise _damaged("inv_inertia is not that of this scene")
 
 
-def _damaged(what: str) -> InputError:
-    return InputError(f"the snapshot is damaged: {what}")
+def _damaged(reason: str) -> InputError:
+    return InputError(f"the snapshot is damaged: {reason}")
 
 
-def well_formed(snapshot: Any) -> None:
-    """Raise where the fields of a snapshot are not of their types."""
+def check_fields(snapshot: Any) -> None:
+    """Raise InputError if the fields of a snapshot have wrong types or lengths."""
     for name in ("steps", "failed"):
         x = getattr(snapshot, name)
         if isinstance(x, bool) or not isinstance(x, int) or not 0 <= x < 2**53:

@@ -1,8 +1,8 @@
 """Films: the poses of a run, frame by frame, in memory and in a file that the page and `lavender view` open.
 
-A file is the magic word, the length of a JSON header (8 bytes, little-endian), the header (version, scene, dt,
-bodies, joints, fields), and frames of little-endian float32: time [s], the eight solver values, then
-position (3) [m] and quaternion (4) of each body.
+A file consists of a magic word, the length of a JSON header (8 bytes, little-endian), the header (version, scene, dt,
+bodies, joints, fields), and frames of little-endian float32: time [s], the eight solver values, then position (3) [m]
+and quaternion (4) of each body.
 """
 
 from __future__ import annotations
@@ -15,30 +15,30 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import InputError
-from lavender.io.stored import framed, unframed, whole_file, write_bytes
+from lavender.io.stored import pack_header, read_whole_file, unpack_header, write_bytes
 from lavender.sim.engine.layout import HEAD, JOINT
 from lavender.sim.engine.state import State
 from lavender.sim.scene import Scene
 
 MAGIC = b"LAVENDER-FILM\n"
 VERSION = 1
-LEAD = 9  # numbers of a frame before the poses: time and the solver values
-MOST_BYTES = 2**28  # of frames; beyond, every other one is dropped
-MOST_HEADER = 2**26  # bytes
+LEAD = 9  # Numbers of a frame before the poses: time and the solver values.
+MAX_FILM_BYTES = 2**28  # If the frames exceed this size, every second one is dropped.
+MAX_FILM_HEADER_BYTES = 2**26
 
 
 class Film:
-    """Frames of one scene; grows by `add` while another thread reads.
+    """Frames of one scene; `add` appends frames while another thread reads.
 
     Parameters
     ----------
     header : dict
-        What `header_of` makes: scene, dt, bodies, joints.
+        Scene, dt, bodies and joints, from `header_of`.
     """
 
     def __init__(self, header: dict[str, Any]) -> None:
         self.header = header
-        self.stride = 1  # steps between two frames that are kept
+        self.stride = 1  # Steps between two frames.
         self.ended = False
         self._width = LEAD + 7 * len(header["bodies"])
         self._frames = np.zeros((64, self._width), np.float32)
@@ -56,13 +56,13 @@ class Film:
         return self._count
 
     def add(self, time: float, observation: dict[str, Any]) -> None:
-        """Append what a step has returned; every `stride`-th is kept."""
+        """Append the observation of a step at `time` [s]; only every `stride`-th call adds a frame."""
         with self._lock:
             self._seen += 1
             if (self._seen - 1) % self.stride:
                 return
             if self._count == len(self._frames):
-                if 2 * self._frames.nbytes > MOST_BYTES and self._count > 2:
+                if 2 * self._frames.nbytes > MAX_FILM_BYTES and self._count > 2:
                     self._count = (self._count + 1) // 2
                     self._frames[: self._count] = self._frames[: 2 * self._count : 2].copy()
                     self.stride *= 2
@@ -75,10 +75,10 @@ class Film:
             with np.errstate(over="ignore"):
                 row[0], row[1:LEAD] = time, observation["solver"]
                 poses[:, :3], poses[:, 3:] = observation["positions"], observation["quaternions"]
-            self._count += bool(np.isfinite(row).all())  # of a state that was lost there is no picture
+            self._count += bool(np.isfinite(row).all())  # States that are not finite are left out.
 
     def frames(self, first: int = 0) -> np.ndarray:
-        """Frames from `first` on, (f, 9 + 7 n) float32: a copy."""
+        """Return a copy of the frames from number `first` on, (f, 9 + 7 n) float32."""
         with self._lock:
             return self._frames[first : self._count].copy()
 
@@ -103,23 +103,29 @@ class Film:
         return self._poses()[:, :, 3:]
 
     def _poses(self) -> FloatArray:
-        found = self.frames()[:, LEAD:].astype(np.float64)
-        return found.reshape(len(found), -1, 7)
+        poses = self.frames()[:, LEAD:].astype(np.float64)
+        return poses.reshape(len(poses), -1, 7)
 
     def save(self, path: str | PathLike[str]) -> None:
-        """Write to a file; one of that name is replaced when the new one is whole."""
+        """Write the film to a file; an existing file is replaced atomically."""
         write_bytes(path, self.to_bytes())
 
     def to_bytes(self) -> bytes:
-        """The bytes of a file."""
-        return framed(MAGIC, {"version": VERSION, **self.header}) + self.frames().astype("<f4").tobytes()
+        """Return the content of a film file."""
+        return pack_header(MAGIC, {"version": VERSION, **self.header}) + self.frames().astype("<f4").tobytes()
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> Film:
-        """Read a file written by `save`."""
-        data = whole_file(path, "the film")
+        """Read a file written by `save`.
+
+        Raises
+        ------
+        InputError
+            The file is damaged or of another version.
+        """
+        data = read_whole_file(path, "the film")
         try:
-            header, end = unframed(data, MAGIC, MOST_HEADER)
+            header, end = unpack_header(data, MAGIC, MAX_FILM_HEADER_BYTES)
             if header.pop("version") != VERSION:
                 raise ValueError
             _check(header)
@@ -136,14 +142,14 @@ class Film:
 
 
 def header_of(scene: Scene, state: State) -> dict[str, Any]:
-    """What a picture needs beside the poses, as plain numbers."""
+    """Return the constant data that a picture needs in addition to the poses, as plain numbers."""
     a = state.a
     joints = []
     for (body_a, body_b), values in zip(a["joint_bodies"].tolist(), a["joint"].tolist(), strict=True):
         name, body = ("anchor_b", body_b) if body_b >= 0 else ("anchor_a", body_a)
         other = body_a if body_b >= 0 else body_b
-        at = JOINT[name]
-        joints.append({"body": body, "other": other, "anchor": values[at : at + 3]})
+        offset = JOINT[name]
+        joints.append({"body": body, "other": other, "anchor": values[offset : offset + 3]})
     return {
         "scene": scene.name or "scene",
         "dt": scene.parameters.dt,
@@ -157,7 +163,7 @@ def header_of(scene: Scene, state: State) -> dict[str, Any]:
 
 
 def _check(header: dict[str, Any]) -> None:
-    # what the page and the pictures read
+    """Raise an error if the header lacks data that the page and the pictures read, or has wrong values."""
     n = len(header["bodies"])
     if not isinstance(header["scene"], str) or not 0.0 < float(header["dt"]) < np.inf:
         raise ValueError

@@ -1,4 +1,4 @@
-"""Places of numbers in the engine's small arrays, by name, as `lavender_ext/engine/arrays.pxd` numbers them."""
+"""Indices of the entries of the engine's small arrays, by name, as in `lavender_ext/engine/arrays.pxd`."""
 
 from lavender_ext.engine import arrays
 

@@ -1,7 +1,8 @@
-"""Pictures of a film by matplotlib: a strip of frames or an animation, for documents.
+"""Pictures of a film with matplotlib: a strip of frames or an animation, for documents.
 
-An orthographic view: `turn` [rad] about the vertical, `tilt` [rad] from above. With r, a, t the directions to the
-right, away from the eye and upwards on the paper, a point p is at (p.r, p.t); faces are painted from far to near.
+The view is orthographic, rotated by `turn` [rad] about the vertical and tilted by `tilt` [rad] from above. With r, a
+and t the directions to the right, away from the viewer and upwards in the picture, a point p is drawn at (p.r, p.t).
+Faces are painted from far to near.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from lavender.sim.scene.parts import rotation
 from lavender_ext.engine.arrays import BOX, PLANE, SPHERE
 
 PICTURES = (".gif", ".mp4", ".png", ".svg", ".pdf")
-DPI = 160  # of an animation: 480 pixels at the width that is the default
+ANIMATION_DPI = 160  # Dots per inch of an animation: 480 pixels at the default width.
 
 CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
 FACES = (
@@ -32,13 +33,13 @@ FACES = (
     (2, 3, 7, 6),
     (0, 2, 6, 4),
     (1, 5, 7, 3),
-)  # -x +x -y +y -z +z
+)  # Corners of the faces -x, +x, -y, +y, -z, +z.
 LIGHT = np.array([-0.45, -0.62, 0.64])
 COLORS = ("#7a5fb5", "#4f7cac", "#5b9279", "#b5895f", "#a85f7a", "#6b8fb5", "#8a7fb0")
 
 
 def picture_suffix(path: str | PathLike[str]) -> str:
-    """The suffix of a picture's file; InputError for one that cannot be made here."""
+    """Return the suffix of a picture file in lower case; raise InputError if the format cannot be written."""
     suffix = as_path(path).suffix
     if suffix.lower() not in PICTURES:
         raise InputError(f"{str(path)!r} ends in {suffix!r}; .gif, .mp4, .png, .svg or .pdf is needed")
@@ -57,11 +58,31 @@ def save_picture(
     size: float = 3.0,
     rate: float = 30,
 ) -> Path:
-    """Write a film, or several by name (beside each other, in a strip below each other), as pictures.
+    """Write a film, or several films by name, as an animation or as a strip of frames.
 
-    `.gif`, or `.mp4` where ffmpeg is: an animation in the time of the film, `rate` frames in a second (of a GIF the
-    nearest that whole hundredths of a second allow). `.png`, `.svg`, `.pdf`: `frames` of them side by side, evenly
-    spaced. `turn` and `tilt` [rad] say where the eye is, `size` [inch] how wide one frame is.
+    Parameters
+    ----------
+    film : Film or mapping of str to Film
+        Several films are drawn side by side in an animation, and one below the other in a strip.
+    path : path
+        `.gif` or `.mp4` (needs ffmpeg): an animation in the time of the film. `.png`, `.svg` or `.pdf`: a strip.
+    frames : int
+        Evenly spaced frames of a strip.
+    turn, tilt : float, rad
+        Direction of view.
+    size : float, inch
+        Width of one frame.
+    rate : float, 1/s
+        Frames per second of an animation. A GIF uses the nearest rate with a whole number of hundredths of a second.
+
+    Returns
+    -------
+    Path
+
+    Raises
+    ------
+    InputError
+        The film has no frames, a value is out of range, or the file cannot be written.
     """
     path, suffix = as_path(path), picture_suffix(path)
     films = film if isinstance(film, Mapping) else {"": film}
@@ -70,19 +91,19 @@ def save_picture(
     frames, rate = check_int("frames", frames, 1), check_float("rate [1/s]", rate, above=0.0)
     size = check_float("size [inch]", size, low=0.5, high=50.0)
     turn, tilt = check_float("turn [rad]", turn), check_float("tilt [rad]", tilt)
-    stages = [Stage(one, turn, tilt, name) for name, one in films.items()]
-    ends = np.array([stage.bounds for stage in stages])
-    for stage in stages:  # one scale for all
-        stage.bounds = tuple(np.where([1, 0, 1, 0], ends.min(axis=0), ends.max(axis=0)))
+    views = [FilmView(one, turn, tilt, name) for name, one in films.items()]
+    bounds = np.array([view.bounds for view in views])
+    for view in views:  # All films have the same scale.
+        view.bounds = tuple(np.where([1, 0, 1, 0], bounds.min(axis=0), bounds.max(axis=0)))
     if suffix in (".gif", ".mp4"):
-        _animate(stages, path, size, rate)
+        _animate(views, path, size, rate)
     else:
-        _strip(stages, path, frames, size)
+        _strip(views, path, frames, size)
     return path
 
 
-class Stage:
-    """One view for all frames: directions, bounds, and bodies as painted shapes."""
+class FilmView:
+    """View of a film: directions and bounds, which are the same for all frames, and drawing of a frame."""
 
     def __init__(self, film: Film, turn: float, tilt: float, name: str = "") -> None:
         self.name = name
@@ -92,30 +113,30 @@ class Stage:
         self.top = np.array([-s * up, c * up, flat])
         self.film, self.bodies = film, film.header["bodies"]
         self.x, self.q, self.time = film.positions, film.quaternions, film.time
-        seen = [i for i, body in enumerate(self.bodies) if body["kind"] >= SPHERE]
-        reach = np.array([np.linalg.norm(self.bodies[i]["shape"][:3]) for i in seen])
-        centre = self.x[:, seen] if seen else np.zeros((1, 1, 3))
-        reach = reach if seen else np.ones(1)
+        visible = [i for i, body in enumerate(self.bodies) if body["kind"] >= SPHERE]
+        radius = np.array([np.linalg.norm(self.bodies[i]["shape"][:3]) for i in visible])
+        centre = self.x[:, visible] if visible else np.zeros((1, 1, 3))
+        radius = radius if visible else np.ones(1)
         across, tall = centre @ self.right, centre @ self.top
         self.bounds: tuple[float, ...] = (
-            float((across - reach).min()),
-            float((across + reach).max()),
-            float((tall - reach).min()),
-            float((tall + reach).max()),
+            float((across - radius).min()),
+            float((across + radius).max()),
+            float((tall - radius).min()),
+            float((tall + radius).max()),
         )
 
     @property
     def height(self) -> float:
-        """Height over width, within what a page can hold."""
+        """Height divided by width, limited to 0.3 to 2.5 for a page."""
         left, right, low, high = self.bounds
         return float(np.clip((high - low) / (right - left), 0.3, 2.5))
 
     def project(self, points: FloatArray) -> FloatArray:
-        """Places in the picture of points in the world."""
+        """Return the picture coordinates (..., 2) [m] of world points (..., 3) [m]."""
         return np.stack([points @ self.right, points @ self.top], axis=-1)
 
     def paint(self, axes: Any, frame: int) -> None:
-        """Draw a frame of the film."""
+        """Draw frame number `frame` on `axes`."""
         from matplotlib.colors import to_rgb
         from matplotlib.patches import Circle, Polygon
 
@@ -151,6 +172,7 @@ class Stage:
         axes.set_title(f"{self.name}  {self.time[frame]:.2f} s".strip(), fontsize=8)
 
     def _ground(self, axes: Any) -> None:
+        """Draw the ground as a line if the scene has a horizontal plane."""
         if any(body["kind"] == PLANE and body["shape"][2] > 0.99 for body in self.bodies):
             left, right, *_ = self.bounds
             offset = next(b["shape"][3] for b in self.bodies if b["kind"] == PLANE and b["shape"][2] > 0.99)
@@ -158,60 +180,63 @@ class Stage:
             axes.plot([left, right], [level, level], color="0.6", lw=0.8, zorder=1)
 
     def _joints(self, axes: Any, frame: int) -> None:
+        """Draw a line from the body to the anchor of each joint."""
         for joint in self.film.header["joints"]:
             i = joint["body"]
-            place = self.x[frame, i] + rotation(self.q[frame, i]) @ np.array(joint["anchor"])
-            axes.plot(*self.project(np.stack([self.x[frame, i], place])).T, color="k", lw=0.6, zorder=4)
-            axes.plot(*self.project(place), "k.", markersize=3, zorder=4)
+            anchor = self.x[frame, i] + rotation(self.q[frame, i]) @ np.array(joint["anchor"])
+            axes.plot(*self.project(np.stack([self.x[frame, i], anchor])).T, color="k", lw=0.6, zorder=4)
+            axes.plot(*self.project(anchor), "k.", markersize=3, zorder=4)
 
 
-def _strip(stages: list[Stage], path: Path, count: int, size: float) -> None:
+def _strip(views: list[FilmView], path: Path, count: int, size: float) -> None:
+    """Write a strip of `count` frames per film."""
     from matplotlib.figure import Figure
 
-    height = size * sum(stage.height for stage in stages) + 0.3 * len(stages)
-    columns = min(count, max(len(stage.time) for stage in stages))
+    height = size * sum(view.height for view in views) + 0.3 * len(views)
+    columns = min(count, max(len(view.time) for view in views))
     canvas = Figure(figsize=(size * columns, height), layout="constrained")
-    rows = canvas.subplots(len(stages), columns, squeeze=False)
-    for stage, row in zip(stages, rows, strict=True):
-        chosen = np.linspace(0, len(stage.time) - 1, columns).round().astype(int)
+    rows = canvas.subplots(len(views), columns, squeeze=False)
+    for view, row in zip(views, rows, strict=True):
+        chosen = np.linspace(0, len(view.time) - 1, columns).round().astype(int)
         for axes, frame in zip(row, chosen, strict=True):
-            stage.paint(axes, int(frame))
+            view.paint(axes, int(frame))
     write_figure(canvas, path, dpi=150)
 
 
-def _animate(stages: list[Stage], path: Path, size: float, rate: float) -> None:
+def _animate(views: list[FilmView], path: Path, size: float, rate: float) -> None:
+    """Write an animation with `rate` [1/s] frames per second of simulated time."""
     from matplotlib.animation import FFMpegWriter, PillowWriter
     from matplotlib.figure import Figure
 
     suffix = path.suffix.lower()
-    first, last = min(stage.time[0] for stage in stages), max(stage.time[-1] for stage in stages)
+    first, last = min(view.time[0] for view in views), max(view.time[-1] for view in views)
     if suffix == ".gif":
-        rate = 100.0 / max(2, round(100.0 / rate))  # a frame of a GIF stands for whole hundredths of a second
-    # evenly in simulated time: a film of fewer steps shows one for longer
-    wanted = np.arange(first, last + 0.5 / rate, 1.0 / rate)
-    chosen = np.stack(
-        [np.searchsorted(s.time, wanted - 1e-9).clip(0, len(s.time) - 1) for s in stages], axis=1
-    )
-    height = size * max(stage.height for stage in stages) + 0.3
-    canvas = Figure(figsize=(size * len(stages), height), layout="constrained")
-    row = canvas.subplots(1, len(stages), squeeze=False)[0]
-    # a shade slower: the milliseconds of a frame, rounded down, are those meant
-    kind, own = (PillowWriter, rate * (1.0 - 1e-9)) if suffix == ".gif" else (FFMpegWriter, rate)
-    writer: Any = kind(fps=own)  # type: ignore[arg-type]
+        rate = 100.0 / max(
+            2, round(100.0 / rate)
+        )  # A frame of a GIF lasts a whole number of hundredths of a second.
+    # Frames are evenly spaced in simulated time: a frame of a film with fewer steps is shown for longer.
+    times = np.arange(first, last + 0.5 / rate, 1.0 / rate)
+    chosen = np.stack([np.searchsorted(s.time, times - 1e-9).clip(0, len(s.time) - 1) for s in views], axis=1)
+    height = size * max(view.height for view in views) + 0.3
+    canvas = Figure(figsize=(size * len(views), height), layout="constrained")
+    row = canvas.subplots(1, len(views), squeeze=False)[0]
+    # The rate of a GIF is slightly reduced: Pillow rounds the milliseconds of a frame down.
+    kind, frame_rate = (PillowWriter, rate * (1.0 - 1e-9)) if suffix == ".gif" else (FFMpegWriter, rate)
+    writer: Any = kind(fps=frame_rate)  # type: ignore[arg-type]
 
     def write(part: Path) -> None:
-        made = Path(f"{part}{suffix}")  # whose suffix tells the format
-        before = np.full(len(stages), -1)
+        temporary = Path(f"{part}{suffix}")  # The writer selects the format by the suffix.
+        before = np.full(len(views), -1)
         try:
-            with writer.saving(canvas, str(made), dpi=DPI):
+            with writer.saving(canvas, str(temporary), dpi=ANIMATION_DPI):
                 for frames in chosen:
-                    for stage, axes, frame, shown in zip(stages, row, frames, before, strict=True):
-                        if frame != shown:
-                            stage.paint(axes, int(frame))
+                    for view, axes, frame, previous_frame in zip(views, row, frames, before, strict=True):
+                        if frame != previous_frame:
+                            view.paint(axes, int(frame))
                     before = frames
                     writer.grab_frame()
-            made.replace(part)
+            temporary.replace(part)
         finally:
-            made.unlink(missing_ok=True)
+            temporary.unlink(missing_ok=True)
 
     write_atomically(path, write)

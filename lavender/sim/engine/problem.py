@@ -1,4 +1,4 @@
-"""The constraint problem of a substep from the engine's arrays; how wrong a step was on it: residuals, motions."""
+"""Build the constraint problem of a substep from the engine's arrays; compute residuals and motion errors of a step."""
 
 from __future__ import annotations
 
@@ -19,20 +19,29 @@ from lavender.sim.scene.arithmetic import norm
 
 motion = lazy_module("lavender.lab.motion")
 
-PARTS = ("joint", "normal", "disk", "spin", "rolling")
+RESIDUAL_PARTS = ("joint", "normal", "disk", "spin", "rolling")
 
 
-def problem_of(state: State, bodies: Sequence[str], joints: Sequence[str], name: str) -> Problem:
-    """The velocity problem of a substep after `kernel.prepare()`, with names of bodies and joints, in copies."""
+def build_problem(state: State, bodies: Sequence[str], joints: Sequence[str], name: str) -> Problem:
+    """Return the velocity problem of a substep after `kernel.prepare()`; arrays are copied.
+
+    Parameters
+    ----------
+    state : State
+    bodies, joints : sequence of str
+        Names, for the names of blocks.
+    name : str
+        Name of the problem.
+    """
     a = state.a
     kj, mj = int(state.size[SIZE["joints"]]), int(state.size[SIZE["joint_rows"]])
     c = int(state.head[HEAD["contacts"]])
     k, m = kj + c, mj + int(state.head[HEAD["contact_rows"]])
     normal = a["normal"][:c].copy()
     tangent = a["tangent"][:c].copy() if len(a["tangent"]) else np.zeros((c, 3))
-    # contacts without friction have no tangent; any unit vector normal to the normal stands in
-    bare = np.flatnonzero(a["mu"][kj:k] == 0.0)
-    tangent[bare] = _any_tangent(normal[bare])
+    # Contacts without friction have no tangent; `Rows` needs a unit vector orthogonal to the normal.
+    frictionless = np.flatnonzero(a["mu"][kj:k] == 0.0)
+    tangent[frictionless] = _any_tangent(normal[frictionless])
     rows = Rows(
         inv_mass=a["inv_mass"].copy(),
         inv_inertia=a["inv_inertia"].copy(),
@@ -58,8 +67,8 @@ def problem_of(state: State, bodies: Sequence[str], joints: Sequence[str], name:
         patch_radius=a["patch_radius"][:k].copy(),
         rolling=a["rolling"][:k].copy() if len(a["rolling"]) else np.zeros(k),
     )
-    # joints above all contacts: 24 bits for each body leave the pair (2^24 - 1, ...) free
-    above = np.uint64(0xFFFFFF << 40) + np.arange(kj, dtype=np.uint64)
+    # Keys of joints are above those of contacts: body numbers have 24 bits, and the pair (2^24 - 1, ...) is unused.
+    joint_keys = np.uint64(0xFFFFFF << 40) + np.arange(kj, dtype=np.uint64)
     pairs = zip(a["contact_pair"][:c].tolist(), _point_numbers(a["key"][:c]), strict=True)
     guess = a["impulse"][:m].copy() if state.head[HEAD["warm_start"]] else None
     return Problem(
@@ -68,7 +77,7 @@ def problem_of(state: State, bodies: Sequence[str], joints: Sequence[str], name:
         rows=rows,
         compliance=a["compliance"][:m].copy(),
         guess=guess,
-        key=np.concatenate([above, a["key"][:c]]),
+        key=np.concatenate([joint_keys, a["key"][:c]]),
         names=[*joints, *(f"{bodies[j]} on {bodies[i]}, point {number}" for (i, j), number in pairs)],
         name=name,
         copy=False,
@@ -76,55 +85,63 @@ def problem_of(state: State, bodies: Sequence[str], joints: Sequence[str], name:
 
 
 def _point_numbers(key: np.ndarray) -> list[int]:
-    """Number the contacts of each pair of bodies from 1 on, in the order of their keys."""
+    """Return the numbers of the contacts of each pair of bodies, from 1 on, in the order of their keys."""
     order = np.argsort(key)
     pair = key[order] >> np.uint64(16)
-    place = np.arange(len(key))
-    first = np.maximum.accumulate(np.where(np.append(True, pair[1:] != pair[:-1])[: len(key)], place, 0))
+    position = np.arange(len(key))
+    first = np.maximum.accumulate(np.where(np.append(True, pair[1:] != pair[:-1])[: len(key)], position, 0))
     number = np.empty(len(key), np.int64)
-    number[order] = 1 + place - first
+    number[order] = 1 + position - first
     return list(number.tolist())
 
 
 def _any_tangent(normal: FloatArray) -> FloatArray:
+    """Return a unit vector orthogonal to each normal (c, 3)."""
     out = np.zeros_like(normal)
     for i, n in enumerate(normal):
         t = np.cross(n, np.eye(3)[np.argmin(np.abs(n))])
         size = norm(t)
-        if size > 0.0:  # a body so far off that its contact has no direction: Rows says so
+        if size > 0.0:  # A zero normal (a body is too far away for a direction) is an error of Rows.
             out[i] = t / size
     return out
 
 
-def judged(problem: Problem, impulse: FloatArray) -> dict[str, Any]:
-    """See `Simulation.residual`."""
-    found = residual(problem, impulse)
+def residual_summary(problem: Problem, impulse: FloatArray) -> dict[str, Any]:
+    """Return the values of `Simulation.residual` for impulses (m,) [N s]."""
+    result = residual(problem, impulse)
     return {
-        "relative": found.relative,
-        "energy": found.energy,
-        "velocity": found.velocity,
-        "floor": found.roundoff_floor,
-        "worst": found.worst_name,
-        "share": _shares(problem, found),
+        "relative": result.relative,
+        "energy": result.energy,
+        "velocity": result.velocity,
+        "floor": result.roundoff_floor,
+        "worst": result.worst_name,
+        "share": _energy_fractions(problem, result),
     }
 
 
-def moved(problem: Problem, impulse: FloatArray, moving: Sequence[str]) -> dict[str, Any]:
-    """See `Simulation.motion`; `moving` names the bodies that are not static."""
-    error, apart = motion.measure(problem, impulse, motion.reference(problem)), 0.0
+def motion_summary(problem: Problem, impulse: FloatArray, moving_bodies: Sequence[str]) -> dict[str, Any]:
+    """Return the values of `Simulation.motion` for impulses (m,) [N s]; `moving_bodies` names the dynamic bodies.
+
+    With Coulomb friction, the smaller of two distances is returned: to the solution of `auto`, and to the solution that
+    continues from the impulses.
+    """
+    error, distance = motion.measure(problem, impulse, motion.reference(problem)), 0.0
     if problem.law == "coulomb":
-        own = motion.branch(problem, impulse)
-        near = motion.measure(problem, impulse, own)
-        if own.accepted and error.reference.accepted:
-            apart = motion.measure(problem, own.impulse, error.reference).speed or 0.0
-        if near.kinetic is not None and (error.kinetic is None or near.kinetic < error.kinetic):
-            error = near
+        branch_solution = motion.branch(problem, impulse)
+        branch_error = motion.measure(problem, impulse, branch_solution)
+        if branch_solution.accepted and error.reference.accepted:
+            distance = motion.measure(problem, branch_solution.impulse, error.reference).speed or 0.0
+        if branch_error.kinetic is not None and (
+            error.kinetic is None or branch_error.kinetic < error.kinetic
+        ):
+            error = branch_error
     names = ("relative", "kinetic", "speed", "spin", "bound", "bound_speed")
-    body = moving[error.body] if error.body >= 0 else ""
-    return {**{name: getattr(error, name) for name in names}, "body": body, "open": apart}
+    body = moving_bodies[error.body] if error.body >= 0 else ""
+    return {**{name: getattr(error, name) for name in names}, "body": body, "open": distance}
 
 
-def _shares(problem: Problem, found: Residual) -> dict[str, float]:
+def _energy_fractions(problem: Problem, result: Residual) -> dict[str, float]:
+    """Return the fraction of the squared energy error [-] on joints, normals, friction, torsion and rolling."""
     c = problem.cones
     part = np.zeros(problem.m, np.int32)
     contact = np.flatnonzero(c.kind > 0)
@@ -136,11 +153,11 @@ def _shares(problem: Problem, found: Residual) -> dict[str, float]:
     for k in (0, 1):
         part[c.rolling_rows[c.rolling_rows >= 0] + k] = 4
     with np.errstate(invalid="ignore"):
-        size = np.sqrt(problem.d) * np.abs(found.error)
+        size = np.sqrt(problem.d) * np.abs(result.error)
     top = float(size.max(initial=0.0))
-    # Over the largest, so that squares neither overflow nor vanish; what is infinite has no shares.
+    # Division by the largest entry prevents overflow and underflow of squares. Infinite errors have no fractions.
     energy = (size / top) ** 2 if 0.0 < top < np.inf else np.zeros(problem.m)
     total = float(energy.sum())
-    names = PARTS if c.has_rolling else PARTS[:4]
+    names = RESIDUAL_PARTS if c.has_rolling else RESIDUAL_PARTS[:4]
     sums = np.bincount(part, weights=energy, minlength=len(names)) if problem.m else np.zeros(len(names))
     return {name: float(x / total) if total > 0.0 else 0.0 for name, x in zip(names, sums, strict=True)}

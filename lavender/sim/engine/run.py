@@ -1,4 +1,4 @@
-"""Run a scene and keep what it says of its solver."""
+"""Run a scene and record its solver values."""
 
 from __future__ import annotations
 
@@ -21,37 +21,62 @@ from lavender.solvers.registry import get
 
 @dataclass(frozen=True, eq=False)
 class Trace:
-    """What a run measured, one row for each step."""
+    """Measurements of a run, with one entry for each step.
+
+    Parameters
+    ----------
+    scene : str
+    time : (steps,) s
+        Simulated time.
+    solver : (steps, 8)
+        Solver values; see `SOLVER_FIELDS`.
+    depth : (steps,) m
+        Largest penetration depth.
+    cost : (steps,) s
+        Wall time of the step.
+    lost_body : str
+        Name of the body whose state is not finite, which ended the run, or empty.
+    recorded : int
+        Number of problems written.
+    title : str
+        Title of figures.
+    order : str
+        Order in which a sweep visits the contacts.
+    method : str
+        Solver, unless it is the engine's own, and order, unless the solver has none.
+    stopped : bool
+        Ctrl-C ended the run; the trace contains the steps before.
+    """
 
     scene: str
-    time: FloatArray  # (steps,) s, simulated
-    solver: FloatArray  # (steps, 8) see SOLVER_FIELDS
-    depth: FloatArray  # (steps,) m, largest depth
-    cost: FloatArray  # (steps,) s, wall time of the step
-    lost_body: str = ""  # name of the body that ended the run, or empty
-    recorded: int = 0  # problems written
-    title: str = ""  # of figures
-    order: str = ""  # in which each sweep visits the contacts
-    method: str = ""  # in words: the solver unless it is the engine's own, the order unless it takes none
-    stopped: bool = False  # by Ctrl-C: these are the steps until then
+    time: FloatArray
+    solver: FloatArray
+    depth: FloatArray
+    cost: FloatArray
+    lost_body: str = ""
+    recorded: int = 0
+    title: str = ""
+    order: str = ""
+    method: str = ""
+    stopped: bool = False
 
     def __len__(self) -> int:
         return len(self.time)
 
     def column(self, name: str) -> FloatArray:
-        """One of `SOLVER_FIELDS` over the steps (steps,)."""
+        """Return one of `SOLVER_FIELDS` for all steps (steps,)."""
         return self.solver[:, SOLVER_FIELDS.index(name)]
 
     def save(self, path: str | PathLike[str]) -> None:
-        """Write as CSV, one line for each step."""
+        """Write the trace as CSV, one line for each step."""
         lines = [["step", "time", *SOLVER_FIELDS, "depth", "cost", "order"]]
         for i in range(len(self)):
             row = [self.time[i], *self.solver[i], self.depth[i], self.cost[i]]
             lines.append([str(i + 1), *(repr(float(x)) for x in row), self.order])
-        write_text(path, "".join(",".join(line) + "\r\n" for line in lines))
+        write_text(path, "".join(",".join(format_step) + "\r\n" for format_step in lines))
 
     def plot(self, path: str | PathLike[str]) -> None:
-        """Residuals, contacts with matches, and depth over time, as a figure."""
+        """Write a figure of residuals, contacts with cache matches, and depth over time."""
         from matplotlib.figure import Figure
 
         canvas = Figure(figsize=(8, 7), layout="constrained")
@@ -64,7 +89,7 @@ class Trace:
             top.semilogy(self.time, np.where(value > 0.0, value, np.nan), label=label)
         top.set(title=f"{self.title}: residual of the normals", ylabel="max $|e_n|$ [N s]")
         for name, label, width in (("contacts", "contacts", 5.0), ("cache_matches", "matches", 1.5)):
-            # both seen where they are equal
+            # Different line widths: both curves are visible if they are equal.
             middle.plot(self.time, self.column(name), linewidth=width, label=label)
         middle.set(title="contacts, and those found in the cache", ylim=(0, None))
         for axes in (top, middle):
@@ -82,10 +107,22 @@ def run(
     replace: bool = False,
     watch: Callable[[int, dict[str, Any], dict[str, Any]], Any] | None = None,
 ) -> Trace:
-    """Step a simulation and keep its trace; stops where the state is no longer finite, and after Ctrl-C.
+    """Step a simulation and return its trace; stop if the state is no longer finite, and after Ctrl-C.
 
-    `record`: a folder for the problem of every step; `replace` takes the problems of another recording out of it, which
-    is refused otherwise. `watch(step, observation, info)` is called after every step.
+    Parameters
+    ----------
+    simulation : Simulation
+    steps : int
+    record : path, optional
+        Folder for the problem of every step.
+    replace : bool
+        Remove the problems of another recording from the folder. Without it, such a folder is an error.
+    watch : callable, optional
+        Called as watch(step, observation, info) after every step.
+
+    Returns
+    -------
+    Trace
     """
     steps = check_int("steps", steps, 1)
     recorded = 0
@@ -113,8 +150,8 @@ def run(
     scene = simulation.scene
     spec = get(scene.parameters.solver)
     order = sweep_order(scene.parameters) or scene.parameters.order
-    words = [] if spec.name == "sequential_impulses" else [spec.name]
-    method = ", ".join([*words, f"order {order}"] if spec.order else words)
+    method_parts = [] if spec.name == "sequential_impulses" else [spec.name]
+    method = ", ".join([*method_parts, f"order {order}"] if spec.order else method_parts)
     return Trace(
         scene=repr(scene),
         time=time[:done],
@@ -131,8 +168,8 @@ def run(
     )
 
 
-def line(step: int, observation: Mapping[str, Any], info: Mapping[str, Any]) -> str:
-    """One line about a step: time, contacts, matches, residual before and after the solve, depth."""
+def format_step(step: int, observation: Mapping[str, Any], info: Mapping[str, Any]) -> str:
+    """Format a step as one line: time, contacts, matches, residual before and after the solve, depth."""
     s = observation["solver"]
     depth = observation["contacts"]["depth"].max(initial=0.0)
     text = (
@@ -140,9 +177,9 @@ def line(step: int, observation: Mapping[str, Any], info: Mapping[str, Any]) -> 
         f"residual {s[4]:.2e} -> {s[5]:.2e} N s  violation {s[7]:.2e} m/s  depth {1e3 * depth:7.3f} mm"
     )
     failed = f"  failed solves {info['failed_solves']}" if info["failed_solves"] else ""
-    rest = (
+    residual_text = (
         f"  relative {info['residual']['relative']:.2e}, worst {info['residual']['worst']}"
         if "residual" in info
         else ""
     )
-    return text + failed + rest
+    return text + failed + residual_text

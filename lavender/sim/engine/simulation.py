@@ -12,22 +12,29 @@ from lavender.base.errors import InputError, LavenderError, check_name
 from lavender.base.lazy_import import lazy_module
 from lavender.io.stored import folder_for_steps
 from lavender.problem import Problem
-from lavender.sim.engine.check import same_scene, well_formed, whole_state
+from lavender.sim.engine.check import check_fields, check_sizes, check_state
 from lavender.sim.engine.film import Film, header_of
 from lavender.sim.engine.layout import HEAD
 from lavender.sim.engine.picture import save_picture
 from lavender.sim.engine.snapshot import Snapshot
 from lavender.sim.engine.state import State
-from lavender.sim.engine.stepping import CLOSED, HALF, INSIDE, Stepping, alone, make_pairs_anew
+from lavender.sim.engine.stepping import (
+    INCOMPLETE_STEP,
+    INSIDE_STEP,
+    SIMULATION_CLOSED,
+    Stepping,
+    exclusive,
+    invalidate_pairs,
+)
 from lavender.sim.scene import Scene
 from lavender_ext.engine.arrays import NEED_ROOM, lengths
 
 
 class Simulation(Stepping):
-    """Steps a scene in time. The scene is copied at the start; changing it later has no effect here.
+    """Simulation of a scene in time. The scene is copied; later changes of it have no effect.
 
     Threads may share a simulation: a call waits until the calls of other threads have ended. A call from inside a step
-    (by a solver that the step runs) is refused.
+    (by a solver that the step runs) raises LavenderError.
 
     A simulation is a context manager: `close` ends its films and viewers.
 
@@ -38,11 +45,11 @@ class Simulation(Stepping):
     stepper : str, optional
         A name of `lavender.sim.scene.steppers`, used with its default options instead of the scene's stepper.
     report_residual : bool, default False
-        Put the judge's residual of all rows of the last substep into `info["residual"]`; costs about as much as a
+        Compute the judge's residual of all rows of the last substep as `info["residual"]`. It costs about as much as a
         step.
     report_motion : bool, default False
-        Put the motion error of the last substep into `info["motion"]` (how wrong the bodies' velocities are); costs a
-        solve to the floor, and two under Coulomb's law.
+        Compute the motion error of the last substep, the error of the bodies' velocities, as `info["motion"]`. It costs
+        a solve to the round-off floor, and two solves with Coulomb friction.
 
     Raises
     ------
@@ -61,89 +68,89 @@ class Simulation(Stepping):
 
     # -- the problem ----------------------------------------------------------------------------
 
-    @alone
+    @exclusive
     def constraint_problem(self) -> Problem:
-        """The next substep's velocity problem, with its warm start as `guess`; changes no state.
+        """Return the velocity problem of the next substep, with its warm start as `guess`; the state is unchanged.
 
-        `lavender.solve(problem, "sequential_impulses", tol=0, max_iter=n)` returns the impulses of that substep,
-        bit for bit, n being `solver_iterations`; with the scene's `order`, unless that is `alternating`: the
-        contacts of such a problem stand in the order in which they are swept. The step publishes the
-        impulses of its last substep. So it is with the stepper `impulses`; others solve no velocity problem, or
-        another one, and their impulses are not those of any solver of this.
+        With the stepper `impulses`, `lavender.solve(problem, "sequential_impulses", tol=0, max_iter=n)` with n =
+        `solver_iterations` returns the impulses of that substep bit for bit. Pass the scene's `order`, unless it is
+        `alternating`: the contacts of such a problem are already in the order of the sweep. The observation of a step
+        contains the impulses of its last substep. Other steppers solve no velocity problem or another one, and no
+        solver of this problem returns their impulses.
         """
         state = self.state.copy()
         if self._restored:
-            make_pairs_anew(state)
+            invalidate_pairs(state)
         while state.kernel.prepare() == NEED_ROOM:
-            state = state.grown()
+            state = state.with_larger_buffers()
         return self._problem(state)
 
     def sweep_seed(self) -> int:
-        """`seed` for `lavender.solve(..., order="random")` that gives the next substep's order."""
+        """Return the `seed` with which `lavender.solve(..., order="random")` uses the order of the next substep."""
         head = self.state.head
         return (int(head[HEAD["seed"]]) << 32) ^ int(head[HEAD["step"]])
 
-    @alone
+    @exclusive
     def residual(self) -> dict[str, Any]:
-        """The judge over all rows of the last substep, with the impulses that it used.
+        """Return the judge's residual of all rows of the last substep, for the impulses that it used.
 
         Returns
         -------
         dict
-            relative [-], energy [sqrt J], velocity [m/s], floor [-], worst (name of a row), and share: the
-            part of energy squared that joints, normals, disks and spins have (they add up to 1, or to 0
-            without error).
+            relative [-], energy [sqrt J], velocity [m/s], floor [-], worst (name of a row), and share: the fractions of
+            the squared energy error on joints, normals, disks and torsion (their sum is 1, or 0 without error).
 
         Raises
         ------
         InputError
             No step has been done.
         """
-        return self._judged()
+        return self._residual_summary()
 
-    @alone
+    @exclusive
     def motion(self) -> dict[str, Any]:
-        """How wrong the bodies move after the last substep: distance to its solution, see `lavender.motion_error`.
+        """Return the motion error of the last substep: the distance to its solution, see `lavender.motion_error`.
 
-        Under Coulomb's law, where several motions may be right, the distance is to the nearer of what `auto`
-        finds and of what the step's own impulses lead to.
+        With Coulomb friction, several motions may be solutions. The distance is to the nearer of two: the solution of
+        `auto`, and the solution that continues from the impulses of the step.
 
         Returns
         -------
         dict
             relative [-], kinetic [sqrt J], speed [m/s] and body (its name), spin [rad/s], bound [sqrt J] and
-            bound_speed [m/s]; None where there is no number. open [m/s]: how far apart those two solutions are, 0
-            without friction.
+            bound_speed [m/s]; a value that cannot be computed is None. open [m/s]: the distance of those two solutions,
+            0 without friction.
 
         Raises
         ------
         InputError
             No step has been done.
         """
-        return self._moved()
+        return self._motion_summary()
 
     def record(self, folder: str | PathLike[str], steps: int, *, form: str = "npz") -> list[Path]:
-        """Step `steps` times and write the problem of each (of its first substep), with its warm start.
+        """Step `steps` times and write the problem of the first substep of each step, with its warm start.
 
         Parameters
         ----------
         folder : path
-            Made if it does not exist; `lavender report` takes it as it is.
+            Created if it does not exist. `lavender report` can read it.
         steps : int
         form : {"npz", "fclib"}
-            `.npz` holds everything; `.hdf5` (FCLIB, extra `fclib`) contacts without joints, spin or soft rows.
+            `.npz` holds every problem; `.hdf5` (FCLIB, extra `fclib`) only contacts without joints, torsional friction
+            or soft rows.
 
         Returns
         -------
         list of Path
-            One file for each step that had rows.
+            One file for each step with rows.
 
         Raises
         ------
         InputError
-            A folder that cannot be written or that holds problems which this simulation did not write, another form.
+            The folder cannot be written or holds problems that this simulation did not write, or `form` is unknown.
         CapabilityError
-            FCLIB cannot hold the rows of the next step, which is not done; files of the steps before it stay.
+            FCLIB cannot hold the rows of the next step. That step is not done; files of the steps before it stay.
         """
         check_name("form", form, ("npz", "fclib"))
         steps = check_int("steps", steps, 1)
@@ -158,7 +165,10 @@ class Simulation(Stepping):
         return [path for path in written if path is not None]
 
     def write_problem(self, folder: Path, digits: int, form: str = "npz") -> Path | None:
-        """Write the next substep's problem, where it has rows, under the scene's name and the step's number."""
+        """Write the problem of the next substep and return its path, or None if it has no rows.
+
+        The file name consists of the scene's name and the number of the step with `digits` digits.
+        """
         problem = self.constraint_problem()
         if not problem.m:
             return None
@@ -170,7 +180,9 @@ class Simulation(Stepping):
     # -- pictures -------------------------------------------------------------------------------
 
     def film(self, steps: int) -> Film:
-        """Step `steps` times and keep the poses, from the present ones on; stops where the state is no longer finite.
+        """Step `steps` times and return a film of the poses, the present ones included.
+
+        It stops if the state is no longer finite.
 
         Parameters
         ----------
@@ -179,7 +191,7 @@ class Simulation(Stepping):
         Returns
         -------
         Film
-            steps + 1 frames; `save` writes a file that `lavender view` opens.
+            At most steps + 1 frames; `save` writes a file that `lavender view` opens.
         """
         steps = check_int("steps", steps, 1)
         film = self.start_film()
@@ -191,31 +203,32 @@ class Simulation(Stepping):
             self.end_film(film)
         return film
 
-    @alone
+    @exclusive
     def start_film(self) -> Film:
-        """A film of the present poses, to which every step is added until `end_film`."""
+        """Return a new film with the present poses; every step adds a frame until `end_film`."""
         film = Film(header_of(self.scene, self.state))
         film.add(self.time, self._observe())
         self.films.append(film)
         return film
 
     def end_film(self, film: Film) -> None:
-        """Add no further step to a film."""
+        """End a film: later steps are not added."""
         with self._lock:
-            if self._refusal == INSIDE:
-                raise LavenderError(INSIDE)
+            if self._refusal == INSIDE_STEP:
+                raise LavenderError(INSIDE_STEP)
             film.ended = True
             self.films = [other for other in self.films if other is not film]
 
-    def frames(self, path: str | PathLike[str], steps: int = 120, **more: Any) -> Path:
-        """Step `steps` times and write pictures: `.gif`, `.mp4` an animation, `.png`, `.svg`, `.pdf` a strip.
+    def frames(self, path: str | PathLike[str], steps: int = 120, **options: Any) -> Path:
+        """Step `steps` times and write an animation (`.gif`, `.mp4`) or a strip of frames (`.png`, `.svg`, `.pdf`).
 
         Parameters
         ----------
         path : path
         steps : int
-        **more
-            frames (4, of a strip), turn, tilt [rad], size [inch], rate [1/s, of an animation].
+        **options
+            frames (number of frames of a strip, default 4), turn and tilt [rad], size [inch], rate [1/s] of an
+            animation.
 
         Returns
         -------
@@ -224,17 +237,17 @@ class Simulation(Stepping):
         Raises
         ------
         InputError
-            Another suffix, a path that cannot be written.
+            The suffix is unknown, or the path cannot be written.
         """
-        return save_picture(self.film(steps), path, **more)
+        return save_picture(self.film(steps), path, **options)
 
     def view(self, *, port: int = 0, browser: bool = True) -> Any:
-        """Show this simulation in a page on this machine: every step from now on, live, and all of them again.
+        """Show this simulation in a browser page on this machine: all later steps live, and a replay of them.
 
         Parameters
         ----------
         port : int
-            On the loopback address; 0 takes a free one.
+            Port on the loopback address; 0 selects a free one.
         browser : bool
             Open the page.
 
@@ -246,7 +259,7 @@ class Simulation(Stepping):
         Raises
         ------
         InputError
-            A port that is taken.
+            The port is in use.
 
         Examples
         --------
@@ -286,13 +299,13 @@ class Simulation(Stepping):
             Called from inside a step.
         """
         with self._lock:
-            if self._refusal == INSIDE:
-                raise LavenderError(INSIDE)
-            self._refusal = CLOSED
+            if self._refusal == INSIDE_STEP:
+                raise LavenderError(INSIDE_STEP)
+            self._refusal = SIMULATION_CLOSED
             for film in self.films:
                 film.ended = True
             self.films = []
-            self._before = self._last = None
+            self._state_before_step = self._last = None
         for viewer in list(self._viewers.values()):
             viewer.close()
 
@@ -304,17 +317,17 @@ class Simulation(Stepping):
 
     # -- snapshots ------------------------------------------------------------------------------
 
-    @alone
+    @exclusive
     def snapshot(self) -> Snapshot:
-        """The whole state: bodies, contact cache, joint impulses, sweep budget, warm-start mode, counters.
+        """Return the complete state: bodies, contact cache, joint impulses, sweep budget, warm-start mode, counters.
 
         Raises
         ------
         LavenderError
             A step ended between its substeps.
         """
-        if self._over == HALF:
-            raise LavenderError(f"{HALF}; reset() or restore a snapshot")
+        if self._end_reason == INCOMPLETE_STEP:
+            raise LavenderError(f"{INCOMPLETE_STEP}; reset() or restore a snapshot")
         s = self.state
         return Snapshot(
             fingerprint=self._fingerprint,
@@ -327,14 +340,15 @@ class Simulation(Stepping):
             keys=read_only(s.keys.copy()),
         )
 
-    @alone
+    @exclusive
     def restore(self, snapshot: Snapshot) -> None:
         """Continue from a snapshot of this scene, bit for bit.
 
         Raises
         ------
         InputError
-            Not a snapshot, of another scene, or with a number in it that no step can have left. Nothing changes.
+            It is not a snapshot, belongs to another scene, or contains a number that no step can produce. The
+            simulation is unchanged.
         """
         if not isinstance(snapshot, Snapshot):
             raise InputError(
@@ -342,24 +356,24 @@ class Simulation(Stepping):
             )
         if snapshot.fingerprint != self._fingerprint:
             raise InputError("the snapshot is of another scene: bodies, joints or parameters differ")
-        well_formed(snapshot)
+        check_fields(snapshot)
         size = snapshot.size.copy()
-        same_scene(self.state, size)
-        given = (len(snapshot.real), len(snapshot.index), len(snapshot.keys))
+        check_sizes(self.state, size)
+        found_lengths = (len(snapshot.real), len(snapshot.index), len(snapshot.keys))
         used = lengths(size)
-        if given != (used[0], used[1], max(used[2], 1)):
+        if found_lengths != (used[0], used[1], max(used[2], 1)):
             raise InputError("the snapshot is damaged: its arrays do not fit its sizes")
         state = State(size)
         state.real[:], state.index[:], state.keys[:] = snapshot.real, snapshot.index, snapshot.keys
         lost = snapshot.lost
-        whole_state(self.state, state, self._sweeps, bool(lost))
+        check_state(self.state, state, self._sweeps, bool(lost))
         if lost != (self._names[state.head[HEAD["lost"]]] if lost else ""):
             raise InputError(
                 f"the snapshot is damaged: {lost[:40]!r} is not the body whose state it says is lost"
             )
         self.state, self._restored = state, True
         self._steps, self._failed = snapshot.steps, snapshot.failed
-        self._last, self._over = None, ""
+        self._last, self._end_reason = None, ""
         self._lost_body()
 
     def save(self, path: str | PathLike[str]) -> None:
@@ -371,11 +385,14 @@ class Simulation(Stepping):
         self.restore(Snapshot.load(path))
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Copied or pickled it is one of its own that goes on from the same state; films stay with this one."""
-        return _gone_on, (self.scene, self.report_residual, self.report_motion, self.snapshot())
+        """Copy or pickle as a new simulation that continues from the same state, without films."""
+        return _restore_simulation, (self.scene, self.report_residual, self.report_motion, self.snapshot())
 
 
-def _gone_on(scene: Scene, report_residual: bool, report_motion: bool, snapshot: Snapshot) -> Simulation:
+def _restore_simulation(
+    scene: Scene, report_residual: bool, report_motion: bool, snapshot: Snapshot
+) -> Simulation:
+    """Build a simulation of the scene and restore the snapshot."""
     sim = Simulation(scene, report_residual=report_residual, report_motion=report_motion)
     sim.restore(snapshot)
     return sim

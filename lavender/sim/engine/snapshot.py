@@ -1,8 +1,8 @@
 """Snapshots of a simulation, in memory and in a file.
 
-A file is the magic word, the length of a JSON header (8 bytes, little-endian), the header (version,
-fingerprint of the scene, counters, lengths), the arrays size, real, index and keys as little-endian bytes,
-and the SHA-256 of all before. Nothing in it is executed when it is read.
+A file consists of a magic word, the length of a JSON header (8 bytes, little-endian), the header (version, fingerprint
+of the scene, counters, lengths), the arrays size, real, index and keys as little-endian bytes, and the SHA-256 of
+everything before it. Nothing in it is executed when it is read.
 """
 
 from __future__ import annotations
@@ -16,60 +16,84 @@ from typing import Any
 import numpy as np
 
 from lavender.base.errors import InputError
-from lavender.io.stored import framed, unframed, whole_file, write_atomically
-from lavender.sim.engine.check import well_formed
+from lavender.io.stored import pack_header, read_whole_file, unpack_header, write_atomically
+from lavender.sim.engine.check import check_fields
 from lavender_ext.engine.arrays import lengths
 
 MAGIC = b"LAVENDER-SNAPSHOT\n"
 VERSION = 1
-MOST_HEADER = 2**20  # bytes
-WORDS = ("fingerprint", "steps", "failed", "lost")
+MAX_SNAPSHOT_HEADER_BYTES = 2**20
+HEADER_FIELDS = ("fingerprint", "steps", "failed", "lost")
 ARRAYS = (("size", "<i4"), ("real", "<f8"), ("index", "<i4"), ("keys", "<u8"))
 
 
 @dataclass(frozen=True, eq=False)
 class Snapshot:
-    """State of a simulation, for `Simulation.restore`."""
+    """State of a simulation, for `Simulation.restore`.
 
-    fingerprint: str  # of the scene
+    Parameters
+    ----------
+    fingerprint : str
+        Hash of the scene.
+    steps : int
+        Number of steps done.
+    failed : int
+        Number of failed solves.
+    lost : str
+        Name of the body whose state is not finite, or empty.
+    size : int32 array
+    real : float64 array
+    index : int32 array
+    keys : uint64 array
+        The engine's buffers.
+    """
+
+    fingerprint: str
     steps: int
-    failed: int  # solves that failed
-    lost: str  # body whose state is not finite, or empty
-    size: np.ndarray = field(repr=False)  # int32
-    real: np.ndarray = field(repr=False)  # float64
-    index: np.ndarray = field(repr=False)  # int32
-    keys: np.ndarray = field(repr=False)  # uint64
+    failed: int
+    lost: str
+    size: np.ndarray = field(repr=False)
+    real: np.ndarray = field(repr=False)
+    index: np.ndarray = field(repr=False)
+    keys: np.ndarray = field(repr=False)
 
     def save(self, path: str | PathLike[str]) -> None:
-        """Write to a file, versioned and checksummed; a file of that name is replaced when the new one is whole."""
-        well_formed(self)
+        """Write the snapshot to a file with version and checksum; an existing file is replaced atomically."""
+        check_fields(self)
         arrays = [np.ascontiguousarray(getattr(self, name), code).tobytes() for name, code in ARRAYS]
-        header = {name: getattr(self, name) for name in WORDS}
+        header = {name: getattr(self, name) for name in HEADER_FIELDS}
         lengths_of = [len(getattr(self, name)) for name, _ in ARRAYS]
-        body = framed(MAGIC, {"version": VERSION, **header, "lengths": lengths_of}) + b"".join(arrays)
+        body = pack_header(MAGIC, {"version": VERSION, **header, "lengths": lengths_of}) + b"".join(arrays)
         checksum = hashlib.sha256(body).digest()
         write_atomically(path, lambda part: _write(part, body + checksum))
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> Snapshot:
-        """Read a file written by `save`."""
-        data = whole_file(path, "the snapshot")
+        """Read a file written by `save`.
+
+        Raises
+        ------
+        InputError
+            The file is not a snapshot, is damaged, or has another version.
+        """
+        data = read_whole_file(path, "the snapshot")
         if not data.startswith(MAGIC):
             raise InputError(f"{str(path)!r} is not a lavender snapshot")
         body, checksum = data[:-32], data[-32:]
         if hashlib.sha256(body).digest() != checksum:
             raise InputError(f"the snapshot {str(path)!r} is damaged: its checksum does not fit")
         try:
-            found = cls._parsed(body)
+            snapshot = cls._parse(body)
         except (ValueError, KeyError, TypeError, RecursionError) as error:
             if isinstance(error, InputError):
                 raise InputError(f"the snapshot {str(path)!r} cannot be read: {error}") from None
             raise InputError(f"the snapshot {str(path)!r} does not hold what its header says") from None
-        return found
+        return snapshot
 
     @classmethod
-    def _parsed(cls, body: bytes) -> Snapshot:
-        header, end = unframed(body, MAGIC, MOST_HEADER)
+    def _parse(cls, body: bytes) -> Snapshot:
+        """Build a snapshot from the bytes before the checksum; raise an error if they are inconsistent."""
+        header, end = unpack_header(body, MAGIC, MAX_SNAPSHOT_HEADER_BYTES)
         if header["version"] != VERSION:
             raise InputError(f"it has version {str(header['version'])[:40]}; {VERSION} is read here")
         arrays: dict[str, Any] = {}
@@ -79,15 +103,16 @@ class Snapshot:
             x = np.frombuffer(body, code, n, end)
             end += x.nbytes
             arrays[name] = x.astype(x.dtype.newbyteorder("="))
-        found = cls(**{name: header[name] for name in WORDS} | arrays)
-        well_formed(found)
-        used = lengths(found.size)
+        snapshot = cls(**{name: header[name] for name in HEADER_FIELDS} | arrays)
+        check_fields(snapshot)
+        used = lengths(snapshot.size)
         if end != len(body) or [max(n, 1) for n in used] != [max(n, 1) for n in header["lengths"][1:]]:
             raise ValueError("lengths")
-        return found
+        return snapshot
 
 
 def _write(part: Path, data: bytes) -> None:
+    """Write bytes and flush them to the disk."""
     with open(part, "wb") as stream:
         stream.write(data)
         stream.flush()

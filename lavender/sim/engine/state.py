@@ -1,4 +1,4 @@
-"""The engine's buffers: made from a scene, grown where they are too small, named by array."""
+"""The engine's buffers: built from a scene, enlarged if they are too small, with named arrays."""
 
 from __future__ import annotations
 
@@ -35,11 +35,12 @@ Copy = Callable[[], np.ndarray]
 
 assert set(ORDER_NUMBER) == set(SCENE_ORDERS)
 
-BRUTE_FORCE = 32  # bodies up to which testing all pairs is quicker than the grid
-BETA = 0.2  # -, share of the position error removed per substep
-MAX_PUSH = 0.2  # m, largest position error corrected per substep
-MOST_BYTES = 2**32  # of the three buffers
-# What the kernels carry from one substep to the next or a scene gives; the rest is scratch of one substep.
+# Up to this many shapes, all pairs are tested; above it, the grid is faster and is used instead.
+BRUTE_FORCE_MAX_SHAPES = 32
+BETA = 0.2  # Fraction of a position error that a substep removes [-].
+MAX_PUSH = 0.2  # Largest position error that a substep corrects [m].
+MAX_BUFFER_BYTES = 2**32  # Largest size of the three buffers together.
+# Arrays that the scene defines or that carry values from one substep to the next; all others are scratch of a substep.
 KEPT = (
     "setting", "x", "q", "v", "inv_mass_body", "inertia", "inv_inertia_body", "shape", "friction", "restitution",
     "patch", "fat", "joint", "joint_impulse", "inv_mass", "inv_inertia", "cache_impulse", "cache_local",
@@ -48,26 +49,39 @@ KEPT = (
 )  # fmt: skip
 
 
-class Seen(NamedTuple):
-    """Copies of what an observation shows, for one number of contacts and of their rows."""
+class ObservationViews(NamedTuple):
+    """Functions that copy the arrays of an observation, for one number of contacts and of contact rows.
 
-    whole: dict[str, Copy]  # by the names of an observation,
-    contacts: dict[str, Copy]  # and of its contacts
-    gap: np.ndarray  # (c,) m
-    impulses: Copy | None  # None where contacts differ in their number of rows
-    per: int  # rows that a contact of this scene can have
+    Parameters
+    ----------
+    arrays : mapping of str to callable
+        Copies of the arrays of an observation, by name.
+    contacts : mapping of str to callable
+        Copies of the arrays of its contacts, by name.
+    gap : (c,) m
+    impulses : callable or None
+        Copy of the contact impulses; None if contacts have different numbers of rows.
+    per : int
+        Largest number of rows of a contact of this scene.
+    """
+
+    arrays: dict[str, Copy]
+    contacts: dict[str, Copy]
+    gap: np.ndarray
+    impulses: Copy | None
+    per: int
 
 
 class State:
-    """Three buffers with the arrays of `lavender_ext/engine/arrays.pyx` by name, as attributes of `a`."""
+    """Three buffers of the engine; `a` holds the arrays of `lavender_ext/engine/arrays.pyx` by name."""
 
     def __init__(self, size: np.ndarray) -> None:
         self.size = np.ascontiguousarray(size, np.int32)
         used = lengths(self.size)
-        if min(used) < 0 or 8 * used[0] + 4 * used[1] + 8 * used[2] > MOST_BYTES:
+        if min(used) < 0 or 8 * used[0] + 4 * used[1] + 8 * used[2] > MAX_BUFFER_BYTES:
             raise InputError(
                 f"{self.size[SIZE['bodies']]} bodies with memory for {self.size[CAP_PAIR]} pairs and "
-                f"{self.size[CAP_CONTACT]} contacts need more than the {MOST_BYTES >> 30} GiB that a simulation "
+                f"{self.size[CAP_CONTACT]} contacts need more than the {MAX_BUFFER_BYTES >> 30} GiB that a simulation "
                 "may take: move the bodies apart or take fewer"
             )
         self.real = np.zeros(used[0])
@@ -76,57 +90,63 @@ class State:
         self.kernel = substep.Buffers(self.size, self.real, self.index, self.keys)
         self.a: dict[str, Any] = self.kernel.arrays()
         self.head, self.setting = self.a["head"], self.a["setting"]
-        self._seen: tuple[int, int, Seen] | None = None
+        self._views: tuple[int, int, ObservationViews] | None = None
 
     @cached_property
     def warm(self) -> Substep:
         """The first phase of `newton` on these buffers."""
         return Substep(self.size, self.real, self.index, self.keys, False)
 
-    def seen(self, contacts: int, rows: int) -> Seen:
-        """What to copy for an observation; kept while the numbers stay."""
-        if self._seen is None or self._seen[:2] != (contacts, rows):
+    def observation_views(self, contacts: int, rows: int) -> ObservationViews:
+        """Return the copy functions of an observation; they are cached while the numbers do not change."""
+        if self._views is None or self._views[:2] != (contacts, rows):
             a, first = self.a, int(self.size[SIZE["joint_rows"]])
             per = int(self.size[SIZE["rows_per_contact"]])
             even = rows == contacts * per
             block = a["impulse"][first : first + rows].reshape(contacts, per).copy if even else None
             out = self.setting[SETTING["out"] : SETTING["out"] + 8].view(SolverValues)
-            whole = {
+            array_of = {
                 "positions": "x",
                 "quaternions": "q",
                 "velocities": "v",
                 "joint_impulses": "joint_impulse",
             }
             each = {"pair": "contact_pair", "point": "point", "normal": "normal", "tangent": "tangent"}
-            seen = Seen(
-                whole={**{name: a[array].copy for name, array in whole.items()}, "solver": out.copy},
+            views = ObservationViews(
+                arrays={**{name: a[array].copy for name, array in array_of.items()}, "solver": out.copy},
                 contacts={name: a[array][:contacts].copy for name, array in each.items()},
                 gap=a["gap"][:contacts],
                 impulses=block,
                 per=per,
             )
-            self._seen = contacts, rows, seen
-        return self._seen[2]
+            self._views = contacts, rows, views
+        return self._views[2]
 
     @property
     def nbytes(self) -> int:
-        """Bytes of all three buffers."""
+        """Size of the three buffers [bytes]."""
         return int(self.real.nbytes + self.index.nbytes + self.keys.nbytes)
 
     def copy(self) -> State:
-        """The same, in buffers of its own."""
+        """Return a copy with its own buffers."""
         other = State(self.size)
-        other.take(self)
+        other.copy_from(self)
         return other
 
-    def take(self, other: State) -> None:
+    def copy_from(self, other: State) -> None:
         """Copy the buffers of a state of the same sizes, bit for bit."""
         self.real[:] = other.real
         self.index[:] = other.index
         self.keys[:] = other.keys
 
-    def grown(self) -> State:
-        """Return a copy with the memory that the last substep lacked."""
+    def with_larger_buffers(self) -> State:
+        """Return a copy with buffers of the sizes that the last substep needed.
+
+        Raises
+        ------
+        InputError
+            There are too many pairs of bodies, or the buffers would exceed `MAX_BUFFER_BYTES`.
+        """
         if self.head[HEAD["need_pairs"]] == TOO_MANY:
             raise InputError(
                 f"more than {MOST_PAIRS} pairs of bodies are close together ({self.size[SIZE['bodies']]} bodies): "
@@ -139,10 +159,16 @@ class State:
 
     @classmethod
     def of_scene(cls, scene: Scene) -> State:
-        """The start state of a scene."""
+        """Build the initial state of a scene.
+
+        Raises
+        ------
+        InputError
+            The stepper does not support the scene, or the buffers would exceed `MAX_BUFFER_BYTES`.
+        """
         p, bodies, joints = scene.parameters, scene.bodies, scene.joints
         n = len(bodies)
-        # the same about every axis, to the bit: then R I R^T is I whatever R
+        # An inertia that is a multiple of the identity to the bit does not change under rotation: R I R^T = I.
         even = (np.array_equal(b.inertia, np.eye(3) * b.inertia[0, 0]) for b in bodies)
         uneven = [not b.is_static and not same for b, same in zip(bodies, even, strict=True)]
         frames = any(uneven) or bool(joints) or any(isinstance(b.shape, Box) for b in bodies)
@@ -166,7 +192,9 @@ class State:
         size[SIZE["joints"]] = len(joints)
         size[SIZE["joint_rows"]] = sum(j.n_rows for j in joints)
         size[SIZE["excluded"]] = len(excluded)
-        size[SIZE["buckets"]] = 0 if n_shapes <= BRUTE_FORCE else 1 << int(np.ceil(np.log2(2 * n_shapes)))
+        size[SIZE["buckets"]] = (
+            0 if n_shapes <= BRUTE_FORCE_MAX_SHAPES else 1 << int(np.ceil(np.log2(2 * n_shapes)))
+        )
         size[SIZE["frames"]] = n if frames else 0
         size[SIZE["rows_per_contact"]] = per
         size[CAP_PAIR] = 4 * n_shapes if n_shapes > 1 else 0
@@ -184,6 +212,7 @@ class State:
 
 
 def _put_parameters(state: State, p: Parameters) -> None:
+    """Write the parameters of a scene to `head` and `setting`."""
     head, setting = state.head, state.setting
     setting[SETTING["h"]] = p.dt / p.substeps
     setting[SETTING["gravity"] : SETTING["gravity"] + 3] = p.gravity
@@ -206,14 +235,15 @@ def _put_parameters(state: State, p: Parameters) -> None:
     head[HEAD["stepper"]] = stepper.number
     for name, value in p.stepper_options.items():
         option = stepper.options[name]
-        if option.is_whole:
-            head[HEAD[option.place]] = value
+        if option.is_integer:
+            head[HEAD[option.slot]] = value
         else:
-            setting[SETTING[option.place]] = value
+            setting[SETTING[option.slot]] = value
     setting[SETTING["out"] : SETTING["out"] + 2] = p.solver_iterations, p.warm_start
 
 
 def _put_bodies(a: dict[str, Any], bodies: Sequence[Body], uneven: Sequence[bool]) -> None:
+    """Write poses, velocities, masses and shapes; `uneven` marks bodies whose inertia changes under rotation."""
     dynamic = 0
     for i, b in enumerate(bodies):
         a["x"][i], a["q"][i] = b.position, b.quaternion
@@ -232,6 +262,7 @@ def _put_bodies(a: dict[str, Any], bodies: Sequence[Body], uneven: Sequence[bool
 
 
 def _put_joints(a: dict[str, Any], joints: Sequence[Joint]) -> None:
+    """Write the joints and the first row of each."""
     row = 0
     for i, j in enumerate(joints):
         values = a["joint"][i]
@@ -258,6 +289,7 @@ def _put_joints(a: dict[str, Any], joints: Sequence[Joint]) -> None:
 
 
 def _shape(shape: Any) -> tuple[int, list[float]]:
+    """Return the kind of a shape and its four numbers in the engine's arrays."""
     if isinstance(shape, Plane):
         return PLANE, [*shape.normal, shape.offset]
     if isinstance(shape, Sphere):

@@ -1,4 +1,4 @@
-"""LavenderSim's step loop: substeps, the solver that a scene names, what a step tells."""
+"""LavenderSim's step loop: substeps, the solver of the scene, and the observation of a step."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from typing import Any, Concatenate, ParamSpec, TypeVar
 import numpy as np
 
 from lavender.base.arrays import FloatArray, as_array, check_int
-from lavender.base.arrays import check_bool as checked
+from lavender.base.arrays import check_bool as check_flag
 from lavender.base.errors import InputError, LavenderError, SolveFailed, UnknownName
 from lavender.judge.solution import Solution, order_name, uninterrupted
 from lavender.problem import Problem
 from lavender.sim.engine.film import Film
 from lavender.sim.engine.layout import HEAD, SIZE
-from lavender.sim.engine.problem import judged, moved, problem_of
+from lavender.sim.engine.problem import build_problem, motion_summary, residual_summary
 from lavender.sim.engine.state import State
 from lavender.sim.scene import Scene
 from lavender.sim.scene.scene import Parameters
@@ -33,31 +33,39 @@ from lavender.solving.solve import solve
 from lavender_ext.engine.arrays import NEED_ROOM, OK
 
 NEWTON = NEWTON_SPEC.factory
-TOL = 1e-6  # of lavender.solve
-INSIDE = "this simulation is inside a step; a solver or callback may not use it until the step has ended"
-CLOSED = "this simulation is closed"
-CHUNK = 256  # compiled substeps between two looks for Ctrl-C
-HALF = "a step ended between its substeps"
-LAST_STEP = 2**31 - 1  # head's count of substeps begins again after it
+TOL = 1e-6  # Default tolerance of lavender.solve.
+INSIDE_STEP = "this simulation is inside a step; a solver or callback may not use it until the step has ended"
+SIMULATION_CLOSED = "this simulation is closed"
+SUBSTEPS_PER_CALL = 256  # Compiled substeps between two checks for Ctrl-C.
+INCOMPLETE_STEP = "a step ended between its substeps"
+LAST_STEP = 2**31 - 1  # The counter of substeps in `head` restarts from 0 after this number.
 P = ParamSpec("P")
 R = TypeVar("R")
 S = TypeVar("S", bound="Stepping")
 
 
 @dataclass(frozen=True)
-class _Pending:
-    """How a substep's solve ended; its `Solution` is made when it is asked for."""
+class _PendingClaim:
+    """Result of a solve on the engine's arrays, from which the `Solution` is built at its first access.
 
-    how: int
+    Parameters
+    ----------
+    status_code : int
+        Result of `Substep.solve`.
+    sweeps, factorisations : int
+    time : float, s
+    """
+
+    status_code: int
     sweeps: int
     factorisations: int
-    time: float  # s
+    time: float
 
 
-def alone(
+def exclusive(
     method: Callable[Concatenate[S, P], R],
 ) -> Callable[Concatenate[S, P], R]:
-    """One call at a time: other threads wait; a call from inside a step or after `close` is refused."""
+    """Decorate a method to run exclusively: other threads wait; inside a step or after `close` it raises an error."""
 
     @wraps(method)
     def call(self: S, /, *args: P.args, **kwargs: P.kwargs) -> R:
@@ -70,7 +78,7 @@ def alone(
 
 
 class Stepping:
-    """The step loop of a scene: what `Simulation` adds its problems, records, films and snapshots to."""
+    """Base class of `Simulation`: the step loop of a scene, without records, films and snapshots."""
 
     def __init__(
         self,
@@ -88,15 +96,16 @@ class Stepping:
             raise InputError("the scene has no bodies; add some (add_box, add_sphere, add_plane)")
         if stepper is not None and get_stepper(stepper).name != scene.parameters.stepper:
             scene = scene.with_parameters(stepper=stepper, stepper_options={})
-        self.scene = scene = copy(scene)  # what is added to it later is not in this simulation
-        self.report_residual = checked("report_residual", report_residual)
-        self.report_motion = checked("report_motion", report_motion)
-        self._lock, self._refusal = RLock(), ""  # why no call is accepted: INSIDE, CLOSED, or empty
-        self.films: list[Film] = []  # that every step is added to
-        self._viewers: dict[int, Any] = {}  # open pages by the id of their film
+        self.scene = scene = copy(scene)  # Later additions to the scene do not change this simulation.
+        self.report_residual = check_flag("report_residual", report_residual)
+        self.report_motion = check_flag("report_motion", report_motion)
+        self._lock, self._refusal = RLock(), ""  # Reason why calls are rejected, or empty.
+        self.films: list[Film] = []  # Every step adds a frame to these films.
+        self._viewers: dict[int, Any] = {}  # Open pages by the id of their film.
         self._load(scene)
 
     def _load(self, scene: Scene) -> None:
+        """Set all attributes to the start of the scene."""
         p = self._parameters = scene.parameters
         self._names = tuple(b.name for b in scene.bodies)
         self._joint_names = tuple(j.name for j in scene.joints)
@@ -104,7 +113,7 @@ class Stepping:
         self._fingerprint = scene.fingerprint()
         self._own_sweeps = p.solver == "sequential_impulses"
         self._sweeps = get_stepper(p.stepper).sweeps if self._own_sweeps else (1, 2**31 - 1)
-        # `newton` with nothing but a tolerance asked for: its first phase runs on the engine's own arrays
+        # If `newton` has no option but the tolerance, its first phase runs on the engine's own arrays.
         tol = p.solver_options.get("tol", TOL)
         self._warm_tol = 0.0
         if p.solver == "newton" and set(p.solver_options) <= {"tol"} and isinstance(tol, (int, float)):
@@ -112,11 +121,13 @@ class Stepping:
         self._order = sweep_order(p)
         self._steps = 0
         self._failed = 0
-        self._over = ""  # why no step can follow
-        self._recorded: Path | None = None  # where its steps were written last
-        self._restored = False  # the list of pairs is somebody else's
-        self._before: State | None = None  # a copy of what a step that may be stopped inside began with
-        self._last: Solution | _Pending | None = None
+        self._end_reason = ""  # Reason why no step can follow, or empty.
+        self._recorded: Path | None = None  # Folder to which `record` wrote last.
+        self._restored = False  # The state is from a snapshot, and its list of pairs is not valid.
+        self._state_before_step: State | None = (
+            None  # Copy of the state, if a step can be stopped between substeps.
+        )
+        self._last: Solution | _PendingClaim | None = None
 
     # -- running --------------------------------------------------------------------------------
 
@@ -127,69 +138,70 @@ class Stepping:
 
     @property
     def steps(self) -> int:
-        """Steps done since the start or the last reset."""
+        """Number of steps since the start or the last reset."""
         return self._steps
 
     @property
     def solver_iterations(self) -> int:
-        """Budget of the velocity solve."""
+        """Iteration budget of the velocity solve."""
         return int(self.state.head[HEAD["iterations"]])
 
     @property
     def warm_start(self) -> bool:
-        """Whether impulses are carried over from the cache."""
+        """Whether a solve starts from the impulses of the contact cache."""
         return bool(self.state.head[HEAD["warm_start"]])
 
     @property
-    @alone
+    @exclusive
     def last_solution(self) -> Solution | None:
-        """What the registered solver returned for the last substep.
+        """Solution of the registered solver for the last substep.
 
-        None with the built-in sweeps, and where the last substep had no rows.
+        None with the built-in sweeps, or if the last substep had no rows.
         """
-        if isinstance(self._last, _Pending):
-            self._last = self._told(self._last)
+        if isinstance(self._last, _PendingClaim):
+            self._last = self._build_solution(self._last)
         return self._last
 
-    @alone
+    @exclusive
     def set_solver_iterations(self, n: int) -> None:
-        """Budget from the next step on.
+        """Set the iteration budget from the next step on.
 
         Raises
         ------
         InputError
-            Not a whole number of 4 to 64 for sequential_impulses (1 to 64 under other steppers than "impulses"), of at
-            least 1 for other solvers.
+            `n` is not an integer from 4 to 64 for sequential_impulses (1 to 64 with steppers other than "impulses"), or
+            of 1 or more for other solvers.
         """
         self.state.head[HEAD["iterations"]] = check_int("solver_iterations", n, *self._sweeps)
 
-    @alone
+    @exclusive
     def set_warm_start(self, flag: bool) -> None:
-        """Warm starting from the next step on; the cache is kept up to date either way."""
-        self.state.head[HEAD["warm_start"]] = checked("warm_start", flag)
+        """Switch warm starting on or off from the next step on; the contact cache is updated in both cases."""
+        self.state.head[HEAD["warm_start"]] = check_flag("warm_start", flag)
 
-    @alone
+    @exclusive
     def set_velocity(self, body: int | str, velocity: Any = None, angular_velocity: Any = None) -> None:
         """Set the velocity with which a body enters the next step, for example to apply an impact.
 
-        What the last step published (observation, residual, solution, contact cache) does not change. A snapshot
-        keeps the new velocity.
+        The results of the last step (observation, residual, solution, contact cache) do not change. A snapshot contains
+        the new velocity.
 
         Parameters
         ----------
         body : int or str
             Number or name of a body that is not static.
         velocity, angular_velocity : (3,) m/s, rad/s, optional
-            In world axes. One that is left out stays as it is.
+            In world axes. A velocity that is not given does not change.
 
         Raises
         ------
         UnknownName
             No body has that name.
         InputError
-            No such number, a name that several bodies have, a static body, or numbers that are not finite or too large.
+            The number does not exist, several bodies have the name, the body is static, or a velocity is not finite or
+            too large.
         LavenderError
-            The simulation had terminated: reset it or restore a snapshot.
+            The simulation has terminated: reset it or restore a snapshot.
         """
         self._check_can_step()
         i = self._body_number(body)
@@ -198,14 +210,15 @@ class Stepping:
             raise InputError(f"{name} is static; it has no velocity")
         parts = ((0, "velocity", velocity, "m/s"), (3, "angular_velocity", angular_velocity, "rad/s"))
         values = [
-            (first, as_array(f"{what} of {name}", x, (3,), unit=unit))
-            for first, what, x, unit in parts
+            (first, as_array(f"{quantity} of {name}", x, (3,), unit=unit))
+            for first, quantity, x, unit in parts
             if x is not None
         ]
         for first, x in values:
             self.state.a["v"][i, first : first + 3] = x
 
     def _body_number(self, body: int | str) -> int:
+        """Return the number of a body given by number or unique name."""
         if not isinstance(body, str):
             return check_int("body", body, 0, len(self._names) - 1)
         if body not in self._names:
@@ -214,11 +227,11 @@ class Stepping:
             raise InputError(f"{self._names.count(body)} bodies are named {body!r}; give the number of one")
         return self._names.index(body)
 
-    @alone
+    @exclusive
     def reset(self, seed: int | None = None) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Back to the start of the scene; with `seed`, of the scene built with that seed.
+        """Return to the start of the scene; with `seed`, of the scene built with that seed.
 
-        The sweep budget and the warm-start mode stay as they are.
+        The sweep budget and the warm-start mode do not change.
 
         Returns
         -------
@@ -239,16 +252,16 @@ class Stepping:
         Parameters
         ----------
         action : None
-            There are no actions; the argument is there for Gymnasium's shape.
+            There are no actions; the argument exists for compatibility with Gymnasium.
 
         Returns
         -------
-        observation : dict of fresh arrays
+        observation : dict of new arrays
             positions (n, 3) [m], quaternions (n, 4) w x y z, velocities (n, 6) [m/s, rad/s],
             joint_impulses (mj,) [N s, N m s], solver (8,) see `SOLVER_FIELDS` (its text has names and units), and
             contacts: pair (c, 2), point, normal, tangent (c, 3), depth (c,) [m, positive inside], impulses (c, r)
-            [N s, N m s], the rows that contacts of this scene can have: normal, two tangents, spin, two that roll.
-            Contacts and impulses are those of the final substep.
+            [N s, N m s] of the rows that contacts of this scene can have: normal, two tangents, torsion, two rolling
+            rows. Contacts and impulses belong to the last substep.
         reward : float
             0.0
         terminated : bool
@@ -256,18 +269,18 @@ class Stepping:
         truncated : bool
             False
         info : dict
-            time [s], step, failed_solves, order (of the sweeps, by name; None if the solver takes none), and on
-            request residual and motion.
+            time [s], step, failed_solves, order (name of the sweep order; None if the solver has none), and residual
+            and motion if they were requested.
 
         Raises
         ------
         SolveFailed
             With `on_failure="raise"`, before the state has changed.
         KeyboardInterrupt
-            Ctrl-C while a registered solver runs: the state is that of before the step, or of after it where it
-            was done already; never of a part.
+            Ctrl-C while a registered solver runs. The state is the one before the step, or the one after it if the step
+            was complete; never one between substeps.
         LavenderError
-            The simulation had terminated (reset it or restore a snapshot), or is closed.
+            The simulation has terminated (reset it or restore a snapshot), or is closed.
         """
         if action is not None:
             raise InputError(f"action is {action!r}; this simulation takes none")
@@ -275,7 +288,7 @@ class Stepping:
             if self._refusal:
                 raise LavenderError(self._refusal)
             self._check_can_step()
-            self._refusal = INSIDE
+            self._refusal = INSIDE_STEP
             try:
                 self._advance()
                 lost = self._lost_body()
@@ -288,68 +301,73 @@ class Stepping:
                 self._refusal = ""
 
     def _check_can_step(self) -> None:
-        if self._over:
-            raise LavenderError(f"{self._over}; reset() or restore a snapshot")
+        if self._end_reason:
+            raise LavenderError(f"{self._end_reason}; reset() or restore a snapshot")
 
     def _advance(self) -> None:
+        """Do all substeps of a step; restore the state before the step if one of them raises."""
         substeps, first = self._parameters.substeps, self.state
-        begun, failed = first.head.item(HEAD["step"]), self._failed
-        # A registered solver may raise or be stopped in any substep, which then must be as if none had been;
-        # until the first has ended, nothing has changed that the next step starts from.
-        keeps = substeps > 1 and not self._own_sweeps
+        first_substep, failed = first.head.item(HEAD["step"]), self._failed
+        # A registered solver may raise or be interrupted in any substep; the state before the step is then restored.
+        # Until the first substep has ended, nothing has changed that the next step starts from.
+        needs_copy = substeps > 1 and not self._own_sweeps
         if self._restored:
-            make_pairs_anew(first)
+            invalidate_pairs(first)
             self._restored = False
-        if keeps:
-            if self._before is None or not np.array_equal(self._before.size, first.size):
-                self._before = State(first.size)
-            self._before.take(first)
+        if needs_copy:
+            if self._state_before_step is None or not np.array_equal(
+                self._state_before_step.size, first.size
+            ):
+                self._state_before_step = State(first.size)
+            self._state_before_step.copy_from(first)
         try:
             if self._own_sweeps:
                 self._sweep_substeps()
             else:
                 self._solve_substeps()
         except BaseException as error:
-            done = (self.state.head.item(HEAD["step"]) - begun) % (LAST_STEP + 1)
+            done = (self.state.head.item(HEAD["step"]) - first_substep) % (LAST_STEP + 1)
             if done == substeps or self._lost_body():
-                self._steps += 1  # it was whole
+                self._steps += 1  # The step was complete.
                 raise
-            if done and self._before is not None and keeps:
-                first.take(self._before)
+            if done and self._state_before_step is not None and needs_copy:
+                first.copy_from(self._state_before_step)
                 first.head[HEAD["solved"]] = 0
                 self.state = first
-            if done and not keeps:
-                self._over = HALF
+            if done and not needs_copy:
+                self._end_reason = INCOMPLETE_STEP
             self._failed = failed
             if not isinstance(error, SolveFailed):
-                self._last = None  # it may lie in arrays that have been written over
+                self._last = None  # Its arrays may have been overwritten.
             raise
         self._steps += 1
 
     def _lost_body(self) -> str:
-        # name of the body whose state is not finite, or empty; no step follows
+        """Return the name of the body whose state is not finite, or an empty text; no step can follow it."""
         lost = self.state.head.item(HEAD["lost"])
         if lost < 0:
             return ""
-        self._over = f"the state of {self._names[lost]!r} is not finite"
+        self._end_reason = f"the state of {self._names[lost]!r} is not finite"
         return self._names[lost]
 
     def _sweep_substeps(self) -> None:
-        left = self._parameters.substeps
+        """Do the substeps with the compiled sweeps; enlarge the buffers if they are too small."""
+        remaining = self._parameters.substeps
         while True:
-            status, done = self.state.kernel.substeps(min(left, CHUNK))
-            left -= done
+            status, done = self.state.kernel.substeps(min(remaining, SUBSTEPS_PER_CALL))
+            remaining -= done
             if status == NEED_ROOM:
-                self.state = self.state.grown()
-            elif left == 0 or status != OK:
+                self.state = self.state.with_larger_buffers()
+            elif remaining == 0 or status != OK:
                 return
 
     def prepare_substep(self) -> None:
-        """Collide and build the rows of the next substep in `state`."""
+        """Detect collisions and build the rows of the next substep in `state`."""
         while self.state.kernel.prepare() == NEED_ROOM:
-            self.state = self.state.grown()
+            self.state = self.state.with_larger_buffers()
 
     def _solve_substeps(self) -> None:
+        """Do the substeps with the registered solver of the scene."""
         warm = self._warm_tol > 0.0 and get("newton").factory == NEWTON
         for _ in range(self._parameters.substeps):
             self._last = None
@@ -359,8 +377,8 @@ class Stepping:
             if not (warm and self._solve_in_place()):
                 try:
                     problem = self._problem(self.state)
-                except InputError:  # its numbers are not finite
-                    self._lose()
+                except InputError:  # The numbers of the problem are not finite.
+                    self._mark_lost()
                     return
                 if problem.m:
                     a["impulse"][: problem.m] = self._solve(problem)
@@ -368,25 +386,28 @@ class Stepping:
             if kernel.finish() != OK:
                 return
 
-    def _lose(self) -> None:
-        # no solver takes the prepared problem: the run ends here, at the body that finish() finds
+    def _mark_lost(self) -> None:
+        """End the run after a prepared problem that is not valid, at the body that `finish()` reports."""
         self.state.kernel.apply()
         if self.state.kernel.finish() == OK:
             bodies = [*self.state.a["contact_pair"][:1].ravel().tolist(), int(self.state.a["body_of"][0])]
             self.state.head[HEAD["lost"]] = next(i for i in bodies if self.state.a["dyn"][i] >= 0)
 
     def _solve_in_place(self) -> bool:
-        # The bits of lavender.solve(problem, "newton"), whose first phase this is, without making the problem.
-        start = perf_counter()
-        how, sweeps, factorisations, _ = self.state.warm.solve(self._warm_tol)
-        if how:
-            self._last = _Pending(how, sweeps, factorisations, perf_counter() - start)
-        return bool(how)
+        """Run the first phase of `newton` on the engine's arrays; return whether it solved the problem.
 
-    def _told(self, pending: _Pending) -> Solution:
-        # The arrays of the last substep's problem stay as they were until the next one.
+        The impulses are bit for bit those of lavender.solve(problem, "newton"), without building the problem.
+        """
+        start = perf_counter()
+        status_code, sweeps, factorisations, _ = self.state.warm.solve(self._warm_tol)
+        if status_code:
+            self._last = _PendingClaim(status_code, sweeps, factorisations, perf_counter() - start)
+        return bool(status_code)
+
+    def _build_solution(self, pending: _PendingClaim) -> Solution:
+        """Build the solution of the last substep, whose arrays do not change until the next one."""
         problem = self._problem(self.state, steps=self._steps)
-        claim = claim_of(pending.how, pending.sweeps, pending.factorisations)
+        claim = claim_of(pending.status_code, pending.sweeps, pending.factorisations)
         assert claim is not None
         impulse = self.state.a["impulse"][: problem.m].copy()
         options = dict(self._parameters.solver_options)
@@ -396,13 +417,14 @@ class Stepping:
         )
 
     def _solve(self, problem: Problem) -> FloatArray:
+        """Return impulses (m,) [N s] of the registered solver; a failed solve is treated as `on_failure` requires."""
         p = self._parameters
         guess = problem.start() if problem.guess is None else problem.guess
         solution = solve(
             problem, p.solver, impulse=guess, max_iter=self.solver_iterations, **p.solver_options
         )
         if "callback" not in p.solver_options:
-            uninterrupted(solution)  # half a solve is no step
+            uninterrupted(solution)  # An interrupted solve must not be used for a step.
         self._last = solution
         if solution.success or solution.residual.at_floor:
             return solution.impulse
@@ -414,30 +436,35 @@ class Stepping:
         return 0.5 * (guess + solution.impulse) if p.on_failure == "damp" else solution.impulse
 
     def _observe(self) -> dict[str, Any]:
+        """Return the observation of the present state, in new arrays."""
         s = self.state
         c = s.head.item(HEAD["contacts"])
-        seen = s.seen(c, s.head.item(HEAD["contact_rows"]))
-        observation: dict[str, Any] = {name: copied() for name, copied in seen.whole.items()}
-        contacts = {name: copied() for name, copied in seen.contacts.items()}
-        contacts["depth"] = 0.0 - seen.gap
-        contacts["impulses"] = seen.impulses() if seen.impulses is not None else self._spread(c, seen.per)
+        views = s.observation_views(c, s.head.item(HEAD["contact_rows"]))
+        observation: dict[str, Any] = {name: copy_array() for name, copy_array in views.arrays.items()}
+        contacts = {name: copy_array() for name, copy_array in views.contacts.items()}
+        contacts["depth"] = 0.0 - views.gap
+        impulses = views.impulses() if views.impulses is not None else self._contact_impulses(c, views.per)
+        contacts["impulses"] = impulses
         observation["contacts"] = contacts
         return observation
 
-    def _spread(self, c: int, per: int) -> FloatArray:
-        # contacts that lack some of the scene's rows have zeros there
+    def _contact_impulses(self, c: int, per: int) -> FloatArray:
+        """Return the impulses (c, per) of contacts with different numbers of rows; missing rows are zero."""
         a, kj = self.state.a, int(self.state.size[SIZE["joints"]])
         out = np.zeros((c, per))
         first, end = a["ptr"][kj : kj + c], a["ptr"][kj + 1 : kj + c + 1]
         for row in range(per):
             has = first + row < end
             out[has, row] = a["impulse"][first[has] + row]
-        if per == 6:  # what rolls stands last, with or without spin before it
-            bare = end - first == 5
-            out[bare, 3:] = np.roll(out[bare, 3:], 1, axis=1)
+        if (
+            per == 6
+        ):  # Rolling rows are the last two, whether the contact has a torsion row before them or not.
+            no_torsion = end - first == 5
+            out[no_torsion, 3:] = np.roll(out[no_torsion, 3:], 1, axis=1)
         return out
 
     def _info(self, lost: str = "") -> dict[str, Any]:
+        """Return the `info` of a step."""
         info: dict[str, Any] = {
             "time": self.time,
             "step": self._steps,
@@ -448,26 +475,29 @@ class Stepping:
             info["lost_body"] = lost
         elif self.state.head.item(HEAD["solved"]):
             if self.report_residual:
-                info["residual"] = self._judged()
+                info["residual"] = self._residual_summary()
             if self.report_motion:
-                info["motion"] = self._moved()
+                info["motion"] = self._motion_summary()
         return info
 
     # -- the problem of the last substep ----------------------------------------------------------
 
     def _problem(self, state: State, steps: int | None = None) -> Problem:
+        """Return the problem of a prepared substep of `state`."""
         step = self._steps + 1 if steps is None else steps
-        return problem_of(state, self._names, self._joint_names, f"{self.scene.name or 'scene'}, step {step}")
+        return build_problem(
+            state, self._names, self._joint_names, f"{self.scene.name or 'scene'}, step {step}"
+        )
 
-    def _judged(self) -> dict[str, Any]:
-        return judged(*self._solved())
+    def _residual_summary(self) -> dict[str, Any]:
+        return residual_summary(*self._last_problem())
 
-    def _moved(self) -> dict[str, Any]:
-        problem, impulse = self._solved()
-        return moved(problem, impulse, [b.name for b in self.scene.bodies if not b.is_static])
+    def _motion_summary(self) -> dict[str, Any]:
+        problem, impulse = self._last_problem()
+        return motion_summary(problem, impulse, [b.name for b in self.scene.bodies if not b.is_static])
 
-    def _solved(self) -> tuple[Problem, FloatArray]:
-        # the problem of the last substep, and its impulses (m,) [N s]
+    def _last_problem(self) -> tuple[Problem, FloatArray]:
+        """Return the problem of the last substep and its impulses (m,) [N s]; InputError if there is none."""
         if not self.state.head[HEAD["solved"]]:
             raise InputError("no step has been done yet, or the last was stopped; call step() and ask again")
         problem = self._problem(self.state)
@@ -478,13 +508,16 @@ class Stepping:
 
 
 def sweep_order(p: Parameters) -> str | None:
-    """Return the order in which the solver of a scene visits the blocks in each sweep; None if it takes none."""
+    """Return the name of the order in which the scene's solver visits the blocks; None if it has no order."""
     if not get(p.solver).order:
         return None
     return order_name(p.solver_options.get("order", p.order))
 
 
-def make_pairs_anew(state: State) -> None:
-    """Have the next substep look for pairs itself: a list that lacks one cannot be told from one that is right."""
+def invalidate_pairs(state: State) -> None:
+    """Mark the list of pairs as invalid: the next substep builds it again.
+
+    A restored list with a missing pair cannot be distinguished from a correct one.
+    """
     for name in ("pairs_valid", "need_pairs", "need_contacts"):
         state.head[HEAD[name]] = 0

@@ -1,12 +1,12 @@
-"""The eight solver values of a step: names, units, and an array that prints with them."""
+"""The eight solver values of a step: names, units, and an array type that prints them."""
 
 from __future__ import annotations
 
 import numpy as np
 
-#: The eight values of `observation["solver"]`, of the final substep: sweep budget, warm-start mode (0 or 1),
-#: contacts, contacts found in the cache, max |e_n| [N s] before the first sweep and after the last, and
-#: max(0, -w_n) [m/s] likewise.
+#: The eight values of `observation["solver"]` for the last substep: sweep budget, warm-start mode (0 or 1), number of
+#: contacts, number of contacts with an entry in the cache, max |e_n| [N s] before the first and after the last sweep,
+#: max(0, -w_n) [m/s] before the first and after the last sweep.
 SOLVER_FIELDS = (
     "iterations",
     "warm_start",
@@ -21,7 +21,7 @@ SOLVER_UNITS = ("", "", "", "", "N s", "N s", "m/s", "m/s")
 
 
 class SolverValues(np.ndarray):
-    """An array whose text, if it holds eight numbers of float64, is one line for each name with its unit."""
+    """Array whose text is one line per value with name and unit, if it holds eight float64 numbers."""
 
     def __str__(self) -> str:
         if self.shape != (len(SOLVER_FIELDS),) or self.dtype != np.float64:

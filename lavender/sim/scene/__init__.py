@@ -1,4 +1,4 @@
-"""Scenes: bodies, shapes and joints, by hand or from the gallery."""
+"""Scenes: bodies, shapes and joints, built by hand or taken from the gallery."""
 
 from lavender.sim.scene.gallery import SCENES
 from lavender.sim.scene.parts import Body, Box, Joint, Plane, Sphere

@@ -1,6 +1,6 @@
-"""The gallery: named scenes, each with its parameters, its sizes and why it exists.
+"""The gallery of named scenes, each with its parameters, its sizes and its purpose.
 
-Lengths in m, masses in kg, angles in rad. Bodies are numbered from the ground up, so that the order of the
+Lengths are in m, masses in kg, angles in rad. Bodies are numbered from the ground up, so that the order of the
 contacts is bottom-up. Each builder registers itself; importing this module fills the table.
 """
 
@@ -13,7 +13,7 @@ import numpy as np
 
 from lavender.base.arrays import check_float, check_int
 from lavender.base.errors import check_name
-from lavender.sim.scene.arithmetic import frame_quaternion, norm, sine_cosine, turned
+from lavender.sim.scene.arithmetic import frame_quaternion, norm, rotate, sine_cosine
 from lavender.sim.scene.parts import quaternion, rotation
 from lavender.sim.scene.scene import SCENES, Scene, named_scene
 
@@ -22,7 +22,7 @@ __all__ = ["SCENES"]
 
 @named_scene()
 def stack(scene: Scene, n: int = 6, size: float = 1.0, mass: float = 1.0) -> None:
-    """`n` equal boxes on each other: 4 n contacts, the slowest mode of Gauss-Seidel in closed form.
+    """Stack `n` equal boxes: 4 n contacts; the slowest mode of Gauss-Seidel is known in closed form.
 
     Six unit boxes: 7 bodies, 24 contacts, 24 rows without friction and 72 with.
     """
@@ -35,10 +35,10 @@ def stack(scene: Scene, n: int = 6, size: float = 1.0, mass: float = 1.0) -> Non
 
 @named_scene()
 def pyramid(scene: Scene, base: int = 10, size: float = 1.0, mass: float = 1.0, gap: float = 0.05) -> None:
-    """Rows of boxes, each one shorter: coupling in two directions, more rows than the bodies can tell apart.
+    """Build rows of boxes, each one box shorter: coupling in two directions, redundant contact rows.
 
-    base 10: 55 boxes, 400 contacts; base 20: 210 boxes, 1,600 contacts. `gap` is the room between neighbours
-    as a share of their size.
+    base 10: 55 boxes, 400 contacts; base 20: 210 boxes, 1,600 contacts. `gap` is the distance between neighbours as a
+    fraction of their size.
     """
     check_int("base", base, 1)
     size, pitch = check_float("size", size, above=0.0), size * (1.0 + check_float("gap", gap, low=0.0))
@@ -51,16 +51,16 @@ def pyramid(scene: Scene, base: int = 10, size: float = 1.0, mass: float = 1.0, 
 
 @named_scene(friction=0.6)
 def card_house(scene: Scene, levels: int = 2, lean: float = 0.3) -> None:
-    """Cards leaning against each other: stands by friction alone, thin boxes, edge on edge.
+    """Build a card house: thin boxes lean against each other, edge on edge, and are held only by friction.
 
-    2 levels: 3 pairs, 1 card across, 7 cards; 3 levels: 15 cards. `lean` is the angle from upright.
+    2 levels: 3 pairs, 1 card across, 7 cards; 3 levels: 15 cards. `lean` is the angle from the vertical.
     """
     check_int("levels", levels, 1)
     lean = check_float("lean", lean, low=0.05, high=0.7)
     thick, width, tall, mass = 0.04, 0.7, 1.0, 0.2
     s, c = sine_cosine(lean)
-    reach = tall * s + thick * c  # half the foot of a pair
-    pitch = 2.0 * reach + thick
+    half_width = tall * s + thick * c  # Half the width of the base of a pair.
+    pitch = 2.0 * half_width + thick
     height = tall * c + thick * s
     scene.add_plane()
     z = 0.0
@@ -72,7 +72,7 @@ def card_house(scene: Scene, levels: int = 2, lean: float = 0.3) -> None:
                 scene.add_box(
                     (thick, width, tall),
                     mass,
-                    position=(x - side * 0.5 * reach, 0.0, z + 0.5 * height),
+                    position=(x - side * 0.5 * half_width, 0.0, z + 0.5 * height),
                     quaternion=quaternion((0.0, 1.0, 0.0), side * lean),
                 )
         for left, right in pairwise(apex):
@@ -86,14 +86,14 @@ def card_house(scene: Scene, levels: int = 2, lean: float = 0.3) -> None:
 
 @named_scene()
 def pile(scene: Scene, n: int = 100, kind: str = "spheres", size: float = 0.5, walls: bool = True) -> None:
-    """`n` bodies dropped into a bin: many contacts, irregular, moving; kind "spheres", "boxes" or "mixed".
+    """Drop `n` bodies into a bin: many irregular, moving contacts; kind "spheres", "boxes" or "mixed".
 
-    1,000 spheres: some 2,500 contacts when they have come down. `seed` shakes the start.
+    1,000 spheres: some 2,500 contacts after they have settled. `seed` perturbs the initial positions.
     """
     check_int("n", n, 1)
     size = check_float("size", size, above=0.0)
     check_name("kind of pile", kind, ("spheres", "boxes", "mixed"))
-    side = next(k for k in range(1, n + 1) if 5 * k**3 >= 4 * n)  # a quarter more high than wide
+    side = next(k for k in range(1, n + 1) if 5 * k**3 >= 4 * n)  # The bin is a quarter higher than wide.
     pitch = 1.15 * size if kind == "spheres" else 1.5 * size
     half = 0.5 * side * pitch
     rng = np.random.default_rng(scene.parameters.seed)
@@ -103,21 +103,22 @@ def pile(scene: Scene, n: int = 100, kind: str = "spheres", size: float = 0.5, w
             scene.add_plane(normal, -half)
     for i in range(n):
         cell = np.array([i % side, (i // side) % side, i // side**2], float)
-        place = (cell + 0.5) * pitch + rng.uniform(-0.05, 0.05, 3) * size
-        place[:2] -= half
+        position = (cell + 0.5) * pitch + rng.uniform(-0.05, 0.05, 3) * size
+        position[:2] -= half
         if kind == "spheres" or (kind == "mixed" and i % 2):
-            scene.add_sphere(0.5 * size, position=place)
+            scene.add_sphere(0.5 * size, position=position)
         else:
             turn = rng.normal(size=4)
             edges = size * rng.uniform(0.6, 0.9, 3)
-            scene.add_box(edges, position=place, quaternion=turn)
+            scene.add_box(edges, position=position, quaternion=turn)
 
 
 @named_scene()
 def chain(scene: Scene, n: int = 20, tip_mass: float = 1.0, length: float = 0.25, angle: float = 1.2) -> None:
-    """`n` links on ball joints with a tip of another mass: joints alone, information travels one link a sweep.
+    """Build a chain of `n` links on ball joints, the last with mass `tip_mass`: only joints.
 
-    3 n rows. `angle` is that of the straight chain from the vertical, at the start.
+    A sweep propagates an impulse by one link. 3 n rows. `angle` is the initial angle of the straight chain from the
+    vertical.
     """
     check_int("n", n, 1)
     length = check_float("length", length, above=0.0)
@@ -140,7 +141,7 @@ def chain(scene: Scene, n: int = 20, tip_mass: float = 1.0, length: float = 0.25
 
 @named_scene()
 def bridge(scene: Scene, n: int = 16, load: float = 10.0) -> None:
-    """`n` planks on hinges between two banks, with a box of mass `load` on them: joints and contacts together.
+    """Build a bridge of `n` planks on hinges between two banks, with a box of mass `load`: joints and contacts.
 
     5 (n + 1) joint rows and the contacts of the load.
     """
@@ -160,7 +161,7 @@ def bridge(scene: Scene, n: int = 16, load: float = 10.0) -> None:
 
 @named_scene()
 def heavy_on_light(scene: Scene, ratio: float = 100.0, n: int = 2) -> None:
-    """Boxes of mass 1, the top one `ratio` times as heavy: a sweep leaves R/(1 + R) of the error.
+    """Stack boxes of mass 1, the top one `ratio` times as heavy: a sweep reduces the error to R/(1 + R) of it.
 
     n = 2: 8 contacts.
     """
@@ -173,9 +174,9 @@ def heavy_on_light(scene: Scene, ratio: float = 100.0, n: int = 2) -> None:
 
 @named_scene()
 def table(scene: Scene, legs: int = 9, top_mass: float = 10.0) -> None:
-    """A top on more legs than it needs: how the load is shared is not unique, the motion is.
+    """Build a table with redundant legs: the distribution of the load is not unique, but the motion is.
 
-    9 legs: 10 bodies, 72 contacts. `legs` stand on a square grid, row by row.
+    9 legs: 10 bodies, 72 contacts. The legs form a square grid, row by row.
     """
     check_int("legs", legs, 3)
     side = int(np.ceil(np.sqrt(legs)))
@@ -190,7 +191,7 @@ def table(scene: Scene, legs: int = 9, top_mass: float = 10.0) -> None:
 
 @named_scene()
 def ramp(scene: Scene, angle: float = 0.35, size: float = 1.0) -> None:
-    """A box on a slope of `angle`: sticks where tan(angle) < friction, slides with g (sin - mu cos) above.
+    """Place a box on a slope of `angle`: it sticks if tan(angle) < friction, else accelerates by g (sin - mu cos).
 
     2 bodies, 4 contacts.
     """
@@ -203,7 +204,7 @@ def ramp(scene: Scene, angle: float = 0.35, size: float = 1.0) -> None:
 
 @named_scene(patch_radius=0.1)
 def spinner(scene: Scene, spin: float = 20.0, radius: float = 0.5) -> None:
-    """A ball spinning on the spot: patch friction slows it with mu r N.
+    """Spin a ball on a plane: torsional friction slows it by the moment mu r N.
 
     2 bodies, 1 contact of 4 rows.
     """
@@ -215,32 +216,32 @@ def spinner(scene: Scene, spin: float = 20.0, radius: float = 0.5) -> None:
 
 @named_scene(restitution=1.0, friction=0.0, restitution_threshold=0.01, dt=1.0 / 240.0, substeps=4)
 def newtons_cradle(scene: Scene, n: int = 5, lifted: int = 1, angle: float = 0.6, gap: float = 0.01) -> None:
-    """Balls on strings, `lifted` of them let go: impacts one after the other, no energy to be gained.
+    """Build Newton's cradle: `lifted` balls on strings are released; impacts follow one another and gain no energy.
 
-    2 n rows of strings. `gap` separates the balls, so that impacts come in turn.
+    The strings have 2 n rows. `gap` separates the balls, so that impacts do not coincide.
     """
     check_int("n", n, 2)
     check_int("lifted", lifted, 0, n)
-    radius, string, apart = 0.25, 2.0, 0.5
-    drop = np.sqrt(string * string - apart * apart)
+    radius, string, half_spread = 0.25, 2.0, 0.5
+    drop = np.sqrt(string * string - half_spread * half_spread)
     for i in range(n):
         pivot = np.array([(i - 0.5 * (n - 1)) * (2.0 * radius + gap), 0.0, 3.0])
         s, c = sine_cosine(-angle if i < lifted else 0.0)
         ball = scene.add_sphere(radius, position=pivot + drop * np.array([s, 0.0, -c]), name=f"ball {i}")
         for side in (-1.0, 1.0):
-            scene.add_joint("distance", -1, ball, anchor_a=pivot + np.array([0.0, side * apart, 0.0]))
+            scene.add_joint("distance", -1, ball, anchor_a=pivot + np.array([0.0, side * half_spread, 0.0]))
 
 
 @named_scene()
 def four_bar(scene: Scene, motor: float | None = None, torque: float = 200.0, tilt: float = 0.4) -> None:
-    """A closed loop of three bars and the ground on four hinges, oblique, bars side by side: redundant rows.
+    """Build a closed loop of three bars and the ground on four oblique hinges: redundant rows.
 
-    3 bodies, 20 rows (21 with a motor) on 18 degrees of freedom, one of them left to move. `motor` is the
-    speed of the crank [rad/s], `torque` its largest [N m].
+    3 bodies, 20 rows (21 with a motor) on 18 degrees of freedom, of which one remains. `motor` is the speed of the
+    crank [rad/s], `torque` the largest torque of the motor [N m].
     """
     r = rotation(quaternion((0.3, 0.2, 1.0), tilt))
     flat = np.array([[0.0, 0.0, 0.0], [0.6, 0.0, 0.8], [2.4, 0.0, 1.6], [2.2, 0.0, 0.0]])
-    corner = [turned(r, p) for p in flat]
+    corner = [rotate(r, p) for p in flat]
     axis = r[:, 1].copy()
     bars = []
     for i in range(3):
@@ -248,11 +249,15 @@ def four_bar(scene: Scene, motor: float | None = None, torque: float = 200.0, ti
         long = norm(d)
         x = d / long
         q = frame_quaternion(np.column_stack([x, axis, np.cross(x, axis)]))
-        # bars lie side by side along the axis: their centres are off the plane of the hinges
-        place = 0.5 * (corner[i] + corner[i + 1]) + 0.15 * (i - 1) * axis
+        # The bars are offset along the axis, so that they do not overlap.
+        position = 0.5 * (corner[i] + corner[i + 1]) + 0.15 * (i - 1) * axis
         bars.append(
             scene.add_box(
-                (long, 0.1, 0.1), long, position=place, quaternion=q, name=("crank", "coupler", "rocker")[i]
+                (long, 0.1, 0.1),
+                long,
+                position=position,
+                quaternion=q,
+                name=("crank", "coupler", "rocker")[i],
             )
         )
     for i, (a, b) in enumerate(zip([-1, *bars], [*bars, -1], strict=True)):

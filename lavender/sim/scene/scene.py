@@ -1,4 +1,4 @@
-"""A scene: bodies, shapes, joints, and how they are to be stepped."""
+"""A scene: bodies, shapes, joints, and the parameters of stepping."""
 
 from __future__ import annotations
 
@@ -34,9 +34,13 @@ from lavender.sim.scene.parts import (
 from lavender.sim.scene.steppers import StepperSpec, get_stepper
 from lavender.solvers.registry import SolverSpec, get
 
-SCENE_ORDERS = (*ENGINE_ORDERS, "alternating")  # alternating: contacts turned round every substep
+SCENE_ORDERS = (
+    *ENGINE_ORDERS,
+    "alternating",
+)  # "alternating" reverses the order of contacts in every substep.
 ON_FAILURE = ("use", "keep", "damp", "raise")
-RANGES: dict[str, dict[str, float]] = {  # of plain numbers
+#: Ranges of the numeric parameters.
+PARAMETER_RANGES: dict[str, dict[str, float]] = {
     "dt": {"above": 0.0},
     "friction": {"low": 0.0},
     "restitution": {"low": 0.0, "high": 1.0},
@@ -45,54 +49,96 @@ RANGES: dict[str, dict[str, float]] = {  # of plain numbers
         for key in ("patch_radius", "rolling_radius", "slop", "restitution_threshold", "margin")
     },
 }
-MOST_SUBSTEPS = 10_000  # of a step where their number is not given; more are asked for by name
-MAX_SUBSTEP = 1.0 / 240.0  # s, within which four warm sweeps hold a stack
-MAX_BODIES = 2**24 - 1  # a contact's key has 24 bits for each body
+# Largest number of substeps that is computed from `max_substep`; more must be given as `substeps`.
+MAX_DEFAULT_SUBSTEPS = 10_000
+# Default of `max_substep` for sequential impulses [s]: four warm-started sweeps keep a stack stable up to it.
+DEFAULT_MAX_SUBSTEP = 1.0 / 240.0
+MAX_BODIES = 2**24 - 1  # The key of a contact has 24 bits for each body.
 
 
 @dataclass(frozen=True)
 class Parameters:
-    """Parameters that every scene has."""
+    """Parameters that every scene has.
 
-    dt: float = 1.0 / 120.0  # s, of one step
-    # None: as few as keep each at most max_substep long
+    Parameters
+    ----------
+    dt : float, s
+        Time step.
+    substeps : int, optional
+        Default: the smallest number for which a substep is not longer than `max_substep`.
+    max_substep : float, s, optional
+        Default: 1/240 for sequential impulses, `dt` for other solvers.
+    gravity : (3,) m/s^2
+        A number points downwards.
+    solver : str
+        "sequential_impulses", or the name of a registered solver.
+    solver_options : mapping
+        Options of a registered solver.
+    solver_iterations : int, optional
+        Default: 16 sweeps, or the default of the registered solver.
+    warm_start : bool
+        Start the solver from the impulses of the contact cache.
+    stepper : str
+        Name of a stepper of `lavender.sim.scene.steppers`.
+    stepper_options : mapping of str to float
+        Options of the stepper; after construction it contains all of them.
+    order : str, optional
+        Sweep order. Default: the stepper's for sequential impulses ("alternating" for "impulses"), "given" for other
+        solvers.
+    friction, restitution : float, -
+        Values for bodies that have none of their own.
+    patch_radius : float, m
+        Value for bodies that have none of their own; 0: no torsional friction.
+    rolling_radius : float, m
+        mu_r of every contact with friction: the rolling moment is at most mu_r lambda_n; 0: no rolling friction.
+    friction_shape : {"disk", "box"}
+        With "box", each tangent has its own bound, as in many engines; there is then no torsional friction.
+    position_iterations : int, optional
+        Default: 2 for "impulses", 0 for the other steppers, which have no position projection.
+    seed : int
+    on_failure : {"use", "keep", "damp", "raise"}
+        Treatment of a failed solve: use its impulses, keep the warm start, use the mean of both, or raise SolveFailed.
+    slop : float, m
+        Depth that is not corrected.
+    margin : float, m
+        Gap below which contacts are created.
+    restitution_threshold : float, m/s
+        Contacts with a smaller closing speed do not bounce.
+    """
+
+    dt: float = 1.0 / 120.0
     substeps: int = None  # type: ignore[assignment]
-    # s; None: 1/240 for sequential impulses, dt for other solvers
     max_substep: float = None  # type: ignore[assignment]
-    gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)  # m/s^2
+    gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)
     solver: str = "sequential_impulses"
     solver_options: Mapping[str, Any] = field(default_factory=dict)
-    solver_iterations: int | None = None  # None: 16 sweeps, or the solver's own default
+    solver_iterations: int | None = None
     warm_start: bool = True
-    stepper: str = "impulses"  # of lavender.sim.scene.steppers
-    stepper_options: Mapping[str, Any] = field(default_factory=dict)  # its own numbers; here all of them
-    # None: the stepper's for sequential impulses (alternating for "impulses"), given for other solvers
+    stepper: str = "impulses"
+    stepper_options: Mapping[str, Any] = field(default_factory=dict)
     order: str = None  # type: ignore[assignment]
-    friction: float = 0.5  # -, of bodies that say nothing else
-    restitution: float = 0.0  # -, of bodies that say nothing else
-    patch_radius: float = 0.0  # m, of bodies that say nothing else; 0: no spin friction
-    # m, mu_r of every contact with friction: a moment of at most mu_r lambda_n; 0: none
+    friction: float = 0.5
+    restitution: float = 0.0
+    patch_radius: float = 0.0
     rolling_radius: float = 0.0
-    # "box": each tangent is bounded by itself, as in most engines; it then has no spin friction
     friction_shape: str = "disk"
-    # None: 2 for "impulses", 0 for the others, which have no position projection
     position_iterations: int = None  # type: ignore[assignment]
     seed: int = 0
     on_failure: str = "use"
-    slop: float = 1e-3  # m, depth left alone
-    margin: float = 1e-2  # m, gap below which contacts are made
-    restitution_threshold: float = 0.5  # m/s, slower closing speeds do not bounce
+    slop: float = 1e-3
+    margin: float = 1e-2
+    restitution_threshold: float = 0.5
 
     def __post_init__(self) -> None:
         put = object.__setattr__
-        for name, allowed in RANGES.items():
+        for name, allowed in PARAMETER_RANGES.items():
             put(self, name, check_float(name, getattr(self, name), **allowed))
         for name in ("friction", "patch_radius", "rolling_radius"):
             check_sizes(name, np.array([getattr(self, name)]))
         gravity: Any = self.gravity
         if shape_of("gravity", gravity) == ():
             size = check_float("gravity", gravity)
-            if size < 0.0:  # of who has the sign of z in mind: everything would fly upwards
+            if size < 0.0:  # The z component was probably meant; bodies would fall upwards.
                 raise InputError(
                     f"gravity is {size:g}; a number points downwards and is at least 0: give {-size:g}, or a vector, "
                     f"(0, 0, {size:g}) m/s^2"
@@ -107,10 +153,10 @@ class Parameters:
         own, stepper = self.solver == "sequential_impulses", get_stepper(self.stepper)
         put(self, "solver_iterations", self._sweeps(get(self.solver), stepper))
         put(self, "stepper_options", stepper.values(self.stepper_options))
-        longest: Any = self.max_substep
-        if longest is None:
-            longest = MAX_SUBSTEP if own else self.dt
-        put(self, "max_substep", check_float("max_substep", longest, above=0.0))
+        max_substep: Any = self.max_substep
+        if max_substep is None:
+            max_substep = DEFAULT_MAX_SUBSTEP if own else self.dt
+        put(self, "max_substep", check_float("max_substep", max_substep, above=0.0))
         put(self, "substeps", self._count_of_substeps())
         put(self, "warm_start", check_bool("warm_start", self.warm_start))
         order: Any = self.order
@@ -137,47 +183,52 @@ class Parameters:
         check_name("on_failure", self.on_failure, ON_FAILURE)
 
     def _sweeps(self, spec: SolverSpec, stepper: StepperSpec) -> int:
-        given = self.solver_iterations
+        """Return the checked `solver_iterations`, or their default."""
+        sweeps = self.solver_iterations
         if self.solver != "sequential_impulses":
             if not stepper.solvers:
                 raise InputError(
                     f"stepper {stepper.name!r} takes no solver {self.solver!r}; leave solver= out, or take 'impulses'"
                 )
-            return check_int("solver_iterations", spec.max_iter if given is None else given, 1)
+            return check_int("solver_iterations", spec.max_iter if sweeps is None else sweeps, 1)
         if self.solver_options:
             raise InputError(
                 f"solver_options {sorted(self.solver_options)} are for other solvers; sequential_impulses "
                 "takes order= and seed= of the scene"
             )
-        return 16 if given is None else check_int("solver_iterations", given, *stepper.sweeps)
+        return 16 if sweeps is None else check_int("solver_iterations", sweeps, *stepper.sweeps)
 
     def _count_of_substeps(self) -> int:
-        given: Any = self.substeps
-        if given is None:
-            ratio = self.dt / self.max_substep - 1e-9  # whole steps whatever their rounding
-            if ratio > MOST_SUBSTEPS:
+        """Return the checked number of substeps, or the smallest number that respects `max_substep`."""
+        substeps: Any = self.substeps
+        if substeps is None:
+            ratio = self.dt / self.max_substep - 1e-9  # Rounding of an integer ratio must not add a substep.
+            if ratio > MAX_DEFAULT_SUBSTEPS:
                 raise InputError(
-                    f"dt is {self.dt:g} s, more than {MOST_SUBSTEPS} substeps of max_substep = {self.max_substep:g} s; "
-                    "give a shorter dt, a longer max_substep, or substeps= if that many are meant"
+                    f"dt is {self.dt:g} s, more than {MAX_DEFAULT_SUBSTEPS} substeps of max_substep = "
+                    f"{self.max_substep:g} s; give a shorter dt, a longer max_substep, or substeps= if that many are "
+                    "meant"
                 )
-            given = max(1, math.ceil(ratio))
-        return check_int("substeps", given, 1)
+            substeps = max(1, math.ceil(ratio))
+        return check_int("substeps", substeps, 1)
 
 
-COMMON = tuple(f.name for f in fields(Parameters))
+COMMON_PARAMETERS = tuple(f.name for f in fields(Parameters))
 
 Builder = Callable[..., None]
-SCENES: dict[str, Builder] = {}  # named scenes; the builders of the gallery stand here once it is imported
-DEFAULTS: dict[str, dict[str, Any]] = {}  # of a named scene, where they are not those of Parameters
+#: Builders of the named scenes. Importing the gallery adds its builders.
+SCENES: dict[str, Builder] = {}
+#: Defaults of a named scene that differ from those of `Parameters`.
+DEFAULTS: dict[str, dict[str, Any]] = {}
 
 
 def named_scene(**defaults: Any) -> Callable[[Builder], Builder]:
-    """Register the decorated builder as a scene of its name.
+    """Register the decorated builder as a scene under the name of the function.
 
     Parameters
     ----------
     **defaults
-        Its values of the parameters that every scene has (see `Parameters`), where they are others.
+        Defaults of the scene for the parameters that every scene has, if they differ from those of `Parameters`.
 
     Returns
     -------
@@ -188,9 +239,9 @@ def named_scene(**defaults: Any) -> Callable[[Builder], Builder]:
     Raises
     ------
     InputError
-        The name is taken, a parameter is one that every scene has or lacks a default.
+        The name is in use, or a parameter of the builder has the name of a common parameter or no default.
     UnknownName
-        A default of no parameter.
+        A default has the name of no parameter.
 
     Examples
     --------
@@ -203,16 +254,16 @@ def named_scene(**defaults: Any) -> Callable[[Builder], Builder]:
     2
     """
     for key in defaults:
-        if key not in COMMON:
-            raise UnknownName("scene parameter", key, COMMON)
+        if key not in COMMON_PARAMETERS:
+            raise UnknownName("scene parameter", key, COMMON_PARAMETERS)
 
-    def enter(build: Builder) -> Builder:
+    def register(build: Builder) -> Builder:
         name = build.__name__
         first, *own = inspect.signature(build).parameters.values()
         if name in SCENES:
             raise InputError(f"a scene {name!r} is registered already; give the builder another name")
         for p in own:
-            if p.name in COMMON or p.default is p.empty or p.kind is p.VAR_KEYWORD:
+            if p.name in COMMON_PARAMETERS or p.default is p.empty or p.kind is p.VAR_KEYWORD:
                 raise InputError(
                     f"parameter {p.name!r} of the scene {name!r}: a name that no other scene parameter has, with a "
                     f"default, is needed after {first.name!r}"
@@ -220,7 +271,7 @@ def named_scene(**defaults: Any) -> Callable[[Builder], Builder]:
         SCENES[name], DEFAULTS[name] = build, defaults
         return build
 
-    return enter
+    return register
 
 
 class Scene:
@@ -255,45 +306,46 @@ class Scene:
             raise UnknownName("scene", name, SCENES)
         own = list(inspect.signature(SCENES[name]).parameters)[1:] if name is not None else []
         for key in parameters:
-            if key not in COMMON and key not in own:
-                what = f"parameter of scene {name!r}" if name else "scene parameter"
-                raise UnknownName(what, key, [*COMMON, *own])
+            if key not in COMMON_PARAMETERS and key not in own:
+                kind = f"parameter of scene {name!r}" if name else "scene parameter"
+                raise UnknownName(kind, key, [*COMMON_PARAMETERS, *own])
         self.name = name or ""
-        common = {k: v for k, v in parameters.items() if k in COMMON}
+        common = {k: v for k, v in parameters.items() if k in COMMON_PARAMETERS}
         if name is not None:
             common = {**DEFAULTS[name], **common}
         self.parameters = Parameters(**common)
-        self._given = common
+        self._common_parameters = common
         self.own = {k: v for k, v in parameters.items() if k in own}
         self.bodies: list[Body] = []
         self.joints: list[Joint] = []
         if name is not None:
             SCENES[name](self, **self.own)
-        self._built = self.n_bodies, self.n_joints  # by the gallery; what follows was added by hand
+        self._built = self.n_bodies, self.n_joints  # Built by the gallery; later ones are added by hand.
 
     @property
     def n_bodies(self) -> int:
-        """Bodies, static ones included."""
+        """Number of bodies, static ones included."""
         return len(self.bodies)
 
     @property
     def n_joints(self) -> int:
-        """Joints."""
+        """Number of joints."""
         return len(self.joints)
 
     def with_parameters(self, **changes: Any) -> Scene:
-        """The same scene with other parameters; one of the gallery is built anew, and what was added to it added again.
+        """Return the same scene with other parameters.
 
-        What was left to its default follows the others: `substeps` the new `dt`, `order` the new `solver`.
+        A scene of the gallery is built again, and bodies and joints that were added by hand are added again. Defaults
+        are computed again: `substeps` from the new `dt`, `order` from the new `solver`.
 
         Raises
         ------
         UnknownName
-            No such parameter; of a scene built by hand only those of `Parameters` can change.
+            No such parameter; a scene that was built by hand only has those of `Parameters`.
         InputError
-            The gallery's own part would have another number of bodies, and joints were added by their numbers.
+            The gallery would build another number of bodies, and joints were added by body numbers.
         """
-        scene = Scene(self.name or None, **{**self._given, **self.own, **changes})
+        scene = Scene(self.name or None, **{**self._common_parameters, **self.own, **changes})
         bodies, joints = self._built
         if scene._built != self._built and self.n_joints > joints:
             raise InputError(
@@ -305,7 +357,7 @@ class Scene:
         return scene
 
     def __copy__(self) -> Scene:
-        """One with lists of its own."""
+        """Return a copy with its own lists of bodies and joints."""
         twin = object.__new__(Scene)
         vars(twin).update(vars(self), bodies=list(self.bodies), joints=list(self.joints))
         return twin
@@ -328,30 +380,32 @@ class Scene:
         patch_radius: float | None = None,
         shape: Plane | Sphere | Box | None = None,
     ) -> int:
-        """Add a body; returns its number.
+        """Add a body and return its number.
 
         Parameters
         ----------
         mass : float, kg
             Positive; not read for a static body.
         inertia : (3,) or (3, 3) kg m^2, optional
-            Principal moments or the tensor in the body's axes, positive definite. Default: that of the
-            solid shape; of a ball of radius 0.1 m where there is none.
+            Principal moments or the tensor in the body's axes, positive definite. Default: the inertia of the solid
+            shape, or of a ball of radius 0.1 m for a body without a shape.
         position : (3,) m
         quaternion : (4,) w x y z
-            Body to world; normalised here.
+            Body to world; it is normalised.
         velocity, angular_velocity : (3,) m/s, rad/s
         static : bool
-            Never moves. 0 is no mass: a body that should stand still says so here.
+            The body never moves. A mass of 0 is not accepted instead.
+        name : str, optional
+            Default: shape and number, as "box 3".
         friction, restitution, patch_radius : float, optional
             Default: the scene's.
         shape : Plane, Sphere or Box, optional
-            None: a body that touches nothing.
+            None: the body has no contacts.
 
         Raises
         ------
         InputError
-            Nothing is added.
+            A value is not valid. The scene is unchanged.
         """
         number_ = len(self.bodies)
         label = name or f"{type(shape).__name__.lower() if shape is not None else 'body'} {number_}"
@@ -382,31 +436,36 @@ class Scene:
             quaternion=unit_q,
             velocity=v,
             angular_velocity=omega,
-            friction=_given(f"friction of {label}", friction, **RANGES["friction"]),
-            restitution=_given(f"restitution of {label}", restitution, **RANGES["restitution"]),
-            patch_radius=_given(f"patch_radius of {label} [m]", patch_radius, low=0.0),
+            friction=_optional_number(f"friction of {label}", friction, **PARAMETER_RANGES["friction"]),
+            restitution=_optional_number(
+                f"restitution of {label}", restitution, **PARAMETER_RANGES["restitution"]
+            ),
+            patch_radius=_optional_number(f"patch_radius of {label} [m]", patch_radius, low=0.0),
         )
         for name in ("friction", "patch_radius"):
             check_sizes(f"{name} of {label}", np.array([getattr(body, name) or 0.0]))
         self.bodies.append(body)
         return number_
 
-    def add_box(self, size: Any = (1.0, 1.0, 1.0), mass: float = 1.0, **more: Any) -> int:
-        """Add a box of whole edges `size` (3,) [m]; `more` as in `add_body`. Returns its number."""
-        return self.add_body(mass, shape=Box(size), **more)
+    def add_box(self, size: Any = (1.0, 1.0, 1.0), mass: float = 1.0, **options: Any) -> int:
+        """Add a box with edges of lengths `size` (3,) [m] and return its number; `options` as in `add_body`."""
+        return self.add_body(mass, shape=Box(size), **options)
 
-    def add_sphere(self, radius: float = 0.5, mass: float = 1.0, **more: Any) -> int:
-        """Add a sphere of `radius` [m]; `more` as in `add_body`. Returns its number."""
-        return self.add_body(mass, shape=Sphere(radius), **more)
+    def add_sphere(self, radius: float = 0.5, mass: float = 1.0, **options: Any) -> int:
+        """Add a sphere of `radius` [m] and return its number; `options` as in `add_body`."""
+        return self.add_body(mass, shape=Sphere(radius), **options)
 
-    def add_plane(self, normal: Any = (0.0, 0.0, 1.0), offset: float = 0.0, **more: Any) -> int:
-        """Add a static half-space normal.x <= offset [m]; `more`: name, friction, restitution, patch_radius."""
+    def add_plane(self, normal: Any = (0.0, 0.0, 1.0), offset: float = 0.0, **options: Any) -> int:
+        """Add a static half-space normal.x <= offset [m] and return its number.
+
+        `options` are name, friction, restitution and patch_radius as in `add_body`.
+        """
         plane = Plane(normal, offset)
         for key in ("position", "quaternion", "velocity", "angular_velocity", "inertia", "mass"):
-            if key in more:
+            if key in options:
                 raise InputError(f"a plane is static and has no {key}; give normal and offset")
-        place = plane.offset * np.array(plane.normal)
-        return self.add_body(0.0, static=True, shape=plane, position=place, **more)
+        position = plane.offset * np.array(plane.normal)
+        return self.add_body(0.0, static=True, shape=plane, position=position, **options)
 
     # -- joints ---------------------------------------------------------------------------------
 
@@ -428,7 +487,7 @@ class Scene:
         collide: bool = False,
         name: str | None = None,
     ) -> int:
-        """Add a joint between bodies a and b as they stand; returns its number.
+        """Add a joint between bodies a and b in their present poses and return its number.
 
         Parameters
         ----------
@@ -440,20 +499,21 @@ class Scene:
         anchor_a, anchor_b : (3,) m, world
             Ends of a distance joint; default: the bodies' centres.
         axis : (3,), world
-            Of a hinge.
+            Axis of a hinge.
         length : float, m
-            Of a distance joint; default: as the anchors stand.
+            Length of a distance joint; default: the present distance of the anchors.
         hertz, damping : float, 1/s and -
-            A soft joint of that frequency and damping ratio; 0 Hz is rigid.
+            Frequency and damping ratio of a soft joint; 0 Hz is rigid.
         motor_speed, motor_torque : float, rad/s and N m
-            A hinge's motor: speed of b against a round the axis, and the largest torque.
+            Motor of a hinge: speed of b relative to a about the axis, and the largest torque.
         collide : bool
             Whether the two bodies may touch; by default they do not.
 
         Raises
         ------
         InputError
-            A missing body, no dynamic body, an anchor or axis too few or too many. Nothing is added.
+            A body does not exist, both bodies are static, or an anchor or axis is missing or superfluous. The scene is
+            unchanged.
         """
         check_name("joint", kind, (DISTANCE, BALL, HINGE))
         label = name or f"{kind} {len(self.joints)}"
@@ -483,18 +543,18 @@ class Scene:
             length=length,
             hertz=check_float(f"hertz of {label}", hertz, low=0.0),
             damping=check_float(f"damping of {label}", damping, low=0.0),
-            motor_speed=_given(f"motor_speed of {label} [rad/s]", motor_speed),
-            motor_torque=_given(f"motor_torque of {label} [N m]", motor_torque, low=0.0) or 0.0,
+            motor_speed=_optional_number(f"motor_speed of {label} [rad/s]", motor_speed),
+            motor_torque=_optional_number(f"motor_torque of {label} [N m]", motor_torque, low=0.0) or 0.0,
             collide=check_bool(f"collide of {label}", collide),
         )
         self.joints.append(joint)
         return len(self.joints) - 1
 
     def _joined(self, label: str, a: Any, b: Any) -> tuple[int, int]:
-        """The numbers of two bodies that a joint may have."""
+        """Return the checked numbers of the two bodies of a joint."""
         for body in (a, b):
-            whole = isinstance(body, (int, np.integer)) and not isinstance(body, bool)
-            if not whole or not -1 <= body < self.n_bodies:
+            is_integer = isinstance(body, (int, np.integer)) and not isinstance(body, bool)
+            if not is_integer or not -1 <= body < self.n_bodies:
                 raise InputError(
                     f"{label} names body {body!r}; there are bodies 0 to {self.n_bodies - 1}, and -1 is the world"
                 )
@@ -507,17 +567,19 @@ class Scene:
     def _distance_ends(
         self, label: str, bodies: tuple[int, int], anchor: Any, a: Any, b: Any, length: Any, axis: Any
     ) -> tuple[FloatArray, FloatArray, float]:
+        """Return the anchors (3,) [m] and the length [m] of a distance joint."""
         if anchor is not None or axis is not None:
             raise InputError(f"{label} takes anchor_a and anchor_b, no anchor or axis")
-        pa, pb = (self._anchor(label, *given) for given in zip("ab", bodies, (a, b), strict=True))
+        pa, pb = (self._anchor(label, *end) for end in zip("ab", bodies, (a, b), strict=True))
         with np.errstate(over="ignore"):
-            far = arithmetic.norm(pb - pa)
-        length = check_float(f"length of {label} [m]", far if length is None else length, low=0.0)
+            distance = arithmetic.norm(pb - pa)
+        length = check_float(f"length of {label} [m]", distance if length is None else length, low=0.0)
         if length == 0.0:
             raise InputError(f"{label} has length 0; use a ball joint")
         return pa, pb, length
 
     def _anchor(self, label: str, side: str, body: int, point: Any) -> FloatArray:
+        """Return the anchor (3,) [m] in the world, by default the body's centre."""
         if point is not None:
             return numbers(f"anchor_{side} of {label} [m]", point, 3)
         if body < 0:
@@ -525,6 +587,7 @@ class Scene:
         return self.bodies[body].position
 
     def _local(self, label: str, body: int, point: FloatArray) -> FloatArray:
+        """Return a world point (3,) [m] in the frame of the body."""
         if body < 0:
             return point
         with np.errstate(over="ignore", invalid="ignore"):
@@ -533,12 +596,16 @@ class Scene:
     # -- identity -------------------------------------------------------------------------------
 
     def fingerprint(self) -> str:
-        """Hash of what cannot change while the scene runs: bodies, joints and parameters, without the start state
-        and without the sweep budget and warm-start mode.
+        """Return a hash of everything that cannot change while the scene runs.
+
+        It contains bodies, joints and parameters, without the initial state, the sweep budget and the warm-start mode.
         """
         free: tuple[str, ...] = ("solver_iterations", "warm_start")
         if self.parameters.stepper == "impulses":
-            free += ("stepper", "stepper_options")  # as it was before there were others: old snapshots fit
+            free += (
+                "stepper",
+                "stepper_options",
+            )  # Snapshots from before there were other steppers still fit.
         head = {f.name: getattr(self.parameters, f.name) for f in fields(Parameters) if f.name not in free}
         parts: list[Any] = [head]
         for b in self.bodies:
@@ -555,13 +622,14 @@ class Scene:
         return f"<Scene {self.name or 'by hand'!r}: {self.n_bodies} bodies, {self.n_joints} joints>"
 
 
-def _given(what: str, value: Any, **allowed: float) -> float | None:
-    return None if value is None else check_float(what, value, **allowed)
+def _optional_number(label: str, value: Any, **allowed: float) -> float | None:
+    return None if value is None else check_float(label, value, **allowed)
 
 
 def _common_point(
     label: str, anchor: Any, a: Any, b: Any, length: Any
 ) -> tuple[FloatArray, FloatArray, float]:
+    """Return the common world point of a ball or hinge twice, and length 0."""
     if anchor is None or a is not None or b is not None or length is not None:
         raise InputError(f"{label} takes anchor=, one world point, and no length")
     point = numbers(f"anchor of {label} [m]", anchor, 3)

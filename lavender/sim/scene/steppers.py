@@ -1,7 +1,8 @@
-"""Ways to step by name: what each is and can do, as data.
+"""Table of the steppers by name, with their capabilities and options.
 
-A stepper owns what happens in a substep between collision and integration. Bodies, shapes, joints, motors, collision,
-matching of contacts, snapshots, films, orders and budgets are the engine's. The kernels are `lavender_ext/engine/`.
+A stepper computes the part of a substep between collision and integration. Bodies, shapes, joints, motors, collision,
+matching of contacts, snapshots, films, orders and budgets belong to the engine. The kernels are in
+`lavender_ext/engine/`.
 """
 
 from __future__ import annotations
@@ -16,72 +17,121 @@ from lavender.base.errors import InputError, UnknownName
 
 @dataclass(frozen=True)
 class Option:
-    """A number of a stepper: where it stands in the engine's arrays, its default and its range."""
+    """Numeric option of a stepper.
 
-    place: str  # of `setting`, or of `head` for a whole number
+    Parameters
+    ----------
+    slot : str
+        Name of its entry in the engine's array `setting`, or in `head` for an integer.
+    default, low, high : float
+        Default value and range.
+    text : str
+        Meaning and unit.
+    """
+
+    slot: str
     default: float
     low: float
     high: float
-    text: str  # meaning and unit
+    text: str
 
     @property
-    def is_whole(self) -> bool:
-        """Whether it is a count."""
+    def is_integer(self) -> bool:
+        """Whether the option is a count."""
         return isinstance(self.default, int)
 
 
 @dataclass(frozen=True)
 class StepperSpec:
-    """One way to step: its number in the kernels, and what a scene may ask of it."""
+    """Name, number in the kernels and capabilities of a stepper.
+
+    Parameters
+    ----------
+    name : str
+    number : int
+        H_STEPPER of lavender_ext/engine/arrays.pxd.
+    summary : str
+    reference : str
+    sweeps : (int, int)
+        Smallest and largest `solver_iterations`.
+    order : str
+        Default sweep order of a scene.
+    position_iterations : int
+        Default; 0 if the stepper has no position projection.
+    solvers : bool
+        A registered solver can replace the stepper's sweeps.
+    spin : bool
+        It supports torsional friction of a patch.
+    rolling : bool
+        It supports rolling friction.
+    boxes : bool
+        It supports separate friction bounds of each tangent, Scene(friction_shape="box").
+    restitution : bool
+        It supports restitution.
+    residuals : bool
+        `observation["solver"]` holds residuals; else they are NaN.
+    exact_problem : bool
+        `constraint_problem()` solved by sequential_impulses gives the impulses of the step bit for bit.
+    options : mapping of str to Option
+    """
 
     name: str
-    number: int  # H_STEPPER of lavender_ext/engine/arrays.pxd
+    number: int
     summary: str
     reference: str
-    sweeps: tuple[int, int]  # least and largest `solver_iterations`
-    order: str  # default sweep order of a scene
-    position_iterations: int  # default; 0: it has no position projection
-    solvers: bool = False  # another solver may take the place of its sweeps
-    spin: bool = False  # friction of a patch against spinning
-    rolling: bool = False  # friction against rolling
-    boxes: bool = False  # friction of each tangent by itself, Scene(friction_shape="box")
+    sweeps: tuple[int, int]
+    order: str
+    position_iterations: int
+    solvers: bool = False
+    spin: bool = False
+    rolling: bool = False
+    boxes: bool = False
     restitution: bool = True
-    residuals: bool = True  # `observation["solver"]` holds residuals; else NaN
-    exact_problem: bool = False  # `constraint_problem()` solved by sequential_impulses gives the step's bits
+    residuals: bool = True
+    exact_problem: bool = False
     options: Mapping[str, Option] = field(default_factory=dict)
 
-    def values(self, given: Mapping[str, Any]) -> dict[str, float]:
-        """Every option, as given or by default."""
-        for name in given:
+    def values(self, options: Mapping[str, Any]) -> dict[str, float]:
+        """Return the values of all options, with defaults for those that `options` does not contain.
+
+        Raises
+        ------
+        UnknownName
+            The stepper has no option of that name.
+        InputError
+            A value is out of range.
+        """
+        for name in options:
             if name not in self.options:
                 raise UnknownName(f"option of stepper {self.name!r}", name, self.options)
-        found: dict[str, float] = {}
+        values: dict[str, float] = {}
         for name, option in self.options.items():
-            x = given.get(name, option.default)
+            x = options.get(name, option.default)
             label = f"{name} of stepper {self.name!r}"
-            if option.is_whole:
-                found[name] = check_int(label, x, int(option.low), int(option.high))
+            if option.is_integer:
+                values[name] = check_int(label, x, int(option.low), int(option.high))
             else:
-                found[name] = check_float(label, x, low=option.low, high=option.high)
-        return found
+                values[name] = check_float(label, x, low=option.low, high=option.high)
+        return values
 
     def check(self, spin: bool, restitution: bool, rolling: bool) -> None:
-        """Raise `InputError` where it does not take a scene with these."""
-        for asked, has, what, instead in (
+        """Raise `InputError` if the stepper does not support a scene with these properties."""
+        for needed, supported, feature, alternative in (
             (spin, self.spin, "spin friction; leave patch_radius", "'impulses'"),
             (rolling, self.rolling, "rolling friction; leave rolling_radius", "'impulses'"),
             (restitution, self.restitution, "restitution; leave it", "another stepper"),
         ):
-            if asked and not has:
-                raise InputError(f"stepper {self.name!r} has no {what} at 0, or take {instead}")
+            if needed and not supported:
+                raise InputError(f"stepper {self.name!r} has no {feature} at 0, or take {alternative}")
 
 
-#: Velocities by sweeps over speculative contacts, penetration by a projection of positions that adds no velocity.
+#: Velocities are computed by sweeps over speculative contacts. Penetration is corrected by a projection of positions,
+#: which adds no velocity.
 #:
-#:     target_n = -g/h where the gap g is open, unless the cache says that the contact bears; rows of joints: target 0
-#:     sweeps on A lambda = b, lambda >= 0, disks; then a shift of positions for what is deeper than the slop
+#:     target_n = -g/h if the gap g is open, except at contacts that carried load in the last substep; joints: target 0
+#:     sweeps on A lambda = b, lambda >= 0, disks; then a shift of positions at contacts deeper than the slop
 #:
-#: `lavender_ext/engine/contacts.pxd`, `projection.pxd`. Any registered solver may take the place of the sweeps.
+#: See `lavender_ext/engine/contacts.pxd` and `projection.pxd`. Any registered solver can replace the sweeps.
 IMPULSES = StepperSpec(
     name="impulses",
     number=0,
@@ -96,15 +146,15 @@ IMPULSES = StepperSpec(
     rolling=True,
     exact_problem=True,
 )
-#: Contacts and joints as damped springs, then a relaxation that takes away the velocity that pushed (Catto, 2024).
+#: Contacts and joints are damped springs; a relaxation then removes the velocity that the springs added (Catto, 2024).
 #:
 #:     omega = 2 pi f,  a1 = 2 zeta + h omega,  a2 = h omega a1
 #:     J v + (omega / a1) C + (A_ii / a2) lambda = 0    while C < 0,    v_n >= -C/h while the gap C is open    (1)
-#:     after positions have moved: sweeps without the spring; restitution last
+#:     after the update of positions: sweeps without the spring; restitution last
 #:
-#: (1) is the implicit damped spring of frequency f and damping ratio zeta on the effective mass 1/A_ii; its derivation
-#: stands in `lavender_ext/engine/soft_step.pxd`. Contacts with what never moves, and joints, are twice as stiff; no
-#: spring swings faster than four substeps can follow. One sweep in each of many substeps goes furthest.
+#: (1) is the implicit damped spring of frequency f and damping ratio zeta on the effective mass 1/A_ii, derived in
+#: `lavender_ext/engine/soft_step.pxd`. Contacts with static bodies and joints have twice the frequency. The period of a
+#: spring is at least four substeps. One sweep in each of many substeps is more accurate than many sweeps in one.
 SOFT_STEP = StepperSpec(
     name="soft_step",
     number=1,
@@ -118,17 +168,17 @@ SOFT_STEP = StepperSpec(
     options={
         "hertz": Option("hertz", 60.0, 1e-3, 1e6, "frequency of contacts [1/s]; at most a quarter of 1/h"),
         "damping_ratio": Option("ratio", 2.0, 0.0, 1e6, "of contacts [-]"),
-        "push_speed": Option("push", 3.0, 0.0, 1e6, "largest speed at which overlaps are pushed apart [m/s]"),
+        "push_speed": Option("push", 3.0, 0.0, 1e6, "largest speed at which overlaps are separated [m/s]"),
         "relaxing_sweeps": Option("relaxing", 1, 0, 64, "sweeps without bias after the others"),
     },
 )
-#: Positions corrected constraint by constraint, velocities from positions (Müller et al., 2020).
+#: Positions are corrected constraint by constraint; velocities are computed from positions (Müller et al., 2020).
 #:
 #:     dlambda = (-C - alpha' lambda)/(w + alpha'),  alpha' = alpha/h^2,  w = sum of 1/m + (r x n).I^-1 (r x n)
-#:     v = (x - x0)/h;  what slides is braked by at most mu lambda_n, what parts or closes goes to -e v_n(before)
+#:     v = (x - x0)/h;  friction reduces sliding by at most mu lambda_n; the normal velocity becomes -e v_n(before)
 #:
-#: Nothing is warm-started, so that one sweep in each of many substeps goes further than many in one; a stack creeps
-#: where sweeps of friction do not reach its ends. `lavender_ext/engine/xpbd.pxd`.
+#: Nothing is warm-started, so that one sweep in each of many substeps is more accurate than many sweeps in one. A stack
+#: creeps if the sweeps of friction are too few to reach its ends. See `lavender_ext/engine/xpbd.pxd`.
 XPBD = StepperSpec(
     name="xpbd",
     number=2,
@@ -139,12 +189,12 @@ XPBD = StepperSpec(
     position_iterations=0,
     residuals=False,
 )
-#: A Newton step of 6 x 6 for body after body on an augmented Lagrangian, whose multipliers are warm-started (2025).
+#: A 6 x 6 Newton step for body after body on an augmented Lagrangian with warm-started multipliers (2025).
 #:
 #:     (M/h + sum kappa J^T J) dz = -M (z - y)/h + sum J^T p,   p = lambda - kappa C(z), clipped to its bounds or disk
-#:     then lambda <- p, and kappa grows with the error that is left
+#:     then lambda <- p, and kappa grows with the remaining error
 #:
-#: `solver_iterations` counts passes over the bodies. `lavender_ext/engine/avbd.pxd`.
+#: `solver_iterations` counts passes over the bodies. See `lavender_ext/engine/avbd.pxd`.
 AVBD = StepperSpec(
     name="avbd",
     number=3,
@@ -156,9 +206,13 @@ AVBD = StepperSpec(
     restitution=False,
     residuals=False,
     options={
-        "keep": Option("hertz", 0.99, 0.0, 1.0, "share of an error that a substep leaves [-]"),
+        "keep": Option("hertz", 0.99, 0.0, 1.0, "fraction of an error that remains after a substep [-]"),
         "stiffening": Option(
-            "ratio", 0.03, 0.0, 1e3, "growth of stiffness, of its least for an error of the slop [-]"
+            "ratio",
+            0.03,
+            0.0,
+            1e3,
+            "growth of stiffness, relative to its minimum, for an error of the slop [-]",
         ),
     },
 )
@@ -166,7 +220,7 @@ STEPPERS = {spec.name: spec for spec in (IMPULSES, SOFT_STEP, XPBD, AVBD)}
 
 
 def get_stepper(name: str) -> StepperSpec:
-    """The stepper of that name."""
+    """Return the stepper of that name; raise UnknownName if there is none."""
     spec = STEPPERS.get(name) if isinstance(name, str) else None
     if spec is None:
         raise UnknownName("stepper", name, STEPPERS)

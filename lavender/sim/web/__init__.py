@@ -1,1 +1,1 @@
-"""The kernels in WebAssembly, and a page that runs them; see docs/web.md."""
+"""The kernels in WebAssembly, and a page that runs them; described in docs/web.md."""

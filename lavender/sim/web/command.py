@@ -7,9 +7,12 @@ from pathlib import Path
 import click
 
 PORT = click.option(
-    "--port", type=click.IntRange(0, 65535), default=0, help="Of the page's server; 0 takes a free one."
+    "--port",
+    type=click.IntRange(0, 65535),
+    default=0,
+    help="Port of the page's server; 0 selects a free one.",
 )
-NO_BROWSER = click.option("--no-browser", is_flag=True, help="Only say where the page is.")
+NO_BROWSER = click.option("--no-browser", is_flag=True, help="Only print the address of the page.")
 
 
 @click.group(invoke_without_command=True)
@@ -30,6 +33,7 @@ def _say(text: str) -> None:
 
 
 def _show(port: int, no_browser: bool) -> None:
+    """Serve the page from a temporary folder until Ctrl-C."""
     import webbrowser
     from tempfile import TemporaryDirectory
 
@@ -55,16 +59,17 @@ def _show(port: int, no_browser: bool) -> None:
     type=click.Choice(["lavender", "newton"]),
     default="lavender",
     show_default=True,
-    help="lavender: the module that works alone; newton: the one for exact solves, loaded beside it.",
+    help="lavender: the independent module; newton: the module for exact solves, loaded in addition to it.",
 )
 def build(out: Path, part: str) -> None:
-    """Compile the kernels to one WebAssembly module; needs the extra `wasm`, or a compiler named in
-    LAVENDER_WASM_CC and LAVENDER_WASM_LD.
+    """Compile the kernels to one WebAssembly module.
+
+    It needs the extra `wasm`, or a compiler named in LAVENDER_WASM_CC and LAVENDER_WASM_LD.
     """
     from lavender.sim.web import pages
 
-    built = pages.build_module(out, part)
-    click.echo(f"{out}: {built.size} bytes, {len(built.functions)} functions ({built.compiler})")
+    result = pages.build_module(out, part)
+    click.echo(f"{out}: {result.size} bytes, {len(result.functions)} functions ({result.compiler})")
 
 
 @web.command()
@@ -80,9 +85,9 @@ def page(folder: Path) -> None:
 
 @web.command()
 def check() -> None:
-    """Hold both WebAssembly modules to the bits of the native kernels under Node; builds what is missing.
+    """Compare both WebAssembly modules bit by bit with the native kernels under Node; build them if necessary.
 
-    Needs a checkout of the project, whose tests/sim/web it runs, and Node 18 or newer. Exit code 1: a bit differs.
+    It needs a checkout of the project, whose tests/sim/web it runs, and Node 18 or newer. Exit code 1: a bit differs.
     """
     from lavender.sim.web import pages
 
@@ -95,7 +100,7 @@ def check() -> None:
 @PORT
 @NO_BROWSER
 def view(film: Path, port: int, no_browser: bool) -> None:
-    """Show a film of `lavender run --film` in a browser."""
+    """Show a film written by `lavender run NAME --film FILM` in a browser page on this machine."""
     from lavender.sim.engine import Film
     from lavender.sim.web.view import Viewer
 

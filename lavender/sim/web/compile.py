@@ -1,24 +1,24 @@
-"""The kernels as WebAssembly modules without Python: what extract_c.py takes out of Cython's C, a compiler for wasm32.
+"""Compile the kernels to WebAssembly modules without Python, from the C that extract_c.py extracts from Cython's C.
 
-    python lavender/sim/web/compile.py FOLDER          from the root of the project, or wherever lavender_ext lies
+    python lavender/sim/web/compile.py FOLDER          from the folder that contains lavender_ext
 
-makes lavender.wasm (`PARTS`), which stands alone, and newton.wasm, which a host that asks for exact solves loads beside
-it: it works on the memory of the first and imports nothing else.
+builds lavender.wasm (`PARTS`), which is independent, and newton.wasm, which a host loads in addition for exact solves.
+The second module uses the memory of the first and imports nothing else.
 
-Only the standard library and Cython are imported, so that setup.py can run this before anything is built.
+Only the standard library and Cython are imported, so that setup.py can run this file before anything is built.
 
-The core functions `cdef public ... lav_*` of the modules are cut out with what they reach. Three checks make that safe:
+The core functions `cdef public ... lav_*` of the modules are extracted with everything that they use. There are three
+checks:
 
-* what is reached must not name Python: a core that calls Python, a function of another module by pointer or a
-  variable of a module is not cut out;
-* no symbol may stay undefined, and every function must be there to be exported: libm or malloc do not link;
-* the finished module has no static data, and a size below its limit.
+* the extracted code must not use Python: extraction fails if a core function calls Python, uses a function of another
+  module by pointer, or uses a variable of a module;
+* no symbol may be undefined, and every exported function must exist: libm and malloc are not linked;
+* the finished module has no static data, and its size is below a limit.
 
-The last section of the module is the hash of the sources it was built from, so that one from other sources is
-noticed.
+The last section of the module is the hash of its sources, so that a module of other sources is detected.
 
-The compiler is ziglang's (PyPI, the extra `wasm`), or what LAVENDER_WASM_CC and LAVENDER_WASM_LD name, such
-as `clang --target=wasm32-wasi` and `wasm-ld`.
+The compiler is ziglang (PyPI, the extra `wasm`), or the one named by LAVENDER_WASM_CC and LAVENDER_WASM_LD, such as
+`clang --target=wasm32-wasi` and `wasm-ld`.
 """
 
 from __future__ import annotations
@@ -40,47 +40,64 @@ from typing import Any
 #: Modules of lavender_ext that the page uses.
 MODULES = ("engine.arrays", "engine.substep", "host.memory", "judge.measure")
 #: Largest size of a finished module [bytes].
-LARGEST = 220_000
+MAX_MODULE_BYTES = 220_000
 
 
 @dataclass(frozen=True)
 class Part:
-    """One module of the page: its kernels, whether it works in the memory of the first."""
+    """One WebAssembly module of the page.
+
+    Parameters
+    ----------
+    modules : tuple of str
+        Kernel modules of lavender_ext.
+    imports_memory : bool
+        The module uses the memory of the first one.
+    """
 
     modules: tuple[str, ...]
-    beside: bool = False
+    imports_memory: bool = False
 
 
-#: Modules of the page by name; the first stands alone.
+#: Modules of the page by name; the first is independent.
 PARTS = {
     "lavender": Part(MODULES),
     "newton": Part(
-        ("engine.newton_substep", "judge.measure", "newton.solve", "newton.warm_start"), beside=True
+        ("engine.newton_substep", "judge.measure", "newton.solve", "newton.warm_start"), imports_memory=True
     ),
 }
 EXTRACT_C: dict[str, Any] = runpy.run_path(str(Path(__file__).resolve().with_name("extract_c.py")))
-#: Name of the custom section with the hash of the sources, which ends the file.
-SECTION = "lavender.sources"
-DATA = 11  # number of the section of static data
-#: What the host needs beside the functions: where free memory begins, and the proof that no data is left.
-EDGES = ("__heap_base", "__data_end", "__global_base")
+#: Name of the custom section with the hash of the sources, the last section of the file.
+SOURCES_SECTION = "lavender.sources"
+DATA_SECTION_ID = 11  # Number of the section of static data.
+#: Exported symbols that are not functions: the beginning of free memory, and the limits that show that no data remains.
+LINKER_SYMBOLS = ("__heap_base", "__data_end", "__global_base")
 
 
 class BuildFailed(Exception):
-    """The module could not be built, or is not what it must be; the message says why."""
+    """The module could not be built, or fails a check; the message contains the reason."""
 
 
 @dataclass(frozen=True)
 class Built:
-    """What was built: size [bytes], exported functions."""
+    """Result of a build.
+
+    Parameters
+    ----------
+    size : int, bytes
+    functions : tuple of str
+        Exported functions.
+    compiler : str
+        Command of the compiler.
+    """
 
     size: int
     functions: tuple[str, ...]
     compiler: str
 
 
-def why_not() -> str:
-    """Why no module can be built here; empty when it can."""
+def missing_requirement() -> str:
+    """Return the reason why no module can be built here, or an empty text."""
     if importlib.util.find_spec("Cython") is None:
         return "Cython is not installed (pip install 'lavender-contact[wasm]')"
     named = os.environ.get("LAVENDER_WASM_CC", "")
@@ -95,12 +112,12 @@ def why_not() -> str:
 
 
 def source_hash(root: Path, modules: Iterable[str | Path] = MODULES) -> str:
-    """Hash of everything that a build of these modules reads; arguments as for `build`."""
+    """Return a hash of all files that a build of these modules reads; arguments as for `build`."""
     return str(EXTRACT_C["source_hash"](root, modules))
 
 
 def is_current(path: Path, root: Path, part: Part) -> bool:
-    """Whether a module of a part lies at `path` and is of the sources below `root`."""
+    """Return whether `path` is a module of the part that was built from the sources below `root`."""
     return path.exists() and path.read_bytes().endswith(source_hash(root, part.modules).encode())
 
 
@@ -109,23 +126,23 @@ def build(
     root: Path,
     modules: Iterable[str | Path] = MODULES,
     *,
-    largest: int | None = None,
-    beside: bool = False,
+    max_bytes: int | None = None,
+    imports_memory: bool = False,
 ) -> Built:
-    """Build one module of the core functions of several kernel modules.
+    """Build one WebAssembly module from the core functions of several kernel modules.
 
     Parameters
     ----------
     out : Path
         File to write; its folder exists.
     root : Path
-        Folder that holds the package lavender_ext with its sources.
+        Folder that contains the package lavender_ext with its sources.
     modules : iterable of str or Path
         Names in lavender_ext, as `judge.measure`, or paths of .pyx files.
-    largest : int, optional
-        Size that is refused [bytes]; `LARGEST`.
-    beside : bool
-        The module imports its memory, as env.memory: that of one that stands alone.
+    max_bytes : int, optional
+        The build fails if the module has this size [bytes] or a larger one. Default: `MAX_MODULE_BYTES`.
+    imports_memory : bool
+        The module imports the memory of an independent module as env.memory.
 
     Returns
     -------
@@ -134,9 +151,9 @@ def build(
     Raises
     ------
     BuildFailed
-        No compiler; the kernels need Python, an import or static data; a module too large.
+        There is no compiler; the kernels need Python, an import or static data; the module is too large.
     """
-    reason = why_not()
+    reason = missing_requirement()
     if reason:
         raise BuildFailed(reason)
     modules = list(modules)
@@ -148,21 +165,21 @@ def build(
             source.write_text(EXTRACT_C["extract_c"](parts, roots=names), encoding="utf-8")
         except EXTRACT_C["ExtractionError"] as error:
             raise BuildFailed(str(error)) from None
-        data = _compiled(source, names, ["--import-memory"] if beside else [])
-    _check(data, LARGEST if largest is None else largest)
-    data += section(SECTION, source_hash(root, modules).encode())
-    out = out.resolve()  # a link stays, what is behind it is replaced
+        data = _compile(source, names, ["--import-memory"] if imports_memory else [])
+    _check_module(data, MAX_MODULE_BYTES if max_bytes is None else max_bytes)
+    data += section(SOURCES_SECTION, source_hash(root, modules).encode())
+    out = out.resolve()  # A link stays; its target is replaced.
     if out.exists() and not out.is_file():
         raise BuildFailed(f"cannot write {out}: it is no file, and is not replaced; give the name of a file")
     try:
-        put(out, data)
+        write_atomically(out, data)
     except OSError as error:
         raise BuildFailed(f"cannot write {out}: {error.strerror or error}") from None
     return Built(len(data), tuple(sorted(names)), shlex.join(_tools()[0]))
 
 
-def put(path: Path, data: bytes) -> None:
-    """Write a file in one step: whoever reads it at the same time sees the old one or the new one."""
+def write_atomically(path: Path, data: bytes) -> None:
+    """Write a file atomically: concurrent readers see the old file or the new one."""
     part = path.with_name(f".{path.name}.{os.getpid()}.{get_native_id()}.part")
     try:
         part.write_bytes(data)
@@ -171,17 +188,23 @@ def put(path: Path, data: bytes) -> None:
         part.unlink(missing_ok=True)
 
 
-def _compiled(source: Path, names: Iterable[str], more: Iterable[str] = ()) -> bytes:
-    """The module of one C file that needs no header of Python's: what these functions reach."""
+def _compile(source: Path, names: Iterable[str], extra_options: Iterable[str] = ()) -> bytes:
+    """Compile and link one C file without Python headers to a module that exports the functions `names`."""
     compiler, linker, named = _tools()
-    # Older clangs call memset and memcpy where zig writes the instructions that stand for them.
+    # Older versions of clang call memset and memcpy; zig uses instructions instead.
     flags = ["-std=c11", "-O3", "-g0", "-w", "-ffp-contract=off", "-ffunction-sections"]
     flags += ["-mbulk-memory"] if named else []
     compiled, linked = source.with_suffix(".o"), source.with_suffix(".wasm")
     _run([*compiler, *flags, "-c", str(source), "-o", str(compiled)], source.parent)
-    keep = ["--no-entry", "--gc-sections", "-s", *(f"--export={name}" for name in (*names, *EDGES)), *more]
+    link_options = [
+        "--no-entry",
+        "--gc-sections",
+        "-s",
+        *(f"--export={name}" for name in (*names, *LINKER_SYMBOLS)),
+        *extra_options,
+    ]
     try:
-        _run([*linker, *keep, str(compiled), "-o", str(linked)], source.parent)
+        _run([*linker, *link_options, str(compiled), "-o", str(linked)], source.parent)
     except BuildFailed as error:
         if "undefined symbol" not in str(error):
             raise
@@ -190,7 +213,7 @@ def _compiled(source: Path, names: Iterable[str], more: Iterable[str] = ()) -> b
 
 
 def _tools() -> tuple[list[str], list[str], bool]:
-    """Compiler, linker, and whether a variable of the environment names the compiler."""
+    """Return the compiler, the linker, and whether an environment variable names the compiler."""
     zig = [sys.executable, "-m", "ziglang"]
     named = shlex.split(os.environ.get("LAVENDER_WASM_CC", ""))
     linker = shlex.split(os.environ.get("LAVENDER_WASM_LD", "")) or [*zig, "wasm-ld"]
@@ -198,8 +221,9 @@ def _tools() -> tuple[list[str], list[str], bool]:
 
 
 def _run(command: list[str], folder: Path) -> None:
+    """Run a command in a folder; raise BuildFailed with its output if it fails."""
     env = dict(os.environ)
-    if not os.access(os.path.expanduser("~"), os.W_OK | os.X_OK):  # where zig keeps libraries
+    if not os.access(os.path.expanduser("~"), os.W_OK | os.X_OK):  # zig caches libraries in the home folder.
         env.setdefault("ZIG_GLOBAL_CACHE_DIR", str(folder / "cache"))
     try:
         done = subprocess.run(
@@ -211,28 +235,28 @@ def _run(command: list[str], folder: Path) -> None:
         raise BuildFailed(f"{shlex.join(command)} failed:\n{(done.stdout + done.stderr)[-4000:]}")
 
 
-def _check(module: bytes, largest: int) -> None:
-    """No byte of static data, and a size below the limit; what the linker has left out or added it tells itself."""
-    at = 8  # behind the magic word and the version: number, size and content of each section
-    while at < len(module):
-        kind, size, shift, at = module[at], 0, 0, at + 1
+def _check_module(module: bytes, max_bytes: int) -> None:
+    """Raise BuildFailed if the module has static data or is too large; the linker reports its own errors."""
+    position = 8  # The magic word and the version are followed by number, size and content of each section.
+    while position < len(module):
+        kind, size, shift, position = module[position], 0, 0, position + 1
         while True:  # LEB128
-            byte, at = module[at], at + 1
+            byte, position = module[position], position + 1
             size |= (byte & 0x7F) << shift
             shift += 7
             if byte < 0x80:
                 break
-        if kind == DATA:
+        if kind == DATA_SECTION_ID:
             raise BuildFailed(
                 f"a kernel reads static data ({size} bytes), which nothing fills outside Python"
             )
-        at += size
-    if len(module) >= largest:
-        raise BuildFailed(f"the module has {len(module)} bytes; below {largest} are allowed")
+        position += size
+    if len(module) >= max_bytes:
+        raise BuildFailed(f"the module has {len(module)} bytes; below {max_bytes} are allowed")
 
 
 def section(name: str, content: bytes) -> bytes:
-    """A custom section of a module, to be appended; lengths below 128 are one byte in LEB128."""
+    """Return a custom section to append to a module; it is limited to 127 bytes, whose length is one byte in LEB128."""
     body = bytes([len(name)]) + name.encode() + content
     if len(body) >= 128:
         raise ValueError("a custom section longer than 127 bytes")
@@ -244,6 +268,6 @@ if __name__ == "__main__":
     try:
         for name, part in PARTS.items():
             out = Path(sys.argv[1], f"{name}.wasm")
-            print(build(out, ROOT, part.modules, beside=part.beside))
+            print(build(out, ROOT, part.modules, imports_memory=part.imports_memory))
     except BuildFailed as failure:
         sys.exit(str(failure))

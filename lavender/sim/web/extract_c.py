@@ -1,19 +1,20 @@
-"""C without Python, cut out of the C that Cython writes: what given functions reach, and nothing else.
+"""Extract C without Python from the C that Cython writes: given functions and everything that they use.
 
-    translate(root, modules, work)      the C of modules of lavender_ext
-    extract_c(translations, front, roots)     one C file of what `front` (C of ours, at its end) and `roots` use
+    translate(root, modules, work)            return the C of modules of lavender_ext
+    extract_c(translations, front, roots)     return one C file with the declarations that `front` and `roots` use
 
-Cython writes a module's core (`cdef ... noexcept nogil`) and its Python part into one file, and what several modules
-cimport into each of them. Every file is read token by token into its declarations (structs, enums, typedefs, functions,
-groups under `#if`); a name leads to the declaration that makes it, and what that uses leads on. Bodies of functions,
-nine tenths of all tokens, are read of those that are reached. A function that another module imports by pointer is the
-function itself here. What is reached must not name Python: who uses it is told.
+Cython writes the core of a module (`cdef ... noexcept nogil`) and its Python part into one file, and a declaration that
+several modules cimport into each of their files. Every file is parsed into its declarations (structs, enums, typedefs,
+functions, groups under `#if`). Starting from the roots, each name is resolved to the declaration that defines it, and
+the names which that declaration uses are resolved in turn. Bodies of functions, nine tenths of all tokens, are only
+parsed if the function is needed. A function that another module imports by pointer is replaced by the function itself.
+If a needed declaration uses Python, the error message names its user.
 
-Names lose what Cython puts before them (`__pyx_f_12lavender_ext_4core_5block_clip` is `core_block_clip`), core
-functions `lav_x` become `k_x`, and everything of the kernels is `static`: a build that leaves some of `front` out
-(LAV_SWEEPS_ONLY) leaves out what only that calls, as every compiler does.
+Names lose the prefix of Cython (`__pyx_f_12lavender_ext_4core_5block_clip` becomes `core_block_clip`), core functions
+`lav_x` become `k_x`, and all declarations of the kernels are `static`: if a build omits parts of `front`
+(LAV_SWEEPS_ONLY), the compiler drops the functions that only those parts call.
 
-Only the standard library is imported, so that setup.py can run this before anything is built.
+Only the standard library is imported, so that setup.py can run this file before anything is built.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ from typing import ClassVar, NamedTuple
 PUBLIC = re.compile(r"^cdef public [^(\n]*?\b(lav_\w+)\(", re.MULTILINE)
 CIMPORT = re.compile(r"^from lavender_ext\.([\w.]+) cimport", re.MULTILINE)
 
-#: What stands before everything: how floating point must be compiled, and words of Cython's own.
+#: Beginning of the file: settings of floating-point arithmetic, and macros that Cython uses.
 PROLOGUE = """\
 #include <float.h>
 #include <math.h>
@@ -56,13 +57,13 @@ PROLOGUE = """\
 #pragma fp_contract(off)
 #endif
 
-/* The kernels below come out of a translator: what it declares and never uses is no mistake of theirs. */
+/* The kernels below were written by a translator, which declares variables that are not used. */
 #if defined(__GNUC__)
 #pragma GCC diagnostic ignored "-Wunused-function"
 #pragma GCC diagnostic ignored "-Wunused-parameter"
 #pragma GCC diagnostic ignored "-Wunused-variable"
 #pragma GCC diagnostic ignored "-Wunused-but-set-variable"
-#if !defined(__clang__) /* which guesses at arrays that a loop over the size of a block fills */
+#if !defined(__clang__) /* A loop over the size of a block fills the arrays in question. */
 #pragma GCC diagnostic ignored "-Wmaybe-uninitialized"
 #endif
 #define CYTHON_UNUSED __attribute__((unused))
@@ -84,15 +85,15 @@ TOKEN = re.compile(
       |(?P<mark>[^\s\w]))""",
     re.VERBOSE | re.DOTALL,
 )
-#: All that may hold a brace which opens or closes no block, and those that do.
+#: Braces, and everything that may contain a brace that does not open or close a block.
 BRACE = re.compile(
     r"""\n[ \t]*\#(?:\\\n|/\*.*?\*/|[^\n])*|/\*.*?\*/|//[^\n]*|"(?:\\.|[^"\\\n])*"|'(?:\\.|[^'\\\n])*'|[{}]""",
     re.DOTALL,
 )
 WORD = re.compile(r"[A-Za-z_]\w*")
-NUMBER = re.compile(r"\d+")
-#: Words that lead nowhere: those of the prologue, and C's.
-PROVIDED = frozenset(
+DIGITS = re.compile(r"\d+")
+#: Words without a declaration in the kernels: those of the prologue, and keywords of C.
+PREDEFINED = frozenset(
     WORD.findall(
         """CYTHON_INLINE CYTHON_UNUSED __PYX_EXTERN_C likely unlikely NULL DL_IMPORT auto break case char const continue
         default do double else enum extern float for goto if inline int long register return short signed sizeof static
@@ -104,30 +105,43 @@ MANGLED = re.compile(r"__pyx_(?:f|t|e|fuse_\d+)_(?=\d)")
 
 
 class ExtractionError(Exception):
-    """The C of the kernels could not be made, or needs Python; the message says where."""
+    """The C of the kernels could not be produced, or needs Python; the message names the place."""
 
 
 class Token(NamedTuple):
-    """A word of C and what stands before it."""
+    """A token of C with the white space before it."""
 
     kind: str
     text: str
-    before: str  # white space
+    before: str
 
 
 @dataclass
 class Item:
-    """One declaration: the names it makes, those it uses, its text."""
+    """One declaration.
 
-    kind: str  # macro, type, prototype, variable, function, group
+    Parameters
+    ----------
+    kind : str
+        "macro", "type", "prototype", "variable", "function" or "group".
+    part : list of Token
+    defines : set of str
+        Names that it defines.
+    origin : str
+        Module of its file.
+    kept_names : frozenset of str
+        Core functions that keep their names.
+    """
+
+    kind: str
     part: list[Token]
-    makes: set[str] = field(default_factory=set)
+    defines: set[str] = field(default_factory=set)
     origin: str = ""
-    kept: frozenset[str] = frozenset()  # core functions that keep their names
+    kept_names: frozenset[str] = frozenset()
 
     @cached_property
-    def whole(self) -> list[Token]:
-        """All tokens, those of bodies one by one."""
+    def all_tokens(self) -> list[Token]:
+        """All tokens, with the bodies of functions split into tokens."""
         out: list[Token] = []
         for token in self.part:
             if token.kind != "body":
@@ -139,56 +153,56 @@ class Item:
 
     @cached_property
     def text(self) -> str:
-        """As it is written out."""
-        # Words are told from what they stand in: no string of a kernel is one.
-        return WORD.sub(lambda match: _plain(match.group(), self.kept), _text(self.whole))
+        """Text of the declaration in the output."""
+        # Words in strings would be renamed, too; no string of a kernel contains such a word.
+        return WORD.sub(lambda match: _output_name(match.group(), self.kept_names), _text(self.all_tokens))
 
     @cached_property
     def uses(self) -> set[str]:
         """Words that may be names of other declarations."""
         used: set[str] = set()
         last = ""
-        for token in self.whole:
+        for token in self.all_tokens:
             words = [token.text] if token.kind == "name" and last not in (".", "->") else []
             if token.kind == "directive":
                 words = WORD.findall(token.text)
             last = "->" if last == "-" and token.text == ">" else token.text
             used.update(words)
-        return {_plain(name, self.kept) for name in used}
+        return {_output_name(name, self.kept_names) for name in used}
 
-    def rename(self, origin: str, kept: frozenset[str]) -> None:
-        """Give names as they are written out."""
-        self.origin, self.kept = origin, kept
-        self.makes = {_plain(name, kept) for name in self.makes}
+    def rename(self, origin: str, kept_names: frozenset[str]) -> None:
+        """Set the module and the kept names, and replace the defined names by those of the output."""
+        self.origin, self.kept_names = origin, kept_names
+        self.defines = {_output_name(name, kept_names) for name in self.defines}
 
 
 def tokens(text: str, bodies: bool = False) -> Iterator[Token]:
-    """Words, literals, marks and lines of the preprocessor; comments are white space.
+    """Yield words, literals, marks and preprocessor lines of C; comments are white space.
 
-    bodies : what stands in braces behind a parenthesis is one token, with its braces.
+    With `bodies`, the text in braces after a closing parenthesis is one token, including its braces.
     """
     before, last, at = "", "", 0
     while at >= 0:
         start, at = at, -1
         for match in TOKEN.finditer(text, start):
             kind = match.lastgroup or ""
-            said = match[kind]
+            word = match[kind]
             if kind == "skip":
-                before += said if said.isspace() else " "
+                before += word if word.isspace() else " "
                 continue
             before += match["space"] or ""
-            if bodies and said == "{" and last == ")":
+            if bodies and word == "{" and last == ")":
                 kind, at = "body", _end_of_block(text, match.end())
-                said = text[match.start("mark") : at]
-            last = said
-            yield Token(kind, said.lstrip() if kind == "directive" else said, before)
+                word = text[match.start("mark") : at]
+            last = word
+            yield Token(kind, word.lstrip() if kind == "directive" else word, before)
             before = ""
             if kind == "body":
                 break
 
 
 def _end_of_block(text: str, at: int) -> int:
-    """Behind the brace that closes the block whose first character stands at `at`."""
+    """Return the position after the brace that closes the block whose first character is at `at`."""
     depth = 1
     for match in BRACE.finditer(text, at):
         depth += (match[0] == "{") - (match[0] == "}")
@@ -198,14 +212,14 @@ def _end_of_block(text: str, at: int) -> int:
 
 
 def read(text: str) -> list[Item]:
-    """The declarations of a C file one by one, those between `#if` and `#endif` together."""
-    guarded = text.partition("\n#ifndef Py_PYTHON_H\n")[2].partition(
-        "\n#else\n"
-    )  # of Cython: all in the last branch
+    """Return the declarations of a C file; those between `#if` and `#endif` form one group."""
+    # Cython's files have all declarations in the last branch of this condition.
+    guarded = text.partition("\n#ifndef Py_PYTHON_H\n")[2].partition("\n#else\n")
     return list(_declarations(list(tokens(guarded[2].rpartition("\n#endif")[0] or text, bodies=True))))
 
 
 def _declarations(stream: list[Token]) -> Iterator[Item]:
+    """Yield the declarations of a sequence of tokens."""
     at = 0
     while at < len(stream):
         word, stop = _word(stream[at]), at + 1
@@ -221,15 +235,15 @@ def _declarations(stream: list[Token]) -> Iterator[Item]:
 
 
 def _word(token: Token) -> str:
-    """The first word of a line of the preprocessor; empty for anything else."""
+    """Return the first word of a preprocessor line; an empty text for any other token."""
     if token.kind != "directive":
         return ""
-    found = WORD.search(token.text)
-    return found.group() if found else ""
+    match = WORD.search(token.text)
+    return match.group() if match else ""
 
 
 def _end_of_group(stream: list[Token], at: int) -> int:
-    """Behind the #endif of the conditional that opens at `at`."""
+    """Return the position after the #endif of the conditional that opens at `at`."""
     depth = 0
     for i in range(at, len(stream)):
         word = _word(stream[i])
@@ -240,6 +254,7 @@ def _end_of_group(stream: list[Token], at: int) -> int:
 
 
 def _end_of_declaration(stream: list[Token], at: int) -> int:
+    """Return the position after the declaration that begins at `at`."""
     depth = 0
     for i in range(at, len(stream)):
         if stream[i].kind == "body" and depth == 0:
@@ -255,6 +270,7 @@ def _end_of_declaration(stream: list[Token], at: int) -> int:
 
 
 def _text(part: list[Token]) -> str:
+    """Return the text of tokens, without empty lines, and with preprocessor lines on lines of their own."""
     out = []
     for i, token in enumerate(part):
         before = token.before if i else ""
@@ -267,15 +283,16 @@ def _text(part: list[Token]) -> str:
 
 
 def _group(part: list[Token]) -> Item:
-    made = Item("group", part)
+    """Return the group of all declarations between `#if` and `#endif`."""
+    group = Item("group", part)
     for item in _declarations([token for token in part if token.kind != "directive"]):
-        made.makes |= item.makes
-    made.makes |= {WORD.findall(token.text)[1] for token in part if _word(token) == "define"}
-    return made
+        group.defines |= item.defines
+    group.defines |= {WORD.findall(token.text)[1] for token in part if _word(token) == "define"}
+    return group
 
 
 def _item(part: list[Token]) -> Item:
-    """One declaration from its tokens: what it is, and what it is called."""
+    """Return one declaration with its kind and the names that it defines, from its tokens."""
     words = ["{" if token.kind == "body" else token.text for token in part]
     names = [i for i, token in enumerate(part) if token.kind == "name"]
     brace = words.index("{") if "{" in words else -1
@@ -291,15 +308,15 @@ def _item(part: list[Token]) -> Item:
             {words[i] for i in names if i > last and words[i + 1] in (";", "[", "__attribute__")},
         )
     if words[0] in ("struct", "union", "enum") and (brace in (1, 2) or words[2:3] == [";"]):
-        made = Item("prototype" if words[2:3] == [";"] else "type", part, {words[1]} if brace != 1 else set())
+        item = Item("prototype" if words[2:3] == [";"] else "type", part, {words[1]} if brace != 1 else set())
         depth = 0
         for i in range(brace, len(words)) if words[0] == "enum" else ():
             depth += (words[i] == "(") - (words[i] == ")")
             if depth == 0 and words[i] in ("{", ",") and part[i + 1].kind == "name":
-                made.makes.add(words[i + 1])
-        return made
+                item.defines.add(words[i + 1])
+        return item
     first = words.index("=") if "=" in words else len(words) - 1
-    if call < first and words[call + 1] == "*":  # a pointer to a function
+    if call < first and words[call + 1] == "*":  # A pointer to a function.
         return Item("variable", part, {words[min(i for i in names if i > call and words[i] != "const")]})
     if call < first:
         return Item("function" if brace > call else "prototype", part, {words[call - 1]})
@@ -307,104 +324,111 @@ def _item(part: list[Token]) -> Item:
     return Item("variable", part, {words[before[-1]]} if before else set())
 
 
-# -- what is reached ----------------------------------------------------------------------------------------
+# -- resolution of names ------------------------------------------------------------------------------------
 
 
 class _Table:
-    """Declarations of all files by the names they make; a definition goes before a prototype or a pointer."""
+    """Declarations of all files by the names that they define; a definition precedes a prototype or a pointer."""
 
     RANK: ClassVar = {"function": 3, "type": 3, "group": 2, "macro": 2, "variable": 1, "prototype": 0}
 
     def __init__(self, items: Iterable[Item]) -> None:
         self.by_name: dict[str, list[Item]] = {}
         for item in items:
-            for name in item.makes:
+            for name in item.defines:
                 self.by_name.setdefault(name, []).append(item)
 
     def reach(self, roots: Iterable[str]) -> list[Item]:
-        """What the names lead to, in an order in which everything stands before its use."""
+        """Return all declarations that the names need, ordered so that each precedes its use."""
         done: dict[int, Item] = {}
         for name in sorted(roots):
             self._visit(name, done, ())
         return list(done.values())
 
     def _visit(self, name: str, done: dict[int, Item], path: tuple[str, ...]) -> None:
-        if name not in self.by_name or name in PROVIDED:
+        """Add the declaration of a name and everything that it uses; `path` contains the names that led to it."""
+        if name not in self.by_name or name in PREDEFINED:
             return
-        every = self.by_name[name]
-        item = max(every, key=lambda item: self.RANK[item.kind])
+        candidates = self.by_name[name]
+        item = max(candidates, key=lambda item: self.RANK[item.kind])
         if id(item) in done:
             return
         if name in path:
-            raise ExtractionError(f"{' > '.join(path)} > {name} comes round")
-        for other in every:
+            raise ExtractionError(f"{' > '.join(path)} > {name} is a cycle")
+        for other in candidates:
             if other.kind == item.kind == "function" and other.part != item.part and other.text != item.text:
                 raise ExtractionError(f"{name} is not the same in {item.origin} and {other.origin}")
         if item.kind in ("variable", "prototype"):
             if item.kind == "prototype" and item.text.startswith(("struct", "union")):
                 return
             raise ExtractionError(
-                f"{path[-1] if path else 'somebody'} needs {name}, which only Python's side has ({item.origin})"
+                f"{path[-1] if path else 'a root'} needs {name}, which only the Python part defines ({item.origin})"
             )
-        for used in sorted(item.uses - item.makes):
+        for used in sorted(item.uses - item.defines):
             self._visit(used, done, (*path, name))
         done[id(item)] = item
 
 
 def extract_c(translations: Iterable[tuple[str, str]], front: str = "", roots: Iterable[str] = ()) -> str:
-    """One C file without Python.
+    """Return one C file without Python.
 
     Parameters
     ----------
     translations : iterable of (str, str)
-        Name of each module, as `sweep.serial`, and the C that Cython has made of it.
+        Name of each module, as `sweep.serial`, and the C that Cython has written for it.
     front : str
-        C that uses kernels by their names here; it stands at the end.
+        C that uses kernels by their names in the output; it is the end of the file.
     roots : iterable of str
         Core functions by their names in the sources, `lav_x`, that keep names and linkage.
 
     Returns
     -------
     str
+
+    Raises
+    ------
+    ExtractionError
+        A core function does not exist, or a needed declaration uses Python.
     """
-    kept = frozenset(roots)
+    kept_names = frozenset(roots)
     items = []
     for name, text in translations:
-        found = read(text)
-        for item in found:
-            item.rename(name, kept)
-        items += found
-    table, own = _Table(items), read(front)
-    made = set().union(*(item.makes for item in own))
-    reached = table.reach(set().union(*(item.uses for item in own), kept) - made)
-    missing = sorted(kept - set(table.by_name))
+        declarations = read(text)
+        for item in declarations:
+            item.rename(name, kept_names)
+        items += declarations
+    table, front_items = _Table(items), read(front)
+    defined = set().union(*(item.defines for item in front_items))
+    reached = table.reach(set().union(*(item.uses for item in front_items), kept_names) - defined)
+    missing = sorted(kept_names - set(table.by_name))
     if missing:
         raise ExtractionError(f"no such core functions: {', '.join(missing)}")
-    return "\n\n".join([PROLOGUE, *(_private(item, kept) for item in reached), front])
+    return "\n\n".join([PROLOGUE, *(_make_static(item, kept_names) for item in reached), front])
 
 
-def _private(item: Item, kept: frozenset[str]) -> str:
+def _make_static(item: Item, kept_names: frozenset[str]) -> str:
+    """Return the text of a declaration; a function is `static` unless it keeps its name."""
     text = item.text
     if item.kind == "function":
         text = re.sub(r"^(?:static\s+)?(?:CYTHON_INLINE\s+)?", "", text)
         inline = "inline " if "CYTHON_INLINE" in item.uses else ""
-        text = text if item.makes & kept else f"static {inline}{text}"
+        text = text if item.defines & kept_names else f"static {inline}{text}"
     return text
 
 
-def _plain(name: str, kept: frozenset[str]) -> str:
-    """A name without what Cython puts before it; one of a variable ends in an underscore, no other one does."""
+def _output_name(name: str, kept_names: frozenset[str]) -> str:
+    """Return a name without Cython's prefix; only names of variables end in an underscore."""
     if not name.startswith("__pyx_"):
         if name == "Py_ssize_t":
             return "ptrdiff_t"
-        return "k_" + name[4:] if name.startswith("lav_") and name not in kept else name
+        return "k_" + name[4:] if name.startswith("lav_") and name not in kept_names else name
     mangled = MANGLED.match(name)
     if mangled:
         at, parts = mangled.end(), []
-        while number := NUMBER.match(name, at):
+        while number := DIGITS.match(name, at):
             end = number.end() + int(number[0])
             if end == number.end() or name[end : end + 1] != "_":
-                break  # a number of Cython's own, as in __pyx_t_1
+                break  # A number that Cython added, as in __pyx_t_1.
             parts.append(name[number.end() : end])
             at = end + 1
         if parts:
@@ -419,66 +443,80 @@ def _plain(name: str, kept: frozenset[str]) -> str:
 
 
 def path_of(root: Path, module: str | Path, suffix: str = ".pyx") -> Path:
-    """The file of a module of lavender_ext, or a path of one elsewhere as it is."""
+    """Return the file of a module of lavender_ext; a path of another module is returned unchanged."""
     if isinstance(module, Path):
         return module
     return root.joinpath("lavender_ext", *module.split(".")).with_suffix(suffix)
 
 
 def core_functions(root: Path, modules: Iterable[str | Path]) -> list[str]:
-    """Names of the core functions `cdef public ... lav_*` in the sources of modules."""
+    """Return the names of the core functions `cdef public ... lav_*` in the sources of modules."""
     texts = [path_of(root, module).read_text(encoding="utf-8") for module in modules]
     return [name for text in texts for name in PUBLIC.findall(text)]
 
 
 def _sources(root: Path, module: str | Path) -> set[Path]:
-    """Files of lavender_ext that the translation of a module reads."""
-    open_, seen = [path_of(root, module)], set()
-    while open_:
-        path = open_.pop()
-        if path in seen or not path.exists():
+    """Return the files of lavender_ext that the translation of a module reads."""
+    pending, sources = [path_of(root, module)], set()
+    while pending:
+        path = pending.pop()
+        if path in sources or not path.exists():
             continue
-        seen.add(path)
+        sources.add(path)
         names = CIMPORT.findall(path.read_text(encoding="utf-8"))
-        open_ += [path.with_suffix(".pxd")]
-        open_ += [path_of(root, name, ".pxd") for name in names]
-    return seen
+        pending += [path.with_suffix(".pxd")]
+        pending += [path_of(root, name, ".pxd") for name in names]
+    return sources
 
 
 def source_hash(root: Path, modules: Iterable[str | Path], more: Iterable[Path] = ()) -> str:
-    """Hash of everything that a cut of these modules is made of, and of `more` files."""
+    """Return a hash of all files from which these modules are extracted, and of the files `more`."""
     paths = {path for name in modules for path in _sources(root, name)}
-    how = (root / "lavender_ext" / "build_options.py", Path(__file__))
-    found = hashlib.sha256()
-    for path in [*sorted(paths), *how, *more]:
-        found.update(path.name.encode() + b"\0" + path.read_text(encoding="utf-8").encode() + b"\0")
-    return found.hexdigest()
+    tools = (root / "lavender_ext" / "build_options.py", Path(__file__))
+    digest = hashlib.sha256()
+    for path in [*sorted(paths), *tools, *more]:
+        digest.update(path.name.encode() + b"\0" + path.read_text(encoding="utf-8").encode() + b"\0")
+    return digest.hexdigest()
 
 
 def translate(
-    root: Path, modules: Iterable[str | Path], work: Path, made: Path | None = None
+    root: Path, modules: Iterable[str | Path], work: Path, cache: Path | None = None
 ) -> list[tuple[str, str]]:
-    """The C of modules of lavender_ext below `root` (or of paths of .pyx files), by Cython.
+    """Return (name, C) of modules, translated by Cython.
 
-    made : folder of translations of an ordinary build; one that is newer than all its sources is taken.
+    Parameters
+    ----------
+    root : Path
+        Folder that contains lavender_ext.
+    modules : iterable of str or Path
+        Names in lavender_ext, or paths of .pyx files.
+    work : Path
+        Folder for new translations.
+    cache : Path, optional
+        Folder of translations of an ordinary build. A translation that is newer than all its sources is used.
+
+    Raises
+    ------
+    ExtractionError
+        Cython fails.
     """
     directives = runpy.run_path(str(root / "lavender_ext" / "build_options.py"))["directives"]()
-    given = [f"-X{name}={value}" for name, value in directives.items()]
-    how = made / "how.json" if made else None
+    options = [f"-X{name}={value}" for name, value in directives.items()]
+    how = cache / "how.json" if cache else None
     if not (how and how.exists() and directives in json.loads(how.read_text(encoding="utf-8"))):
-        made = None  # with every check on, or unfinished
+        cache = None  # The build has all run-time checks, or is not complete.
 
-    def one(module: str | Path) -> tuple[str, str]:
+    def translate_module(module: str | Path) -> tuple[str, str]:
         source = path_of(root, module)
         name = module.stem if isinstance(module, Path) else module
-        there = made.joinpath("lavender_ext", *name.split(".")).with_suffix(".c") if made else None
-        if there and there.exists():
+        cached = cache.joinpath("lavender_ext", *name.split(".")).with_suffix(".c") if cache else None
+        if cached and cached.exists():
             newest = max(path.stat().st_mtime for path in _sources(root, module))
-            if there.stat().st_mtime > newest:
-                return name, there.read_text(encoding="utf-8")
+            if cached.stat().st_mtime > newest:
+                return name, cached.read_text(encoding="utf-8")
         out = work / f"{name}.c"
         done = subprocess.run(
-            [sys.executable, "-m", "cython", *given, "--shared=lavender_ext._utility", str(source), "-o", str(out)],
+            [sys.executable, "-m", "cython", *options, "--shared=lavender_ext._utility", str(source), "-o", str(out)],
             cwd=root, capture_output=True, encoding="utf-8", errors="replace", check=False,
         )  # fmt: skip
         if done.returncode:
@@ -486,4 +524,4 @@ def translate(
         return name, out.read_text(encoding="utf-8")
 
     with ThreadPoolExecutor(2) as pool:
-        return list(pool.map(one, modules))
+        return list(pool.map(translate_module, modules))

@@ -1,4 +1,4 @@
-"""The page: its folder, its modules, and a server on this machine."""
+"""Write the folder of the page, build its modules, and serve it on this machine."""
 
 from __future__ import annotations
 
@@ -17,48 +17,73 @@ from typing import Any
 
 import lavender_ext
 from lavender.base.errors import InputError, LavenderError
-from lavender.io.stored import kept, make_folder, writable, write_bytes, write_text
+from lavender.io.stored import check_writable, load_or_make, make_folder, write_bytes, write_text
 from lavender.sim.web import compile as wasm
 from lavender.sim.web.scenes import page_scenes
 
 HERE = Path(__file__).resolve().parent
-ROOT = Path(lavender_ext.__file__).resolve().parent.parent  # the folder that holds lavender_ext
-SHIPPED = HERE  # the folder of the modules that come with the package
+ROOT = Path(lavender_ext.__file__).resolve().parent.parent  # The folder that contains lavender_ext.
+SHIPPED = HERE  # The folder of the modules in the package.
 
 
 def build_module(out: Path, name: str = "lavender") -> wasm.Built:
-    """Compile the kernels to a WebAssembly module: "lavender", which stands alone, or "newton" beside it."""
-    writable(out)
+    """Compile the kernels to a WebAssembly module: "lavender", which is independent, or "newton", which extends it.
+
+    Raises
+    ------
+    LavenderError
+        The module cannot be built.
+    """
+    check_writable(out)
     part = wasm.PARTS[name]
     try:
-        return wasm.build(out, ROOT, part.modules, beside=part.beside)
+        return wasm.build(out, ROOT, part.modules, imports_memory=part.imports_memory)
     except wasm.BuildFailed as error:
         raise LavenderError(str(error)) from None
 
 
 def module(say: Callable[[str], Any] = lambda text: None, name: str = "lavender") -> bytes:
-    """A module of the kernels as they are: the one that lies in the package, or a new one, kept there.
+    """Return a module of the present kernels: the one in the package, or a new one, which is stored there if possible.
 
-    `say` is told when something takes time.
+    Parameters
+    ----------
+    say : callable
+        Called with a message before a build.
+    name : {"lavender", "newton"}
+
+    Raises
+    ------
+    LavenderError
+        The module of the package is missing or outdated, and cannot be built.
     """
     shipped = SHIPPED / f"{name}.wasm"
 
     def make() -> bytes:
-        if reason := wasm.why_not():
+        if reason := wasm.missing_requirement():
             state = "is of other kernels" if shipped.exists() else "is not in this installation"
             raise LavenderError(f"the WebAssembly module {name} {state} and cannot be built: {reason}")
-        say(f"building the WebAssembly module {name} (some 10 s, kept for the next time)")
+        say(f"building the WebAssembly module {name} (about 10 s, once)")
         with TemporaryDirectory() as folder:
             out = Path(folder, shipped.name)
             build_module(out, name)
             return out.read_bytes()
 
-    return kept(shipped, lambda _: wasm.is_current(shipped, ROOT, wasm.PARTS[name]), make)
+    return load_or_make(shipped, lambda _: wasm.is_current(shipped, ROOT, wasm.PARTS[name]), make)
 
 
 def write_page(folder: Path, say: Callable[[str], Any] = lambda text: None) -> Path:
-    """Write the page into a folder for any file server; nothing in it needs Python or a network. Returns index.html."""
-    make_folder(writable(folder, folder=True))
+    """Write the page into a folder for any file server and return the path of index.html.
+
+    The page needs neither Python nor a network.
+
+    Raises
+    ------
+    InputError
+        The folder cannot be written.
+    LavenderError
+        A module cannot be built.
+    """
+    make_folder(check_writable(folder, folder=True))
     modules = {name: module(say, name) for name in wasm.PARTS}
     try:
         shutil.copytree(HERE / "page", folder, copy_function=_copy, dirs_exist_ok=True)
@@ -72,12 +97,12 @@ def write_page(folder: Path, say: Callable[[str], Any] = lambda text: None) -> P
 
 
 def check(say: Callable[[str], Any] = lambda text: None) -> bool:
-    """Whether the modules repeat under Node what the native kernels do, bit by bit; what it finds is printed.
+    """Return whether the modules under Node give the bits of the native kernels; print the differences.
 
     Raises
     ------
     LavenderError
-        No checkout, no Node, or a module that is missing and cannot be built.
+        There is no checkout or no Node, or a module cannot be built.
     """
     script = ROOT / "tests" / "sim" / "web" / "check_wasm_exports.mjs"
     if not script.is_file():
@@ -88,7 +113,7 @@ def check(say: Callable[[str], Any] = lambda text: None) -> bool:
     node = shutil.which("node")
     if node is None:
         raise LavenderError(
-            "node is not there, which runs the check: install Node 18 or newer (nodejs.org, or apt)"
+            "node, which runs the check, is not installed: install Node 18 or newer (nodejs.org, or apt)"
         )
     modules = {name: module(say, name) for name in wasm.PARTS}
     with TemporaryDirectory(prefix="lavender-web-") as folder:
@@ -104,7 +129,7 @@ def _copy(source: str, target: str) -> None:
 
 
 class Handler(SimpleHTTPRequestHandler):
-    """Types are said here, since a machine's own table may lack or miscall them."""
+    """Handler with its own table of content types, because the table of the system may be incomplete or wrong."""
 
     extensions_map = {  # noqa: RUF012 - as the base class has it
         "": "application/octet-stream",
@@ -117,12 +142,12 @@ class Handler(SimpleHTTPRequestHandler):
     }
 
     def end_headers(self) -> None:
-        """Nothing is kept by a browser."""
+        """Forbid browsers to cache the files."""
         self.send_header("Cache-Control", "no-cache")
         super().end_headers()
 
     def send_head(self) -> Any:
-        """What is no path of a file, such as one with a NUL character, is not found."""
+        """Answer "not found" for an invalid path, such as one with a NUL character."""
         try:
             return super().send_head()
         except (OSError, ValueError):
@@ -130,16 +155,16 @@ class Handler(SimpleHTTPRequestHandler):
             return None
 
     def log_message(self, format: str, *arguments: Any) -> None:  # noqa: A002 - the base class names it so
-        """Say nothing about single requests."""
+        """Print nothing about single requests."""
 
 
 def server(folder: Path, port: int = 0) -> ThreadingHTTPServer:
-    """A server of `folder` on the loopback address, not yet running; port 0 takes a free one."""
-    return bound(partial(Handler, directory=str(folder)), port)
+    """Create a server of `folder` on the loopback address without starting it; port 0 selects a free one."""
+    return create_server(partial(Handler, directory=str(folder)), port)
 
 
-def bound(handler: Callable[..., Any], port: int) -> ThreadingHTTPServer:
-    """A server on the loopback address that answers by `handler`."""
+def create_server(handler: Callable[..., Any], port: int) -> ThreadingHTTPServer:
+    """Create a server on the loopback address that answers with `handler`; InputError if the port cannot be used."""
     try:
         return ThreadingHTTPServer(("127.0.0.1", port), handler)
     except (OSError, OverflowError) as error:

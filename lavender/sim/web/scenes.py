@@ -1,4 +1,4 @@
-"""What a host without Python is given: layouts, and scenes as the numbers of their start."""
+"""Data for a host without Python: the layout of the engine's arrays, and the initial arrays of scenes."""
 
 from __future__ import annotations
 
@@ -12,98 +12,107 @@ from lavender.sim.engine.snapshot import Snapshot
 from lavender.sim.scene import Scene
 from lavender_ext.engine.arrays import CAP_CONTACT, CAP_PAIR, SHAPES, offsets
 
-#: Scenes of the page, the whole gallery: name, title, what to look for, what the caption measures of each side:
-#: "displacement" (largest distance of a body from its start, sideways or downwards), "gap" (how far the ends of a joint
-#: are apart), "apart" (how far a body of B is from the same of A).
+#: Scenes of the page, the whole gallery: name, title, description, and the quantity in the caption of each side:
+#: "displacement" (largest distance of a body from its initial position, sideways or downwards), "gap" (largest distance
+#: between the ends of a joint), "apart" (largest distance of a body of B from the same body of A).
 PAGE: tuple[tuple[str, str, str, str], ...] = (
     (
         "stack",
         "Stack of six boxes",
-        "24 contacts, 72 rows. The slowest error shrinks by cos²(π/12) a sweep; warm starts go on from the last step.",
+        "24 contacts, 72 rows. The slowest error mode shrinks by cos²(π/12) per sweep; warm starts use the last step.",
         "displacement",
     ),
     (
         "pyramid",
         "Pyramid of 55 boxes",
-        "400 contacts, more rows than the bodies can tell apart: the impulses are not unique, the motion is.",
+        "400 contacts with redundant rows: the impulses are not unique, but the motion is.",
         "displacement",
     ),
     (
         "chain",
         "Chain of 20 links",
-        "Joints alone: the eight values speak of contacts and stay 0, the error of the joint rows is E.",
+        "Only joints: the eight values are for contacts and remain 0; E is the error of the joint rows.",
         "gap",
     ),
     (
         "spinner",
         "Spinning ball",
-        "One contact of four rows. Patch friction slows the ball with μ r N; one sweep solves a single contact.",
+        "One contact of four rows. Torsional friction slows the ball by the moment μ r N. One sweep solves it.",
         "apart",
     ),
     (
         "heavy_on_light",
         "Heavy box on a light one",
-        "A hundred times the mass on top: a sweep leaves 100/101 of the error.",
+        "The upper box has a hundred times the mass: after a sweep, 100/101 of the error remains.",
         "displacement",
     ),
     (
         "card_house",
         "House of cards",
-        "Cards that stand by friction alone: what a solver leaves over, they slide by.",
+        "Only friction holds the cards: they slide with the velocity error of the solver.",
         "displacement",
     ),
     (
         "bridge",
         "Bridge of 16 planks",
-        "Hinges and contacts together, a box ten times as heavy as a plank on it: it sags by what impulses miss.",
+        "Hinges and contacts, with a box ten times as heavy as a plank: it sags if the impulses are too small.",
         "gap",
     ),
     (
         "pile",
         "Pile of a hundred bodies",
-        "Boxes and spheres that fall on each other: contacts come and go, the cache matches those that stay.",
+        "Boxes and spheres fall on each other: contacts appear and disappear; the cache matches the remaining ones.",
         "apart",
     ),
     (
         "table",
         "Table on nine legs",
-        "More legs than it needs: how they share the load is not unique, how it moves is.",
+        "The legs are redundant: the distribution of the load is not unique, but the motion is.",
         "displacement",
     ),
-    ("ramp", "Box on a ramp", "Sticks below tan θ = μ, slides above it: one body, four contacts.", "apart"),
+    ("ramp", "Box on a ramp", "Sticks below tan θ = μ, slides above: one body, four contacts.", "apart"),
     (
         "newtons_cradle",
         "Newton's cradle",
-        "Distance joints and impacts: contacts of one instant, solved one after the other.",
+        "Distance joints and impacts: contacts of the same instant are solved one after the other.",
         "apart",
     ),
     (
         "four_bar",
         "Four-bar linkage",
-        "A motor drives a closed loop of hinges: one row more than the loop needs.",
+        "A motor drives a closed loop of hinges with redundant rows.",
         "gap",
     ),
 )
 
 
 class Number(NamedTuple):
-    """A line above the pictures: of A and of B, medians of one of `SOLVER_FIELDS` over steps first + 1 to last.
+    """A line above the pictures: medians of a solver value of A and of B over steps first + 1 to last.
 
-    Without any step (0 to 0) of the very first solve, which is one substep.
+    Parameters
+    ----------
+    text : str
+        Label.
+    field : str
+        One of `SOLVER_FIELDS`.
+    first, last : int
+        Range of steps; 0 and 0 select the very first solve, which is one substep.
+    over : str
+        "AB" for the ratio A/B, "BA" for B/A, or "" for no ratio.
     """
 
     text: str
     field: str
     first: int
     last: int
-    over: str  # "AB" for the ratio A/B, "BA" for B/A, or "" without
+    over: str
 
 
 class Side(NamedTuple):
-    """What is set on one side."""
+    """Settings of one side; `warm_start` is WARM or COLD."""
 
     iterations: int
-    warm_start: bool  # WARM or COLD
+    warm_start: bool
     order: str = "given"
     solver: str = "sweeps"
 
@@ -112,32 +121,43 @@ COLD, WARM = False, True
 
 
 class Preset(NamedTuple):
-    """A button of the page: two settings of one scene side by side."""
+    """A button of the page: two settings of one scene side by side.
 
-    name: str  # in the page's address
+    Parameters
+    ----------
+    name : str
+        Name in the address of the page.
+    title : str
+    scene : str
+    sides : (Side, Side)
+    note : str
+        Description of the comparison.
+    numbers : tuple of Number
+    """
+
+    name: str
     title: str
     scene: str
     sides: tuple[Side, Side]
-    note: str  # what to see
+    note: str
     numbers: tuple[Number, ...] = ()
 
 
-_LEFT = "residual after the last sweep [N s]"
-_APPROACH = "approach velocity left [m/s]"
+_FINAL_RESIDUAL = "residual after the last sweep [N s]"
+_FINAL_VIOLATION = "remaining approach velocity [m/s]"
 
-#: The chapter's five, under its numbers (docs/chapter.md), opened by a link.
+#: The five experiments of docs/chapter.md under its numbers; links of the chapter open them.
 EXPERIMENTS = (
     Preset(
         name="experiment=1",
         title="1 directly, or by sweeps",
         scene="stack",
         sides=(Side(16, COLD, solver="newton"), Side(64, COLD)),
-        note="A factorises a few times and is done; B sweeps 64 times and leaves more. Both begin each "
-        "step from nothing. "
-        "In the plots along the sweeps each point of A is a factorisation.",
+        note="A converges after a few factorisations; B has a larger error after 64 sweeps. Both start each step from "
+        "zero impulses. In the plots over the sweeps, each point of A is a factorisation.",
         numbers=(
-            Number(_LEFT, "residual_final", 20, 60, "BA"),
-            Number(_APPROACH, "violation_final", 20, 60, "BA"),
+            Number(_FINAL_RESIDUAL, "residual_final", 20, 60, "BA"),
+            Number(_FINAL_VIOLATION, "violation_final", 20, 60, "BA"),
         ),
     ),
     Preset(
@@ -145,12 +165,11 @@ EXPERIMENTS = (
         title="2 inequalities, sweep by sweep",
         scene="stack",
         sides=(Side(8, COLD, "bottom_up"), Side(32, COLD, "bottom_up")),
-        note="Pause and step: the plots show the error after every sweep. Each impulse is clamped in its "
-        "own row, so that "
-        "the error falls from sweep to sweep; clamping once at the end would not do.",
+        note="Pause and step: the plots show the error after every sweep. Each impulse is clamped in its own row, so "
+        "that the error falls from sweep to sweep; it would not if impulses were clamped only at the end.",
         numbers=(
-            Number(_LEFT, "residual_final", 0, 0, "AB"),
-            Number(_APPROACH, "violation_final", 0, 0, "AB"),
+            Number(_FINAL_RESIDUAL, "residual_final", 0, 0, "AB"),
+            Number(_FINAL_VIOLATION, "violation_final", 0, 0, "AB"),
         ),
     ),
     Preset(
@@ -158,12 +177,11 @@ EXPERIMENTS = (
         title="3 two orders",
         scene="stack",
         sides=(Side(4, COLD, "bottom_up"), Side(4, COLD, "top_down")),
-        note="The same sweeps, from the ground up and from the top down. By the residual B looks better, "
-        "by the approach "
-        "velocity A does: compare orders by the error of all rows, E.",
+        note="The same sweeps, from the ground up and from the top down. B has the smaller residual, A the smaller "
+        "approach velocity: compare orders by the error of all rows, E.",
         numbers=(
-            Number(_LEFT, "residual_final", 20, 60, "AB"),
-            Number(_APPROACH, "violation_final", 20, 60, "AB"),
+            Number(_FINAL_RESIDUAL, "residual_final", 20, 60, "AB"),
+            Number(_FINAL_VIOLATION, "violation_final", 20, 60, "AB"),
         ),
     ),
     Preset(
@@ -171,11 +189,11 @@ EXPERIMENTS = (
         title="4 four sweeps or 64",
         scene="stack",
         sides=(Side(4, COLD, "bottom_up"), Side(64, COLD, "bottom_up")),
-        note="B sweeps sixteen times as often; both from nothing, from the ground up. How much less it "
-        "leaves depends on "
-        "when you look: A moves sideways.",
+        note="B does sixteen times as many sweeps; both start from zero impulses and sweep from the ground up. The "
+        "ratio of the errors depends on the time, because A moves sideways.",
         numbers=tuple(
-            Number(_LEFT, "residual_final", *steps, "AB") for steps in ((0, 0), (20, 60), (180, 240))
+            Number(_FINAL_RESIDUAL, "residual_final", *steps, "AB")
+            for steps in ((0, 0), (20, 60), (180, 240))
         ),
     ),
     Preset(
@@ -183,9 +201,8 @@ EXPERIMENTS = (
         title="5 warm or cold",
         scene="stack",
         sides=(Side(4, WARM, "alternating"), Side(4, COLD, "alternating")),
-        note="Four sweeps in both. A finds its contacts in the cache and begins where the last step "
-        "ended; B begins from "
-        "nothing.",
+        note="Four sweeps in both. A finds its contacts in the cache and starts from the impulses of the last step; B "
+        "starts from zero impulses.",
         numbers=(
             Number("residual before the first sweep [N s]", "residual_initial", 20, 90, "BA"),
             Number("contacts found in the cache", "cache_matches", 20, 90, ""),
@@ -193,63 +210,62 @@ EXPERIMENTS = (
     ),
 )
 
-#: The first opens the page.
+#: The page opens with the first preset.
 PRESETS = (
     Preset(
         name="chain-cold",
         title="a chain, 16 sweeps: warm against cold",
         scene="chain",
         sides=(Side(16, WARM), Side(16, COLD)),
-        note="16 sweeps a substep in both; A starts them from the impulses of the last one, B from "
-        "nothing: its links part.",
+        note="16 sweeps per substep in both. A starts from the impulses of the last substep, B from zero impulses: its "
+        "links separate.",
     ),
     Preset(
         name="4-warm-64-cold",
         title="4 warm against 64 cold",
         scene="stack",
         sides=(Side(4, WARM), Side(64, COLD)),
-        note="B works sixteen times as hard as A and still creeps: each step starts from nothing.",
+        note="B does sixteen times as many sweeps as A and still creeps, because each step starts from zero impulses.",
     ),
     Preset(
         name="bottom-up-top-down",
         title="bottom-up against top-down, cold",
         scene="stack",
         sides=(Side(16, COLD, "bottom_up"), Side(16, COLD, "top_down")),
-        note="The same sweeps in opposite orders, each time from nothing: both towers walk sideways.",
+        note="The same sweeps in opposite orders, each time from zero impulses: both towers drift sideways.",
     ),
     Preset(
         name="heavy-on-light",
         title="heavy on light",
         scene="heavy_on_light",
         sides=(Side(16, WARM), Side(16, COLD)),
-        note="The upper box is a hundred times as heavy. A carries it, B lets it slip off.",
+        note="The upper box is a hundred times as heavy. It stays in A and slips off in B.",
     ),
     Preset(
         name="newton-against-sweeps",
         title="newton against sweeps, cold",
         scene="heavy_on_light",
         sides=(Side(16, COLD, solver="newton"), Side(64, COLD)),
-        note="Each step starts from nothing. A takes a few Newton steps to the answer; B sweeps 64 times "
-        "and the box slips.",
+        note="Each step starts from zero impulses. A needs a few Newton steps; B does 64 sweeps, and the box slips.",
     ),
     Preset(
         name="cards",
         title="a house of cards",
         scene="card_house",
         sides=(Side(16, WARM), Side(16, COLD)),
-        note="A stands. B slides by what its sweeps leave over, and falls after some seconds.",
+        note="A is stable. B slides with the error of its sweeps, and falls after some seconds.",
     ),
 )
 
 
 def layout() -> dict[str, Any]:
-    """Arrays and numbered entries, as this build of the kernels has them.
+    """Return the arrays and the numbered entries of this build of the kernels.
 
     Returns
     -------
     dict
-        arrays: buffer -> names in order; size, head, setting, joint, joint_kinds: name -> place, number; orders:
-        name -> number; steppers: name -> what it writes.
+        arrays: buffer -> names in order; size, head, setting, joint, joint_kinds: name -> index or number; orders: name
+        -> number; steppers: name -> entries that it sets.
     """
     return {
         "arrays": {buffer: tuple(names) for buffer, names in SHAPES.items()},
@@ -264,18 +280,18 @@ def layout() -> dict[str, Any]:
 
 
 def _stepper(name: str) -> dict[str, dict[str, Any]]:
-    """What a stepper writes into `head` and `setting`."""
+    """Return the entries of `head` and `setting` that a stepper sets."""
     state = Simulation(Scene("stack", stepper=name)).snapshot()
     first = offsets(state.size)
     head, setting = state.index[first["head"] :], state.real[first["setting"] :]
-    numbers = {place: int(head[HEAD[place]]) for place in ("stepper", "relaxing", "position_iterations")}
+    numbers = {slot: int(head[HEAD[slot]]) for slot in ("stepper", "relaxing", "position_iterations")}
     return {"head": numbers, "setting": {p: float(setting[SETTING[p]]) for p in ("hertz", "ratio", "push")}}
 
 
 def describe(start: Snapshot) -> dict[str, Any]:
-    """Sizes, and every array that is not all zero as a list of numbers, of a snapshot.
+    """Return the sizes of a snapshot and, as lists of numbers, its arrays that are not all zero.
 
-    Exact when written as JSON, since the shortest text of a double that reads back as the same double is written.
+    The numbers are exact in JSON, which uses the shortest text that reads back as the same double.
     """
     first = offsets(start.size)
     arrays = {}
@@ -289,7 +305,7 @@ def describe(start: Snapshot) -> dict[str, Any]:
 
 
 def page_scenes() -> dict[str, Any]:
-    """Everything that the page reads: layout, scenes and presets."""
+    """Return all data that the page reads: layout, scenes and presets."""
     scenes = []
     for name, title, note, measure in PAGE:
         scene = Scene(name)

@@ -1,4 +1,4 @@
-"""A film in the page: a server on this machine that hands out frames as they come."""
+"""Serve a film to the page on this machine, with new frames as they are added."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
 from lavender.sim.engine.film import Film
-from lavender.sim.web.pages import HERE, Handler, bound
+from lavender.sim.web.pages import HERE, Handler, create_server
 
-MOST_FRAMES = 2000  # of one answer
+MAX_FRAMES_PER_ANSWER = 2000
 
 
 class Viewer:
-    """Serves the page `view.html` for a film until it is closed; a context manager.
+    """Server of the page `view.html` for a film until it is closed; a context manager.
 
     Parameters
     ----------
     film : Film
-        May grow while it is shown.
+        Frames may be added while it is shown.
     port : int
-        On the loopback address; 0 takes a free one.
+        Port on the loopback address; 0 selects a free one.
     browser : bool
         Open the page.
     end : callable, optional
@@ -33,7 +33,7 @@ class Viewer:
     Raises
     ------
     InputError
-        A port that is taken.
+        The port is in use.
     """
 
     def __init__(
@@ -41,7 +41,7 @@ class Viewer:
     ) -> None:
         self.film = film
         self._end: Callable[[], Any] | None = end
-        self._server = bound(partial(_FilmHandler, film), port)
+        self._server = create_server(partial(_FilmHandler, film), port)
         self._server.daemon_threads = True
         self._thread = threading.Thread(target=self._server.serve_forever, daemon=True)
         self._thread.start()
@@ -52,11 +52,11 @@ class Viewer:
 
     @property
     def address(self) -> str:
-        """Where the page is."""
+        """Address of the page."""
         return f"http://127.0.0.1:{self._server.server_address[1]}/view.html"
 
     def wait(self) -> None:
-        """Until Ctrl-C; the film stays to be looked at."""
+        """End the film and wait until Ctrl-C; the film can still be viewed."""
         self.film.ended = True
         try:
             self._thread.join()
@@ -89,9 +89,9 @@ class _FilmHandler(Handler):
         super().__init__(*arguments, directory=str(HERE / "page"))
 
     def do_GET(self) -> None:
-        """The page's files; `film.json`, the header; `frames?from=K&stride=S`, frames from number K on."""
+        """Answer with `film.json` (the header), `frames?from=K&stride=S` (frames from number K on) or a page file."""
         host = self.headers.get("Host", "").rsplit(":", 1)[0]
-        if host not in ("127.0.0.1", "localhost"):  # a name that a foreign page has bent to this machine
+        if host not in ("127.0.0.1", "localhost"):  # A foreign page may map its own name to this machine.
             self.send_error(HTTPStatus.FORBIDDEN)
             return
         address = urlsplit(self.path)
@@ -103,6 +103,7 @@ class _FilmHandler(Handler):
             super().do_GET()
 
     def _frames(self, query: dict[str, list[str]]) -> None:
+        """Answer a request for frames; start again from 0 if the stride of the film has changed."""
         try:
             first, stride = (int(query.get(name, ["0"])[0]) for name in ("from", "stride"))
             if first < 0:
@@ -112,14 +113,15 @@ class _FilmHandler(Handler):
             return
         film = self._film
         ended = film.ended
-        if stride != film.stride:  # every other frame has been dropped: begin again
+        if stride != film.stride:  # Every second frame has been dropped: start again.
             first = 0
-        found = film.frames(first)[:MOST_FRAMES]
-        whole = ended and first + len(found) >= len(film)
-        more = {"X-First": str(first), "X-Stride": str(film.stride), "X-Ended": str(int(whole))}
-        self._answer("application/octet-stream", found.astype("<f4").tobytes(), more)
+        frames = film.frames(first)[:MAX_FRAMES_PER_ANSWER]
+        is_complete = ended and first + len(frames) >= len(film)
+        headers = {"X-First": str(first), "X-Stride": str(film.stride), "X-Ended": str(int(is_complete))}
+        self._answer("application/octet-stream", frames.astype("<f4").tobytes(), headers)
 
     def _answer(self, kind: str, data: bytes, headers: dict[str, str]) -> None:
+        """Send `data` of content type `kind` with additional headers."""
         self.send_response(HTTPStatus.OK)
         self.send_header("Content-Type", kind)
         self.send_header("Content-Length", str(len(data)))

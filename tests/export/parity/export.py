@@ -22,7 +22,7 @@ from record import SCENES, STEPS  # noqa: E402
 
 import lavender as lv  # noqa: E402
 from lavender.export import engine_image, vectors  # noqa: E402
-from lavender.export.view import NotTaken  # noqa: E402
+from lavender.export.view import NotSupported  # noqa: E402
 from lavender_ext.engine.arrays import views  # noqa: E402
 
 ORDERS = ("symmetric", "random", "reverse")
@@ -89,7 +89,7 @@ def solved(given, number):
         for tol, iterations, options in asked:
             try:
                 yield vectors.pack(given, solver, tol, iterations, options)[0]
-            except (NotTaken, lv.CapabilityError):
+            except (NotSupported, lv.CapabilityError):
                 continue
 
 
@@ -118,7 +118,7 @@ def record(folder, steps=STEPS, scenes=SCENES):
     (folder / "scenes.bin").write_bytes(numbers(len(made)) + b"".join(made))
     given = [*problems(), *of_velocities()]
     packed = [vector for i, problem in enumerate(given) for vector in solved(problem, i)]
-    (folder / "vectors.bin").write_bytes(vectors.file_of(packed))
+    (folder / "vectors.bin").write_bytes(vectors.join_vectors(packed))
     return len(made), len(packed)
 
 

@@ -12,7 +12,7 @@ ROOT = HERE.parents[2]
 pytestmark = pytest.mark.slow
 
 
-def why_not():
+def missing_requirement():
     if shutil.which("gcc") is None:
         return "gcc is not installed"
     pytest.importorskip("ziglang", reason="ziglang is not installed (extra: wasm): no compiler for AArch64")
@@ -20,8 +20,8 @@ def why_not():
 
 
 def test_x86_and_aarch64_have_the_bits_of_the_extension_and_contraction_is_seen():
-    if why_not():
-        pytest.skip(why_not())
+    if missing_requirement():
+        pytest.skip(missing_requirement())
     done = subprocess.run(
         [sys.executable, str(ROOT / ".ci" / "parity"), "--quick", "--steps", "20"],
         capture_output=True, text=True, check=False, cwd=ROOT,

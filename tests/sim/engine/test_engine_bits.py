@@ -148,12 +148,12 @@ def test_arrays_grow_in_one_go_and_pair_lists_last():
     sim, small = (lv.Simulation(lv.Scene("pile", n=60, kind="boxes")) for _ in range(2))
     anew = paired_anew(lv.Simulation(lv.Scene("pile", n=60, kind="boxes")), None)
     small.state = with_room(small.state, 3, 3)
-    grown = 0
+    with_larger_buffers = 0
     for _ in range(80):
         before = int(sim.state.size[9])
         assert len({trajectory(of, 1)[0] for of in (sim, small, anew)}) == 1
-        grown += int(sim.state.size[9]) != before
-    assert small.state.size[9] > 3 and grown <= 3
+        with_larger_buffers += int(sim.state.size[9]) != before
+    assert small.state.size[9] > 3 and with_larger_buffers <= 3
     assert sim.state.head[HEAD["rebuilds"]] < 0.7 * anew.state.head[HEAD["rebuilds"]]
 
 

@@ -10,7 +10,7 @@ from test_engine_bits import SCENES
 from worked import after
 
 import lavender as lv
-from lavender.io.stored import framed, unframed
+from lavender.io.stored import pack_header, unpack_header
 from lavender.sim.engine import stepping
 from lavender.sim.engine.layout import HEAD
 from lavender.sim.engine.snapshot import MAGIC
@@ -106,7 +106,7 @@ def test_foreign_and_damaged_snapshots_are_refused(tmp_path):
         with pytest.raises(lv.InputError, match=r"not a lavender snapshot|damaged"):
             sim.load(path)
     # What is cut or lengthened inside a file whose checksum is right.
-    header, end = unframed(data, MAGIC, 2**20)
+    header, end = unpack_header(data, MAGIC, 2**20)
     said, arrays = header["lengths"], data[end:-32]
     for lengths, rest in (
         (said, arrays[:-8]),
@@ -117,7 +117,7 @@ def test_foreign_and_damaged_snapshots_are_refused(tmp_path):
         ([10**30, *said[1:]], arrays),
         ([*said[:3], float(said[3])], arrays),
     ):
-        body = framed(MAGIC, {**header, "lengths": lengths}) + rest
+        body = pack_header(MAGIC, {**header, "lengths": lengths}) + rest
         path.write_bytes(body + hashlib.sha256(body).digest())
         with pytest.raises(lv.InputError, match=r"does not hold what its header says|size has 9 entries"):
             sim.load(path)
@@ -237,7 +237,7 @@ def test_recorded_problems_are_the_problems_of_the_steps(tmp_path):
 
 
 def test_the_motion_is_not_computed_for_those_who_do_not_ask(monkeypatch):
-    monkeypatch.setattr(stepping, "moved", None)
+    monkeypatch.setattr(stepping, "motion_summary", None)
     *_, info = lv.Simulation("stack").step()
     assert "motion" not in info
 

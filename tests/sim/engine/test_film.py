@@ -72,10 +72,10 @@ def test_the_film_of_a_run_that_was_lost_can_be_read_and_drawn(tmp_path):
 
 
 def test_a_long_film_drops_every_other_frame_and_keeps_its_end(monkeypatch):
-    monkeypatch.setattr(films, "MOST_BYTES", 64 * 4 * (9 + 7 * 3))
+    monkeypatch.setattr(films, "MAX_FILM_BYTES", 64 * 4 * (9 + 7 * 3))
     sim = lv.Simulation(lv.Scene("heavy_on_light"))
     film = sim.film(1000)
-    assert film.frames().nbytes <= films.MOST_BYTES
+    assert film.frames().nbytes <= films.MAX_FILM_BYTES
     assert film.stride == 16
     steps = np.rint(film.time * 120).astype(int)
     np.testing.assert_array_equal(steps, np.arange(len(steps)) * film.stride)
@@ -166,12 +166,12 @@ def test_a_body_is_painted_where_it_is():
     # a ball alone, seen from the front: where it is dark in the picture is where it is in the film
     from matplotlib.figure import Figure
 
-    from lavender.sim.engine.picture import Stage
+    from lavender.sim.engine.picture import FilmView
 
     scene = lv.Scene(gravity=0.0)
     scene.add_sphere(0.5, position=(0, 0, 0), velocity=(2.0, 0, 0))
     film = lv.Simulation(scene).film(60)
-    stage = Stage(film, 0.0, 0.0)
+    stage = FilmView(film, 0.0, 0.0)
     axes = Figure().subplots()
     for frame in (0, 60):
         stage.paint(axes, frame)

@@ -87,8 +87,8 @@ def test_inverse_and_rotations_are_those_of_linear_algebra():
         assert q[0] >= 0.0
         np.testing.assert_allclose(rotation(q), r, rtol=0.0, atol=1e-14)
         p = rng.normal(size=3)
-        np.testing.assert_allclose(arithmetic.turned(r, p), r @ p, rtol=0.0, atol=1e-14)
-        np.testing.assert_allclose(arithmetic.turned_back(r, p), r.T @ p, rtol=0.0, atol=1e-14)
+        np.testing.assert_allclose(arithmetic.rotate(r, p), r @ p, rtol=0.0, atol=1e-14)
+        np.testing.assert_allclose(arithmetic.rotate_back(r, p), r.T @ p, rtol=0.0, atol=1e-14)
         assert arithmetic.norm(p) == pytest.approx(np.linalg.norm(p), rel=1e-15)
     np.testing.assert_allclose(
         rotation(quaternion((0, 0, 2), np.pi / 2)), [[0, -1, 0], [1, 0, 0], [0, 0, 1]], rtol=0.0, atol=1e-15

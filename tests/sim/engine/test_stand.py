@@ -22,7 +22,7 @@ def drift(name, seconds=SECONDS, *, dt=1 / 60, **parameters):
             status, done = sim.state.kernel.substeps(left)
             left -= done
             if status == 1:
-                sim.state = sim.state.grown()
+                sim.state = sim.state.with_larger_buffers()
         x = sim.state.a["x"]
         if np.abs(x - first).max() > MAX_DISPLACEMENT:  # also in the first two seconds
             return np.inf

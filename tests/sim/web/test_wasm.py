@@ -23,7 +23,7 @@ CHECK = HERE / "check_wasm_exports.mjs"
 # Left out where the kernels run with every check on: the module is compiled without them either way.
 pytestmark = pytest.mark.slow
 
-needs_compiler = pytest.mark.skipif(bool(wasm.why_not()), reason=wasm.why_not())
+needs_compiler = pytest.mark.skipif(bool(wasm.missing_requirement()), reason=wasm.missing_requirement())
 
 
 @pytest.fixture(scope="session")
@@ -82,7 +82,7 @@ SIGNS = {"libm": "symbol: sin", "a parallel loop": "PyEval_SaveThread"}  # else:
 def test_a_kernel_that_needs_more_does_not_link(tmp_path, kind):
     path = tmp_path / "bad.pyx"
     path.write_text(HEAD + BAD[kind])
-    with pytest.raises(wasm.BuildFailed, match=SIGNS.get(kind, "Python's side")):
+    with pytest.raises(wasm.BuildFailed, match=SIGNS.get(kind, "the Python part")):
         wasm.build(tmp_path / "bad.wasm", ROOT, [path])
     assert not (tmp_path / "bad.wasm").exists()
 
@@ -113,7 +113,7 @@ def test_the_same_sources_give_the_same_bytes_and_pointers_of_the_module_s_machi
         assert built.size < 1000
     assert (tmp_path / "one.wasm").read_bytes() == (tmp_path / "two.wasm").read_bytes()
     with pytest.raises(wasm.BuildFailed, match="below 10 are allowed"):
-        wasm.build(tmp_path / "good.wasm", ROOT, [path], largest=10)
+        wasm.build(tmp_path / "good.wasm", ROOT, [path], max_bytes=10)
 
 
 @pytest.mark.parametrize("name", list(wasm.PARTS))
@@ -122,7 +122,7 @@ def test_a_module_has_the_size_that_the_page_says_and_room_to_grow(name, request
     page = (ROOT / "docs" / "web.md").read_text(encoding="utf-8")
     (told,) = re.findall(rf"`{name}\.wasm` \((\d+) kB\)", page)
     assert size == pytest.approx(1000 * int(told), rel=0.03)  # compilers differ by a percent or two
-    assert size < 0.95 * wasm.LARGEST
+    assert size < 0.95 * wasm.MAX_MODULE_BYTES
 
 
 def test_a_compiler_that_is_not_there_is_named(tmp_path, monkeypatch):
@@ -137,17 +137,17 @@ def test_a_folder_that_is_not_there_is_named(tmp_path):
 
 
 def test_without_compiler_a_missing_or_stale_module_says_what_to_do(tmp_path, monkeypatch):
-    monkeypatch.setattr(wasm, "why_not", lambda: "no compiler")
+    monkeypatch.setattr(wasm, "missing_requirement", lambda: "no compiler")
     monkeypatch.setattr(pages, "SHIPPED", tmp_path)
     with pytest.raises(
         LavenderError, match="lavender is not in this installation and cannot be built: no compiler"
     ):
         pages.module()
-    other = b"\0asm\1\0\0\0" + wasm.section(wasm.SECTION, b"0" * 64)
+    other = b"\0asm\1\0\0\0" + wasm.section(wasm.SOURCES_SECTION, b"0" * 64)
     (tmp_path / "lavender.wasm").write_bytes(other)
     with pytest.raises(LavenderError, match="is of other kernels"):
         pages.module()
-    fresh = b"\0asm\1\0\0\0" + wasm.section(wasm.SECTION, wasm.source_hash(ROOT).encode())
+    fresh = b"\0asm\1\0\0\0" + wasm.section(wasm.SOURCES_SECTION, wasm.source_hash(ROOT).encode())
     (tmp_path / "lavender.wasm").write_bytes(fresh)
     assert pages.module() == fresh
 

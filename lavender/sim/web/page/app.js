@@ -1,25 +1,25 @@
-// The page: two simulations of one scene with settings of their own, stepped together, drawn and plotted.
+// The page: two simulations of one scene with different settings, stepped together, drawn and plotted.
 
 import { Chart, OVER_TIME, positive } from "./charts.js";
 import { colors, fail, find } from "./draw.js";
 import { Newton, ORDERS, SOLVER_FIELDS } from "./lavender.js";
 import { Side } from "./side.js";
 
-const MOST_STEPS = 6; // in one frame; a slower machine runs slower than real time
-const PART_EVERY = 16; // ms between two parts of the page beside the pictures, of eight, while it runs
-const MOST_PARTS = 3; // in one frame
+const MOST_STEPS = 6; // Largest number of steps per frame; a slow machine runs slower than real time.
+const PART_EVERY = 16; // [ms] Time between updates of two of the eight parts of the page that are not pictures, while it runs.
+const MOST_PARTS = 3; // Largest number of such updates per frame.
 const PLAIN = ["scene", "a", "b", "speed", "play"];
 
 class App {
   constructor(module, contents) {
     this.module = module;
     this.contents = contents;
-    this.newton = null; // the module, once it has been asked for and has come
+    this.newton = null; // The module, after it was requested and loaded.
     this.playing = false;
-    this.owed = 0; // s, simulated time that the frames have not stepped yet
+    this.owed = 0; // [s] Simulated time that has not been stepped yet.
     this.last = null;
-    this.due = 0; // parts of the page that the next picture brings up to date
-    this.next = 0; // the first of them
+    this.due = 0; // Number of parts of the page to update with the next picture.
+    this.next = 0; // The first part to update.
     this.colors = colors();
     this.sides = Array.from(document.querySelectorAll(".side"), (place, i) => new Side(place, i, this));
     const views = this.sides.map((side) => side.view);
@@ -87,7 +87,7 @@ class App {
       return;
     }
     if (event.target.tagName === "SELECT" && event.key.length === 1) {
-      return; // a letter or digit there chooses an option
+      return; // In such a field, a letter or digit selects an option.
     }
     const side = this.sides[event.shiftKey ? 1 : 0];
     const sweeps = (by) => side.set({ iterations: Math.min(64, Math.max(4, side.simulation.settings.iterations + by)) });
@@ -114,14 +114,14 @@ class App {
     }
   }
 
-  // -- the address: everything that is set, or the name of a preset or of a scene alone
+  // -- the address: all settings, or only the name of a preset or of a scene
 
   read() {
     let words = location.hash.slice(1);
     try {
       words = decodeURIComponent(words);
     } catch {
-      // a "%" that encodes nothing: a name as it stands
+      // An invalid escape sequence: the name is used unchanged.
     }
     const given = new URLSearchParams(words.includes("=") ? words : "");
     const preset = this.contents.presets.find((one) => one.name === words);
@@ -179,14 +179,14 @@ class App {
     if (this.now !== now) {
       this.now = now;
       const pressed = document.querySelector("[data-preset][aria-pressed=true]");
-      if (pressed) { // where the row of buttons is wider than the window
+      if (pressed) { // The row of buttons may be wider than the window.
         pressed.parentElement.scrollLeft = pressed.offsetLeft - pressed.parentElement.offsetLeft;
       }
       this.forgetNumbers();
     }
   }
 
-  // The lines of an experiment, before a step has been taken.
+  // Create the lines of an experiment before the first step.
   forgetNumbers() {
     const numbers = this.now?.numbers ?? [];
     this.seen = numbers.map(() => null);
@@ -200,7 +200,7 @@ class App {
     }));
   }
 
-  // Each line is told once, when its last step has been taken.
+  // Fill each line once, after its last step.
   tellNumbers() {
     (this.now?.numbers ?? []).forEach(({ field, first, last, over }, i) => {
       if (this.seen[i]) {
@@ -243,12 +243,12 @@ class App {
       });
   }
 
-  // Whether a side waits for the module of Newton's method.
+  // Return whether a side waits for the module of Newton's method.
   get waiting() {
     return this.sides.some((side) => side.wanted === "newton" && !side.simulation.newton);
   }
 
-  // -- a body held by the pointer, on both sides alike
+  // -- a body held by the pointer, in the same way on both sides
 
   grab(side, body) {
     if (side.simulation.array("dyn")[body] >= 0) {
@@ -285,7 +285,7 @@ class App {
     this.show(true);
   }
 
-  // A pause begins with a step that is watched, so that what is shown belongs to one step.
+  // A pause begins with a step that records its sweeps, so that all displayed data belong to one step.
   play(on) {
     const pauses = this.playing && !on;
     this.playing = on;
@@ -298,7 +298,7 @@ class App {
     this.write();
   }
 
-  // The same steps on both sides.
+  // Do the same steps on both sides.
   advance(steps) {
     if (this.waiting) {
       return;
@@ -340,7 +340,7 @@ class App {
     this.show(true);
   }
 
-  // The same push on both sides, the same after every reset.
+  // Apply the same push on both sides; it is also the same after every reset.
   push() {
     const start = this.seed;
     for (const side of this.sides) {
@@ -368,8 +368,8 @@ class App {
     requestAnimationFrame((next) => this.frame(next));
   }
 
-  // The pictures, and of all else everything or what is due: text and charts that changed in every frame would cost
-  // more than the pictures.
+  // Draw the pictures, and update all other parts or only those that are due: updating text and charts in every frame
+  // would take more time than the pictures.
   show(always) {
     this.sides.forEach((side) => side.draw());
     const n = this.parts.length;
@@ -382,7 +382,7 @@ class App {
     }
   }
 
-  // What the two settings did, measured.
+  // Update the captions with the measured effects of the two settings.
   caption() {
     find("clock").textContent = `${(this.steps * this.scene.dt).toFixed(3)} s, step ${this.steps}`;
     const { measure, bodies } = this.scene;
@@ -408,7 +408,7 @@ class App {
     }
   }
 
-  // Sweeps are watched one by one, Newton's method at its scores: each side has its own places, joined by lines.
+  // The error is recorded at every sweep, or at the checks of Newton's method: each side has its own points, joined by lines.
   plotCurves() {
     const along = [...new Set(this.sides.flatMap((side) => side.curve?.at ?? []))].sort((x, y) => x - y);
     for (const name of ["energy", "normal"]) {
@@ -431,7 +431,7 @@ class App {
   }
 }
 
-// As people say lengths: 8 cm, 0.3 mm, 1.2 m.
+// Format a length with a suitable unit: 8 cm, 0.3 mm, 1.2 m.
 export function length(x) {
   if (!Number.isFinite(x)) {
     return "out of sight";

@@ -1,9 +1,9 @@
-// Plots of the page: uPlot in its colours, over time or over sweeps.
+// Plots of the page with uPlot, in the colours of the page, over time or over sweeps.
 
 import { find } from "./draw.js";
 
 export const positive = (x) => (x > 0 ? x : null);
-// Of each chart over time the fields of both sides, in the order of its series.
+// Fields of each chart over time, for both sides, in the order of its series.
 export const OVER_TIME = {
   residual: { fields: ["residual_initial", "residual_final"], change: positive },
   violation: { fields: ["violation_initial", "violation_final"], change: positive },
@@ -24,7 +24,7 @@ function upwards(plot, low, high) {
 }
 
 export class Chart {
-  // series: { side, dash, scale } each; `log`: powers of ten on the left.
+  // series: an array of { side, dash, scale }; `log`: logarithmic left axis.
   constructor(place, series, { log = false, right = false, empty = false, x = "time [s]" } = {}) {
     this.place = find(place);
     this.series = series;
@@ -38,7 +38,7 @@ export class Chart {
     return { width: Math.max(200, this.place.clientWidth), height: 190 };
   }
 
-  // Also after a change between light and dark.
+  // It also runs after a change between the light and the dark style.
   make() {
     this.plot?.destroy();
     const style = getComputedStyle(document.documentElement);
@@ -82,7 +82,7 @@ export class Chart {
 
   set(data) {
     this.data = data;
-    // A panel that has nothing to show gives way.
+    // A panel without data is hidden.
     const figure = this.place.closest("figure");
     const nothing = data[0].length > 0 && data.slice(1).every((ys) => ys.every((y) => y === null || y === undefined || (this.options.empty && y === 0)));
     if (figure.hidden !== nothing) {

@@ -1,4 +1,4 @@
-// Bodies on a canvas: an orthographic view of boxes, spheres, the ground, joints and contacts.
+// Draw an orthographic view of boxes, spheres, the ground, joints and contacts on a canvas.
 
 const PLANE = 1;
 const SPHERE = 2;
@@ -10,7 +10,7 @@ const FACES = [
 ];
 const LIGHT = [-0.45, -0.62, 0.64];
 
-// Rows of the rotation matrix of a unit quaternion w, x, y, z, at q[4 i], one after the other.
+// Return the rotation matrix, row by row, of the unit quaternion w, x, y, z at q[4 i].
 function rotation(q, i) {
   const [w, x, y, z] = [q[4 * i], q[4 * i + 1], q[4 * i + 2], q[4 * i + 3]];
   return [
@@ -24,12 +24,12 @@ function dot(a, b) {
   return a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 }
 
-// How far a column of a rotation points along an axis.
+// Return the component of a column of a rotation matrix along an axis.
 function along(r, column, axis) {
   return r[column] * axis[0] + r[3 + column] * axis[1] + r[6 + column] * axis[2];
 }
 
-// hsl of a face: the body's hue, brightness by the light in whole percents, so that few colours are ever read.
+// Return the hsl colour of a face: hue of the body, brightness in whole percents, so that few colours have to be parsed.
 const shades = new Map();
 function shade(hue, saturation, bright, dark) {
   const light = Math.round(dark ? 26 + 34 * bright : 44 + 36 * bright);
@@ -42,7 +42,7 @@ function shade(hue, saturation, bright, dark) {
   return said;
 }
 
-// What the page's style sets, light or dark.
+// Return the colours of the page's style, light or dark.
 export function colors() {
   const style = getComputedStyle(document.documentElement);
   const dark = matchMedia("(prefers-color-scheme: dark)").matches;
@@ -69,7 +69,7 @@ export function fail(text) {
   find("failure").hidden = false;
 }
 
-// A row of a table for each field, with its unit; returns the cells of the values by field.
+// Add a table row with label and unit for each field; return the cells of the values by field.
 export function rows(table, fields) {
   return Object.fromEntries(fields.map((field) => {
     const row = table.insertRow();
@@ -87,8 +87,8 @@ export function rows(table, fields) {
 export class View {
   constructor(canvas) {
     this.canvas = canvas;
-    this.context = canvas.getContext("2d", { alpha: false }); // its own background: nothing to blend on the page
-    this.size = null; // [px], asked of the layout only after it changed
+    this.context = canvas.getContext("2d", { alpha: false }); // The canvas is opaque: the browser need not blend it with the page.
+    this.size = null; // [px]; the layout is only queried after a change.
     new ResizeObserver(() => {
       const { clientWidth, clientHeight } = canvas;
       const before = this.size;
@@ -97,8 +97,8 @@ export class View {
         this.onlook?.();
       }
     }).observe(canvas);
-    this.turn = 0.45; // rad, about the vertical
-    this.tilt = 0.22; // rad, from above
+    this.turn = 0.45; // [rad] about the vertical
+    this.tilt = 0.22; // [rad] from above
     this.linked = [this];
     this.box = null;
     this.#listen();
@@ -161,7 +161,7 @@ export class View {
     }
   }
 
-  // The nearest body of the picture as it was drawn that lies under a place on the canvas, or -1.
+  // Return the nearest body of the last picture at a position on the canvas, or -1.
   bodyAt(at) {
     let best = { body: -1, depth: Infinity };
     for (const { body, middle, size } of this.places ?? []) {
@@ -172,13 +172,13 @@ export class View {
     return best.body;
   }
 
-  // A way on the canvas [px] as one in the scene [m], across the line of sight.
+  // Convert a displacement on the canvas [px] to one in the scene [m], orthogonal to the line of sight.
   inScene(dx, dy) {
     const { right, top, scale } = this.eye;
     return [0, 1, 2].map((k) => (dx * right[k] - dy * top[k]) / scale);
   }
 
-  // What the picture must hold: the bodies at the start, with room.
+  // Compute the bounds of the picture: the bodies at the start, with a margin.
   fit(simulation) {
     const [x, kind, shape] = ["x", "kind_of_shape", "shape"].map((name) => simulation.array(name));
     const low = [Infinity, Infinity, Infinity];
@@ -196,14 +196,14 @@ export class View {
       }
     });
     if (simulation.joints > 0 && !hasGround) {
-      // A chain swings about the world's origin as far as it is long.
+      // A chain swings about the world's origin with a radius of its length.
       const reach = Math.max(...high.map((v, k) => Math.max(v, -low[k])));
       [low[0], low[2], high[0], high[2]] = [-reach, -1.05 * reach, reach, 0.05 * reach];
     }
     this.hold(low, high, hasGround);
   }
 
-  // What the picture must hold, as a box.
+  // Set the bounds of the picture as a box.
   hold(low, high, hasGround) {
     this.hasGround = hasGround;
     this.low = low;
@@ -225,11 +225,11 @@ export class View {
     c.fillRect(0, 0, width, height);
     c.lineJoin = "round";
     const [sin, cos, up, flat] = [Math.sin(this.turn), Math.cos(this.turn), Math.sin(this.tilt), Math.cos(this.tilt)];
-    // Right, away from the eye, up on the screen.
+    // Directions to the right, away from the viewer, and up on the screen.
     const right = [cos, sin, 0];
     const away = [-sin * flat, cos * flat, -up];
     const top = [-sin * up, cos * up, flat];
-    // As large as the box of what must be seen allows.
+    // The scale is the largest one at which the bounds fit.
     const corners = [0, 1, 2, 3, 4, 5, 6, 7].map((k) => [0, 1, 2].map((j) => (k & (1 << j) ? this.high : this.low)[j]));
     const extent = (axis) => [Math.min, Math.max].map((pick) => pick(...corners.map((p) => dot(p, axis))));
     const [across, tall] = [extent(right), extent(top)];
@@ -248,7 +248,7 @@ export class View {
     this.#contacts(simulation, colors);
   }
 
-  // Where a point lies on the canvas [px], and how far away [m].
+  // Return the position of a point on the canvas [px] and its depth [m].
   #project(x, y, z) {
     const { right, top, away, scale, left, high } = this.eye;
     return [
@@ -277,7 +277,7 @@ export class View {
     c.stroke();
   }
 
-  // What there is to paint: faces of boxes that look this way, and balls; `depth` [m] is that of the middle.
+  // Collect the visible faces of boxes, and balls; `depth` [m] is the depth of the centre.
   #bodies(simulation, colors) {
     const { away, scale } = this.eye;
     const [x, q, kind, shape] = ["x", "q", "kind_of_shape", "shape"].map((name) => simulation.array(name));
@@ -341,8 +341,8 @@ export class View {
     c.stroke();
   }
 
-  // A shaded ball with three great circles, so that turning shows. The half of a circle that can be seen is half an
-  // ellipse: its long axis is a diameter of the ball, across the circle's normal n; its short one size |n away|.
+  // Draw a shaded ball with three great circles, which show its rotation. The visible half of a circle is half an
+  // ellipse: its long axis is a diameter of the ball, orthogonal to the circle's normal n; the short one is size |n away|.
   #ball({ middle, size, hue, r }, colors) {
     const { context: c } = this;
     const { right, top, away } = this.eye;
@@ -376,7 +376,7 @@ export class View {
     c.stroke();
   }
 
-  // A dot at each joint, and a line from there to the middle of its second body.
+  // Draw a dot at each joint, and a line from it to the centre of its second body.
   #joints(simulation, colors) {
     const { context: c } = this;
     const [x, q, joint, bodies] = ["x", "q", "joint", "joint_bodies"].map((name) => simulation.array(name));
@@ -401,7 +401,7 @@ export class View {
     }
   }
 
-  // A dot where bodies touch, as large as the normal impulse is beside the largest.
+  // Draw a dot at each contact; its size shows the normal impulse relative to the largest one.
   #contacts(simulation, colors) {
     const { context: c } = this;
     const [point, impulse, ptr] = ["point", "impulse", "ptr"].map((name) => simulation.array(name));

@@ -1,12 +1,11 @@
-// The kernels of lavender.wasm for JavaScript: memory, and a simulation over three buffers; and newton.wasm, exact solves
-// for it.
+// JavaScript interface of lavender.wasm (memory, and a simulation in three buffers) and of newton.wasm (exact solves).
 //
-// The module has no imports and no allocator: whatever it works on lies where this file puts it.
+// The module has no imports and no allocator: this file places all its data in its memory.
 
-const SIZES = 10; // entries of size[], see lavender_ext/engine/arrays.pxd
+const SIZES = 10; // Entries of size[], as in lavender_ext/engine/arrays.pxd.
 const MOST_SWEEPS = 64;
-const MOST_TRACED = 256; // scores of one solve by Newton's method, see lavender_ext/newton/warm_start.pxd
-export const TOL = 1e-6; // relative residual at which such a solve ends, as in Python
+const MOST_TRACED = 256; // Largest number of checks of one solve by Newton's method, as in lavender_ext/newton/warm_start.pxd.
+export const TOL = 1e-6; // Relative residual at which Newton's method ends, as in Python.
 const OK = 0;
 const NEED_ROOM = 1;
 const NOT_FINITE = 2;
@@ -18,7 +17,7 @@ export const SOLVER_FIELDS = [
 export const ORDERS = ["given", "reverse", "symmetric", "random", "bottom_up", "top_down", "colored", "alternating"];
 
 export class Kernels {
-  // `module`: a WebAssembly.Module; `layout`: arrays and places in them, as lavender.sim.web.scenes lists them.
+  // `module`: a WebAssembly.Module; `layout`: arrays and indices, as listed by lavender.sim.web.scenes.
   constructor(module, layout) {
     this.functions = new WebAssembly.Instance(module, {}).exports;
     this.memory = this.functions.memory;
@@ -26,7 +25,7 @@ export class Kernels {
     this.top = this.functions.__heap_base.value;
   }
 
-  // Zeroed bytes; they stay until `top` is set back.
+  // Allocate zeroed bytes; they are free again when `top` is reset.
   alloc(bytes) {
     const place = Math.ceil(this.top / 16) * 16;
     this.top = place + bytes;
@@ -38,7 +37,7 @@ export class Kernels {
     return place;
   }
 
-  // Views are made when they are used: growing the memory detaches older ones.
+  // Views are created at each use, because growing the memory detaches older ones.
   f64(place, n) {
     return new Float64Array(this.memory.buffer, place, n);
   }
@@ -55,7 +54,7 @@ export class Kernels {
     return new Uint8Array(this.memory.buffer, place, n);
   }
 
-  // A copy in the module's memory; returns where.
+  // Copy values to the module's memory; return the address.
   putInts(values) {
     const place = this.alloc(4 * Math.max(values.length, 1));
     this.i32(place, values.length).set(values);
@@ -63,8 +62,8 @@ export class Kernels {
   }
 }
 
-// Newton's method for simulations on `kernels`: a module beside the other, in its memory. `solve` is for a substep that is
-// prepared and has its guess applied.
+// Newton's method for simulations on `kernels`: a second module in the same memory. `solve` needs a prepared substep with
+// its initial guess applied.
 export class Newton {
   constructor(module, kernels) {
     this.k = kernels;
@@ -78,7 +77,7 @@ export class Newton {
     this.places = [0, 0];
   }
 
-  // Room for n numbers of 4 or 8 bytes; what became too small is not given back.
+  // Return memory for n numbers of 4 or 8 bytes; memory that has become too small is not reused.
   #scratch(which, n) {
     if (n < 0) {
       throw new Error("the substep needs more than 2^31 numbers of scratch");
@@ -90,8 +89,8 @@ export class Newton {
     return this.places[which];
   }
 
-  // { met, sweeps, steps, relative, at, energy, normal }: whether the residual is within tol, the work, the relative
-  // residual; and of each score on the way the work so far, E [sqrt J] and max |e_n| [N s].
+  // Return { met, sweeps, steps, relative, at, energy, normal }: whether the residual is within tol, the work, and the
+  // relative residual; for each check, the work until then, E [sqrt J] and max |e_n| [N s].
   solve(buffers, tol) {
     const whole = this.#scratch(0, this.f.lav_newton_index_workspace_size(...buffers, 1));
     const real = this.#scratch(1, this.f.lav_newton_plan(...buffers, 1, whole));
@@ -103,20 +102,20 @@ export class Newton {
   }
 }
 
-// A scene that runs: everything it knows lies in `size` and three buffers of `kernels.memory`.
+// A running scene: its state consists of `size` and three buffers in `kernels.memory`.
 export class Simulation {
-  // scene: { size, arrays, substeps, dt }; arrays that are left out are zero. One Kernels for each Simulation:
-  // memory that became too small is not given back before both go.
+  // scene: { size, arrays, substeps, dt }; missing arrays are zero. Every Simulation needs its own Kernels, because memory
+  // that has become too small is only freed with both.
   constructor(kernels, scene) {
     this.k = kernels;
     this.scene = scene;
     this.substeps = scene.substeps;
     this.newton = null;
     this.stepper = "impulses";
-    this.short = 0; // substeps that Newton's method left short of TOL
-    this.solved = 0; // all that it solved
+    this.short = 0; // Number of substeps in which Newton's method did not reach TOL.
+    this.solved = 0; // Number of substeps that it solved.
     this.steps = 0;
-    this.first = null; // the eight values of the very first solve
+    this.first = null; // The eight values of the very first solve.
     this.lost = -1;
     this.#allocate(scene.size);
     for (const [name, values] of Object.entries(scene.arrays)) {
@@ -165,7 +164,7 @@ export class Simulation {
     return [this.size, this.real, this.index, this.keys];
   }
 
-  // A live view of one of the engine's arrays.
+  // Return a view of one of the engine's arrays.
   array(name) {
     const [buffer, first, n] = this.places[name];
     if (buffer === 0) {
@@ -174,7 +173,7 @@ export class Simulation {
     return buffer === 1 ? this.k.i32(this.index + 4 * first, n) : this.k.u64(this.keys + 8 * first, n);
   }
 
-  // A point (3,) [m] that is fixed to a body, in the world; body -1 is the world.
+  // Return the world position (3,) [m] of a point that is fixed to a body; body -1 is the world.
   point(body, local) {
     if (body < 0) {
       return Array.from(local);
@@ -191,7 +190,7 @@ export class Simulation {
     return Array.from(this.k.i32(this.size, SIZES));
   }
 
-  // iterations, warm_start, order; box: 1 where friction bounds each tangent by itself, else 0
+  // Set iterations, warm_start, order, and box: 1 if friction has a separate bound for each tangent, else 0.
   get settings() {
     const [head, at] = [this.array("head"), this.k.layout.head];
     return {
@@ -206,7 +205,7 @@ export class Simulation {
     }
   }
 
-  // The velocity [m/s, rad/s] with which a body that is not static enters the next step: six numbers, in world axes.
+  // Set the velocity [m/s, rad/s] with which a dynamic body enters the next step: six numbers, in world axes.
   setVelocity(body, velocity) {
     if (!(this.array("dyn")[body] >= 0) || velocity.length !== 6) {
       throw new Error("the number of a body that is not static, and six numbers are needed");
@@ -214,7 +213,7 @@ export class Simulation {
     this.array("v").set(velocity, 6 * body);
   }
 
-  // The eight values of SOLVER_FIELDS.
+  // Return the eight values of SOLVER_FIELDS.
   get values() {
     const { out } = this.k.layout.setting;
     return Array.from(this.array("setting").subarray(out, out + 8));
@@ -228,8 +227,8 @@ export class Simulation {
     this.k.functions.lav_engine_move(...old, ...this.buffers);
   }
 
-  // From the next step on: a Newton of the same kernels, or null for what the stepper of that name does. Each takes as
-  // many substeps as it does natively.
+  // Select the solver from the next step on: a Newton of the same kernels, or null for the sweeps of the named stepper. The
+  // number of substeps is the one that Python uses for it.
   use(newton, stepper = "impulses") {
     this.newton = newton;
     this.stepper = stepper;
@@ -259,7 +258,7 @@ export class Simulation {
     return { ...told, finite: this.#finished(status) };
   }
 
-  // One step; false when the state is no longer finite.
+  // Do one step; return false if the state is no longer finite.
   step() {
     if (this.newton) {
       return this.#stepNewton().finite;
@@ -279,9 +278,9 @@ export class Simulation {
     }
   }
 
-  // The same step, bit for bit, and the error before and after every sweep of its last substep:
-  // { normal: max |e_n| [N s], energy: E [sqrt J], at: sweeps so far }, each of 1 + sweeps numbers. By Newton's method
-  // what `Newton.solve` says of the last substep.
+  // Do the same step, bit for bit, and return the error before and after every sweep of its last substep:
+  // { normal: max |e_n| [N s], energy: E [sqrt J], at: sweeps so far }, each with 1 + sweeps numbers. With Newton's method,
+  // return the result of `Newton.solve` for the last substep.
   stepWatched() {
     if (this.newton) {
       return this.#stepNewton();
@@ -318,7 +317,7 @@ export class Simulation {
     return status === OK;
   }
 
-  // Bytes of everything the simulation knows; `restore` continues from there to the last bit.
+  // Return the bytes of the complete state; `restore` continues from it bit for bit.
   snapshot() {
     return {
       size: this.sizes,

@@ -1,13 +1,13 @@
-// One side of the page: a simulation with settings of its own, its picture and its numbers.
+// One side of the page: a simulation with its own settings, its picture and its numbers.
 
 import { View, find, rows } from "./draw.js";
 import { Kernels, Newton, ORDERS, Simulation, SOLVER_FIELDS, TOL } from "./lavender.js";
 
-const KEPT = 720; // steps in the plots over time
+const KEPT = 720; // Number of steps in the plots over time.
 const DEFAULTS = [{ warm_start: 1 }, { warm_start: 0 }];
 const WHOLE = new Set(["iterations", "warm_start", "contacts", "cache_matches"]);
-const PULL = 200; // 1/s^2 and, as 2 sqrt of it, 1/s: the spring a held body hangs on, critically damped
-// Of joints, which the eight values of a step say nothing of: how far the worst is open, and its largest impulse.
+const PULL = 200; // Stiffness per mass [1/s^2] of the critically damped spring between the pointer and a held body; damping 2 sqrt(PULL) [1/s].
+// Additional values for joints, which the eight values of a step do not contain: largest gap, and largest impulse.
 const OF_JOINTS = ["joints open", "joint impulse"];
 
 export function shown(field, value) {
@@ -57,9 +57,9 @@ export class Side {
   }
 
   forget() {
-    this.history = { time: [], values: [], plain: true }; // plain: settings of its own, and nothing else, since the start
-    this.curve = null; // of the last step whose sweeps were watched
-    this.fresh = true; // no step since then
+    this.history = { time: [], values: [], plain: true }; // plain: since the start, only the side's own settings have acted.
+    this.curve = null; // Curve of the last step that recorded its sweeps.
+    this.fresh = true; // No step has followed.
     this.kept = null;
   }
 
@@ -77,7 +77,7 @@ export class Side {
     this.app.write();
   }
 
-  // The module of Newton's method is fetched when it is first asked for; no step is taken until it has come.
+  // The module of Newton's method is loaded at its first use; no step is done until it is loaded.
   choose(solver) {
     this.wanted = solver;
     if (solver !== "newton") {
@@ -89,7 +89,7 @@ export class Side {
     }
   }
 
-  // A held body follows the pointer as if on a spring, whatever its mass.
+  // A held body follows the pointer as on a spring, independent of its mass.
   pull({ body, at }) {
     const [x, v, dynamic] = ["x", "v", "dyn"].map((name) => this.simulation.array(name));
     if (dynamic[body] < 0) {
@@ -103,7 +103,7 @@ export class Side {
     }
   }
 
-  // Largest distance [m] of a body from its start: sideways, and downwards.
+  // Return the largest distance [m] of a body from its initial position: sideways, and downwards.
   displacement() {
     const [x, dynamic] = [this.simulation.array("x"), this.simulation.array("dyn")];
     const most = [0, 0];
@@ -117,7 +117,7 @@ export class Side {
     return most;
   }
 
-  // Largest distance [m] between the ends of a joint (from its length, of a distance joint).
+  // Return the largest distance [m] between the ends of a joint (for a distance joint, the deviation from its length).
   gap() {
     const s = this.simulation;
     const { joint: at, joint_kinds: kinds } = s.k.layout;
@@ -137,7 +137,7 @@ export class Side {
     const { iterations, warm_start, order, solver, box } = this.settings;
     const newton = solver === "newton";
     this.solver.value = solver;
-    this.sweeps.disabled = newton; // it asks for a residual, not for a number of sweeps
+    this.sweeps.disabled = newton; // Newton's method has a tolerance, not a number of sweeps.
     this.order.disabled = newton;
     this.sweeps.value = iterations;
     this.sweepsShown.textContent = iterations;
@@ -146,7 +146,7 @@ export class Side {
     this.order.value = order;
   }
 
-  // Watching the sweeps of a step takes as long as the step: only where their error is shown.
+  // Recording the sweeps of a step takes as long as the step: it is only done if their error is displayed.
   step(time, watched = true) {
     this.fresh = watched || this.simulation.newton !== null;
     let finite;
@@ -158,7 +158,7 @@ export class Side {
     }
     this.history.time.push(time);
     const values = this.simulation.values;
-    this.history.values.push(this.simulation.newton ? [null, ...values.slice(1)] : values); // no number of sweeps
+    this.history.values.push(this.simulation.newton ? [null, ...values.slice(1)] : values); // Newton's method has no number of sweeps.
     if (this.history.time.length > KEPT) {
       this.history.time.shift();
       this.history.values.shift();
@@ -202,8 +202,8 @@ export class Side {
     this.view.draw(this.simulation, this.app.colors);
   }
 
-  // Median of one of the eight values over the steps first + 1 to last, or the first solve's where last is 0; null
-  // before, or where the run was touched.
+  // Return the median of one of the eight values over steps first + 1 to last, or the value of the first solve if last is 0;
+  // null before step `last`, or if the user has changed the run.
   median(field, first, last) {
     const { time, values, plain } = this.history;
     if (!plain || values.length < last || values.length !== Math.round(time[time.length - 1] / this.app.scene.dt)) {
@@ -218,7 +218,7 @@ export class Side {
     return found.length % 2 ? found[half] : (found[half - 1] + found[half]) / 2;
   }
 
-  // What the step cost, in words.
+  // Describe the work of the last step.
   work() {
     const { newton, substeps, short, solved, settings } = this.simulation;
     const parts = substeps === 1 ? "in one step" : `in each of ${substeps} substeps`;

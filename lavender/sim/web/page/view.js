@@ -1,15 +1,15 @@
-// A film: poses of a run, frame by frame, live from the Python that steps it or out of a file.
+// Show a film: poses of a run, frame by frame, live from the Python process that steps it, or from a file.
 
 import { View, colors, fail, find, rows } from "./draw.js";
 import { SOLVER_FIELDS } from "./lavender.js";
 
 const [PLANE, SPHERE] = [1, 2];
-const LEAD = 9; // numbers of a frame before the poses: time, then the eight solver values
+const LEAD = 9; // Numbers of a frame before the poses: time and the eight solver values.
 const MAGIC = "LAVENDER-FILM\n";
 const VERSION = 1;
-const POLL = 60; // ms between two questions for new frames
+const POLL = 60; // [ms] Time between two requests for new frames.
 
-// Header and frames of a film's bytes, all of it looked at before any of it is shown.
+// Return header and frames from the bytes of a film; everything is checked before anything is displayed.
 function read(bytes) {
   const start = MAGIC.length + 8, text = new TextDecoder().decode(bytes.slice(0, MAGIC.length));
   const size = bytes.byteLength > start ? Number(new DataView(bytes).getBigUint64(MAGIC.length, true)) : 0;
@@ -30,12 +30,12 @@ function read(bytes) {
   return { header, data };
 }
 
-// One frame as draw.js reads a simulation.
+// A frame with the interface of a simulation that draw.js uses.
 class Frame {
   constructor(header) {
     this.header = header;
     this.joints = header.joints.length;
-    this.steps = 0; // no contacts are kept
+    this.steps = 0; // A film has no contacts.
     this.values = new Float32Array(8);
     this.k = { layout: { joint: { anchor_b: 0 } } };
     const n = header.bodies.length;
@@ -67,7 +67,7 @@ class Frame {
   }
 }
 
-// What the picture must hold: all bodies of the frames so far, within three times what the first one needs.
+// Bounds of the picture: all bodies of the present frames, at most three times as large as for the first frame.
 class Bounds {
   constructor(header) {
     this.seen = header.bodies.flatMap((body, i) => (
@@ -77,7 +77,7 @@ class Bounds {
     this.low = null;
   }
 
-  // Returns whether anything is outside of what was.
+  // Extend the bounds by frames; return whether they have changed.
   take(numbers) {
     const [low, high] = [[Infinity, Infinity, Infinity], [-Infinity, -Infinity, -Infinity]];
     for (const [i, r] of this.seen) {
@@ -139,7 +139,7 @@ class Player {
     find("title").textContent = `${header.scene}, ${header.bodies.length} bodies`;
   }
 
-  // Frames (f, 9 + 7 n) from number `first` on.
+  // Add frames (f, 9 + 7 n) from number `first` on.
   add(first, data) {
     const width = LEAD + 7 * this.header.bodies.length;
     this.frames.length = first;
@@ -233,7 +233,7 @@ class Player {
     try {
       film = read(await file.arrayBuffer());
     } catch (error) {
-      fail(`${file.name} is no film that this page reads: ${error.message}`); // what is shown stays
+      fail(`${file.name} is no film that this page reads: ${error.message}`); // The displayed film stays.
       return;
     }
     find("failure").hidden = true;
@@ -245,7 +245,7 @@ class Player {
     find("live").disabled = true;
   }
 
-  // Ask for what is new until the run has ended.
+  // Request new frames until the run has ended.
   async listen() {
     this.source = {};
     const source = this.source;
@@ -277,7 +277,7 @@ async function start() {
   window.lavender = player;
   const answer = await fetch("film.json");
   if (!answer.ok) {
-    find("title").textContent = "open a film"; // the page lies on a file server: there is no run behind it
+    find("title").textContent = "open a film"; // The page comes from a file server, without a run.
     find("live").disabled = true;
     return;
   }
