@@ -35,7 +35,7 @@ LARGEST = L(1.7976931348623157e308)  # of an impulse in float64
 @dataclass
 class Judgement:
     relative: float
-    floor: float
+    roundoff_floor: float
     allowed: float  # relative residual that float64 may add
     unrefined: float  # and that a pass by the factor of M may add besides
     floor_most: float  # at most what the judge may call its floor

@@ -115,7 +115,7 @@ def test_every_motion_of_the_example_is_a_solution_and_they_differ(drawn):
     assert (
         lv.motion.distance(found["problem"], motions[i].impulse, motions[j].impulse).speed == motions.spread
     )
-    assert found["cone"].lift > 0.1
+    assert found["cone"].separation_speed > 0.1
 
 
 def test_drift_follows_the_motion_error_over_runs(monkeypatch):

@@ -627,7 +627,7 @@ def test_ctrl_c_in_any_substep_restores_the_state_before_the_step(caller, at, re
         np.testing.assert_array_equal(sim.state.a[name], twin.state.a[name], err_msg=name)
 
 
-@pytest.mark.parametrize(("solver", "calls"), [("newton", "run"), ("auto", "turn")])
+@pytest.mark.parametrize(("solver", "calls"), [("newton", "run"), ("auto", "advance")])
 def test_ctrl_c_inside_a_solver_that_returns_its_best_impulse_stops_the_step(solver, calls, monkeypatch):
     # `newton` and `auto` return their best impulses after Ctrl-C: the step does not use them.
     from lavender.solvers.newton import Newton

@@ -55,7 +55,7 @@ struct lav_solver {
   struct accelerate_accelerated_sweep_data_t fast;
   struct core_view_view_t view; /* The problem for newton: rows of A if A was formed. */
   struct core_method_options_t newton_options;
-  struct core_method_room_t drive;
+  struct core_method_workspace_t drive;
   int32_t driven;              /* Newton's method has begun with `newton_options`. */
   blocks_t q;                  /* Blocks with d, nu and step of A, for methods that use A. */
   struct pivot_direct_direct_t direct;

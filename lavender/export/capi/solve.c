@@ -89,7 +89,7 @@ static int64_t newton_workspace_size(const lav_problem *q, const lav_options *o,
   const int32_t one = LAV_CONTACT, ends[2] = {0, q->n_rows};
   struct core_view_view_t view;
   struct core_method_options_t newton;
-  struct core_method_room_t workspace;
+  struct core_method_workspace_t workspace;
   csr_t none = {NULL, NULL, NULL};
   (void)o, (void)n_v;
   if (q->form == LAV_VELOCITIES) return 60 * m + 18 * k + 2 * nv * (nv < 180 ? nv : 180) + 2048;
