@@ -107,7 +107,7 @@ const newton = readFileSync(join(dirname(process.argv[2]), "newton.wasm"), "utf8
 process.exit(readFileSync(process.argv[2], "utf8") === "lavender" && newton === "newton" && process.env.PYTHON ? 0 : 1);
 """)
     monkeypatch.setattr(shutil, "which", lambda name: None)
-    with pytest.raises(LavenderError, match=r"node is not there.*install Node 18"):
+    with pytest.raises(LavenderError, match=r"node.*is not installed: install Node 18"):
         pages.check()
     monkeypatch.undo()
     if shutil.which("node") is None:

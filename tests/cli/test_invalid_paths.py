@@ -293,7 +293,7 @@ WRITE_AND_DIE = """if True:
 
     if sys.argv[1] == "module":
         Path.replace = lambda part, target: os.kill(os.getpid(), signal.SIGKILL)
-        compile.put(Path("a.txt"), b"half")
+        compile.write_atomically(Path("a.txt"), b"half")
     write_atomically("a.txt", write)"""
 
 
