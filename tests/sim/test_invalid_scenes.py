@@ -572,7 +572,7 @@ def caller(plug_in):
                 plan.now()
             return lv.Claim(lv.Status.MAX_ITERATIONS, 1)
 
-        plug_in(run, "caller", parts=True, **more)
+        plug_in(run, "caller", supports_rolling=True, **more)
         return plan
 
     return make

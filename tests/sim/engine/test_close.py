@@ -56,7 +56,7 @@ def test_close_from_inside_a_step_is_refused(plug_in):
             refused.append(call)
         return lv.Claim(lv.Status.MAX_ITERATIONS, 1)
 
-    plug_in(run, "closer", parts=True)
+    plug_in(run, "closer", supports_rolling=True)
     sim = lv.Simulation(lv.Scene("stack", n=2, solver="closer"))
     film = sim.start_film()
     sim.step()
