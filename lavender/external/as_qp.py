@@ -134,7 +134,7 @@ class _ScaledProblem:
     sigma: float
 
     @classmethod
-    def of(cls, problem: Problem, unit_diagonal: bool, assume: bool) -> _ScaledProblem:
+    def from_problem(cls, problem: Problem, unit_diagonal: bool, assume: bool) -> _ScaledProblem:
         """Scale a problem; `assume` also removes rows that are far from leaving their bound."""
         c = problem.cones
         known = (c.lower == c.upper) & np.isfinite(c.lower)
@@ -411,7 +411,7 @@ def impulse_form(
     assume : bool
         Remove rows that are far from leaving their bound.
     """
-    scaled = _ScaledProblem.of(problem, unit_diagonal, assume)
+    scaled = _ScaledProblem.from_problem(problem, unit_diagonal, assume)
     c, unknown, root, sigma = problem.cones, scaled.unknown_rows, scaled.root, scaled.sigma
     a = problem.csr
     scale = sp.diags_array(root)
@@ -458,7 +458,7 @@ def impulse_form(
 def velocity_form(problem: Problem, *, assume: bool = False) -> QP:
     """Build the mass-scaled velocity form of a problem with rows; `assume` as for `impulse_form`."""
     form = problem.velocity_form()
-    scaled = _ScaledProblem.of(problem, True, assume)
+    scaled = _ScaledProblem.from_problem(problem, True, assume)
     c, unknown, root, sigma = problem.cones, scaled.unknown_rows, scaled.root, scaled.sigma
     k = len(unknown)
     # K~ = [K, theta^1/2]
@@ -587,7 +587,7 @@ class ProgramQP(QP):
 
 def program_form(problem: Problem, *, assume: bool = False) -> ProgramQP:
     """Write a quadratic program with a singular P in the units of its problem; `assume` as in `impulse_form`."""
-    scaled, qp = _ScaledProblem.of(problem, True, assume), problem.qp
+    scaled, qp = _ScaledProblem.from_problem(problem, True, assume), problem.qp
     unknown, n = scaled.unknown_rows, len(qp.q)
     n_x = int(np.searchsorted(unknown, n))
     # One unit for all variables and one for all rows, because backends balance rows and columns themselves. With rows

@@ -250,9 +250,9 @@ class Solution:
     @classmethod
     def of(cls, values: dict[str, Any]) -> Solution:
         """Build a solution from all its fields by name, without copying or checking them."""
-        made: Solution = object.__new__(cls)
-        made.__dict__.update(values)
-        return made
+        solution: Solution = object.__new__(cls)
+        solution.__dict__.update(values)
+        return solution
 
     @classmethod
     def late(
@@ -265,22 +265,23 @@ class Solution:
         setup_time: float = 0.0,
     ) -> Solution:
         """Build a solution whose other fields `rest` (a function and its arguments) computes at their first access."""
-        made: Solution = object.__new__(cls)
-        kept = made.__dict__
-        kept["impulse"], kept["status"], kept["tol"] = impulse, status, tol
-        kept["setup_time"], kept["solve_time"], kept["_rest"] = setup_time, solve_time, rest
-        return made
+        solution: Solution = object.__new__(cls)
+        attributes = solution.__dict__
+        attributes["impulse"], attributes["status"], attributes["tol"] = impulse, status, tol
+        attributes["setup_time"], attributes["solve_time"] = setup_time, solve_time
+        attributes["_rest"] = rest
+        return solution
 
     def __getattr__(self, name: str) -> Any:
         # Called only for missing names: a field that `late` postponed, or an unknown attribute.
-        kept = self.__dict__
-        rest = kept.get("_rest")
+        attributes = self.__dict__
+        rest = attributes.get("_rest")
         if rest is not None:
             function, arguments = rest
-            kept.update(function(*arguments))  # two threads write equal values
-            kept.pop("_rest", None)
-        if name in kept:
-            return kept[name]
+            attributes.update(function(*arguments))  # two threads write equal values
+            attributes.pop("_rest", None)
+        if name in attributes:
+            return attributes[name]
         raise build_attribute_error("Solution", repr(type(self).__name__), name)
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -296,13 +297,13 @@ class Solution:
     @property
     def states(self) -> States:
         """State of each block (open, sticks, slides, at a bound or free), and which states are uncertain."""
-        kept = self.__dict__
-        if "_states" not in kept:
+        attributes = self.__dict__
+        if "_states" not in attributes:
             from lavender.judge.states import states_of
 
-            kept["_states"] = states_of(self.residual._problem, self.impulse)
-        found: States = kept["_states"]
-        return found
+            attributes["_states"] = states_of(self.residual._problem, self.impulse)
+        states: States = attributes["_states"]
+        return states
 
     def state(self, i: int) -> State:
         """Return the state of block i (see `states`).
@@ -312,8 +313,8 @@ class Solution:
         IndexError
             The problem has no block i.
         """
-        found: State = self.states[i]
-        return found
+        state: State = self.states[i]
+        return state
 
     @property
     def is_contradicted(self) -> bool:

@@ -156,12 +156,12 @@ class States(Sequence[State]):
         return ", ".join(f"{names.count(name)} {name}" for name in dict.fromkeys(names)) or "no blocks"
 
 
-def linear_of(problem: Problem, impulse: FloatArray, most: int = 0) -> Linear:
-    """Judge and linearise an impulse (m,) [N s]; ellipses are treated as disks. `most` is as in `Linears`."""
+def linear_of(problem: Problem, impulse: FloatArray, max_rows: int = 0) -> Linear:
+    """Judge and linearise an impulse (m,) [N s]; ellipses are treated as disks. `max_rows`: see `Linears`."""
     data = problem.disk.metric
     if data.reference_energy < 0.0:
         get_reference(problem.disk)
-    return Linears([data], [problem.on_disk(impulse)], most).one(0)
+    return Linears([data], [problem.on_disk(impulse)], max_rows).one(0)
 
 
 def states_of(problem: Problem, impulse: FloatArray, linear: Linear | None = None) -> States:

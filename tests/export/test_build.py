@@ -179,9 +179,9 @@ def test_vectors_are_of_what_the_report_of_these_records_recommends(tmp_path):
     lv.Problem.lcp(np.array([[2.0, 0.5], [0.5, 1.0]]), np.ones(2)).save(problem)
     for repeats, solver in ((1, "direct"), (2, "nncg")):  # two runs: the page is of the newest
         bench.run([problem], [solver], bench.Plan(tolerances=(1e-6,), budgets=(), repeats=repeats), records)
-    assert "LAV_NNCG" in vectors.made(records, None, 1)["chosen.h"]
-    with pytest.raises(lv.InputError, match="reached no tolerance in these records; of both are: nncg"):
-        vectors.made(records, "direct", 1)
+    assert "LAV_NNCG" in vectors.make_files(records, None, 1)["chosen.h"]
+    with pytest.raises(lv.InputError, match="reached no tolerance in these records; available: nncg"):
+        vectors.make_files(records, "direct", 1)
 
 
 def test_the_programs_of_the_page_run_verbatim(folder, shared, compiler, tmp_path, monkeypatch):
@@ -190,7 +190,7 @@ def test_the_programs_of_the_page_run_verbatim(folder, shared, compiler, tmp_pat
     (python,) = re.findall(r"^```py\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)
     records = tmp_path / "records.jsonl"
     bench.run(["granularF(n=3)"], ["auto"], bench.Plan(tolerances=(1e-6,), budgets=(), repeats=1), records)
-    (tmp_path / "chosen.h").write_text(vectors.made(records, None, 1)["chosen.h"])
+    (tmp_path / "chosen.h").write_text(vectors.make_files(records, None, 1)["chosen.h"])
     (tmp_path / "drop.c").write_text(program)
     call = "  if (solve(chosen, q, impulse, &result) || !(result.verdict.relative < 1e-6)) return 2;\n"
     whole = program.replace("int main(", steps + "\nint main(").replace(

@@ -11,8 +11,8 @@ from clib import METHODS, Motion, Refused, run
 from tower import self_test_hash, self_test_problem
 
 import lavender as lv
-from lavender.export.vectors import run_driver, pack
-from lavender.export.view import OTHER_BITS, NotTaken, takes
+from lavender.export.vectors import pack, run_driver
+from lavender.export.view import OTHER_BITS, NotSupported, accepts
 
 
 def problems():
@@ -112,7 +112,7 @@ def test_every_method_has_the_bits_of_the_package(library, at):
     start, ran, formed = given.start(), 0, 0
     try:
         problem = library.problem(given, impulse=start)
-    except NotTaken as reason:
+    except NotSupported as reason:
         pytest.skip(str(reason))
     for name, (n, tol) in itertools.product(METHODS, ((1, 0.0), (9, 0.0), (40, 0.0), (300, 1e-7))):
         if name in OTHER_BITS or (name in ("newton", "direct") and tol == 0.0):
@@ -190,7 +190,7 @@ def test_vectors_are_of_methods_that_the_library_takes(library):
             except lv.CapabilityError:
                 continue
             code = library.c.lav_takes(ct.byref(problem), ct.byref(library.options(name)))
-            assert takes(given, name) == (code == 0), (name, given.law, given.cones.kind)
+            assert accepts(given, name) == (code == 0), (name, given.law, given.cones.kind)
             looked.add((name, code))
     assert len(looked) > len(METHODS)
 
@@ -200,7 +200,7 @@ def test_no_vector_of_sweeps_over_a_matrix_that_the_library_does_not_form():
     given = lv.Problem.from_jacobian(
         rng.normal(size=(9, 12)), np.eye(12) + 0.1, rng.normal(size=12), cones=lv.Cones.contacts(0.5, count=3)
     )
-    with pytest.raises(NotTaken, match="formed A"):
+    with pytest.raises(NotSupported, match="formed A"):
         pack(given, "pgs", 0.0, 5, {})
 
 
@@ -291,7 +291,7 @@ def test_methods_with_bits_of_their_own_meet_the_tolerance_where_the_package_doe
     for given in GIVEN:
         try:
             solver = library.open(library.problem(given), library.options(name))
-        except (NotTaken, Refused):
+        except (NotSupported, Refused):
             continue
         said = solver.run(10_000, 1e-7)
         truth = lv.residual(given, solver.impulse()).relative
@@ -347,7 +347,7 @@ def test_motion_errors_are_those_of_the_package(library):
     for given in GIVEN:
         try:
             solver = library.open(library.problem(given), library.options("newton"))
-        except (NotTaken, Refused):
+        except (NotSupported, Refused):
             continue
         if solver.run(5000, 1e-12).verdict.relative > 1e-11:
             continue

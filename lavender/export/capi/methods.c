@@ -188,7 +188,7 @@ static void keep_better(lav_solver *s, const double *begin, double tol) {
   struct judge_best_best_t best;
   judge_best_bind_best(&best, &s->p, s->score_workspace);
   double *zero = s->compare + s->p.n_rows; /* `begin` is stored before it. */
-  judge_measure_do_nothing(&s->p, zero, s->watch.w);
+  judge_measure_set_zero_impulse(&s->p, zero, s->watch.w);
   see(s, &best, begin, -1.0);
   see(s, &best, zero, -1.0);
   if (see(s, &best, s->impulse, tol) > tol) COPY(s->impulse, best.impulse, s->p.n_rows);
