@@ -29,9 +29,15 @@ import numpy as np
 from benchmarks.output import markdown, out_option, write_json
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import InputError, UnknownName
-from lavender.cli.options import ListType
+from lavender.cli.options import ValueList
 from lavender.lab.bench.machine import versions
-from lavender.lab.phenomena.engines import PACKAGES_OF_NODE, Stepping, engine, lacks, versions_of_node
+from lavender.lab.phenomena.engines import (
+    PACKAGES_OF_NODE,
+    Stepping,
+    create_engine,
+    installation_hint,
+    versions_of_node,
+)
 from lavender.lab.phenomena.parts import has_fallen
 from lavender.sim.scene import Scene
 from lavender.sim.scene.scene import SCENE_ORDERS
@@ -109,11 +115,11 @@ class Contestant:
         """The engine with a scene that takes ours' settings; of the tower step, sweeps, substeps and order count."""
         if self.module == "own":
             asked = {"solver_iterations": tower.sweeps, "order": tower.order} if self.sweeps else {}
-            return engine("own", build(dt=tower.dt, substeps=tower.substeps, **asked, **self.options))
+            return create_engine("own", build(dt=tower.dt, substeps=tower.substeps, **asked, **self.options))
         sweeps = self.default if tower.sweeps is None else tower.sweeps
         options = {"dt": tower.dt, **self.options, **({self.sweeps: sweeps} if self.sweeps else {})}
         options |= {"substeps": tower.substeps or 1} if self.substeps else {}
-        return engine(self.module, build(), **options)
+        return create_engine(self.module, build(), **options)
 
     def make(self, tower: Tower) -> Standing:
         """The engine with a tower."""
@@ -150,7 +156,7 @@ ENGINES: dict[str, Contestant] = {
 
 def missing(name: str) -> str:
     """What the engine of that name lacks here; empty where it can run."""
-    return lacks(ENGINES[name].needs)
+    return installation_hint(ENGINES[name].needs)
 
 
 def installed() -> list[str]:
@@ -278,26 +284,28 @@ def _at_least(low: int, **lists: Sequence[int]) -> None:
 
 
 @click.command("stand")
-@click.option("--engines", type=ListType(str), help="Default: all that are installed.")
+@click.option("--engines", type=ValueList(str), help="Default: all that are installed.")
 @click.option(
-    "--boxes", type=ListType(int), default="6,10,20", show_default=True, help="Heights of the towers."
+    "--boxes", type=ValueList(int), default="6,10,20", show_default=True, help="Heights of the towers."
 )
 @click.option(
     "--sweeps",
-    type=ListType(int),
+    type=ValueList(int),
     default="4,8,16",
     show_default=True,
     help="Sweeps of a substep, for whoever takes a number.",
 )
-@click.option("--rates", type=ListType(int), default="60,120", show_default=True, help="Steps a second.")
+@click.option("--rates", type=ValueList(int), default="60,120", show_default=True, help="Steps a second.")
 @click.option(
     "--substeps",
-    type=ListType(int),
+    type=ValueList(int),
     default="0,1,2,4",
     show_default=True,
     help="Substeps of a step; 0: the engine's own number.",
 )
-@click.option("--orders", type=ListType(str), help="Sweep orders of LavenderSim; default: that of the scene.")
+@click.option(
+    "--orders", type=ValueList(str), help="Sweep orders of LavenderSim; default: that of the scene."
+)
 @click.option(
     "--seconds", type=click.FloatRange(min=3.0), default=60.0, show_default=True, help="Simulated at most."
 )

@@ -1,4 +1,4 @@
-"""Run the command line: `python -m lavender.cli`."""
+"""Run `python -m lavender.cli`, which is the command `lavender`."""
 
 from lavender.cli.entry import main
 

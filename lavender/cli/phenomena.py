@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from lavender.cli.options import PATH, parse_parameters, reject_unused_options
-from lavender.io.stored import check_writable, write_text
+from lavender.cli.options import PATH, parse_parameters, reject_unused
+from lavender.io.stored import writable, write_text
 
 if TYPE_CHECKING:
     from lavender.lab.phenomena import Record
@@ -18,7 +18,8 @@ if TYPE_CHECKING:
 ENGINE_PACKAGES = ("mujoco", "pybullet", "drake", "lavendersim", "newton", "numpy")
 
 
-def _split_names(text: str | None) -> list[str] | None:
+def _names(text: str | None) -> list[str] | None:
+    """Split a comma-separated list of names; None selects all."""
     if text is None or text == "all":
         return None
     return [] if text == "none" else [w.strip() for w in text.split(",") if w.strip()]
@@ -26,9 +27,12 @@ def _split_names(text: str | None) -> list[str] | None:
 
 @click.command("phenomena")
 @click.argument("names", nargs=-1, metavar="[NAMES]...")
-@click.option("--steppers", help="Steppers of lavender, separated by commas; default: all; none: no stepper.")
+@click.option("--steppers", help="lavender's steppers, separated by commas, or none; default: all.")
 @click.option(
-    "--engines", default="none", show_default=True, help="Other engines, separated by commas, or all."
+    "--engines",
+    default="none",
+    show_default=True,
+    help="Other engines, separated by commas, or all, or none.",
 )
 @click.option(
     "--set",
@@ -59,17 +63,17 @@ def phenomena(
     out: Path | None,
     listed: bool,
 ) -> None:
-    """Measure steppers and engines on scenes with a known motion.
+    """Measure steppers and engines on scenes with known motion.
 
     A cell shows the worst distance from the exact motion and the number of cases within all bounds. A note says which
     engine is missing, crashed, or cannot build a scene.
     """
-    from lavender.lab.phenomena import ENGINE_VARIANTS, chosen, run
+    from lavender.lab.phenomena import WAYS, run, select_phenomena
     from lavender.lab.phenomena import table as tables
 
     if listed:
-        reject_unused_options(context, ["steppers", "engines", "parameters", "limit", "out"], "with --list")
-        click.echo(tables.described(chosen(names)))
+        reject_unused(context, ["steppers", "engines", "parameters", "limit", "out"], "with --list")
+        click.echo(tables.describe_phenomena(select_phenomena(names)))
         return
     if out is not None:
         check_writable(out)
@@ -78,9 +82,9 @@ def phenomena(
 
     def show(record: Record) -> None:
         records.append(record)
-        click.echo(tables.line(record), err=True)
+        click.echo(tables.format_record(record), err=True)
         if out is not None:
-            write_text(out, json.dumps(_collect_results(records), indent=1) + "\n")
+            write_text(out, json.dumps(_to_json(records), indent=1) + "\n")
 
     run(
         names,
@@ -91,28 +95,23 @@ def phenomena(
         show=show,
     )
     for heading, lines in (
-        ("Steppers of lavender out of bounds", tables.out_of_bound_cases(records)),
+        ("lavender's steppers out of their bounds", tables.out_of_bound_cases(records)),
         ("Without values", tables.notes(records)),
     ):
         if lines:
             click.echo(f"{heading}:\n" + "\n".join(f"- {x}" for x in lines) + "\n")
     click.echo(tables.table(records))
-    ran = {r.engine for r in records}
-    click.echo(
-        "\n"
-        + "\n".join(
-            f"- {variant.name}: {variant.text}" for variant in ENGINE_VARIANTS.values() if variant.name in ran
-        )
-    )
+    measured = {r.engine for r in records}
+    click.echo("\n" + "\n".join(f"- {way.name}: {way.text}" for way in WAYS.values() if way.name in measured))
 
 
-def _collect_results(records: list[Record]) -> dict[str, object]:
-    """Return the content of the file of --out: processor, versions and records."""
+def _to_json(records: list[Record]) -> dict[str, object]:
+    """Collect records with the machine and versions."""
     from lavender.lab.bench.machine import cpu_name, versions
     from lavender.lab.phenomena.engines import versions_of_node
 
     return {
         "cpu": cpu_name(),
-        "versions": versions(ENGINE_PACKAGES) | versions_of_node(),
+        "versions": versions(PACKAGES) | versions_of_node(),
         "records": [asdict(r) for r in records],
     }

@@ -13,7 +13,7 @@ from lavender.lab.bench.cases import Source
 from lavender.lab.bench.recommendation import SHORT_TIME_RATIO, Advice, Subject, list_subjects
 from lavender.lab.bench.resampling import TimedCall, rank_calls_in_time, select_calls
 from lavender.lab.bench.running.alternating import time_alternately
-from lavender.lab.bench.running.plan import UNLIMITED, Plan
+from lavender.lab.bench.running.plan import UNLIMITED_ITERATIONS, Plan
 from lavender.lab.bench.running.timing import Ask
 from lavender.lab.bench.statistics import drop_idle_cases
 from lavender.lab.bench.store import Records
@@ -23,11 +23,9 @@ from lavender.solvers.registry import specs
 CANDIDATE_TIME_RATIO = (
     1.6  # A rerun may rank a solver first if its time is below this multiple of the best's.
 )
-MAX_CANDIDATES = 4  # Solvers timed for a tolerance and for each time limit, at most.
-TIME_LIMIT_FRACTIONS = (
-    0.5,
-    0.8,
-)  # Parts of a time that `time_limit` is set to: set-up and judge take the rest.
+MAX_CANDIDATES = 4  # Solvers timed for a level and for each time limit, at most.
+# Parts of a time that `time_limit` is set to: set-up and judge take the rest.
+TIME_LIMIT_FRACTIONS = (0.5, 0.8)
 
 
 def list_candidates(records: Records, times: Sequence[float] = ()) -> list[Ask]:
@@ -58,10 +56,10 @@ def list_candidates(records: Records, times: Sequence[float] = ()) -> list[Ask]:
     return list(dict.fromkeys(asks))
 
 
-def _required_max_iter(records: Records, solver: str, tolerance: float) -> int:
-    """Return `max_iter` of a call: 0 (the default), or unlimited if a case needs more than the default."""
-    runs = (r for r in records if r.solver == solver and r.mode == "tol" and r.tol == tolerance)
-    return UNLIMITED if any(exceeds_default_budget(solver, r.iterations) for r in runs) else 0
+def _required_max_iter(records: Records, solver: str, level: float) -> int:
+    """Return `max_iter` of a call to a level: 0 (the default), or unlimited if a case needs more than the default."""
+    runs = (r for r in records if r.solver == solver and r.mode == "tol" and r.tol == level)
+    return UNLIMITED_ITERATIONS if any(exceeds_default_budget(solver, r.iterations) for r in runs) else 0
 
 
 def _list_time_limited(

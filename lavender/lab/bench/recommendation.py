@@ -50,9 +50,8 @@ class Choice:
     cases: int
     # Ranks solvers and is shown: shifted geometric mean of times [s], or the 90th percentile of residuals [-].
     score: float
-    p95: float = (
-        math.nan
-    )  # 95th percentile over the cases of the values that `score` summarises; inf: not reached
+    # 95th percentile over the cases of the values that `score` summarises; inf: not reached.
+    p95: float = math.nan
     worst: float = math.nan
     hardest: str = ""  # the case of `worst`
     how: str = ""  # the budget that was used, and for a sequence whether impulses are carried

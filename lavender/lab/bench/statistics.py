@@ -14,7 +14,7 @@ from statistics import median
 
 from lavender.judge.residuals import at_floor
 from lavender.judge.solution import CLAIM_CHECKS, CONFIRMED
-from lavender.lab.bench.record import Record, asked_of
+from lavender.lab.bench.record import Record, describe_target
 from lavender.lab.bench.store import Records
 
 STRUCTURE_ORDER = ("separate", "chain", "mesh", "stack", "pile", "dense")  # as tables list structures
@@ -115,9 +115,8 @@ class Difficulty:
     rows: int
     sweeps: int | None  # of `pgs` to EASY_RESIDUAL; None where it did not get there, or was not asked
     condition: float | None  # of A, as `CaseInfo.condition`
-    boundary_fraction: (
-        float | None
-    )  # share of blocks at a boundary at the best answer, of those whose error has a bound
+    # Share of blocks at a boundary at the best answer, of those whose error has a bound.
+    degenerate: float | None
     proof: str
     same: tuple[str, ...]  # solvers that gave the same bits without an iteration: a shortcut of all was timed
 
@@ -549,8 +548,8 @@ class Pass:
 
     @property
     def asked(self) -> str:
-        """The budget or the tolerance."""
-        return asked_of(self.mode, self.tol, self.max_iter)
+        """The budget or the level."""
+        return describe_target(self.mode, self.tol, self.max_iter)
 
     @property
     def time(self) -> dict[str, float]:
