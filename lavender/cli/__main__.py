@@ -1,4 +1,4 @@
-"""Run `python -m lavender.cli`, which is the command `lavender`."""
+"""Run the command line: `python -m lavender.cli`."""
 
 from lavender.cli.entry import main
 

@@ -13,8 +13,8 @@ from lavender.cli.options import (
     EXIT_UNMET,
     FILE,
     FOLDER,
+    one_thread,
     precision_option,
-    set_one_thread,
     threshold_option,
     was_given,
     worlds_options,
@@ -32,37 +32,37 @@ from lavender.io.stored import lock_output
     metavar="mujoco|mjx|mujoco_warp",
     help="Engine that steps the worlds.",
 )
-@click.option("--accept", type=float, metavar="M/S",
-              help="Velocity error [m/s] up to which a step above its round-off floor is accepted.")  # fmt: skip
+@click.option("--max-velocity-error", type=float, metavar="M/S",
+              help="Exit with 1 if a step that is not at its floor has a larger velocity error [m/s].")  # fmt: skip
 @threshold_option
 @precision_option
-@click.option(
-    "--workers", type=int, default=-1, help="Number of processes for mujoco; -1: one for each core."
-)
-@click.option("--backend", default="loky", show_default=True, help="joblib backend, such as dask.")
+@click.option("--workers", type=int, default=-1, help="Processes, for mujoco; -1: one for each core.")
+@click.option("--backend", default="loky", show_default=True, help="A backend of joblib, such as dask.")
 @click.option("--out", type=FOLDER, default=Path("lavender-audit"),
-              show_default=True, help="Folder for the page, the records and the worst worlds.")  # fmt: skip
+              show_default=True, help="Folder of the page, the records and the worst worlds.")  # fmt: skip
 @click.pass_context
-def audit(context: click.Context, /, model: Path, out: Path, accept: float | None, **options: Any) -> None:
-    """Judge an engine's answer to every step of a MuJoCo model.
+def audit(
+    context: click.Context, /, model: Path, out: Path, max_velocity_error: float | None, **options: Any
+) -> None:
+    """Judge every step of many worlds of a MuJoCo model.
 
-    Simulates worlds of the model (MJCF). The page shows how many steps were judged, how many of these stopped before
-    convergence, their errors and worst rows, and how many rows and contacts they have. The worst worlds are written as
-    problem files to OUT/worst; OUT/states.npz holds the states before them, from which --states starts again.
+    MODEL.xml is an MJCF file. The page shows how many steps were judged, how many of these stopped before convergence,
+    their errors with time and body, and the numbers of rows and contacts. The worst worlds are problem files in
+    OUT/worst; OUT/states.npz holds the states before them, from which --states starts again.
 
-    Exit code 1: a world diverged, or a step could not be judged; with --accept, an answer above its floor has a larger
-    error. Exit code 130: stopped by Ctrl-C; the page shows the steps so far.
+    Exit code 1: a world diverged, a step could not be judged, or an answer that is not at its floor has a velocity
+    error above --max-velocity-error. Exit code 130: stopped by Ctrl-C; the page shows the completed steps.
     """
     from lavender.lab.audit import audit as run
 
-    if accept is not None and not accept >= 0.0:
-        raise InputError(f"--accept is {accept}; a velocity error in m/s is needed")
+    if max_velocity_error is not None and not max_velocity_error >= 0.0:
+        raise InputError(f"--max-velocity-error is {max_velocity_error}; a velocity error in m/s is needed")
     if options["engine"] != "mujoco":
         for name in ("workers", "backend", "precision"):
             if was_given(context, name):
-                raise InputError(f"--{name} has no effect without --engine mujoco: leave it out")
+                raise InputError(f"--{name} needs --engine mujoco: leave it out")
     context.with_resource(lock_output(out, folder=True))
-    set_one_thread()
+    one_thread()
     with progress() as watch:
         result = run(model, watch=watch, **options)
     result.write(out)

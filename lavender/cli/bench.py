@@ -9,22 +9,22 @@ from pathlib import Path
 import click
 
 from lavender.base.errors import InputError, LavenderError
-from lavender.cli.options import EXIT_UNMET, PATH, echo, set_one_thread
+from lavender.cli.options import EXIT_UNMET, PATH, echo, one_thread
 from lavender.io.stored import writable, write_text
 
 
 @click.group()
 def bench() -> None:
-    """Measure lavender's solvers in steps of your own simulator.
+    """Measure solvers inside the steps of your own simulator.
 
-    `lavender report` measures problem files.
+    `lavender report` measures solvers on files.
     """
 
 
 @bench.command("mujoco")
 @click.argument("models", nargs=-1, required=True, type=PATH)
 @click.option(
-    "--steps", type=click.IntRange(0), default=10, show_default=True, help="Number of problems per model."
+    "--steps", type=click.IntRange(0), default=10, show_default=True, help="Problems of each model."
 )
 @click.option(
     "--record-every",
@@ -32,7 +32,7 @@ def bench() -> None:
     type=click.IntRange(1),
     default=20,
     show_default=True,
-    help="Number of simulation steps between two problems.",
+    help="Simulation steps between two problems.",
 )
 @click.option(
     "--warm",
@@ -41,13 +41,13 @@ def bench() -> None:
     show_default=True,
     help="Also measure this many consecutive steps of each model, warm-started.",
 )
-@click.option("--out", type=PATH, help="Write the numbers of every problem to this file as JSON lines.")
+@click.option("--out", type=PATH, help="Write the numbers of every problem as JSON lines.")
 def mujoco(models: tuple[Path, ...], steps: int, every: int, warm: int, out: Path | None) -> None:
-    """Compare lavender's `newton` with MuJoCo's Newton solver on your models.
+    """Compare `newton` with MuJoCo's Newton solver on your models.
 
-    MODELS are MJCF files. Exit code 1: a model could not be measured; no number includes it.
+    The problems are steps of your own models (MJCF files). Exit code 1: a model is left out of all numbers.
     """
-    set_one_thread()
+    one_thread()
     if out is not None:
         check_writable(out)
     from lavender.io.mujoco import package
@@ -63,9 +63,9 @@ def mujoco(models: tuple[Path, ...], steps: int, every: int, warm: int, out: Pat
         try:
             new = measure(mj, path, steps, every)
             after = measure_warm(mj, path, warm)
-        except (ValueError, LavenderError) as error:  # MuJoCo raises ValueError for an invalid file.
-            lost.append(f"{path.name}: left out: {str(error).splitlines()[0][:140]}")
-            echo(lost[-1], err=True)
+        except (ValueError, LavenderError) as error:  # MuJoCo reports an invalid file as ValueError.
+            left_out.append(f"{path.name}: left out: {str(error).splitlines()[0][:140]}")
+            echo(left_out[-1], err=True)
             continue
         measured += new
         consecutive += after
@@ -76,11 +76,11 @@ def mujoco(models: tuple[Path, ...], steps: int, every: int, warm: int, out: Pat
         lines += [json.dumps(asdict(w)) for w in consecutive]
         write_text(out, "\n".join(lines) + "\n")
     if not measured and not consecutive:
-        raise InputError("no step of these models had a problem to solve: give more --steps, or other models")
+        raise InputError("no step of these models had a problem to solve: more steps, or other models")
     if measured:
         echo(table(measured))
     if consecutive:
         echo(f"\n{warm_table(consecutive)}")
-    if lost:
-        echo("\n".join(lost))
+    if left_out:
+        echo("\n".join(left_out))
         raise click.exceptions.Exit(EXIT_UNMET)

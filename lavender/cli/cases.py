@@ -10,9 +10,7 @@ from lavender.cli.options import echo
 @click.command()
 @click.argument("pattern", default="")
 def cases(pattern: str) -> None:
-    """List the families of the built-in test suite.
-
-    Prints their parameters with defaults, and their purpose.
+    """List the families of the built-in suite.
 
     The list shows parameters, defaults and purpose. PATTERN selects families whose name or description contains it.
     A case is a family with parameters: "pyramid(k=20)".
@@ -20,16 +18,16 @@ def cases(pattern: str) -> None:
     from lavender.base.errors import UnknownName
     from lavender.lab.suite.case import FAMILIES, spell
 
-    selected = {
+    families = {
         name: f
         for name, f in sorted(FAMILIES.items())
         if pattern.lower() in name.lower() or pattern.lower() in f.summary.lower()
     }
-    if not selected:
+    if not families:
         raise UnknownName("family of cases", pattern, FAMILIES)
-    for name, f in selected.items():
+    for name, f in families.items():
         values = {n: f.preset.get(n, p.default) for n, p in f.signature.parameters.items()}
-        parameters = ", ".join(n if v is p.empty else f"{n}={spell(v)}" for (n, v), p in
+        words = ", ".join(n if v is p.empty else f"{n}={spell(v)}" for (n, v), p in
                           zip(values.items(), f.signature.parameters.values(), strict=True))  # fmt: skip
-        echo(f"{name}({parameters})", style="bold")
+        echo(f"{name}({words})", style="bold")
         echo(f"    {f.summary}")

@@ -8,12 +8,12 @@ import click
 
 from lavender.base.errors import InputError
 from lavender.cli.options import (
-    ManyValues,
-    Reading,
-    ValueList,
+    ErrorReporter,
+    ListType,
+    MultiValueCommand,
     echo,
+    one_thread,
     precision_option,
-    set_one_thread,
     threshold_option,
     was_given,
 )
@@ -21,15 +21,12 @@ from lavender.cli.options import (
 
 @click.command(cls=MultiValueCommand)
 @click.argument("files", nargs=-1, metavar="[FILES | FOLDERS | NAMES]...")
-@click.option("--solvers", type=ValueList(str), help="Solvers by name; default: all that accept the problem.")
+@click.option("--solvers", type=ListType(str), help="Solvers by name; default: all that accept the problem.")
 @click.option(
-    "--reference",
-    default="osqp",
-    show_default=True,
-    help="Solver whose solution the others are compared with.",
+    "--reference", default="osqp", show_default=True, help="Solver with whose result the others are compared."
 )
 @click.option("--tol", type=float, default=1e-6, show_default=True, help="Relative residual to reach.")
-@click.option("--time-limit", type=float, metavar="S", help="Limit of the solve time of each solver.")
+@click.option("--time-limit", type=float, metavar="S", help="Time limit of each solve.")
 @precision_option
 @threshold_option
 @click.pass_context
@@ -45,8 +42,8 @@ def check(
 ) -> None:
     """Compare solvers with a reference solver and with the judge.
 
-    A solution stored in a file is judged, too: is it at the floor of its precision, close enough (--threshold), or did
-    its solver stop early?
+    The judge checks the claim of each solver. A solution stored in a file is judged, too: it is at the floor of its
+    precision, close enough (--threshold), or its solver stopped early.
 
     Exit code 1: a claim is contradicted; none of the solvers accepts a problem; a file in a folder cannot be read; or,
     with --precision or --threshold, a stored solution is neither at its floor nor close enough.
@@ -58,15 +55,15 @@ def check(
     from lavender.lab.check import cross_check
     from lavender.solving.solve import seconds_of
 
-    set_one_thread()
+    one_thread()
     for name in files:
         if name.endswith(".jsonl"):
             raise InputError(
-                f"{name}: problems are checked, not records; `lavender report {name}` shows records again"
+                f"{name}: problems are checked, not records; `lavender report {name}` shows them again"
             )
-    contradicted = unaccepted = answers = above = unmet = 0
-    reading = Reading(partial(echo, style="yellow"))
-    options = precision is not None or was_given(context, "threshold")
+    contradicted = unaccepted = solutions = above = unmet = 0
+    errors = ErrorReporter(partial(echo, style="yellow"))
+    judges_stored = precision is not None or was_given(context, "threshold")
     bench.solver_names([*(solvers or ()), reference])
     check_float("tol", tol, low=0.0)
     check_float("threshold", threshold, low=0.0)
@@ -78,23 +75,21 @@ def check(
             )
             stored = item.judge_stored(precision, threshold)
             echo(item.name, style="bold")
-            echo(str(found))
+            echo(str(comparison))
             if stored is not None:
                 solutions += 1
                 above += stored.verdict != AT_FLOOR
                 unmet += stored.verdict not in (AT_FLOOR, CLOSE)
-                echo(f"stored answer: {stored.verdict_in_words} of {stored.precision}; {stored}")
-            contradicted += len(found.contradicted)
-            unaccepted += len(found.refused) == len(found.rows)
+                echo(f"stored solution: {stored.verdict_in_words} of {stored.precision}; {stored}")
+            contradicted += len(comparison.contradicted)
+            unaccepted += len(comparison.refused) == len(comparison.rows)
     if contradicted:
         echo(f"{contradicted} claims are contradicted", style="bold red")
     if unaccepted:
         echo(f"{unaccepted} problems are accepted by none of these solvers", style="bold red")
-    if options and not answers:
-        raise InputError("--precision, --threshold: no file holds a solution to judge (an entry `impulse`)")
-    if answers:
-        shares = (
-            f"{above} of {answers} above their floor, {unmet} of these with errors above {threshold:g} m/s"
-        )
-        echo(f"stored answers: {shares}")
-    reading.end(contradicted or unaccepted or (options and unmet))
+    if judges_stored and not solutions:
+        raise InputError("--precision, --threshold: no file has a solution to judge (an entry `impulse`)")
+    if solutions:
+        shares = f"{above} of {solutions} above their floor, {unmet} also more than {threshold:g} m/s off"
+        echo(f"stored solutions: {shares}")
+    errors.exit(contradicted or unaccepted or (judges_stored and unmet))

@@ -1,4 +1,4 @@
-"""`lavender doctor`: describe the installation and test whether its kernels give the same bits as elsewhere."""
+"""Define `lavender doctor`: describe the installation and compare the bits of its kernels with other machines."""
 
 from __future__ import annotations
 
@@ -7,26 +7,24 @@ from dataclasses import asdict
 
 import click
 
-from lavender.cli.options import Reading, echo
+from lavender.cli.options import ErrorReporter, echo
 
 
 @click.command()
 @click.argument("files", nargs=-1, metavar="[FILES | FOLDERS | NAMES]...")
 @click.option("--json", "as_json", is_flag=True, help="Print everything as JSON, for a bug report.")
 def doctor(files: tuple[str, ...], as_json: bool) -> None:
-    """Print versions and run a self-test, or examine problems.
-
-    Prints versions, processor, compiler and backends.
+    """Check the installation, or the data of problems.
 
     Without arguments, print versions, processor, compiler and backends, and run a self-test. Exit code 1: the
     self-test gives other bits than on other machines.
 
-    With problems, prints likely mistakes in their data (flipped normals, masses in place of their inverses, rows out of
-    order, ...). Exit code 1: there is a diagnostic, or a file in a folder cannot be read. Exit code 2: a named file
+    With problems, print probable mistakes in their data (flipped normals, masses in place of their inverses, rows out
+    of order, ...). Exit code 1: there is a diagnostic, or a file in a folder cannot be read. Exit code 2: a named file
     cannot be read.
     """
     if files:
-        _diagnose_files(files, as_json)
+        _diagnose_problems(files, as_json)
         return
     from lavender.lab.bench.doctor import examine
 
@@ -38,29 +36,32 @@ def doctor(files: tuple[str, ...], as_json: bool) -> None:
             if key not in ("self_test", "same_bits"):
                 text = ", ".join(f"{k} {v}" for k, v in value.items()) if isinstance(value, dict) else value
                 click.echo(f"{key:<14}{text}")
-        wrong = {name: text for name, text in results["self_test"].items() if text != "same"}
-        n = len(results["self_test"])
-        click.echo(f"{'self-test':<14}{n - len(wrong)} of {n} parts give the same bits")
-        for name, text in wrong.items():
-            click.echo(f"{'':<14}{name}: {text}")
+        wrong = {name: result for name, result in results["self_test"].items() if result != "same"}
+        click.echo(
+            f"{'self-test':<14}{len(results['self_test']) - len(wrong)} of {len(results['self_test'])} give their bits"
+        )
+        for name, result in wrong.items():
+            click.echo(f"{'':<14}{name}: {result}")
     if not results["same_bits"]:
         raise click.exceptions.Exit(1)
 
 
-def _diagnose_files(files: tuple[str, ...], as_json: bool) -> None:
-    """Print the diagnostics of problems."""
+def _diagnose_problems(files: tuple[str, ...], as_json: bool) -> None:
+    """Print probable mistakes in the data of problems, and exit with 1 if there is one."""
     from lavender.lab import bench
     from lavender.lab.diagnostics import diagnose
 
-    results, reading = {}, Reading()
+    diagnostics, errors = {}, ErrorReporter()
     for item in bench.resolve(files):
-        with reading(item):
-            results[item.name] = diagnose(item.problem)
-            for diagnostic in () if as_json else results[item.name]:
+        with errors(item):
+            diagnostics[item.name] = diagnose(item.problem)
+            for diagnostic in () if as_json else diagnostics[item.name]:
                 echo(f"{item.name}: {diagnostic}")
-    suspect = sum(map(bool, results.values()))
+    suspect = sum(map(bool, diagnostics.values()))
     if as_json:
-        click.echo(json.dumps({name: list(map(asdict, items)) for name, items in results.items()}, indent=2))
+        click.echo(
+            json.dumps({name: list(map(asdict, entries)) for name, entries in diagnostics.items()}, indent=2)
+        )
     else:
-        click.echo(f"{len(results)} examined, {suspect or 'none'} suspicious")
-    reading.end(suspect)
+        click.echo(f"{len(diagnostics)} problems checked, {suspect or 'none'} with diagnostics")
+    errors.exit(suspect)

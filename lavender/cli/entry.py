@@ -1,4 +1,4 @@
-"""The group of all commands, and the entry point that converts exceptions to exit codes."""
+"""Define the group of all commands, and the entry point, which turns exceptions into exit codes."""
 
 from __future__ import annotations
 
@@ -17,29 +17,32 @@ import click
 from lavender._version import __version__
 from lavender.base import early_sigint as _early_sigint
 from lavender.base.errors import LavenderError, UnknownName
-from lavender.cli.options import EXIT_BAD_INPUT, EXIT_INTERRUPTED, discard_output, echo
+from lavender.cli.options import EXIT_BAD_INPUT, EXIT_INTERRUPTED, discard_output, echo, suggest_new_option
 
-#: Commands by subject, as `lavender --help` lists them.
-SECTIONS = {
-    "Solve and judge": ("solve", "check", "prove", "explain", "doctor"),
-    "Measure": ("report", "reference", "solvers", "cases", "problems", "bench"),
-    "MuJoCo": ("record", "audit", "tune"),
-    "Engine": ("run", "view", "web", "phenomena"),
-    "C library": ("export",),
+#: Names of the commands by the heading under which `lavender --help` lists them.
+COMMAND_GROUPS = {
+    "Solve and judge": ("solve", "check", "prove", "reference", "explain"),
+    "Measure": ("report", "phenomena"),
+    "MuJoCo": ("record", "audit", "tune", "bench"),
+    "Engine": ("run", "view", "web"),
+    "Tools": ("solvers", "cases", "problems", "doctor", "export"),
 }
-#: Name -> the module that defines the command.
-COMMANDS = {name: f"lavender.cli.{name}" for names in SECTIONS.values() for name in names} | dict.fromkeys(
-    ("view", "web"), "lavender.sim.web.command"
-)
+_WEB_COMMANDS = ("view", "web")
+#: Module of each command.
+COMMANDS = {
+    name: "lavender.sim.web.command" if name in _WEB_COMMANDS else f"lavender.cli.{name}"
+    for names in COMMAND_GROUPS.values()
+    for name in names
+}
 
 
 class Commands(click.Group):
-    """Commands by name, each imported when it is used."""
+    """Group of commands, each of which is imported when it is used."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Reject empty arguments, which would be read as the current folder."""
+        """Reject an empty argument, which would mean the current folder, then parse as click does."""
         if any(word == "" or (word.startswith("--") and word.endswith("=")) for word in args):
-            raise click.UsageError("an empty argument: is a shell variable not set?", ctx)
+            raise click.UsageError("an empty argument: is a variable of the shell not set?", ctx)
         return super().parse_args(ctx, args)
 
     def list_commands(self, ctx: click.Context) -> list[str]:
@@ -58,46 +61,32 @@ class Commands(click.Group):
                 )
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        """Import a command and return it."""
+        """Import and return a command; an unknown name raises UnknownName."""
         if cmd_name not in COMMANDS:
-            if not ctx.resilient_parsing:  # Shell completion also passes incomplete names.
+            if not ctx.resilient_parsing:  # True while a shell completes words.
                 raise UnknownName("command", cmd_name, COMMANDS)
             return None
         command: click.Command = getattr(importlib.import_module(COMMANDS[cmd_name]), cmd_name)
         return command
 
-    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Write the list of commands by subject, without cutting descriptions off."""
-        width = max(map(len, COMMANDS))
-        for section, names in SECTIONS.items():
-            with formatter.section(section):
-                commands = [(name, self.get_command(ctx, name)) for name in names]
-                formatter.write_dl(
-                    [
-                        (name.ljust(width), c.get_short_help_str(limit=200))
-                        for name, c in commands
-                        if c is not None
-                    ]
-                )
-
 
 @click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
 @click.version_option(__version__, prog_name="lavender")
 def cli() -> None:
-    """Solve and compare constraint problems of rigid-body simulation.
+    """Solve constraint problems of rigid-body simulation, and compare the error and the cost of solvers.
 
     Problems are files (.npz, .hdf5), folders of them, or cases of the built-in suite such as "stack(n=64)".
     """
 
 
 def main(args: Sequence[str] | None = None) -> None:
-    """Run the command line: lavender's errors become one line and exit code 2, Ctrl-C ends with 130.
+    """Run the command line. An error of lavender is printed as one line and exits with 2, Ctrl-C exits with 130.
 
-    SIGTERM (from a batch queue or from `timeout`) is handled like Ctrl-C and ends with 143; a second one ends the
-    process at once.
+    SIGTERM, which `timeout` and batch queues send, stops a command as Ctrl-C does and exits with 143; a second SIGTERM
+    ends the process at once.
     """
     _early_sigint.restore_handler()
-    with _recorded_signals() as received:
+    with _note_signals() as received:
         try:
             code = _run_command(args)
         except Exception as error:
@@ -113,43 +102,45 @@ def main(args: Sequence[str] | None = None) -> None:
     raise SystemExit(code)
 
 
-#: Signal that stops a command -> Python's default handler.
-STOPS: dict[int, Any] = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}
+#: Signals that stop a command, with the handlers that Python installs for them.
+DEFAULT_SIGNAL_HANDLERS: dict[int, Any] = {
+    signal.SIGINT: signal.default_int_handler,
+    signal.SIGTERM: signal.SIG_DFL,
+}
 
 
 @contextlib.contextmanager
-def _recorded_signals() -> Iterator[list[int]]:
-    """Collect the signals that arrive: C libraries may replace the exception that a signal raises in them."""
+def _note_signals() -> Iterator[list[int]]:
+    """Note the signals that arrive; C libraries replace the exception of a signal by an error of their own."""
     received: list[int] = []
 
-    def record_signal(number: int, frame: FrameType | None) -> None:
-        """Record a signal and raise KeyboardInterrupt."""
+    def note(number: int, frame: FrameType | None) -> None:
         received.append(number)
         if number == signal.SIGTERM:
             signal.signal(number, signal.SIG_DFL)
         signal.default_int_handler(number, frame)
 
-    for number, default in STOPS.items():
-        with contextlib.suppress(ValueError):  # Only the main thread may set handlers.
-            if signal.getsignal(number) is default:
-                signal.signal(number, record_signal)
+    for number, handler in DEFAULT_SIGNAL_HANDLERS.items():
+        with contextlib.suppress(ValueError):  # Raised outside the main thread.
+            if signal.getsignal(number) is handler:
+                signal.signal(number, note)
     try:
         yield received
     finally:
-        for number, default in STOPS.items():
-            if signal.getsignal(number) is record_signal:
-                signal.signal(number, default)
+        for number, handler in DEFAULT_SIGNAL_HANDLERS.items():
+            if signal.getsignal(number) is note:
+                signal.signal(number, handler)
 
 
 def _run_command(args: Sequence[str] | None) -> int:
-    """Run a command and return its exit code; print the reason if it failed."""
+    """Run a command, print the error that ended it, and return the exit code."""
     for name in ("stdout", "stderr"):
-        if getattr(sys, name) is None:  # The stream is closed: the next file would get its descriptor.
+        if getattr(sys, name) is None:  # Closed by the caller: the next file would get its descriptor.
             null_device = os.open(os.devnull, os.O_WRONLY)
-            setattr(sys, name, open(null_device, "w", encoding="utf-8", closefd=False))  # noqa: SIM115 - open until exit
+            setattr(sys, name, open(null_device, "w", encoding="utf-8", closefd=False))  # noqa: SIM115 - never closed
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")  # File names may contain bytes that are not text.
+            stream.reconfigure(errors="backslashreplace")  # File names may not be valid UTF-8.
     try:
         code = cli.main(
             args=None if args is None else list(args), prog_name="lavender", standalone_mode=False
@@ -167,24 +158,24 @@ def _run_command(args: Sequence[str] | None) -> int:
         click.echo("lavender: stopped", err=True)
         code = EXIT_INTERRUPTED
     except (BrokenPipeError, SystemExit):
-        # The output is no longer read, as in `lavender solvers | head`; click and rich convert this to an exit.
+        # The reader has closed the pipe (`lavender solvers | head`); click and rich raise SystemExit then.
         discard_output()
         code = 0
     except MemoryError as error:
         click.echo(
-            f"lavender: not enough memory ({str(error) or 'none is left'}): give a smaller problem", err=True
+            f"lavender: not enough memory ({str(error) or 'none left'}): give a smaller problem", err=True
         )
         code = EXIT_BAD_INPUT
-    except OSError as error:  # For example, the disk of a redirected stdout is full.
+    except OSError as error:  # For example a full disk behind stdout.
         click.echo(f"lavender: {error}{_explain_os_error()}", err=True)
         code = EXIT_BAD_INPUT
     return code if isinstance(code, int) else 0
 
 
 def _explain_os_error() -> str:
-    """Return an explanation if the working directory no longer exists; otherwise an empty string."""
+    """Return a hint to the cause of an OSError, or an empty text."""
     try:
         os.getcwd()
     except OSError:
-        return " (the working directory is gone: change to a folder that exists)"
+        return " (the working directory is gone: change to a folder that is there)"
     return ""

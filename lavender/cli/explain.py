@@ -6,17 +6,17 @@ import json
 
 import click
 
-from lavender.cli.options import Reading, echo
+from lavender.cli.options import ErrorReporter, echo
 
 
 @click.command()
 @click.argument("files", nargs=-1, required=True, metavar="FILES...")
 @click.option("--tol", type=float, default=1e-6, show_default=True, help="Relative residual to reach.")
-@click.option("--json", "as_data", is_flag=True, help="Print the plan of each problem as a line of JSON.")
+@click.option("--json", "as_data", is_flag=True, help="Print one decision trace per line as JSON.")
 def explain(files: tuple[str, ...], tol: float, as_data: bool) -> None:
-    """Print how `auto` would select solvers for problems.
+    """Print the decision trace of `auto` on problems.
 
-    FILE is a file, a folder, or a case of the suite. Nothing is solved. Costs are estimated from the structure of a
+    FILES are files, folders or cases of the suite. Nothing is solved. Costs are counted from the structure of a
     problem, with the same rates on every machine.
 
     Exit code 1: a file in a folder cannot be read; the others are explained. Exit code 2: a named file cannot be read.
@@ -34,4 +34,4 @@ def explain(files: tuple[str, ...], tol: float, as_data: bool) -> None:
                 click.echo(json.dumps(plan.data()))
             else:
                 echo(f"{item.name}: {plan}\n")
-    reading.end()
+    errors.exit()

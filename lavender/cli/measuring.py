@@ -1,4 +1,4 @@
-"""Run a measurement plan with a progress bar."""
+"""Run a plan with a progress bar, for the commands that measure."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ import click
 from lavender.base.errors import InputError
 from lavender.cli.options import (
     console,
+    convert_to_bytes,
     echo,
-    exit_interrupted,
-    ignore_closed_pipe,
-    reject_unused,
-    set_one_thread,
-    to_bytes,
+    exit_stopped,
+    ignore_closed_output,
+    one_thread,
+    reject_unused_options,
     was_given,
 )
 
@@ -34,17 +34,14 @@ PROGRESS_INTERVAL = 10.0  # [s] Time between two lines of progress if the output
 
 @dataclass(frozen=True)
 class Measured:
-    """Records that a command measured or reused.
+    """Records of a command, measured now or read from its output folder.
 
     Parameters
     ----------
     records : Records
-    stopped : bool
-        The measurement was stopped by Ctrl-C.
-    reused : int
-        Number of records that an earlier run had measured.
-    since : str
-        Start of that run.
+    stopped : whether Ctrl-C ended the measurement
+    reused : number of records that were not measured again
+    since : date of the first reused record
     """
 
     records: Records
@@ -54,7 +51,7 @@ class Measured:
 
     @property
     def note(self) -> str:
-        """Sentence about the records that were reused; empty if all were measured now."""
+        """Sentence on reused records; empty if all were measured now."""
         if not self.reused:
             return ""
         return f"{self.reused} of {len(self.records)} runs of {self.since} reused; --no-reuse measures again"
@@ -65,13 +62,13 @@ class Measured:
         return sum(not skip.solver for skip in self.records.skips)
 
 
-def check_named(items: Sequence[Item]) -> None:
-    """Load the items that were requested by name, and release their memory.
+def check_named_problems(items: Sequence[Item]) -> None:
+    """Load each named problem and release its memory.
 
     Raises
     ------
     InputError
-        One of them does not load: nothing is measured, and no page is changed.
+        A problem does not load. Nothing has been measured and no page changed.
     """
     from lavender.lab.bench.running.runner import describe_load_error
 
@@ -84,122 +81,123 @@ def check_named(items: Sequence[Item]) -> None:
             item.forget()
 
 
-def plan_of(options: Mapping[str, Any], kind: type[P], **extra_options: Any) -> P:
-    """Build the plan of the options `plan_options`; options without a value keep the plan's default.
+def make_plan(options: Mapping[str, Any], kind: type[P], **more: Any) -> P:
+    """Make a plan of the options of `plan_options`; options that are None keep the default of the plan.
 
     Raises
     ------
     InputError
-        A level, budget or limit is invalid.
+        A tolerance, budget or limit is invalid.
     """
-    names = ("levels", "budgets", "motion", "prove", "speed_levels", "orders")
-    return kind(**{name: options[name] for name in names if options[name] is not None}, **extra_options)
+    names = ("tolerances", "budgets", "motion", "prove", "velocity_tolerances", "orders")
+    return kind(**{name: options[name] for name in names if options[name] is not None}, **more)
 
 
 def is_campaign(context: click.Context) -> bool:
-    """Whether workers measure: errors and robustness, without times."""
+    """Return whether workers measure error and robustness without times."""
     return was_given(context, "workers") or was_given(context, "backend")
 
 
 def measure(context: click.Context, files: Sequence[str], path: Path, sweeps: Sequence[int]) -> Measured:
-    """Run a plan with a progress bar and store the records in `path`; without workers, also time the report's lines.
+    """Measure solvers on files with a progress bar, and time the calls that a report would print.
+
+    With workers nothing is timed. `path` is the records file.
 
     Raises
     ------
     InputError
-        A named file does not load; the folder cannot be written, or another process is writing to it.
+        A named file does not load, or the folder cannot be written or is in use by another process.
     """
     from lavender.lab import bench
     from lavender.lab.bench.candidates import time_candidates
 
-    set_one_thread()
+    one_thread()
     options = context.params
-    bench.solver_names(options["solvers"])  # Check the names before any file is loaded.
-    campaign, cases = is_campaign(context), list(files)
-    extra_options: dict[str, Any] = {}
+    bench.solver_names(options["solvers"])  # An unknown name is an error before a problem is loaded.
+    campaign, names = is_campaign(context), list(files)
+    more: dict[str, Any] = {}
     plan: Plan
     if campaign:
         workers = options["workers"] if was_given(context, "workers") else -1
-        extra_options = {"workers": workers, "backend": options["backend"]}
-        cases = bench.expand_seeds(files, len(options["seeds"]), options["seeds"].start)
-        if cases == list(files):
-            reject_unused(context, ["seeds"], "because no case has a seed")
-        plan = plan_of({**options, "orders": options["orders"] or ()}, bench.CampaignPlan)
+        more = {"workers": workers, "backend": options["backend"]}
+        names = bench.expand_seeds(files, len(options["seeds"]), options["seeds"].start)
+        if names == list(files):
+            reject_unused_options(context, ["seeds"], "if no case takes one")
+        plan = make_plan({**options, "orders": options["orders"] or ()}, bench.CampaignPlan)
     else:
-        plan = _timed_plan(options, files, sweeps)
+        plan = _make_timed_plan(options, files, sweeps)
     reused = 0
     with bench.Store(path) as store:
-        items = bench.resolve(cases, options["sequence"])
-        if was_given(context, "pass_limit") and not any(item.sequence for item in items):
-            raise InputError("--pass-limit has no effect without a sequence: leave it out")
-        check_named(items)
-        started_of = {name: run.started for name, run in store.records.runs.items()}
-        collected: list[Records] = []
+        items = bench.resolve(names, options["sequence"])
+        if was_given(context, "sequence_time_limit") and not any(item.sequence for item in items):
+            raise InputError("--sequence-time-limit has no effect without a sequence: leave it out")
+        check_named_problems(items)
+        before = {name: run.started for name, run in store.records.runs.items()}
+        measured: list[Records] = []
         with progress() as bar:
 
-            def count_reused(event: Event) -> None:
-                """Show an event and count reused records."""
+            def show_event(event: Event) -> None:
                 nonlocal reused
                 reused += event.reused
                 bar(event)
 
             stopped = False
             try:
-                common = {
-                    "watch": count_reused,
-                    "fresh": options["fresh"],
-                    "memory": to_bytes(options["memory"]),
+                common: dict[str, Any] = {
+                    "watch": show_event,
+                    "reuse": not options["no_reuse"],
+                    "memory": convert_to_bytes(options["memory"]),
                 }
-                bench.run(items, options["solvers"], plan, store, into=collected, **common, **extra_options)
+                bench.run(items, options["solvers"], plan, store, into=measured, **common, **more)
                 if not campaign:
-                    time_candidates(items, collected[0], plan, store, **common)
+                    time_candidates(items, measured[0], plan, store, **common)
             except KeyboardInterrupt:
-                if not collected:
+                if not measured:
                     raise
                 stopped = True
-    since = started_of.get(next(iter(collected[0].runs)), "") if reused else ""
-    return Measured(collected[0], stopped, reused, since.replace("T", " ")[:16])
+    since = before.get(next(iter(measured[0].runs)), "") if reused else ""
+    return Measured(measured[0], stopped, reused, since.replace("T", " ")[:16])
 
 
-def _timed_plan(options: Mapping[str, Any], files: Sequence[str], sweeps: Sequence[int]) -> Plan:
-    """Build the plan of a run that measures times."""
+def _make_timed_plan(options: Mapping[str, Any], files: Sequence[str], sweeps: Sequence[int]) -> Plan:
+    """Make the plan of a report that measures times."""
     from lavender.lab.bench import Plan
     from lavender.lab.proof import require_python_flint
 
     if options["sequence"] and not files:
         raise InputError("--sequence needs a folder of problem files, one for each step")
-    limits = {"pass_limit": options["pass_limit"]} if options["pass_limit"] is not None else {}
-    # Without files, the whole suite runs in about a minute.
+    limits = (
+        {"sequence_time_limit": options["sequence_time_limit"]}
+        if options["sequence_time_limit"] is not None
+        else {}
+    )
+    # Without files, the short limit measures the whole suite in a minute.
     limits["time_limit"] = (
         (1.0 if files else 0.25) if options["time_limit"] is None else options["time_limit"]
     )
-    extra_options: dict[str, Any] = {
-        "repeats": options["repeats"],
-        "times": options["time_budgets"],
-        "sweeps": sweeps,
-    }
-    plan = plan_of(options, Plan, **limits, **extra_options)
+    more: dict[str, Any] = {"repeats": options["repeats"], "times": options["time_budgets"], "sweeps": sweeps}
+    plan = make_plan(options, Plan, **limits, **more)
     if plan.prove:
         require_python_flint()
     return plan
 
 
 def show_page(page: SummaryPage, folder: Path) -> None:
-    """Write a page and print its short form; exit with 130 if Ctrl-C ended the measurement."""
+    """Write a page and print its short form; exit if Ctrl-C ended the measurement."""
     path = page.write(folder)
-    with ignore_closed_pipe():
+    with ignore_closed_output():
         page.print_short(console())
         echo(f"\npage: {path}")
     if page.stopped:
-        exit_interrupted()
+        exit_stopped()
 
 
 @contextlib.contextmanager
 def progress() -> Iterator[Callable[[Event], None]]:
-    """Show progress: a bar on a terminal, otherwise a line on stderr every PROGRESS_INTERVAL seconds."""
-    terminal = console(stderr=True)
-    if not terminal.is_terminal:
-        yield _progress_printer()
+    """Yield a callback that shows progress: a bar on a terminal, otherwise a line of stderr now and then."""
+    to = console(stderr=True)
+    if not to.is_terminal:
+        yield _print_progress_lines()
         return
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
@@ -208,32 +206,30 @@ def progress() -> Iterator[Callable[[Event], None]]:
         MofNCompleteColumn(),
         TimeElapsedColumn(),
         TextColumn("{task.fields[what]}", markup=False),
-        console=terminal,
+        console=to,
         transient=True,
         refresh_per_second=4,  # Drawing takes processor time from the measurement.
     ) as bar:
         task = bar.add_task("", total=None, what="")
         yield lambda event: bar.update(
-            task, completed=event.done, total=event.total or None, what=_describe_event(event)
+            task, completed=event.done, total=event.total or None, what=_format_event(event)
         )
 
 
-def _progress_printer() -> Callable[[Event], None]:
-    """Return a function that prints a line of progress every PROGRESS_INTERVAL seconds."""
+def _print_progress_lines() -> Callable[[Event], None]:
+    """Return a callback that prints a line of progress every `PROGRESS_INTERVAL` seconds."""
     began = printed = time.monotonic()
 
-    def print_progress(event: Event) -> None:
-        """Print an event unless the last line is recent."""
+    def show_event(event: Event) -> None:
         nonlocal printed
         now = time.monotonic()
         if now - printed >= PROGRESS_INTERVAL:
             printed = now
             count = f"{event.done} of {event.total}, " if event.total else ""
-            click.echo(f"{count}{now - began:.0f} s: {_describe_event(event)}", err=True)
+            click.echo(f"{count}{now - began:.0f} s: {_format_event(event)}", err=True)
 
-    return print_progress
+    return show_event
 
 
-def _describe_event(event: Event) -> str:
-    """Return the case and the solver of an event."""
+def _format_event(event: Event) -> str:
     return f"{event.case} {event.solver}".strip()

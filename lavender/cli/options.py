@@ -1,4 +1,4 @@
-"""Shared parts of commands: option types, options of a plan, the console, exit codes."""
+"""Common parts of the commands: option types, options of a plan, console output, exit codes."""
 
 from __future__ import annotations
 
@@ -24,22 +24,43 @@ if TYPE_CHECKING:
 else:
     _ParamType = click.ParamType
 
-EXIT_UNMET = (
-    1  # A claim is not met: a problem is not solved, a check fails, a file in a folder cannot be read.
-)
-EXIT_BAD_INPUT = 2  # The input is invalid, or another process is writing to the folder.
+EXIT_UNMET = 1  # The problem is not solved, a check failed, or a file in a folder cannot be read.
+EXIT_BAD_INPUT = 2  # An argument is invalid, or another process writes to the output folder.
 EXIT_INFEASIBLE = 3  # The problem is infeasible, with a certificate that the judge confirms.
 EXIT_INTERRUPTED = 130
-MIN_TERMINAL_WIDTH = 60  # [columns] Output for a narrower terminal has this width.
+MIN_TERMINAL_WIDTH = 60  # [columns] Tables are formatted for at least this width.
 PATH = click.Path(path_type=Path)
 FILE = click.Path(dir_okay=False, path_type=Path)
 FOLDER = click.Path(file_okay=False, path_type=Path)
-Option = tuple[tuple[str, ...], dict[str, Any]]  # names of an option, and keyword arguments of click.option
+Option = tuple[tuple[str, ...], dict[str, Any]]  # Names of an option, and its arguments of `click.option`.
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
 
 
+#: Present name of each option that earlier versions had under another name.
+RENAMED_OPTIONS = {
+    "--accept": "--max-velocity-error",
+    "--ahead": "--horizon",
+    "--campaign": "--workers",
+    "--every": "--record-every",
+    "--for": "--records",
+    "--fresh": "--no-reuse",
+    "--levels": "--tolerances",
+    "--pass-limit": "--sequence-time-limit",
+    "--rounds": "--repeats",
+    "--speed-levels": "--velocity-tolerances",
+}
+
+
+def suggest_new_option(error: click.NoSuchOption) -> None:
+    """Let the message of an unknown option suggest its present name, if the command has an option of that name."""
+    new_name = RENAMED_OPTIONS.get(error.option_name)
+    command = error.ctx.command if error.ctx is not None else None
+    if command is not None and any(new_name in option.opts for option in command.params):
+        error.message = f"{error.message} Did you mean {new_name!r}?"  # type: ignore[misc]
+        error.possibilities = None  # type: ignore[misc]
+
+
 def _is_number(word: str) -> bool:
-    """Whether a word is a number."""
     try:
         float(word)
     except ValueError:
@@ -48,26 +69,24 @@ def _is_number(word: str) -> bool:
 
 
 def _is_order(word: str) -> bool:
-    """Whether a word is a sweep order, with or without a seed."""
-    from lavender.problem.ordering import ORDERS
+    from lavender.problem.ordering import SWEEP_ORDERS
 
     return word.partition(":")[0] in SWEEP_ORDERS
 
 
 def _is_solver(word: str) -> bool:
-    """Whether a word is a solver's name, perhaps misspelled, and not a file or case."""
     from lavender.lab import suite
     from lavender.solvers import registry
 
     if Path(word).exists():
         return False
     names = {family.partition("(")[0] for family in suite.families()}
-    # A word that is neither a case nor a path is a misspelled solver name, which is rejected with suggestions.
+    # A word that is neither a case nor a path is a misspelt solver name; it is rejected as such later.
     return word in registry.specs() or not (word in names or set(word) & set("(*?[/\\."))
 
 
-class ManyValues(click.Command):
-    """Command that accepts `--levels 1e-3 1e-6` as well as `--levels 1e-3,1e-6`: words are values while they fit."""
+class MultiValueCommand(click.Command):
+    """Command that accepts `--tolerances 1e-3 1e-6` as well as `--tolerances 1e-3,1e-6`."""
 
     VALUE_TESTS: dict[str, Callable[[str], bool]] = {  # noqa: RUF012 - a constant of the class
         "--tolerances": _is_number,
@@ -79,7 +98,7 @@ class ManyValues(click.Command):
     }
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Join the values of such an option with commas, then parse the arguments."""
+        """Join the values that follow an option of `VALUE_TESTS` into one word, then parse as click does."""
         folded: list[str] = []
         i = 0
         while i < len(args):
@@ -96,7 +115,7 @@ class ManyValues(click.Command):
         return super().parse_args(ctx, folded)
 
 
-class ValueList(_ParamType):
+class ListType(_ParamType):
     """Option type: numbers or words, separated by commas or blanks."""
 
     def __init__(self, kind: type) -> None:
@@ -106,7 +125,7 @@ class ValueList(_ParamType):
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> tuple[Any, ...]:
-        """Convert a value to a tuple."""
+        """Return the values as a tuple."""
         if not isinstance(value, str):
             return tuple(value)
         try:
@@ -117,13 +136,13 @@ class ValueList(_ParamType):
             )
 
 
-class Seeds(_ParamType):
-    """Option type: N or A:B, integers."""
+class SeedRange(_ParamType):
+    """Option type: seeds as N (0 to N - 1) or A:B (A to B - 1)."""
 
     name = "n"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> range:
-        """Convert a value to a range of seeds."""
+        """Return the range of seeds."""
         if isinstance(value, range):
             return value
         first, colon, last = str(value).partition(":")
@@ -134,61 +153,60 @@ class Seeds(_ParamType):
         return range(int(first), int(last))
 
 
-def set_one_thread() -> None:
-    """Limit libraries that are loaded later to one thread; loaded libraries are limited while times are measured."""
+def one_thread() -> None:
+    """Limit libraries that are loaded later to one thread; loaded ones are limited during timing."""
     for name in THREAD_VARIABLES:
         os.environ.setdefault(name, "1")
 
 
 def console(stderr: bool = False) -> Console:
-    """Create the rich console: at least MIN_TERMINAL_WIDTH wide on a terminal, wide enough for any table elsewhere."""
+    """Return a console that never cuts names; in a file or pipe, lines are as long as the tables need."""
     from rich.console import Console
 
-    known = Console(stderr=stderr).is_terminal or os.environ.get("COLUMNS", "0").strip("0").isdigit()
-    # At this width no line is folded or cut.
-    width = max(shutil.get_terminal_size().columns, MIN_TERMINAL_WIDTH) if known else 10_000
+    has_width = Console(stderr=stderr).is_terminal or os.environ.get("COLUMNS", "0").strip("0").isdigit()
+    width = max(shutil.get_terminal_size().columns, MIN_TERMINAL_WIDTH) if has_width else 10_000
     return Console(stderr=stderr, width=width)
 
 
 def discard_output() -> None:
-    """Redirect stdout to the null device, after its reader has closed it (as `| head` does)."""
+    """Redirect standard output to the null device after its reader has closed the pipe (`| head`)."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 @contextlib.contextmanager
-def ignore_closed_pipe() -> Iterator[None]:
-    """Continue if the reader of stdout closes it, so that a command still writes its files."""
+def ignore_closed_output() -> Iterator[None]:
+    """Discard output if its reader has closed the pipe, so that the command still writes its files."""
     try:
         yield
-    except (BrokenPipeError, SystemExit):  # rich converts BrokenPipeError to SystemExit.
+    except (BrokenPipeError, SystemExit):  # rich turns BrokenPipeError into SystemExit.
         discard_output()
 
 
 def was_given(context: click.Context, name: str) -> bool:
-    """Whether an option was given on the command line or in the environment, with any value."""
+    """Return whether an option is set on the command line or in the environment, with any value."""
     return context.get_parameter_source(name) not in (None, click.core.ParameterSource.DEFAULT)
 
 
 def add_options(
-    options: Sequence[Option], **shared: Any
+    options: Sequence[Option], **common: Any
 ) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Return a decorator that adds options to a command, in this order, with `shared` arguments for all of them."""
+    """Return a decorator that adds options to a command in this order, all with the settings `common`."""
 
     def decorate(command: Callable[..., Any]) -> Callable[..., Any]:
-        for names, more in reversed(options):
-            command = click.option(*names, **shared, **more)(command)
+        for names, settings in reversed(options):
+            command = click.option(*names, **common, **settings)(command)
         return command
 
     return decorate
 
 
 def worlds_options(worlds: int, steps: int) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Return a decorator that adds the options of simulated worlds, with these default numbers."""
+    """Return a decorator with the options for simulating worlds of a MuJoCo model; the arguments are defaults."""
     options: list[Option] = [
-        (("--worlds",), {"default": worlds, "help": "Number of worlds; the first is that of `lavender record`."}),
-        (("--steps",), {"default": steps, "help": "Number of steps of each world."}),
+        (("--worlds",), {"default": worlds, "help": "Number of worlds; the first is the one of `lavender record`."}),
+        (("--steps",), {"default": steps, "help": "Steps of each world."}),
         (("--spread",), {"default": 0.1, "metavar": "M/S",
-                         "help": "Standard deviation of the noise on the initial velocities of the other worlds."}),
+                         "help": "Standard deviation by which the initial velocities of the other worlds differ."}),
     ]  # fmt: skip
     options += [
         (names, more) for names, more in RECORDING_OPTIONS if names[0] in ("--controls", "--seed", "--states")
@@ -196,30 +214,31 @@ def worlds_options(worlds: int, steps: int) -> Callable[[Callable[..., Any]], Ca
     return add_options(options, show_default=True)
 
 
-def reject_unused_recording(context: click.Context, recorded: bool) -> None:
-    """Reject recording options that would be ignored."""
+def reject_unused_recording_options(context: click.Context, recorded: bool) -> None:
+    """Raise InputError for options of a recording that would be ignored."""
     if not recorded:
-        reject_unused(context, RECORDING, "without a MODEL.xml")
+        reject_unused_options(context, RECORDING_NAMES, "without a MODEL.xml")
     elif context.params["control"] != "random":
-        reject_unused(context, ["seed"], "without --controls random")
+        reject_unused_options(context, ["seed"], "without --controls random")
 
 
-def reject_unused(context: click.Context, names: Sequence[str], reason: str) -> None:
-    """Reject options that would be ignored.
+def reject_unused_options(context: click.Context, names: Sequence[str], condition: str) -> None:
+    """Raise InputError if one of these options is set, which would be ignored.
 
-    Raises
-    ------
-    InputError
-        One of them was given; the message ends with `reason`.
+    Parameters
+    ----------
+    context : context of the command
+    names : names of the options' parameters
+    condition : why the options have no effect, such as "without --records"
     """
     options = {p.name: p.opts[0] for p in context.command.params}
     for name in names:
         if was_given(context, name):
-            raise InputError(f"{options[name]} has no effect {reason}: leave it out")
+            raise InputError(f"{options[name]} has no effect {condition}: leave it out")
 
 
-def reject_idle(context: click.Context, solvers: Sequence[str] | None) -> None:
-    """Reject options of a plan that none of the named solvers uses.
+def reject_options_without_effect(context: click.Context, solvers: Sequence[str] | None) -> None:
+    """Raise InputError for options of a plan that none of the named solvers uses.
 
     Raises
     ------
@@ -235,14 +254,14 @@ def reject_idle(context: click.Context, solvers: Sequence[str] | None) -> None:
         return
     specs = [registry.get(name) for name in solvers]
     if not any(s.resumable and not s.exact for s in specs):
-        reject_unused(context, ["budgets"], "on solvers that cannot stop after any iteration")
+        reject_unused_options(context, ["budgets"], "on solvers that cannot stop after any iteration")
     if not any(s.order and not s.exact for s in specs):
-        reject_unused(context, ["orders"], "on solvers without a sweep order")
+        reject_unused_options(context, ["orders"], "on solvers that take no order")
     if not any(map(is_foreign, specs)):
-        reject_unused(context, ["memory"], "if no solver of another package runs")
+        reject_unused_options(context, ["memory"], "if no solver of another package runs")
 
 
-#: Option for the answers of an engine.
+#: Option of commands that judge solutions of an engine.
 precision_option = click.option(
     "--precision", type=click.Choice(["float64", "float32"]),
     help="Precision in which the engine computed its solutions; default: that of the problem, or float64.",
@@ -256,30 +275,30 @@ RECORDING_OPTIONS: tuple[Option, ...] = (
     (("--steps",), {"default": 500, "help": "MODEL.xml: number of simulation steps."}),
     (("--record-every", "every"), {"default": 5, "help": "MODEL.xml: record every n-th step."}),
     (("--controls", "control"), {"default": "random", "metavar": "zero|random|FILE",
-                                 "help": "MODEL.xml: controls. FILE: an .npy array of shape (any, nu)."}),
+                                 "help": "MODEL.xml: its controls. FILE: an .npy array of shape (any, nu)."}),
     (("--seed",), {"default": 0, "help": "MODEL.xml: seed of random controls."}),
     (("--states",), {"default": None, "metavar": "FILE|keyframes",
-                     "help": "MODEL.xml: start from these states. FILE: an .npz, best with `state`, rows of "
-                     "mjSTATE_INTEGRATION (with warm start and controls); otherwise qpos, qvel and other arrays of "
-                     "MjData, such as `lavender audit` writes. keyframes: the model's own."}),
+                     "help": "MODEL.xml: start from these states. FILE: an .npz, best with `state`, vectors of "
+                     "mjSTATE_INTEGRATION (with warm start and controls) in its rows; else qpos and qvel, and other "
+                     "arrays of MjData, such as `lavender audit` writes. keyframes: those of the model."}),
 )  # fmt: skip
-RECORDING = ("steps", "every", "control", "seed", "states", "threshold")  # parameter names of these options
+RECORDING_NAMES = ("steps", "every", "control", "seed", "states", "threshold")  # Parameter names.
 recording_options = add_options([THRESHOLD, *RECORDING_OPTIONS], show_default=True)
 
-#: Options of measurements.
+#: Options of the commands that measure, as fields of `lavender.lab.bench.Plan`.
 PLAN_OPTIONS: tuple[tuple[str, dict[str, Any]], ...] = (
-    ("--solvers", {"type": ValueList(str), "help": "Solvers by name; default: all that are installed."}),
-    ("--levels", {"type": ValueList(float), "default": "1e-3,1e-6,1e-9", "show_default": True,
+    ("--solvers", {"type": ListType(str), "help": "Solvers by name; default: all that are installed."}),
+    ("--tolerances", {"type": ListType(float), "default": "1e-3,1e-6,1e-9", "show_default": True,
                   "help": "Relative residuals to reach."}),
-    ("--motion", {"is_flag": True, "help": "Also measure the motion error: the relative error of the velocities, "
-                  "by a reference that is solved once for each case."}),
-    ("--prove", {"is_flag": True, "help": "Measure the motion error from an exact solution that is enclosed with a "
-                 "proof, if there is one (extra `proof`); implies --motion."}),
-    ("--speed-levels", {"type": ValueList(float), "default": (), "metavar": "M/S,M/S,...",
+    ("--motion", {"is_flag": True, "help": "Also measure the motion error: how wrong the velocities of the bodies are, "
+                  "relative to a reference that is solved once for each case."}),
+    ("--prove", {"is_flag": True, "help": "Measure the motion error from an enclosed exact solution, if one is proven "
+                 "(extra `proof`); implies --motion."}),
+    ("--velocity-tolerances", {"type": ListType(float), "default": (), "metavar": "M/S,M/S,...",
                         "help": "Motion errors to reach, in metres per second; implies --motion."}),
-    ("--budgets", {"type": ValueList(int), "default": "4,8,16,32,64", "show_default": True,
+    ("--budgets", {"type": ListType(int), "default": "4,8,16,32,64", "show_default": True,
                    "help": "Numbers of iterations to run exactly."}),
-    ("--orders", {"type": ValueList(str), "default": None,
+    ("--orders", {"type": ListType(str), "default": None,
                   "help": "Sweep orders to compare with 'given', at the middle budget; random:3 uses seed 3."}),
     ("--repeats", {"type": int, "default": 3, "show_default": True,
                    "help": "Repetitions of each solve; minimum and median are recorded."}),
@@ -294,13 +313,13 @@ PLAN_OPTIONS: tuple[tuple[str, dict[str, Any]], ...] = (
 plan_options = add_options([((name,), more) for name, more in PLAN_OPTIONS])
 
 
-def to_bytes(gigabytes: float | None) -> int | None:
-    """Convert the value of an option in GB to bytes.
+def convert_to_bytes(gigabytes: float | None) -> int | None:
+    """Return the bytes of an option in GB.
 
     Raises
     ------
     InputError
-        It is not a positive number.
+        The number is not positive.
     """
     if gigabytes is None:
         return None
@@ -310,7 +329,7 @@ def to_bytes(gigabytes: float | None) -> int | None:
 
 
 def escape_markup(text: str) -> str:
-    """Escape markup of rich, and write control characters of a terminal as their codes."""
+    """Return text with rich's markup escaped and control characters written as their codes."""
     from rich.markup import escape
 
     from lavender.lab.bench.record import printable
@@ -319,7 +338,7 @@ def escape_markup(text: str) -> str:
 
 
 def echo(text: str, err: bool = False, style: str = "") -> None:
-    """Print text that may contain names of files and problems: control characters are written as their codes."""
+    """Print text that may contain names of files and problems; control characters are written as their codes."""
     from lavender.lab.bench.record import printable
 
     if style:
@@ -328,14 +347,14 @@ def echo(text: str, err: bool = False, style: str = "") -> None:
         click.echo(printable(text, lines=True), err=err)
 
 
-def exit_interrupted() -> NoReturn:
-    """Exit after Ctrl-C, when the results so far are written."""
-    echo("Stopped: the results are of the work until then.", style="yellow")
+def exit_stopped() -> NoReturn:
+    """Exit a command after Ctrl-C, once the completed part is written."""
+    echo("Stopped: the results are those of the completed part.", style="yellow")
     raise click.exceptions.Exit(EXIT_INTERRUPTED)
 
 
-class Reading:
-    """Context for the work on each problem of a command: errors are reported and determine the exit code."""
+class ErrorReporter:
+    """Context manager of each problem of a command: it prints the errors of a problem and sets the exit code."""
 
     def __init__(self, report: Callable[[str], Any] | None = None) -> None:
         self.report = report or partial(echo, err=True)
@@ -343,32 +362,32 @@ class Reading:
 
     @contextlib.contextmanager
     def __call__(self, item: Item) -> Iterator[None]:
-        """Work on one problem, whose memory is released at the end."""
+        """Run the block for one problem and release its memory at the end."""
         try:
             yield
         except LavenderError as error:
             self.report(f"{item.name}: {error}")
-            named = isinstance(error, InputError) and item.named
-            self.code = max(self.code, EXIT_BAD_INPUT if named else EXIT_UNMET)
+            is_bad_argument = isinstance(error, InputError) and item.named
+            self.code = max(self.code, EXIT_BAD_INPUT if is_bad_argument else EXIT_UNMET)
         finally:
             item.forget()
 
-    def end(self, unmet: Any = False) -> None:
-        """Exit: with 2 if a named problem could not be read, with 1 if another could not, or if `unmet`."""
+    def exit(self, unmet: Any = False) -> None:
+        """Exit with 2 if a named problem could not be read, with 1 after another error or if `unmet`."""
         if code := self.code or (EXIT_UNMET if unmet else 0):
             raise click.exceptions.Exit(code)
 
 
 def parse_parameters(words: tuple[str, ...]) -> dict[str, Any]:
-    """Convert words such as `n=20` to {"n": 20}: values are numbers, true, false, none, or strings."""
+    """Return {"n": 20} for `n=20`. Values are numbers, true, false, none, or else texts."""
     parameters: dict[str, Any] = {}
     for word in words:
         name, equals, value = word.partition("=")
         if not equals or not name:
             raise InputError(f"--set {word!r}; NAME=VALUE is needed")
-        known = {"true": True, "false": False, "none": None}
-        if value.lower() in known:
-            parameters[name] = known[value.lower()]
+        constants = {"true": True, "false": False, "none": None}
+        if value.lower() in constants:
+            parameters[name] = constants[value.lower()]
             continue
         try:
             parameters[name] = float(value) if not value.lstrip("+-").isdigit() else int(value)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from lavender.cli.options import PATH, parse_parameters, reject_unused
+from lavender.cli.options import PATH, parse_parameters, reject_unused_options
 from lavender.io.stored import writable, write_text
 
 if TYPE_CHECKING:
@@ -18,8 +18,7 @@ if TYPE_CHECKING:
 ENGINE_PACKAGES = ("mujoco", "pybullet", "drake", "lavendersim", "newton", "numpy")
 
 
-def _names(text: str | None) -> list[str] | None:
-    """Split a comma-separated list of names; None selects all."""
+def _split_names(text: str | None) -> list[str] | None:
     if text is None or text == "all":
         return None
     return [] if text == "none" else [w.strip() for w in text.split(",") if w.strip()]
@@ -27,12 +26,9 @@ def _names(text: str | None) -> list[str] | None:
 
 @click.command("phenomena")
 @click.argument("names", nargs=-1, metavar="[NAMES]...")
-@click.option("--steppers", help="lavender's steppers, separated by commas, or none; default: all.")
+@click.option("--steppers", help="Steppers of lavender, separated by commas; default: all; none: no stepper.")
 @click.option(
-    "--engines",
-    default="none",
-    show_default=True,
-    help="Other engines, separated by commas, or all, or none.",
+    "--engines", default="none", show_default=True, help="Other engines, separated by commas, or all."
 )
 @click.option(
     "--set",
@@ -63,16 +59,16 @@ def phenomena(
     out: Path | None,
     listed: bool,
 ) -> None:
-    """Measure steppers and engines on scenes with known motion.
+    """Measure steppers and engines on scenes with a known motion.
 
     A cell shows the worst distance from the exact motion and the number of cases within all bounds. A note says which
     engine is missing, crashed, or cannot build a scene.
     """
-    from lavender.lab.phenomena import WAYS, run, select_phenomena
+    from lavender.lab.phenomena import ENGINE_VARIANTS, run, select_phenomena
     from lavender.lab.phenomena import table as tables
 
     if listed:
-        reject_unused(context, ["steppers", "engines", "parameters", "limit", "out"], "with --list")
+        reject_unused_options(context, ["steppers", "engines", "parameters", "limit", "out"], "with --list")
         click.echo(tables.describe_phenomena(select_phenomena(names)))
         return
     if out is not None:
@@ -84,7 +80,7 @@ def phenomena(
         records.append(record)
         click.echo(tables.format_record(record), err=True)
         if out is not None:
-            write_text(out, json.dumps(_to_json(records), indent=1) + "\n")
+            write_text(out, json.dumps(_collect_results(records), indent=1) + "\n")
 
     run(
         names,
@@ -95,23 +91,28 @@ def phenomena(
         show=show,
     )
     for heading, lines in (
-        ("lavender's steppers out of their bounds", tables.out_of_bound_cases(records)),
+        ("Steppers of lavender out of bounds", tables.out_of_bound_cases(records)),
         ("Without values", tables.notes(records)),
     ):
         if lines:
             click.echo(f"{heading}:\n" + "\n".join(f"- {x}" for x in lines) + "\n")
     click.echo(tables.table(records))
-    measured = {r.engine for r in records}
-    click.echo("\n" + "\n".join(f"- {way.name}: {way.text}" for way in WAYS.values() if way.name in measured))
+    ran = {r.engine for r in records}
+    click.echo(
+        "\n"
+        + "\n".join(
+            f"- {variant.name}: {variant.text}" for variant in ENGINE_VARIANTS.values() if variant.name in ran
+        )
+    )
 
 
-def _to_json(records: list[Record]) -> dict[str, object]:
-    """Collect records with the machine and versions."""
+def _collect_results(records: list[Record]) -> dict[str, object]:
+    """Return the content of the file of --out: processor, versions and records."""
     from lavender.lab.bench.machine import cpu_name, versions
     from lavender.lab.phenomena.engines import versions_of_node
 
     return {
         "cpu": cpu_name(),
-        "versions": versions(PACKAGES) | versions_of_node(),
+        "versions": versions(ENGINE_PACKAGES) | versions_of_node(),
         "records": [asdict(r) for r in records],
     }

@@ -7,22 +7,20 @@ from pathlib import Path
 import click
 
 from lavender.base.errors import InputError
-from lavender.cli.options import EXIT_UNMET, FILE, FOLDER, echo, reject_unused, set_one_thread
+from lavender.cli.options import EXIT_UNMET, FILE, FOLDER, echo, one_thread, reject_unused_options
 from lavender.io.stored import lock_output, writable, write_text
 
 
 @click.command()
 @click.argument("groups", nargs=-1, metavar="[@SET | FILE | FOLDER]...")
-@click.option("--out", type=FOLDER, help="Write every problem as a file to this folder.")
-@click.option(
-    "--check", is_flag=True, help="Build every problem again and compare its numbers with the manifest."
-)
+@click.option("--out", type=FOLDER, help="Write every problem as a file here.")
+@click.option("--check", is_flag=True, help="Build every problem and compare its numbers with the manifest.")
 @click.option(
     "--certify",
     type=FILE,
-    help="Prove the properties of each problem and write this manifest; takes minutes and the extra `proof`.",
+    help="Prove properties of each solution and write this manifest; takes minutes and needs the extra `proof`.",
 )
-@click.option("--page", type=FILE, help="Write the catalogue to this file as markdown.")
+@click.option("--page", type=FILE, help="Write the catalogue as markdown.")
 @click.pass_context
 def problems(
     context: click.Context,
@@ -32,22 +30,23 @@ def problems(
     certify: Path | None,
     page: Path | None,
 ) -> None:
-    """List, build or check the problem set and its proved properties.
+    """List, build or check the problem set.
 
-    Without an option, prints a line for each problem of the named sets, or of all sets. Your own files and folders are
-    accepted only with --certify. Problems that need a package that is not installed are left out, and a line says so.
+    Without an option, print a line for each problem of the named sets, or of all sets: name, size, and the proven
+    properties of its solution. Only --certify accepts files and folders of your own. Problems that need a package that
+    is not installed are left out, with a message.
 
-    Exit code 1: a problem has other numbers than the manifest.
+    Exit code 1: the numbers of a problem differ from the manifest.
     """
     from lavender.lab import collection, suite
     from lavender.lab.bench.cases import is_path
     from lavender.lab.bench.record import file_name
 
-    set_one_thread()
+    one_thread()
     if certify is not None:
-        reject_unused(context, ["out", "check", "page"], "with --certify")
+        reject_unused_options(context, ["out", "check", "page"], "with --certify")
     elif check:
-        reject_unused(context, ["out"], "with --check")
+        reject_unused_options(context, ["out"], "with --check")
     if out is not None:
         context.with_resource(lock_output(out, folder=True))
     for path in (certify, page):
@@ -56,7 +55,7 @@ def problems(
     names = [group.removeprefix("@") for group in groups]
     for name in names:
         if not is_path(name):
-            suite.names(f"@{name}")  # Check the names of sets before any work.
+            suite.names(f"@{name}")  # An unknown set is an error before any work starts.
         elif certify is None:
             raise InputError(
                 f"{name} is a file or folder, which only --certify accepts; give sets, such as @hard"
@@ -71,22 +70,22 @@ def problems(
     entries = [e for e in collection.load() if not names or e.group in names]
     if page is not None:
         write_text(page, collection.page(entries, collection.load(collection.RECORDED)))
-    buildable, missing = collection.select_buildable(entries)
+    here, missing = collection.select_buildable(entries)
     for line in missing if check or out is not None else ():
         click.echo(f"left out: {line}", err=True)
     if check:
-        wrong = list(collection.find_changes(buildable))
+        wrong = list(collection.find_changes(here))
         for line in wrong:
             click.echo(line)
-        click.echo(f"{len(buildable) - len(wrong)} of {len(buildable)} problems are the same")
+        click.echo(f"{len(here) - len(wrong)} of {len(here)} problems are the same")
         if wrong:
             raise click.exceptions.Exit(EXIT_UNMET)
         return
     if out is not None:
-        for entry in buildable:
+        for entry in here:
             (case,) = suite.cases(entry.name)
             case.problem.save(out / f"{file_name(entry.name)}.npz")
-        echo(f"{len(buildable)} problems in {out}")
+        echo(f"{len(here)} problems in {out}")
     elif page is None:
         for e in entries:
             echo(f"@{e.group} {e.name}: {e.rows} rows, {e.law}, {collection.describe(e)}")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import click
 
-from lavender.cli.options import Reading, echo, set_one_thread
+from lavender.cli.options import ErrorReporter, echo, one_thread
 
 
 @click.command()
@@ -13,14 +13,14 @@ from lavender.cli.options import Reading, echo, set_one_thread
     "--solver",
     default="auto",
     show_default=True,
-    help="Solver whose answer is compared with the exact solution.",
+    help="Solver whose result is compared with the exact solution.",
 )
-@click.option("--tol", type=float, default=1e-12, show_default=True, help="Relative residual of that answer.")
+@click.option("--tol", type=float, default=1e-12, show_default=True, help="Relative residual to reach.")
 def prove(files: tuple[str, ...], solver: str, tol: float) -> None:
-    """Prove that an exact solution is near an answer.
+    """Solve problems and enclose an exact solution near each result.
 
-    Solves problems (files, folders or cases of the suite); needs the extra `proof`. Each line gives the largest
-    distance of the exact solution, or says that there is none, or names the undecided condition.
+    FILES are files, folders or cases of the suite; the extra `proof` is needed. Each line states the largest distance
+    of the exact solution, that there is no solution, or why neither could be proven.
 
     Exit code 1: a result has no proof, or a file in a folder cannot be read. Exit code 2: a named file cannot
     be read.
@@ -32,17 +32,17 @@ def prove(files: tuple[str, ...], solver: str, tol: float) -> None:
     from lavender.lab.proof import require_python_flint
     from lavender.solvers.registry import get
 
-    set_one_thread()
-    # Invalid arguments and missing packages raise an error before any file is read.
-    number("tol", tol, low=0.0)
+    one_thread()
+    # Check the arguments before any file is read.
+    check_float("tol", tol, low=0.0)
     get(solver)
     require_python_flint()
-    unmet, reading = False, Reading()
+    unmet, errors = False, ErrorReporter()
     for item in resolve(list(files)):
         with errors(item), Worker() as worker:
             solution = solve_isolated(worker, item.problem, solver, tol=tol)
-            enclosure = enclose(item.problem, solution)
-            suffix = "" if solution.success else f"; {solver}: {solution.status.name}"
-            echo(f"{item.name}: {enclosure}{suffix}")
-            unmet |= not (enclosure.proven or enclosure.infeasible)
-    reading.end(unmet)
+            proof = enclose(item.problem, solution)
+            failure = "" if solution.success else f"; {solver}: {solution.status.name}"
+            echo(f"{item.name}: {proof}{failure}")
+            unmet |= not (proof.proven or proof.infeasible)
+    errors.exit(unmet)

@@ -13,7 +13,7 @@ from lavender.cli.options import (
     echo,
     precision_option,
     recording_options,
-    reject_unused_recording,
+    reject_unused_recording_options,
 )
 
 
@@ -22,18 +22,18 @@ from lavender.cli.options import (
 @recording_options
 @click.option("--out", required=True, type=FOLDER, help="Folder for the problems.")
 @click.option(
-    "--replace", is_flag=True, help="First delete the problems of an earlier recording in this folder."
+    "--replace", is_flag=True, help="First delete the problems of an earlier recording in the folder."
 )
 @precision_option
 @click.pass_context
 def record(
     context: click.Context, /, model: Path, out: Path, steps: int, precision: str | None, **options: Any
 ) -> None:
-    """Simulate a MuJoCo model (MJCF) and write its problems.
+    """Simulate a MuJoCo model and write its constraint problems.
 
-    The folder OUT is input for `lavender report`.
+    MODEL.xml is an MJCF file. `lavender report OUT` measures solvers on the problems.
     """
     from lavender.io.recording import record_file
 
-    reject_unused_recording(context, True)
+    reject_unused_recording_options(context, True)
     echo(str(record_file(model, out, steps, precision=precision or "float64", **options)))

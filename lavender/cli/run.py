@@ -14,10 +14,10 @@ from lavender.base.errors import InputError
 from lavender.cli.options import (
     PATH,
     echo,
-    exit_interrupted,
-    ignore_closed_pipe,
+    exit_stopped,
+    ignore_closed_output,
     parse_parameters,
-    reject_unused,
+    reject_unused_options,
 )
 from lavender.io.stored import check_figure_path, check_writable, destination
 
@@ -76,12 +76,14 @@ def run(
     film: Path | None,
     **scene_options: Any,
 ) -> None:
-    """Simulate a scene of the gallery, and record its steps.
+    """Simulate a scene of the gallery.
 
     With --record, its steps are written as a sequence for `lavender report`.
 
-    The recorded steps are a sequence for `lavender report`. Exit code 130: stopped by Ctrl-C; the files hold the steps
-    until then.
+    SCENE is stack, pyramid, card_house, pile, chain, bridge, heavy_on_light, table, ramp, spinner, newtons_cradle or
+    four_bar.
+
+    Exit code 130: stopped by Ctrl-C; the files contain the completed steps.
     """
     from lavender.sim.engine import Simulation
     from lavender.sim.engine import run as run_simulation
@@ -90,34 +92,32 @@ def run(
     from lavender.sim.scene import Scene
 
     if record is None:
-        reject_unused(context, ["replace"], "without --record")
+        reject_unused_options(context, ["replace"], "without --record")
     if plot is not None:
         plot = check_figure_path(plot)
     files = {
         name: path for name, path in (("trace", trace), ("figure", plot), ("film", film)) if path is not None
     }
     if len({destination(path) for path in files.values()}) < len(files):
-        raise InputError(
-            f"{', '.join(map(str, files.values()))}: a file can hold only one of these; name several"
-        )
+        raise InputError(f"{', '.join(map(str, files.values()))}: each needs a file of its own")
     for path in files.values():
         check_writable(path)
     drawn = film is not None and film.suffix.lower() in PICTURES
     if film is not None and drawn:
         picture_suffix(film)
-    is_terminal, writes = sys.stdout.isatty(), bool(files) or record is not None
+    live, writes = sys.stdout.isatty(), bool(files) or record is not None
 
     def show(text: str) -> None:
-        """Print a line; on a terminal it replaces the previous one."""
-        with ignore_closed_pipe() if writes else contextlib.nullcontext():
-            click.echo(f"\r{text}\x1b[K" if is_terminal else text, nl=not is_terminal)
+        # On a terminal each line replaces the previous one.
+        with ignore_closed_output() if writes else contextlib.nullcontext():
+            click.echo(f"\r{text}\x1b[K" if live else text, nl=not live)
 
-    simulation = Simulation(Scene(scene, **_parameters(parameters, scene_options)), report_residual=residual)
-    every = 1 if is_terminal else max(1, steps // 20)
+    simulation = Simulation(
+        Scene(scene, **_collect_parameters(parameters, scene_options)), report_residual=residual
+    )
+    every = 1 if live else max(1, steps // 20)
     with simulation.view() if view else contextlib.nullcontext() as viewer:
-        film_frames = (
-            viewer.film if viewer is not None else simulation.start_film() if film is not None else None
-        )
+        frames = viewer.film if viewer is not None else simulation.start_film() if film is not None else None
         if viewer is not None:
             show(f"{viewer.address}   Ctrl-C ends")
         begun = perf_counter()
@@ -125,24 +125,24 @@ def run(
         def show_step(step: int, observation: dict[str, Any], info: dict[str, Any]) -> None:
             if step % every == 0 or step == steps or "lost_body" in info:
                 show(line(step, observation, info))
-            if viewer is not None:  # Do not run faster than real time.
+            if viewer is not None:  # Not faster than real time.
                 sleep(max(0.0, info["time"] - (perf_counter() - begun)))
 
-        result = run_simulation(simulation, steps, record=record, replace=replace, watch=watch)
+        result = run_simulation(simulation, steps, record=record, replace=replace, watch=show_step)
         if result.lost_body:
             show(f"stopped: the state of {result.lost_body!r} is not finite")
         if trace is not None:
             result.save(trace)
         if plot is not None:
             result.plot(plot)
-        if film is not None and film_frames is not None:
+        if film is not None and frames is not None:
             if drawn:
-                save_picture(film_frames, film)
+                save_picture(frames, film)
             else:
-                film_frames.save(film)
+                frames.save(film)
         if viewer is not None and not result.stopped:
             viewer.wait()
-    if is_terminal:
+    if live:
         click.echo()
     for name, path in files.items():
         shown_by = f": lavender view {path}" if name == "film" and not drawn else ""
@@ -151,24 +151,23 @@ def run(
         echo(f"{result.recorded} problems in {record}: lavender report {record}")
     best = 1e3 * result.cost.min()
     click.echo(
-        f"{result.scene}: {len(result)} steps, {result.time[-1]:.3f} s, {result.method}, {best:.3g} ms a step at best"
+        f"{result.scene}: {len(result)} steps, {result.time[-1]:.3f} s, {result.method}, {best:.3g} ms per step at best"
     )
     if result.stopped:
-        exit_interrupted()
+        exit_stopped()
 
 
-def _parameters(assignments: tuple[str, ...], options: dict[str, Any]) -> dict[str, Any]:
-    """Collect the parameters of the scene from `--set` and from the options that set one."""
-    parameters = parse_parameters(assignments)
+def _collect_parameters(assignments: tuple[str, ...], options: dict[str, Any]) -> dict[str, Any]:
+    """Return the parameters of the scene from `--set` and from the options for single parameters."""
+    values = parse_parameters(assignments)
     for name, value in options.items():
         if value is None:
             continue
-        if name in parameters:
+        if name in values:
             raise InputError(
-                f"--set {name}={parameters[name]} and an option ({value}) both set {name}: leave one out"
+                f"--set {name}={values[name]} and an option ({value}) both set {name}: leave one out"
             )
-        parameters[name] = value
-    if parameters.get("solver", "sequential_impulses") != "sequential_impulses" and "order" in parameters:
-        # A solver without a sweep order rejects it.
-        parameters["solver_options"] = {"order": parameters.pop("order")}
-    return parameters
+        values[name] = value
+    if values.get("solver", "sequential_impulses") != "sequential_impulses" and "order" in values:
+        values["solver_options"] = {"order": values.pop("order")}  # A solver without sweep orders rejects it.
+    return values

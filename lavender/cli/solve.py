@@ -8,11 +8,11 @@ from typing import Any
 import click
 
 from lavender.base.errors import InputError
-from lavender.cli.options import EXIT_INFEASIBLE, EXIT_INTERRUPTED, EXIT_UNMET, PATH, echo, set_one_thread
+from lavender.cli.options import EXIT_INFEASIBLE, EXIT_INTERRUPTED, EXIT_UNMET, PATH, echo, one_thread
 from lavender.io.stored import writable, write_atomically
 
-# Fields of the residual in --output.
-RESIDUAL_FIELDS = ("error", "relative", "energy", "velocity", "roundoff_floor")
+#: Fields of the residual that --output writes.
+SAVED_RESIDUAL_FIELDS = ("error", "relative", "energy", "velocity", "roundoff_floor")
 
 
 @click.command()
@@ -27,9 +27,9 @@ RESIDUAL_FIELDS = ("error", "relative", "energy", "velocity", "roundoff_floor")
     show_default=True,
     help="Relative residual to reach; 0 runs exactly --max-iter iterations.",
 )
-@click.option("--max-iter", type=int, help="Maximum number of iterations; default: the solver's.")
+@click.option("--max-iter", type=int, help="Largest number of iterations; default: the solver's.")
 @click.option("--time-limit", type=float, metavar="S", help="Limit of the solve time.")
-@click.option("--order", help="Sweep order, for solvers that have one.")
+@click.option("--order", help="Sweep order, for solvers that take one.")
 @click.option("--seed", type=int, help="Seed of a random order.")
 @click.option("--output", type=PATH, help="Write impulse, slack, status and residual to this .npz file.")
 def solve(
@@ -42,9 +42,7 @@ def solve(
     seed: int | None,
     output: Path | None,
 ) -> None:
-    """Solve one problem and print its error.
-
-    FILE is a problem file, or a case of the suite.
+    """Solve one problem and print the judged result.
 
     FILE is a file or a case of the suite. Exit code 0: the judge accepts the result (within tol, or at the floor of
     float64; with --tol 0 always). 1: the judge rejects it. 3: the problem is infeasible, with a certificate that the
@@ -54,16 +52,14 @@ def solve(
     from lavender.lab import bench
     from lavender.lab.bench.running.worker import Worker, solve_isolated
 
-    set_one_thread()
+    one_thread()
     if output is not None:
         check_writable(output)
     (item, *more) = bench.resolve([file])
     if more:
         raise InputError(f"{file} holds {len(more) + 1} problems; give one file")
     if output is not None and output.exists() and Path(item.source).exists() and output.samefile(item.source):
-        raise InputError(
-            f"--output {output} is the problem file, which would be overwritten: give another file"
-        )
+        raise InputError(f"--output {output} would overwrite the problem: give another file")
     options: dict[str, Any] = {k: v for k, v in (("order", order), ("seed", seed)) if v is not None}
     with Worker() as worker:
         solution = solve_isolated(
@@ -78,7 +74,7 @@ def solve(
                     f,
                     impulse=solution.impulse,
                     slack=solution.slack,
-                    **{name: getattr(solution.residual, name) for name in RESIDUAL_FIELDS},
+                    **{name: getattr(solution.residual, name) for name in SAVED_RESIDUAL_FIELDS},
                     status=solution.status.name,
                     solver=solution.solver.name,
                     iterations=solution.iterations,
@@ -97,8 +93,9 @@ def solve(
         raise click.exceptions.Exit(EXIT_INFEASIBLE)
     judged = solution.residual
     if judged.nothing_to_do and judged.verdict != WRONG:
-        text = "nothing to do: the zero impulse is a solution; this one changes velocities by"
-        click.echo(f"{text} {judged.velocity:.1e} m/s")
+        click.echo(
+            f"nothing to do: the zero impulse is a solution; this result differs by {judged.velocity:.1e} m/s"
+        )
         return
     if tol > 0.0 and not (solution.success or judged.at_floor):
         raise click.exceptions.Exit(EXIT_UNMET)

@@ -9,7 +9,10 @@ from lavender.cli.options import console, escape_markup
 
 @click.command()
 def solvers() -> None:
-    """List the solvers, their capabilities, and missing packages."""
+    """List the solvers and their capabilities.
+
+    Solvers that are not installed show the package to install.
+    """
     from rich.table import Table
 
     from lavender.problem import LAWS, OPERATORS
@@ -19,7 +22,7 @@ def solvers() -> None:
     for name in ("solver", "laws", "reads", "capabilities", "description"):
         table.add_column(name, no_wrap=name == "solver", overflow="fold")
     reasons = registry.known()
-    # List the installed solvers first.
+    # Installed solvers come first.
     order = sorted(registry.specs().items(), key=lambda pair: (reasons[pair[0]] is not None, pair[0]))
     for name, spec in order:
         abilities = [

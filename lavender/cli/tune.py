@@ -8,37 +8,33 @@ from typing import Any
 import click
 
 from lavender.cli.measuring import progress, show_page
-from lavender.cli.options import FILE, FOLDER, set_one_thread, threshold_option, worlds_options
+from lavender.cli.options import FILE, FOLDER, one_thread, threshold_option, worlds_options
 from lavender.io.stored import lock_output
 
 
 @click.command()
 @click.argument("model", metavar="MODEL.xml", type=FILE)
 @worlds_options(worlds=16, steps=200)
-@click.option(
-    "--ahead", default=10, show_default=True, help="Number of steps after which the motion is compared."
-)
-@click.option(
-    "--rounds", default=5, show_default=True, help="Rounds of timing, in which the settings alternate."
-)
+@click.option("--horizon", default=10, show_default=True, help="Steps after which the motion is compared.")
+@click.option("--repeats", default=5, show_default=True, help="Times that each setting is timed.")
 @threshold_option
 @click.option("--out", type=FOLDER, default=Path("lavender-tune"),
-              show_default=True, help="Folder for the page.")  # fmt: skip
+              show_default=True, help="Folder of the page.")  # fmt: skip
 @click.pass_context
 def tune(context: click.Context, /, model: Path, out: Path, **options: Any) -> None:
-    """Find MuJoCo settings that are faster or more accurate.
+    """Find faster or more accurate MuJoCo settings for a model.
 
-    Measures time and error of a step on worlds of a model (MJCF). Prints the <option> line that is as accurate as the
-    present one and faster, and the one that is as fast and more accurate. Both are chosen on half of the worlds and
-    tested on the other half. No line is printed if fewer than 20 % of the steps have contact: give states with contact
-    (--states).
+    MODEL.xml is an MJCF file. The time and the error of a step are measured with many settings on worlds of the model.
+    Two <option> lines are printed: one that is faster and as accurate as the present setting, and one that is more
+    accurate and as fast. Both are chosen on half of the worlds and validated on the other half. No line is printed if
+    fewer than 20 % of the steps have contact: then start from states with contact (--states).
 
-    Exit code 130: stopped by Ctrl-C; the page shows the results so far.
+    Exit code 130: stopped by Ctrl-C; the page shows the completed part.
     """
     from lavender.lab.tune import tune as run
 
     context.with_resource(lock_output(out, folder=True))
-    set_one_thread()
+    one_thread()
     with progress() as watch:
-        result = run(model, watch=watch, **options)
-    show_page(result.summary_page, out)
+        tuning = run(model, watch=watch, **options)
+    show_page(tuning.summary_page, out)

@@ -217,13 +217,13 @@ class Audit:
         return StepSizes(self.rows[self.is_judged], self.contacts[self.is_judged], self.can_touch)
 
     def has_exact_solves(self, divergence: Divergence) -> bool:
-        """Whether every solve of a world that diverged was exact: at its floor, or within the threshold and `ENOUGH`.
+        """Whether every solve of a world that diverged was exact: at its floor or close enough, within `DEFAULT_THRESHOLD`.
 
         The solve of the last step does not count if the state or the unconstrained acceleration was already too large.
         """
         selection = divergence.world, slice(0, divergence.step + (not divergence.is_outside))
         verdict = self.verdict[selection]
-        close = (verdict == VERDICTS.index(CLOSE)) & (self.numbers[0][selection] <= ENOUGH)
+        close = (verdict == VERDICTS.index(CLOSE)) & (self.numbers[0][selection] <= DEFAULT_THRESHOLD)
         return bool(np.all(close | (verdict == VERDICTS.index(AT_FLOOR))))
 
     @property
@@ -443,7 +443,7 @@ def audit(
         raise InputError(f"precision is {precision!r}; {' or '.join(PRECISIONS)}, of MuJoCo alone, is needed")
     check_workers(workers)
     runs = Runs(os.fspath(model), worlds, steps, control=control, seed=seed, spread=spread).start_from(states)
-    judging = precision or "float64", number("threshold", threshold, low=0.0)
+    judging = precision or "float64", check_float("threshold", threshold, low=0.0)
     numbers, verdict = np.full((len(NUMBERS), worlds, steps), np.nan), np.full((worlds, steps), -1, np.int8)
     rows, contacts = np.zeros((2, worlds, steps), int)
     result = Audit(

@@ -271,7 +271,7 @@ def _check_solver(
         if get(run).builtin:
             raise
         # A plug-in may raise any exception; only its own row is lost.
-        return CrossCheckRow(name, NOT_SOLVED, note=last_words(error))
+        return CrossCheckRow(name, NOT_SOLVED, note=format_error(error))
     return replace(compare(problem, name, solution, optimum), ran="" if other is None else run)
 
 
@@ -304,7 +304,7 @@ def _solve_reference(
             failed.append(f"{name}: {format_error(error)}")
             continue
         r = solution.residual
-        needed = max(REFERENCE_MAX_RESIDUAL, min(10.0 * r.roundoff_floor, FLOOR_MOST))
+        needed = max(REFERENCE_MAX_RESIDUAL, min(10.0 * r.roundoff_floor, MAX_EXCUSED_RESIDUAL))
         if r.relative <= needed:
             note = f"relative {r.relative:.1e}"
             return solution, name, note + (f" ({'; '.join(failed)})" if failed else "")

@@ -4,12 +4,12 @@
     found.faster, found.closer; found.summary_page.write("lavender-tune")
 
 Settings are chosen on the worlds with even numbers; those with odd numbers are held back. Each world is cut into
-stretches of `ahead` steps of a run with the model's own settings. From the start of each stretch, a setting makes its
+stretches of `horizon` steps of a run with the model's own settings. From the start of each stretch, a setting makes its
 own steps, warm-started from its own answers:
 
-    time    of mj_step, mean of all steps [s]; of each step the minimum of several rounds, in which settings alternate
+    time    of mj_step, mean of all steps [s]; of each step the minimum of several repeats, in which settings alternate
     error   of the engine's answer to the problem of each step, by the judge [m/s]
-    motion  largest distance of a body, after `ahead` steps, from its position in the converged run [m]
+    motion  largest distance of a body, after `horizon` steps, from its position in the converged run [m]
 
 If fewer than `MIN_CONTACT_SHARE` of the steps have contact, only the model's own setting is measured and no line is
 recommended.
@@ -36,7 +36,7 @@ from lavender.base.errors import InputError, reject_former_names
 from lavender.batch.residuals import residual_many
 from lavender.io.efc import from_mujoco_many
 from lavender.io.recording import Control
-from lavender.judge.residuals import ENOUGH
+from lavender.judge.residuals import DEFAULT_THRESHOLD
 from lavender.lab.audit import MAX_PROBLEMS_IN_MEMORY
 from lavender.lab.bench.running.runner import Event
 from lavender.lab.report.figures import Curve, Figure
@@ -134,7 +134,7 @@ class Measured:
     error : (steps,) m/s
     motion : (stretches,) m
     times : (steps,) s
-        Each the minimum of all rounds, which removes interruptions.
+        Each the minimum of all repeats, which removes interruptions.
     rows, contacts : (steps,) int
     """
 
@@ -172,7 +172,7 @@ class Stage:
         The module mujoco and the model with its own setting.
     starts : (n, size)
         State at the start of each stretch.
-    controls : (n, ahead, nu)
+    controls : (n, horizon, nu)
     ends : (n, bodies, 3) m
         Positions of the bodies after each stretch of the converged run.
     """
@@ -184,14 +184,14 @@ class Stage:
     ends: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     @classmethod
-    def of(cls, mj: Any, model: Any, runs: Runs, worlds: Iterable[int], ahead: int) -> Stage:
+    def of(cls, mj: Any, model: Any, runs: Runs, worlds: Iterable[int], horizon: int) -> Stage:
         """Cut worlds that run with the model's own setting into stretches."""
         starts, controls = [], []
         for world in worlds:
             drive = runs.drive(model, world)
             world_controls = np.array([drive(None, step) for step in range(runs.steps)])
-            ctrl = world_controls.reshape(runs.steps // ahead, ahead, model.nu)
-            starts.append(simulate_world(mj, model, runs, world)[0][::ahead])
+            ctrl = world_controls.reshape(runs.steps // horizon, horizon, model.nu)
+            starts.append(simulate_world(mj, model, runs, world)[0][::horizon])
             controls.append(ctrl)
         configured = cls(mj, model, np.concatenate(starts), np.concatenate(controls))
         try:
@@ -208,8 +208,8 @@ class Stage:
         """
         mj, kind = self.mj, self.mj.mjtState.mjSTATE_INTEGRATION
         data = mj.MjData(model)
-        n, ahead, _ = self.controls.shape
-        step_times = np.empty(n * ahead)
+        n, horizon, _ = self.controls.shape
+        step_times = np.empty(n * horizon)
         ends = np.empty((n, model.nbody, 3))
         for i in range(n):
             mj.mj_setState(model, data, self.starts[i], kind)
@@ -219,7 +219,7 @@ class Stage:
                     mj.mj_getState(model, data, states[horizon * i + k], kind)
                 begin = perf_counter()
                 mj.mj_step(model, data)
-                step_times[ahead * i + k] = perf_counter() - begin
+                step_times[horizon * i + k] = perf_counter() - begin
             mj.mj_kinematics(model, data)
             ends[i] = np.nan if has_diverged(mj, data) else data.xpos
         return step_times, ends
@@ -254,14 +254,14 @@ class Stage:
             result, error=np.nan_to_num(np.concatenate(errors), nan=np.inf), motion=distance, **sizes
         )
 
-    def time(self, settings: list[Measured], rounds: int, report_progress: Callable[[str], None]) -> None:
+    def time(self, settings: list[Measured], repeats: int, report_progress: Callable[[str], None]) -> None:
         """Time the steps of several rounds in which all settings alternate; the first is the model's own.
 
         A setting with which a world diverges is not timed.
         """
         settings = [m for m in settings if np.isfinite(m.error).all()]
         models = [m.setting.on(self.mj, self.model) for m in settings]
-        for round_index in range(rounds):
+        for round_index in range(repeats):
             for m, model in zip(settings, models, strict=True):
                 # Medians: a step that is interrupted in the first round does not exclude a setting.
                 if round_index == 0 or np.median(m.times) <= MAX_TIME_RATIO * np.median(settings[0].times):
@@ -276,7 +276,7 @@ class Tuning:
     Parameters
     ----------
     runs : Runs
-    ahead : int
+    horizon : int
         Number of steps of a stretch.
     measured : list of Measured
         Results on the worlds with even numbers.
@@ -484,7 +484,7 @@ def vary(mj: Any, model: Any, setting: Setting) -> list[Setting]:
     return [Setting.of(mj, model, **options | x) for x in tried]
 
 
-@reject_former_names(ahead="horizon", rounds="repeats")
+@reject_former_names(horizon="horizon", repeats="repeats")
 def tune(
     model: str | os.PathLike[str],
     *,
@@ -505,13 +505,13 @@ def tune(
     ----------
     model : path (MJCF)
     worlds, steps, control, seed, spread
-        See `Runs`. Half of the worlds are held back; `steps` is a multiple of `ahead`.
+        See `Runs`. Half of the worlds are held back; `steps` is a multiple of `horizon`.
     states : path of an .npz, "keyframes", or arrays, optional
         See `audit`.
-    ahead : int
+    horizon : int
         Number of steps of a stretch.
-    rounds : int
-        Number of rounds of timing, in which settings alternate.
+    repeats : int
+        Repetitions of the timing, in which settings alternate.
     threshold : float, m/s, m
         Smaller errors and distances count as accurate enough.
     watch : callable, optional
@@ -525,16 +525,16 @@ def tune(
     Raises
     ------
     InputError
-        The model cannot be read, there are fewer than two worlds, or `ahead` does not divide `steps`.
+        The model cannot be read, there are fewer than two worlds, or `horizon` does not divide `steps`.
     CapabilityError
         The problem of the model's integrator is not one of M.
     """
     own: dict[str, Any] = {"worlds": check_int("worlds", worlds, 2, None), "steps": steps}
     runs = Runs(os.fspath(model), **own, control=control, seed=seed, spread=spread).start_from(states)
-    ahead, rounds = whole_number("ahead", ahead, 1, None), whole_number("rounds", rounds, 1, None)
-    threshold = number("threshold", threshold, low=0.0)
-    if steps % ahead:
-        raise InputError(f"steps is {steps} and ahead {ahead}; a multiple of it is needed")
+    horizon, repeats = check_int("horizon", horizon, 1, None), check_int("repeats", repeats, 1, None)
+    threshold = check_float("threshold", threshold, low=0.0)
+    if steps % horizon:
+        raise InputError(f"steps is {steps} and horizon {horizon}; a multiple of it is needed")
     mj, configured = runs.load()
     # An unsupported model raises here, once.
     from_mujoco_many(configured, np.zeros((0, configured.nq + configured.nv)))
@@ -565,7 +565,7 @@ def tune(
         return out
 
     try:
-        stage, held_back = (Stage.of(mj, configured, runs, range(i, worlds, 2), ahead) for i in (0, 1))
+        stage, held_back = (Stage.of(mj, configured, runs, range(i, worlds, 2), horizon) for i in (0, 1))
         measured += judge(stage, [Setting()])
         if not np.isfinite(measured[0].error).all():
             raise InputError(f"{runs.model}: these worlds diverge with the model's own setting")
@@ -574,21 +574,21 @@ def tune(
         rows, contacts = (np.concatenate([getattr(m, name) for m in both]) for name in ("rows", "contacts"))
         sizes = StepSizes(rows, contacts, can_touch(mj, configured))
         if not sizes.is_enough:
-            stage.time(measured, rounds, report_progress)
+            stage.time(measured, repeats, report_progress)
             return make_result(False)
         measured += judge(stage, grid(mj, configured)[1:])
-        stage.time(measured, min(N_TRIAL_ROUNDS, rounds), report_progress)
+        stage.time(measured, min(N_TRIAL_ROUNDS, repeats), report_progress)
         near = [
             m.setting for m in make_result(False).front if m.time <= MAX_VARIED_TIME_RATIO * measured[0].time
         ]
         known = {m.setting for m in measured}
         more = dict.fromkeys(x for s in [Setting(), *near] for x in vary(mj, configured, s) if x not in known)
         measured += judge(stage, list(more))
-        stage.time(measured, rounds, report_progress)
+        stage.time(measured, repeats, report_progress)
         chosen = make_result(False)
         other = dict.fromkeys(m.setting for m in (chosen.faster, chosen.closer) if m is not None)
         last += judge(held_back, list(other))
-        held_back.time(last, 2 * rounds, report_progress)
+        held_back.time(last, 2 * repeats, report_progress)
         held += last if np.isfinite(last[0].time) else []
     except KeyboardInterrupt:
         if not measured or not np.isfinite(measured[0].time):

@@ -133,7 +133,7 @@ def test_solvers_lists_all_with_reasons(lavender):
         (("report", "stack(n=4)", "--seeds", "3"), "--seeds has no effect without --workers"),
         (
             ("report", "stack(n=4)", "--workers", "1", "--seeds", "3"),
-            "--seeds has no effect because no case has a seed",
+            "--seeds has no effect if no case takes one",
         ),
         (("report", "stack(n=4)", "--steps", "3"), "--steps has no effect without a MODEL.xml"),
         (
@@ -144,7 +144,19 @@ def test_solvers_lists_all_with_reasons(lavender):
         (("report", "stack(n=4)", "--solvers", "direct", "--orders", "reverse"), "--orders has no effect"),
         (("report", "--workers", "1", "--time-limit", "3"), "--time-limit has no effect with --workers"),
         (("report", "--campaign"), "Did you mean '--workers'?"),
-        (("report", "a.jsonl", "--levels", "1e-3"), "--levels has no effect if records are shown again"),
+        (("report", "--levels", "1e-3"), "Did you mean '--tolerances'?"),
+        (("report", "--speed-levels=1e-3"), "Did you mean '--velocity-tolerances'?"),
+        (("report", "--fresh"), "Did you mean '--no-reuse'?"),
+        (("report", "--pass-limit=3"), "Did you mean '--sequence-time-limit'?"),
+        (("record", "a.xml", "--every", "5"), "Did you mean '--record-every'?"),
+        (("audit", "a.xml", "--accept", "1e-3"), "Did you mean '--max-velocity-error'?"),
+        (("tune", "a.xml", "--ahead", "5"), "Did you mean '--horizon'?"),
+        (("tune", "a.xml", "--rounds", "5"), "Did you mean '--repeats'?"),
+        (("export", "c", "lib", "--for", "records.jsonl"), "Did you mean '--records'?"),
+        (
+            ("report", "a.jsonl", "--tolerances", "1e-3"),
+            "--tolerances has no effect if records are shown again",
+        ),
         (("report", "stack(n=4)", "--solvers", "pgs", "--memory", "3"), "--memory has no effect"),
         (("run", "stack", "--replace"), "--replace has no effect without --record"),
         (("record", "a.xml", "--out", "o", "--seed", "3", "--controls", "zero"), "without --controls random"),
@@ -350,9 +362,9 @@ def test_another_program_keeps_its_own_ctrl_c():
 
 
 def test_doctor_tells_what_looks_wrong_in_a_problem(lavender, path, tmp_path):
-    assert lavender("doctor", path)[:2] == (0, "1 examined, none suspicious\n")
+    assert lavender("doctor", path)[:2] == (0, "1 problems checked, none with diagnostics\n")
     code, out, _ = lavender("doctor", path, "duplicated(k=3)")
-    assert (code, out.splitlines()[-1]) == (1, "2 examined, 1 suspicious")
+    assert (code, out.splitlines()[-1]) == (1, "2 problems checked, 1 with diagnostics")
     assert out.startswith("duplicated(k=3): duplicate rows: 2 contacts")
     assert json.loads(lavender("doctor", "duplicated(k=3)", "--json")[1])["duplicated(k=3)"][0]["blocks"] == [
         1,
@@ -456,6 +468,6 @@ def test_check_judges_a_stored_answer_for_the_precision_it_was_made_in(lavender,
     # Without the option the precision is the problem's, and the exit code that of the claims.
     assert lavender("check", tmp_path / "early.npz", *told[:2])[0] == 0
     code, _, err = lavender("check", tmp_path / "none.npz", *told)
-    assert code == cli.EXIT_BAD_INPUT and "no file holds a solution" in err
+    assert code == cli.EXIT_BAD_INPUT and "no file has a solution" in err
     code, _, err = lavender("check", tmp_path / "done.npz", "--precision", "half")
     assert code == cli.EXIT_BAD_INPUT and "'half' is not one of 'float64', 'float32'" in err

@@ -37,9 +37,9 @@ def test_what_a_robot_does_not_feel_is_close_enough_and_the_threshold_is_the_use
         with pytest.raises(lv.InputError, match="threshold"):
             lv.io.record(model, mj.MjData(model), tmp_path / "c", 1, threshold=wrong)
     words = ("check", tmp_path / "a" / at["file"], "--solvers", "auto", "--threshold")
-    for threshold, status, told in (("1e-6", 0, "0 of these with errors above 1e-06"), ("0", 1, "1 of these with errors above 0")):
+    for threshold, status, told in (("1e-6", 0, "0 also more than 1e-06"), ("0", 1, "1 also more than 0")):
         code, out, _ = lavender(*words, threshold)
-        assert code == status and f"1 of 1 above their floor, {told} m/s" in " ".join(out.split())
+        assert code == status and f"1 of 1 above their floor, {told} m/s off" in " ".join(out.split())
 
 
 def test_record_and_report_take_the_same_options_with_the_same_defaults():

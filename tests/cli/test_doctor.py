@@ -45,7 +45,7 @@ def test_another_bit_is_told_and_is_status_1(monkeypatch):
     done = CliRunner().invoke(cli, ["doctor"])
     assert done.exit_code == 1
     assert f"{name}: {'0' * 16} expected" in done.output
-    assert f"{len(doctor.HASHES) - 1} of {len(doctor.HASHES)} parts give the same bits" in done.output
+    assert f"{len(doctor.HASHES) - 1} of {len(doctor.HASHES)} give their bits" in done.output
 
 
 def test_one_sweep_less_is_seen_in_every_part(monkeypatch):
@@ -58,7 +58,7 @@ def test_one_sweep_less_is_seen_in_every_part(monkeypatch):
     after = doctor.self_test()
     same = {name for name in before if before[name] == after[name]}
     assert same == {"stack, 60 steps", "gallery, 5 steps"}
-    monkeypatch.setattr(doctor, "simulate_positions", lambda name, n, steps=doctor.simulate_positions: steps(name, n - 1))
+    monkeypatch.setattr(doctor, "steps_of", lambda name, n, steps=doctor.steps_of: steps(name, n - 1))
     after = doctor.self_test()
     assert all(before[name] != after[name] for name in before)
 

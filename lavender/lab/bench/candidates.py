@@ -23,7 +23,7 @@ from lavender.solvers.registry import specs
 CANDIDATE_TIME_RATIO = (
     1.6  # A rerun may rank a solver first if its time is below this multiple of the best's.
 )
-MAX_CANDIDATES = 4  # Solvers timed for a level and for each time limit, at most.
+MAX_CANDIDATES = 4  # Solvers timed for a tolerance and for each time limit, at most.
 # Parts of a time that `time_limit` is set to: set-up and judge take the rest.
 TIME_LIMIT_FRACTIONS = (0.5, 0.8)
 
@@ -56,9 +56,9 @@ def list_candidates(records: Records, times: Sequence[float] = ()) -> list[Ask]:
     return list(dict.fromkeys(asks))
 
 
-def _required_max_iter(records: Records, solver: str, level: float) -> int:
-    """Return `max_iter` of a call to a level: 0 (the default), or unlimited if a case needs more than the default."""
-    runs = (r for r in records if r.solver == solver and r.mode == "tol" and r.tol == level)
+def _required_max_iter(records: Records, solver: str, tolerance: float) -> int:
+    """Return `max_iter` of a call to a tolerance: 0 (the default), or unlimited if a case needs more."""
+    runs = (r for r in records if r.solver == solver and r.mode == "tol" and r.tol == tolerance)
     return UNLIMITED_ITERATIONS if any(exceeds_default_budget(solver, r.iterations) for r in runs) else 0
 
 

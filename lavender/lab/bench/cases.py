@@ -83,7 +83,9 @@ class Item:
         """The problem; accessing it raises the errors of loading it."""
         return self.load()
 
-    def judge_stored(self, precision: str | None = None, threshold: float = ENOUGH) -> Residual | None:
+    def judge_stored(
+        self, precision: str | None = None, threshold: float = DEFAULT_THRESHOLD
+    ) -> Residual | None:
         """Judge the stored answer; None if there is none, or if its length belongs to another problem."""
         impulse = self.load_stored()
         if impulse is None or impulse.shape != (self.problem.m,):

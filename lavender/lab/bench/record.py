@@ -16,16 +16,16 @@ from lavender.judge.solution import CLAIM_CHECKS, CONFIRMED, CONTRADICTED, NOT_P
 ERROR, KILLED, CRASHED = "ERROR", "KILLED", "CRASHED"
 
 
-def level_name(level: float) -> str:
-    """Format a level without leading zeros in its exponent: 1e-3, not 1e-03."""
-    mantissa, _, exponent = f"{level:.3e}".partition("e")
+def format_tolerance(tolerance: float) -> str:
+    """Format a tolerance without leading zeros in its exponent: 1e-3, not 1e-03."""
+    mantissa, _, exponent = f"{tolerance:.3e}".partition("e")
     mantissa = mantissa.rstrip("0").rstrip(".")
     return f"{mantissa}e{int(exponent)}"
 
 
 def describe_target(mode: str, tol: float, max_iter: int) -> str:
     """Describe the target of a run: "to 1e-6", or "16 iterations"."""
-    return f"{max_iter} iterations" if mode == "budget" else f"to {level_name(tol)}"
+    return f"{max_iter} iterations" if mode == "budget" else f"to {format_tolerance(tol)}"
 
 
 MAX_FILE_NAME_LENGTH = 120  # [characters] File systems accept 255 bytes, including a suffix.
@@ -238,15 +238,15 @@ class Record(_PrintableEntry):
     velocity : float, m/s
     roundoff_floor : float
         Residual, by the judge.
-    motion : float or None
+    motion_error : float or None
         Relative motion error; None if it was not requested, or if there is none.
     motion_speed : float or None, m/s
         Motion error of the body with the largest one, or of a row without bodies.
     bound : float or None, sqrt J
         Proved bound of the motion error.
-    degenerate : float or None
+    boundary_fraction : float or None
         Fraction of blocks at a boundary; None if no error has a bound.
-    bits : str
+    solution_hash : str
         Hash of the answer: equal for answers with equal bits.
     worst_row : int
     worst_name : str
@@ -264,24 +264,24 @@ class Record(_PrintableEntry):
     repeats : int
     setup_min, setup_median, solve_min, solve_median : float, s
     time_min, time_median : float, s
-        Time of one repeat: of the call that `way` names, or else of set-up and solve together.
+        Time of one repeat: of the call that `timing_mode` names, or else of set-up and solve together.
     threads : int
     step : int
         Step of a sequence; -1 for a single case.
     way : {"", "call", "steps", "batch"}
         What was timed. "call": one `lv.solve` on a new problem; "steps": the same in a loop that carries impulses;
         "batch": a problem's share of one `lv.solve_many`; "": prepare and solve, without judge and input validation.
-    turns : str
+    interleave_group : str
         Identifies the calls and cases that alternated with this one; "" if its repeats were consecutive.
     times : tuple of float, s
         Time of each repeat.
-    reached : tuple of float
+    residual_per_repeat : tuple of float
         Relative residual of each repeat, if they differ (mode "time").
-    pace : float or None, s
+    calibration_time : float or None, s
         Time of a loop of fixed work next to the repeats, which measures the machine's speed.
     load : float or None
         Number of runnable processes when the record was made, including this one.
-    own_min : float or None, s
+    backend_time_min : float or None, s
         Minimum time of a third-party backend's own solve, on data that it already held.
     """
 
@@ -302,11 +302,11 @@ class Record(_PrintableEntry):
     energy: float = math.inf
     velocity: float = math.inf
     roundoff_floor: float = math.nan
-    motion: float | None = None
+    motion_error: float | None = None
     motion_speed: float | None = None
     bound: float | None = None
-    degenerate: float | None = None
-    bits: str = ""
+    boundary_fraction: float | None = None
+    solution_hash: str = ""
     worst_row: int = -1
     worst_name: str = ""
     success: bool = False
@@ -326,13 +326,13 @@ class Record(_PrintableEntry):
     time_median: float = math.nan
     threads: int = 1
     step: int = -1
-    way: str = ""
-    turns: str = ""
+    timing_mode: str = ""
+    interleave_group: str = ""
     times: tuple[float, ...] = ()
-    reached: tuple[float, ...] = ()
-    pace: float | None = None
+    residual_per_repeat: tuple[float, ...] = ()
+    calibration_time: float | None = None
     load: float | None = None
-    own_min: float | None = None
+    backend_time_min: float | None = None
 
     @property
     def key(self) -> tuple[Any, ...]:
@@ -341,7 +341,7 @@ class Record(_PrintableEntry):
 
     @property
     def asked(self) -> str:
-        """Budget or level, and the sweep order if it is not "given"."""
+        """Budget or tolerance, and the sweep order if it is not "given"."""
         order = "" if self.order == "given" else f", order {self.order}"
         return describe_target(self.mode, self.tol, self.max_iter) + order
 
@@ -355,7 +355,7 @@ def measurement_key(measurement: Any) -> tuple[Any, ...]:
     """Return the key of a measurement from its `Task` or its `Record`."""
     m = measurement
     options = repr(sorted(to_jsonable(m.options).items()))
-    request = (m.start, m.mode, m.tol, m.max_iter, m.time_limit, m.way, m.turns)
+    request = (m.start, m.mode, m.tol, m.max_iter, m.time_limit, m.timing_mode, m.interleave_group)
     return (m.case, m.sha, m.solver, options, *request)
 
 
@@ -490,9 +490,9 @@ def _is_positive(value: Any) -> bool:
 
 
 def _is_plan(plan: Mapping[str, Any]) -> bool:
-    """Whether a mapping is a plan with positive levels."""
-    levels = plan.get("levels", [])
-    return _is_mapping(plan, _is_flat) and isinstance(levels, list) and all(map(_is_positive, levels))
+    """Whether a mapping is a plan with positive tolerances."""
+    tolerances = plan.get("tolerances", [])
+    return _is_mapping(plan, _is_flat) and isinstance(tolerances, list) and all(map(_is_positive, tolerances))
 
 
 _Rule = tuple[str, Callable[[Any], bool]]

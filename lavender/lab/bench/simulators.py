@@ -168,7 +168,7 @@ def measure(mj: Any, path: Path, steps: int, every: int) -> list[Step]:
     model = mj.MjModel.from_xml_path(os.fspath(path))
     out: list[Step] = []
     for step, data, problem in _recorded_problems(mj, path, model, 20 * steps * every, every):
-        if problem is None or reference(problem)[1] < 1e-9:
+        if problem is None or get_reference(problem)[1] < 1e-9:
             continue
         tolerance, engine, engine_residual = time_engine(mj, model, data, problem)
         ours, batch_time, residual_found = time_cold_solves(problem)

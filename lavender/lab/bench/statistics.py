@@ -115,8 +115,8 @@ class Difficulty:
     rows: int
     sweeps: int | None  # of `pgs` to EASY_RESIDUAL; None where it did not get there, or was not asked
     condition: float | None  # of A, as `CaseInfo.condition`
-    # Share of blocks at a boundary at the best answer, of those whose error has a bound.
-    degenerate: float | None
+    # Fraction of blocks at a boundary at the best answer, of those whose error has a bound.
+    boundary_fraction: float | None
     proof: str
     same: tuple[str, ...]  # solvers that gave the same bits without an iteration: a shortcut of all was timed
 

@@ -28,7 +28,7 @@ def make_call_arguments(measurement: Any, iterations: int) -> dict[str, Any]:
     """
     arguments: dict[str, Any] = {"tol": measurement.tol}
     is_common = (
-        measurement.turns and measurement.max_iter
+        measurement.interleave_group and measurement.max_iter
     )  # timed alternately: one limit that suffices for all cases
     if measurement.mode == "budget" or is_common or exceeds_default_budget(measurement.solver, iterations):
         arguments["max_iter"] = measurement.max_iter
@@ -49,11 +49,11 @@ def format_call(record: Record, guessed: bool = False) -> tuple[str, ...]:
     """
     arguments = make_call_arguments(record, record.iterations)
     text = {
-        name: str(x) if name == "max_iter" else _exact(x, level_name(x) if x else "0")
+        name: str(x) if name == "max_iter" else _exact(x, format_tolerance(x) if x else "0")
         for name, x in arguments.items()
     }
     argument_text = ", ".join(f"{name}={value}" for name, value in text.items())
-    if record.way == "batch":
+    if record.timing_mode == "batch":
         cold = (f"problems = [{COLD_PROBLEM.format('p')} for p in problems]",) if guessed else ()
         return (*cold, f'solutions = lv.solve_many(problems, "{record.solver}", {argument_text})')
     if record.start != "carried":

@@ -171,7 +171,7 @@ def redundancy(problem: Problem, *, tol: float = 1e-12) -> Redundancy:
         )
     for island in rows_by_island(problem, np.arange(m + 1, dtype=np.int32)):
         a = scaled[island][:, island]
-        sound = problem.is_semidefinite or (problem.is_symmetric and semidefinite(a))
+        sound = problem.is_semidefinite or (problem.is_symmetric and has_shifted_cholesky(a))
         if problem.is_symmetric and len(island) <= MAX_DENSE_ISLAND_ROWS:
             dependent_rows, limit, descriptions = _dense_island(
                 a.toarray(), [root[island] for root in roots], tol, sound

@@ -177,7 +177,7 @@ class SolutionSet:
 
     def __getitem__(self, i: Any) -> Any:
         """Return motion i, or a list of motions."""
-        i = places(i, len(self.motions), "motion")
+        i = resolve_index(i, len(self.motions), "motion")
         return [self.motions[j] for j in i] if isinstance(i, list) else self.motions[i]
 
     def select(self, choice: str, impulse: Any = None) -> Motion:
@@ -197,7 +197,7 @@ class SolutionSet:
         InputError
             Unknown `choice`, wrong `impulse`, or no motion was found.
         """
-        choice = one_of("choice", choice, SELECTION_RULES)
+        choice = check_choice("choice", choice, SELECTION_RULES)
         if not self.motions:
             raise InputError("no run ended at a solution; there is nothing to choose from")
         if choice == "dissipation":

@@ -6,7 +6,7 @@ returns poses over time, from which the quantities are measured, in the same way
 
 from lavender.lab.phenomena.engines import ENGINE_VARIANTS, EngineVariant
 from lavender.lab.phenomena.parts import Parameter, Phenomenon, Quantity, Record, Track
-from lavender.lab.phenomena.running import PHENOMENA, run, select_phenomena, ways
+from lavender.lab.phenomena.running import PHENOMENA, run, select_phenomena, select_variants
 
 __all__ = [
     "ENGINE_VARIANTS",
@@ -17,8 +17,7 @@ __all__ = [
     "Quantity",
     "Record",
     "Track",
-    "Way",
     "run",
     "select_phenomena",
-    "ways",
+    "select_variants",
 ]

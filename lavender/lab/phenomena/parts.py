@@ -149,9 +149,9 @@ class Phenomenon:
             label = f"{name} of {self.name!r} ({p.text})"
             x = overrides.get(name, p.default)
             if isinstance(p.default, int):
-                values[name] = whole_number(label, x, int(p.low), int(p.high))
+                values[name] = check_int(label, x, int(p.low), int(p.high))
             else:
-                values[name] = number(label, x, low=p.low, high=p.high)
+                values[name] = check_float(label, x, low=p.low, high=p.high)
         return values
 
     def scene(self, overrides: Mapping[str, Any] | None = None, **more: Any) -> Scene:

@@ -10,7 +10,7 @@ from lavender.base import subprocesses
 from lavender.base.arrays import check_float, check_sequence
 from lavender.base.errors import CapabilityError, InputError, UnknownName, check_name
 from lavender.base.subprocesses import ProcessBackend, ProcessEnded, RemoteError
-from lavender.lab.phenomena.engines import WAYS, Way, make_engine, record_track
+from lavender.lab.phenomena.engines import ENGINE_VARIANTS, EngineVariant, make_engine, record_track
 from lavender.lab.phenomena.friction import FRICTION_PHENOMENA
 from lavender.lab.phenomena.joints import JOINT_PHENOMENA
 from lavender.lab.phenomena.parts import Phenomenon, Record, Track, measure_track
@@ -32,7 +32,7 @@ class EngineProcess(ProcessBackend):
         super().__init__(simulate)
         self.limit = limit
 
-    def track(self, way: Way, scene: Scene, seconds: float, interval: float) -> Track | str:
+    def track(self, variant: EngineVariant, scene: Scene, seconds: float, interval: float) -> Track | str:
         """Return the motion that the engine computes, or the reason why there is none."""
         try:
             self.start()
@@ -40,7 +40,7 @@ class EngineProcess(ProcessBackend):
             return f"its process does not start: {error}"
         try:
             answer, (time, positions, quaternions, velocities) = self.call(
-                way.name, scene, seconds, interval, timeout=self.limit, max_bytes=MAX_TRACK_SIZE
+                variant.name, scene, seconds, interval, timeout=self.limit, max_bytes=MAX_TRACK_SIZE
             )
             k, n = len(time), len(scene.bodies)
             return Track(
@@ -66,7 +66,7 @@ class EngineProcess(ProcessBackend):
 
 def simulate(name: str, scene: Scene, seconds: float, interval: float) -> subprocesses.Answer:
     """Step a scene with the engine of that name, in the process of `EngineProcess`."""
-    engine = make_engine(WAYS[name], scene)
+    engine = make_engine(ENGINE_VARIANTS[name], scene)
     try:
         track = record_track(engine, seconds, interval)
     finally:
@@ -99,9 +99,9 @@ def select_variants(
     UnknownName
         There is no such stepper or engine.
     """
-    found: list[Way] = []
+    found: list[EngineVariant] = []
     for kind, requested, own in (("stepper", steppers, True), ("engine", engines, False)):
-        candidates = [w for w in WAYS.values() if (w.module == "own") == own]
+        candidates = [w for w in ENGINE_VARIANTS.values() if (w.module == "own") == own]
         names = {n for w in candidates for n in (w.name, w.name.split()[0])}
         for name in requested if requested is not None else ():
             if name not in names:
@@ -160,14 +160,14 @@ def run(
         for p in select_phenomena(names)
         for case in map(p.values, p.cases if parameters is None else (parameters,))
     ]
-    selected = ways(steppers, engines)
+    selected = select_variants(steppers, engines)
     if not selected:
         raise InputError("no stepper and no engine to measure; name one, or leave steppers to its default")
     found = []
     process = EngineProcess(limit)
     try:
-        for way in selected:
-            for record in _measure(way, plan, process, keep):
+        for variant in selected:
+            for record in _measure(variant, plan, process, keep):
                 found.append(record)
                 show(record)
     finally:
@@ -182,28 +182,30 @@ def _measure(
     keep: Callable[[Record, Track], None],
 ) -> Iterator[Record]:
     """Measure all cases of the plan in one engine variant; a case that it cannot run gets a note."""
-    reason = way.missing()
+    reason = variant.missing()
     for phenomenon, case in plan:
-        note = reason or next((way.cannot[x] for x in sorted(phenomenon.needs) if x in way.cannot), "")
-        found = note or _simulate_case(way, phenomenon, case, process)
+        note = reason or next(
+            (variant.cannot[x] for x in sorted(phenomenon.needs) if x in variant.cannot), ""
+        )
+        found = note or _simulate_case(variant, phenomenon, case, process)
         if isinstance(found, str):
             yield Record(phenomenon.name, variant.name, case, note=found)
         else:
-            record = measure_track(phenomenon, way.name, case, found)
+            record = measure_track(phenomenon, variant.name, case, found)
             if not record.note:
                 keep(record, found)
             yield record
 
 
 def _simulate_case(
-    way: Way, phenomenon: Phenomenon, case: dict[str, float], process: EngineProcess
+    variant: EngineVariant, phenomenon: Phenomenon, case: dict[str, float], process: EngineProcess
 ) -> Track | str:
     """Simulate one case, third-party engines in the other process; return the reason if that fails."""
     seconds = phenomenon.seconds(case)
     try:
-        scene = phenomenon.scene(case, **way.scene)
-        if way.module != "own":
-            return process.track(way, scene, seconds, phenomenon.interval)
-        return record_track(make_engine(way, scene), seconds, phenomenon.interval)
+        scene = phenomenon.scene(case, **variant.scene)
+        if variant.module != "own":
+            return process.track(variant, scene, seconds, phenomenon.interval)
+        return record_track(make_engine(variant, scene), seconds, phenomenon.interval)
     except (InputError, CapabilityError) as error:  # The stepper does not support the scene.
         return str(error)

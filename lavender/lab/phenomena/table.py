@@ -49,10 +49,13 @@ def table(records: Sequence[Record]) -> str:
     groups = _group_records(records)
     names = [n for n in PHENOMENA if any(key[1] == n for key in groups)]
     lines = [f"| | {' | '.join(names)} |", "|---" * (len(names) + 1) + "|"]
-    for way in WAYS:
-        if any(key[0] == way for key in groups):
-            cells = [_format_cell(groups[way, n], PHENOMENA[n]) if (way, n) in groups else "" for n in names]
-            lines.append(f"| {way} | {' | '.join(cells)} |")
+    for variant in ENGINE_VARIANTS:
+        if any(key[0] == variant for key in groups):
+            cells = [
+                _format_cell(groups[variant, n], PHENOMENA[n]) if (variant, n) in groups else ""
+                for n in names
+            ]
+            lines.append(f"| {variant} | {' | '.join(cells)} |")
     return "\n".join(lines)
 
 
@@ -68,9 +71,9 @@ def notes(records: Sequence[Record]) -> list[str]:
 def out_of_bound_cases(records: Sequence[Record]) -> list[str]:
     """Return one line per lavender stepper and phenomenon with cases out of bound."""
     lines = []
-    for (way, name), group in _group_records(records).items():
+    for (variant, name), group in _group_records(records).items():
         bad = [r for r in group if not r.passed and not r.note]
-        if WAYS[way].module != "own" or not bad:
+        if ENGINE_VARIANTS[variant].module != "own" or not bad:
             continue
         phenomenon = PHENOMENA[name]
         exceeded = [q for q in phenomenon.quantities if any(r.value(q.name) > q.bound for r in bad)]
@@ -85,7 +88,7 @@ def out_of_bound_cases(records: Sequence[Record]) -> list[str]:
             - {r.engine for r in records if r.phenomenon == name and r.case in cases and not r.passed}
         )
         within = f"; within it: {', '.join(others)}" if others else "; no engine is within it"
-        lines.append(f"{name}, {way}: {len(bad)} of {len(group)} cases out, {measurements}{within}")
+        lines.append(f"{name}, {variant}: {len(bad)} of {len(group)} cases out, {measurements}{within}")
     return lines
 
 

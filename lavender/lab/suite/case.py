@@ -179,7 +179,7 @@ def _convert_parameter(name: str, parameter: inspect.Parameter, value: Any) -> A
         if not isinstance(value, str):
             raise InputError(f"{prefix}; a word is needed")
         return value
-    converted = number(f"{name}: {parameter.name}", value)
+    converted = check_float(f"{name}: {parameter.name}", value)
     if expected_type is int:
         if converted != int(converted) or not 0 <= converted <= MAX_SIZE:
             raise InputError(f"{prefix}; a whole number from 0 to {MAX_SIZE} is needed")

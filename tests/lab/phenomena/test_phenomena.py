@@ -15,7 +15,15 @@ from broken_engines import simulate as simulate_broken
 
 import lavender as lv
 from lavender.base.errors import LavenderError
-from lavender.lab.phenomena import PHENOMENA, WAYS, Record, Track, run, select_phenomena, ways
+from lavender.lab.phenomena import (
+    ENGINE_VARIANTS,
+    PHENOMENA,
+    Record,
+    Track,
+    run,
+    select_phenomena,
+    select_variants,
+)
 from lavender.lab.phenomena import table as tables
 from lavender.lab.phenomena.engines import PACKAGES_OF_NODE, make_engine, record_track, versions_of_node
 from lavender.lab.phenomena.engines.node import JsonLines
@@ -125,7 +133,9 @@ def test_friction_of_four_fifths_is_out_of_a_bound(name, of):
     p, values = PHENOMENA[name], PHENOMENA[name].values()
     weak = {of: 0.8 * values[of]} | ({"slope": values["slope"] / 0.8} if name == "slide" else {})  # of mu
     scene = p.scene(values | weak, stepper="impulses")
-    track = record_track(make_engine(WAYS["impulses newton"], scene), p.seconds(values), p.interval)
+    track = record_track(
+        make_engine(ENGINE_VARIANTS["impulses newton"], scene), p.seconds(values), p.interval
+    )
     assert not measure_track(p, "weak", values, track).passed
 
 
@@ -137,9 +147,9 @@ def test_a_pendulum_loses_less_in_shorter_steps(stepper):
     for substeps in (4, 16):
         scene = p.scene(case, stepper=stepper, dt=1 / 60, substeps=substeps)
         left.append(
-            p.measure(case, record_track(make_engine(WAYS[stepper], scene), p.seconds(case), p.interval))[
-                "energy"
-            ]
+            p.measure(
+                case, record_track(make_engine(ENGINE_VARIANTS[stepper], scene), p.seconds(case), p.interval)
+            )["energy"]
         )
     assert left[1] < 0.5 * left[0]
 
@@ -220,7 +230,7 @@ def test_what_an_engine_cannot_build_is_said(variant):
     rough.add_box(friction=0.3)
     for scene, word in ((lv.Scene("four_bar"), "loop"), (soft, "rigid"), (rough, "one friction")):
         with pytest.raises(lv.CapabilityError, match=word):
-            make_engine(WAYS[way], scene)
+            make_engine(ENGINE_VARIANTS[variant], scene)
 
 
 def test_a_static_box_is_refused_where_an_engines_file_makes_none():
@@ -348,7 +358,7 @@ def under_node(monkeypatch, tmp_path):
 
     def made(*said):
         monkeypatch.setattr(Answers, "said", said)
-        return make_engine(WAYS["rapier"], PHENOMENA["stick"].scene())
+        return make_engine(ENGINE_VARIANTS["rapier"], PHENOMENA["stick"].scene())
 
     return made
 
@@ -414,11 +424,11 @@ def test_a_limit_that_is_none_is_refused(limit):
         run(["stick"], steppers=["impulses"], limit=limit)
 
 
-def test_names_of_ways():
+def test_names_of_engine_variants():
     assert [p.name for p in select_phenomena(["stick", "stop", "stick"])] == ["stick", "stop"]
-    assert {w.name for w in ways(["soft_step"], [])} == {"soft_step", "soft_step 16x4"}
-    assert [w.name for w in ways([], ["pybullet 4x100"])] == ["pybullet 4x100"]
-    assert len(ways()) == len(WAYS)
+    assert {w.name for w in select_variants(["soft_step"], [])} == {"soft_step", "soft_step 16x4"}
+    assert [w.name for w in select_variants([], ["pybullet 4x100"])] == ["pybullet 4x100"]
+    assert len(select_variants()) == len(ENGINE_VARIANTS)
     with pytest.raises(lv.UnknownName, match="soft_step"):
         select_variants(["softstep"])
     with pytest.raises(lv.UnknownName, match="engine"):

@@ -19,7 +19,14 @@ from lavender.lab.bench.cases import Item, Source, resolve
 from lavender.lab.bench.record import CaseInfo, Record
 from lavender.lab.bench.running.plan import Plan
 from lavender.lab.bench.running.runner import Runner, Watch, is_foreign, open_runner
-from lavender.lab.bench.running.timing import Ask, Task, copy_into_new_arrays, make_outcome, make_record, pace
+from lavender.lab.bench.running.timing import (
+    Ask,
+    Task,
+    copy_into_new_arrays,
+    make_outcome,
+    make_record,
+    measure_calibration_time,
+)
 from lavender.lab.bench.store import Records, Store
 
 DEFAULT_REPETITIONS, MIN_REPETITIONS, MAX_REPETITIONS = 7, 3, 41
@@ -57,7 +64,7 @@ def time_alternately(
     cases, plan, store, watch, isolate, memory, fresh
         See `lavender.lab.bench.run`.
     asks : sequence of Ask
-        Calls of way "call" on single cases, "steps" over sequences, "batch" on either.
+        Calls of timing mode "call" on single cases, "steps" over sequences, "batch" on either.
     known : Records
 
     Returns
@@ -91,7 +98,7 @@ def time_alternately(
 
 
 class _Alternation:
-    """Repeats all calls on the cases of a part; `turns` identifies the calls and cases that are timed together."""
+    """Repeats all calls on the cases of a part; `interleave_group` identifies calls and cases timed together."""
 
     def __init__(self, runner: Runner, asks: Sequence[Ask], interleave_group: str) -> None:
         self.runner, self.asks, self.interleave_group = runner, asks, interleave_group
@@ -132,7 +139,7 @@ class _Alternation:
     def accepts(self, ask: Ask, item: Item) -> bool:
         """Whether the solver of a call can be timed on a case."""
         spec = self.runner.specs[ask.solver]
-        if is_foreign(spec) and (ask.way == "batch" or ask.mode == "time"):
+        if is_foreign(spec) and (ask.timing_mode == "batch" or ask.mode == "time"):
             return False  # An isolated process adds its start to the time, or has no time limit.
         return spec.refuses(item.problem) is None
 
@@ -162,7 +169,9 @@ class _Alternation:
 
     def time_steps(self, ask: Ask, steps: Cases, records: RecordsByKey) -> None:
         """Time a call on all steps of a sequence, unless their records were stored before."""
-        if ask.way == "batch" or all(self.make_task(ask, info).key in self.known for _, info in steps):
+        if ask.timing_mode == "batch" or all(
+            self.make_task(ask, info).key in self.known for _, info in steps
+        ):
             return
         before = None
         for item, info in steps:
@@ -175,7 +184,7 @@ class _Alternation:
         if all(task.key in self.known for task in tasks):
             return
         problems = [copy_into_new_arrays(item.problem, ask.start) for item, _ in cases]
-        calibration_time = pace()
+        calibration_time = measure_calibration_time()
         start_time = perf_counter()
         try:
             solutions = solve_many(problems, ask.solver, tol=ask.tol, max_iter=ask.max_iter or None)

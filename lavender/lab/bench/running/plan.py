@@ -1,4 +1,4 @@
-"""Define the measurements of a run: levels, budgets, starts and orders, and their sequence for a solver."""
+"""Define the measurements of a run: tolerances, budgets, starts and orders, and their sequence for a solver."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from lavender.problem import Problem
 from lavender.problem.ordering import SWEEP_ORDERS
 from lavender.solvers.registry import SolverSpec
 
-# A motion error is reached by solves to ever tighter residuals: the first, the last, and the largest number per level.
+# A motion error is reached by solves to ever tighter residuals: first and last residual, largest number of solves.
 FIRST_TOL, LAST_TOL, MAX_SPEED_TRIES = 1e-2, 1e-13, 6
-DEFAULT_PASS_LIMIT = 5.0  # [s] Time limit of one pass over a sequence.
+DEFAULT_SEQUENCE_TIME_LIMIT = 5.0  # [s] Time limit of one pass over a sequence.
 UNLIMITED_ITERATIONS = 10_000_000  # Iteration limit of a run to a tolerance; the time limit ends it first.
 # [s] After this time, a campaign kills the process of a third-party solver and records KILLED.
 HANG_LIMIT = 60.0
@@ -35,7 +35,7 @@ class Plan:
 
     Parameters
     ----------
-    levels : sequence of float
+    tolerances : sequence of float
         Relative residuals to reach, each by a solve with this `tol`.
     budgets : sequence of int
         Exact iteration counts (`tol=0`), for solvers that can stop after any iteration.
@@ -44,8 +44,8 @@ class Plan:
         `time_limit` together. Steps of sequences of more than twenty steps are solved once.
     time_limit : float, s
         Of one solve.
-    pass_limit : float, s
-        Of one solver over all steps of a sequence at one budget or level. The remaining steps are not solved, and a
+    sequence_time_limit : float, s
+        Of one solver over all steps of a sequence at one budget or tolerance. The remaining steps are not solved, and a
         note says so.
     warm : bool
         Also start from the problem's guess, unless it is an answer.
@@ -57,9 +57,9 @@ class Plan:
     prove : bool
         Compare motions with an exact solution if one is enclosed (`lavender.prove`); implies `motion`. A claim is
         contradicted if its distance from the solution is larger than its residual allows.
-    speed_levels : sequence of float, m/s
+    velocity_tolerances : sequence of float, m/s
         Motion errors to reach; implies `motion`. Each solver is run to the residual that is estimated to reach them,
-        with tighter residuals if it does not, at most `MAX_SPEED_TRIES` times per level.
+        with tighter residuals if it does not, at most `MAX_SPEED_TRIES` times per tolerance.
     times : sequence of float, s
         Time budgets for which the report recommends a solver.
     sweeps : sequence of int
@@ -68,7 +68,7 @@ class Plan:
     Raises
     ------
     InputError
-        A level, budget, count or limit is not positive, or a seed is invalid.
+        A tolerance, budget, count or limit is not positive, or a seed is invalid.
     UnknownName
         An order does not exist.
     """
@@ -77,7 +77,7 @@ class Plan:
     budgets: Sequence[int] = (4, 8, 16, 32, 64)
     repeats: int = 3
     time_limit: float = 1.0
-    pass_limit: float = DEFAULT_PASS_LIMIT
+    sequence_time_limit: float = DEFAULT_SEQUENCE_TIME_LIMIT
     warm: bool = True
     orders: Sequence[str] = ("reverse", "symmetric", "random:0", "random:1", "random:2")
     campaign: bool = False
@@ -88,8 +88,8 @@ class Plan:
     sweeps: Sequence[int] = ()
 
     def __post_init__(self) -> None:
-        for name in ("levels", "budgets", "orders", "speed_levels", "times", "sweeps"):
-            entries = several(name, getattr(self, name), "words" if name == "orders" else "numbers")
+        for name in ("tolerances", "budgets", "orders", "velocity_tolerances", "times", "sweeps"):
+            entries = check_sequence(name, getattr(self, name), "words" if name == "orders" else "numbers")
             object.__setattr__(self, name, tuple(entries))
         for name, values in (
             ("tolerance", self.tolerances),
@@ -112,7 +112,7 @@ class Plan:
             if seed and not (name == "random" and seed.isdecimal()):
                 raise InputError(f"order {word!r}: only random has a seed, an integer: random:3")
         # Remove duplicates: a value given twice would be run twice and change the middle value.
-        for name in ("levels", "speed_levels"):
+        for name in ("tolerances", "velocity_tolerances"):
             object.__setattr__(
                 self, name, tuple(sorted({float(x) for x in getattr(self, name)}, reverse=True))
             )
@@ -123,7 +123,7 @@ class Plan:
         object.__setattr__(self, "orders", tuple(dict.fromkeys(self.orders)))
         object.__setattr__(self, "motion", self.motion or self.prove or bool(self.velocity_tolerances))
 
-    way = "call"  # value of `Record.way` for single problems
+    timing_mode = "call"  # value of `Record.timing_mode` for single problems
 
     def iteration_limit(self) -> int:
         """Return the maximum number of iterations of a run to a tolerance."""
@@ -138,14 +138,16 @@ class Plan:
     ) -> None:
         """Measure one solver on one case; each record decides the next measurement.
 
-        First come runs to a tolerance: an exact solver once, at the tightest level; others level by level. A solver
-        that can be resumed, or that ran out of time, is not run to a tighter level than one that it missed: its
+        First come runs to a tolerance: an exact solver once, at the tightest tolerance; others at each tolerance, loosest first.
+        A solver that can be resumed, or that ran out of time, gets no tighter tolerance than one that it missed: its
         iterates would be the same. Then follow budgets, then sweep orders at the middle budget.
         """
 
         def measure_one(mode: str, tol: float, max_iter: int, start: str, **options: Any) -> Record:
             """Make one measurement."""
-            ask = Ask(spec.name, mode, tol, max_iter, start=start, way="" if options else self.way)
+            ask = Ask(
+                spec.name, mode, tol, max_iter, start=start, timing_mode="" if options else self.timing_mode
+            )
             more = {"options": options, "repeats": self.repeats, "time_limit": self.time_limit}
             return make(Task.of(info, ask, **more))
 
@@ -154,9 +156,11 @@ class Plan:
             starts.append("warm")
         max_iterations = self.iteration_limit() if spec.resumable else 0
         for start in starts:
-            for level in self.levels[-1:] if spec.exact else self.levels:
-                record = measure_one("tol", level, max_iterations, start)
-                if not record.relative <= level and (spec.resumable or _rules_out_tighter_levels(record)):
+            for tolerance in self.tolerances[-1:] if spec.exact else self.tolerances:
+                record = measure_one("tol", tolerance, max_iterations, start)
+                if not record.relative <= tolerance and (
+                    spec.resumable or _rules_out_tighter_tolerances(record)
+                ):
                     break
             if not spec.exact:
                 self._to_speeds(partial(measure_one, "tol", max_iter=max_iterations, start=start))
@@ -183,7 +187,7 @@ class Plan:
                     speed = math.inf if last.motion_speed is None else last.motion_speed
                     if speed <= tolerance:
                         break
-                    # No tighter level can be reached: the residual was missed, or no motion error is known.
+                    # No tighter tolerance can be reached: the residual was missed, or no motion error is known.
                     if not (last.relative <= tol and speed < math.inf) or tol <= LAST_TOL:
                         return
                     tol = max(LAST_TOL, min(0.3 * tol, 0.5 * last.relative * tolerance / speed))
@@ -200,7 +204,7 @@ class CampaignPlan(Plan):
     Parameters
     ----------
     cap : int
-        Largest number of iterations of a run to a level.
+        Largest number of iterations of a run to a tolerance.
     time_limit : float, s
         After this time the process of a third-party solver is killed; only its own record depends on it.
     """
@@ -209,7 +213,7 @@ class CampaignPlan(Plan):
     time_limit: float = HANG_LIMIT
     cap: int = 20_000
     campaign: bool = True
-    way = ""  # No times are measured.
+    timing_mode = ""  # No times are measured.
 
     def iteration_limit(self) -> int:
         """Return `cap`."""
@@ -217,17 +221,20 @@ class CampaignPlan(Plan):
 
 
 def list_passes(plan: Plan, spec: SolverSpec) -> list[Ask]:
-    """Return the passes over a sequence: each budget and level, from a cold start and with carried impulses."""
+    """Return the passes over a sequence: each budget and tolerance, from a cold start and with carried impulses."""
     max_iterations = UNLIMITED_ITERATIONS if spec.resumable else 0
-    targets = [("tol", level, max_iterations) for level in (plan.levels[-1:] if spec.exact else plan.levels)]
+    tolerances = plan.tolerances[-1:] if spec.exact else plan.tolerances
+    targets = [("tol", tolerance, max_iterations) for tolerance in tolerances]
     if spec.resumable and not spec.exact:
         targets = [*(("budget", 0.0, n) for n in plan.budgets), *targets]
     starts = ("cold", "carried") if spec.impulse and not spec.exact else ("cold",)
-    return [Ask(spec.name, *target, way="steps", start=start) for start in starts for target in targets]
+    return [
+        Ask(spec.name, *target, timing_mode="steps", start=start) for start in starts for target in targets
+    ]
 
 
-def _rules_out_tighter_levels(record: Record) -> bool:
-    """Whether a run that missed its level shows that tighter levels cannot be reached either."""
+def _rules_out_tighter_tolerances(record: Record) -> bool:
+    """Whether a run that missed its tolerance shows that tighter tolerances cannot be reached either."""
     return record.status in ("TIME_LIMIT", "KILLED", "ERROR", "INFEASIBLE") or record.status.startswith(
         "CRASHED"
     )

@@ -80,7 +80,7 @@ def add_motion_error(record: Record, problem: Problem, impulse: Any) -> Record:
         motion.motion_error(problem, impulse) if found is None else motion.nearest(problem, impulse, found)
     )
     speed = error.rows if error.speed is None else error.speed
-    with_motion = replace(record, motion=error.relative, motion_speed=speed, bound=error.bound)
+    with_motion = replace(record, motion_error=error.relative, motion_speed=speed, bound=error.bound)
     reference = error.reference
     if (
         record.claims
@@ -178,8 +178,8 @@ def run(
         of a machine of a cluster.
     into : list, optional
         Receives the records before the first is made, so that they are available if the run is interrupted.
-    fresh : bool
-        Repeat measurements that `store` holds.
+    reuse : bool
+        Do not repeat measurements that `store` holds.
 
     Returns
     -------
@@ -223,7 +223,7 @@ def open_runner(
 ) -> Iterator[Runner]:
     """Open the store and a process for other packages' solvers, and limit BLAS to one thread; see `run`."""
     with opened(store) as kept, Worker(memory) as worker, one_thread():  # Describing a case uses BLAS, too.
-        yield Runner(this, plan, names, kept, watch, worker if isolate else None, fresh)
+        yield Runner(this, plan, names, kept, watch, worker if isolate else None, reuse)
 
 
 class Runner:

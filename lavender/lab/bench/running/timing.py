@@ -2,8 +2,8 @@
 
 The timed call is the one that a report prints, `lv.solve(problem, "name", tol=...)`, including the judge. The arrays of
 its problem were written just before, as a simulator leaves them, and other work has used the caches since. A guarded
-solve under the time limit runs first; if it does not end, its own time is recorded. If `Task.way` is empty, only
-`prepare` and `solve` are timed, without the judge, on a problem from which nothing is derived yet. BLAS and OpenMP use
+solve under the time limit runs first; if it does not end, its own time is recorded. If `Task.timing_mode` is empty,
+only `prepare` and `solve` are timed, without the judge, on a problem from which nothing is derived yet. BLAS and OpenMP use
 one thread, and the garbage collector is off.
 """
 
@@ -51,7 +51,7 @@ class Ask:
     time_limit : float, s
         Of one solve; 0 means the plan's.
     way : str
-        See `Record.way`.
+        See `Record.timing_mode`.
     start : {"cold", "warm", "carried"}
     """
 
@@ -60,7 +60,7 @@ class Ask:
     tol: float
     max_iter: int = 0
     time_limit: float = 0.0
-    way: str = "call"
+    timing_mode: str = "call"
     start: str = "cold"
 
 
@@ -84,8 +84,8 @@ class Task:
     options: Mapping[str, Any] = field(default_factory=dict)
     repeats: int = 1
     step: int = -1
-    way: str = ""
-    turns: str = ""
+    timing_mode: str = ""
+    interleave_group: str = ""
     guarded: bool = True
     lead: float = 0.0
 
@@ -174,11 +174,11 @@ class Outcome:
         Times of each repeat.
     times : tuple of float, s
         Time of the call of each repeat; empty if the guarded solve did not end.
-    pace : float or None, s
-        See `Record.pace`.
-    own : float or None, s
+    calibration_time : float or None, s
+        See `Record.calibration_time`.
+    backend_time : float or None, s
         Time in the backend's own solve.
-    reached : tuple of float
+    residual_per_repeat : tuple of float
         Relative residual of each repeat, in mode "time".
     status_conflict : str
         As in a Solution.
@@ -194,9 +194,9 @@ class Outcome:
     setups: tuple[float, ...]
     solves: tuple[float, ...]
     times: tuple[float, ...]
-    pace: float | None
-    own: float | None = None
-    reached: tuple[float, ...] = ()
+    calibration_time: float | None
+    backend_time: float | None = None
+    residual_per_repeat: tuple[float, ...] = ()
     status_conflict: str = ""
 
 
@@ -225,14 +225,14 @@ def measure(problem: Problem, task: Task, impulse: Any = None) -> tuple[Record, 
 def attempt(problem: Problem, task: Task, impulse: Any = None) -> Outcome | str:
     """Run the solver of a task in this process. Return an exception as text."""
     runs: list[tuple[Solution, float]] = []  # (solution, time of the call)
-    paces: list[float] = []
+    calibration_times: list[float] = []
     backend_times: list[float] = []
     guard: Solution | None = None
     try:
         _warm_up(task.solver)
         with _stable_timing(task.solver):
             start_time = perf_counter()
-            if task.way and task.guarded:
+            if task.timing_mode and task.guarded:
                 # A plug-in may not test convergence: run it with its own iteration limit first, as a larger one might
                 # never be reached.
                 tests = registry.get(task.solver).builtin or task.mode != "tol"
@@ -243,8 +243,8 @@ def attempt(problem: Problem, task: Task, impulse: Any = None) -> Outcome | str:
                     guard = uninterrupted(_prepare_and_solve(problem, task, impulse))
             remaining = max(1, task.repeats - (guard is not None))
             while remaining and (guard is None or guard.status is not Status.TIME_LIMIT):
-                paces.append(pace())
-                if not task.way:
+                calibration_times.append(measure_calibration_time())
+                if not task.timing_mode:
                     parts = uninterrupted(_prepare_and_solve(problem, task, impulse))
                     runs.append((parts, parts.setup_time + parts.solve_time))
                 else:
@@ -252,7 +252,7 @@ def attempt(problem: Problem, task: Task, impulse: Any = None) -> Outcome | str:
                         runs.append(_time_call(problem, task, impulse, guard))
                     backend_times += [sum(time_in_backend)] if time_in_backend else []
                 # When alternating, a quick call is made twice, as a simulator repeats the same call.
-                if task.turns:
+                if task.interleave_group:
                     remaining, runs = (
                         remaining if perf_counter() - start_time < MAX_WARM_UP_TIME else 1,
                         runs[-1:],
@@ -261,7 +261,7 @@ def attempt(problem: Problem, task: Task, impulse: Any = None) -> Outcome | str:
                 if runs[-1][0].status is Status.TIME_LIMIT or perf_counter() - start_time > task.time_limit:
                     remaining = 0 if task.mode != "time" else remaining
             solution = runs[-1][0] if runs else guard
-            if guard is None and task.way and _ended_by_budget(solution, task):
+            if guard is None and task.timing_mode and _ended_by_budget(solution, task):
                 # The solve needs more iterations than the solver's default limit: repeat it with a guarded solve.
                 return attempt(problem, replace(task, guarded=True), impulse)
     except Exception as error:
@@ -270,17 +270,17 @@ def attempt(problem: Problem, task: Task, impulse: Any = None) -> Outcome | str:
     assert solution is not None  # there is at least one repeat
     repeats = [s for s, _ in runs] or [solution]
     outcome = make_outcome(
-        solution, repeats, [t for _, t in runs], min(paces, default=None), task.mode == "time"
+        solution, repeats, [t for _, t in runs], min(calibration_times, default=None), task.mode == "time"
     )
-    return replace(outcome, own=min(backend_times, default=None))
+    return replace(outcome, backend_time=min(backend_times, default=None))
 
 
 def make_outcome(
     solution: Solution,
     repeats: list[Solution],
     times: list[float],
-    paced: float | None,
-    reached: bool = False,
+    calibration_time: float | None,
+    keeps_residuals: bool = False,
 ) -> Outcome:
     """Create the outcome of the repeats, the last of which is `solution`."""
     return Outcome(
@@ -295,8 +295,8 @@ def make_outcome(
         setups=tuple(s.setup_time for s in repeats),
         solves=tuple(s.solve_time for s in repeats),
         times=tuple(times),
-        pace=paced,
-        reached=tuple(float(s.residual.relative) for s in repeats) if reached else (),
+        calibration_time=calibration_time,
+        residual_per_repeat=tuple(float(s.residual.relative) for s in repeats) if keeps_residuals else (),
     )
 
 
@@ -311,7 +311,7 @@ def _ended_by_budget(solution: Solution | None, task: Task) -> bool:
     )
 
 
-_LOOP_NUMBERS = np.arange(2.0**15)  # 256 KiB: more than a first-level cache holds
+_LOOP_NUMBERS = np.arange(2.0**15)  # 256 KiB: more than a first-tolerance cache holds
 
 
 def measure_calibration_time() -> float:
@@ -384,7 +384,7 @@ def _prepare_and_solve(problem: Problem, task: Task, impulse: Any) -> Solution:
     arguments = {"isolate": False} if "isolate" in registry.get(task.solver).accepts else {}
     # The run isolates third-party solvers itself.
     prepared = prepare(fresh, task.solver, **{**arguments, **task.options})
-    reference(fresh)  # The judge's reference energies are computed before the clocks start.
+    get_reference(fresh)  # The judge's reference energies are computed before the clocks start.
     if task.start == "cold":
         impulse = fresh.start()
     elif task.start == "warm":
@@ -425,9 +425,9 @@ def make_record(task: Task, s: Solution, outcome: Outcome) -> Record:
         solve_median=statistics.median(solves),
         time_min=min(times),
         time_median=statistics.median(times),
-        times=outcome.times if task.way else (),
-        reached=outcome.reached,
-        pace=outcome.pace,
+        times=outcome.times if task.timing_mode else (),
+        residual_per_repeat=outcome.residual_per_repeat,
+        calibration_time=outcome.calibration_time,
         load=machine.running(),
-        own_min=outcome.own,
+        backend_time_min=outcome.backend_time,
     )

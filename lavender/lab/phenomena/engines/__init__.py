@@ -1,4 +1,4 @@
-"""Engines, one file each: `Engine(scene, **options)` steps a scene. A `Way` is an engine with settings."""
+"""Engines, one file each: `Engine(scene, **options)` steps a scene. A `EngineVariant` is an engine with settings."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ class Stepping:
 
 
 @dataclass(frozen=True)
-class Way:
+class EngineVariant:
     """An engine with settings: its defaults, or recommended ones.
 
     Parameters
@@ -143,9 +143,9 @@ def missing_in_node(package: str) -> str:
 FINE_STEPS = {"substeps": 16, "solver_iterations": 4}
 
 
-def _own_ways() -> list[Way]:
+def _own_ways() -> list[EngineVariant]:
     """Build the variants of lavender's own steppers."""
-    ways = []
+    select_variants = []
     for name, spec in STEPPERS.items():
         cannot = {} if spec.spin else {"spin": "the stepper has no torsional friction"}
         cannot |= {} if spec.rolling else {"rolling": "the stepper has no rolling friction"}
@@ -157,10 +157,12 @@ def _own_ways() -> list[Way]:
             settings.append((f"{name} newton", newton, "4 substeps, Newton to 1e-6"))
         for full_name, overrides, description in settings:
             parameters = {"stepper": name, "dt": 1 / 60, **overrides}
-            ways.append(
-                Way(full_name, "own", "", {}, f"1/60 s, {description}", scene=parameters, cannot=cannot)
+            select_variants.append(
+                EngineVariant(
+                    full_name, "own", "", {}, f"1/60 s, {description}", scene=parameters, cannot=cannot
+                )
             )
-    return ways
+    return select_variants
 
 
 _NO_PATCH_FRICTION = {"spin": NO_PATCH_RADIUS, "rolling": NO_ROLLING}
@@ -174,18 +176,18 @@ _THIRD_PARTY_WAYS = (
         )
         for cone in ("pyramidal", "elliptic") for noslip in (0, 10)
     ),
-    Way("pybullet", "bullet", "pybullet", {"sweeps": 50, "substeps": 1}, "1/240 s, 50 sweeps"),
-    Way("pybullet 4x100", "bullet", "pybullet", {"sweeps": 100, "substeps": 4}, "1/240 s in 4 of 100 sweeps"),
-    Way("drake", "drake", "pydrake", {"approximation": "lagged", "hydroelastic": False},
+    EngineVariant("pybullet", "bullet", "pybullet", {"sweeps": 50, "substeps": 1}, "1/240 s, 50 sweeps"),
+    EngineVariant("pybullet 4x100", "bullet", "pybullet", {"sweeps": 100, "substeps": 4}, "1/240 s in 4 of 100 sweeps"),
+    EngineVariant("drake", "drake", "pydrake", {"approximation": "lagged", "hydroelastic": False},
         "1 ms, point contacts: its defaults", cannot=_NO_PATCH_FRICTION),
-    Way("drake lagged", "drake", "pydrake", {"approximation": "lagged", "hydroelastic": True},
+    EngineVariant("drake lagged", "drake", "pydrake", {"approximation": "lagged", "hydroelastic": True},
         "1 ms, hydroelastic bodies of 1e8 Pa", cannot=_NO_PATCH_FRICTION),
-    Way("drake sap", "drake", "pydrake", {"approximation": "sap", "hydroelastic": True},
+    EngineVariant("drake sap", "drake", "pydrake", {"approximation": "sap", "hydroelastic": True},
         "1 ms, SAP, hydroelastic bodies of 1e8 Pa", cannot=_NO_PATCH_FRICTION),
-    Way("lavendersim", "lavender_sim", "lavendersim", {"sweeps": 22}, "1/60 s in 4 of 22 sweeps"),
-    Way("lavendersim 64", "lavender_sim", "lavendersim", {"sweeps": 64}, "1/60 s in 4 of 64 sweeps"),
-    Way("rapier", "node", _RAPIER, {"engine": "rapier", "iterations": 4}, "1/60 s, 4 iterations: its defaults",
-        cannot=NO_TORSION),
+    EngineVariant("lavendersim", "lavender_sim", "lavendersim", {"sweeps": 22}, "1/60 s in 4 of 22 sweeps"),
+    EngineVariant("lavendersim 64", "lavender_sim", "lavendersim", {"sweeps": 64}, "1/60 s in 4 of 64 sweeps"),
+    EngineVariant("rapier", "node", _RAPIER, {"engine": "rapier", "iterations": 4},
+        "1/60 s, 4 iterations: its defaults", cannot=NO_TORSION),
     EngineVariant("jolt", "node", _JOLT, {"engine": "jolt", "sweeps": 10, "substeps": 1, "gyroscopic": False},
         "1/60 s, 10 sweeps: its defaults", cannot=NO_TORSION),
     EngineVariant("jolt 4", "node", _JOLT, {"engine": "jolt", "sweeps": 10, "substeps": 4, "gyroscopic": True},
@@ -198,7 +200,9 @@ _THIRD_PARTY_WAYS = (
         "1/60 s in 4 of 10 iterations, its default", cannot=NO_TORSION),
 )  # fmt: skip
 #: Name -> engine variant; lavender's own come first.
-WAYS: dict[str, Way] = {way.name: way for way in (*_own_ways(), *_THIRD_PARTY_WAYS)}
+ENGINE_VARIANTS: dict[str, EngineVariant] = {
+    variant.name: variant for variant in (*_own_ways(), *_THIRD_PARTY_WAYS)
+}
 
 
 def create_engine(module: str, scene: Scene, **options: Any) -> Stepping:
@@ -209,9 +213,9 @@ def create_engine(module: str, scene: Scene, **options: Any) -> Stepping:
     return created
 
 
-def make_engine(way: Way, scene: Scene) -> Stepping:
+def make_engine(variant: EngineVariant, scene: Scene) -> Stepping:
     """Create the engine of a variant with a scene."""
-    return create_engine(way.module, scene, **way.options)
+    return create_engine(variant.module, scene, **variant.options)
 
 
 def record_track(engine: Stepping, seconds: float, interval: float) -> Track:

@@ -12,7 +12,7 @@ from lavender.lab.phenomena.engines.tree import collision_shape, parents, relati
 from lavender.sim.scene import Body, Joint, Plane, Scene, Sphere
 from lavender.sim.scene.parts import rotation
 
-with quiet(noisy=True):  # PyBullet prints a line at import.
+with capture_output(noisy=True):  # PyBullet prints a line at import.
     import pybullet
 
 
