@@ -10,7 +10,7 @@ import click
 
 from lavender.base.errors import InputError, LavenderError
 from lavender.cli.options import EXIT_UNMET, PATH, echo, one_thread
-from lavender.io.stored import writable, write_text
+from lavender.io.stored import check_writable, write_text
 
 
 @click.group()

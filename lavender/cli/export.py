@@ -39,6 +39,6 @@ def export(
     if records is None:
         reject_unused_options(context, ["solver"], "without --records")
     context.with_resource(lock_output(folder, folder=True))  # Locked before the test vectors are solved.
-    more = vectors.made(records, solver, MAX_TEST_PROBLEMS) if records is not None else {}
+    more = vectors.make_files(records, solver, MAX_TEST_PROBLEMS) if records is not None else {}
     written = library.write(folder, more=more, replace=replace)
     echo(f"{len(written)} files in {folder}: {', '.join(p.name for p in written)}")

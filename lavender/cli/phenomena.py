@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from lavender.cli.options import PATH, parse_parameters, reject_unused_options
-from lavender.io.stored import writable, write_text
+from lavender.io.stored import check_writable, write_text
 
 if TYPE_CHECKING:
     from lavender.lab.phenomena import Record

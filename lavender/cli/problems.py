@@ -8,7 +8,7 @@ import click
 
 from lavender.base.errors import InputError
 from lavender.cli.options import EXIT_UNMET, FILE, FOLDER, echo, one_thread, reject_unused_options
-from lavender.io.stored import lock_output, writable, write_text
+from lavender.io.stored import check_writable, lock_output, write_text
 
 
 @click.command()

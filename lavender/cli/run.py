@@ -124,7 +124,7 @@ def run(
 
         def show_step(step: int, observation: dict[str, Any], info: dict[str, Any]) -> None:
             if step % every == 0 or step == steps or "lost_body" in info:
-                show(line(step, observation, info))
+                show(format_step(step, observation, info))
             if viewer is not None:  # Not faster than real time.
                 sleep(max(0.0, info["time"] - (perf_counter() - begun)))
 

@@ -9,7 +9,7 @@ import click
 
 from lavender.base.errors import InputError
 from lavender.cli.options import EXIT_INFEASIBLE, EXIT_INTERRUPTED, EXIT_UNMET, PATH, echo, one_thread
-from lavender.io.stored import writable, write_atomically
+from lavender.io.stored import check_writable, write_atomically
 
 #: Fields of the residual that --output writes.
 SAVED_RESIDUAL_FIELDS = ("error", "relative", "energy", "velocity", "roundoff_floor")

@@ -217,7 +217,7 @@ class Audit:
         return StepSizes(self.rows[self.is_judged], self.contacts[self.is_judged], self.can_touch)
 
     def has_exact_solves(self, divergence: Divergence) -> bool:
-        """Whether every solve of a world that diverged was exact: at its floor or close enough, within `DEFAULT_THRESHOLD`.
+        """Whether every solve of a world that diverged was exact: at its floor, or within `DEFAULT_THRESHOLD`.
 
         The solve of the last step does not count if the state or the unconstrained acceleration was already too large.
         """

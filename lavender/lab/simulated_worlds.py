@@ -89,8 +89,8 @@ class Runs:
 
     def load(self) -> tuple[Any, Any]:
         """Load MuJoCo and the model; InputError if it cannot be read, or the controls do not fit."""
-        mj, model = model_of(self.model)
-        drive_of(model, self.control, self.seed)
+        mj, model = load_model(self.model)
+        make_controller(model, self.control, self.seed)
         return mj, model
 
     def start_from(self, states: Any) -> Runs:
@@ -112,7 +112,7 @@ class Runs:
 
     def drive(self, model: Any, world: int) -> Any:
         """Return the function (data, step) -> controls of a world."""
-        drive = drive_of(model, self.control, self.seed + world)
+        drive = make_controller(model, self.control, self.seed + world)
         if self.starts is None or self.starts.controls is None:
             return drive
         first = self.starts.controls[world % len(self.starts)]

@@ -149,7 +149,7 @@ def time_cold_solves(problem: Problem) -> tuple[float, float, float]:
 
 def _recorded_problems(mj: Any, path: Path, model: Any, steps: int, every: int) -> Iterator[Any]:
     """Yield number, data and problem of each `every`-th step under random controls; None for problems without rows."""
-    data, drive = mj.MjData(model), drive_of(model, "random", 0)
+    data, drive = mj.MjData(model), make_controller(model, "random", 0)
     for step in range(steps):
         data.ctrl[:] = drive(data, step)
         mj.mj_step(model, data)

@@ -170,7 +170,7 @@ def save_reference(
     The reference is `impulse` (m,) [N s] with its `source`, or by default the stored one, which is solved for if there
     is none. Raises InputError if nothing solved the problem.
     """
-    out = writable(_reference_path(path))
+    out = check_writable(_reference_path(path))
     if impulse is not None:
         motion_cache(problem.disk).reference = make_reference(problem.disk, impulse, source)
     best = reference(problem.disk)

@@ -138,9 +138,9 @@ class Plan:
     ) -> None:
         """Measure one solver on one case; each record decides the next measurement.
 
-        First come runs to a tolerance: an exact solver once, at the tightest tolerance; others at each tolerance, loosest first.
-        A solver that can be resumed, or that ran out of time, gets no tighter tolerance than one that it missed: its
-        iterates would be the same. Then follow budgets, then sweep orders at the middle budget.
+        First come runs to a tolerance: an exact solver once, at the tightest tolerance; others at each tolerance, the
+        loosest first. A solver that can be resumed, or that ran out of time, gets no tighter tolerance than one that it
+        missed: its iterates would be the same. Then follow budgets, then sweep orders at the middle budget.
         """
 
         def measure_one(mode: str, tol: float, max_iter: int, start: str, **options: Any) -> Record:

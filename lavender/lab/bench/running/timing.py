@@ -3,8 +3,8 @@
 The timed call is the one that a report prints, `lv.solve(problem, "name", tol=...)`, including the judge. The arrays of
 its problem were written just before, as a simulator leaves them, and other work has used the caches since. A guarded
 solve under the time limit runs first; if it does not end, its own time is recorded. If `Task.timing_mode` is empty,
-only `prepare` and `solve` are timed, without the judge, on a problem from which nothing is derived yet. BLAS and OpenMP use
-one thread, and the garbage collector is off.
+only `prepare` and `solve` are timed, without the judge, on a problem from which nothing is derived yet. BLAS and
+OpenMP use one thread, and the garbage collector is off.
 """
 
 from __future__ import annotations

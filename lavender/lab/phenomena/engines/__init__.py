@@ -143,9 +143,9 @@ def missing_in_node(package: str) -> str:
 FINE_STEPS = {"substeps": 16, "solver_iterations": 4}
 
 
-def _own_ways() -> list[EngineVariant]:
+def _own_variants() -> list[EngineVariant]:
     """Build the variants of lavender's own steppers."""
-    select_variants = []
+    variants = []
     for name, spec in STEPPERS.items():
         cannot = {} if spec.spin else {"spin": "the stepper has no torsional friction"}
         cannot |= {} if spec.rolling else {"rolling": "the stepper has no rolling friction"}
@@ -157,18 +157,18 @@ def _own_ways() -> list[EngineVariant]:
             settings.append((f"{name} newton", newton, "4 substeps, Newton to 1e-6"))
         for full_name, overrides, description in settings:
             parameters = {"stepper": name, "dt": 1 / 60, **overrides}
-            select_variants.append(
+            variants.append(
                 EngineVariant(
                     full_name, "own", "", {}, f"1/60 s, {description}", scene=parameters, cannot=cannot
                 )
             )
-    return select_variants
+    return variants
 
 
 _NO_PATCH_FRICTION = {"spin": NO_PATCH_RADIUS, "rolling": NO_ROLLING}
 _JOLT, _RAPIER = PACKAGES_OF_NODE["jolt"], PACKAGES_OF_NODE["rapier"]
 #: Third-party engines.
-_THIRD_PARTY_WAYS = (
+_THIRD_PARTY_VARIANTS = (
     *(
         EngineVariant(
             f"mujoco {cone}{' noslip' if noslip else ''}", "mujoco", "mujoco", {"cone": cone, "noslip": noslip},
@@ -201,7 +201,7 @@ _THIRD_PARTY_WAYS = (
 )  # fmt: skip
 #: Name -> engine variant; lavender's own come first.
 ENGINE_VARIANTS: dict[str, EngineVariant] = {
-    variant.name: variant for variant in (*_own_ways(), *_THIRD_PARTY_WAYS)
+    variant.name: variant for variant in (*_own_variants(), *_THIRD_PARTY_VARIANTS)
 }
 
 
