@@ -29,7 +29,7 @@ import numpy as np
 from benchmarks.output import markdown, out_option, write_json
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import InputError, UnknownName
-from lavender.cli.options import ValueList
+from lavender.cli.options import ListType
 from lavender.lab.bench.machine import versions
 from lavender.lab.phenomena.engines import (
     PACKAGES_OF_NODE,
@@ -284,28 +284,26 @@ def _at_least(low: int, **lists: Sequence[int]) -> None:
 
 
 @click.command("stand")
-@click.option("--engines", type=ValueList(str), help="Default: all that are installed.")
+@click.option("--engines", type=ListType(str), help="Default: all that are installed.")
 @click.option(
-    "--boxes", type=ValueList(int), default="6,10,20", show_default=True, help="Heights of the towers."
+    "--boxes", type=ListType(int), default="6,10,20", show_default=True, help="Heights of the towers."
 )
 @click.option(
     "--sweeps",
-    type=ValueList(int),
+    type=ListType(int),
     default="4,8,16",
     show_default=True,
     help="Sweeps of a substep, for whoever takes a number.",
 )
-@click.option("--rates", type=ValueList(int), default="60,120", show_default=True, help="Steps a second.")
+@click.option("--rates", type=ListType(int), default="60,120", show_default=True, help="Steps a second.")
 @click.option(
     "--substeps",
-    type=ValueList(int),
+    type=ListType(int),
     default="0,1,2,4",
     show_default=True,
     help="Substeps of a step; 0: the engine's own number.",
 )
-@click.option(
-    "--orders", type=ValueList(str), help="Sweep orders of LavenderSim; default: that of the scene."
-)
+@click.option("--orders", type=ListType(str), help="Sweep orders of LavenderSim; default: that of the scene.")
 @click.option(
     "--seconds", type=click.FloatRange(min=3.0), default=60.0, show_default=True, help="Simulated at most."
 )

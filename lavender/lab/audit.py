@@ -4,8 +4,8 @@
     result.table_of_errors; result.worst[0].problem
     result.write("lavender-audit"); result.summary_page.write("lavender-audit")
 
-An answer whose error rounding explains, in the precision of the engine, is at its floor and did not stop before
-convergence (`Residual.verdict`). MuJoCo's problems are those of `lavender.io.from_mujoco_many`, computed again from the
+An answer with an error that rounding explains, in the precision of the engine, is at its floor and did not stop before
+convergence (`Residual.verdict`). MuJoCo's problems are built by `lavender.io.from_mujoco_many` again from the
 state before each step with its warm start and controls: the engine's answer is reproduced to the bit.
 `noslip_iterations` are applied after the problem is solved; the answer before them is judged. An answer consists of
 forces: MuJoCo's Newton and CG move bodies by accelerations that they compute separately, which are more accurate after
@@ -62,7 +62,7 @@ NUMBERS = ("velocity", "impulse", "relative", "floor")  # [m/s, N s, -, -] error
 QUANTILES = (0.5, 0.9, 0.99, 0.999, 1.0)
 MAX_PROBLEMS_IN_MEMORY = 512  # Problems are built and judged in batches of this many.
 STEPS_PER_TASK = 4096  # A worker returns its results after this many steps.
-N_WORST_WORLDS = 3  # Number of worlds whose worst step is written to a file.
+N_WORST_WORLDS = 3  # Number of worlds for which the worst step is written to a file.
 MAX_CURVE_POINTS = 60  # Largest number of points of a curve over time.
 ERRORS_NOTE = (
     "Of the worst row of each step judged. At its floor: rounding explains the error, in the engine's precision. Close "
@@ -310,7 +310,7 @@ class Audit:
 
     @property
     def table_of_worst(self) -> Table:
-        """The worlds whose worst steps are written to files."""
+        """The worlds of the worst steps, which are written to files."""
         rows = [
             [f"worst_{i}.npz", str(w.world), str(w.step), format_size(w.velocity), w.where]
             for i, w in enumerate(self.worst, 1)

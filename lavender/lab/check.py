@@ -1,4 +1,4 @@
-"""Compare solvers with the judge and with a reference optimum, by default that of a QP solver.
+"""Compare solvers with the judge and with a reference optimum, by default from a QP solver.
 
 If the problem is convex, the distance of two answers is bounded by their residuals (`lavender.lab.motion.bound`,
 inequality (3)). A breach of this bound means that a residual is computed incorrectly. |Delta|_A [sqrt J] is the energy
@@ -64,7 +64,7 @@ class CrossCheckRow:
     slack : float or None, m/s
         Largest difference of slack.
     objective : float or None, J
-        1/2 l.A l - b.l minus that of the reference.
+        1/2 l.A l - b.l minus the reference's.
     time : float or None, s
         Set-up and solve.
     note : str
@@ -131,7 +131,7 @@ class CrossCheck:
 
     @property
     def contradicted(self) -> tuple[CrossCheckRow, ...]:
-        """Rows whose claim is contradicted."""
+        """Rows with a contradicted claim."""
         return tuple(row for row in self.rows if row.contradicted)
 
     @property

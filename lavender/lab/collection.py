@@ -61,7 +61,7 @@ class Entry:
     condition : float or None
         Condition number of A on its range, scaled to a diagonal of 1; None above CONDITION rows.
     degenerate : float
-        Fraction of blocks at a boundary, of those whose error has a bound; 0 if none has one.
+        Fraction of blocks at a boundary, of the blocks with a bounded error; 0 without such blocks.
     known : {"enclosed", "infeasible", "open"}
     radius : float or None, m/s
         Radius of the enclosed solution, for every row.
@@ -174,7 +174,7 @@ def load(path: Path | str = MANIFEST) -> list[Entry]:
 
 
 def select_buildable(entries: Iterable[Entry]) -> tuple[list[Entry], list[str]]:
-    """Select the entries whose models are installed; return them and a line for each package that is not."""
+    """Select the entries with installed models; return them and a line for each missing package."""
     entries = list(entries)
     missing = {e.name: suite.missing(package) for e in entries if (package := suite.package_of(e.name))}
     buildable = [e for e in entries if not missing.get(e.name)]

@@ -50,9 +50,9 @@ BLOCK_KINDS = {
 }
 PYRAMIDAL_CONTACT = 6  # mjtConstraint of an edge of a pyramidal contact
 MIN_WARP_ROWS = 256  # Smallest number of rows per world for which MuJoCo Warp allocates memory.
-# If a smaller fraction of the judged steps has contact, no setting is recommended, and an audit warns that it says
-# little about contact: mean times and the error that 1 % of the steps exceed then describe steps without contact. 6 %
-# of the steps of dm_control's finger have contact, none of its stacker's.
+# If a smaller fraction of the judged steps has contact, no setting is recommended, and an audit warns that its results
+# hardly concern contact: mean times and the error that 1 % of the steps exceed then describe steps without contact.
+# 6 % of the steps of dm_control's finger have contact, none of its stacker's.
 MIN_CONTACT_SHARE = 0.2
 
 
@@ -339,7 +339,7 @@ def iterate_frames(engine: str, runs: Runs) -> Iterator[Frame]:
 
 
 def _sizes_of(jac: Any, nefc: Any, world_of: Any, address: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Count the rows of each world that are not padding (zeros of J), and the contacts whose first row is one."""
+    """Count the rows of each world that are not padding (zeros of J), and the contacts that begin with such a row."""
     is_active = (jac != 0.0).any(axis=2)
     if nefc is not None:
         is_active &= np.arange(is_active.shape[1]) < nefc[:, None]

@@ -58,7 +58,7 @@ N_TRIAL_ROUNDS = 2  # Settings near the front are varied after this many rounds.
 MAX_VARIED_TIME_RATIO = 1.5
 TOLERANCES = (1e-3, 1e-4, 1e-6, 1e-8, 1e-10, 1e-12, 1e-15)
 ITERATIONS = {"Newton": (1, 2, 3, 5, 10), "CG": (3, 6, 12, 25, 50), "PGS": (3, 6, 12, 25, 50, 100)}
-# Prefixes of MuJoCo's enumerators whose other part is the MJCF keyword.
+# Prefixes of MuJoCo's enumerators; the rest of the name is the MJCF keyword.
 ENUMS = {
     "solver": "mjSOL_",
     "cone": "mjCONE_",

@@ -1,7 +1,7 @@
 """Choose the calls that are worth timing alternately, and time them.
 
-A report prints calls of `lv.solve`. Those near the best of what `bench.run` measured are timed again, interleaved with
-each other (`lavender.lab.bench.time_alternately`), so that the printed times are times of exactly these calls.
+A report prints calls of `lv.solve`. Those near the best call that `bench.run` measured are timed again, interleaved
+with each other (`lavender.lab.bench.time_alternately`), so that the printed times are times of exactly these calls.
 """
 
 from __future__ import annotations
@@ -102,7 +102,7 @@ def _list_time_limited(
 def time_candidates(
     cases: Iterable[Source], records: Records, plan: Plan, store: Any = None, **more: Any
 ) -> Records:
-    """Choose the candidates among what `bench.run` measured, and time them by `bench.time_alternately`."""
+    """Choose the candidates among the calls that `bench.run` measured, and time them by `bench.time_alternately`."""
     remaining = drop_idle_cases(records)
     if not len(remaining) or plan.velocity_tolerances:
         return records

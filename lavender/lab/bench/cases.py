@@ -118,8 +118,8 @@ def resolve(words: Source | Iterable[Source], sequences: bool | None = None) -> 
     ----------
     words : files, folders, names or cases of the suite, problems; or one of them
     sequences : bool, optional
-        Folders hold the steps of a simulation. If None, this is assumed for folders whose files differ only in a number
-        and name their blocks (`Problem.key`), as recorded steps do.
+        Folders hold the steps of a simulation. If None, this is assumed for folders with files that differ only in a
+        number and name their blocks (`Problem.key`), as recorded steps do.
 
     Raises
     ------

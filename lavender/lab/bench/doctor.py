@@ -37,7 +37,7 @@ HASHES = {
 def self_test() -> dict[str, str]:
     """Compute the hash of each part: sweeps over a matrix and over bodies, exact blocks, steps of scenes.
 
-    `newton`, `direct` and `admm` are left out: parts of them use BLAS and LAPACK, whose bits depend on the library.
+    `newton`, `direct` and `admm` are left out: parts of them use BLAS and LAPACK, and their bits depend on the library.
     """
     results = {}
     for name, law in (

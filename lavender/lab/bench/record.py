@@ -136,7 +136,7 @@ class CaseInfo(_PrintableEntry):
     source : str
         Path, or name in the suite.
     sha : str
-        Hash of the numbers: a file whose numbers change is another case.
+        Hash of the numbers: a file with changed numbers is another case.
     law : str
     rows, blocks, contacts : int
     bodies : int
@@ -268,8 +268,8 @@ class Record(_PrintableEntry):
     threads : int
     step : int
         Step of a sequence; -1 for a single case.
-    way : {"", "call", "steps", "batch"}
-        What was timed. "call": one `lv.solve` on a new problem; "steps": the same in a loop that carries impulses;
+    timing_mode : {"", "call", "steps", "batch"}
+        Timed call. "call": one `lv.solve` on a new problem; "steps": the same in a loop that carries impulses;
         "batch": a problem's share of one `lv.solve_many`; "": prepare and solve, without judge and input validation.
     interleave_group : str
         Identifies the calls and cases that alternated with this one; "" if its repeats were consecutive.

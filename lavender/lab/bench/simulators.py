@@ -3,7 +3,7 @@
 Each model is simulated under random controls. At some of its steps the constraint problem is read from memory and
 solved from a cold start by both solvers to the same judged residual:
 
-    MuJoCo      `mj_fwdConstraint` with the Newton solver, at the loosest tolerance whose answer the judge accepts
+    MuJoCo      `mj_fwdConstraint` with the Newton solver, at the loosest tolerance with an accepted answer
     lavender    `lavender.solve(problem)`: prepare, solve and judge; and the same in `solve_many`
 
 Building the problem, with M's factor, is not included, as `mj_factorM` is not. Times are minima of several repetitions

@@ -96,7 +96,7 @@ class Records:
         return len(self.records)
 
     def latest(self) -> Records:
-        """Return the records of the run that wrote last, of cases whose numbers have not changed since.
+        """Return the records of the run that wrote last, of cases with unchanged numbers.
 
         Times are compared only within one run, and a file that has changed is another problem.
         """

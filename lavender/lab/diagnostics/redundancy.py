@@ -48,7 +48,7 @@ MAX_HIDDEN_DIAGONAL = 1e-10
 # If A_ii is at most this fraction of a d that two rows share, the units of the two rows differ.
 MAX_SHARED_SCALE_FRACTION = 1e-3
 SEMIDEFINITE_SLACK = 1e-8  # A counts as semidefinite in a row if |A_ij| / sqrt(A_ii A_jj) <= 1 + this.
-NULL_VECTOR_TOL = 1e-9  # A row whose entries in all unit null vectors are at most this is not moved by them.
+NULL_VECTOR_TOL = 1e-9  # A row with entries of at most this in all unit null vectors is not moved by them.
 
 
 IndexArray = npt.NDArray[np.intp]
@@ -70,7 +70,7 @@ class Redundancy:
     rows : tuple of int
         Redundant rows: each depends on the rows that are not redundant.
     impulse_is_unique : (m,) bool
-        Rows whose impulse no redundancy can change.
+        Rows with an impulse that no redundancy can change.
     """
 
     problem: Problem
@@ -87,14 +87,14 @@ class Redundancy:
 
     @cached_property
     def blocks(self) -> tuple[int, ...]:
-        """Blocks (joints, contacts) whose rows are all redundant: removing them changes no motion."""
+        """Blocks (joints, contacts) with only redundant rows: removing them changes no motion."""
         ptr = self.problem.cones.ptr
         count = np.bincount([self.problem.block_of(i) for i in self.rows], minlength=self.problem.n_blocks)
         return tuple(int(i) for i in np.flatnonzero((count > 0) & (count == np.diff(ptr))))
 
     @property
     def block_names(self) -> tuple[str, ...]:
-        """Names of the blocks whose rows are all redundant."""
+        """Names of the blocks with only redundant rows."""
         return tuple(map(self.problem.block_name, self.blocks))
 
     @property

@@ -6,7 +6,7 @@ it:
 
     w = A y - b,   p = Pi_C(y - D^-1 w) in the metric of D,   e = y - p                              (1)
 
-Let y* be a solution of the problem whose targets are shifted by D e [m/s], so that b' = b + D e. Then
+Let y* be a solution of the problem with targets shifted by D e [m/s], so that b' = b + D e. Then
 
     |y - y*|_A <= |e|_A          and so, for every impulse x,    |x - y*|_A <= |x - y|_A + |e|_A     (2)
 

@@ -15,7 +15,7 @@ from lavender.lab.motion.operator import U
 from lavender.lab.motion.reference import Reference, motion_cache
 from lavender.problem import Problem
 
-# Motions whose distance is below this fraction of the constraints' own motion count as the same: a residual of 1e-10
+# Motions at a distance below this fraction of the constraints' own motion count as the same: a residual of 1e-10
 # moves by up to 1e-7 of it on the worst conditioned piles of the suite.
 SAME_MOTION_FRACTION = 1e-6
 

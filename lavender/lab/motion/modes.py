@@ -25,7 +25,7 @@ from lavender.problem import Problem
 MAX_ENUMERATED_CONTACTS = 8  # Problems with more contacts are not enumerated.
 MAX_MODES = 4**MAX_ENUMERATED_CONTACTS  # Problems with more modes are not enumerated.
 MODES_PER_BATCH = 4096  # Number of systems that are in memory at once.
-# At most this many singular modes whose solutions have several dimensions are examined, by a linear program each.
+# At most this many singular modes with several dimensions of solutions are examined, by a linear program each.
 MAX_SINGULAR_MODES = 300
 INEQUALITY_TOL = (
     1e-9  # Rounding may violate an inequality by this fraction of the largest number of a system.

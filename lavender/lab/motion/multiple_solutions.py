@@ -1,6 +1,6 @@
 """The motions that solve one problem: under Coulomb's law there may be several, and no solver accuracy selects one.
 
-Runs from different starts, in different orders and by different solvers end at solutions; solutions whose motions agree
+Runs from different starts, in different orders and by different solvers end at solutions; solutions with equal motions
 are one motion. A search finds motions but does not prove that there are no others: `uniqueness` can, and problems of up
 to eight contacts with one tangent are enumerated completely (`lavender/lab/motion/modes.py`).
 """
@@ -137,7 +137,7 @@ class Pick(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class SolutionSet:
-    """SolutionSet that all solve one problem, most frequent first; `str()` gives one line for each.
+    """Motions that all solve one problem, most frequent first; `str()` gives one line for each.
 
     Parameters
     ----------
@@ -443,7 +443,7 @@ def _start(
 
 
 def _merge_equal_motions(problem: Problem, found: list[tuple[Reference, str]]) -> list[Motion]:
-    """Merge solutions whose motions agree into one `Motion`, the best solved of each; most frequent first."""
+    """Merge solutions with equal motions into one `Motion`, the best solved of each; most frequent first."""
     groups: list[list[tuple[Reference, str]]] = []
     for first in found:
         for group in groups:
@@ -510,7 +510,7 @@ def motion_error(problem: Problem, impulse: Any, reference: Any = None) -> Motio
 
         kinetic = sqrt(1/2 dv.M dv)        energy = sqrt(1/2 (lambda - lambda*).A (lambda - lambda*))
 
-    so that two impulses whose difference moves nothing (a table on four legs) have distance 0. The bound does not
+    so that two impulses with a difference that moves nothing (a table on four legs) have distance 0. The bound does not
     depend on trust in the reference: with e the judge's error of lambda* and targets moved by d e, the solution is
     within sqrt(1/2) |e|_A of it (proof in `lavender.lab.motion.bound`).
 

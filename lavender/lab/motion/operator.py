@@ -25,7 +25,7 @@ U = 2.0**-53  # Unit round-off of float64.
 # negative eigenvalue makes the inverse inertia indefinite.
 NEGATIVE_EIGENVALUE_TOL = 1e-12
 MAX_TREE_VELOCITIES = (
-    2000  # Largest number of generalised velocities of one tree, whose M is inverted as a dense matrix.
+    2000  # Largest number of generalised velocities of one tree: its M is inverted as a dense matrix.
 )
 
 

@@ -88,8 +88,8 @@ class Uniqueness:
 def uniqueness(problem: Problem) -> Uniqueness:
     """Prove that a problem has one motion; return the criterion that holds, or the first contact at which none does.
 
-    For the last criterion, a problem whose friction is not small is solved by `auto`, once. Islands of more than 600
-    rows with friction are not proved.
+    For the last criterion, a problem with friction that is not small is solved by `auto`, once. Islands of more
+    than 600 rows with friction are not proved.
     """
     refusal = motion_cache(problem).refusal
     if refusal:
@@ -195,7 +195,7 @@ def _contraction_number(
 
 
 def _friction_components(c: Cones) -> dict[int, list[IntArray]]:
-    """Return the friction components of each contact whose bound is not 0."""
+    """Return the friction components of each contact that have a non-zero bound."""
     components: dict[int, list[IntArray]] = {}
     reach = c.reach
     for i, rows_of_component in c.parts():

@@ -1,4 +1,4 @@
-"""Scenes whose motion is known, measured in every stepper of LavenderSim and in other engines.
+"""Scenes with known motion, measured in every stepper of LavenderSim and in other engines.
 
 A phenomenon is data: parameters with ranges, an exact motion with its derivation, quantities with bounds. An engine
 returns poses over time, from which the quantities are measured, in the same way for all engines.

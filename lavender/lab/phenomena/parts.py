@@ -91,7 +91,7 @@ class Track:
 
 @dataclass(frozen=True)
 class Phenomenon:
-    """A scene whose motion is known.
+    """A scene with known motion.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Measure phenomena in engines. Third-party engines run in another process, whose end is a note in the record."""
+"""Measure phenomena in engines. Third-party engines run in another process; if it ends, the record has a note."""
 
 from __future__ import annotations
 

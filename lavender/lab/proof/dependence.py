@@ -53,7 +53,7 @@ MAX_INTEGER_RANK = 600
 
 
 def dependencies(flint: Any, j: Any, target: FloatArray, sure: int = 0) -> tuple[Any, Any]:
-    """Return rows of J that are independent of those before them, and dependent rows whose target contradicts them.
+    """Return rows of J that are independent of those before them, and dependent rows with contradicting targets.
 
     Rows that are independent modulo a prime are independent. If they span all columns that they use, the other rows
     depend on them; otherwise the rank over the integers decides, with the targets as one more column for the rows that

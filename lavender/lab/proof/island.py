@@ -31,7 +31,7 @@ MAX_INVERSE_ENTRIES = (
     4_000_000  # Largest number of entries of the inverse that are in memory at once (32 MB).
 )
 
-# A friction component whose speed in the answer is at most this fraction of the largest b may stick in the solution.
+# A friction component with a speed of at most this fraction of the largest b may stick in the solution.
 STICKING_SPEED_FRACTION = 1e-9
 
 MAX_BOX_ENLARGEMENTS = 10  # The box X is enlarged at most this often.

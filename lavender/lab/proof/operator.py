@@ -14,7 +14,7 @@ from lavender.lab.proof.numbers import UNIT, Balls, sparse_times, to_dense, uppe
 from lavender.problem import Problem
 from lavender.problem.derived import cached_property
 
-# Largest number of coupled unknowns of J and M, whose M^-1 is a dense matrix of balls: about a minute and 0.3 GB.
+# Largest number of coupled unknowns of J and M: M^-1 is a dense matrix of balls: about a minute and 0.3 GB.
 MAX_COUPLED_UNKNOWNS = 2000
 
 MAX_DENSE_BALL_ROWS = 64  # Up to this many rows, A is a dense matrix of balls.

@@ -46,7 +46,7 @@ class Enclosure:
     unique : bool
         All solutions have the same velocities: proved for convex laws; under Coulomb's law only by `motion.uniqueness`.
     reason : str
-        If nothing is proven: why, and what would be needed. If it is proven: rows whose impulses are one of a family.
+        If nothing is proven: the cause and a remedy. If it is proven: rows with impulses of a family.
     impulse : (m,) N s, or None
         The exact solution, rounded.
     boundary : tuple of str
@@ -373,7 +373,7 @@ class Search:
             lam[r] = x
 
     def _singular_error(self, which: Any, slope: Any) -> _Undecided:
-        """Create the exception that names the blocks whose impulses singular equations do not fix."""
+        """Create the exception that names the blocks that have impulses not fixed by singular equations."""
         rows = which[:0]
         slope = slope if isinstance(slope, np.ndarray) else slope.toarray()
         if len(which) <= MAX_SINGULAR_DIRECTION_UNKNOWNS and np.isfinite(slope).all():

@@ -65,7 +65,7 @@ __all__ = [
     "walking",
 ]
 
-# Models of each package whose steps the set "robots" contains.
+# Models of each package in the set "robots".
 ROBOTS = {
     "gymnasium": ("ant", "half_cheetah", "hopper", "humanoid", "humanoidstandup", "pusher_v5", "walker2d_v5"),
     "dm_control": (

@@ -200,7 +200,7 @@ def _propose_rest_impulse(problem: Problem, momentum: FloatArray, scale: FloatAr
 
 
 def _row_pointers(n_rows: int, entries_per_row: int) -> IntArray:
-    """Return the row pointers of a CSR matrix whose rows have equally many entries."""
+    """Return the row pointers of a CSR matrix with equally many entries in all rows."""
     return np.arange(0, entries_per_row * n_rows + 1, entries_per_row, dtype=np.int32)
 
 

@@ -447,7 +447,7 @@ def random_spd(n: int = 100, condition: float = 1e6, seed: int = 0) -> Draft:
 def boxed_friction(
     n: int = 4, scene: str = "box_stack", mass_ratio: float = 1.0, sliding: float = 0.5
 ) -> Draft:
-    """Contacts whose tangents are bounded by mu times an estimated load: a square, so a boxed LCP.
+    """Contacts with tangents bounded by mu times an estimated load: a square, so a boxed LCP.
 
     Every QP solver accepts it, and the exact solution has unique velocities. Scenes: box_stack, pyramid, granular, of
     size n.

@@ -188,7 +188,7 @@ def ring(n: int = 8) -> Draft:
 
 @family()
 def near_parallel(angle: float = 1e-4) -> Draft:
-    """A point mass on two planes whose normals differ by 2 x `angle` [rad]: A = [[1, c], [c, 1]], c = cos 2 angle."""
+    """A point mass on two planes, normals 2 x `angle` [rad] apart: A = [[1, c], [c, 1]], c = cos 2 angle."""
     check_positive(angle=angle)
     problem = _on_two_planes(math.sin(angle), math.cos(angle))
     # 1 - c^2 = 4 angle^2 amplifies the rounding of the normals.
@@ -204,7 +204,7 @@ def near_parallel(angle: float = 1e-4) -> Draft:
 
 @family()
 def wedge(angle: float = 1e-4) -> Draft:
-    """A point mass falls into a slot whose two walls are `angle` [rad] from vertical: impulses 1 / (2 sin angle)."""
+    """A point mass falls into a slot with two walls at `angle` [rad] from vertical: impulses 1 / (2 sin angle)."""
     check_positive(angle=angle)
     problem = _on_two_planes(math.cos(angle), math.sin(angle))
 
@@ -287,7 +287,7 @@ def units(kg: float = 1e12, m: float = 1.0, s: float = 1.0, n: int = 5) -> Draft
 
 @family()
 def least_speeds(n: int = 8) -> Draft:
-    """A stack whose speeds are the smallest that a problem may have: lambda_i = (n - i) 2^-199, exactly."""
+    """A stack with the smallest speeds that a problem may have: lambda_i = (n - i) 2^-199, exactly."""
     check_minimum(1, n=n)
     a = 2.0 * np.eye(n) - np.eye(n, k=1) - np.eye(n, k=-1)
     a[0, 0] = 1.0

@@ -61,7 +61,7 @@ def time_alternately(
 
     Parameters
     ----------
-    cases, plan, store, watch, isolate, memory, fresh
+    cases, plan, store, watch, isolate, memory, reuse
         See `lavender.lab.bench.run`.
     asks : sequence of Ask
         Calls of timing mode "call" on single cases, "steps" over sequences, "batch" on either.
@@ -73,7 +73,7 @@ def time_alternately(
         `known`, with the new records.
     """
     this = list(known.runs.values())[-1]
-    names = list(dict.fromkeys(ask.solver for ask in asks))
+    names = list(dict.fromkeys(call.solver for call in asks))
     with open_runner(this, plan, names, store, watch, isolate, memory, reuse) as runner:
         runner.out = known
         described = [(i, known.cases[i.name]) for i in resolve(cases) if i.name in known.cases]
@@ -112,7 +112,7 @@ class _Alternation:
         """Repeat all calls on some cases or one sequence: at most `limit` [s], above the default number `extra` [s]."""
         is_sequence = bool(part[0][0].sequence)
         asks = [a for a in self.asks if a.timing_mode == "batch" or (a.timing_mode == "steps") == is_sequence]
-        accepted = {ask: [(i, info) for i, info in part if self.accepts(ask, i)] for ask in asks}
+        accepted = {call: [(i, info) for i, info in part if self.accepts(call, i)] for call in asks}
         records: RecordsByKey = {}
         start_time = perf_counter()
         for repetition in range(MAX_REPETITIONS):
@@ -123,71 +123,71 @@ class _Alternation:
             first = repetition % len(asks) if asks else 0
             order = asks[first:] + asks[:first]
             if is_sequence:
-                for ask in order:
-                    self.time_steps(ask, accepted[ask], records)
+                for call in order:
+                    self.time_steps(call, accepted[call], records)
             else:
                 for item, info in part:
-                    for ask in order:
-                        if ask.timing_mode != "batch" and any(info is other for _, other in accepted[ask]):
-                            self.add(records, self.time_case(ask, item, info, None)[0])
-            for ask in order:
-                if ask.timing_mode == "batch" and _is_batch(accepted[ask], is_sequence):
-                    self.time_batch(ask, accepted[ask], records)
+                    for call in order:
+                        if call.timing_mode != "batch" and any(info is other for _, other in accepted[call]):
+                            self.add(records, self.time_case(call, item, info, None)[0])
+            for call in order:
+                if call.timing_mode == "batch" and _is_batch(accepted[call], is_sequence):
+                    self.time_batch(call, accepted[call], records)
         for repeated in records.values():
             self.runner.keep(_merge(repeated))
 
-    def accepts(self, ask: Ask, item: Item) -> bool:
+    def accepts(self, call: Ask, item: Item) -> bool:
         """Whether the solver of a call can be timed on a case."""
-        spec = self.runner.specs[ask.solver]
-        if is_foreign(spec) and (ask.timing_mode == "batch" or ask.mode == "time"):
+        spec = self.runner.specs[call.solver]
+        if is_foreign(spec) and (call.timing_mode == "batch" or call.mode == "time"):
             return False  # An isolated process adds its start to the time, or has no time limit.
         return spec.refuses(item.problem) is None
 
-    def make_task(self, ask: Ask, info: CaseInfo) -> Task:
+    def make_task(self, call: Ask, info: CaseInfo) -> Task:
         """Return the task of one repetition of a call on one case."""
         more = {
-            "time_limit": ask.time_limit or self.runner.plan.time_limit,
-            "repeats": 1 if ask.timing_mode == "steps" else 2,
+            "time_limit": call.time_limit or self.runner.plan.time_limit,
+            "repeats": 1 if call.timing_mode == "steps" else 2,
             "interleave_group": self.interleave_group,
             "guarded": False,
         }
-        return Task.of(info, ask, **more)
+        return Task.of(info, call, **more)
 
     def add(self, records: RecordsByKey, record: Record | None) -> None:
         """Collect a record unless it was stored before."""
         if record is not None and record.key not in self.known:
             records.setdefault(record.key, []).append(record)
 
-    def time_case(self, ask: Ask, item: Item, info: CaseInfo, before: Any) -> tuple[Record | None, Any]:
+    def time_case(self, call: Ask, item: Item, info: CaseInfo, before: Any) -> tuple[Record | None, Any]:
         """Time a call on a case, starting from the step `before`; return its record and its impulses."""
-        task = self.make_task(ask, info)
-        if task.key in self.known and ask.start != "carried":
+        task = self.make_task(call, info)
+        if task.key in self.known and call.start != "carried":
             return None, None
-        record, after = self.runner.measure_step(item.problem, task, self.runner.specs[ask.solver], before)
-        self.runner.report_progress(info.case, ask.solver, record)
+        record, after = self.runner.measure_step(item.problem, task, self.runner.specs[call.solver], before)
+        self.runner.report_progress(info.case, call.solver, record)
         return record, after
 
-    def time_steps(self, ask: Ask, steps: Cases, records: RecordsByKey) -> None:
+    def time_steps(self, call: Ask, steps: Cases, records: RecordsByKey) -> None:
         """Time a call on all steps of a sequence, unless their records were stored before."""
-        if ask.timing_mode == "batch" or all(
-            self.make_task(ask, info).key in self.known for _, info in steps
+        if call.timing_mode == "batch" or all(
+            self.make_task(call, info).key in self.known for _, info in steps
         ):
             return
         before = None
         for item, info in steps:
-            record, before = self.time_case(ask, item, info, before)
+            record, before = self.time_case(call, item, info, before)
             self.add(records, record)
 
-    def time_batch(self, ask: Ask, cases: Cases, records: RecordsByKey) -> None:
+    def time_batch(self, call: Ask, cases: Cases, records: RecordsByKey) -> None:
         """Time one call of `solve_many`; each problem's record has an equal part of the time."""
-        tasks = [self.make_task(ask, info) for _, info in cases]
+        tasks = [self.make_task(call, info) for _, info in cases]
         if all(task.key in self.known for task in tasks):
             return
-        problems = [copy_into_new_arrays(item.problem, ask.start) for item, _ in cases]
+        problems = [copy_into_new_arrays(item.problem, call.start) for item, _ in cases]
         calibration_time = measure_calibration_time()
         start_time = perf_counter()
         try:
-            solutions = solve_many(problems, ask.solver, tol=ask.tol, max_iter=ask.max_iter or None)
+            solutions = solve_many(problems, call.solver, tol=call.tol, max_iter=call.max_iter or None)
         except Exception as error:  # Only the records of this call are lost.
             for task in tasks:
                 self.add(

@@ -120,7 +120,7 @@ def is_foreign(spec: SolverSpec) -> bool:
 
 
 def solver_names(names: str | Sequence[str] | None) -> list[str]:
-    """Return the names of the solvers to run: those that are given, each of them installed, or every installed one.
+    """Return the names of the solvers to run: the named ones, each of them installed, or every installed solver.
 
     Raises
     ------
@@ -406,15 +406,15 @@ class Runner:
         for name in self.names:
             spec = self.select_solver(items[0].sequence, name, [item for item, _ in steps])
             if spec is not None:
-                for ask in list_passes(self.plan, spec):
+                for call in list_passes(self.plan, spec):
                     self.report_progress(items[0].sequence, spec.name)
-                    self.measure_pass(steps, spec, ask)
+                    self.measure_pass(steps, spec, call)
             self.done += len(items)
 
-    def measure_pass(self, steps: list[tuple[Item, CaseInfo]], spec: SolverSpec, ask: Ask) -> None:
+    def measure_pass(self, steps: list[tuple[Item, CaseInfo]], spec: SolverSpec, call: Ask) -> None:
         """Measure one pass. It ends, with a note, when its steps have taken `Plan.sequence_time_limit` together."""
         repeats = self.plan.repeats if len(steps) <= MAX_REPEATED_STEPS else 1
-        tasks = [Task.of(info, ask, repeats=repeats, time_limit=self.plan.time_limit) for _, info in steps]
+        tasks = [Task.of(info, call, repeats=repeats, time_limit=self.plan.time_limit) for _, info in steps]
         problems = [item for item, _ in steps]
         limit, spent, made = self.plan.sequence_time_limit, 0.0, 0
         for task in tasks:
@@ -425,7 +425,7 @@ class Runner:
             self.out.add(record)
             self.report_progress(task.case, spec.name, record, True)
         before: tuple[Problem, FloatArray] | None = None
-        if ask.start == "carried" and 0 < made < len(tasks) and spent <= limit:
+        if call.start == "carried" and 0 < made < len(tasks) and spent <= limit:
             # An earlier run was stopped in this pass: solve its steps again, unrecorded, for the last step's impulses.
             for item, task in zip(problems[:made], tasks, strict=False):
                 again = replace(task, repeats=1)
@@ -443,12 +443,14 @@ class Runner:
             self.report_progress(record.case, spec.name, record)
             spent, made = spent + _elapsed_time(record), made + 1
         if made < len(tasks):
-            asked = describe_target(ask.mode, ask.tol, ask.max_iter)
+            asked = describe_target(call.mode, call.tol, call.max_iter)
             reason = (
                 f"stopped after {made} of {len(tasks)} steps, which took more than the pass limit of {limit:.3g} s "
                 "together (--sequence-time-limit)"
             )
-            self.keep(Skip(self.this.run, f"{problems[0].sequence}, {asked}, {ask.start}", spec.name, reason))
+            self.keep(
+                Skip(self.this.run, f"{problems[0].sequence}, {asked}, {call.start}", spec.name, reason)
+            )
 
     def measure_step(
         self, problem: Problem, task: Task, spec: SolverSpec, before: tuple[Problem, FloatArray] | None
@@ -462,10 +464,10 @@ class Runner:
         record, impulse = self.make_record(problem, task, spec, start)
         return record, None if impulse is None else (problem, impulse)
 
-    def select_solver(self, case: str, name: str, given: Sequence[Item | Problem]) -> SolverSpec | None:
+    def select_solver(self, case: str, name: str, items: Sequence[Item | Problem]) -> SolverSpec | None:
         """Return the solver to run for `name`, or its method with bounds if it refuses a case, or None, with a note."""
         spec = self.specs[name]
-        for problem in (item.problem if isinstance(item, Item) else item for item in given):
+        for problem in (item.problem if isinstance(item, Item) else item for item in items):
             reason = spec.refuses(problem)
             if reason:
                 break

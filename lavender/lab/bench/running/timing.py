@@ -50,7 +50,7 @@ class Ask:
         0 means the solver's default.
     time_limit : float, s
         Of one solve; 0 means the plan's.
-    way : str
+    timing_mode : str
         See `Record.timing_mode`.
     start : {"cold", "warm", "carried"}
     """
@@ -95,9 +95,9 @@ class Task:
         return measurement_key(self)
 
     @classmethod
-    def of(cls, info: CaseInfo, ask: Ask, **arguments: Any) -> Task:
+    def of(cls, info: CaseInfo, call: Ask, **arguments: Any) -> Task:
         """Create the task of an `Ask` on a case."""
-        return cls(run=info.run, case=info.case, sha=info.sha, step=info.step, **{**vars(ask), **arguments})
+        return cls(run=info.run, case=info.case, sha=info.sha, step=info.step, **{**vars(call), **arguments})
 
     def record(self, **results: Any) -> Record:
         """Create a record of this task with `results`."""

@@ -1,4 +1,4 @@
-"""PyBullet: native shapes; joints as links of one multibody, whose motors are disabled."""
+"""PyBullet: native shapes; joints as links of one multibody, with disabled motors."""
 
 from __future__ import annotations
 
