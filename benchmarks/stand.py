@@ -31,7 +31,13 @@ from lavender.base.arrays import FloatArray
 from lavender.base.errors import InputError, UnknownName
 from lavender.cli.options import ListType
 from lavender.lab.bench.machine import versions
-from lavender.lab.phenomena.engines import PACKAGES_OF_NODE, Stepping, engine, lacks, versions_of_node
+from lavender.lab.phenomena.engines import (
+    PACKAGES_OF_NODE,
+    Stepping,
+    create_engine,
+    installation_hint,
+    versions_of_node,
+)
 from lavender.lab.phenomena.parts import has_fallen
 from lavender.sim.scene import Scene
 from lavender.sim.scene.scene import SCENE_ORDERS
@@ -109,11 +115,11 @@ class Contestant:
         """The engine with a scene that takes ours' settings; of the tower step, sweeps, substeps and order count."""
         if self.module == "own":
             asked = {"solver_iterations": tower.sweeps, "order": tower.order} if self.sweeps else {}
-            return engine("own", build(dt=tower.dt, substeps=tower.substeps, **asked, **self.options))
+            return create_engine("own", build(dt=tower.dt, substeps=tower.substeps, **asked, **self.options))
         sweeps = self.default if tower.sweeps is None else tower.sweeps
         options = {"dt": tower.dt, **self.options, **({self.sweeps: sweeps} if self.sweeps else {})}
         options |= {"substeps": tower.substeps or 1} if self.substeps else {}
-        return engine(self.module, build(), **options)
+        return create_engine(self.module, build(), **options)
 
     def make(self, tower: Tower) -> Standing:
         """The engine with a tower."""
@@ -150,7 +156,7 @@ ENGINES: dict[str, Contestant] = {
 
 def missing(name: str) -> str:
     """What the engine of that name lacks here; empty where it can run."""
-    return lacks(ENGINES[name].needs)
+    return installation_hint(ENGINES[name].needs)
 
 
 def installed() -> list[str]:

@@ -9,7 +9,7 @@ from random_problems import as_matrix, random_contact_problem, random_lcp
 
 import lavender as lv
 from lavender.lab.motion.bound import difference, witness
-from lavender.lab.motion.operator import make
+from lavender.lab.motion.operator import make_operator
 
 SHAPES = ("disk", "disk", "box", "rolling")
 
@@ -81,11 +81,11 @@ def draw(rng):
     if good and not reference.accepted:
         return None
     y = reference.impulse if good else random_impulse(rng, problem, reference.impulse)
-    operator = make(problem)
+    operator = make_operator(problem)
     assert operator.refusal() is None
     proof = witness(problem, operator, y)
     x = random_impulse(rng, problem, reference.impulse)
-    bound = difference(operator, x, y)[1].most + proof.radius
+    bound = difference(operator, x, y)[1].upper_bound + proof.radius
     return Draw(problem, x, y, good, float(bound), float(proof.moved))
 
 

@@ -179,20 +179,20 @@ class Centre:
     """Catches the balls that a proof ends with, as Fractions of their middles."""
 
     def __enter__(self):
-        self.told = Search.told
+        self.make_enclosure = Search.make_enclosure
 
-        def told(search, lam, w):
+        def record_balls(search, lam, w):
             self.x = [
                 Fraction(int(m)) * Fraction(2) ** int(e) for m, e in (_parts(search.flint, q) for q in lam)
             ]
             self.radius = max((float(q.rad()) for q in lam if isinstance(q, search.flint.arb)), default=0.0)
-            return self.told(search, lam, w)
+            return self.make_enclosure(search, lam, w)
 
-        Search.told = told
+        Search.make_enclosure = record_balls
         return self
 
     def __exit__(self, *_):
-        Search.told = self.told
+        Search.make_enclosure = self.make_enclosure
 
 
 def _parts(flint, q):

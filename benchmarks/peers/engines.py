@@ -20,7 +20,7 @@ import numpy as np
 from benchmarks import stand
 from benchmarks.stand import Contestant, Tower
 from lavender.base.errors import UnknownName
-from lavender.lab.phenomena.engines import engine, lacks
+from lavender.lab.phenomena.engines import create_engine, installation_hint
 from lavender.problem import Problem
 from lavender.sim.scene import Scene
 
@@ -82,7 +82,7 @@ def export(scene: str, cone: str = "elliptic", settle: int = 120) -> Problem:
     """
     import mujoco
 
-    made: Any = engine("mujoco", _scene(scene), cone=cone, dt=DT, sweeps=16, tree=False)
+    made: Any = create_engine("mujoco", _scene(scene), cone=cone, dt=DT, sweeps=16, tree=False)
     made.advance(settle)
     mujoco.mj_forward(made.model, made.data)
     problem: Problem = made.problem()
@@ -121,7 +121,7 @@ def measure_scene(
         if name not in ENGINES:
             raise UnknownName("engine", name, ENGINES)
     asked = Tower(0, DT, sweeps)
-    known = [ENGINES[name] for name in engines if not lacks(ENGINES[name].needs)]
+    known = [ENGINES[name] for name in engines if not installation_hint(ENGINES[name].needs)]
     notes: dict[int, str] = {}
     with ExitStack() as stack:
         made = []
@@ -152,7 +152,7 @@ def measure_scene(
                 found.append(Step(scene, name, not one.sweeps, note=notes[i]))
                 continue
             stepping.step()
-            contacts, depth, relative = stepping.left()
+            contacts, depth, relative = stepping.last_step_quality()
             speed = float(np.linalg.norm(stepping.state()[2][:, :3], axis=1).max(initial=0.0))
             found.append(Step(scene, name, not one.sweeps, float(best[i]), contacts, depth, speed, relative))
         return found

@@ -73,7 +73,7 @@ def check(
             comparison = cross_check(
                 item.problem, solvers=solvers, reference=reference, tol=tol, time_limit=time_limit
             )
-            stored = item.judged(precision, threshold)
+            stored = item.judge_stored(precision, threshold)
             echo(item.name, style="bold")
             echo(str(comparison))
             if stored is not None:

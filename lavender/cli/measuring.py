@@ -162,7 +162,7 @@ def measure(context: click.Context, files: Sequence[str], path: Path, sweeps: Se
 def _make_timed_plan(options: Mapping[str, Any], files: Sequence[str], sweeps: Sequence[int]) -> Plan:
     """Make the plan of a report that measures times."""
     from lavender.lab.bench import Plan
-    from lavender.lab.proof import require
+    from lavender.lab.proof import require_python_flint
 
     if options["sequence"] and not files:
         raise InputError("--sequence needs a folder of problem files, one for each step")
@@ -178,7 +178,7 @@ def _make_timed_plan(options: Mapping[str, Any], files: Sequence[str], sweeps: S
     more: dict[str, Any] = {"repeats": options["repeats"], "times": options["time_budgets"], "sweeps": sweeps}
     plan = make_plan(options, Plan, **limits, **more)
     if plan.prove:
-        require()
+        require_python_flint()
     return plan
 
 

@@ -64,12 +64,12 @@ def phenomena(
     A cell shows the worst distance from the exact motion and the number of cases within all bounds. A note says which
     engine is missing, crashed, or cannot build a scene.
     """
-    from lavender.lab.phenomena import ENGINE_VARIANTS, chosen, run
+    from lavender.lab.phenomena import ENGINE_VARIANTS, run, select_phenomena
     from lavender.lab.phenomena import table as tables
 
     if listed:
         reject_unused_options(context, ["steppers", "engines", "parameters", "limit", "out"], "with --list")
-        click.echo(tables.described(chosen(names)))
+        click.echo(tables.describe_phenomena(select_phenomena(names)))
         return
     if out is not None:
         check_writable(out)
@@ -78,7 +78,7 @@ def phenomena(
 
     def show(record: Record) -> None:
         records.append(record)
-        click.echo(tables.line(record), err=True)
+        click.echo(tables.format_record(record), err=True)
         if out is not None:
             write_text(out, json.dumps(_collect_results(records), indent=1) + "\n")
 

@@ -70,11 +70,11 @@ def problems(
     entries = [e for e in collection.load() if not names or e.group in names]
     if page is not None:
         write_text(page, collection.page(entries, collection.load(collection.RECORDED)))
-    here, missing = collection.makeable(entries)
+    here, missing = collection.select_buildable(entries)
     for line in missing if check or out is not None else ():
         click.echo(f"left out: {line}", err=True)
     if check:
-        wrong = list(collection.changed(here))
+        wrong = list(collection.find_changes(here))
         for line in wrong:
             click.echo(line)
         click.echo(f"{len(here) - len(wrong)} of {len(here)} problems are the same")
@@ -88,4 +88,4 @@ def problems(
         echo(f"{len(here)} problems in {out}")
     elif page is None:
         for e in entries:
-            echo(f"@{e.group} {e.name}: {e.rows} rows, {e.law}, {collection.told(e)}")
+            echo(f"@{e.group} {e.name}: {e.rows} rows, {e.law}, {collection.describe(e)}")

@@ -29,14 +29,14 @@ def prove(files: tuple[str, ...], solver: str, tol: float) -> None:
     from lavender.lab.bench.cases import resolve
     from lavender.lab.bench.running.worker import Worker, solve_isolated
     from lavender.lab.proof import prove as enclose
-    from lavender.lab.proof import require
+    from lavender.lab.proof import require_python_flint
     from lavender.solvers.registry import get
 
     one_thread()
     # Check the arguments before any file is read.
     check_float("tol", tol, low=0.0)
     get(solver)
-    require()
+    require_python_flint()
     unmet, errors = False, ErrorReporter()
     for item in resolve(list(files)):
         with errors(item), Worker() as worker:

@@ -27,11 +27,11 @@ def reference(files: tuple[str, ...], proven: bool) -> None:
     cannot be read. Exit code 2: a named file cannot be read.
     """
     from lavender.lab import bench, motion
-    from lavender.lab.proof import enclosed, require
+    from lavender.lab.proof import enclose_reference, require_python_flint
 
     one_thread()
     if proven:
-        require()
+        require_python_flint()
 
     def print_line(text: str, style: str = "") -> None:
         with ignore_closed_output():
@@ -42,7 +42,7 @@ def reference(files: tuple[str, ...], proven: bool) -> None:
         with errors(item):
             if not Path(item.source).is_file():
                 raise InputError(f"{item.source} is not a file; a reference is written next to a file")
-            proof = enclosed(item.problem) if proven else None
+            proof = enclose_reference(item.problem) if proven else None
             reference = motion.reference(item.problem.disk)
             if proof is not None and not proof.proven:
                 errors.report(f"{item.name}: {proof}")

@@ -1,14 +1,15 @@
-"""Judge every step of many worlds: which solves stopped before convergence, how wrong they are, and the worst states.
+"""Judge every step of many worlds: which solves stopped before convergence, their errors, and the worst states.
 
     result = audit("ant.xml", worlds=64, steps=200)
     result.table_of_errors; result.worst[0].problem
     result.write("lavender-audit"); result.summary_page.write("lavender-audit")
 
-An answer that rounding explains, in the precision of the engine, is at its floor and did not stop before convergence
-(`Residual.verdict`). MuJoCo's problems are those of `lavender.io.from_mujoco_many`, computed again from the state
-before each step, its warm start and controls: its own answer to the bit. `noslip_iterations` come after the problem,
-and the answer before them is judged. An answer consists of forces: MuJoCo's Newton and CG move bodies by accelerations
-of their own, which are less far off after a stop before convergence (docs/mujoco.md).
+An answer with an error that rounding explains, in the precision of the engine, is at its floor and did not stop before
+convergence (`Residual.verdict`). MuJoCo's problems are built by `lavender.io.from_mujoco_many` again from the
+state before each step with its warm start and controls: the engine's answer is reproduced to the bit.
+`noslip_iterations` are applied after the problem is solved; the answer before them is judged. An answer consists of
+forces: MuJoCo's Newton and CG move bodies by accelerations that they compute separately, which are more accurate after
+a stop before convergence (docs/mujoco.md).
 
 A step is judged if its error is finite. When a world diverges, its later steps cannot be judged, and the step in which
 it diverged is judged only if the engine's answer is finite.
@@ -50,61 +51,89 @@ from lavender.lab.simulated_worlds import (
     StepSizes,
     can_touch,
     fields_of,
-    frames,
+    iterate_frames,
     simulate_world,
 )
 from lavender.problem import PRECISIONS, Problem
 
 VERDICTS = (*JUDGED, "not judged")
 NOT_JUDGED = len(JUDGED)
-NUMBERS = ("velocity", "impulse", "relative", "floor")  # m/s, N s, -, - of the worst row
+NUMBERS = ("velocity", "impulse", "relative", "floor")  # [m/s, N s, -, -] errors of the worst row
 QUANTILES = (0.5, 0.9, 0.99, 0.999, 1.0)
-AT_ONCE = 512  # problems in memory
-TASK = 4096  # steps that a worker does between two answers
-WORST = 3  # worlds that are kept as files
-POINTS = 60  # of a curve over time
-OF_ERRORS = (
+MAX_PROBLEMS_IN_MEMORY = 512  # Problems are built and judged in batches of this many.
+STEPS_PER_TASK = 4096  # A worker returns its results after this many steps.
+N_WORST_WORLDS = 3  # Number of worlds for which the worst step is written to a file.
+MAX_CURVE_POINTS = 60  # Largest number of points of a curve over time.
+ERRORS_NOTE = (
     "Of the worst row of each step judged. At its floor: rounding explains the error, in the engine's precision. Close "
-    "enough: no row is further off than the threshold. Stopped before convergence, or wrong: the rest. Not judged: the "
-    "engine's answer is not finite, or the world diverged before. The errors are of the engine's forces: the "
-    "accelerations by which MuJoCo's Newton and CG move bodies are mostly less far off."
+    "enough: no row has a larger error than the threshold. Stopped before convergence, or wrong: the rest. Not judged: "
+    "the engine's answer is not finite, or the world diverged before. The errors are of the engine's forces: the "
+    "accelerations by which MuJoCo's Newton and CG move bodies are usually more accurate."
 )
-OF_SIZES = "Rows and contacts of the steps judged."
-OF_FILES = (
+SIZES_NOTE = "Rows and contacts of the steps judged."
+FILES_NOTE = (
     "Problems with the engine's impulses, in the folder worst; states.npz holds the states before these steps "
     "(--states starts from them again)."
 )
-OF_DIVERGED = (
-    "The step in which each world diverged, what was not finite or above 1e10 in it, and whether every solve of the "
-    "world until then was exact. If so, the cause lies outside the constraint solver."
+DIVERGED_NOTE = (
+    "The step in which each world diverged, the quantity that was not finite or above 1e10, and whether every solve of "
+    "the world until then was exact. If so, the cause lies outside the constraint solver."
 )
-OUTSIDE = "outside the constraint solver (time step, integrator, actuators or the model itself)"
-NUMBER = re.compile(r"^contact \d+ ")  # of a contact within its step, which says nothing over steps
+OUTSIDE_SOLVER = "outside the constraint solver (time step, integrator, actuators or the model itself)"
+# Number of a contact within its step; it is removed from row names, as it differs between steps.
+CONTACT_NUMBER = re.compile(r"^contact \d+ ")
 
 
 @dataclass(frozen=True)
 class Worst:
-    """The worst step of a world."""
+    """The worst step of a world.
 
-    velocity: float  # m/s
+    Parameters
+    ----------
+    velocity : float, m/s
+        Largest velocity error of a row.
+    world, step : int
+    where : str
+        Name of this row.
+    problem : Problem
+    impulse : (m,) N s
+        The engine's answer.
+    state : dict
+        State before the step, by the names of MjData.
+    """
+
+    velocity: float
     world: int
     step: int
-    where: str  # row
+    where: str
     problem: Problem = field(repr=False)
-    impulse: FloatArray = field(repr=False)  # (m,) N s, the engine's
-    state: dict[str, FloatArray] = field(repr=False)  # before the step, by the names of MjData
+    impulse: FloatArray = field(repr=False)
+    state: dict[str, FloatArray] = field(repr=False)
 
 
 class Piece(NamedTuple):
-    """Results of some steps."""
+    """Results of k steps.
 
-    world: Any  # (k,) int
+    Parameters
+    ----------
+    world, step : (k,) int
+    numbers : (len(NUMBERS), k)
+    verdict : (k,) int
+        Indices in VERDICTS.
+    rows, contacts : (k,) int
+    where : list of (int, str)
+        Index of a step that stopped before convergence, and the name of its worst row.
+    worst : list of Worst
+    divergences : sequence of Divergence
+    """
+
+    world: Any
     step: Any
-    numbers: FloatArray  # (len(NUMBERS), k)
-    verdict: Any  # (k,) places in VERDICTS
-    rows: Any  # (k,) int
+    numbers: FloatArray
+    verdict: Any
+    rows: Any
     contacts: Any
-    where: list[tuple[int, str]]  # place among these steps and row, of those that stopped before convergence
+    where: list[tuple[int, str]]
     worst: list[Worst]
     divergences: Sequence[Divergence] = ()
 
@@ -120,18 +149,18 @@ class Audit:
     numbers : (4, worlds, steps)
         Errors of the worst row [m/s, N s], relative residual and its floor; NaN if the step was not judged.
     verdict : (worlds, steps) int
-        Places in `VERDICTS`; -1 if the audit was stopped before the step.
+        Indices in `VERDICTS`; -1 if the audit was stopped before the step.
     rows, contacts : (worlds, steps) int
-        Contacts that have rows; 0 if the step was not judged.
+        Rows, and contacts that have rows; 0 if the step was not judged.
     can_touch : bool
         Whether the model has geoms that can collide.
     where : dict
-        Row (without the contact's number): in how many steps that stopped before convergence it was the worst, and its
-        largest error [m/s].
+        Row name (without the contact's number) -> number of steps that stopped before convergence with this worst row,
+        and its largest error [m/s].
     worst : list of Worst
     divergences : list of Divergence
     stopped : bool
-        By Ctrl-C, or workers were lost.
+        The audit was stopped by Ctrl-C, or workers were lost.
     """
 
     runs: Runs
@@ -148,12 +177,12 @@ class Audit:
 
     @property
     def is_judged(self) -> Any:
-        """(worlds, steps) bool: the error is finite."""
+        """(worlds, steps) bool: whether the error is finite."""
         return (self.verdict >= 0) & (self.verdict < NOT_JUDGED)
 
     @property
     def unconverged(self) -> Any:
-        """(worlds, steps) bool: stopped before convergence, or wrong."""
+        """(worlds, steps) bool: whether the solve stopped before convergence, or is wrong."""
         return (self.verdict == VERDICTS.index(UNCONVERGED)) | (self.verdict == VERDICTS.index(WRONG))
 
     @property
@@ -163,17 +192,17 @@ class Audit:
 
     @property
     def unjudged(self) -> int:
-        """Number of steps that were asked for and not judged."""
+        """Number of steps that were requested and not judged."""
         return self.verdict.size - self.judged
 
     @property
     def done(self) -> int:
-        """Number of steps that the audit came to."""
+        """Number of steps that the audit processed."""
         return int(np.count_nonzero(self.verdict >= 0))
 
     @property
     def diverged(self) -> int:
-        """Number of steps in which a world diverged: one for each world that did."""
+        """Number of steps in which a world diverged: one for each world that diverged."""
         return len(self.divergences)
 
     @property
@@ -188,61 +217,62 @@ class Audit:
         return StepSizes(self.rows[self.is_judged], self.contacts[self.is_judged], self.can_touch)
 
     def has_exact_solves(self, divergence: Divergence) -> bool:
-        """Whether every solve of a world that diverged was exact: at its floor, or close enough and within `ENOUGH`.
+        """Whether every solve of a world that diverged was exact: at its floor, or within `DEFAULT_THRESHOLD`.
 
         The solve of the last step does not count if the state or the unconstrained acceleration was already too large.
         """
-        some = divergence.world, slice(0, divergence.step + (not divergence.is_outside))
-        verdict = self.verdict[some]
-        close = (verdict == VERDICTS.index(CLOSE)) & (self.numbers[0][some] <= DEFAULT_THRESHOLD)
+        selection = divergence.world, slice(0, divergence.step + (not divergence.is_outside))
+        verdict = self.verdict[selection]
+        close = (verdict == VERDICTS.index(CLOSE)) & (self.numbers[0][selection] <= DEFAULT_THRESHOLD)
         return bool(np.all(close | (verdict == VERDICTS.index(AT_FLOOR))))
 
     @property
     def head(self) -> str:
-        """All in a few sentences."""
+        """Summary in a few sentences."""
         unconverged, judged = self.unconverged, self.judged
         worlds = format_count(int(np.count_nonzero(self.is_judged.any(axis=1))), "world")
         n = int(unconverged.sum())
-        said = (
+        text = (
             f"{Path(self.runs.model).name}, {self.engine}: {n or 'none'} of {format_count(judged, 'step')} judged in "
             f"{worlds} stopped before convergence"
         )
         if n:
-            said += (
+            text += (
                 f" ({format_percent(n, judged, 1)}), in {format_count(int(unconverged.any(axis=1).sum()), 'world')}; "
-                f"the worst is {format_size(self.largest)} m/s off"
+                f"the worst error is {format_size(self.largest)} m/s"
             )
-        few = "" if self.sizes.is_enough else (
+        warning = "" if self.sizes.is_enough else (
             f"Only {self.sizes.sentence}: this says little about the solver. Start from other states with --states."
         )  # fmt: skip
-        more = [self._of_divergence, few]
-        return " ".join([f"{said}.", *filter(None, more)])
+        more = [self._divergence_sentence, warning]
+        return " ".join([f"{text}.", *filter(None, more)])
 
     @property
-    def _of_divergence(self) -> str:
+    def _divergence_sentence(self) -> str:
+        """Sentence about the steps that were not judged and the worlds that diverged; empty if there are none."""
         lost = self.verdict == NOT_JUDGED
         unjudged = format_count(int(lost.sum()), "step")
         were = "was" if lost.sum() == 1 else "were"
         if not self.divergences:
             return f"{unjudged} {were} not judged: the answer is not finite." if lost.any() else ""
         first = min(d.step for d in self.divergences)
-        said = f"{format_count(self.diverged, 'world')} diverged, in step {first} at the earliest"
-        said += f"; {unjudged} {were} not judged." if lost.any() else "."
+        text = f"{format_count(self.diverged, 'world')} diverged, in step {first} at the earliest"
+        text += f"; {unjudged} {were} not judged." if lost.any() else "."
         exact = sum(map(self.has_exact_solves, self.divergences))
         if exact == self.diverged:
-            return f"{said} Every solve until then was exact: the cause lies {OUTSIDE}."
+            return f"{text} Every solve until then was exact: the cause lies {OUTSIDE_SOLVER}."
         if exact:
-            said += f" In {exact} of these every solve until then was exact: the cause lies {OUTSIDE}."
-        return said
+            text += f" In {exact} of these every solve until then was exact: the cause lies {OUTSIDE_SOLVER}."
+        return text
 
     @property
     def table_of_errors(self) -> Table:
         """Quantiles of the errors over all steps judged, and over those that stopped before convergence."""
         heads = ["error", *(f"{100.0 * q:g} %" for q in QUANTILES[:-1]), "worst"]
         rows: list[list[str | Cell]] = []
-        for of, chosen in (("all steps judged", self.is_judged), (UNCONVERGED, self.unconverged)):
+        for of, selected in (("all steps judged", self.is_judged), (UNCONVERGED, self.unconverged)):
             for name, unit, x in (("velocity", "m/s", self.numbers[0]), ("impulse", "N s", self.numbers[1])):
-                known = x[chosen & np.isfinite(x)]
+                known = x[selected & np.isfinite(x)]
                 if len(known):
                     quantiles = np.quantile(known, QUANTILES, method="higher")
                     rows.append([f"{name} [{unit}], {of}", *map(format_size, quantiles.tolist())])
@@ -250,7 +280,7 @@ class Audit:
 
     @property
     def table_of_verdicts(self) -> Table:
-        """How many steps have each verdict, in how many worlds."""
+        """Number of steps and of worlds with each verdict."""
         rows = []
         for i, word in enumerate(VERDICTS):
             here = self.verdict == i
@@ -261,7 +291,7 @@ class Audit:
 
     @property
     def table_of_rows(self) -> Table:
-        """The worst rows of steps that stopped before convergence, most often first."""
+        """The worst rows of steps that stopped before convergence, most frequent first."""
         ranked = sorted(self.where.items(), key=lambda entry: -entry[1][0])
         rows = [[name, str(n), format_size(largest)] for name, (n, largest) in ranked]
         return Table(["worst row", UNCONVERGED, "at most [m/s]"], rows)
@@ -280,7 +310,7 @@ class Audit:
 
     @property
     def table_of_worst(self) -> Table:
-        """The worlds that are kept as files."""
+        """The worlds of the worst steps, which are written to files."""
         rows = [
             [f"worst_{i}.npz", str(w.world), str(w.step), format_size(w.velocity), w.where]
             for i, w in enumerate(self.worst, 1)
@@ -292,7 +322,7 @@ class Audit:
     @property
     def figure(self) -> Figure:
         """Errors over time."""
-        width = -(-self.runs.steps // POINTS)
+        width = -(-self.runs.steps // MAX_CURVE_POINTS)
         parts = [self.numbers[0][:, k : k + width] for k in range(0, self.runs.steps, width)]
         known = [(k * width, p[np.isfinite(p)]) for k, p in enumerate(parts) if np.isfinite(p).any()]
         curves = tuple(
@@ -302,13 +332,14 @@ class Audit:
         return Figure("over-time", "over time", "step", "velocity error [m/s]", curves, x_log=False)
 
     def write(self, folder: str | os.PathLike[str]) -> None:
-        """Write `records.npz`, the worst steps as `worst/worst_1.npz`, and `states.npz`.
+        """Write `records.npz`, the worst steps as `worst/worst_1.npz` etc., and `states.npz`.
 
         `summary_page.write` writes the page.
 
         `records.npz` holds `velocity` [m/s], `impulse` [N s], `relative`, `floor`, `verdict`, `rows`, `contacts` (each
-        (worlds, steps)), `verdicts` and `diverged`, rows of (world, step). `states.npz` holds qpos, qvel, act, ctrl,
-        qacc_warmstart of the worst, a row each, before their step, and of MuJoCo `state`, their mjSTATE_INTEGRATION.
+        (worlds, steps)), `verdicts` and `diverged`, rows of (world, step). `states.npz` holds qpos, qvel, act, ctrl and
+        qacc_warmstart of the worst worlds before their step, one row each, and for MuJoCo `state`, their
+        mjSTATE_INTEGRATION.
         """
         folder = Path(folder)
         with folder_for_steps(folder / "worst", replace=True) as worst:
@@ -316,17 +347,17 @@ class Audit:
                 npz.write(w.problem, worst / f"worst_{i}.npz", impulse=w.impulse)
         names = self.worst[0].state if self.worst else ()
         states = {name: np.array([w.state[name] for w in self.worst]) for name in names}
-        places = {name: np.array([getattr(w, name) for w in self.worst], int) for name in ("world", "step")}
-        held = dict(zip(NUMBERS, self.numbers, strict=True))
-        write_arrays(folder / "states.npz", states | places)
-        held |= {"verdict": self.verdict, "verdicts": np.array(VERDICTS)}
-        held |= {"rows": self.rows, "contacts": self.contacts}
-        held["diverged"] = np.array([(d.world, d.step) for d in self.divergences], int).reshape(-1, 2)
-        write_arrays(folder / "records.npz", held)
+        indices = {name: np.array([getattr(w, name) for w in self.worst], int) for name in ("world", "step")}
+        records = dict(zip(NUMBERS, self.numbers, strict=True))
+        write_arrays(folder / "states.npz", states | indices)
+        records |= {"verdict": self.verdict, "verdicts": np.array(VERDICTS)}
+        records |= {"rows": self.rows, "contacts": self.contacts}
+        records["diverged"] = np.array([(d.world, d.step) for d in self.divergences], int).reshape(-1, 2)
+        write_arrays(folder / "records.npz", records)
 
     @property
     def totals(self) -> dict[str, Any]:
-        """The sums, as `numbers.json` has them."""
+        """Totals, as `numbers.json` holds them."""
         runs, unconverged = self.runs, self.unconverged
         divergences = [d._asdict() | {"exact": self.has_exact_solves(d)} for d in self.divergences]
         return {
@@ -338,18 +369,18 @@ class Audit:
 
     @property
     def summary_page(self) -> SummaryPage:
-        """The page."""
+        """The summary page."""
         return SummaryPage(
             "lavender audit", self.head,
             [
                 PageSection(
-                    "How wrong", [self.table_of_errors, self.table_of_verdicts], [self.figure], OF_ERRORS, short=4
+                    "Errors", [self.table_of_errors, self.table_of_verdicts], [self.figure], ERRORS_NOTE, short=4
                 ),
-                PageSection("Rows and contacts", [self.sizes.table], short=2, note=OF_SIZES),
-                PageSection("Worlds that diverged", [self.table_of_diverged], short=2, note=OF_DIVERGED),
-                PageSection("Where", [self.table_of_rows], short=3,
+                PageSection("Rows and contacts", [self.sizes.table], short=2, note=SIZES_NOTE),
+                PageSection("Worlds that diverged", [self.table_of_diverged], short=2, note=DIVERGED_NOTE),
+                PageSection("Worst rows", [self.table_of_rows], short=3,
                         note="Rows that were the worst of a step that stopped before convergence."),
-                PageSection("The worst worlds", [self.table_of_worst], short=WORST, note=OF_FILES),
+                PageSection("The worst worlds", [self.table_of_worst], short=N_WORST_WORLDS, note=FILES_NOTE),
             ],
             self.totals,
             self.stopped,
@@ -377,41 +408,42 @@ def audit(
     Parameters
     ----------
     model : path (MJCF)
-    worlds, steps, control, seed, spread : as `Runs`
+    worlds, steps, control, seed, spread
+        See `Runs`.
     engine : {"mujoco", "mjx", "mujoco_warp"}
     states : path of an .npz, "keyframes", or arrays, optional
         States in which the worlds start: see `lavender.io.states`. Default: the model's own.
     precision : {"float64", "float32"}, optional
-        In which MuJoCo computes; default float64. The others say it themselves.
+        Precision in which MuJoCo computes; default float64. The other engines determine it themselves.
     threshold : float, m/s
-        Velocity error that is close enough.
+        A smaller velocity error is close enough.
     workers : int
-        Processes, of MuJoCo; -1: one for each core.
+        Processes for MuJoCo; -1: one for each core.
     backend : str
-        Of joblib, as of a campaign.
+        Name of a joblib backend, as for a campaign.
     watch : callable, optional
-        Statement of what is done.
+        Called with the progress.
 
     Returns
     -------
     Audit
-        After Ctrl-C of what was done by then, `stopped`.
+        After Ctrl-C, the result of the steps so far, with `stopped`.
 
     Raises
     ------
     InputError
-        A model that cannot be read, an engine that is not installed, numbers out of range.
+        The model cannot be read, the engine is not installed, or a number is out of range.
     CapabilityError
-        An integrator whose problem is not of M.
-    check_name
-        Another engine.
+        The problem of the model's integrator is not one of M.
+    UnknownName
+        The engine is unknown.
     """
     check_name("engine", engine, ENGINES)
     if precision not in (None, *PRECISIONS) or (precision and engine != "mujoco"):
         raise InputError(f"precision is {precision!r}; {' or '.join(PRECISIONS)}, of MuJoCo alone, is needed")
     check_workers(workers)
     runs = Runs(os.fspath(model), worlds, steps, control=control, seed=seed, spread=spread).start_from(states)
-    how = precision or "float64", check_float("threshold", threshold, low=0.0)
+    judging = precision or "float64", check_float("threshold", threshold, low=0.0)
     numbers, verdict = np.full((len(NUMBERS), worlds, steps), np.nan), np.full((worlds, steps), -1, np.int8)
     rows, contacts = np.zeros((2, worlds, steps), int)
     result = Audit(
@@ -419,9 +451,9 @@ def audit(
         worst=[], divergences=[],
     )  # fmt: skip
     if engine == "mujoco":
-        pieces = _by_mujoco(runs, how, workers, backend)
+        pieces = _audit_mujoco(runs, judging, workers, backend)
     else:
-        pieces = _by_frames(engine, runs, how[1])
+        pieces = _audit_frames(engine, runs, judging[1])
     try:
         for piece in pieces:
             numbers[:, piece.world, piece.step] = piece.numbers
@@ -429,9 +461,9 @@ def audit(
             rows[piece.world, piece.step] = piece.rows
             contacts[piece.world, piece.step] = piece.contacts
             for i, name in piece.where:
-                times, largest = result.where.get(name, (0, 0.0))
-                result.where[name] = times + 1, max(largest, float(piece.numbers[0, i]))
-            result.worst[:] = _worst([*result.worst, *piece.worst])
+                count, largest = result.where.get(name, (0, 0.0))
+                result.where[name] = count + 1, max(largest, float(piece.numbers[0, i]))
+            result.worst[:] = _select_worst([*result.worst, *piece.worst])
             result.divergences[:] = sorted([*result.divergences, *piece.divergences])
             if watch is not None:
                 n = int(result.unconverged.sum())
@@ -444,29 +476,32 @@ def audit(
     return replace(result, stopped=result.done < worlds * steps)
 
 
-def _worst(some: list[Worst]) -> list[Worst]:
-    """The worst of them, each of another world."""
-    kept: dict[int, Worst] = {}
-    for w in sorted(some, key=lambda w: (-w.velocity, w.world, w.step)):
-        kept.setdefault(w.world, w)
-    return list(kept.values())[:WORST]
+def _select_worst(candidates: list[Worst]) -> list[Worst]:
+    """Select the worst steps, at most one of each world."""
+    worst: dict[int, Worst] = {}
+    for w in sorted(candidates, key=lambda w: (-w.velocity, w.world, w.step)):
+        worst.setdefault(w.world, w)
+    return list(worst.values())[:N_WORST_WORLDS]
 
 
-def _by_mujoco(runs: Runs, how: tuple[str, float], workers: int, backend: str) -> Iterator[Piece]:
+def _audit_mujoco(runs: Runs, judging: tuple[str, float], workers: int, backend: str) -> Iterator[Piece]:
+    """Simulate and judge MuJoCo's steps in worker processes."""
     _, model = runs.load()
-    from_mujoco_many(model, np.concatenate([model.qpos0, np.zeros(model.nv)])[None])  # refuses here, once
-    many = max(1, min(TASK // runs.steps, runs.worlds))
+    # An unsupported model raises here, once.
+    from_mujoco_many(model, np.concatenate([model.qpos0, np.zeros(model.nv)])[None])
+    worlds_per_task = max(1, min(STEPS_PER_TASK // runs.steps, runs.worlds))
     parts = (
-        (runs, how, range(first, min(first + many, runs.worlds))) for first in range(0, runs.worlds, many)
+        (runs, judging, range(first, min(first + worlds_per_task, runs.worlds)))
+        for first in range(0, runs.worlds, worlds_per_task)
     )
     name, cluster = connect_backend(backend)
     with cluster:
-        for pieces in map_unordered(simulated, parts, workers, name):
+        for pieces in map_unordered(audit_worlds, parts, workers, name):
             yield from pieces
 
 
-def simulated(runs: Runs, how: tuple[str, float], worlds: range) -> list[Piece]:
-    """MuJoCo's steps of some worlds, in a worker."""
+def audit_worlds(runs: Runs, judging: tuple[str, float], worlds: range) -> list[Piece]:
+    """Simulate and judge MuJoCo's steps of some worlds, in a worker."""
     mj, model = runs.load()
     simulations = [simulate_world(mj, model, runs, world) for world in worlds]
     states = np.concatenate([states for states, _ in simulations])
@@ -475,29 +510,30 @@ def simulated(runs: Runs, how: tuple[str, float], worlds: range) -> list[Piece]:
     judge.opt.noslip_iterations = 0
     world, step = np.repeat(worlds, runs.steps), np.tile(np.arange(runs.steps), len(worlds))
     out = []
-    for i in range(0, len(states), AT_ONCE):
-        some = slice(i, i + AT_ONCE)
-        batch, impulse = from_mujoco_many(judge, states[some], errors="status")
+    for i in range(0, len(states), MAX_PROBLEMS_IN_MEMORY):
+        selection = slice(i, i + MAX_PROBLEMS_IN_MEMORY)
+        batch, impulse = from_mujoco_many(judge, states[selection], errors="status")
         assert impulse is not None
 
-        def state_of(k: int, some: FloatArray = states[some]) -> dict[str, FloatArray]:
-            return fields_of(mj, model, some[k]) | {VECTOR: some[k].copy()}
+        def state_of(k: int, selection: FloatArray = states[selection]) -> dict[str, FloatArray]:
+            return fields_of(mj, model, selection[k]) | {VECTOR: selection[k].copy()}
 
         sizes = batch.row_counts, batch.contact_counts
-        out.append(_judged(batch, impulse, how, world[some], step[some], state_of, sizes))
+        out.append(_judge_steps(batch, impulse, judging, world[selection], step[selection], state_of, sizes))
     return [*out[:-1], out[-1]._replace(divergences=divergences)]
 
 
-def _by_frames(engine: str, runs: Runs, threshold: float) -> Iterator[Piece]:
+def _audit_frames(engine: str, runs: Runs, threshold: float) -> Iterator[Piece]:
+    """Judge the steps of an engine that steps all worlds at once."""
     world, diverged = np.arange(runs.worlds), np.zeros(runs.worlds, bool)
-    for step, frame in enumerate(frames(engine, runs)):
+    for step, frame in enumerate(iterate_frames(engine, runs)):
 
         def state_of(k: int, frame: Any = frame) -> dict[str, FloatArray]:
             return {name: x[k] for name, x in frame.state.items()}
 
-        how, sizes = (frame.batch.precision, threshold), (frame.rows, frame.contacts)
+        judging, sizes = (frame.batch.precision, threshold), (frame.rows, frame.contacts)
         at = np.full(runs.worlds, step)
-        piece = _judged(frame.batch, frame.impulse, how, world, at, state_of, sizes)
+        piece = _judge_steps(frame.batch, frame.impulse, judging, world, at, state_of, sizes)
         lost = (piece.verdict == NOT_JUDGED) & ~diverged
         finite = [all(np.isfinite(x[k]).all() for x in frame.state.values()) for k in world]
         divergences = [
@@ -508,36 +544,38 @@ def _by_frames(engine: str, runs: Runs, threshold: float) -> Iterator[Piece]:
         yield piece._replace(divergences=divergences)
 
 
-def _judged(
+def _judge_steps(
     batch: Batch,
     impulse: FloatArray,
-    how: tuple[str, float],
+    judging: tuple[str, float],
     world: Any,
     step: Any,
     state_of: Callable[[int], Any],
     sizes: tuple[Any, Any],
 ) -> Piece:
-    """Judge some steps."""
-    found = residual_many(batch, impulse, precision=how[0], threshold=how[1], errors="status")
-    numbers = np.array([found.velocity_error, found.impulse_error, found.relative, found.roundoff_floor])
-    words = found.verdict
-    verdict = np.full(len(words), NOT_JUDGED, np.int8)
+    """Judge some steps with `judging` = (precision, threshold [m/s])."""
+    residuals = residual_many(batch, impulse, precision=judging[0], threshold=judging[1], errors="status")
+    numbers = np.array(
+        [residuals.velocity_error, residuals.impulse_error, residuals.relative, residuals.roundoff_floor]
+    )
+    verdicts = residuals.verdict
+    verdict = np.full(len(verdicts), NOT_JUDGED, np.int8)
     measured = np.isfinite(numbers[0])
     for i, word in enumerate(JUDGED):
-        verdict[measured & (words == word)] = i
+        verdict[measured & (verdicts == word)] = i
     numbers[:, verdict == NOT_JUDGED] = np.nan
     rows, contacts = (np.where(verdict == NOT_JUDGED, 0, x) for x in sizes)
     unconverged = np.flatnonzero((verdict == JUDGED.index(UNCONVERGED)) | (verdict == JUDGED.index(WRONG)))
-    names = {int(i): found[int(i)].worst_name for i in unconverged}
+    names = {int(i): residuals[int(i)].worst_name for i in unconverged}
     order = unconverged[np.argsort(-numbers[0, unconverged], kind="stable")]
     _, first = np.unique(world[order], return_index=True)
     flat, worst = impulse.reshape(-1), []
-    for i in order[np.sort(first)][:WORST].tolist():
-        own = flat[batch.rows_of(i)].copy()
-        at = int(world[i]), int(step[i])
-        kept = {"where": names[i], "problem": batch[i], "impulse": own, "state": state_of(i)}
-        worst.append(Worst(float(numbers[0, i]), *at, **kept))
-    where = [(i, NUMBER.sub("contact ", name)) for i, name in names.items()]
+    for i in order[np.sort(first)][:N_WORST_WORLDS].tolist():
+        impulse_of_step = flat[batch.rows_of(i)].copy()
+        world_and_step = int(world[i]), int(step[i])
+        fields = {"where": names[i], "problem": batch[i], "impulse": impulse_of_step, "state": state_of(i)}
+        worst.append(Worst(float(numbers[0, i]), *world_and_step, **fields))
+    where = [(i, CONTACT_NUMBER.sub("contact ", name)) for i, name in names.items()]
     return Piece(
         world, step, numbers, verdict=verdict, rows=rows, contacts=contacts, where=where, worst=worst
     )

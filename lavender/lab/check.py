@@ -1,8 +1,8 @@
-"""Do solvers agree? Each against the judge, and against the optimum that a QP backend found.
+"""Compare solvers with the judge and with a reference optimum, by default from a QP solver.
 
-Where the problem is convex, two answers are no further from each other than their residuals allow
-(`lavender.lab.motion.bound`, inequality (3)). A breach means that a residual is computed wrongly. |Delta|_A [sqrt J] is
-the energy of the difference of velocities, which is unique where impulses are not.
+If the problem is convex, the distance of two answers is bounded by their residuals (`lavender.lab.motion.bound`,
+inequality (3)). A breach of this bound means that a residual is computed incorrectly. |Delta|_A [sqrt J] is the energy
+norm of the difference of velocities, which are unique even if impulses are not.
 """
 
 from __future__ import annotations
@@ -25,14 +25,18 @@ from lavender.solvers.registry import available, get, known, specs
 from lavender.solving.solve import check_budget, seconds_of
 
 REFERENCES = ("osqp", "clarabel", "piqp", "direct")
-CONE_REFERENCES = ("clarabel_cone", "block_gauss_seidel")  # of relaxed friction, which is no QP
-REFERENCE_TOL = 1e-9  # relative residual that a reference must reach, or 10 times the floor
+CONE_REFERENCES = ("clarabel_cone", "block_gauss_seidel")  # for relaxed friction, which is not a QP
+REFERENCE_MAX_RESIDUAL = (
+    1e-9  # A reference must reach this relative residual, or 10 times the round-off floor.
+)
 
 AGREES = "agrees"
 AGREES_UNCOMPARED = "solved, nothing to compare with"
 PROVED = "no solution, proved"
-NEAR_NONE = "no solution within rounding"  # of the data: theirs has huge impulses, if any
-INEXACT = "no exact solution"  # a certificate holds, and others meet the tolerance
+NEAR_NONE = (
+    "no solution within rounding"  # of the data: if the exact data have a solution, its impulses are huge
+)
+INEXACT = "no exact solution"  # a certificate holds, and other solvers meet the tolerance
 NOT_SOLVED = "not solved"
 NOTHING = "nothing to do"
 CLAIM_CONTRADICTED = "claim contradicted"
@@ -43,36 +47,72 @@ REFUSED = "refused"
 
 @dataclass(frozen=True)
 class CrossCheckRow:
-    """One solver beside the reference; numbers are None where they mean nothing."""
+    """Comparison of one solver with the reference; numbers without a meaning are None.
 
-    solver: str  # as asked for
+    Parameters
+    ----------
+    solver : str
+        Name as requested.
+    verdict : str
+    status : str
+    relative, roundoff_floor : float or None
+        Relative residual and its round-off floor, by the judge.
+    distance : float or None, sqrt J
+        |Delta|_A to the reference.
+    allowed : float or None, sqrt J
+        Largest distance that (3) allows.
+    slack : float or None, m/s
+        Largest difference of slack.
+    objective : float or None, J
+        1/2 l.A l - b.l minus the reference's.
+    time : float or None, s
+        Set-up and solve.
+    note : str
+        Operator form, message and reason.
+    ran : str
+        Name of the bounded variant that was run instead, if the requested solver accepts only free rows.
+    solution : Solution or None
+    """
+
+    solver: str
     verdict: str
     status: str = ""
-    relative: float | None = None  # -, the judge's
-    roundoff_floor: float | None = None  # -
-    distance: float | None = None  # sqrt J, |Delta|_A to the reference
-    allowed: float | None = None  # sqrt J, largest distance that (3) allows
-    slack: float | None = None  # m/s, largest difference of slack
-    objective: float | None = None  # J, 1/2 l.A l - b.l minus that of the reference
-    time: float | None = None  # s, set-up and solve
-    note: str = ""  # form, message, reason
-    ran: str = ""  # the solver that is the one asked for with bounds, where that one takes free rows alone
+    relative: float | None = None
+    roundoff_floor: float | None = None
+    distance: float | None = None
+    allowed: float | None = None
+    slack: float | None = None
+    objective: float | None = None
+    time: float | None = None
+    note: str = ""
+    ran: str = ""
     solution: Solution | None = None
 
     @property
     def contradicted(self) -> bool:
-        """The solver claims what the judge does not find, or inequality (3) is broken."""
+        """Whether the judge contradicts the solver's claim, or inequality (3) is violated."""
         return self.verdict in (CLAIM_CONTRADICTED, BREACH)
 
 
 @dataclass(frozen=True)
 class CrossCheck:
-    """Table of `cross_check`; iterates over its rows, and `str()` is plain text."""
+    """Result of `cross_check`; iterates over its rows, and `str()` gives a plain-text table.
+
+    Parameters
+    ----------
+    problem : Problem
+    tol : float
+    reference : str or None
+        Name of the solver of the reference; None without one.
+    reference_note : str
+        Quality of the reference, or the reason why there is none.
+    rows : tuple of CrossCheckRow
+    """
 
     problem: Problem
     tol: float
-    reference: str | None  # name of the solver that gave the reference, None without one
-    reference_note: str  # how good it is, or why there is none
+    reference: str | None
+    reference_note: str
     rows: tuple[CrossCheckRow, ...]
 
     def __iter__(self) -> Iterator[CrossCheckRow]:
@@ -91,7 +131,7 @@ class CrossCheck:
 
     @property
     def contradicted(self) -> tuple[CrossCheckRow, ...]:
-        """Rows whose claim does not hold."""
+        """Rows with a contradicted claim."""
         return tuple(row for row in self.rows if row.contradicted)
 
     @property
@@ -101,18 +141,18 @@ class CrossCheck:
 
     @property
     def refused(self) -> tuple[CrossCheckRow, ...]:
-        """Rows of solvers that do not take the problem; their notes say why."""
+        """Rows of solvers that do not accept the problem; their notes give the reason."""
         return tuple(row for row in self.rows if row.verdict == REFUSED)
 
     @property
     def ok(self) -> bool:
-        """Every solver that takes the problem solves it, and agrees with the reference; False where none takes it.
+        """Whether all solvers that accept the problem solve it and agree with the reference; False if none does.
 
-        Where there is no reference, nothing is compared: `reference` is None, as always under Coulomb's law, and
-        solvers may have found different motions (see `lavender.find_solutions`).
+        Without a reference nothing is compared: `reference` is None, as always under Coulomb's law, and solvers may
+        have found different motions (see `lavender.find_solutions`).
         """
-        asked = {row.verdict for row in self.rows} - {REFUSED}
-        return bool(asked) and asked <= {AGREES, AGREES_UNCOMPARED, NOTHING}
+        verdicts = {row.verdict for row in self.rows} - {REFUSED}
+        return bool(verdicts) and verdicts <= {AGREES, AGREES_UNCOMPARED, NOTHING}
 
     def __str__(self) -> str:
         head = (
@@ -121,8 +161,9 @@ class CrossCheck:
         body = [
             (
                 f"{r.solver} → {r.ran}" if r.ran else r.solver, r.verdict, r.status,
-                _short(r.relative), _short(r.roundoff_floor), _short(r.distance),
-                _short(r.allowed), _short(r.objective), "" if r.time is None else f"{1e3 * r.time:.3g}", r.note,
+                _format_number(r.relative), _format_number(r.roundoff_floor), _format_number(r.distance),
+                _format_number(r.allowed), _format_number(r.objective),
+                "" if r.time is None else f"{1e3 * r.time:.3g}", r.note,
             )
             for r in self.rows
         ]  # fmt: skip
@@ -138,7 +179,8 @@ class CrossCheck:
         )
 
 
-def _short(x: float | None) -> str:
+def _format_number(x: float | None) -> str:
+    """Format a number, or nothing."""
     return "" if x is None else f"{x:.1e}"
 
 
@@ -151,43 +193,43 @@ def cross_check(
     max_iter: int | None = None,
     time_limit: float | None = None,
 ) -> CrossCheck:
-    """Solve with every solver, from doing nothing, and compare each with a judged reference.
+    """Solve from the zero impulse with every solver, and compare each with a judged reference.
 
-    The reference must reach max(1e-9, 10 floor), and 1e-5, by the judge; otherwise the next of osqp, clarabel, piqp,
-    direct (relaxed friction: clarabel_cone, block_gauss_seidel) is taken, and named.
+    The reference must reach max(1e-9, 10 floor), and 1e-5, by the judge. Otherwise the next of osqp, clarabel, piqp,
+    direct (relaxed friction: clarabel_cone, block_gauss_seidel) is used, and named.
 
     Parameters
     ----------
     problem : Problem
     solvers : names, optional
-        Default: all that take the problem here.
+        Default: all available solvers that accept the problem.
     reference : str
-        Tried first.
+        Solver that is tried first as the reference.
     tol : float
-        Relative residual asked of the solvers.
+        Relative residual tolerance of the solvers.
     max_iter : int, optional
-        Budget of the solvers, in their own iterations; default: each spec's.
+        Largest number of iterations of each solver; default: each spec's.
     time_limit : float, optional, s
-        For each solver, where it can be stopped.
+        For each solver that can be stopped.
 
     Returns
     -------
     CrossCheck
-        A solver of free rows is run as the one that is the same method with bounds ("gauss_seidel → pgs"), and `ran`
-        names it. Distances, slack and objective only for symmetric positive semidefinite A without Coulomb friction
+        If a solver accepts only free rows, its bounded variant is run ("gauss_seidel → pgs"), and `ran` names it.
+        Distances, slack and objective are computed only for symmetric positive semidefinite A without Coulomb friction
         and for quadratic programs.
 
     Raises
     ------
     UnknownName
-        A solver or reference that does not exist.
+        A solver or reference does not exist.
     InputError
-        Wrong `tol` or limits.
+        `tol` or a limit is invalid.
     """
     check_problem(problem)
     check_budget(specs()["auto"], tol, max_iter)
     seconds_of(time_limit)
-    if problem.guess is not None:  # solvers are compared by what they do, not by where they begin
+    if problem.guess is not None:  # All solvers start from the zero impulse.
         problem = replace(problem, guess=None, copy=False)
     if isinstance(solvers, str):
         solvers = [solvers]
@@ -197,48 +239,54 @@ def cross_check(
         if not isinstance(name, str) or name not in reasons:
             get(name)  # raises UnknownName with the nearest names
     with Worker() as worker:
-        solver = partial(solve_isolated, worker, problem, time_limit=time_limit)
-        optimum, chosen, note = _reference(problem, reference, reasons, solver)
-        solver = partial(solver, tol=tol, max_iter=max_iter)
-        rows = [_row(problem, name, reasons[name], optimum, solver) for name in names]
+        run_solver = partial(solve_isolated, worker, problem, time_limit=time_limit)
+        optimum, reference_solver, note = _solve_reference(problem, reference, reasons, run_solver)
+        run_solver = partial(run_solver, tol=tol, max_iter=max_iter)
+        rows = [_check_solver(problem, name, reasons[name], optimum, run_solver) for name in names]
     if optimum is not None or any(row.verdict == AGREES_UNCOMPARED for row in rows):
         rows = [replace(r, verdict=INEXACT) if r.verdict in (PROVED, NEAR_NONE) else r for r in rows]
-    return CrossCheck(problem, tol, chosen, note, tuple(rows))
+    return CrossCheck(problem, tol, reference_solver, note, tuple(rows))
 
 
-def _row(
-    problem: Problem, name: str, reason: str | None, optimum: Solution | None, solver: Callable[..., Solution]
+def _check_solver(
+    problem: Problem,
+    name: str,
+    reason: str | None,
+    optimum: Solution | None,
+    run_solver: Callable[..., Solution],
 ) -> CrossCheckRow:
+    """Run one solver, or the bounded variant if `reason` says why it does not accept the problem, and compare it."""
     other = None if reason is None else specs()[name].standing_in(problem)
     if reason is not None and other is None:
         return CrossCheckRow(name, REFUSED, note=reason)
     run = name if other is None else other.name
     try:
-        solution = uninterrupted(solver(run))
+        solution = uninterrupted(run_solver(run))
     except Exception as error:
         if isinstance(error, TaskFailed):
             return CrossCheckRow(name, NOT_SOLVED, error.status, note=error.text)
         if isinstance(error, LavenderError) and not isinstance(error, InputError):
-            return CrossCheckRow(name, REFUSED, note=str(error))  # only after a look at the numbers
+            # The solver rejected the numbers of the problem.
+            return CrossCheckRow(name, REFUSED, note=str(error))
         if get(run).builtin:
             raise
-        # a plug-in may raise anything: it costs its own row
+        # A plug-in may raise any exception; only its own row is lost.
         return CrossCheckRow(name, NOT_SOLVED, note=format_error(error))
     return replace(compare(problem, name, solution, optimum), ran="" if other is None else run)
 
 
-def _reference(
-    problem: Problem, first: str, reasons: dict[str, str | None], solver: Callable[..., Solution]
+def _solve_reference(
+    problem: Problem, first: str, reasons: dict[str, str | None], run_solver: Callable[..., Solution]
 ) -> tuple[Solution | None, str | None, str]:
-    """(solution, solver, how good) of the first that passes, or (None, None, why none does)."""
+    """Return (solution, solver, quality) of the first reference that passes, or (None, None, reason)."""
     if problem.law == "coulomb":
         return None, None, "Coulomb friction is not the optimality condition of a QP"
     if not (problem.has_singular_program or problem.is_symmetric):
         return None, None, f"A is not symmetric (by {problem.asymmetry:.1e}), so the problem is no QP"
     if not (problem.has_singular_program or problem.is_semidefinite):
         return None, None, "A is not positive semidefinite: solutions may be many, of different motions"
-    usual = CONE_REFERENCES if problem.law == "cone" else REFERENCES
-    chain = (first, *(r for r in usual if r != first))
+    defaults = CONE_REFERENCES if problem.law == "cone" else REFERENCES
+    chain = (first, *(r for r in defaults if r != first))
     failed = []
     for name in chain:
         reason = reasons.get(name, "not registered")
@@ -247,15 +295,16 @@ def _reference(
             continue
         spec = get(name)
         try:
-            budget = 100 * spec.max_iter if spec.resumable else None  # a reference may take its time
-            solution = uninterrupted(solver(name, tol=0.1 * REFERENCE_TOL, max_iter=budget))
+            # A reference may take longer than a solver.
+            budget = 100 * spec.max_iter if spec.resumable else None
+            solution = uninterrupted(run_solver(name, tol=0.1 * REFERENCE_MAX_RESIDUAL, max_iter=budget))
         except Exception as error:
             if spec.builtin and not isinstance(error, LavenderError):
                 raise
             failed.append(f"{name}: {format_error(error)}")
             continue
         r = solution.residual
-        needed = max(REFERENCE_TOL, min(10.0 * r.roundoff_floor, MAX_EXCUSED_RESIDUAL))
+        needed = max(REFERENCE_MAX_RESIDUAL, min(10.0 * r.roundoff_floor, MAX_EXCUSED_RESIDUAL))
         if r.relative <= needed:
             note = f"relative {r.relative:.1e}"
             return solution, name, note + (f" ({'; '.join(failed)})" if failed else "")
@@ -264,12 +313,12 @@ def _reference(
 
 
 def compare(problem: Problem, name: str, solution: Solution, optimum: Solution | None) -> CrossCheckRow:
-    """A row of one solver's solution beside the optimum."""
+    """Compare one solver's solution with the optimum and build its row."""
     r = solution.residual
     note = "; ".join(
         x for x in (solution.solver.form and f"{solution.solver.form} form", solution.message) if x
     )
-    shared: dict[str, Any] = {
+    fields: dict[str, Any] = {
         "status": solution.status.name,
         "relative": r.relative,
         "roundoff_floor": r.roundoff_floor,
@@ -278,15 +327,15 @@ def compare(problem: Problem, name: str, solution: Solution, optimum: Solution |
     }
     verdict, breached = AGREES_UNCOMPARED, False
     if optimum is not None and np.isfinite(solution.impulse).all():
-        with np.errstate(over="ignore", invalid="ignore"):  # impulses whose squares are no numbers
-            apart, allowed = separation(problem, solution, optimum)
-            shared |= {
-                "distance": apart,
+        with np.errstate(over="ignore", invalid="ignore"):  # Squares of the impulses may overflow.
+            distance, allowed = separation(problem, solution, optimum)
+            fields |= {
+                "distance": distance,
                 "allowed": allowed,
                 "slack": float(np.abs(r.slack - optimum.slack).max(initial=0.0)),
                 "objective": _objective(problem, solution) - _objective(problem, optimum),
             }
-        verdict, breached = AGREES, apart > allowed
+        verdict, breached = AGREES, distance > allowed
     if breached:
         verdict = BREACH
     elif solution.claim_check == CONTRADICTED:
@@ -300,11 +349,11 @@ def compare(problem: Problem, name: str, solution: Solution, optimum: Solution |
         verdict, note = NOTHING, f"{units}; {note}".rstrip("; ")
     elif not (solution.success or r.at_floor):
         verdict = NOT_SOLVED
-    return CrossCheckRow(name, verdict, note=note, **shared)
+    return CrossCheckRow(name, verdict, note=note, **fields)
 
 
 def _objective(problem: Problem, solution: Solution) -> float:
-    """1/2 l.A l - b.l [J], or 1/2 x.P x + q.x of a program with a singular P."""
+    """Compute the objective 1/2 l.A l - b.l [J], or 1/2 x.P x + q.x of a program with a singular P."""
     if problem.has_singular_program:
         return float(problem.qp.solution(solution).objective)
     lam = solution.impulse

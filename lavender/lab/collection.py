@@ -1,11 +1,11 @@
-"""A problem set that others can cite: the sets of the suite, and what is known of each problem's solution.
+"""The citable problem set: the cases of the suite's sets, and the proved properties of each problem's solution.
 
     enclosed    an exact solution is proved to lie within `radius` m/s of an answer (`lavender.prove`)
-    infeasible  a certificate that there is none, checked by the judge
-    open        neither: `reason` says what is in the way
+    infeasible  a certificate, checked by the judge, proves that there is no solution
+    open        neither is proved: `reason` says why
 
-`manifest.json` beside this file has a line for each problem; its `sha` is of all numbers, so that anybody can make the
-problem from its name and see that it is the same.
+`manifest.json` in this folder has a line for each problem. Its `sha` is a hash of all numbers, so that anybody can
+build the problem from its name and check that it is the same.
 """
 
 from __future__ import annotations
@@ -30,44 +30,73 @@ from lavender.problem import Problem
 from lavender.solving.solve import solve
 
 MANIFEST = Path(__file__).with_name("manifest.json")
-RECORDED = MANIFEST.with_name("recorded.json")  # of files of other projects, which are not part of this one
-SEARCHED = 60  # rows under Coulomb's law up to which other motions are looked for
-NEAR = 1e-9  # m/s
-SWEEPS = 10_000  # of PGS, at most
-SECONDS = 30.0  # of `auto`, to the answer that a proof begins from
+# Manifest of files of other projects, which this one does not contain.
+RECORDED = MANIFEST.with_name("recorded.json")
+MAX_SEARCH_ROWS = 60  # Other motions of problems under Coulomb's law are searched up to this many rows.
+NEAR_SOLUTION_SPEED = 1e-9  # [m/s] The catalogue counts answers within this distance of an exact solution.
+MAX_SWEEPS = 10_000  # Largest number of PGS sweeps with which the difficulty of a problem is measured.
+ANSWER_TIME_LIMIT = 30.0  # [s] Time limit of `auto` for the answer from which a proof starts.
 
 
 @dataclass(frozen=True)
 class Entry:
-    """One problem of the set and what is known of it."""
+    """One problem of the set and its proved properties.
+
+    Parameters
+    ----------
+    name, group : str
+        Name of the case, and set that contains it.
+    sha : str
+        Hash of its numbers.
+    rows : int
+    law : str
+    form : {"rows", "matrix", "generalized"}
+        Bodies, A, or J and M.
+    licence : str
+        Licence of a model that another package installs.
+    made : str
+        Versions of other packages on which the numbers depend.
+    sweeps : int or None
+        Sweeps of PGS to a residual of 1e-3; None if 10,000 do not suffice, or PGS does not accept the problem.
+    condition : float or None
+        Condition number of A on its range, scaled to a diagonal of 1; None above CONDITION rows.
+    degenerate : float
+        Fraction of blocks at a boundary, of the blocks with a bounded error; 0 without such blocks.
+    known : {"enclosed", "infeasible", "open"}
+    radius : float or None, m/s
+        Radius of the enclosed solution, for every row.
+    unique : bool
+        It is proved to be the only motion.
+    motions : int
+        Number of motions that were found, a lower bound; 0 if they were not searched.
+    apart : float or None, m/s
+        Largest distance of two motions.
+    reason : str
+    """
 
     name: str
     group: str
-    sha: str  # of its numbers
+    sha: str
     rows: int
     law: str
-    form: str  # rows (bodies), matrix, generalized (J and M)
-    licence: str = ""  # of a model that another package installs
-    made: str = ""  # versions that give these numbers, where they hang on other packages
-    # of PGS to 1e-3 of doing nothing; None: not within 10,000, or it does not take the problem
+    form: str
+    licence: str = ""
+    made: str = ""
     sweeps: int | None = None
-    # of A, scaled to a diagonal of 1, over its range; None above CONDITION rows
     condition: float | None = None
-    degenerate: float = (
-        0.0  # share of blocks at a boundary, among those whose error has a bound (0 if none has one)
-    )
-    known: str = "open"  # enclosed, infeasible or open
-    radius: float | None = None  # m/s, of every row of the enclosed solution
-    unique: bool = False  # proved to be the only motion
-    motions: int = 0  # found, at least; 0: not looked for
-    apart: float | None = None  # m/s between two of them
+    degenerate: float = 0.0
+    known: str = "open"
+    radius: float | None = None
+    unique: bool = False
+    motions: int = 0
+    apart: float | None = None
     reason: str = ""
 
 
-def certified(problem: Problem, name: str, group: str) -> Entry:
-    """The entry of a problem, with a proof or a certificate where there is one. Needs the extra `proof`."""
+def certify(problem: Problem, name: str, group: str) -> Entry:
+    """Build the entry of a problem, with a proof or a certificate if there is one; needs the extra `proof`."""
     package = suite.package_of(name)
-    answer = solve(problem, "auto", tol=1e-12, time_limit=SECONDS)
+    answer = solve(problem, "auto", tol=1e-12, time_limit=ANSWER_TIME_LIMIT)
     entry = Entry(
         name=name,
         group=group,
@@ -93,37 +122,37 @@ def certified(problem: Problem, name: str, group: str) -> Entry:
         return Entry(**base | {"known": "infeasible"})
     if found.proven:
         base |= {"known": "enclosed", "radius": found.velocity_radius}
-    if problem.law == "coulomb" and not found.unique and problem.m <= SEARCHED:
-        several = find_solutions(problem.disk)
-        base |= {"motions": len(several), "apart": several.spread, "unique": bool(several.unique)}
+    if problem.law == "coulomb" and not found.unique and problem.m <= MAX_SEARCH_ROWS:
+        solutions = find_solutions(problem.disk)
+        base |= {"motions": len(solutions), "apart": solutions.spread, "unique": bool(solutions.unique)}
     return Entry(**base)
 
 
 def difficulty(problem: Problem) -> int | None:
-    """Sweeps that `pgs` takes to a thousandth of the error of doing nothing, `Entry.sweeps`."""
+    """Count the sweeps that `pgs` needs to a thousandth of the zero impulse's error; None if they do not suffice."""
     try:
-        found = solve(problem, "pgs", impulse=problem.start(), tol=1e-3, max_iter=SWEEPS)
+        found = solve(problem, "pgs", impulse=problem.start(), tol=1e-3, max_iter=MAX_SWEEPS)
     except CapabilityError:
         return None
     return found.iterations if found.success else None
 
 
 def entries(groups: Iterable[str]) -> Iterator[Entry]:
-    """The certified entry of every problem of these sets, files and folders; of all sets if none is named."""
+    """Certify every problem of these sets, files and folders; of all sets if none is named."""
     for group in [g.removeprefix("@") for g in groups] or suite.SETS:
         if is_path(group):
             for item in resolve(group):
-                yield certified(item.problem, item.name, "recorded")
+                yield certify(item.problem, item.name, "recorded")
                 item.forget()
             continue
         for case in suite.cases(f"@{group}"):
-            yield certified(case.problem, case.name, group)
+            yield certify(case.problem, case.name, group)
 
 
-def save(found: Iterable[Entry], path: Path | str) -> None:
+def save(entries_to_save: Iterable[Entry], path: Path | str) -> None:
     """Write a manifest."""
-    usual = {f.name: f.default for f in fields(Entry)}
-    lines = [{k: v for k, v in asdict(e).items() if v != usual[k]} for e in found]
+    defaults = {f.name: f.default for f in fields(Entry)}
+    lines = [{k: v for k, v in asdict(e).items() if v != defaults[k]} for e in entries_to_save]
     text = ",\n ".join(json.dumps(line, ensure_ascii=False) for line in lines)
     write_text(path, f"[{text}]\n")
 
@@ -134,27 +163,27 @@ def load(path: Path | str = MANIFEST) -> list[Entry]:
     Raises
     ------
     InputError
-        Not a manifest, with what is wrong.
+        The file is not a manifest; the message says why.
     """
     known = {f.name for f in fields(Entry)}
     try:
         lines: list[dict[str, Any]] = json.loads(read_whole_file(path, "the manifest"))
         return [Entry(**{k: v for k, v in line.items() if k in known}) for line in lines]
     except (ValueError, TypeError, AttributeError) as error:
-        raise InputError(f"{path} is no manifest of problems: {error}") from None
+        raise InputError(f"{path} is not a manifest of problems: {error}") from None
 
 
-def makeable(found: Iterable[Entry]) -> tuple[list[Entry], list[str]]:
-    """Those of the entries whose models are installed, and a line for each package that is not."""
-    found = list(found)
-    missing = {e.name: suite.missing(package) for e in found if (package := suite.package_of(e.name))}
-    kept = [e for e in found if not missing.get(e.name)]
-    return kept, sorted({told for told in missing.values() if told})
+def select_buildable(entries: Iterable[Entry]) -> tuple[list[Entry], list[str]]:
+    """Select the entries with installed models; return them and a line for each missing package."""
+    entries = list(entries)
+    missing = {e.name: suite.missing(package) for e in entries if (package := suite.package_of(e.name))}
+    buildable = [e for e in entries if not missing.get(e.name)]
+    return buildable, sorted({message for message in missing.values() if message})
 
 
-def changed(found: Iterable[Entry]) -> Iterator[str]:
-    """Make every problem again by its name; a line for each that has other numbers."""
-    for entry in found:
+def find_changes(entries: Iterable[Entry]) -> Iterator[str]:
+    """Build every problem again from its name; yield a line for each that has other numbers."""
+    for entry in entries:
         problem = suite.case(entry.name).problem
         if (now := fingerprint(problem)) != entry.sha:
             here = suite.versions(suite.package_of(entry.name))
@@ -162,43 +191,43 @@ def changed(found: Iterable[Entry]) -> Iterator[str]:
             yield f"{entry.name}: {now} here, {entry.sha} in the manifest{why}"
 
 
-def told(entry: Entry) -> str:
-    """What is known of a problem, in a few words."""
-    words = f"enclosed within {entry.radius:.1e} m/s" if entry.radius is not None else entry.known
+def describe(entry: Entry) -> str:
+    """Describe the proved properties of a problem in a few words."""
+    text = f"enclosed within {entry.radius:.1e} m/s" if entry.radius is not None else entry.known
     more = ", one motion" if entry.unique else ""
-    return words + more + (f", at least {entry.motions} motions" if entry.motions > 1 else "")
+    return text + more + (f", at least {entry.motions} motions" if entry.motions > 1 else "")
 
 
-def page(found: list[Entry], recorded: Sequence[Entry] = ()) -> str:
-    """The catalogue: what is known of how many, and the problems that have no solution, several, or none known.
+def page(entries: list[Entry], recorded: Sequence[Entry] = ()) -> str:
+    """Write the catalogue: counts of proved properties, and problems without a solution, with several, or open.
 
-    `recorded` are files of other projects.
+    `recorded` holds the entries of files of other projects.
     """
-    found = [*found, *recorded]
+    found = [*entries, *recorded]
     count = Counter(e.known for e in found)
-    near = sum(e.radius is not None and e.radius <= NEAR for e in found)
+    near = sum(e.radius is not None and e.radius <= NEAR_SOLUTION_SPEED for e in found)
     unique = sum(e.unique for e in found)
     first = (
         f"Of these {len(found)} contact problems {count['enclosed']} have an exact solution that is proved to lie "
-        f"near a known answer, {near} within {NEAR:.0e} m/s of it; for {unique} no other motion exists; "
+        f"near a known answer, {near} within {NEAR_SOLUTION_SPEED:.0e} m/s of it; for {unique} no other motion exists; "
         f"{count['infeasible']} have no solution, with a certificate."
     )
     how = (
-        "`lavender problems` makes them from their names, `lavender problems --check` compares every number with "
+        "`lavender problems` builds them from their names, `lavender problems --check` compares every number with "
         "`lavender/lab/manifest.json`, from which `lavender problems --page docs/catalogue.md` writes this page. "
-        "Robots need the extra `robots`: models of gymnasium (MIT) and dm_control (Apache-2.0). Recorded are files of "
-        "other projects that are not part of this one: test data of FCLIB and Siconos (Apache-2.0), and two of "
-        "ContactBench (BSD-2-Clause); `lavender problems FOLDER --certify FILE` says the same of yours."
+        "Robots need the extra `robots`: models of gymnasium (MIT) and dm_control (Apache-2.0). Recorded problems are "
+        "files of other projects that are not part of this one: test data of FCLIB and Siconos (Apache-2.0), and two "
+        "of ContactBench (BSD-2-Clause); `lavender problems FOLDER --certify FILE` certifies your files."
     )
     columns = (
-        "Rows from the least to the most; sweeps of PGS to a thousandth of the error of doing nothing, in the median "
-        f"({SWEEPS:,} where it does not get there or does not take the problem), the same of the condition of A, "
-        "problems with blocks at a boundary; problems by law; and what is known. "
-        "Open are problems on the boundary of two states, where no proof by signs exists."
+        "The columns: smallest and largest number of rows; median of the PGS sweeps to a thousandth of the error of "
+        f"the zero impulse ({MAX_SWEEPS:,} if these do not suffice or PGS does not accept the problem); median "
+        "condition number of A; problems with blocks at a boundary; problems by law; and their proved properties. "
+        "Open problems are on the boundary of two states, where no proof by signs exists."
     )
     claims = (
-        "None of the files says which solver claimed what, so no published claim stands here to be contradicted; "
-        "`lavender report @hard --prove` holds what solvers claim of a run of yours against what is proved."
+        "None of the files states a claim of a solver, so no published claim is contradicted here; "
+        "`lavender report @hard --prove` compares the claims of solvers in your run with the proofs."
     )
     laws = sorted({e.law for e in found})
     out = [
@@ -219,7 +248,7 @@ def page(found: list[Entry], recorded: Sequence[Entry] = ()) -> str:
             len(own),
             f"{min(e.rows for e in own)} to {max(e.rows for e in own)}",
         ]
-        cells.append(f"{np.median([SWEEPS if e.sweeps is None else e.sweeps for e in own]):.0f}")
+        cells.append(f"{np.median([MAX_SWEEPS if e.sweeps is None else e.sweeps for e in own]):.0f}")
         conditions = [e.condition for e in own if e.condition is not None]
         cells += [f"{np.median(conditions):.0e}" if conditions else "", sum(e.degenerate > 0.0 for e in own)]
         cells += [sum(e.law == law for e in own) for law in laws]
@@ -228,17 +257,17 @@ def page(found: list[Entry], recorded: Sequence[Entry] = ()) -> str:
         out.append("| " + " | ".join(map(str, cells)) + " |")
     if recorded:
         out += ["## Recorded files", "| file | sha | rows | law | known |\n|---|---|---|---|---|"]
-        out += [f"| `{e.name}` | `{e.sha}` | {e.rows} | {e.law} | {told(e)} |" for e in recorded]
-    several = [e for e in found if e.motions > 1]
-    for title, chosen, tell in (
+        out += [f"| `{e.name}` | `{e.sha}` | {e.rows} | {e.law} | {describe(e)} |" for e in recorded]
+    solutions = [e for e in found if e.motions > 1]
+    for title, selected, cell in (
         ("No solution", [e for e in found if e.known == "infeasible"], lambda e: e.reason),
-        ("Several motions", several, lambda e: f"at least {e.motions}, up to {e.apart:.1e} m/s apart"),
+        ("Several motions", solutions, lambda e: f"at least {e.motions}, up to {e.apart:.1e} m/s apart"),
         ("Open", [e for e in found if e.known == "open"], lambda e: e.reason),
     ):
         out += [
             f"## {title}",
-            f"{len(chosen)} problems." if not chosen else "| problem | rows | |\n|---|---|---|",
+            f"{len(selected)} problems." if not selected else "| problem | rows | |\n|---|---|---|",
         ]
-        out += [f"| `{e.name}` | {e.rows} | {tell(e)} |" for e in chosen]
+        out += [f"| `{e.name}` | {e.rows} | {cell(e)} |" for e in selected]
     text = "\n\n".join(out)
     return text.replace(" |\n\n|", " |\n|").replace("|\n\n| `", "|\n| `") + "\n"

@@ -1,14 +1,14 @@
-"""Worlds of one MuJoCo model, stepped by the engine that is asked for, and the constraint problem of every step.
+"""Worlds of one MuJoCo model, stepped by a selectable engine, and the constraint problem of every step.
 
-World 0 is what `lavender record` simulates; the others differ from it by their start and by their random controls:
+World 0 is the one that `lavender record` simulates; the others differ from it by their start and their random controls:
 
     qvel += spread N(0, 1) [m/s, rad/s], drawn with (seed, world)        controls drawn with seed + world
 
-With start states, world i starts from state i without that noise; further worlds start from the same states with it.
+With start states, world i starts from state i without this noise; further worlds start from the same states with it.
 The first step uses the controls of the state, if it has any.
 
-A problem is that of the engine's own forward pass, from its own warm start, with its own answer beside it. MJX and
-MuJoCo Warp step all worlds at once, and hold float32.
+A problem is the one of the engine's own forward pass, with its warm start and its answer. MJX and MuJoCo Warp step all
+worlds at once, in float32.
 """
 
 from __future__ import annotations
@@ -30,29 +30,44 @@ from lavender.lab.report.table import Table
 from lavender.lab.report.text import format_percent
 
 ENGINES = ("mujoco", "mjx", "mujoco_warp")
-BEGIN = ("qpos", "qvel", "act", "qacc_warmstart", "mocap_pos", "mocap_quat")  # what MJX and Warp start from
-FIELDS = ("qpos", "qvel", "act", "ctrl", "qacc_warmstart")  # what a step is made of
-KIND = {0: "equality", 1: "friction loss", 2: "friction loss", 3: "limit of a joint", 4: "limit of a tendon"}
-PYRAMIDAL = 6  # of mjtConstraint, as the keys of KIND
-ROOM = 256  # rows of each world that MuJoCo Warp is given at least
-# Below this share of judged steps with contact no setting is recommended and an audit says that it tells little about
-# contact. Mean times and the error that 1 % of the steps exceed are then those of steps without contact: 6 % of the
-# steps of dm_control's finger have contact, none of its stacker's.
+# MJX and Warp start from these.
+START_FIELDS = (
+    "qpos",
+    "qvel",
+    "act",
+    "qacc_warmstart",
+    "mocap_pos",
+    "mocap_quat",
+)
+STEP_FIELDS = ("qpos", "qvel", "act", "ctrl", "qacc_warmstart")  # A step depends on these.
+# mjtConstraint -> name of a block that is not a contact.
+BLOCK_KINDS = {
+    0: "equality",
+    1: "friction loss",
+    2: "friction loss",
+    3: "limit of a joint",
+    4: "limit of a tendon",
+}
+PYRAMIDAL_CONTACT = 6  # mjtConstraint of an edge of a pyramidal contact
+MIN_WARP_ROWS = 256  # Smallest number of rows per world for which MuJoCo Warp allocates memory.
+# If a smaller fraction of the judged steps has contact, no setting is recommended, and an audit warns that its results
+# hardly concern contact: mean times and the error that 1 % of the steps exceed then describe steps without contact.
+# 6 % of the steps of dm_control's finger have contact, none of its stacker's.
 MIN_CONTACT_SHARE = 0.2
 
 
 @dataclass(frozen=True)
 class Runs:
-    """What is simulated.
+    """Parameters of a simulation of several worlds.
 
     Parameters
     ----------
     model : path of a model (MJCF)
     worlds, steps : int
-    control : "random", "zero", or an array (any, nu), played by every world
+    control : "random", "zero", or an array (any, nu) that every world plays
     seed : int
     spread : float, m/s, rad/s
-        Standard deviation of what is added to the velocities that a world starts with.
+        Standard deviation of the noise that is added to the velocities at the start.
     starts : StartStates, optional
         States in which the worlds start; default: the model's own.
     """
@@ -73,19 +88,19 @@ class Runs:
         check_float("spread", self.spread, low=0.0)
 
     def load(self) -> tuple[Any, Any]:
-        """MuJoCo and the model; InputError where its problems cannot be read."""
+        """Load MuJoCo and the model; InputError if it cannot be read, or the controls do not fit."""
         mj, model = load_model(self.model)
         make_controller(model, self.control, self.seed)
         return mj, model
 
     def start_from(self, states: Any) -> Runs:
-        """Return these runs with start states of any source that `read_states` takes; None leaves the model's own."""
+        """Return these runs with start states from any source of `read_states`; None keeps the model's own."""
         if states is None:
             return self
         return replace(self, starts=read_states(*self.load(), states).subset(self.worlds))
 
     def start(self, mj: Any, model: Any, world: int) -> Any:
-        """MjData as this world begins."""
+        """Create the MjData with which a world starts."""
         data, exact = mj.MjData(model), 1
         if self.starts is not None:
             exact = len(self.starts)
@@ -96,7 +111,7 @@ class Runs:
         return data
 
     def drive(self, model: Any, world: int) -> Any:
-        """The controls of a world by (data, step)."""
+        """Return the function (data, step) -> controls of a world."""
         drive = make_controller(model, self.control, self.seed + world)
         if self.starts is None or self.starts.controls is None:
             return drive
@@ -114,7 +129,7 @@ class StepSizes:
     rows, contacts : (steps,) int
         Contacts that have rows.
     can_touch : bool
-        Whether the model has geoms that can collide. Without, the share of steps with rows decides.
+        Whether the model has geoms that can collide. If not, the fraction of steps with rows decides.
     """
 
     rows: np.ndarray
@@ -124,43 +139,44 @@ class StepSizes:
     @property
     def is_enough(self) -> bool:
         """Whether enough of the steps have contact to recommend a setting."""
-        return self._with_any >= MIN_CONTACT_SHARE * len(self.rows)
+        return self._n_with_contact >= MIN_CONTACT_SHARE * len(self.rows)
 
     @property
-    def _with_any(self) -> int:
+    def _n_with_contact(self) -> int:
+        """Number of steps with contact, or with rows if the model has no geoms that can collide."""
         return int(np.count_nonzero(self.contacts if self.can_touch else self.rows))
 
     @property
     def sentence(self) -> str:
-        """How many steps have contact, and how many are needed."""
-        n, what = len(self.rows), "contact" if self.can_touch else "a constraint"
-        share = f" ({format_percent(self._with_any, n, min(1, self._with_any))})" if n else ""
+        """Phrase with the number of steps that have contact and the fraction that is needed."""
+        n, object_name = len(self.rows), "contact" if self.can_touch else "a constraint"
+        fraction = f" ({format_percent(self._n_with_contact, n, min(1, self._n_with_contact))})" if n else ""
         needed = f"{100.0 * MIN_CONTACT_SHARE:g} %"
-        return f"{self._with_any} of {n} steps judged have {what}{share}, fewer than {needed}"
+        return f"{self._n_with_contact} of {n} steps judged have {object_name}{fraction}, fewer than {needed}"
 
     @property
     def table(self) -> Table:
-        """Median and maximum of rows and contacts, and how many steps have any."""
+        """Median and maximum of rows and contacts, and the fraction of steps that have any."""
         rows = []
         for name, counts in (("rows", self.rows), ("contacts", self.contacts)):
             if len(counts):
-                some = format_percent(int(np.count_nonzero(counts)), len(counts), 1)
-                rows.append([name, f"{np.median(counts):g}", str(counts.max()), some])
+                with_any = format_percent(int(np.count_nonzero(counts)), len(counts), 1)
+                rows.append([name, f"{np.median(counts):g}", str(counts.max()), with_any])
         heads = ["in a step", "median", "maximum", "steps with any"]
         return Table(heads, rows, words=frozenset(heads[:1]))
 
     @property
     def numbers(self) -> dict[str, Any]:
-        """The same for numbers.json."""
-        found: dict[str, Any] = {"can_touch": self.can_touch, "min_contact_share": MIN_CONTACT_SHARE}
+        """The contents of `table` for numbers.json."""
+        numbers: dict[str, Any] = {"can_touch": self.can_touch, "min_contact_share": MIN_CONTACT_SHARE}
         for name, counts in (("rows", self.rows), ("contacts", self.contacts)):
-            some = len(counts) > 0
-            found[name] = {
-                "median": float(np.median(counts)) if some else None,
-                "maximum": int(counts.max()) if some else None,
-                "share": float(np.mean(counts > 0)) if some else None,
+            with_any = len(counts) > 0
+            numbers[name] = {
+                "median": float(np.median(counts)) if with_any else None,
+                "maximum": int(counts.max()) if with_any else None,
+                "share": float(np.mean(counts > 0)) if with_any else None,
             }
-        return found
+        return numbers
 
 
 def can_touch(mj: Any, model: Any) -> bool:
@@ -169,8 +185,8 @@ def can_touch(mj: Any, model: Any) -> bool:
         return False
     if model.npair or model.nflex:
         return True
-    words = np.stack([model.geom_contype, model.geom_conaffinity], axis=1)
-    kinds, counts = np.unique(words, axis=0, return_counts=True)
+    bit_masks = np.stack([model.geom_contype, model.geom_conaffinity], axis=1)
+    kinds, counts = np.unique(bit_masks, axis=0, return_counts=True)
     return any(
         (a[0] & b[1] or b[0] & a[1]) and (i != j or counts[i] > 1)
         for i, a in enumerate(kinds.tolist())
@@ -179,24 +195,43 @@ def can_touch(mj: Any, model: Any) -> bool:
 
 
 class Divergence(NamedTuple):
-    """The step in which a world diverged: MuJoCo starts the simulation again, or ends in an error."""
+    """The step in which a world diverged: MuJoCo resets the simulation, or ends in an error.
+
+    Parameters
+    ----------
+    world, step : int
+    cause : str
+        The quantity that was not finite or above mjMAXVAL, or MuJoCo's error.
+    is_outside : bool
+        The quantity is the state or the unconstrained acceleration, so that this step's solve is not the cause.
+    """
 
     world: int
     step: int
-    cause: str  # what was not finite or above mjMAXVAL, or MuJoCo's error
-    is_outside: (
-        bool  # The state or the unconstrained acceleration was, so this step's solve is not the cause.
-    )
+    cause: str
+    is_outside: bool
 
 
 class Frame(NamedTuple):
-    """One step of all worlds, before it is made: problems, the engine's answers, and the state to go back to."""
+    """All worlds before one step: problems, the engine's answers, and the state to restart from.
+
+    Parameters
+    ----------
+    batch : Batch
+    impulse : array, N s
+    state : dict of (worlds, ...)
+        By the names of MjData.
+    rows : (worlds,) int
+        Number of rows that are not padding.
+    contacts : (worlds,) int
+        Number of contacts that have such rows.
+    """
 
     batch: Batch
-    impulse: FloatArray  # N s
-    state: dict[str, FloatArray]  # (worlds, ...) by the names of MjData
-    rows: np.ndarray  # (worlds,) rows that are not padding
-    contacts: np.ndarray  # (worlds,) contacts that have such rows
+    impulse: FloatArray
+    state: dict[str, FloatArray]
+    rows: np.ndarray
+    contacts: np.ndarray
 
 
 def simulate_world(mj: Any, model: Any, runs: Runs, world: int) -> tuple[FloatArray, Divergence | None]:
@@ -217,7 +252,7 @@ def simulate_world(mj: Any, model: Any, runs: Runs, world: int) -> tuple[FloatAr
         mj.mj_getState(model, data, states[step], kind)
         try:
             mj.mj_step(model, data)
-        except mj.FatalError as error:  # out of memory
+        except mj.FatalError as error:  # MuJoCo is out of memory.
             states[step:] = np.nan
             return states, Divergence(world, step, f"MuJoCo ended in an error: {error}", False)
         if has_diverged(mj, data):
@@ -227,7 +262,7 @@ def simulate_world(mj: Any, model: Any, runs: Runs, world: int) -> tuple[FloatAr
 
 
 def has_diverged(mj: Any, data: Any) -> bool:
-    """Whether MuJoCo has started the simulation again because its numbers were not finite or above mjMAXVAL."""
+    """Whether MuJoCo has reset the simulation because its numbers were not finite or above mjMAXVAL."""
     kinds = mj.mjtWarning
     return any(
         data.warning[int(k)].number
@@ -236,95 +271,101 @@ def has_diverged(mj: Any, data: Any) -> bool:
 
 
 def _divergence_of(mj: Any, model: Any, data: Any, state: FloatArray, world: int, step: int) -> Divergence:
-    """Find out what was too large in a step in which MuJoCo started again."""
+    """Determine which quantity was too large in a step in which MuJoCo reset the simulation."""
     kinds = mj.mjtWarning
     for kind, name in ((kinds.mjWARN_BADQPOS, "position"), (kinds.mjWARN_BADQVEL, "velocity")):
         if data.warning[int(kind)].number:
             return Divergence(world, step, f"{name} before the step", True)
-    again = mj.MjData(model)
-    mj.mj_setState(model, again, state, mj.mjtState.mjSTATE_INTEGRATION)
+    repeated = mj.MjData(model)
+    mj.mj_setState(model, repeated, state, mj.mjtState.mjSTATE_INTEGRATION)
     try:
-        mj.mj_forward(model, again)
+        mj.mj_forward(model, repeated)
     except mj.FatalError as error:
         return Divergence(world, step, f"MuJoCo ended in an error: {error}", False)
-    smooth = np.abs(again.qacc_smooth).max(initial=0.0)
+    smooth = np.abs(repeated.qacc_smooth).max(initial=0.0)
     if not smooth <= mj.mjMAXVAL:
         return Divergence(world, step, "acceleration without constraints", True)
     return Divergence(world, step, "acceleration", False)
 
 
 def fields_of(mj: Any, model: Any, state: FloatArray) -> dict[str, FloatArray]:
-    """A state by the names of MjData."""
+    """Convert a state vector to a dict by the names of MjData."""
     data = mj.MjData(model)
     mj.mj_setState(model, data, state, mj.mjtState.mjSTATE_INTEGRATION)
-    return {name: np.array(getattr(data, name)) for name in FIELDS}
+    return {name: np.array(getattr(data, name)) for name in STEP_FIELDS}
 
 
-def frames(engine: str, runs: Runs) -> Iterator[Frame]:
-    """Every step of all worlds by MJX or MuJoCo Warp.
+def iterate_frames(engine: str, runs: Runs) -> Iterator[Frame]:
+    """Step all worlds by MJX or MuJoCo Warp and yield the frame of each step.
 
     Raises
     ------
     InputError
-        The package is not installed, or does not take the model.
+        The package is not installed, or does not accept the model.
     CapabilityError
-        MuJoCo Warp has no room for the rows of a world.
+        A world has more rows than MuJoCo Warp has memory for.
     """
     mj, model = runs.load()
     model = copy.copy(model)
     model.opt.jacobian = mj.mjtJacobian.mjJAC_DENSE
     starts = [runs.start(mj, model, world) for world in range(runs.worlds)]
     drives = [runs.drive(model, world) for world in range(runs.worlds)]
-    names = ("qpos", "qvel") if runs.starts is None else BEGIN
-    begin = {name: np.array([getattr(d, name) for d in starts], np.float32) for name in names}
+    names = ("qpos", "qvel") if runs.starts is None else START_FIELDS
+    start_arrays = {name: np.array([getattr(d, name) for d in starts], np.float32) for name in names}
     try:
-        step = {"mjx": _mjx, "mujoco_warp": _warp}[engine](mj, model, begin)
+        step = {"mjx": _mjx, "mujoco_warp": _warp}[engine](mj, model, start_arrays)
     except ImportError as error:
         package = {"mjx": "mujoco-mjx", "mujoco_warp": "mujoco-warp"}[engine]
         raise InputError(f"engine {engine!r} cannot be imported ({error}): pip install {package}") from None
     except (NotImplementedError, ValueError) as error:
-        raise InputError(f"engine {engine!r} does not take {runs.model}: {error}") from None
+        raise InputError(f"engine {engine!r} does not accept {runs.model}: {error}") from None
     dt = float(model.opt.timestep)
     for k in range(runs.steps):
         ctrl = np.array([drive(d, k) for drive, d in zip(drives, starts, strict=True)], np.float32)
-        state, efc, mass, contact, rest = step(ctrl)
-        where, address, dim, rub, _ = contact
-        given = {f"efc_{name}": x for name, x in efc.items()} | rest
+        state, efc, mass, contact, extra = step(ctrl)
+        world_of, address, dim, friction, _ = contact
+        problem_arrays = {f"efc_{name}": x for name, x in efc.items()} | extra
         triangle = mass, model.M_colind, np.append(model.M_rowadr, len(model.M_colind))
-        given |= {"M": mass if mass.ndim == 3 else triangle, "qvel": state["qvel"]}
-        made = from_efc(**given, timestep=dt, contacts=(where, address, dim, rub))
-        made.batch.names_of = _namer(mj, model, made.batch, efc["type"], contact)
-        assert made.impulse is not None
-        yield Frame(made.batch, made.impulse, state, *_sizes_of(efc["J"], rest.get("nefc"), where, address))
+        problem_arrays |= {"M": mass if mass.ndim == 3 else triangle, "qvel": state["qvel"]}
+        problems = from_efc(**problem_arrays, timestep=dt, contacts=(world_of, address, dim, friction))
+        problems.batch.names_of = _block_namer(mj, model, problems.batch, efc["type"], contact)
+        assert problems.impulse is not None
+        yield Frame(
+            problems.batch,
+            problems.impulse,
+            state,
+            *_sizes_of(efc["J"], extra.get("nefc"), world_of, address),
+        )
 
 
-def _sizes_of(jac: Any, nefc: Any, where: Any, address: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Count the rows of each world that are not padding (zeros of J), and the contacts that begin with one."""
-    acts = (jac != 0.0).any(axis=2)
+def _sizes_of(jac: Any, nefc: Any, world_of: Any, address: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Count the rows of each world that are not padding (zeros of J), and the contacts that begin with such a row."""
+    is_active = (jac != 0.0).any(axis=2)
     if nefc is not None:
-        acts &= np.arange(acts.shape[1]) < nefc[:, None]
-    has_row = (address >= 0) & (address < acts.shape[1])
-    has_row[has_row] = acts[where[has_row], address[has_row]]
-    return acts.sum(axis=1), np.bincount(where[has_row], minlength=len(jac))
+        is_active &= np.arange(is_active.shape[1]) < nefc[:, None]
+    has_row = (address >= 0) & (address < is_active.shape[1])
+    has_row[has_row] = is_active[world_of[has_row], address[has_row]]
+    return is_active.sum(axis=1), np.bincount(world_of[has_row], minlength=len(jac))
 
 
-def _mjx(mj: Any, model: Any, begin: dict[str, Any]) -> Any:
+def _mjx(mj: Any, model: Any, start_arrays: dict[str, Any]) -> Any:
+    """Return the function that steps all worlds with MJX and returns the data of the step."""
     import jax
     from mujoco import mjx
 
-    held = mjx.put_model(model)
+    device_model = mjx.put_model(model)
     first = mjx.make_data(model)
-    data = jax.vmap(lambda own: first.replace(**own))(begin)
+    data = jax.vmap(lambda own: first.replace(**own))(start_arrays)
 
-    def one(d: Any, c: Any) -> Any:
+    def step_world(d: Any, c: Any) -> Any:
         d = d.replace(ctrl=c)
-        return d, mjx.forward(held, d), mjx.step(held, d)
+        return d, mjx.forward(device_model, d), mjx.step(device_model, d)
 
-    both = jax.jit(jax.vmap(one))
+    step_worlds = jax.jit(jax.vmap(step_world))
 
     def step(ctrl: Any) -> Any:
         nonlocal data
-        before, now, data = both(data, ctrl)
+        before, now, data = step_worlds(data, ctrl)
         e, n = now._impl, len(ctrl)
         efc = {name: np.asarray(getattr(e, f"efc_{name}")) for name in
                ("J", "D", "aref", "type", "frictionloss", "force")}  # fmt: skip
@@ -335,70 +376,75 @@ def _mjx(mj: Any, model: Any, begin: dict[str, Any]) -> Any:
             np.repeat(np.arange(n), size), address.ravel(), _flat(c.dim, n, size), _flat(c.friction, n, size, 5),
             _flat(c.geom, n, size, 2),
         )  # fmt: skip
-        state = {name: np.asarray(getattr(before, name)) for name in FIELDS}
-        rest = {"qacc_smooth": np.asarray(now.qacc_smooth), "qfrc_smooth": np.asarray(now.qfrc_smooth)}
-        return state, efc, np.asarray(e.M), contact, rest
+        state = {name: np.asarray(getattr(before, name)) for name in STEP_FIELDS}
+        extra = {"qacc_smooth": np.asarray(now.qacc_smooth), "qfrc_smooth": np.asarray(now.qfrc_smooth)}
+        return state, efc, np.asarray(e.M), contact, extra
 
     return step
 
 
 def _flat(x: Any, n: int, size: int, *each: int) -> Any:
-    """Of all contacts of n worlds, one after the other."""
+    """Concatenate an array over the contacts of n worlds."""
     return np.broadcast_to(np.asarray(x), (n, size, *each)).reshape(n * size, *each)
 
 
-def _warp(mj: Any, model: Any, begin: dict[str, Any]) -> Any:
+def _warp(mj: Any, model: Any, start_arrays: dict[str, Any]) -> Any:
+    """Return the function that steps all worlds with MuJoCo Warp and returns the data of the step."""
     import mujoco_warp as mjw
     import warp as wp
 
-    wp.config.log_level = getattr(wp, "LOG_WARNING", 30)  # not a line for each kernel
+    wp.config.log_level = getattr(wp, "LOG_WARNING", 30)  # Do not print a line for each kernel.
     first = mj.MjData(model)
     mj.mj_forward(model, first)
-    rows = max(ROOM, 2 * int(first.nefc))
-    held, n = mjw.put_model(model), len(begin["qpos"])
+    rows = max(MIN_WARP_ROWS, 2 * int(first.nefc))
+    device_model, n = mjw.put_model(model), len(start_arrays["qpos"])
     data = mjw.put_data(model, first, nworld=n, njmax=rows, nconmax=rows)
-    for name, x in begin.items():
+    for name, x in start_arrays.items():
         if x.size:
             getattr(data, name).assign(x)
 
     def step(ctrl: Any) -> Any:
         data.ctrl.assign(ctrl)
-        state = {name: getattr(data, name).numpy().copy() for name in FIELDS}
-        mjw.forward(held, data)
+        state = {name: getattr(data, name).numpy().copy() for name in STEP_FIELDS}
+        mjw.forward(device_model, data)
         if int(data.nefc.numpy().max()) > rows or int(data.nacon.numpy()[0]) > n * rows:
-            raise CapabilityError(f"a world has more than {rows} rows or contacts, for which room was made")
+            raise CapabilityError(
+                f"a world has more rows or contacts than the {rows} for which memory was allocated"
+            )
         e, c, nv = data.efc, data.contact, model.nv
         efc = {name: getattr(e, name).numpy()[:, :rows].copy() for name in
                ("D", "aref", "type", "frictionloss", "force")}  # fmt: skip
         efc["J"] = e.J.numpy()[:, :rows, :nv].copy()
         k = int(data.nacon.numpy()[0])
         parts = [c.worldid, c.efc_address, c.dim, c.friction, c.geom]
-        where, address, dim, rub, geom = (x.numpy()[:k].copy() for x in parts)
-        rest = {name: getattr(data, name).numpy().copy() for name in ("qacc_smooth", "qfrc_smooth")}
-        made = state, efc, data.M.numpy().copy(), (where, address[:, 0], dim, rub, geom)
-        rest["nefc"] = data.nefc.numpy().copy()
-        mjw.step(held, data)
-        return *made, rest
+        world_of, address, dim, friction, geom = (x.numpy()[:k].copy() for x in parts)
+        extra = {name: getattr(data, name).numpy().copy() for name in ("qacc_smooth", "qfrc_smooth")}
+        step_data = state, efc, data.M.numpy().copy(), (world_of, address[:, 0], dim, friction, geom)
+        extra["nefc"] = data.nefc.numpy().copy()
+        mjw.step(device_model, data)
+        return *step_data, extra
 
     return step
 
 
-def _namer(mj: Any, model: Any, batch: Batch, of: IntArray, contact: Any) -> Any:
-    """Names of the blocks of a world, by the type of its rows and the geoms of its contacts."""
-    where, address, _, _, geom = contact
+def _block_namer(mj: Any, model: Any, batch: Batch, row_types: IntArray, contact: Any) -> Any:
+    """Return the function that names a world's blocks by the types of its rows and the geoms of its contacts."""
+    world_of, address, _, _, geom = contact
 
     def geom_name(g: Any) -> str:
+        """Return the name of a geom, or its index without one."""
         return mj.mj_id2name(model, mj.mjtObj.mjOBJ_GEOM, int(g)) or str(int(g))
 
     def names_of(i: int) -> list[str]:
-        types = np.broadcast_to(of, (len(batch), of.shape[-1]))[i]
-        first = {int(address[k]): k for k in np.flatnonzero((where == i) & (address >= 0))}
-        names, word, begun = [], "contact", 0
+        """Return the names of the blocks of world i."""
+        types = np.broadcast_to(row_types, (len(batch), row_types.shape[-1]))[i]
+        first = {int(address[k]): k for k in np.flatnonzero((world_of == i) & (address >= 0))}
+        names, name, first_row = [], "contact", 0
         for row in batch._cones_of(i).ptr[:-1].tolist():
             if row in first:
-                word, begun = f"contact ({', '.join(map(geom_name, geom[first[row]]))})", row
-            edge = f", edge {row - begun}" if int(types[row]) == PYRAMIDAL else ""
-            names.append(KIND.get(int(types[row]), word + edge))
+                name, first_row = f"contact ({', '.join(map(geom_name, geom[first[row]]))})", row
+            edge = f", edge {row - first_row}" if int(types[row]) == PYRAMIDAL_CONTACT else ""
+            names.append(BLOCK_KINDS.get(int(types[row]), name + edge))
         return names
 
     return names_of

@@ -1,20 +1,21 @@
-"""MuJoCo's settings on worlds of one model: time of a step beside error, and the `<option>` line to copy.
+"""Measure MuJoCo's settings on worlds of one model: time of a step, error, and the `<option>` line to copy.
 
     found = tune("ant.xml", worlds=16, steps=200)
     found.faster, found.closer; found.summary_page.write("lavender-tune")
 
-Even worlds are chosen on, odd ones held back. Each world is cut into stretches of `horizon` steps of a run with the
-settings that the model has. From the start of each, a setting makes its own steps, warm from its own answers:
+Settings are chosen on the worlds with even numbers; those with odd numbers are held back. Each world is cut into
+stretches of `horizon` steps of a run with the model's own settings. From the start of each stretch, a setting makes its
+own steps, warm-started from its own answers:
 
-    time    of mj_step, the mean of all steps [s], of each the least of several repetitions, in which settings alternate
+    time    of mj_step, mean of all steps [s]; of each step the minimum of several repeats, in which settings alternate
     error   of the engine's answer to the problem of each step, by the judge [m/s]
-    motion  how far the body that is furthest off is, after `horizon` steps, from where the converged run has it [m]
+    motion  largest distance of a body, after `horizon` steps, from its position in the converged run [m]
 
 If fewer than `MIN_CONTACT_SHARE` of the steps have contact, only the model's own setting is measured and no line is
 recommended.
 
-A cone, impratio or noslip other than the model's is another problem: its error is that of its own, its motion says how
-far it leads away, and no line names it.
+A cone, impratio or noslip other than the model's defines another problem: its error is measured on its own problem, its
+motion shows how far it deviates, and no line recommends it.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ from lavender.batch.residuals import residual_many
 from lavender.io.efc import from_mujoco_many
 from lavender.io.recording import Control
 from lavender.judge.residuals import DEFAULT_THRESHOLD
-from lavender.lab.audit import AT_ONCE
+from lavender.lab.audit import MAX_PROBLEMS_IN_MEMORY
 from lavender.lab.bench.running.runner import Event
 from lavender.lab.report.figures import Curve, Figure
 from lavender.lab.report.summary_page import PageSection, SummaryPage
@@ -45,20 +46,26 @@ from lavender.lab.report.text import format_ratio, format_size
 from lavender.lab.simulated_worlds import Runs, StepSizes, can_touch, has_diverged, simulate_world
 from lavender.problem.derived import cached_property
 
-WORST = 0.99  # quantile of the error by which settings are compared
-EQUAL = 0.05  # share of a time by which two may differ and be called equal: noise is a few per cent
-SLOW = 2.0  # times the time now, above which a setting is timed no more
-TRIAL = 2  # repetitions after which settings near the front are varied
-NEAR = 1.5  # times the time now, up to which settings of the front are varied
+ERROR_QUANTILE = 0.99  # Settings are compared by this quantile of the error.
+TIME_NOISE_FRACTION = (
+    0.05  # Times that differ by at most this fraction count as equal: noise is a few per cent.
+)
+MAX_TIME_RATIO = (
+    2.0  # A setting is timed no further if it takes longer than this multiple of the present setting.
+)
+N_TRIAL_ROUNDS = 2  # Settings near the front are varied after this many rounds.
+# Settings of the front are varied if they take at most this multiple of the present setting's time.
+MAX_VARIED_TIME_RATIO = 1.5
 TOLERANCES = (1e-3, 1e-4, 1e-6, 1e-8, 1e-10, 1e-12, 1e-15)
 ITERATIONS = {"Newton": (1, 2, 3, 5, 10), "CG": (3, 6, 12, 25, 50), "PGS": (3, 6, 12, 25, 50, 100)}
+# Prefixes of MuJoCo's enumerators; the rest of the name is the MJCF keyword.
 ENUMS = {
     "solver": "mjSOL_",
     "cone": "mjCONE_",
     "jacobian": "mjJAC_",
-}  # what words of MJCF begin with in MuJoCo
+}
 OPTIONS = ("solver", "iterations", "tolerance", "ls_iterations", "ls_tolerance", "jacobian")
-OTHER = ("cone", "impratio", "noslip_iterations")  # of another problem
+PROBLEM_OPTIONS = ("cone", "impratio", "noslip_iterations")  # Options that change the problem.
 CONVERGED = {
     "solver": "Newton",
     "iterations": 300,
@@ -76,76 +83,99 @@ class Setting:
 
     @classmethod
     def of(cls, mj: Any, model: Any, **options: Any) -> Setting:
-        """Those that differ, in the order of `OPTIONS`."""
-        has = {name: _word(mj, model, name) for name in (*OPTIONS, *OTHER)}
+        """Create the setting of the options that differ from the model's, in the order of `OPTIONS`."""
+        has = {name: _option_value(mj, model, name) for name in (*OPTIONS, *PROBLEM_OPTIONS)}
         return cls(tuple((name, options[name]) for name in has if options.get(name, has[name]) != has[name]))
 
     def on(self, mj: Any, model: Any) -> Any:
-        """A copy of the model with these."""
-        made = copy.copy(model)
+        """Return a copy of the model with these options."""
+        configured = copy.copy(model)
         for name, x in self.options:
             kind = ENUMS.get(name)
-            setattr(made.opt, name, x if kind is None else _values(mj, name)[x])
-        return made
+            setattr(configured.opt, name, x if kind is None else _keyword_values(mj, name)[x])
+        return configured
 
     @property
     def line(self) -> str:
-        """To copy into the model; empty where nothing differs."""
-        said = (f'{name}="{x:g}"' if isinstance(x, float) else f'{name}="{x}"' for name, x in self.options)
-        return f"<option {' '.join(said)}/>" if self.options else ""
+        """`<option>` line to copy into the model; empty if no option differs."""
+        texts = (f'{name}="{x:g}"' if isinstance(x, float) else f'{name}="{x}"' for name, x in self.options)
+        return f"<option {' '.join(texts)}/>" if self.options else ""
 
     @property
     def is_other(self) -> bool:
-        """Another problem than the model's."""
-        return any(name in OTHER for name, _ in self.options)
+        """Whether the setting defines another problem than the model's."""
+        return any(name in PROBLEM_OPTIONS for name, _ in self.options)
 
 
-def _values(mj: Any, name: str) -> dict[str, Any]:
+def _keyword_values(mj: Any, name: str) -> dict[str, Any]:
+    """Return {MJCF keyword: MuJoCo's value} of an enumerated option."""
     members = getattr(mj, f"mjt{name.capitalize()}").__members__
-    words = {"NEWTON": "Newton", "CG": "CG", "PGS": "PGS"}
+    keywords = {"NEWTON": "Newton", "CG": "CG", "PGS": "PGS"}
     short = ((key.removeprefix(ENUMS[name]), value) for key, value in members.items())
-    return {words.get(key, key.lower()): value for key, value in short}
+    return {keywords.get(key, key.lower()): value for key, value in short}
 
 
-def _word(mj: Any, model: Any, name: str) -> Any:
+def _option_value(mj: Any, model: Any, name: str) -> Any:
+    """Return the model's value of an option as MJCF writes it."""
     x = getattr(model.opt, name)
     if name not in ENUMS:
         return float(x) if isinstance(x, float) else int(x)
-    return next(word for word, value in _values(mj, name).items() if int(value) == int(x))
+    return next(word for word, value in _keyword_values(mj, name).items() if int(value) == int(x))
 
 
 @dataclass(eq=False)
 class Measured:
-    """One setting on some worlds."""
+    """Results of one setting on some worlds.
+
+    Parameters
+    ----------
+    setting : Setting
+    solver : str
+    error : (steps,) m/s
+    motion : (stretches,) m
+    times : (steps,) s
+        Each the minimum of all repeats, which removes interruptions.
+    rows, contacts : (steps,) int
+    """
 
     setting: Setting
     solver: str
-    error: FloatArray = field(repr=False)  # (steps,) m/s
-    motion: FloatArray = field(repr=False)  # (stretches,) m
-    # (steps,) s, each the least of all repetitions: what interrupts one is no part of it
+    error: FloatArray = field(repr=False)
+    motion: FloatArray = field(repr=False)
     times: FloatArray = field(repr=False)
-    rows: Any = field(default=(), repr=False)  # (steps,) int
+    rows: Any = field(default=(), repr=False)
     contacts: Any = field(default=(), repr=False)
 
     @property
     def time(self) -> float:
-        """Of a step [s]; infinite where it was not timed."""
+        """Mean time of a step [s]; infinite if it was not timed."""
         return float(self.times.mean())
 
     @property
     def worst(self) -> float:
-        """Error that one step of a hundred exceeds [m/s]."""
-        return float(np.quantile(self.error, WORST, method="higher"))
+        """Error that one step in a hundred exceeds [m/s]."""
+        return float(np.quantile(self.error, ERROR_QUANTILE, method="higher"))
 
     @property
     def worst_motion(self) -> float:
-        """Distance that one stretch of a hundred exceeds [m]."""
-        return float(np.quantile(self.motion, WORST, method="higher"))
+        """Distance that one stretch in a hundred exceeds [m]."""
+        return float(np.quantile(self.motion, ERROR_QUANTILE, method="higher"))
 
 
 @dataclass(eq=False)
 class Stage:
-    """Worlds on which settings are measured: starts (n, size), controls (n, horizon, nu), where bodies converge to."""
+    """Worlds on which settings are measured.
+
+    Parameters
+    ----------
+    mj, model
+        The module mujoco and the model with its own setting.
+    starts : (n, size)
+        State at the start of each stretch.
+    controls : (n, horizon, nu)
+    ends : (n, bodies, 3) m
+        Positions of the bodies after each stretch of the converged run.
+    """
 
     mj: Any
     model: Any
@@ -155,27 +185,31 @@ class Stage:
 
     @classmethod
     def of(cls, mj: Any, model: Any, runs: Runs, worlds: Iterable[int], horizon: int) -> Stage:
-        """Stretches of worlds that run with the model's own setting."""
+        """Cut worlds that run with the model's own setting into stretches."""
         starts, controls = [], []
         for world in worlds:
             drive = runs.drive(model, world)
-            each = np.array([drive(None, step) for step in range(runs.steps)])
-            ctrl = each.reshape(runs.steps // horizon, horizon, model.nu)
+            world_controls = np.array([drive(None, step) for step in range(runs.steps)])
+            ctrl = world_controls.reshape(runs.steps // horizon, horizon, model.nu)
             starts.append(simulate_world(mj, model, runs, world)[0][::horizon])
             controls.append(ctrl)
-        made = cls(mj, model, np.concatenate(starts), np.concatenate(controls))
+        configured = cls(mj, model, np.concatenate(starts), np.concatenate(controls))
         try:
-            made.ends = made.run(Setting.of(mj, model, **CONVERGED).on(mj, model))[1]
+            configured.ends = configured.run(Setting.of(mj, model, **CONVERGED).on(mj, model))[1]
         except mj.FatalError as error:
             raise InputError(f"{runs.model}: MuJoCo ends in an error, {error}") from None
-        return made
+        return configured
 
     def run(self, model: Any, states: FloatArray | None = None) -> tuple[FloatArray, FloatArray]:
-        """Seconds of each step, and places of bodies after each stretch (n, bodies, 3) [m]; states before each step."""
+        """Run all stretches.
+
+        Returns (seconds of each step, positions of bodies after each stretch (n, bodies, 3) [m]), and stores the state
+        before each step in `states`.
+        """
         mj, kind = self.mj, self.mj.mjtState.mjSTATE_INTEGRATION
         data = mj.MjData(model)
         n, horizon, _ = self.controls.shape
-        spent = np.empty(n * horizon)
+        step_times = np.empty(n * horizon)
         ends = np.empty((n, model.nbody, 3))
         for i in range(n):
             mj.mj_setState(model, data, self.starts[i], kind)
@@ -185,16 +219,16 @@ class Stage:
                     mj.mj_getState(model, data, states[horizon * i + k], kind)
                 begin = perf_counter()
                 mj.mj_step(model, data)
-                spent[horizon * i + k] = perf_counter() - begin
+                step_times[horizon * i + k] = perf_counter() - begin
             mj.mj_kinematics(model, data)
             ends[i] = np.nan if has_diverged(mj, data) else data.xpos
-        return spent, ends
+        return step_times, ends
 
-    def measured(self, setting: Setting) -> Measured:
+    def measure(self, setting: Setting) -> Measured:
         """Judge a setting without timing it; its errors are infinite if a world diverges."""
         mj, model = self.mj, setting.on(self.mj, self.model)
         never = np.full(1, np.inf)
-        apart = Measured(setting, str(_word(mj, model, "solver")), never, never, never)
+        result = Measured(setting, str(_option_value(mj, model, "solver")), never, never, never)
         states = np.empty((self.controls.shape[0] * self.controls.shape[1], self.starts.shape[1]))
         judge = copy.copy(model)
         judge.opt.noslip_iterations = 0
@@ -203,50 +237,55 @@ class Stage:
         contacts: list[Any] = []
         try:
             ends = self.run(model, states)[1]
-            for i in range(0, len(states), AT_ONCE):
-                batch, impulse = from_mujoco_many(judge, states[i : i + AT_ONCE], errors="status")
+            for i in range(0, len(states), MAX_PROBLEMS_IN_MEMORY):
+                batch, impulse = from_mujoco_many(
+                    judge, states[i : i + MAX_PROBLEMS_IN_MEMORY], errors="status"
+                )
                 errors.append(residual_many(batch, impulse, errors="status").velocity_error)
                 rows.append(batch.row_counts)
                 contacts.append(batch.contact_counts)
-        except (mj.FatalError, InputError):  # of a step, of its forward pass
-            return apart
-        off = np.linalg.norm(ends - self.ends, axis=2).max(axis=1)
-        if np.isnan(off).any():
-            return apart
+        except (mj.FatalError, InputError):  # A step or a forward pass failed.
+            return result
+        distance = np.linalg.norm(ends - self.ends, axis=2).max(axis=1)
+        if np.isnan(distance).any():
+            return result
         sizes: dict[str, Any] = {"rows": np.concatenate(rows), "contacts": np.concatenate(contacts)}
-        return replace(apart, error=np.nan_to_num(np.concatenate(errors), nan=np.inf), motion=off, **sizes)
+        return replace(
+            result, error=np.nan_to_num(np.concatenate(errors), nan=np.inf), motion=distance, **sizes
+        )
 
-    def time(self, some: list[Measured], repeats: int, tell: Callable[[str], None]) -> None:
-        """Time the steps of several repetitions in which all alternate, the first of them the model's own setting.
+    def time(self, settings: list[Measured], repeats: int, report_progress: Callable[[str], None]) -> None:
+        """Time the steps of several rounds in which all settings alternate; the first is the model's own.
 
         A setting with which a world diverges is not timed.
         """
-        some = [m for m in some if np.isfinite(m.error).all()]
-        models = [m.setting.on(self.mj, self.model) for m in some]
-        for turn in range(repeats):
-            for m, model in zip(some, models, strict=True):
-                # Medians: one step that was interrupted in the first round says nothing of a setting.
-                if turn == 0 or np.median(m.times) <= SLOW * np.median(some[0].times):
+        settings = [m for m in settings if np.isfinite(m.error).all()]
+        models = [m.setting.on(self.mj, self.model) for m in settings]
+        for round_index in range(repeats):
+            for m, model in zip(settings, models, strict=True):
+                # Medians: a step that is interrupted in the first round does not exclude a setting.
+                if round_index == 0 or np.median(m.times) <= MAX_TIME_RATIO * np.median(settings[0].times):
                     m.times = np.minimum(m.times, self.run(model)[0])
-                    tell("timed")
+                    report_progress("timed")
 
 
 @dataclass(frozen=True, eq=False)
 class Tuning:
-    """What `tune` found; the first of `measured` and of `held` is the model's own setting.
+    """Result of `tune`; the first of `measured` and of `held` is the model's own setting.
 
     Parameters
     ----------
     runs : Runs
     horizon : int
-        Steps of a stretch.
+        Number of steps of a stretch.
     measured : list of Measured
-        On the even worlds.
+        Results on the worlds with even numbers.
     held : list of Measured
-        The own setting and those chosen, on the odd worlds; empty where Ctrl-C came before.
+        Results of the model's own setting and those chosen on the worlds with odd numbers; empty if Ctrl-C came before.
     threshold : float, m/s, m
-        Error, and distance, below which nobody asks for less.
+        Smaller errors and distances count as accurate enough.
     stopped : bool
+        The measurement was stopped by Ctrl-C.
     sizes : StepSizes, optional
         Rows and contacts of the steps of all worlds with the model's own setting.
     """
@@ -261,47 +300,52 @@ class Tuning:
 
     @property
     def now(self) -> Measured:
-        """The model's own setting."""
+        """Result of the model's own setting."""
         return self.measured[0]
 
     @property
-    def _own(self) -> list[Measured]:
+    def _same_problem(self) -> list[Measured]:
+        """Timed settings that do not change the problem."""
         return [m for m in self.measured if not m.setting.is_other and np.isfinite(m.time)]
 
     def _holds(self, m: Measured) -> bool:
-        """No further off than now in its worst steps and in motion, or within the threshold."""
-        now, most = self.now, self.threshold
+        """Whether worst error and motion are at most the present setting's, or within the threshold."""
+        now, threshold = self.now, self.threshold
         pairs = ((m.error.max(), now.error.max()), (m.worst_motion, now.worst_motion))
-        return all(x <= max(own, most) for x, own in pairs)
+        return all(x <= max(own, threshold) for x, own in pairs)
 
     @cached_property
     def faster(self) -> Measured | None:
-        """As accurate as now, or within the threshold, and fastest."""
+        """Fastest setting that is at least as accurate as the present one, or within the threshold; None if none is."""
         now = self.now
-        good = [m for m in self._own if m.worst <= max(now.worst, self.threshold) and self._holds(m)]
+        good = [m for m in self._same_problem if m.worst <= max(now.worst, self.threshold) and self._holds(m)]
         best = min(good, key=lambda m: m.time)
-        return best if best.time < (1.0 - EQUAL) * now.time else None
+        return best if best.time < (1.0 - TIME_NOISE_FRACTION) * now.time else None
 
     @cached_property
     def closer(self) -> Measured | None:
-        """As fast as now, and most accurate; None where now is within the threshold."""
+        """Most accurate setting that is as fast as the present one; None if that is within the threshold."""
         now = self.now
-        good = [m for m in self._own if m.time <= (1.0 + EQUAL) * now.time and self._holds(m)]
+        good = [
+            m
+            for m in self._same_problem
+            if m.time <= (1.0 + TIME_NOISE_FRACTION) * now.time and self._holds(m)
+        ]
         best = min(good, key=lambda m: m.worst)
         return best if best.worst < now.worst > self.threshold else None
 
     @property
     def front(self) -> list[Measured]:
-        """Settings that no other beats in both, the fastest first."""
-        kept: list[Measured] = []
-        for m in sorted(self._own, key=lambda m: (m.time, m.worst)):
-            if not kept or m.worst < kept[-1].worst:
-                kept.append(m)
-        return kept
+        """Settings that no other setting beats in both time and error, fastest first."""
+        front: list[Measured] = []
+        for m in sorted(self._same_problem, key=lambda m: (m.time, m.worst)):
+            if not front or m.worst < front[-1].worst:
+                front.append(m)
+        return front
 
     @property
     def why_no_line(self) -> str:
-        """Why no line is recommended; empty if enough of the steps have contact."""
+        """Reason why no line is recommended; empty if enough of the steps have contact."""
         if self.sizes is None or self.sizes.is_enough:
             return ""
         if not self.sizes.can_touch:
@@ -316,33 +360,34 @@ class Tuning:
         """Lines to copy, and their results on the worlds held back; none if too few steps have contact."""
         if self.why_no_line:
             return []
-        none = f"none of {len(self._own)} settings"
+        none = f"none of {len(self._same_problem)} settings"
         enough = f"not needed, {format_size(self.now.worst)} m/s is within {self.threshold:g}"
         closer = enough if self.now.worst <= self.threshold else none
-        said = []
-        for word, m, why, gains, most in (
-            ("as accurate as now, faster", self.faster, none, "time", 1.0 - EQUAL),
+        lines = []
+        for description, m, reason, gains, max_ratio in (
+            ("as accurate as now, faster", self.faster, none, "time", 1.0 - TIME_NOISE_FRACTION),
             ("as fast as now, more accurate", self.closer, closer, "worst", 1.0),
         ):
             if m is None:
-                said.append(f"{word}: {why}")
+                lines.append(f"{description}: {reason}")
                 continue
             held = next((h for h in self.held[1:] if h.setting == m.setting), None)
-            if held is not None and getattr(held, gains) >= most * getattr(self.held[0], gains):
-                word += ": not on the worlds held back"
-            said += [
-                f"{m.setting.line}  <!-- {word} -->", f"    chosen on: {_beside(m, self.now)}",
-                f"    held back: {'not measured' if held is None else _beside(held, self.held[0])}",
+            if held is not None and getattr(held, gains) >= max_ratio * getattr(self.held[0], gains):
+                description += ": not on the worlds held back"
+            lines += [
+                f"{m.setting.line}  <!-- {description} -->", f"    chosen on: {_compare(m, self.now)}",
+                f"    held back: {'not measured' if held is None else _compare(held, self.held[0])}",
             ]  # fmt: skip
-        return said
+        return lines
 
-    def _table(self, some: Iterable[Measured]) -> Table:
+    def _table(self, settings: Iterable[Measured]) -> Table:
+        """Build the table of some settings."""
         rows = [
             [
                 m.setting.line or "as it is", seconds(m.time), f"{m.time / self.now.time:.2f}", format_size(m.worst),
                 format_size(float(m.error.max())), format_size(m.worst_motion),
             ]
-            for m in some
+            for m in settings
         ]  # fmt: skip
         heads = [
             "setting",
@@ -356,29 +401,29 @@ class Tuning:
 
     @property
     def figure(self) -> Figure:
-        """Error against time: every setting, the front, and what the model has."""
+        """Error over time: every setting, the front, and the model's own setting."""
 
-        def curve(name: str, some: list[Measured], **more: Any) -> Curve:
-            notes = tuple(m.setting.line for m in some)
-            return replace(Curve.of(name, name, [(m.time, m.worst) for m in some], notes=notes), **more)
+        def curve(name: str, settings: list[Measured], **more: Any) -> Curve:
+            notes = tuple(m.setting.line for m in settings)
+            return replace(Curve.of(name, name, [(m.time, m.worst) for m in settings], notes=notes), **more)
 
-        by = {s: [m for m in self._own if m.solver == s] for s in ITERATIONS}
-        parts = [curve(s, some, points=True) for s, some in by.items() if some]
+        by = {s: [m for m in self._same_problem if m.solver == s] for s in ITERATIONS}
+        parts = [curve(s, settings, points=True) for s, settings in by.items() if settings]
         parts += [curve("front", self.front), curve("as it is", [self.now], points=True)]
         return Figure("time-and-error", Path(self.runs.model).name, "time of a step [s]",
                       "error that 1 % of the steps exceed [m/s]", tuple(parts), x_log=True)  # fmt: skip
 
     @property
     def summary_page(self) -> SummaryPage:
-        """The page."""
+        """The summary page."""
         now = self.now
         head = (
-            f"{Path(self.runs.model).name}: a step takes {seconds(now.time)}, and 1 % of the steps are more than "
-            f"{format_size(now.worst)} m/s off."
+            f"{Path(self.runs.model).name}: a step takes {seconds(now.time)}, and 1 % of the steps have errors above "
+            f"{format_size(now.worst)} m/s."
         )
         if self.closer is not None:
             gain = format_ratio(now.worst / self.closer.worst) if self.closer.worst else "exact:"
-            head += f" In the same time it can be {gain} less."
+            head += f" In the same time the error can be {gain} less."
         if self.why_no_line:
             head += f" {self.why_no_line}"
         other = [m for m in self.measured if m.setting.is_other]
@@ -391,7 +436,7 @@ class Tuning:
             [
                 PageSection("Lines to copy", code=self.lines,
                      note="None, for the reason above." if self.why_no_line
-                     else "Chosen on the even worlds, tried on the odd ones."),
+                     else "Chosen on the worlds with even numbers, tested on the others."),
                 PageSection("Rows and contacts", sizes, short=2, note="Of the steps with the model's own setting."),
                 PageSection("The front of time and error", [self._table(shown)], figures, short=5),
                 PageSection("Other problems", [self._table(other)], short=2,
@@ -400,22 +445,24 @@ class Tuning:
             ],
             {"model": self.runs.model, "lines": self.lines, "why_no_line": self.why_no_line,
              **({} if self.sizes is None else self.sizes.numbers), "stopped": self.stopped,
-             "measured": [_told(m) for m in self.measured], "held": [_told(m) for m in self.held]},
+             "measured": [_to_dict(m) for m in self.measured], "held": [_to_dict(m) for m in self.held]},
             self.stopped,
         )  # fmt: skip
 
 
-def _beside(m: Measured, now: Measured) -> str:
-    return f"{m.time / now.time:.2f} of the time, error {format_size(m.worst)} m/s beside {format_size(now.worst)}"
+def _compare(m: Measured, now: Measured) -> str:
+    """Compare time and error of a setting with the present ones."""
+    return f"{m.time / now.time:.2f} of the time, error {format_size(m.worst)} m/s instead of {format_size(now.worst)}"
 
 
-def _told(m: Measured) -> dict[str, Any]:
+def _to_dict(m: Measured) -> dict[str, Any]:
+    """Convert a result to a dict for JSON."""
     return {"options": dict(m.setting.options), "seconds": m.time, "error": m.worst,
             "worst": float(m.error.max()), "motion": m.worst_motion}  # fmt: skip
 
 
 def grid(mj: Any, model: Any) -> list[Setting]:
-    """What is tried first: each solver to each tolerance and for each number of iterations; then other problems."""
+    """List the first settings: each solver with each tolerance and number of iterations; then other problems."""
     enough = max(100, int(model.opt.iterations))
     tried: list[dict[str, Any]] = [{}]
     for solver, budgets in ITERATIONS.items():
@@ -426,18 +473,18 @@ def grid(mj: Any, model: Any) -> list[Setting]:
     return list(dict.fromkeys(Setting.of(mj, model, **x) for x in tried))
 
 
-def around(mj: Any, model: Any, setting: Setting) -> list[Setting]:
-    """A setting with another line search, and with J stored the other way."""
-    whole = dict(setting.options)
+def vary(mj: Any, model: Any, setting: Setting) -> list[Setting]:
+    """List variants of a setting: other line searches, and dense instead of sparse J or the reverse."""
+    options = dict(setting.options)
     stored = "dense" if mj.mj_isSparse(model) else "sparse"
     tried: list[dict[str, Any]] = [{"jacobian": stored}]
-    if whole.get("solver", _word(mj, model, "solver")) != "PGS":
+    if options.get("solver", _option_value(mj, model, "solver")) != "PGS":
         tried += [{"ls_tolerance": x} for x in (0.1, 1e-3)] + [{"ls_iterations": n} for n in (5, 15, 50)]
         tried += [{"jacobian": stored, "ls_tolerance": x} for x in (0.1, 1e-3)]
-    return [Setting.of(mj, model, **whole | x) for x in tried]
+    return [Setting.of(mj, model, **options | x) for x in tried]
 
 
-@reject_former_names(ahead="horizon", rounds="repeats")
+@reject_former_names(horizon="horizon", repeats="repeats")
 def tune(
     model: str | os.PathLike[str],
     *,
@@ -457,89 +504,94 @@ def tune(
     Parameters
     ----------
     model : path (MJCF)
-    worlds, steps, control, seed, spread : as `Runs`
-        Half of the worlds are held back; `steps` is a multiple of `horizon`.
+    worlds, steps, control, seed, spread
+        See `Runs`. Half of the worlds are held back; `steps` is a multiple of `horizon`.
     states : path of an .npz, "keyframes", or arrays, optional
-        As of `audit`.
+        See `audit`.
     horizon : int
-        Steps of a stretch.
+        Number of steps of a stretch.
     repeats : int
         Repetitions of the timing, in which settings alternate.
     threshold : float, m/s, m
-        Error, and distance, below which nobody asks for less.
+        Smaller errors and distances count as accurate enough.
     watch : callable, optional
-        Statement of what is done.
+        Called with the progress.
 
     Returns
     -------
     Tuning
-        After Ctrl-C of what was done by then, `stopped`.
+        After Ctrl-C, the result so far, with `stopped`.
 
     Raises
     ------
     InputError
-        A model that cannot be read, fewer than two worlds, or steps that `horizon` does not divide.
+        The model cannot be read, there are fewer than two worlds, or `horizon` does not divide `steps`.
     CapabilityError
-        An integrator whose problem is not of M.
+        The problem of the model's integrator is not one of M.
     """
     own: dict[str, Any] = {"worlds": check_int("worlds", worlds, 2, None), "steps": steps}
     runs = Runs(os.fspath(model), **own, control=control, seed=seed, spread=spread).start_from(states)
-    horizon = check_int("horizon", horizon, 1, None)
-    repeats = check_int("repeats", repeats, 1, None)
+    horizon, repeats = check_int("horizon", horizon, 1, None), check_int("repeats", repeats, 1, None)
     threshold = check_float("threshold", threshold, low=0.0)
     if steps % horizon:
         raise InputError(f"steps is {steps} and horizon {horizon}; a multiple of it is needed")
-    mj, made = runs.load()
-    from_mujoco_many(made, np.zeros((0, made.nq + made.nv)))  # what it refuses is refused here
+    mj, configured = runs.load()
+    # An unsupported model raises here, once.
+    from_mujoco_many(configured, np.zeros((0, configured.nq + configured.nv)))
     done = 0
 
-    def tell(what: str) -> None:
+    def report_progress(text: str) -> None:
+        """Report one more measurement."""
         nonlocal done
         done += 1
         if watch is not None:
-            watch(Event(done, 0, what, ""))
+            watch(Event(done, 0, text, ""))
 
     measured: list[Measured] = []
     held: list[Measured] = []
     sizes: StepSizes | None = None
 
-    def found(stopped: bool) -> Tuning:
+    def make_result(stopped: bool) -> Tuning:
+        """Build the result so far."""
         timed = [m for m in measured if np.isfinite(m.time)]
         return Tuning(runs, horizon, timed, held, threshold=threshold, stopped=stopped, sizes=sizes)
 
     def judge(stage: Stage, settings: list[Setting]) -> list[Measured]:
+        """Judge settings."""
         out = []
         for setting in settings:
-            out.append(stage.measured(setting))
-            tell(setting.line or "as it is")
+            out.append(stage.measure(setting))
+            report_progress(setting.line or "as it is")
         return out
 
     try:
-        stage, held_back = (Stage.of(mj, made, runs, range(i, worlds, 2), horizon) for i in (0, 1))
+        stage, held_back = (Stage.of(mj, configured, runs, range(i, worlds, 2), horizon) for i in (0, 1))
         measured += judge(stage, [Setting()])
         if not np.isfinite(measured[0].error).all():
             raise InputError(f"{runs.model}: these worlds diverge with the model's own setting")
         last = judge(held_back, [Setting()])
         both = [*measured, *last]
         rows, contacts = (np.concatenate([getattr(m, name) for m in both]) for name in ("rows", "contacts"))
-        sizes = StepSizes(rows, contacts, can_touch(mj, made))
+        sizes = StepSizes(rows, contacts, can_touch(mj, configured))
         if not sizes.is_enough:
-            stage.time(measured, repeats, tell)
-            return found(False)
-        measured += judge(stage, grid(mj, made)[1:])
-        stage.time(measured, min(TRIAL, repeats), tell)
-        near = [m.setting for m in found(False).front if m.time <= NEAR * measured[0].time]
+            stage.time(measured, repeats, report_progress)
+            return make_result(False)
+        measured += judge(stage, grid(mj, configured)[1:])
+        stage.time(measured, min(N_TRIAL_ROUNDS, repeats), report_progress)
+        near = [
+            m.setting for m in make_result(False).front if m.time <= MAX_VARIED_TIME_RATIO * measured[0].time
+        ]
         known = {m.setting for m in measured}
-        more = dict.fromkeys(x for s in [Setting(), *near] for x in around(mj, made, s) if x not in known)
+        more = dict.fromkeys(x for s in [Setting(), *near] for x in vary(mj, configured, s) if x not in known)
         measured += judge(stage, list(more))
-        stage.time(measured, repeats, tell)
-        chosen = found(False)
+        stage.time(measured, repeats, report_progress)
+        chosen = make_result(False)
         other = dict.fromkeys(m.setting for m in (chosen.faster, chosen.closer) if m is not None)
         last += judge(held_back, list(other))
-        held_back.time(last, 2 * repeats, tell)
+        held_back.time(last, 2 * repeats, report_progress)
         held += last if np.isfinite(last[0].time) else []
     except KeyboardInterrupt:
         if not measured or not np.isfinite(measured[0].time):
             raise
-        return found(True)
-    return found(False)
+        return make_result(True)
+    return make_result(False)

@@ -46,7 +46,7 @@ def test_numbers_are_those_of_the_run_itself(boxes, options):
 
 
 def test_workers_change_no_bit(boxes, monkeypatch):
-    monkeypatch.setattr(module, "TASK", 20)
+    monkeypatch.setattr(module, "STEPS_PER_TASK", 20)
     path = boxes(EARLY)
     one, two = (audit(path, worlds=4, steps=20, workers=n) for n in (1, 2))
     assert one.numbers.tobytes() == two.numbers.tobytes()
@@ -101,7 +101,7 @@ def frames_in_float32(planted):
 
 def test_the_floor_of_float32_is_told_from_an_early_stop(boxes, monkeypatch):
     planted = {3, 9, 12}
-    monkeypatch.setattr(module, "frames", frames_in_float32(planted))
+    monkeypatch.setattr(module, "iterate_frames", frames_in_float32(planted))
     found = audit(boxes('jacobian="dense"'), worlds=1, steps=16, engine="mjx", threshold=0.0)
     assert set(np.flatnonzero(found.unconverged[0])) == planted
     assert (found.numbers[0, 0] > 1e-9).sum() > len(planted)  # rounding leaves errors that float64 would not
@@ -130,7 +130,7 @@ def test_a_world_of_another_engine_that_diverges_does_not_end_the_audit(boxes, m
             ), {"qpos": both(data.qpos)}, np.full(2, data.nefc), np.full(2, data.ncon))  # fmt: skip
             mj.mj_step(made, data)
 
-    monkeypatch.setattr(module, "frames", frames)
+    monkeypatch.setattr(module, "iterate_frames", frames)
     found = audit(boxes('jacobian="dense"'), worlds=2, steps=10, engine="mjx")
     assert (found.judged, found.unjudged, found.diverged) == (14, 6, 1)
     assert [(d.world, d.step, d.is_outside) for d in found.divergences] == [(1, 4, True)]
@@ -138,7 +138,7 @@ def test_a_world_of_another_engine_that_diverges_does_not_end_the_audit(boxes, m
 
 
 def test_ctrl_c_keeps_what_there_is(boxes, tmp_path, monkeypatch):
-    monkeypatch.setattr(module, "TASK", 20)
+    monkeypatch.setattr(module, "STEPS_PER_TASK", 20)
 
     def watch(event):
         raise KeyboardInterrupt
@@ -384,7 +384,7 @@ def test_an_engine_that_is_not_installed_says_how(boxes, engine, package, monkey
 def test_other_engines_pose_the_problem_that_mujoco_poses(boxes, engine, package, options):
     pytest.importorskip(package, reason="needs the engine")
     path = str(boxes(options + ' iterations="100" ls_iterations="50"'))
-    (frame,) = list(module.frames(engine, Runs(path, 2, 1)))
+    (frame,) = list(module.iterate_frames(engine, Runs(path, 2, 1)))
     made = mj.MjModel.from_xml_path(path)
     for world in range(2):
         data = mj.MjData(made)

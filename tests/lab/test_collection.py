@@ -25,11 +25,11 @@ def test_the_manifest_has_every_problem_of_every_set_in_order():
 
 @pytest.mark.parametrize("start", range(5))
 def test_problems_are_made_again_with_the_same_numbers(start):
-    chosen, _ = collection.makeable(e for e in ENTRIES[start::15] if e.rows < 2000)
+    chosen, _ = collection.select_buildable(e for e in ENTRIES[start::15] if e.rows < 2000)
     chosen = [e for e in chosen if e.made == suite.versions(suite.package_of(e.name))]
-    assert list(collection.changed(chosen)) == []
+    assert list(collection.find_changes(chosen)) == []
     wrong = replace(chosen[0], sha="0" * 16)
-    (line,) = collection.changed([wrong])
+    (line,) = collection.find_changes([wrong])
     assert wrong.name in line and wrong.sha in line
 
 
@@ -46,7 +46,7 @@ def test_no_problem_hangs_on_the_processor(other):
     found = np.show_config(mode="dicts")["SIMD Extensions"].get("found", [])
     if "SkylakeX" in other.values() and not set(found) & set(AVX512.split()):
         pytest.skip("this processor has no AVX-512")
-    changed = "c.changed(e for e in c.load() if not e.made)"
+    changed = "c.find_changes(e for e in c.load() if not e.made)"
     code = f"from lavender.lab import collection as c; print(*{changed}, sep='\\n', end='')"
     assert subprocess.check_output([sys.executable, "-c", code], env=os.environ | other, text=True) == ""
 
@@ -57,7 +57,7 @@ def test_no_problem_hangs_on_the_processor(other):
 def test_what_the_manifest_says_of_a_problem_is_found_again(entry):
     pytest.importorskip("flint")
     (case,) = suite.cases(entry.name)
-    found = collection.certified(case.problem, entry.name, entry.group)
+    found = collection.certify(case.problem, entry.name, entry.group)
     assert (found.known, found.unique, found.sweeps) == (entry.known, entry.unique, entry.sweeps)
     # An answer ends where the floor of another BLAS lets it.
     assert found.radius is None or found.radius <= max(100.0 * entry.radius, 1e-9)
@@ -73,7 +73,7 @@ def test_a_manifest_comes_back_as_it_was_written(tmp_path):
     assert collection.load(tmp_path / "m.json") == ENTRIES
     for text in ("{", "[1]", '[{"name": "x"}]'):
         (tmp_path / "m.json").write_text(text)
-        with pytest.raises(lv.InputError, match="no manifest"):
+        with pytest.raises(lv.InputError, match="not a manifest"):
             collection.load(tmp_path / "m.json")
 
 
@@ -91,7 +91,7 @@ def test_robots_whose_package_is_absent_are_left_out_with_what_to_install(monkey
     )
     assert [s.case for s in records.skips] == names and len(records) == 1
     assert all("lavender-contact[robots]" in s.reason for s in records.skips)
-    here, missing = collection.makeable(ENTRIES)
+    here, missing = collection.select_buildable(ENTRIES)
     assert len(missing) == 2 and not [e for e in here if e.made]
 
 

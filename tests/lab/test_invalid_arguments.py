@@ -68,7 +68,7 @@ CALLS = {
     "bench.solver_names": Call(lambda solvers: bench.solver_names(solvers), {"solvers": ["pgs"]}),
     "bench.carry": Call(bench.carry, {"before": LCP, "impulse": B, "problem": LCP}, {"before": "previous"}),
     "bench.structure_of": Call(bench.structure_of, {"problem": LCP}),
-    "phenomena.chosen": Call(phenomena.chosen, {"names": ["slide"]}),
+    "phenomena.select_phenomena": Call(phenomena.select_phenomena, {"names": ["slide"]}),
     "suite.case": Call(lambda case: suite.case(case), {"case": "stack"}),
     "suite.stack": Call(suite.stack, {"n": 3, "mass_ratio": 2.0, "friction": "none", "sliding": 0.5}),
     "suite.engine_step": Call(suite.engine_step, {"scene": "pyramid", "at": 3}),

@@ -46,7 +46,7 @@ def test_the_converged_run_does_not_move_away_from_itself(boxes):
     runs = Runs(str(boxes()), 1, 20)
     handle, made = runs.load()
     stage = Stage.of(handle, made, runs, [0], 10)
-    same = stage.measured(Setting.of(handle, made, **module.CONVERGED))
+    same = stage.measure(Setting.of(handle, made, **module.CONVERGED))
     assert same.motion.max() == 0.0 and same.worst < 1e-9
 
 
@@ -54,7 +54,7 @@ def test_what_interrupts_a_step_in_one_round_is_not_its_time(boxes, monkeypatch)
     runs = Runs(str(boxes()), 1, 40)
     handle, made = runs.load()
     stage = Stage.of(handle, made, runs, [0], 10)
-    found = [stage.measured(s) for s in (Setting(), Setting((("iterations", 5),)))]
+    found = [stage.measure(s) for s in (Setting(), Setting((("iterations", 5),)))]
     rng, now = np.random.default_rng(1), 0.0
 
     def busy():
@@ -71,13 +71,13 @@ def test_what_interrupts_a_step_in_one_round_is_not_its_time(boxes, monkeypatch)
 @pytest.mark.parametrize("options", ["", 'solver="CG" cone="elliptic" jacobian="sparse" impratio="3"'])
 def test_a_line_means_in_a_model_what_was_measured(options):
     plain = mj.MjModel.from_xml_string(BOXES.format(options=options))
-    for setting in [*grid(mj, plain), *module.around(mj, plain, Setting())]:
+    for setting in [*grid(mj, plain), *module.vary(mj, plain, Setting())]:
         text = setting.line.removeprefix("<option").removesuffix("/>")
         names = {name for name, _ in setting.options}
         kept = " ".join(w for w in options.split() if w.partition("=")[0] not in names)
         copied = mj.MjModel.from_xml_string(BOXES.format(options=f"{kept} {text}")).opt
         tried = setting.on(mj, plain).opt
-        for name in (*module.OPTIONS, *module.OTHER):
+        for name in (*module.OPTIONS, *module.PROBLEM_OPTIONS):
             assert getattr(copied, name) == getattr(tried, name), setting
     assert Setting.of(mj, plain, iterations=int(plain.opt.iterations)).line == ""
 
@@ -136,7 +136,7 @@ def test_both_sides_of_the_choice_are_printed():
     held = [measured(10.0, 2e-3), measured(11.0, 3e-3, iterations=9)]
     lines = chosen(now, quick, held=held).lines
     assert "0.80 of the time, error 1.0e-3" in lines[1]
-    assert "1.10 of the time, error 3.0e-3 m/s beside 2.0e-3" in lines[2]
+    assert "1.10 of the time, error 3.0e-3 m/s instead of 2.0e-3" in lines[2]
 
 
 def test_a_gain_that_the_held_back_worlds_do_not_have_is_told_as_none():
@@ -189,6 +189,6 @@ def test_a_setting_with_which_mujoco_ends_in_an_error_is_left_out(boxes, monkeyp
     monkeypatch.setattr(Stage, "run", dies)
     found = tune(boxes(), worlds=2, steps=10, repeats=1)
     assert not any(dict(m.setting.options).get("iterations") == 25 for m in found.measured)
-    monkeypatch.setattr(Stage, "measured", lambda self, setting: measured(np.inf, np.inf))
+    monkeypatch.setattr(Stage, "measure", lambda self, setting: measured(np.inf, np.inf))
     with pytest.raises(lv.InputError, match="diverge"):
         tune(boxes(), worlds=2, steps=10, repeats=1)

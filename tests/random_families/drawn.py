@@ -21,9 +21,9 @@ import numpy as np
 from lavender.base.errors import check_name
 from lavender.base.lazy_import import sparse as sp
 from lavender.base.lazy_import import spatial
-from lavender.lab.suite.build import Bodies, Contacts, each, sideways
+from lavender.lab.suite.build import Bodies, Contacts, add_horizontal_velocity, map_scalar
 from lavender.lab.suite.case import Draft
-from lavender.lab.suite.families import BOX, SPHERE, at_least
+from lavender.lab.suite.families import BOX, SPHERE, check_minimum
 from lavender.problem import Problem
 from lavender.problem.cones import Cones
 from random_families.wild import (
@@ -56,8 +56,8 @@ def dome(rng: np.random.Generator, rows: int) -> World:
     up = 0.5 * np.pi * (ring + 0.5) / (rings + 1)
     turn = 2.0 * np.pi * (k + 0.5 * (ring % 2)) / around
     size = around / 6.0
-    high, far = each(math.sin, up), each(math.cos, up)
-    position = size * np.stack([far * each(math.cos, turn), far * each(math.sin, turn), high], 1)
+    high, far = map_scalar(math.sin, up), map_scalar(math.cos, up)
+    position = size * np.stack([far * map_scalar(math.cos, turn), far * map_scalar(math.sin, turn), high], 1)
     index = np.arange(rings * around)
     side = np.stack([index, around * ring + (k + 1) % around], 1)
     world = World(position, BOX).add(between(position, side))
@@ -180,9 +180,9 @@ def obstacle(rng: np.random.Generator, rows: int) -> Problem:
         sp.kron(line, eye) + sp.kron(eye, line) + 10.0 ** rng.uniform(-6, -1) * sp.eye_array(side * side)
     )
     x, y = (v.ravel() / side for v in np.meshgrid(np.arange(side), np.arange(side), indexing="ij"))
-    force = rng.standard_normal() + 3.0 * each(math.sin, 2.0 * np.pi * x * rng.integers(1, 4)) * each(
-        math.cos, 3.0 * np.pi * y
-    )
+    force = rng.standard_normal() + 3.0 * map_scalar(
+        math.sin, 2.0 * np.pi * x * rng.integers(1, 4)
+    ) * map_scalar(math.cos, 3.0 * np.pi * y)
     return Problem.lcp(a, force / side)
 
 
@@ -260,7 +260,7 @@ def option(rng: np.random.Generator, rows: int) -> Problem:
         offsets=[-1, 0, 1],
     )
     payoff = np.maximum(0.0, rng.uniform(0.2, 0.8) - k / m)
-    held = payoff + 0.1 * each(math.exp, -(((k / m - 0.5) / 0.2) ** 2))
+    held = payoff + 0.1 * map_scalar(math.exp, -(((k / m - 0.5) / 0.2) ** 2))
     return Problem.lcp(sp.csr_array(a), held - a @ payoff)
 
 
@@ -270,7 +270,7 @@ def kernel(rng: np.random.Generator, rows: int) -> Problem:
     x = rng.standard_normal((m, int(rng.integers(1, 6))))
     label = np.where(x.sum(axis=1) + 0.5 * rng.standard_normal(m) > 0.0, 1.0, -1.0)
     square = ((x[:, None] - x[None]) ** 2).sum(axis=2)
-    a = label[:, None] * each(math.exp, -square * 10.0 ** rng.uniform(-1.0, 1.0)) * label
+    a = label[:, None] * map_scalar(math.exp, -square * 10.0 ** rng.uniform(-1.0, 1.0)) * label
     a[np.arange(m), np.arange(m)] += 10.0 ** rng.uniform(-6.0, -1.0)
     return Problem.lcp(a, rng.uniform(0.5, 1.5, m), 0.0, 10.0 ** rng.uniform(-1.0, 2.0))
 
@@ -279,7 +279,7 @@ def deblur(rng: np.random.Generator, rows: int) -> Problem:
     """A signal without negative values, seen through a blur of some width: K^T K, nearly singular."""
     m = min(max(8, rows), LARGEST_DENSE)
     wide = int(rng.integers(1, max(2, min(20, m // 4)) + 1))
-    weight = each(math.exp, -0.5 * (np.arange(-2 * wide, 2 * wide + 1) / wide) ** 2)
+    weight = map_scalar(math.exp, -0.5 * (np.arange(-2 * wide, 2 * wide + 1) / wide) ** 2)
     k = sp.diags_array(
         list(weight / weight.sum()), offsets=list(range(-2 * wide, 2 * wide + 1)), shape=(m, m)
     )
@@ -299,7 +299,9 @@ def beam(rng: np.random.Generator, rows: int) -> Problem:
         second.T @ sp.diags_array(stiff) @ second + 10.0 ** rng.uniform(-6, -1) * sp.eye_array(m)
     )
     x = (np.arange(m) + 0.5) / m
-    load = -1.0 + 3.0 * each(math.sin, 2.0 * np.pi * x * rng.integers(1, 5)) + 0.3 * rng.standard_normal(m)
+    load = (
+        -1.0 + 3.0 * map_scalar(math.sin, 2.0 * np.pi * x * rng.integers(1, 5)) + 0.3 * rng.standard_normal(m)
+    )
     return Problem.lcp(0.5 * (a + a.T), load / m, 0.0, rng.choice([np.inf, 2.0]))
 
 
@@ -323,7 +325,7 @@ def drawn(seed: int = 0, rows: int = 3000, part: str = "all") -> Draft:
 
     Or "rolling": worlds to tune on whose contacts resist rolling, and perhaps spin.
     """
-    at_least(8, rows=rows)
+    check_minimum(8, rows=rows)
     check_name("part", part, PART)
     title = f"drawn(seed={seed}, rows={rows}, part={part})"
     rng = np.random.default_rng([seed, 0x647261, PART.index(part)])
@@ -339,7 +341,7 @@ def drawn(seed: int = 0, rows: int = 3000, part: str = "all") -> Draft:
     world = WORLDS[name](rng, max(2, round(wanted / (5 if rolls else 1 if law == "none" else 3))))
     bodies = Bodies(world.position, masses_of(rng, masses, len(world.position)), world.inertia)
     bodies.v_free += rng.choice([0.0, 1e-3, 0.05]) * rng.standard_normal(bodies.v_free.shape)
-    sideways(bodies, float(rng.choice([0.0, 0.0, 0.2, 1.0])), seed=seed)
+    add_horizontal_velocity(bodies, float(rng.choice([0.0, 0.0, 0.2, 1.0])), seed=seed)
     soft = 10.0 ** rng.uniform(-4.0, 1.0) if name == "jelly" else None
     if rolls:
         law, form = str(rng.choice(LAWS[1:3])), "rows"

@@ -24,9 +24,16 @@ import numpy as np
 from lavender.base.arrays import FloatArray
 from lavender.base.lazy_import import sparse as sp
 from lavender.base.lazy_import import spatial
-from lavender.lab.suite.build import Bodies, Contacts, each, manifold, sideways, static_loads
+from lavender.lab.suite.build import (
+    Bodies,
+    Contacts,
+    add_horizontal_velocity,
+    manifold,
+    map_scalar,
+    static_loads,
+)
 from lavender.lab.suite.case import Draft
-from lavender.lab.suite.families import BOX, ROD, SPHERE, at_least, ball_joints
+from lavender.lab.suite.families import BOX, ROD, SPHERE, ball_joints, check_minimum
 from lavender.problem import Problem
 
 __all__ = ["STRUCTURES", "wild"]
@@ -39,7 +46,7 @@ LARGEST_DENSE = 1_500  # rows of a dense matrix: 18 MB
 
 def tenfold(exponent: FloatArray) -> FloatArray:
     """Return 10 to the power of every number, with the same bits on every processor."""
-    return each(partial(pow, 10.0), exponent)
+    return map_scalar(partial(pow, 10.0), exponent)
 
 
 @dataclass
@@ -151,7 +158,7 @@ def net(rng: np.random.Generator, rows: int) -> World:
     """A net of ball joints, held at its corners: loops, so rows that depend on each other."""
     side = max(2, round(np.sqrt(rows / 6)))
     grid = np.stack(np.meshgrid(np.arange(side), np.arange(side), indexing="ij"), -1).reshape(-1, 2)
-    sag = 0.3 * each(math.sin, np.pi * grid / (side - 1)).prod(axis=1)
+    sag = 0.3 * map_scalar(math.sin, np.pi * grid / (side - 1)).prod(axis=1)
     position = np.stack([grid[:, 0], grid[:, 1], 1.0 - sag], 1) + 1e-3 * rng.standard_normal((side * side, 3))
     pairs = spatial.cKDTree(grid).query_pairs(1.01, output_type="ndarray")
     pairs = pairs[np.lexsort(pairs.T[::-1])]
@@ -184,7 +191,7 @@ def snake(rng: np.random.Generator, rows: int) -> World:
     n = max(2, rows // 4)
     k = np.arange(n)
     position = np.stack(
-        [1.0 * k, 0.3 * each(math.sin, 0.3 * k), np.full(n, 0.1)], 1
+        [1.0 * k, 0.3 * map_scalar(math.sin, 0.3 * k), np.full(n, 0.1)], 1
     ) + 0.01 * rng.standard_normal((n, 3))
     joint = np.stack([k[:-1], k[1:]], 1)
     world = World(position, ROD, joint=joint, anchor=0.5 * (position[:-1] + position[1:]))
@@ -208,7 +215,7 @@ STRUCTURES: dict[str, Structure] = {
 
 def wild(seed: int = 0, rows: int = 3000) -> Draft:
     """A problem drawn by `seed`: structure, masses, law and form, of some 8 to `rows` rows, even in the logarithm."""
-    at_least(8, rows=rows)
+    check_minimum(8, rows=rows)
     rng = np.random.default_rng([seed, 0x77696C64])
     name = str(rng.choice(list(STRUCTURES)))
     law, masses, form = (str(rng.choice(words)) for words in (LAWS, MASSES, FORMS))
@@ -216,7 +223,7 @@ def wild(seed: int = 0, rows: int = 3000) -> Draft:
     world = STRUCTURES[name](rng, max(2, round(wanted / (1 if law == "none" else 3))))
     bodies = Bodies(world.position, masses_of(rng, masses, len(world.position)), world.inertia)
     bodies.v_free += rng.choice([0.0, 1e-3, 0.05]) * rng.standard_normal(bodies.v_free.shape)
-    sideways(bodies, float(rng.choice([0.0, 0.0, 0.2, 1.0])), seed=seed)
+    add_horizontal_velocity(bodies, float(rng.choice([0.0, 0.0, 0.2, 1.0])), seed=seed)
     problem, form = given_as(rng, problem_of(rng, world, bodies, law), form)
     problem = replace(problem, name=f"wild(seed={seed}, rows={rows})", copy=False)
     return Draft(problem, f"{name}, masses {masses}, friction {law}, given as {form}: drawn, not chosen")

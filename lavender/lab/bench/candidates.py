@@ -1,7 +1,7 @@
 """Choose the calls that are worth timing alternately, and time them.
 
-A report prints calls of `lv.solve`. Those near the best of what `bench.run` measured are timed again, interleaved with
-each other (`lavender.lab.bench.time_alternately`), so that the printed times are times of exactly these calls.
+A report prints calls of `lv.solve`. Those near the best call that `bench.run` measured are timed again, interleaved
+with each other (`lavender.lab.bench.time_alternately`), so that the printed times are times of exactly these calls.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from lavender.lab.bench.cases import Source
 from lavender.lab.bench.recommendation import SHORT_TIME_RATIO, Advice, Subject, list_subjects
 from lavender.lab.bench.resampling import TimedCall, rank_calls_in_time, select_calls
 from lavender.lab.bench.running.alternating import time_alternately
-from lavender.lab.bench.running.plan import UNLIMITED, Plan
+from lavender.lab.bench.running.plan import UNLIMITED_ITERATIONS, Plan
 from lavender.lab.bench.running.timing import Ask
 from lavender.lab.bench.statistics import drop_idle_cases
 from lavender.lab.bench.store import Records
@@ -24,10 +24,8 @@ CANDIDATE_TIME_RATIO = (
     1.6  # A rerun may rank a solver first if its time is below this multiple of the best's.
 )
 MAX_CANDIDATES = 4  # Solvers timed for a tolerance and for each time limit, at most.
-TIME_LIMIT_FRACTIONS = (
-    0.5,
-    0.8,
-)  # Parts of a time that `time_limit` is set to: set-up and judge take the rest.
+# Parts of a time that `time_limit` is set to: set-up and judge take the rest.
+TIME_LIMIT_FRACTIONS = (0.5, 0.8)
 
 
 def list_candidates(records: Records, times: Sequence[float] = ()) -> list[Ask]:
@@ -59,9 +57,9 @@ def list_candidates(records: Records, times: Sequence[float] = ()) -> list[Ask]:
 
 
 def _required_max_iter(records: Records, solver: str, tolerance: float) -> int:
-    """Return `max_iter` of a call: 0 (the default), or unlimited if a case needs more than the default."""
+    """Return `max_iter` of a call to a tolerance: 0 (the default), or unlimited if a case needs more."""
     runs = (r for r in records if r.solver == solver and r.mode == "tol" and r.tol == tolerance)
-    return UNLIMITED if any(exceeds_default_budget(solver, r.iterations) for r in runs) else 0
+    return UNLIMITED_ITERATIONS if any(exceeds_default_budget(solver, r.iterations) for r in runs) else 0
 
 
 def _list_time_limited(
@@ -104,7 +102,7 @@ def _list_time_limited(
 def time_candidates(
     cases: Iterable[Source], records: Records, plan: Plan, store: Any = None, **more: Any
 ) -> Records:
-    """Choose the candidates among what `bench.run` measured, and time them by `bench.time_alternately`."""
+    """Choose the candidates among the calls that `bench.run` measured, and time them by `bench.time_alternately`."""
     remaining = drop_idle_cases(records)
     if not len(remaining) or plan.velocity_tolerances:
         return records

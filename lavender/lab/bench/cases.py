@@ -1,4 +1,4 @@
-"""From what a user names (files, folders, cases of the suite) to problems with a description."""
+"""Resolve files, folders and names of suite cases to problems, and describe each problem."""
 
 from __future__ import annotations
 
@@ -30,28 +30,49 @@ from lavender.lab.suite.case import FAMILIES, parse
 from lavender.problem import Problem, check_problem
 from lavender.problem.derived import cached_property
 
-RANK_ROWS = 300  # rows up to which the rank of A is computed, a fraction of a second
-SINGULAR = 1e-12  # of the largest singular value: far below any condition number met in practice
-MANIFOLD = 8  # blocks between one pair of bodies, at most
-LARGE_RATIO = 1e3  # mass ratio from which the velocity form changes everything
-ASYMMETRY = 0.1  # of A, relative: recorded contact problems stay below a hundredth
-MAX_SEEDS = 1_000_000  # of a family in one run: the name and place of each case take a kilobyte
-SOLVED = 1e-6  # relative residual at which `lv.solve` ends by default
+MAX_RANK_ROWS = 300  # The rank of A is computed up to this many rows, in a fraction of a second.
+# A singular value is zero if it is at most this fraction of the largest: far below any condition number in practice.
+ZERO_SINGULAR_VALUE_TOL = 1e-12
+MAX_MANIFOLD_BLOCKS = 8  # Largest number of contacts between one pair of bodies.
+LARGE_MASS_RATIO = 1e3  # From this mass ratio on, the velocity form is much more accurate.
+MAX_MECHANICAL_ASYMMETRY = 0.1  # Relative asymmetry of A; recorded contact problems stay below a hundredth.
+MAX_SEEDS = 1_000_000  # Largest number of seeds in one run: name and path of each case take a kilobyte.
+DEFAULT_SOLVE_TOL = 1e-6  # Relative residual at which `lv.solve` ends by default.
 
 
 @dataclass(eq=False)
 class Item:
-    """One case to run: a problem that is loaded when it is first looked at."""
+    """One case of a run; its problem is loaded at the first access.
+
+    Parameters
+    ----------
+    name : str
+    source : str
+        Path, or name in the suite.
+    load : callable
+        Loads the problem.
+    reason : str
+        Property that the case tests.
+    sequence : str
+        Sequence of which it is a step.
+    step : int
+        Number of the step; -1 if it is not a step.
+    in_memory : Problem, optional
+        The problem itself, if it was passed as an object.
+    load_stored : callable
+        Returns the answer stored with the problem (m,) [N s], or None.
+    named : bool
+        It was requested by name, not found in a folder: if it does not load, the request is wrong.
+    """
 
     name: str
-    source: str  # path, or the name in the suite
+    source: str
     load: Callable[[], Problem]
     reason: str = ""
     sequence: str = ""
     step: int = -1
-    given: Problem | None = None  # in memory, not behind a name
-    stored: Callable[[], FloatArray | None] = lambda: None  # (m,) N s, the answer beside the problem
-    # asked for by name, not met in a folder: that it does not load is the request's fault
+    in_memory: Problem | None = None
+    load_stored: Callable[[], FloatArray | None] = lambda: None
     named: bool = False
 
     def __post_init__(self) -> None:
@@ -59,23 +80,25 @@ class Item:
 
     @cached_property
     def problem(self) -> Problem:
-        """The problem; loading errors come from here."""
+        """The problem; accessing it raises the errors of loading it."""
         return self.load()
 
-    def judged(self, precision: str | None = None, threshold: float = DEFAULT_THRESHOLD) -> Residual | None:
-        """The answer stored beside the problem, judged; None where there is none, or one of another problem."""
-        impulse = self.stored()
+    def judge_stored(
+        self, precision: str | None = None, threshold: float = DEFAULT_THRESHOLD
+    ) -> Residual | None:
+        """Judge the stored answer; None if there is none, or if its length belongs to another problem."""
+        impulse = self.load_stored()
         if impulse is None or impulse.shape != (self.problem.m,):
             return None
         return residual(self.problem, impulse, precision, threshold)
 
     def forget(self) -> None:
-        """Let go of the problem's memory."""
+        """Release the memory of the problem."""
         self.__dict__.pop("problem", None)
 
 
 def is_path(word: Source) -> bool:
-    """A file or folder is meant, be it there or not; else a case of the suite."""
+    """Whether a file or folder is meant, even if it does not exist, and not a case of the suite."""
     if isinstance(word, Path):
         return True
     return isinstance(word, str) and (
@@ -87,28 +110,28 @@ Source = str | Path | Problem | Case | Item
 
 
 def resolve(words: Source | Iterable[Source], sequences: bool | None = None) -> list[Item]:
-    """Cases behind files, folders (their files, those of folders in them), names or cases of the suite: all if none.
+    """Resolve files, folders (and folders in them), names and cases of the suite to items; the default suite if none.
 
-    Nothing is solved, and as a rule nothing loaded yet, but every word is checked to exist.
+    No problem is solved and usually none is loaded, but every word is checked to exist.
 
     Parameters
     ----------
     words : files, folders, names or cases of the suite, problems; or one of them
     sequences : bool, optional
-        Folders hold the steps of a simulation. If None, those do whose files differ in a number alone and
-        name their blocks (`Problem.key`), as recorded steps do.
+        Folders hold the steps of a simulation. If None, this is assumed for folders with files that differ only in a
+        number and name their blocks (`Problem.key`), as recorded steps do.
 
     Raises
     ------
     InputError
-        Neither a file nor a case of the suite; a folder without problem files.
+        A word is neither a file nor a case of the suite, or a folder holds no problem files.
     UnknownName
-        A case that the suite does not have.
+        The suite does not have the case.
     """
     if sequences is not None:
         check_bool("sequences", sequences)
     items: list[Item] = []
-    read: set[Path] = set()  # folders, which a link in one of them may lead back to
+    visited: set[Path] = set()  # folders: a link in one of them may lead back to another
     words = (
         [words]
         if isinstance(words, Source)
@@ -119,40 +142,43 @@ def resolve(words: Source | Iterable[Source], sequences: bool | None = None) -> 
     for word in words:
         if isinstance(word, Problem):
             name = word.name or f"problem {len(items)}"
-            items.append(Item(name, name, _constant(word), given=word))
+            items.append(Item(name, name, _constant(word), in_memory=word))
         elif isinstance(word, Item):
             items.append(word)
         elif isinstance(word, Case):
             items.append(_from_case(word, word.name))
         elif not (isinstance(word, str) or hasattr(word, "__fspath__")):
-            raise InputError(f"case {word!r:.60} is neither a file nor a name of the suite, nor a problem")
+            raise InputError(f"case {word!r:.60} is not a file, a name of the suite or a problem")
         elif sequences or (sequences is None and _holds_steps(Path(word))):
-            steps = _another(steps_in(word), items)
-            name, lost = steps[0].sequence, map(_from_file, _left_out(Path(word)))
-            items += [*steps, *(replace(item, name=f"{name}, {item.name}", sequence=name) for item in lost)]
+            steps = _unique_sequence(steps_in(word), items)
+            name, missing = steps[0].sequence, map(_from_file, _unrecorded_steps(Path(word)))
+            items += [
+                *steps,
+                *(replace(item, name=f"{name}, {item.name}", sequence=name) for item in missing),
+            ]
         elif Path(word).is_dir():
             paths = _problem_files(Path(word))
-            read.add(Path(word).resolve())
+            visited.add(Path(word).resolve())
             inner = [
                 p
                 for p in sorted(Path(word).iterdir())
-                if p.is_dir() and p.resolve() not in read and os.access(p, os.R_OK) and _problem_files(p)
+                if p.is_dir() and p.resolve() not in visited and os.access(p, os.R_OK) and _problem_files(p)
             ]
             words += inner
             if not paths and not inner:
-                kept = Path(word) / "records.jsonl"
-                shown = f": {kept} shows its report again" if kept.is_file() else ""
+                records = Path(word) / "records.jsonl"
+                shown = f": {records} shows its report again" if records.is_file() else ""
                 raise InputError(f"{word} holds no problem file ({', '.join(SUFFIXES)}){shown}")
-            items += [_from_file(path) for path in (*paths, *_left_out(Path(word)))]
-        elif Path(word).exists() or Path(word) in _left_out(Path(word).parent):
+            items += [_from_file(path) for path in (*paths, *_unrecorded_steps(Path(word)))]
+        elif Path(word).exists() or Path(word) in _unrecorded_steps(Path(word).parent):
             items.append(replace(_from_file(Path(word)), named=True))
         elif is_path(word):
             raise InputError(
                 f"{word}: no such file; give problem files ({', '.join(SUFFIXES)}), folders or suite names"
             )
         else:
-            chosen = [_from_name(name) for name in suite.names(str(word))]
-            items += _as_steps(chosen) if str(word).removeprefix("@") == "sequences" else chosen
+            selected = [_from_name(name) for name in suite.names(str(word))]
+            items += _as_steps(selected) if str(word).removeprefix("@") == "sequences" else selected
     return _unique_names(items)
 
 
@@ -160,8 +186,8 @@ def resolve_again(source: str | Problem, name: str, reason: str) -> Item:
     """Resolve the source of one item in another process. An error is raised when the problem is loaded."""
     try:
         (item,) = resolve([source])
-    except Exception as error:  # the file is gone, or reading its folder raises
-        item = Item(name, str(source), _raising(error))
+    except Exception as error:  # The file was removed, or reading its folder raises an error.
+        item = Item(name, str(source), _raise_when_loaded(error))
     return replace(item, name=name, reason=reason, sequence="", step=-1)
 
 
@@ -171,24 +197,24 @@ def expand_seeds(words: Iterable[str], n: int, first: int = 0) -> list[str]:
     Raises
     ------
     UnknownName, InputError
-        A name that the suite does not have; more than `MAX_SEEDS` seeds.
+        The suite does not have the name, or there are more than `MAX_SEEDS` seeds.
     """
     n, first = check_int("n", n, high=None), check_int("first", first, high=None)
     if n > MAX_SEEDS:
         raise InputError(
-            f"{n} seeds are asked for; at most {MAX_SEEDS} in one run: give A:B, part after part"
+            f"{n} seeds are requested; at most {MAX_SEEDS} are possible in one run: give A:B, one part at a time"
         )
     out = []
     for word in check_sequence("cases", words, "names"):
         if not isinstance(word, str):
-            raise InputError(f"case {word!r:.60} is no name of the suite")
+            raise InputError(f"case {word!r:.60} is not a name of the suite")
         if is_path(word) or word.startswith("@"):
             out.append(word)
             continue
-        name, given = parse(word)
-        if name in FAMILIES and "seed" in FAMILIES[name].signature.parameters and "seed" not in given:
+        name, parameters = parse(word)
+        if name in FAMILIES and "seed" in FAMILIES[name].signature.parameters and "seed" not in parameters:
             for seed in range(first, first + n):
-                inside = ", ".join(f"{k}={v}" for k, v in {**given, "seed": seed}.items())
+                inside = ", ".join(f"{k}={v}" for k, v in {**parameters, "seed": seed}.items())
                 out.append(f"{name}({inside})")
         else:
             out.append(word)
@@ -196,23 +222,23 @@ def expand_seeds(words: Iterable[str], n: int, first: int = 0) -> list[str]:
 
 
 def sequence(problems: Iterable[Problem], name: str) -> list[Item]:
-    """Consecutive problems as the steps of one sequence."""
+    """Return consecutive problems as the steps of one sequence."""
     if not isinstance(name, str):
-        raise InputError(f"name of a sequence is {name!r:.60}; a text is needed")
+        raise InputError(f"name of a sequence is {name!r:.60}; a string is needed")
     items = []
     for i, problem in enumerate(check_sequence("problems", problems, "Problems")):
         check_problem(problem)
-        items.append(Item(f"{name}[{i}]", name, _constant(problem), sequence=name, step=i, given=problem))
+        items.append(Item(f"{name}[{i}]", name, _constant(problem), sequence=name, step=i, in_memory=problem))
     return items
 
 
 def steps_in(folder: str | Path) -> list[Item]:
-    """Problem files of a folder as the steps of one sequence, numbers in their names in numeric order.
+    """Return the problem files of a folder as the steps of one sequence, in the numeric order of their names.
 
     Raises
     ------
     InputError
-        Not a folder, or fewer than two problem files in it.
+        It is not a folder, or it holds fewer than two problem files.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -232,27 +258,30 @@ def steps_in(folder: str | Path) -> list[Item]:
 
 
 def _check_one_recording(folder: Path, paths: list[Path]) -> None:
-    # Two files of one number, two rows of numbers, or files that the engine's own list does not name.
+    """Raise InputError if a folder holds steps of several recordings.
+
+    They do if two files have one number, names have two prefixes, or the engine's list does not contain a file.
+    """
     numbered = [(m[1], int(m[2])) for p in paths if (m := re.fullmatch(r"(.*?)(\d+)", p.stem))]
     series = [prefix for prefix, n in Counter(prefix for prefix, _ in numbered).items() if n > 1]
     twice = len(numbered) > len(set(numbered))
-    listed = {str(line["file"]) for line in _told(folder)}
-    strange = [p.name for p in paths if listed and p.name not in listed]
-    if twice or len(series) > 1 or strange:
-        why = (
-            f"{strange[0]} is not in its {ENGINE}"
-            if strange
+    listed = {str(line["file"]) for line in _engine_lines(folder)}
+    unlisted = [p.name for p in paths if listed and p.name not in listed]
+    if twice or len(series) > 1 or unlisted:
+        reason = (
+            f"{unlisted[0]} is not in its {ENGINE}"
+            if unlisted
             else "two files have one number"
             if twice
             else f"files are named {series[0]}N and {series[1]}N"
         )
         raise InputError(
-            f"{folder} holds steps of more than one recording ({why}): move each into a folder of its own"
+            f"{folder} holds steps of more than one recording ({reason}): move each into a folder of its own"
         )
 
 
-def _told(folder: Path) -> list[dict[str, Any]]:
-    """What an engine said of the steps in a folder, each with its "file"; nothing if a line of it cannot be read."""
+def _engine_lines(folder: Path) -> list[dict[str, Any]]:
+    """Read the engine's data of the steps in a folder, each with its "file"; empty if a line cannot be read."""
     try:
         text = read_whole_file(folder / ENGINE, "the engine's answers").decode(errors="replace")
         lines = [dict(json.loads(line)) for line in text.splitlines()]
@@ -261,66 +290,76 @@ def _told(folder: Path) -> list[dict[str, Any]]:
         return []
 
 
-def _left_out(folder: Path) -> dict[Path, str]:
-    """Files that a recording should have made and could not, with the reason of each."""
-    found = {folder / Path(str(t["file"])).name: str(t["left_out"]) for t in _told(folder) if "left_out" in t}
-    return {path: why for path, why in found.items() if not path.exists()}
+def _unrecorded_steps(folder: Path) -> dict[Path, str]:
+    """Return {file: reason} for steps that could not be recorded."""
+    steps = {
+        folder / Path(str(t["file"])).name: str(t["left_out"])
+        for t in _engine_lines(folder)
+        if "left_out" in t
+    }
+    return {path: reason for path, reason in steps.items() if not path.exists()}
 
 
 def _problem_files(folder: Path) -> list[Path]:
+    """List the problem files of a folder, in the numeric order of their names."""
     try:
-        return sorted((p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES), key=_natural)
+        return sorted((p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES), key=_natural_order)
     except OSError as error:
         raise InputError(f"cannot read the folder {folder} ({error.strerror or error})") from None
 
 
-def _natural(path: Path) -> list[tuple[int, int | str]]:
-    # Numbers by size; what merely looks like one, such as a superscript, is a letter.
+def _natural_order(path: Path) -> list[tuple[int, int | str]]:
+    """Return a sort key in which numbers are ordered by value; digits such as superscripts count as letters."""
     parts = re.split(r"([0-9]{1,18})", path.name)
     return [(0, int(t)) if i % 2 else (1, t) for i, t in enumerate(parts) if t]
 
 
 def _holds_steps(folder: Path) -> bool:
+    """Whether a folder holds the recorded steps of one simulation."""
     paths = _problem_files(folder) if folder.is_dir() else []
     if len(paths) < 2 or len({re.sub(r"\d+$", "", p.stem) for p in paths}) > 1:
         return False
     try:
         return _from_file(paths[0]).problem.key is not None
-    except Exception:  # whatever it raises, it is told where the case is run
+    except Exception:  # The error is reported when the case is run.
         return False
 
 
-def _another(steps: list[Item], items: list[Item]) -> list[Item]:
-    # Two folders of one name are two sequences, told apart by the folder around them where that is another. Figures
-    # are named after them: names are other ones as names of files, too.
+def _unique_sequence(steps: list[Item], items: list[Item]) -> list[Item]:
+    """Rename a sequence if an earlier one has its name: prefix the parent folder's name, or append a number.
+
+    Figures are files named after sequences, so names must differ as file names, too.
+    """
     names = {file_name(item.sequence).lower() for item in items if item.sequence}
     name, n = steps[0].sequence, 1
     if file_name(name).lower() in names:
-        around = f"{Path(steps[0].source).resolve().parent.parent.name}/{name}"
-        name = name if file_name(around).lower() in names else around
+        with_parent = f"{Path(steps[0].source).resolve().parent.parent.name}/{name}"
+        name = name if file_name(with_parent).lower() in names else with_parent
     while file_name(unique := f"{name} #{n}" if n > 1 else name).lower() in names:
         n += 1
     return [replace(item, name=f"{unique}[{item.step}]", sequence=unique) for item in steps]
 
 
 def _constant(problem: Problem) -> Callable[[], Problem]:
+    """Return a function that returns the problem."""
     return lambda: problem
 
 
 def _from_case(case: Case, source: str) -> Item:
+    """Create the item of a case."""
     return Item(case.name, source, _constant(case.problem), case.reason)
 
 
 def _from_name(name: str) -> Item:
-    """A case of the suite; where it needs a package that is not there, one that does not load."""
+    """Create the item of a name in the suite; if a package is missing, loading the item raises the error."""
     try:
         return _from_case(suite.case(name), name)
     except SolverUnavailable as error:
-        return Item(name, name, _raising(error))
+        return Item(name, name, _raise_when_loaded(error))
 
 
 def _as_steps(items: list[Item]) -> list[Item]:
-    """Cases that differ in `at` alone, one after the other: the steps of sequences."""
+    """Convert consecutive cases that differ only in `at` to the steps of sequences."""
     out, count = [], Counter[str]()
     for item in items:
         name = item.name.rpartition(", at=")[0] + ")"
@@ -329,7 +368,9 @@ def _as_steps(items: list[Item]) -> list[Item]:
     return out
 
 
-def _raising(error: Exception) -> Callable[[], Problem]:
+def _raise_when_loaded(error: Exception) -> Callable[[], Problem]:
+    """Return a function that raises the error when the problem is loaded."""
+
     def load() -> Problem:
         raise error
 
@@ -337,34 +378,36 @@ def _raising(error: Exception) -> Callable[[], Problem]:
 
 
 def _from_file(path: Path) -> Item:
+    """Create the item of a problem file."""
+
     def load() -> Problem:
         if path.exists() and not path.is_file():
-            # a pipe never ends
-            raise InputError(f"{path} is no file; a problem ({', '.join(SUFFIXES)}) is needed")
-        if not path.exists() and (why := _left_out(path.parent).get(path)):
-            raise InputError(f"{path}: left out of its recording: {why}")
+            # A pipe may never end.
+            raise InputError(f"{path} is not a file; a problem ({', '.join(SUFFIXES)}) is needed")
+        if not path.exists() and (reason := _unrecorded_steps(path.parent).get(path)):
+            raise InputError(f"{path}: it could not be recorded: {reason}")
         return io.load(path)
 
-    return Item(path.stem, str(path), load, stored=partial(io.load_solution, path))
+    return Item(path.stem, str(path), load, load_stored=partial(io.load_solution, path))
 
 
 def _unique_names(items: list[Item]) -> list[Item]:
-    # As files on a system that does not tell capitals, too: figures are named after cases.
-    taken: set[str] = set()
+    """Append numbers to equal names; figures are files named after cases, so case-insensitive names must differ."""
+    used_names: set[str] = set()
     for item in items:
         name, n = item.name, 1
-        while file_name(item.name).lower() in taken:
+        while file_name(item.name).lower() in used_names:
             n += 1
             item.name = f"{name} #{n}"
-        taken.add(file_name(item.name).lower())
+        used_names.add(file_name(item.name).lower())
     return items
 
 
 def describe(item: Item, run: str) -> CaseInfo:
-    """What the report says of a case; loads its problem."""
+    """Load the problem of an item and describe it for the report."""
     p = item.problem
     contacts = int(np.count_nonzero(p.cones.is_contact))
-    answer = item.judged()
+    answer = item.judge_stored()
     return CaseInfo(
         run=run,
         case=item.name,
@@ -386,23 +429,23 @@ def describe(item: Item, run: str) -> CaseInfo:
         stored_verdict=answer.verdict_in_words if answer and answer.rounding else "",
         nothing_to_do=is_solved_by_zero(p),
         diagnostics=tuple(map(str, diagnose(p))),
-        guess=_guess_of(item),
+        guess=_classify_guess(item),
         condition=condition(p),
     )
 
 
-def _guess_of(item: Item) -> str:
-    """As `CaseInfo.guess`. An answer is the one stored beside the problem, or any at which a solve would end."""
+def _classify_guess(item: Item) -> str:
+    """Return the value of `CaseInfo.guess`; an answer is a stored one, or a guess at which a solve would end."""
     guess = item.problem.guess
     if guess is None:
         return ""
-    stored = item.stored()
+    stored = item.load_stored()
     is_stored = stored is not None and np.array_equal(guess, stored)
-    return "answer" if is_stored or residual(item.problem, guess).relative <= SOLVED else "start"
+    return "answer" if is_stored or residual(item.problem, guess).relative <= DEFAULT_SOLVE_TOL else "start"
 
 
 def fingerprint(problem: Problem) -> str:
-    """Hash of the numbers of a problem and the keys of its blocks; what bodies' v* is to it stands in b."""
+    """Hash the numbers of a problem and the keys of its blocks; the v* of bodies is hashed as part of b."""
     digest = hashlib.sha256(problem.friction.encode())
     c, r, g = problem.cones, problem.rows, problem.generalized
     arrays: list[Any] = [problem.b, problem.guess, c.ptr, c.kind, c.lower, c.upper, c.mu, c.patch_radius]
@@ -424,7 +467,7 @@ def fingerprint(problem: Problem) -> str:
 
 
 def mass_ratio(problem: Problem) -> float:
-    """Heaviest over lightest: moving bodies where there are rows, else the diagonal of A on rows and normals."""
+    """Compute the largest mass over the smallest, or for a matrix the ratio of A's diagonal on rows and normals."""
     if problem.rows is not None:
         x = problem.rows.inv_mass
     else:
@@ -436,60 +479,60 @@ def mass_ratio(problem: Problem) -> float:
 
 
 def structure_of(problem: Problem) -> tuple[str, ...]:
-    """Words that decide which solver suits, read off the numbers; a problem may have several.
+    """Return the words that describe a problem's structure, from its numbers; they decide which solver suits.
 
-    - The largest part of the graph that hangs together. One moving body (in a matrix: a few blocks that all
-      couple with each other, as its contacts do): "separate". At most two neighbours on average: "chain"
-      (most couplings are joints) or "stack" (contacts). More: "mesh" of joints or "pile". A matrix that couples
-      more than half of all pairs: "dense".
-    - "redundant": fewer independent rows than rows, where the rank is cheap to know or the counts alone
-      prove it.
-    - "friction": the law. "ellipses": contacts of two coefficients. "large mass ratio": from 1000 on.
-    - "asymmetric": A is not symmetric. A matrix that is not even nearly so comes from no scene of
-      bodies, and gets no word for its shape or masses.
+    - The largest connected component of the coupling graph. One moving body (in a matrix: a few blocks that are all
+      coupled, as a body's contacts are): "separate". At most two neighbours on average: "chain" (most couplings are
+      joints) or "stack" (contacts). More: "mesh" of joints or "pile". A matrix that couples more than half of all
+      pairs: "dense".
+    - "redundant": there are fewer independent rows than rows, if the rank is cheap to compute or the counts prove it.
+    - "friction": the law. "ellipses": contacts with two coefficients. "large mass ratio": 1000 or more.
+    - "asymmetric": A is not symmetric. A matrix that is not nearly symmetric comes from no scene of bodies, and gets no
+      word for its graph or masses.
     """
     check_problem(problem)
     if problem.m == 0:
         return ("empty",)
-    found = []
-    mechanical = problem.asymmetry <= ASYMMETRY
+    words = []
+    mechanical = problem.asymmetry <= MAX_MECHANICAL_ASYMMETRY
     if mechanical:
-        found.append(_shape(problem))
+        words.append(_shape(problem))
     if _redundant(problem):
-        found.append("redundant")
+        words.append("redundant")
     if problem.law in ("coulomb", "cone"):
-        found.append("friction")
+        words.append("friction")
     if problem.cones.has_ellipse:
-        found.append("ellipses")
-    if mechanical and mass_ratio(problem) >= LARGE_RATIO:
-        found.append("large mass ratio")
+        words.append("ellipses")
+    if mechanical and mass_ratio(problem) >= LARGE_MASS_RATIO:
+        words.append("large mass ratio")
     if not problem.is_symmetric:
-        found.append("asymmetric")
-    return tuple(found)
+        words.append("asymmetric")
+    return tuple(words)
 
 
 def _shape(problem: Problem) -> str:
+    """Return the word for the largest connected component of the coupling graph."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
     n, i, j = _coupled_bodies(problem) if problem.rows is not None else _coupled_blocks(problem)
     graph = coo_array((np.ones(len(i)), (i, j)), shape=(n, n))
-    part = connected_components(graph, directed=False)[1]
-    largest = np.bincount(part).argmax()
-    size = np.count_nonzero(part == largest)
-    neighbours = 2.0 * np.count_nonzero(part[i] == largest) / size
+    component = connected_components(graph, directed=False)[1]
+    largest = np.bincount(component).argmax()
+    size = np.count_nonzero(component == largest)
+    neighbours = 2.0 * np.count_nonzero(component[i] == largest) / size
     bilateral = _is_bilateral(problem)
     if size == 1:
         return "separate"
     if neighbours <= 2.0:
         return "chain" if bilateral else "stack"
-    if problem.rows is None and size > MANIFOLD and neighbours > 0.5 * (size - 1):
+    if problem.rows is None and size > MAX_MANIFOLD_BLOCKS and neighbours > 0.5 * (size - 1):
         return "dense"
     return "mesh" if bilateral else "pile"
 
 
 def _is_bilateral(problem: Problem) -> bool:
-    # Joints couple most of what is coupled; of a matrix, rows without bounds.
+    """Whether most couplings are joints, or, in a matrix, rows without bounds."""
     if problem.law == "linear":
         return True
     r, c = problem.rows, problem.cones
@@ -503,24 +546,24 @@ def _is_bilateral(problem: Problem) -> bool:
     return bool(2 * free > c.n_blocks)
 
 
-Edges = tuple[int, NDArray[np.int64], NDArray[np.int64]]  # nodes, and the ends of each edge, once
+Edges = tuple[int, NDArray[np.int64], NDArray[np.int64]]  # number of nodes, and both ends of each edge
 
 
 def _coupled_bodies(problem: Problem) -> Edges:
-    # Moving bodies that a joint or a contact connects.
+    """Return the graph of moving bodies that a joint or a contact connects."""
     r = problem.rows
     assert r is not None
     ends = np.concatenate([r.joint_body, r.contact_body])
     pairs = np.unique(np.sort(ends[(ends >= 0).any(axis=1)], axis=1), axis=0)
-    bodies, place = np.unique(pairs, return_inverse=True)
-    place = place.reshape(pairs.shape)[pairs[:, 0] >= 0]
-    # The ground, -1, stands first where there is one; bodies count from it.
+    bodies, indices = np.unique(pairs, return_inverse=True)
+    indices = indices.reshape(pairs.shape)[pairs[:, 0] >= 0]
+    # The ground, -1, comes first if there is one; bodies count from it.
     ground = int(len(bodies) > 0 and bodies[0] < 0)
-    return max(1, len(bodies) - ground), place[:, 0] - ground, place[:, 1] - ground
+    return max(1, len(bodies) - ground), indices[:, 0] - ground, indices[:, 1] - ground
 
 
 def _coupled_blocks(problem: Problem) -> Edges:
-    # Blocks that an entry of A couples; those that couple to the same blocks are the points of one manifold.
+    """Return the graph of blocks that A couples; blocks with equal couplings are the points of one manifold."""
     import scipy.sparse as sp
 
     c = problem.cones
@@ -533,8 +576,8 @@ def _coupled_blocks(problem: Problem) -> Edges:
     patterns = [graph.indices[graph.indptr[k] : graph.indptr[k + 1]].tobytes() for k in range(c.n_blocks)]
     count = Counter(patterns)
     groups: dict[bytes | int, int] = {}
-    # More twins than points between two bodies: a dense matrix, not a manifold.
-    keys = [p if count[p] <= MANIFOLD else k for k, p in enumerate(patterns)]
+    # More blocks with equal couplings than a manifold has points mean a dense matrix.
+    keys = [p if count[p] <= MAX_MANIFOLD_BLOCKS else k for k, p in enumerate(patterns)]
     label = np.array([groups.setdefault(key, len(groups)) for key in keys])
     g = graph.tocoo()
     i, j = label[g.coords[0]], label[g.coords[1]]
@@ -543,21 +586,23 @@ def _coupled_blocks(problem: Problem) -> Edges:
 
 
 def _redundant(problem: Problem) -> bool:
+    """Whether there are fewer independent rows than rows, by the counts or by the singular values."""
     if problem.rows is not None and problem.m > 6 * problem.rows.n_bodies:
         return True
     values = _singular_values(problem)
-    return len(values) > 0 and bool(values[-1] <= SINGULAR * values[0])
+    return len(values) > 0 and bool(values[-1] <= ZERO_SINGULAR_VALUE_TOL * values[0])
 
 
 def condition(problem: Problem) -> float | None:
-    """Of A, scaled to a diagonal of 1, over its range, to two digits; None above RANK_ROWS rows, and of A = 0."""
+    """Compute the condition of A, scaled to a unit diagonal, on its range; None for A = 0 or too many rows."""
     values = _singular_values(problem)
-    live = values[values > SINGULAR * values.max(initial=0.0)]
-    return float(f"{live[0] / live[-1]:.1e}") if len(live) else None
+    nonzero = values[values > ZERO_SINGULAR_VALUE_TOL * values.max(initial=0.0)]
+    return float(f"{nonzero[0] / nonzero[-1]:.1e}") if len(nonzero) else None
 
 
 def _singular_values(problem: Problem) -> NDArray[Any]:
-    if problem.m > RANK_ROWS:
+    """Compute the singular values of A, scaled to a unit diagonal; empty above MAX_RANK_ROWS rows."""
+    if problem.m > MAX_RANK_ROWS:
         return np.zeros(0)
     with np.errstate(all="ignore"):
         scale = 1.0 / np.sqrt(problem.d)

@@ -1,4 +1,4 @@
-"""What a report of a bug needs: versions, processor, compiler, backends, and whether kernels give their bits here."""
+"""Facts for bug reports: versions, processor, compiler, backends, and whether kernels give the expected bits here."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from lavender.solvers.registry import get, known, specs
 from lavender.solving.solve import solve
 from lavender_ext.sweep import serial
 
-#: Hash of what each part of the self-test made, on any machine: starts are exact numbers, kernels round alike.
+#: Expected hashes of the parts of the self-test: starts are exact numbers, and kernels round equally everywhere.
 HASHES = {
     "pgs, coulomb": "4d51c4d5ba92212c",
     "block_gauss_seidel, coulomb": "c08c92ae0a6354d6",
@@ -35,35 +35,40 @@ HASHES = {
 
 
 def self_test() -> dict[str, str]:
-    """Hash of each part: sweeps over a matrix and over bodies, exact blocks, steps of a stack and of every scene.
+    """Compute the hash of each part: sweeps over a matrix and over bodies, exact blocks, steps of scenes.
 
-    `newton`, `direct` and `admm` are left out: parts of them pass through BLAS and LAPACK, whose bits are their own.
+    `newton`, `direct` and `admm` are left out: parts of them use BLAS and LAPACK, and their bits depend on the library.
     """
-    made = {}
+    results = {}
     for name, law in (
         ("pgs", "coulomb"),
         ("block_gauss_seidel", "coulomb"),
         ("nncg", "coulomb"),
         ("anderson", "cone"),
     ):
-        made[f"{name}, {law}"] = solve(_contacts(law), name, tol=0.0, max_iter=12).impulse
+        results[f"{name}, {law}"] = solve(_contacts(law), name, tol=0.0, max_iter=12).impulse
     for name in ("sequential_impulses", "anderson"):
-        made[f"{name}, bodies"] = solve(_bodies(), name, tol=0.0, max_iter=12).impulse
-    made["stack, 60 steps"] = steps_of("stack", 60)
-    # starts of scenes, too; NumPy draws the turns of a pile, which may pass through the mathematical library
-    own = [name for name, build in SCENES.items() if build.__module__ == "lavender.sim.scene.gallery"]
-    made["gallery, 5 steps"] = np.concatenate([steps_of(name, 5) for name in sorted(own) if name != "pile"])
+        results[f"{name}, bodies"] = solve(_bodies(), name, tol=0.0, max_iter=12).impulse
+    results["stack, 60 steps"] = simulate_positions("stack", 60)
+    # The starts of scenes are tested, too. The rotations of a pile are drawn by NumPy and may depend on the C library.
+    gallery_scenes = [
+        name for name, build in SCENES.items() if build.__module__ == "lavender.sim.scene.gallery"
+    ]
+    results["gallery, 5 steps"] = np.concatenate(
+        [simulate_positions(name, 5) for name in sorted(gallery_scenes) if name != "pile"]
+    )
     return {
-        name: hashlib.sha256(np.ascontiguousarray(x).tobytes()).hexdigest()[:16] for name, x in made.items()
+        name: hashlib.sha256(np.ascontiguousarray(x).tobytes()).hexdigest()[:16]
+        for name, x in results.items()
     }
 
 
 def examine() -> dict[str, Any]:
-    """Everything, as plain data; `self_test` says "same" or what was expected and what came of each part."""
-    begun = perf_counter()
+    """Collect all facts as plain data; `self_test` gives "same", or the expected and the actual hash, for each part."""
+    start_time = perf_counter()
     backends = {name: reason for name, reason in known().items() if specs()[name].external}
     parts = {
-        n: "same" if h == HASHES.get(n) else f"{HASHES.get(n)} expected, {h} came"
+        n: "same" if h == HASHES.get(n) else f"{HASHES.get(n)} expected, {h} found"
         for n, h in self_test().items()
     }
     affinity = getattr(os, "sched_getaffinity", None)
@@ -84,18 +89,18 @@ def examine() -> dict[str, Any]:
         "backends": {name: reason or version_of(name) for name, reason in backends.items()},
         "self_test": parts,
         "same_bits": all(x == "same" for x in parts.values()),
-        "seconds": round(perf_counter() - begun, 2),
+        "seconds": round(perf_counter() - start_time, 2),
     }
 
 
 def version_of(solver: str) -> str:
-    """Versions of the packages that a backend runs on."""
-    found = versions(get(solver).requires, base=())
-    return ", ".join(f"{name} {v}" for name, v in found.items()) or "installed"
+    """Return the versions of the packages that a backend needs."""
+    package_versions = versions(get(solver).requires, base=())
+    return ", ".join(f"{name} {v}" for name, v in package_versions.items()) or "installed"
 
 
-def steps_of(scene: str, n: int) -> Any:
-    """Positions of all bodies after n steps of a scene."""
+def simulate_positions(scene: str, n: int) -> Any:
+    """Compute the positions of all bodies after n steps of a scene."""
     simulation = Simulation(scene)
     for _ in range(n):
         positions = simulation.step()[0]["positions"]
@@ -103,7 +108,7 @@ def steps_of(scene: str, n: int) -> Any:
 
 
 def _contacts(law: str) -> Problem:
-    """Eight contacts of three rows: whole numbers and halves alone, so that no library computes the start."""
+    """Build eight contacts of three rows from integers and halves only, so that no library rounds the start."""
     m = 24
     i, j = np.indices((m, m))
     a = np.where(i == j, 4.0, np.where(np.abs(i - j) <= 3, -0.5, 0.0)) + np.where(
@@ -115,11 +120,11 @@ def _contacts(law: str) -> Problem:
 
 
 def _bodies() -> Problem:
-    """Six boxes on each other, four contacts between each two, pushed sideways: every number is a dyadic fraction."""
+    """Build six boxes on each other with four contacts each, pushed sideways; every number is a dyadic fraction."""
     n, corners = 6, np.array([[-0.5, -0.5], [-0.5, 0.5], [0.5, -0.5], [0.5, 0.5]])
     arm = np.repeat([[0.0, 0.0, 0.5]], 4, axis=0)
     arm[:, :2] = corners
-    down = arm * [1.0, 1.0, -1.0]
+    lower_arm = arm * [1.0, 1.0, -1.0]
     bodies = np.repeat(np.array([[i - 1, i] for i in range(n)], np.int32), 4, axis=0)
     c = 4 * n
     inverse = np.array([2.0**-i for i in range(n)])
@@ -135,7 +140,7 @@ def _bodies() -> Problem:
         normal=np.tile([0.0, 0.0, 1.0], (c, 1)),
         tangent=np.tile([1.0, 0.0, 0.0], (c, 1)),
         arm_a=np.tile(arm, (n, 1)),
-        arm_b=np.tile(down, (n, 1)),
+        arm_b=np.tile(lower_arm, (n, 1)),
         contact_body=bodies,
     )
     return Problem.from_rows(rows, mu=0.5 * np.ones(c))

@@ -1,4 +1,4 @@
-"""The machine and the versions that a timing belongs to."""
+"""Describe the machine and the versions with which times were measured."""
 
 from __future__ import annotations
 
@@ -21,28 +21,30 @@ from lavender._version import __version__
 from lavender.lab.bench.record import Run
 from lavender_ext.sweep import serial
 
-SHARE = 0.5  # of the machine's memory, which the processes of backends may take together
-LEAST = 2 * 2**30  # bytes: below that, packages of compiled code do not start
+BACKEND_MEMORY_FRACTION = (
+    0.5  # The processes of backends may use this fraction of the machine's memory together.
+)
+MIN_BACKEND_MEMORY = 2 * 2**30  # [bytes] With less memory, packages of compiled code do not start.
 
-BASE = ("numpy", "scipy", "qpsolvers", "osqp")
+BASE_PACKAGES = ("numpy", "scipy", "qpsolvers", "osqp")
 
 
 def _cpuinfo(name: str) -> str:
-    """What Linux says of the first processor under that name; empty elsewhere."""
+    """Return Linux's value of an entry for the first processor; empty on other systems."""
     with contextlib.suppress(OSError):
-        told = Path("/proc/cpuinfo").read_text(errors="replace")
-        if found := re.search(rf"^(?:{name})\s*:\s*(.+)$", told, re.MULTILINE):
+        text = Path("/proc/cpuinfo").read_text(errors="replace")
+        if found := re.search(rf"^(?:{name})\s*:\s*(.+)$", text, re.MULTILINE):
             return found[1].strip()
     return ""
 
 
 def cpu_name() -> str:
-    """Model of the processor, as the system names it."""
+    """Return the model of the processor, as the system names it."""
     return _cpuinfo("model name|Model") or platform.processor() or platform.machine() or "unknown"
 
 
 def memory() -> int:
-    """Bytes of memory of this machine, or of the container that it is; 0 where that is not known."""
+    """Return the memory of this machine or of its container [bytes]; 0 if it is not known."""
     found = []
     with contextlib.suppress(AttributeError, ValueError, OSError):
         found.append(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
@@ -53,12 +55,16 @@ def memory() -> int:
 
 
 def memory_share(processes: int = 1) -> int:
-    """Bytes that each of so many processes of backends may take: half of the memory together, 2 GiB each at least."""
-    return max(LEAST, int(SHARE * memory() / max(1, processes))) if memory() else 0
+    """Return the memory [bytes] that each of these backend processes may use: half of it together, 2 GiB at least."""
+    return (
+        max(MIN_BACKEND_MEMORY, int(BACKEND_MEMORY_FRACTION * memory() / max(1, processes)))
+        if memory()
+        else 0
+    )
 
 
-def versions(packages: Iterable[str] = (), base: Iterable[str] = BASE) -> dict[str, str]:
-    """Version of each installed distribution, or of that of a module; those that are not installed are left out."""
+def versions(packages: Iterable[str] = (), base: Iterable[str] = BASE_PACKAGES) -> dict[str, str]:
+    """Return the version of each installed distribution, or of a module's; missing ones are left out."""
     found = {}
     for name in sorted({*base, *packages}):
         try:
@@ -70,11 +76,12 @@ def versions(packages: Iterable[str] = (), base: Iterable[str] = BASE) -> dict[s
 
 @cache
 def _distributions() -> Mapping[str, list[str]]:
-    return metadata.packages_distributions()  # by module; reads the lists of all that is installed
+    """Return {module: distributions}; it reads the file lists of all installed packages."""
+    return metadata.packages_distributions()
 
 
 def describe(plan: Mapping[str, Any], packages: Iterable[str] = ()) -> Run:
-    """The run that starts now. Its identity holds CPU, versions and plan, not the time."""
+    """Describe a run that starts now; its identity is a hash of CPU, versions and plan, not of the time."""
     facts = {
         "lavender": __version__,
         "python": platform.python_version(),
@@ -84,11 +91,14 @@ def describe(plan: Mapping[str, Any], packages: Iterable[str] = ()) -> Run:
         "threads": 1,
         "versions": versions(packages),
     }
-    # What decides how a single measurement comes out; which cases and solvers are asked for does not.
-    same: dict[str, Any] = {**facts, "plan": {k: plan[k] for k in ("repeats", "campaign") if k in plan}}
+    # These facts affect a single measurement; the selection of cases and solvers does not.
+    identity_facts: dict[str, Any] = {
+        **facts,
+        "plan": {k: plan[k] for k in ("repeats", "campaign") if k in plan},
+    }
     build = build_facts()
-    same["build"] = build
-    digest = hashlib.sha256(json.dumps(same, sort_keys=True, default=str).encode()).hexdigest()[:12]
+    identity_facts["build"] = build
+    digest = hashlib.sha256(json.dumps(identity_facts, sort_keys=True, default=str).encode()).hexdigest()[:12]
     started = datetime.now(timezone.utc).isoformat(timespec="seconds")
     return Run(
         run=digest,
@@ -101,21 +111,21 @@ def describe(plan: Mapping[str, Any], packages: Iterable[str] = ()) -> Run:
 
 
 def load() -> float | None:
-    """Processes that wanted a processor, mean of the last minute; None where the system does not say."""
+    """Return the mean number of runnable processes in the last minute; None if the system does not provide it."""
     with contextlib.suppress(AttributeError, OSError):
         return float(os.getloadavg()[0])
     return None
 
 
 def running() -> float | None:
-    """Processes that want a processor now, this one among them; elsewhere than on Linux as `load`."""
+    """Return the number of runnable processes now, including this one; other systems than Linux return `load`."""
     with contextlib.suppress(OSError, ValueError, IndexError):
         return float(Path("/proc/loadavg").read_text().split()[3].partition("/")[0])
     return load()
 
 
 def clock() -> dict[str, str]:
-    """Frequency of the processor now, and what governs it, as far as the system says."""
+    """Return the frequency of the processor and its governor, if the system provides them."""
     mhz = _cpuinfo("cpu MHz")
     found = {"clock": f"{float(mhz):.0f} MHz"} if mhz else {}
     with contextlib.suppress(OSError):
@@ -125,7 +135,7 @@ def clock() -> dict[str, str]:
 
 @cache
 def build_facts() -> dict[str, str]:
-    """What was built, and of what: commit of a checkout or hash of a wheel's kernels, compiler, flags, BLAS."""
+    """Describe the build: commit of a checkout, hash of the kernels, compiler, flags, BLAS."""
     package = Path(__file__).resolve().parents[2]
     library = Path(str(serial.__file__))
     found = {"commit": commit} if (commit := commit_of(package.parent)) else {}
@@ -143,21 +153,21 @@ def build_facts() -> dict[str, str]:
 
 
 def commit_of(root: Path) -> str:
-    """Of a checkout, with a mark where files differ from it; empty elsewhere."""
+    """Return the commit of a checkout, marked if files differ from it; empty if it is not a checkout."""
     if not (root / ".git").exists():
         return ""
     with contextlib.suppress(OSError, subprocess.SubprocessError):
-        said = subprocess.run(
+        described = subprocess.run(
             ["git", "--no-optional-locks", "-C", str(root),
              "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"],
             capture_output=True, encoding="utf-8", errors="replace", timeout=10, check=True,
         )  # fmt: skip
-        return said.stdout.strip()
+        return described.stdout.strip()
     return ""
 
 
 def build_of(library: bytes) -> dict[str, str]:
-    """Compiler and Cython that a compiled module names; what it does not name is left out."""
+    """Return the compiler and the Cython version that a compiled module names, if it names them."""
     found = {}
     compiler = re.search(rb"GCC: \([^)\x00]*\) [\d.]+|clang version [\d.]+|MSVC [\d.]+", library)
     if compiler:

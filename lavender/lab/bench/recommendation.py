@@ -50,14 +50,13 @@ class Choice:
     cases: int
     # Ranks solvers and is shown: shifted geometric mean of times [s], or the 90th percentile of residuals [-].
     score: float
-    p95: float = (
-        math.nan
-    )  # 95th percentile over the cases of the values that `score` summarises; inf: not reached
+    # 95th percentile over the cases of the values that `score` summarises; inf: not reached.
+    p95: float = math.nan
     worst: float = math.nan
     hardest: str = ""  # the case of `worst`
-    how: str = ""  # the budget that was used, and for a sequence whether impulses are carried
+    how: str = ""  # the budget, and for a sequence, whether impulses are carried
     iterations: int = 0  # of that budget, 0 without one
-    overrun: float = math.nan  # 95th percentile of the call's time over the time that it was given
+    overrun: float = math.nan  # 95th percentile of the call's time over its time limit
 
     def is_for(self, share: float) -> bool:
         """Return whether it solves at least this share of the cases, and at least one case."""
@@ -86,7 +85,7 @@ class Advice:
     target: float  # tolerance [-] or time [s]
     ranking: tuple[Choice, ...]
     equal: int = 1  # number of solvers at the head that are the best within noise; their order is fixed
-    least: float = 0.0  # share of the cases below which no solver is recommended
+    least: float = 0.0  # A solver must serve at least this fraction of the cases to be recommended.
 
     @property
     def best(self) -> Choice | None:
@@ -198,7 +197,7 @@ def _group_runs(records: Records) -> RunGroups:
 
 
 def _group_sweep_budgets(records: Records) -> dict[int, RunGroups]:
-    """Group the runs of each budget whose iterations are sweeps."""
+    """Group the runs of each budget that is counted in sweeps."""
     groups: dict[int, dict[tuple[str, str, str], _RunGroup]] = defaultdict(dict)
     for r in records:
         compared = (
@@ -248,7 +247,7 @@ def rank_in_time(
 ) -> Advice:
     """Rank solvers by the residual that they leave on these cases, or steps, within a time [s].
 
-    A run whose time equals the limit within noise is in it in one report and not in the next: a solver that would be
+    A run with a time equal to the limit within noise is in it in one report and not in the next: a solver that would be
     the best with such runs is as good as the best.
     """
     selected = _select_groups(cases, _group_runs(records) if groups is None else groups)

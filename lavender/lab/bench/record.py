@@ -1,4 +1,4 @@
-"""One line of a report: what was asked, what came back, what it cost, on which machine."""
+"""Entries of a report: a run, a case, a solver that did not run, and a measurement; their JSON form."""
 
 from __future__ import annotations
 
@@ -12,46 +12,46 @@ from typing import Any
 from lavender.judge.residuals import VERDICTS_OF_OLD
 from lavender.judge.solution import CLAIM_CHECKS, CONFIRMED, CONTRADICTED, NOT_PROVEN
 
-# Beside the statuses of a solve: what can happen to a run that brings no solution back.
+# Statuses of a run that returned no solution, in addition to the statuses of a solve.
 ERROR, KILLED, CRASHED = "ERROR", "KILLED", "CRASHED"
 
 
 def format_tolerance(tolerance: float) -> str:
-    """Return a tolerance with the exponent's leading zeros removed: 1e-3, not 1e-03."""
+    """Format a tolerance without leading zeros in its exponent: 1e-3, not 1e-03."""
     mantissa, _, exponent = f"{tolerance:.3e}".partition("e")
     mantissa = mantissa.rstrip("0").rstrip(".")
     return f"{mantissa}e{int(exponent)}"
 
 
-def asked_of(mode: str, tol: float, max_iter: int) -> str:
-    """What a run is asked for, in words: to 1e-6, or 16 iterations."""
+def describe_target(mode: str, tol: float, max_iter: int) -> str:
+    """Describe the target of a run: "to 1e-6", or "16 iterations"."""
     return f"{max_iter} iterations" if mode == "budget" else f"to {format_tolerance(tol)}"
 
 
-LONGEST_NAME = 120  # characters of a file's name: file systems take 255 bytes, with a suffix
+MAX_FILE_NAME_LENGTH = 120  # [characters] File systems accept 255 bytes, including a suffix.
 
 
 def file_name(name: str) -> str:
-    """A name that every file system, and the address of a part of a page, takes; long ones keep their difference."""
-    plain = re.sub(r"[^A-Za-z0-9._-]+", "_", name).strip("_.") or "figure"
-    if len(plain) <= LONGEST_NAME:
-        return plain
+    """Convert a name to one that every file system and URL fragment accepts; a hash keeps long names distinct."""
+    short = re.sub(r"[^A-Za-z0-9._-]+", "_", name).strip("_.") or "figure"
+    if len(short) <= MAX_FILE_NAME_LENGTH:
+        return short
     digest = hashlib.sha256(name.encode("utf-8", "surrogatepass")).hexdigest()[:12]
-    return f"{plain[: LONGEST_NAME - 13]}-{digest}"
+    return f"{short[: MAX_FILE_NAME_LENGTH - 13]}-{digest}"
 
 
-#: What no text of a report holds: controls, lone surrogates, marks that end a line or turn the writing round.
+#: Characters that no text of a report contains: controls, lone surrogates, line ends, marks of writing direction.
 _UNPRINTABLE = re.compile(
     "[\x00-\x1f\x7f-\x9f\u2028\u2029\u200e\u200f\u202a-\u202e\u2066-\u2069\ud800-\udfff]"
 )
-_NAMED = {"\n": "\\n", "\t": "\\t", "\r": "\\r"}
+_ESCAPE_SEQUENCES = {"\n": "\\n", "\t": "\\t", "\r": "\\r"}
 
 
 def printable(text: str, lines: bool = False) -> str:
-    """Text that any terminal, file and page can show: what cannot be shown is written as its code.
+    """Replace characters that a terminal, file or page cannot show by their codes.
 
-    A byte of a file name that is no UTF-8 (a lone surrogate in Python's text) is written as that byte. With `lines`
-    ends of lines and tabs are kept, as messages have them; a name stands on one line.
+    A byte of a file name that is not UTF-8 (a lone surrogate in Python's string) is written as this byte. With `lines`,
+    line ends and tabs are kept, as in messages; without, the result is one line.
     """
     if text.isprintable():
         return text
@@ -62,128 +62,257 @@ def printable(text: str, lines: bool = False) -> str:
         code = ord(found[0])
         if 0xDC80 <= code <= 0xDCFF:
             code -= 0xDC00
-        return _NAMED.get(found[0]) or (f"\\x{code:02x}" if code < 0x100 else f"\\u{code:04x}")
+        return _ESCAPE_SEQUENCES.get(found[0]) or (f"\\x{code:02x}" if code < 0x100 else f"\\u{code:04x}")
 
     return _UNPRINTABLE.sub(escape, text)
 
 
-def _clean(value: Any, lines: bool = False) -> Any:
+def _make_printable(value: Any, lines: bool = False) -> Any:
+    """Make all texts in a value printable."""
     if isinstance(value, str):
         return printable(value, lines)
     if isinstance(value, Mapping):
-        return {_clean(k): _clean(v) for k, v in value.items()}
+        return {_make_printable(k): _make_printable(v) for k, v in value.items()}
     if isinstance(value, (list, tuple)):
-        return type(value)(map(_clean, value))
+        return type(value)(map(_make_printable, value))
     return value
 
 
-class _Texts:
-    """An entry whose texts can be printed, wherever they came from; messages alone have several lines."""
+class _PrintableEntry:
+    """Base of entries: their texts are made printable; only messages may have several lines."""
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
             if isinstance(value, (str, tuple, Mapping)):
-                object.__setattr__(self, name, _clean(value, name == "message"))
+                object.__setattr__(self, name, _make_printable(value, name == "message"))
 
 
 @dataclass(frozen=True)
-class Run(_Texts):
-    """One machine, one set of versions, one plan; records refer to it by `run`."""
+class Run(_PrintableEntry):
+    """One machine, one set of versions and one plan, to which records refer by `run`.
 
-    run: str  # identity: equal where machine, versions and plan are equal
-    started: str  # ISO 8601, UTC
+    Parameters
+    ----------
+    run : str
+        Identity: equal if machine, versions and plan are equal.
+    started : str
+        ISO 8601, UTC.
+    lavender, python, platform, cpu : str
+    cores : int
+    threads : int
+        Threads of BLAS and OpenMP while times are measured.
+    versions : mapping
+    plan : mapping
+    build : mapping
+        Commit, hash of the kernels, compiler, BLAS, clock.
+    load : float or None
+        Mean number of runnable processes in the minute before.
+    whole : bool
+        False from the start of the run until all measurements are made.
+    """
+
+    run: str
+    started: str
     lavender: str
     python: str
     platform: str
     cpu: str
     cores: int
-    threads: int  # of BLAS and OpenMP while timing
+    threads: int
     versions: Mapping[str, str]
     plan: Mapping[str, Any]
-    # commit, hash of the kernels, compiler, BLAS, clock
     build: Mapping[str, str] = field(default_factory=dict)
-    load: float | None = None  # processes that wanted the processor, mean of the minute before
-    whole: bool = True  # False from its start until all that was asked for is measured
+    load: float | None = None
+    whole: bool = True
 
 
 @dataclass(frozen=True)
-class CaseInfo(_Texts):
-    """What a report says of a problem without holding it."""
+class CaseInfo(_PrintableEntry):
+    """Description of a case for a report, without its problem.
+
+    Parameters
+    ----------
+    run, case : str
+    source : str
+        Path, or name in the suite.
+    sha : str
+        Hash of the numbers: a file with changed numbers is another case.
+    law : str
+    rows, blocks, contacts : int
+    bodies : int
+        0 if only a matrix is known.
+    nonzeros : int
+        Of A, or of J if A is not formed.
+    mass_ratio : float
+        Largest over smallest body mass, or entry of A's diagonal.
+    structure : tuple of str
+        "stack", "chain", "pile", "redundant", "friction", "large mass ratio", ...
+    symmetric : bool
+    reason : str
+        Property that the case tests.
+    stored : float
+        Relative residual of the answer stored with the problem, such as an engine's.
+    sequence : str
+        Sequence of which it is a step.
+    step : int
+    nothing_to_do : bool
+        The zero impulse is a solution: the case is not ranked.
+    identity : str
+        Hash of the numbers of all steps of its sequence: equal only for steps of the same sequence.
+    stored_verdict : str
+        Verdict on a stored answer in float32: at its floor, stopped before convergence (by how much), or wrong.
+    diagnostics : tuple of str
+        Likely mistakes in its data.
+    guess : {"", "start", "answer"}
+        Kind of the problem's guess; no run starts from an "answer".
+    condition : float or None
+        Condition number of A on its range, scaled to a unit diagonal; None if it was not computed.
+    proof : str
+        Distance of an enclosed exact solution, or the reason why none is; empty if it was not requested.
+    """
 
     run: str
     case: str
-    source: str  # path, or the name in the suite
-    sha: str  # of the numbers, so that a changed file is another case
+    source: str
+    sha: str
     law: str
     rows: int
     blocks: int
     contacts: int
-    bodies: int  # 0 where only a matrix is known
-    nonzeros: int  # of A; of J where A is not formed
-    mass_ratio: float  # largest over smallest: body masses, or the diagonal of A
-    structure: tuple[str, ...]  # stack, chain, pile, redundant, friction, large mass ratio, ...
+    bodies: int
+    nonzeros: int
+    mass_ratio: float
+    structure: tuple[str, ...]
     symmetric: bool
-    reason: str = ""  # why the case is in the suite
-    stored: float = math.nan  # - relative residual of the answer stored beside the problem, an engine's own
-    sequence: str = ""  # name of the sequence that this is a step of
+    reason: str = ""
+    stored: float = math.nan
+    sequence: str = ""
     step: int = -1
-    nothing_to_do: bool = False  # doing nothing is a solution: the case is not ranked
-    identity: str = ""  # of the sequence, from the numbers of all its steps: steps of two are never one
-    # of a stored answer in float32: at its floor, stopped before convergence (by how much) or wrong
+    nothing_to_do: bool = False
+    identity: str = ""
     stored_verdict: str = ""
-    diagnostics: tuple[str, ...] = ()  # what looks like a mistake in its data
-    guess: str = ""  # to begin at: a "start"; an "answer", from which nothing is measured; or nothing
-    # of A, scaled to a diagonal of 1, over its range; None where it was not computed
+    diagnostics: tuple[str, ...] = ()
+    guess: str = ""
     condition: float | None = None
-    # how near an exact solution is enclosed, or why none is; empty where it was not asked for
     proof: str = ""
 
 
 @dataclass(frozen=True)
-class Skip(_Texts):
-    """A solver that did not run on a case, or a case that did not load (then `solver` is empty)."""
+class Skip(_PrintableEntry):
+    """A solver that did not run on a case, or, with an empty `solver`, a case that did not load.
+
+    `sequence` is the sequence of a step that did not load.
+    """
 
     run: str
     case: str
     solver: str
     reason: str
-    sequence: str = ""  # that a case which did not load is a step of
+    sequence: str = ""
 
 
 @dataclass(frozen=True)
-class Record(_Texts):
-    """One solver on one case with one budget or tolerance. Times are seconds."""
+class Record(_PrintableEntry):
+    """One solver on one case with one budget, tolerance or time limit.
+
+    Parameters
+    ----------
+    run, case : str
+    sha : str
+        Hash of the case's numbers.
+    solver : str
+    options : mapping
+    start : {"cold", "warm", "carried"}
+        From the zero impulse, from the problem's guess, or from the impulses of the step before.
+    mode : {"tol", "budget", "time"}
+        "tol": to the residual `tol`; "budget": exactly `max_iter` iterations; "time": to `tol`, until `time_limit`.
+    tol : float
+    max_iter : int
+    time_limit : float, s
+    order : str
+    seed : int
+    status : str
+        Name of a Status, ERROR, KILLED or CRASHED.
+    relative : float
+    energy : float, sqrt J
+    velocity : float, m/s
+    roundoff_floor : float
+        Residual, by the judge.
+    motion_error : float or None
+        Relative motion error; None if it was not requested, or if there is none.
+    motion_speed : float or None, m/s
+        Motion error of the body with the largest one, or of a row without bodies.
+    bound : float or None, sqrt J
+        Proved bound of the motion error.
+    boundary_fraction : float or None
+        Fraction of blocks at a boundary; None if no error has a bound.
+    solution_hash : str
+        Hash of the answer: equal for answers with equal bits.
+    worst_row : int
+    worst_name : str
+    success : bool
+        By the judge, relative <= tol; False for a budget.
+    claim_check : {"confirmed", "not proven", "contradicted"}
+        As in a Solution.
+    status_conflict : str
+        Reason why the judge contradicts the status; empty if it does not.
+    claims : bool
+        The solver claims a solution: CONVERGED, ROUNDOFF_LIMIT or INFEASIBLE.
+    iterations : int
+    work : mapping
+    form, message : str
+    repeats : int
+    setup_min, setup_median, solve_min, solve_median : float, s
+    time_min, time_median : float, s
+        Time of one repeat: of the call that `timing_mode` names, or else of set-up and solve together.
+    threads : int
+    step : int
+        Step of a sequence; -1 for a single case.
+    timing_mode : {"", "call", "steps", "batch"}
+        Timed call. "call": one `lv.solve` on a new problem; "steps": the same in a loop that carries impulses;
+        "batch": a problem's share of one `lv.solve_many`; "": prepare and solve, without judge and input validation.
+    interleave_group : str
+        Identifies the calls and cases that alternated with this one; "" if its repeats were consecutive.
+    times : tuple of float, s
+        Time of each repeat.
+    residual_per_repeat : tuple of float
+        Relative residual of each repeat, if they differ (mode "time").
+    calibration_time : float or None, s
+        Time of a loop of fixed work next to the repeats, which measures the machine's speed.
+    load : float or None
+        Number of runnable processes when the record was made, including this one.
+    backend_time_min : float or None, s
+        Minimum time of a third-party backend's own solve, on data that it already held.
+    """
 
     run: str
     case: str
-    sha: str  # of the case's numbers
+    sha: str
     solver: str
     options: Mapping[str, Any]
-    # "cold" from doing nothing, "warm" from the guess of the problem, "carried" from the step before
     start: str
-    # "tol": to that residual; "budget": exactly max_iter iterations; "time": to tol, but stopped at time_limit
     mode: str
     tol: float
     max_iter: int
-    time_limit: float  # s
+    time_limit: float
     order: str
     seed: int
-    status: str  # a Status name, ERROR, KILLED or CRASHED
-    relative: float = math.inf  # -
-    energy: float = math.inf  # sqrt J
-    velocity: float = math.inf  # m/s
-    roundoff_floor: float = math.nan  # -
-    motion_error: float | None = None  # -, relative motion error; None if not requested or not available
-    motion_speed: float | None = None  # m/s, of the body that is furthest off (row, without bodies)
-    bound: float | None = None  # sqrt J, proved bound of the motion error
-    boundary_fraction: float | None = None  # -, share of blocks at a boundary; None if no error has a bound
-    solution_hash: str = ""  # hash of the impulses: equal if they are bit-identical
+    status: str
+    relative: float = math.inf
+    energy: float = math.inf
+    velocity: float = math.inf
+    roundoff_floor: float = math.nan
+    motion_error: float | None = None
+    motion_speed: float | None = None
+    bound: float | None = None
+    boundary_fraction: float | None = None
+    solution_hash: str = ""
     worst_row: int = -1
     worst_name: str = ""
-    success: bool = False  # the judge: relative <= tol (a budget: false)
-    claim_check: str = CONFIRMED  # "confirmed", "not proven" or "contradicted", as in a Solution
-    status_conflict: str = ""  # why the judge's figures exclude what the status claims; empty if they do not
-    claims: bool = False  # the solver claims a solution: CONVERGED, ROUNDOFF_LIMIT or INFEASIBLE
+    success: bool = False
+    claim_check: str = CONFIRMED
+    status_conflict: str = ""
+    claims: bool = False
     iterations: int = 0
     work: Mapping[str, int] = field(default_factory=dict)
     form: str = ""
@@ -193,53 +322,41 @@ class Record(_Texts):
     setup_median: float = math.nan
     solve_min: float = math.nan
     solve_median: float = math.nan
-    # of one repeat: of the line where `timing_mode` says one, else set-up and solve together
     time_min: float = math.nan
     time_median: float = math.nan
     threads: int = 1
-    step: int = -1  # of a sequence
-    # "call": one `lv.solve` on a new problem. "steps": the same in a loop that carries impulses. "batch": the time of
-    # one `lv.solve_many`, divided by its problems. "": prepare and solve, without the judge and the input validation.
+    step: int = -1
     timing_mode: str = ""
-    # identifies the calls that were timed alternately with this one; "": its repeats came one after the other
     interleave_group: str = ""
-    times: tuple[float, ...] = ()  # s, of each repeat
-    residual_per_repeat: tuple[float, ...] = ()  # relative residual of each repeat, in mode "time"
-    calibration_time: float | None = None  # s, of a loop of fixed work that ran with the repeats
-    load: float | None = None  # processes that wanted a processor when it was made, this one among them
-    # s, in the own interface of a third-party backend, on converted data
+    times: tuple[float, ...] = ()
+    residual_per_repeat: tuple[float, ...] = ()
+    calibration_time: float | None = None
+    load: float | None = None
     backend_time_min: float | None = None
 
     @property
     def key(self) -> tuple[Any, ...]:
-        """What makes two records the same measurement."""
+        """Key that is equal for records of the same measurement."""
         return measurement_key(self)
 
     @property
     def asked(self) -> str:
-        """The budget or the tolerance, and the order of sweeps where it is another."""
+        """Budget or tolerance, and the sweep order if it is not "given"."""
         order = "" if self.order == "given" else f", order {self.order}"
-        return asked_of(self.mode, self.tol, self.max_iter) + order
+        return describe_target(self.mode, self.tol, self.max_iter) + order
 
     @property
     def usable(self) -> bool:
-        """It brought back a finite residual and a time."""
+        """Whether the run returned a finite residual and a time."""
         return math.isfinite(self.relative) and math.isfinite(self.time_min)
 
 
-def measurement_key(what: Any) -> tuple[Any, ...]:
-    """The identity of a measurement, of its `Task` as of its `Record`."""
-    options = repr(sorted(plain(what.options).items()))
-    asked = (
-        what.start,
-        what.mode,
-        what.tol,
-        what.max_iter,
-        what.time_limit,
-        what.timing_mode,
-        what.interleave_group,
-    )
-    return (what.case, what.sha, what.solver, options, *asked)
+def measurement_key(measurement: Any) -> tuple[Any, ...]:
+    """Return the key of a measurement from its `Task` or its `Record`."""
+    m = measurement
+    options = repr(sorted(to_jsonable(m.options).items()))
+    request = (m.start, m.mode, m.tol, m.max_iter, m.time_limit, m.timing_mode, m.interleave_group)
+    return (m.case, m.sha, m.solver, options, *request)
 
 
 Entry = Run | CaseInfo | Skip | Record
@@ -266,25 +383,25 @@ KINDS: dict[str, type] = {"run": Run, "case": CaseInfo, "skip": Skip, "record": 
 
 
 def to_json(entry: Entry) -> dict[str, Any]:
-    """A dictionary that JSON can hold: inf and nan become words."""
+    """Convert an entry to a dictionary that JSON can hold: inf and nan become strings."""
     kind = next(name for name, cls in KINDS.items() if isinstance(entry, cls))
-    return {"kind": kind, **{f.name: plain(getattr(entry, f.name)) for f in fields(entry)}}
+    return {"kind": kind, **{f.name: to_jsonable(getattr(entry, f.name)) for f in fields(entry)}}
 
 
 def from_json(line: Any) -> Entry:
-    """Back again; fields that this version does not know are left out.
+    """Convert a dictionary back to an entry; unknown fields are ignored.
 
     Raises
     ------
     ValueError
-        Not an entry of a records file: a field that is missing, of another type or out of its range.
+        It is not an entry of a records file: a field is missing, has another type or is out of its range.
     """
     if not isinstance(line, Mapping) or not isinstance(line.get("kind"), str) or line["kind"] not in KINDS:
         raise ValueError("not an entry of a records file")
     cls = KINDS[line["kind"]]
-    line = _with_new_names(line)
+    line = _rename_fields(line)
     try:
-        values = values_in(cls, line)
+        values = parse_fields(cls, line)
         word, comma, rest = str(values.get("stored_verdict", "")).partition(",")
         if word in VERDICTS_OF_OLD:
             values["stored_verdict"] = VERDICTS_OF_OLD[word] + comma + rest
@@ -293,7 +410,7 @@ def from_json(line: Any) -> Entry:
         raise ValueError(f"not an entry of a records file ({error})") from None
 
 
-def _with_new_names(line: Mapping[str, Any]) -> Mapping[str, Any]:
+def _rename_fields(line: Mapping[str, Any]) -> Mapping[str, Any]:
     """Return a line of an earlier version with the fields' names of this one."""
     renamed = {RENAMED_FIELDS.get(name, name): value for name, value in line.items()}
     status = renamed.get("status")
@@ -310,13 +427,13 @@ def _with_new_names(line: Mapping[str, Any]) -> Mapping[str, Any]:
     return renamed | {"claim_check": CONTRADICTED}
 
 
-def values_in(cls: Any, line: Mapping[str, Any]) -> dict[str, Any]:
-    """Those fields of a data class that JSON can hold, as far as a line has them.
+def parse_fields(cls: Any, line: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the fields of a data class that a line of JSON contains, converted and checked.
 
     Raises
     ------
     ValueError
-        One is of another type than declared, or out of its range.
+        A field has another type than declared, or is out of its range.
     """
     values = {}
     for f in fields(cls):
@@ -325,14 +442,14 @@ def values_in(cls: Any, line: Mapping[str, Any]) -> dict[str, Any]:
             continue
         value = line[f.name]
         if kind.startswith("float") and (
-            _is_whole(value) or (_is_word(value) and value in ("inf", "-inf", "nan"))
+            _is_integer(value) or (_is_string(value) and value in ("inf", "-inf", "nan"))
         ):
             value = float(value)
         elif kind.startswith("tuple") and isinstance(value, list):
-            value = tuple(map(_number, value) if "float" in kind else value)
-        wanted, holds = _TYPES[kind]
-        if not holds(value):
-            raise ValueError(f"{f.name} is not {wanted}")
+            value = tuple(map(_to_float, value) if "float" in kind else value)
+        expected, is_valid = _TYPES[kind]
+        if not is_valid(value):
+            raise ValueError(f"{f.name} is not {expected}")
         rule = _RANGES.get((cls.__name__, f.name)) or (_RANGES[""] if isinstance(value, float) else None)
         if rule and not rule[1](value):
             raise ValueError(f"{f.name} is not {rule[0]}")
@@ -340,43 +457,49 @@ def values_in(cls: Any, line: Mapping[str, Any]) -> dict[str, Any]:
     return values
 
 
-def _number(value: Any) -> Any:
-    return float(value) if _is_whole(value) or value in ("inf", "nan") else value
+def _to_float(value: Any) -> Any:
+    """Convert an integer, or "inf" or "nan", to float; return other values unchanged."""
+    return float(value) if _is_integer(value) or value in ("inf", "nan") else value
 
 
-def _is_whole(value: Any) -> bool:
+def _is_integer(value: Any) -> bool:
+    """Whether a value is a 64-bit integer."""
     return isinstance(value, int) and not isinstance(value, bool) and -(2**63) <= value < 2**63
 
 
 def _is_flat(value: Any) -> bool:
-    """A number, a word, nothing, or a list of such: what options and plans hold."""
+    """Whether a value is a number, a string, None or a list of these, as options and plans hold."""
     if isinstance(value, list):
         return all(_is_flat(v) and not isinstance(v, list) for v in value)
-    return value is None or isinstance(value, (bool, str, float)) or _is_whole(value)
+    return value is None or isinstance(value, (bool, str, float)) or _is_integer(value)
 
 
-def _is_mapping(value: Any, holds: Callable[[Any], bool]) -> bool:
-    return isinstance(value, Mapping) and all(isinstance(k, str) and holds(v) for k, v in value.items())
+def _is_mapping(value: Any, is_valid: Callable[[Any], bool]) -> bool:
+    """Whether a value is a mapping from strings to values that `is_valid` accepts."""
+    return isinstance(value, Mapping) and all(isinstance(k, str) and is_valid(v) for k, v in value.items())
 
 
-def _is_word(value: Any) -> bool:
+def _is_string(value: Any) -> bool:
+    """Whether a value is a string."""
     return isinstance(value, str)
 
 
 def _is_positive(value: Any) -> bool:
-    return (_is_whole(value) or isinstance(value, float)) and math.isfinite(value) and value > 0
+    """Whether a value is a finite positive number."""
+    return (_is_integer(value) or isinstance(value, float)) and math.isfinite(value) and value > 0
 
 
 def _is_plan(plan: Mapping[str, Any]) -> bool:
+    """Whether a mapping is a plan with positive tolerances."""
     tolerances = plan.get("tolerances", [])
     return _is_mapping(plan, _is_flat) and isinstance(tolerances, list) and all(map(_is_positive, tolerances))
 
 
 _Rule = tuple[str, Callable[[Any], bool]]
-#: What a field of each declared type holds in a file.
+#: Description and test of the values of each declared type in a file.
 _TYPES: dict[str, _Rule] = {
-    "str": ("a text", _is_word),
-    "int": ("a whole number", _is_whole),
+    "str": ("a text", _is_string),
+    "int": ("a whole number", _is_integer),
     "float": ("a number", lambda v: isinstance(v, float)),
     "float | None": (
         "a number of 0 or more, or nothing",
@@ -387,15 +510,15 @@ _TYPES: dict[str, _Rule] = {
         "a list of numbers of 0 or more",
         lambda v: isinstance(v, tuple) and all(isinstance(x, float) and not x < 0.0 for x in v),
     ),
-    "tuple[str, ...]": ("a list of words", lambda v: isinstance(v, tuple) and all(map(_is_word, v))),
+    "tuple[str, ...]": ("a list of words", lambda v: isinstance(v, tuple) and all(map(_is_string, v))),
     "Mapping[str, Any]": (
         "a table of numbers and words",
         lambda v: _is_mapping(v, _is_flat),
     ),
-    "Mapping[str, str]": ("a table of words", lambda v: _is_mapping(v, _is_word)),
-    "Mapping[str, int]": ("a table of whole numbers", lambda v: _is_mapping(v, _is_whole)),
+    "Mapping[str, str]": ("a table of words", lambda v: _is_mapping(v, _is_string)),
+    "Mapping[str, int]": ("a table of whole numbers", lambda v: _is_mapping(v, _is_integer)),
 }
-#: What their values are limited to; "" is the rule of every other number with a fraction.
+#: Description and test of the range of a field; "" applies to all other floats.
 _RANGES: dict[Any, _Rule] = {
     "": ("0 or more", lambda v: not v < 0.0),
     ("Run", "plan"): ("a plan with positive tolerances", _is_plan),
@@ -416,16 +539,16 @@ _RANGES: dict[Any, _Rule] = {
 }
 
 
-def plain(value: Any) -> Any:
-    """What JSON can hold of a value: inf and nan become words."""
+def to_jsonable(value: Any) -> Any:
+    """Convert a value to one that JSON can hold: inf and nan become strings."""
     if isinstance(value, float):
         return value if math.isfinite(value) else str(value)
     if isinstance(value, Mapping):
-        return {str(k): plain(v) for k, v in value.items()}
+        return {str(k): to_jsonable(v) for k, v in value.items()}
     if isinstance(value, (list, tuple)):
-        return [plain(v) for v in value]
+        return [to_jsonable(v) for v in value]
     if isinstance(value, (bool, int, str)) or value is None:
         return value
     if hasattr(value, "tolist"):
-        return plain(value.tolist())
+        return to_jsonable(value.tolist())
     return str(value)

@@ -1,16 +1,16 @@
-"""Our Newton and MuJoCo's on the steps of models that one has, in one run.
+"""Compare lavender's Newton solver with MuJoCo's on steps of the user's models, in one run.
 
-Each model runs under random controls. At some of its steps the constraint problem is taken from memory and solved cold
-by both sides to the same judged residual:
+Each model is simulated under random controls. At some of its steps the constraint problem is read from memory and
+solved from a cold start by both solvers to the same judged residual:
 
-    MuJoCo   `mj_fwdConstraint` with the Newton solver, at the loosest tolerance whose answer the judge accepts
-    ours     `lavender.solve(problem)`: prepare, solve and judge; and the same in `solve_many`
+    MuJoCo      `mj_fwdConstraint` with the Newton solver, at the loosest tolerance with an accepted answer
+    lavender    `lavender.solve(problem)`: prepare, solve and judge; and the same in `solve_many`
 
-Construction of the problem, with M's factor, is apart, as `mj_factorM` is not counted either. Times are the least of
-several repetitions, taken in turns.
+Building the problem, with M's factor, is not included, as `mj_factorM` is not. Times are minima of several repetitions
+that alternate.
 
-`measure_warm` goes through consecutive steps: MuJoCo starts from its last accelerations, ours from the impulses of the
-last step, by key; MuJoCo at its own tolerance.
+`measure_warm` measures consecutive steps: MuJoCo starts from its last accelerations, lavender from the impulses of the
+last step, matched by key; MuJoCo has its own tolerance.
 """
 
 from __future__ import annotations
@@ -35,45 +35,69 @@ from lavender.lab.bench.running.runner import carry
 from lavender.problem import Problem
 from lavender.solving.solve import solve
 
-TARGET = 1e-6  # judged relative residual that both sides must reach
-STRICT = 1e-9  # that ours is asked for besides
-TOLERANCES = (1e-2, 1e-4, 1e-6, 1e-8, 1e-10, 1e-12, 1e-15)  # of MuJoCo, loosest first
-REPEATS = 5
-MANY = 64  # problems in one call of solve_many
+TARGET = 1e-6  # Judged relative residual that both solvers must reach.
+STRICT = 1e-9  # Tighter relative residual tolerance with which lavender's solver is run, too.
+MUJOCO_TOLERANCES = (1e-2, 1e-4, 1e-6, 1e-8, 1e-10, 1e-12, 1e-15)  # loosest first
+N_REPEATS = 5
+BATCH_SIZE = 64  # Number of problems in one call of solve_many.
 
 
 @dataclass(frozen=True)
 class WarmStep:
-    """One problem, both sides; of consecutive steps each from what it knew. Times in s, residuals relative."""
+    """One problem of consecutive steps, each solved from the result of the step before. Residuals are relative.
+
+    Parameters
+    ----------
+    model : str
+    step, rows : int
+    engine, ours : float, s
+        Time of MuJoCo's solver, and of one call of lavender's.
+    engine_residual, residual : float
+        Relative residual of MuJoCo's answer, and of lavender's.
+    """
 
     model: str
     step: int
     rows: int
     engine: float
-    ours: float  # one call
+    ours: float
     engine_residual: float
     residual: float
 
 
 @dataclass(frozen=True)
 class Step(WarmStep):
-    """One problem, both sides from nothing."""
+    """One problem, solved by both solvers from a cold start.
+
+    Parameters
+    ----------
+    nv : int
+    law : str
+    tolerance : float
+        Loosest tolerance of MuJoCo that was accepted; 0 if none was.
+    many : float, s
+        Time of lavender's solver per problem in solve_many.
+    strict : float
+        Relative residual of lavender's solver with the tolerance STRICT.
+    coulomb : float or None
+        The same under Coulomb's law; None if a contact has more than two tangents.
+    """
 
     nv: int
     law: str
-    tolerance: float  # of MuJoCo, the loosest accepted; 0 where none was
-    many: float  # s, each in solve_many
-    strict: float  # residual of ours when asked for STRICT
-    coulomb: float | None  # the same under Coulomb's law; None where a contact has more than two tangents
+    tolerance: float
+    many: float
+    strict: float
+    coulomb: float | None
 
 
-def fresh(problem: Problem) -> Problem:
-    """The same problem with nothing worked out of it, to be started from doing nothing."""
+def copy_cold(problem: Problem) -> Problem:
+    """Copy a problem without its guess and without anything derived from it."""
     return replace(problem, guess=None, copy=False)
 
 
-def least(run: Callable[[], Any], repeats: int = REPEATS) -> float:
-    """Least time of several runs [s]."""
+def min_time(run: Callable[[], Any], repeats: int = N_REPEATS) -> float:
+    """Return the minimum time of several runs [s]."""
     best = np.inf
     for _ in range(repeats):
         start = perf_counter()
@@ -82,75 +106,79 @@ def least(run: Callable[[], Any], repeats: int = REPEATS) -> float:
     return float(best)
 
 
-def engine_time(mj: Any, model: Any, data: Any, problem: Problem) -> tuple[float, float, float]:
-    """(tolerance, time, residual) of MuJoCo's Newton at the loosest tolerance that is accepted; else 0, its default."""
+def time_engine(mj: Any, model: Any, data: Any, problem: Problem) -> tuple[float, float, float]:
+    """Return (tolerance, time, residual) of MuJoCo's Newton at the loosest accepted tolerance, or 0, its default."""
     model = copy.copy(model)
     default = model.opt.tolerance
     model.opt.solver = mj.mjtSolver.mjSOL_NEWTON
     model.opt.disableflags |= int(mj.mjtDisableBit.mjDSBL_WARMSTART)
-    found = 0.0, np.inf
-    for tolerance in (*TOLERANCES, 0.0):
+    accepted = 0.0, np.inf
+    for tolerance in (*MUJOCO_TOLERANCES, 0.0):
         model.opt.tolerance = tolerance or default
         mj.mj_fwdConstraint(model, data)
-        found = tolerance, residual(problem, adapter.impulse(model, data)).relative
-        if found[1] <= TARGET:
+        accepted = tolerance, residual(problem, adapter.impulse(model, data)).relative
+        if accepted[1] <= TARGET:
             break
-    seconds = least(lambda: mj.mj_fwdConstraint(model, data), 4 * REPEATS)
-    return found[0], seconds, found[1]
+    seconds = min_time(lambda: mj.mj_fwdConstraint(model, data), 4 * N_REPEATS)
+    return accepted[0], seconds, accepted[1]
 
 
-def one_call(problem: Problem, impulse: Any = None) -> tuple[float, Solution]:
-    """Least time of a solve [s], and its solution: the same every time."""
+def time_one_call(problem: Problem, impulse: Any = None) -> tuple[float, Solution]:
+    """Return the minimum time of a solve [s], and its solution, which is always the same."""
     best = np.inf
-    for _ in range(REPEATS):
-        made = fresh(problem)
+    for _ in range(N_REPEATS):
+        cold_problem = copy_cold(problem)
         begin = perf_counter()
-        solution = solve(made, tol=TARGET, impulse=impulse)
+        solution = solve(cold_problem, tol=TARGET, impulse=impulse)
         best = min(best, perf_counter() - begin)
     return float(best), solution
 
 
-def our_times(problem: Problem) -> tuple[float, float, float]:
-    """(one call, each of many, residual), cold."""
-    one, solution = one_call(problem)
-    many, found = np.inf, solution.residual.relative
-    for _ in range(REPEATS):
-        batch = [fresh(problem) for _ in range(MANY)]
-        begin = thread_time()  # of the processor: milliseconds are long enough to be interrupted
-        made_of = solve_many(batch, tol=TARGET)
-        many = min(many, (thread_time() - begin) / MANY)
-        found = max(found, *(solution.residual.relative for solution in made_of))
-    return one, float(many), float(found)
+def time_cold_solves(problem: Problem) -> tuple[float, float, float]:
+    """Return (time of one call, time per problem of a batch, residual), from a cold start."""
+    single_time, solution = time_one_call(problem)
+    batch_time, residual_found = np.inf, solution.residual.relative
+    for _ in range(N_REPEATS):
+        batch = [copy_cold(problem) for _ in range(BATCH_SIZE)]
+        begin = thread_time()  # CPU time: the batch takes milliseconds and may be interrupted.
+        solutions = solve_many(batch, tol=TARGET)
+        batch_time = min(batch_time, (thread_time() - begin) / BATCH_SIZE)
+        residual_found = max(residual_found, *(solution.residual.relative for solution in solutions))
+    return single_time, float(batch_time), float(residual_found)
 
 
-def _problems(mj: Any, path: Path, model: Any, steps: int, every: int) -> Iterator[Any]:
-    """Number, data and problem of each `every`-th step under random controls; None for a problem without a row."""
+def _recorded_problems(mj: Any, path: Path, model: Any, steps: int, every: int) -> Iterator[Any]:
+    """Yield number, data and problem of each `every`-th step under random controls; None for problems without rows."""
     data, drive = mj.MjData(model), make_controller(model, "random", 0)
     for step in range(steps):
         data.ctrl[:] = drive(data, step)
         mj.mj_step(model, data)
         if (step + 1) % every == 0:
             mj.mj_forward(model, data)
-            some = int(data.nefc) > 0
-            yield step, data, adapter.from_mujoco(model, data, name=f"{path.stem} {step}") if some else None
+            has_rows = int(data.nefc) > 0
+            yield (
+                step,
+                data,
+                adapter.from_mujoco(model, data, name=f"{path.stem} {step}") if has_rows else None,
+            )
 
 
 def measure(mj: Any, path: Path, steps: int, every: int) -> list[Step]:
-    """Steps of one model under random controls; those without constraints or nothing to do are left out."""
+    """Measure steps of one model under random controls, except those without constraints or with a zero solution."""
     model = mj.MjModel.from_xml_path(os.fspath(path))
     out: list[Step] = []
-    for step, data, problem in _problems(mj, path, model, 20 * steps * every, every):
+    for step, data, problem in _recorded_problems(mj, path, model, 20 * steps * every, every):
         if problem is None or get_reference(problem)[1] < 1e-9:
             continue
-        tolerance, engine, engine_residual = engine_time(mj, model, data, problem)
-        ours, many, found = our_times(problem)
-        strict = solve(fresh(problem), tol=STRICT).residual
+        tolerance, engine, engine_residual = time_engine(mj, model, data, problem)
+        ours, batch_time, residual_found = time_cold_solves(problem)
+        strict = solve(copy_cold(problem), tol=STRICT).residual
         coulomb = None
         if not problem.cones.has_round:
-            under = solve(
+            coulomb_residual = solve(
                 problem.relaxed("coulomb"), tol=STRICT, impulse=problem.start(), time_limit=5.0
             ).residual
-            coulomb = 0.0 if under.at_floor else under.relative
+            coulomb = 0.0 if coulomb_residual.at_floor else coulomb_residual.relative
         out.append(
             Step(
                 model=path.stem,
@@ -161,9 +189,9 @@ def measure(mj: Any, path: Path, steps: int, every: int) -> list[Step]:
                 tolerance=tolerance,
                 engine=engine,
                 ours=ours,
-                many=many,
+                many=batch_time,
                 engine_residual=engine_residual,
-                residual=found,
+                residual=residual_found,
                 strict=0.0 if strict.at_floor else strict.relative,
                 coulomb=coulomb,
             )
@@ -174,18 +202,18 @@ def measure(mj: Any, path: Path, steps: int, every: int) -> list[Step]:
 
 
 def measure_warm(mj: Any, path: Path, steps: int) -> list[WarmStep]:
-    """Consecutive steps of one model under random controls, each solved warm by both sides."""
+    """Measure consecutive steps of one model under random controls, each solved warm by both solvers."""
     model = mj.MjModel.from_xml_path(os.fspath(path))
     model.opt.solver = mj.mjtSolver.mjSOL_NEWTON
     out: list[WarmStep] = []
     before: tuple[Problem, Any] | None = None
-    for step, data, problem in _problems(mj, path, model, steps, 1):
+    for step, data, problem in _recorded_problems(mj, path, model, steps, 1):
         if problem is None:
             before = None
             continue
-        engine = least(partial(mj.mj_fwdConstraint, model, data))
+        engine = min_time(partial(mj.mj_fwdConstraint, model, data))
         start = problem.start() if before is None else carry(*before, problem)
-        ours, solution = one_call(problem, start)
+        ours, solution = time_one_call(problem, start)
         before = problem, solution.impulse
         if get_reference(problem)[1] < 1e-9:
             continue

@@ -1,7 +1,7 @@
 """Compute statistics of records, of each case and over many cases, as lists of small frozen rows.
 
-Time to a tolerance: the smallest time of any run whose judged residual is at or below it, whatever was asked
-for: runs are matched by the accuracy they reached, never by the one they were asked for.
+The time to a tolerance is the shortest time of all runs with a judged residual of at most this tolerance. Runs are
+compared by the residual that they reached, not by the tolerance that they were given.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from statistics import median
 
 from lavender.judge.residuals import at_floor
 from lavender.judge.solution import CLAIM_CHECKS, CONFIRMED
-from lavender.lab.bench.record import Record, asked_of
+from lavender.lab.bench.record import Record, describe_target
 from lavender.lab.bench.store import Records
 
 STRUCTURE_ORDER = ("separate", "chain", "mesh", "stack", "pile", "dense")  # as tables list structures
@@ -47,9 +47,9 @@ def pairs(records: Iterable[Record]) -> dict[tuple[str, str, str], list[Record]]
 
 
 def families(records: Records) -> dict[str, list[str]]:
-    """Group cases by structure. A case is in every family whose word describes it.
+    """Group cases by structure. A case is in the family of every word that describes it.
 
-    A structure whose cases have several laws is a family for each law: "pile, coulomb". Words that describe the same
+    A structure with cases of several laws is a family for each law: "pile, coulomb". Words that describe the same
     cases are one family: "stack / friction".
     """
     cases_by_word: dict[str, dict[str, list[str]]] = defaultdict(lambda: defaultdict(list))
@@ -73,7 +73,7 @@ def is_campaign(records: Records) -> bool:
 
 
 def drop_idle_cases(records: Records) -> Records:
-    """Return the records without cases whose solution is the zero impulse: no ranking counts them."""
+    """Return the records without cases that the zero impulse solves: no ranking counts them."""
     idle = {name for name, info in records.cases.items() if info.nothing_to_do}
     if not idle:
         return records
@@ -86,53 +86,96 @@ def drop_idle_cases(records: Records) -> Records:
 
 @dataclass(frozen=True)
 class Reach:
-    """Times and smallest residual of one solver on one case."""
+    """Times and smallest residual of one solver on one case.
+
+    Parameters
+    ----------
+    case, solver, start : str
+    times : mapping of float to float, s
+        Time to each tolerance; inf if it was not reached.
+    best, roundoff_floor : float
+        Smallest relative residual of all runs, and its round-off floor.
+    status : str
+        Of the run to the tightest tolerance.
+    claim_check : str
+        The worst of all runs.
+    status_conflict, form : str
+    motion_error : float
+        Relative motion error of the best run; nan without one.
+    bound : float, sqrt J
+        Its proved bound; nan without one.
+    """
 
     case: str
     solver: str
     start: str
-    times: Mapping[float, float]  # s to each tolerance, inf where it was not reached
-    best: float  # smallest relative residual of any run
-    roundoff_floor: float  # of that run
-    status: str  # of the run to the tightest tolerance asked for
-    claim_check: str  # the worst of all runs
+    times: Mapping[float, float]
+    best: float
+    roundoff_floor: float
+    status: str
+    claim_check: str
     status_conflict: str
     form: str
-    motion_error: float  # -, relative motion error of the best run; nan where there is none
-    bound: float  # sqrt J, proved bound of it; nan where nothing is proved
+    motion_error: float
+    bound: float
 
     @property
     def at_floor(self) -> bool:
-        """No better residual can be asked of float64."""
+        """Whether the best residual is at the round-off floor of float64."""
         return at_floor(self.best, self.roundoff_floor)
 
 
 @dataclass(frozen=True)
 class Difficulty:
-    """Measures of the difficulty of a case, and the solvers that took the same shortcut."""
+    """Measures of the difficulty of a case.
+
+    Parameters
+    ----------
+    case : str
+    rows : int
+    sweeps : int or None
+        Sweeps of `pgs` to EASY_RESIDUAL; None if it did not reach it or did not run.
+    condition : float or None
+        See `CaseInfo.condition`.
+    boundary_fraction : float or None
+        Fraction of blocks at a boundary in the best answer, of the blocks with a bounded error.
+    proof : str
+    same : tuple of str
+        Solvers that returned the same bits without an iteration: their times are those of one shortcut.
+    """
 
     case: str
     rows: int
-    sweeps: int | None  # of `pgs` to EASY_RESIDUAL; None where it did not get there, or was not asked
-    condition: float | None  # of A, as `CaseInfo.condition`
-    boundary_fraction: (
-        float | None
-    )  # share of blocks at a boundary at the best answer, of those whose error has a bound
+    sweeps: int | None
+    condition: float | None
+    boundary_fraction: float | None
     proof: str
-    same: tuple[str, ...]  # solvers that gave the same bits without an iteration: a shortcut of all was timed
+    same: tuple[str, ...]
 
 
 @dataclass(frozen=True)
 class Claims:
-    """Claims of a solver, compared with the judge."""
+    """Claims of a solver, compared with the judge.
+
+    Parameters
+    ----------
+    solver : str
+    runs : int
+    claims, wrong : int
+        Runs with the status CONVERGED, ROUNDOFF_LIMIT or INFEASIBLE, and those that the judge contradicts.
+    asked, reached : int
+        Runs to a tolerance, and those that reached it by the judge.
+    crashed : int
+        Runs with the status ERROR, KILLED or CRASHED.
+    """
 
     solver: str
     runs: int
-    claims: int  # says CONVERGED, ROUNDOFF_LIMIT or INFEASIBLE
+    claims: int
     wrong: int
-    reached: int  # runs to a tolerance that the judge confirms
+    reached: int
     asked: int
-    crashed: int  # ERROR, KILLED, CRASHED
+    crashed: int
 
 
 @dataclass(frozen=True)
@@ -143,11 +186,11 @@ class Spread:
     solver: str
     budget: int
     by_order: Mapping[str, float]
-    roundoff_floor: float = 0.0  # below it residuals are rounding
+    roundoff_floor: float = 0.0  # Residuals below it are rounding errors.
 
     @property
     def factor(self) -> float:
-        """Worst over best order, neither counted as better than the floor."""
+        """Ratio of the worst to the best order, with residuals below the floor raised to it."""
         values = [
             max(v, self.roundoff_floor) for v in self.by_order.values() if max(v, self.roundoff_floor) > 0.0
         ]
@@ -284,15 +327,19 @@ def budgets(records: Records) -> dict[tuple[str, str, str], list[tuple[int, floa
 
 @dataclass(frozen=True)
 class Change:
-    """One case and solver in an old and a new run."""
+    """One case and solver in an old and a new run.
+
+    `old` and `new` [s] are the times to the tolerance, inf if it was missed. Times within the factor `noise` > 1 are
+    equal.
+    """
 
     case: str
     solver: str
     start: str
     tolerance: float
-    old: float  # s, inf where the tolerance was missed
+    old: float
     new: float
-    noise: float  # what counts as noise: a factor above 1
+    noise: float
 
     @property
     def kind(self) -> str:
@@ -305,7 +352,7 @@ class Change:
 
 
 def changes(old: Records, new: Records) -> list[Change]:
-    """Compare times to each tolerance of two runs, on the cases whose numbers are the same in both.
+    """Compare times to each tolerance of two runs, on cases with the same numbers in both.
 
     Noise is at least `TIME_NOISE_FACTOR`, and at least twice the ratio between minimum and median of either run.
     Earlier times are multiplied by the drift of the case, if both runs have measured it.
@@ -346,7 +393,7 @@ class Profile:
     law: str
     tolerance: float
     cases: int
-    curves: Mapping[str, tuple[tuple[float, float], ...]]  # solver -> (ratio, share) steps
+    curves: Mapping[str, tuple[tuple[float, float], ...]]  # solver -> steps of (ratio, fraction of cases)
 
 
 def geometric_mean(values: Sequence[float], shift: float = 0.0) -> float:
@@ -388,7 +435,7 @@ def geometric_means(records: Records) -> dict[str, dict[float, dict[str, tuple[f
         for tolerance in get_tolerances(records):
             times = times_to(records, tolerance)
             by: dict[str, tuple[float, int, int]] = {}
-            for solver in _whole(times, cases):
+            for solver in _complete_solvers(times, cases):
                 t = [times[c][solver] for c in cases]
                 solved = sum(map(math.isfinite, t))
                 by[solver] = (
@@ -402,13 +449,25 @@ def geometric_means(records: Records) -> dict[str, dict[float, dict[str, tuple[f
 
 @dataclass(frozen=True)
 class Backend:
-    """A solver of another package to the middle tolerance, on the cases that it brings there."""
+    """Times of a third-party solver to the middle tolerance, on the cases that it solves.
+
+    Parameters
+    ----------
+    solver : str
+    solved : int
+    whole : float, s
+        Geometric mean of the time of the complete call.
+    backend_time : float, s
+        Geometric mean of the time in the solver's own interface, on converted data.
+    wins : int
+        Cases on which `backend_time` is shorter than the time of lavender's fastest solver.
+    """
 
     solver: str
     solved: int
-    whole: float  # s, geometric mean of the whole way from a problem
-    backend_time: float  # s, of its own solve, on data that it was given before
-    wins: int  # cases on which that is less than the fastest of ours takes
+    whole: float
+    backend_time: float
+    wins: int
 
 
 def backends(records: Records) -> list[Backend]:
@@ -440,6 +499,7 @@ def backends(records: Records) -> list[Backend]:
 
 
 def _laws(records: Records) -> dict[str, list[str]]:
+    """Group the cases that ran by law."""
     ran = {r.case for r in records if r.step < 0}
     out: dict[str, list[str]] = defaultdict(list)
     for name, info in records.cases.items():
@@ -448,7 +508,8 @@ def _laws(records: Records) -> dict[str, list[str]]:
     return dict(out)
 
 
-def _whole(times: Mapping[str, Mapping[str, float]], cases: Sequence[str]) -> list[str]:
+def _complete_solvers(times: Mapping[str, Mapping[str, float]], cases: Sequence[str]) -> list[str]:
+    """Return the solvers that have a time on every case."""
     everyone = sorted({s for c in cases for s in times.get(c, {})})
     return [s for s in everyone if all(s in times.get(c, {}) for c in cases)]
 
@@ -456,8 +517,7 @@ def _whole(times: Mapping[str, Mapping[str, float]], cases: Sequence[str]) -> li
 def profiles(records: Records) -> list[Profile]:
     """Compute the share of cases that a solver solves within `ratio` times the fastest; a miss is infinite.
 
-    Over the cases of one law, and within one run (`Records.latest`); a case that no solver brought to
-    the tolerance counts as a miss of all.
+    The cases have one law and are of one run (`Records.latest`); a case that no solver solves is a miss of all.
     """
     out = []
     for law, cases in _laws(records).items():
@@ -489,8 +549,8 @@ class Robustness:
     family: str
     solver: str
     cases: int
-    reached: Mapping[float, int]  # tolerance -> cases that the judge confirms
-    wrong: int  # claims that do not hold
+    reached: Mapping[float, int]  # tolerance -> number of cases that the judge confirms
+    wrong: int  # number of contradicted claims
     died: int
     budgets: Mapping[int, tuple[float, float]]  # iterations -> median and 95th percentile of the residual
     hardest: str  # case with the largest residual of its best run
@@ -549,8 +609,8 @@ class Pass:
 
     @property
     def asked(self) -> str:
-        """The budget or the tolerance."""
-        return asked_of(self.mode, self.tol, self.max_iter)
+        """Budget or tolerance."""
+        return describe_target(self.mode, self.tol, self.max_iter)
 
     @property
     def time(self) -> dict[str, float]:

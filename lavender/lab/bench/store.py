@@ -35,8 +35,8 @@ from lavender.lab.bench.record import (
     Run,
     Skip,
     from_json,
-    plain,
     to_json,
+    to_jsonable,
 )
 
 MAX_LINE_BYTES = 2**26  # A longer line is no record; the longest records have a few thousand bytes.
@@ -96,7 +96,7 @@ class Records:
         return len(self.records)
 
     def latest(self) -> Records:
-        """Return the records of the run that wrote last, of cases whose numbers have not changed since.
+        """Return the records of the run that wrote last, of cases with unchanged numbers.
 
         Times are compared only within one run, and a file that has changed is another problem.
         """
@@ -331,7 +331,10 @@ def write_csv(records: Records, path: str | Path) -> None:
             writer.writeheader()
             for row in rows:
                 writer.writerow(
-                    {k: json.dumps(plain(v)) if isinstance(v, (dict, tuple)) else v for k, v in row.items()}
+                    {
+                        k: json.dumps(to_jsonable(v)) if isinstance(v, (dict, tuple)) else v
+                        for k, v in row.items()
+                    }
                 )
 
     write_atomically(path, write)

@@ -1,4 +1,4 @@
-"""The Python call that was timed, as arguments for `lv.solve` and as the lines that a report prints."""
+"""Format the timed call as arguments of `lv.solve` and as the lines of Python that a report prints."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from typing import Any
 from lavender.lab.bench.record import Record, format_tolerance
 from lavender.solvers import registry
 
-COLD = "dataclasses.replace({}, guess=None)"  # removes the start that came with a problem
-CARRIED = (
+COLD_PROBLEM = "dataclasses.replace({}, guess=None)"  # removes the guess of a problem
+CARRIED_START = (
     "before, impulse = problems[0], None",
     "for problem in problems:",
     "    start = problem.start() if impulse is None else lv.bench.carry(before, impulse, problem)",
@@ -16,25 +16,25 @@ CARRIED = (
 
 
 def exceeds_default_budget(solver: str, iterations: int) -> bool:
-    """Whether a solve took more iterations than the solver's default budget, so that its line needs `max_iter`."""
+    """Whether a solve took more iterations than the solver's default budget, so that its call needs `max_iter`."""
     spec = registry.specs().get(solver)
     return spec is not None and iterations > spec.max_iter
 
 
-def make_call_arguments(what: Any, iterations: int) -> dict[str, Any]:
+def make_call_arguments(measurement: Any, iterations: int) -> dict[str, Any]:
     """Return the keyword arguments, without the start, of the timed and printed call of a Task or Record.
 
     `iterations` is the number that a solve took.
     """
-    asked: dict[str, Any] = {"tol": what.tol}
-    given = (
-        what.interleave_group and what.max_iter
-    )  # timed alternately with others: the number that all cases need
-    if what.mode == "budget" or given or exceeds_default_budget(what.solver, iterations):
-        asked["max_iter"] = what.max_iter
-    if what.mode == "time":
-        asked["time_limit"] = what.time_limit
-    return asked
+    arguments: dict[str, Any] = {"tol": measurement.tol}
+    is_common = (
+        measurement.interleave_group and measurement.max_iter
+    )  # timed alternately: one limit that suffices for all cases
+    if measurement.mode == "budget" or is_common or exceeds_default_budget(measurement.solver, iterations):
+        arguments["max_iter"] = measurement.max_iter
+    if measurement.mode == "time":
+        arguments["time_limit"] = measurement.time_limit
+    return arguments
 
 
 def _exact(x: float, short: str) -> str:
@@ -43,24 +43,24 @@ def _exact(x: float, short: str) -> str:
 
 
 def format_call(record: Record, guessed: bool = False) -> tuple[str, ...]:
-    """Return the lines that a record was measured with; the last one was timed.
+    """Return the lines with which a record was measured; the last one was timed.
 
-    `guessed`: some problems bring a guess, which a cold start removes.
+    `guessed`: some problems have a guess, which a cold start removes.
     """
-    asked = make_call_arguments(record, record.iterations)
+    arguments = make_call_arguments(record, record.iterations)
     text = {
         name: str(x) if name == "max_iter" else _exact(x, format_tolerance(x) if x else "0")
-        for name, x in asked.items()
+        for name, x in arguments.items()
     }
-    words = ", ".join(f"{name}={value}" for name, value in text.items())
+    argument_text = ", ".join(f"{name}={value}" for name, value in text.items())
     if record.timing_mode == "batch":
-        cold = (f"problems = [{COLD.format('p')} for p in problems]",) if guessed else ()
-        return (*cold, f'solutions = lv.solve_many(problems, "{record.solver}", {words})')
+        cold = (f"problems = [{COLD_PROBLEM.format('p')} for p in problems]",) if guessed else ()
+        return (*cold, f'solutions = lv.solve_many(problems, "{record.solver}", {argument_text})')
     if record.start != "carried":
-        cold = (f"problem = {COLD.format('problem')}",) if guessed and record.start == "cold" else ()
-        return (*cold, f'lv.solve(problem, "{record.solver}", {words})')
+        cold = (f"problem = {COLD_PROBLEM.format('problem')}",) if guessed and record.start == "cold" else ()
+        return (*cold, f'lv.solve(problem, "{record.solver}", {argument_text})')
     return (
-        *CARRIED,
-        f'    solution = lv.solve(problem, "{record.solver}", impulse=start, {words})',
+        *CARRIED_START,
+        f'    solution = lv.solve(problem, "{record.solver}", impulse=start, {argument_text})',
         "    before, impulse = problem, solution.impulse",
     )

@@ -1,14 +1,14 @@
-"""Which rows repeat others, and what is unique all the same.
+"""Redundant rows of a problem, and the quantities that are unique although A is singular.
 
-Where A is singular, impulses are not unique: a table on four legs. The slack w, and with it every body's
-velocity, is unique for symmetric positive semidefinite A without Coulomb friction. A row is redundant when
-what is left of it after all rows before it are taken out,
+If A is singular, impulses are not unique: a table on four legs. The slack w, and with it every body's velocity, is
+unique for symmetric positive semidefinite A without Coulomb friction. A row i is redundant if its pivot after
+elimination of the rows before it,
 
     p_i = A_ii - A_iB A_BB^-1 A_Bi   (B: rows before i that are not redundant)   [1/kg]
 
-is at most `tol`^2 A_ii: sqrt(p_i / A_ii) is the share of its direction that is new, in the metric of the masses. If J
-is known, this share is computed from J, and what is new in J alone counts, too: beside a body that is 1e25 times
-heavier the masses hide it. If only A is known, its rounding hides shares below SHARE_OF_A.
+is at most `tol`^2 A_ii: sqrt(p_i / A_ii) is the new fraction of its direction, in the metric of the masses. If J is
+known, this fraction is computed from J, and a direction that is new in J alone counts, too: next to a body that is
+1e25 times heavier, the masses hide it. If only A is known, its rounding hides fractions below MIN_NEW_FRACTION_OF_A.
 """
 
 from __future__ import annotations
@@ -29,39 +29,56 @@ from lavender.problem.operators import analyze_panels, has_shifted_cholesky
 from lavender.problem.ordering import rows_by_island
 from lavender_ext.pivot.direct import Pivoting
 
-# Smallest share of a row's direction that differs from rounding of A: A has the squares of shares, and rounding of its
-# products and of their elimination leaves some 1e-14 of the diagonal, seldom 1e-13.
-SHARE_OF_A = 1e-6
-# The same for data that were float32: rows that are equal differ by roundings of 2^-24, of which some ten add up.
-SHARE_OF_FLOAT32 = 1e-6
-DENSE = 1200  # rows of an island up to which it is decomposed as a dense matrix
-PIVOT_TOL_PER_ROW = (
-    1e-12  # Larger islands: pivots up to this share of d times the number of rows count as zero.
-)
-# Larger islands: rows with pivots up to this share of d are left out of the sparse factor and looked at afterwards. A
-# smaller share spoils later pivots by rounding, a larger one leaves more rows out; the next one is used if more than
-# DENSE rows may be new. Of 851 matrices, 1e-2 gives each its rank, 1e-3 gives 843, and a factor alone 822.
+# Smallest new fraction of a row's direction that differs from rounding of A. A holds squares of fractions, and rounding
+# of its products and of their elimination leaves about 1e-14 of the diagonal, rarely 1e-13.
+MIN_NEW_FRACTION_OF_A = 1e-6
+# The same for float32 data: equal rows differ by roundings of 2^-24, of which about ten add up.
+MIN_NEW_FRACTION_FLOAT32 = 1e-6
+MAX_DENSE_ISLAND_ROWS = 1200  # Islands of up to this many rows are decomposed as dense matrices.
+# In larger islands, pivots up to this fraction of d times the number of rows count as zero.
+PIVOT_TOL_PER_ROW = 1e-12
+# In larger islands, rows with pivots up to this fraction of d are left out of the sparse factor and tested afterwards.
+# A smaller fraction spoils later pivots by rounding, a larger one leaves more rows out; the next one is used if more
+# than MAX_DENSE_ISLAND_ROWS rows may be new. Of 851 matrices, 1e-2 gives each its rank, 1e-3 gives 843, a factor alone
+# 822.
 LEFT_OUT_PIVOTS = (1e-2, 1e-4, 1e-6)
-PROBES = 3  # random vectors whose products show which of the rows left out are new
-FALLS_BACK = 1e-10  # A_ii over the largest entry of its row, up to which d is that entry
-SHARED = 1e-3  # A_ii over a d that two rows share, up to which their units are unlike
-SOUND = 1e-8  # -, above 1, up to which |A_ij| / sqrt(A_ii A_jj) is that of a semidefinite A
-UNMOVED = 1e-9  # -, entries of all unit null vectors up to which a row counts as not moved
+N_PROBE_VECTORS = 3  # Products with this many random vectors show which of the rows left out are new.
+# If A_ii is at most this fraction of the largest entry of its row, d is that entry and A_ii is examined separately.
+MAX_HIDDEN_DIAGONAL = 1e-10
+# If A_ii is at most this fraction of a d that two rows share, the units of the two rows differ.
+MAX_SHARED_SCALE_FRACTION = 1e-3
+SEMIDEFINITE_SLACK = 1e-8  # A counts as semidefinite in a row if |A_ij| / sqrt(A_ii A_jj) <= 1 + this.
+NULL_VECTOR_TOL = 1e-9  # A row with entries of at most this in all unit null vectors is not moved by them.
 
 
-Places = npt.NDArray[np.intp]
+IndexArray = npt.NDArray[np.intp]
 
 
 @dataclass(frozen=True, eq=False)
 class Redundancy:
-    """What `redundancy` found; `str()` says it in a few lines."""
+    """Result of `redundancy`; `str()` gives a summary of a few lines.
+
+    Parameters
+    ----------
+    problem : Problem
+    rank : int
+        Rank of A.
+    tol : float
+        Largest threshold that was used: a row is redundant if the new fraction of its direction is at most this.
+    method : str
+        Description of the decompositions.
+    rows : tuple of int
+        Redundant rows: each depends on the rows that are not redundant.
+    impulse_is_unique : (m,) bool
+        Rows with an impulse that no redundancy can change.
+    """
 
     problem: Problem
-    rank: int  # of A
-    tol: float  # -, share of a row's direction up to which the row counts as redundant; the largest that was used
-    method: str  # how the rank was found, in words
-    rows: tuple[int, ...]  # redundant rows: each adds nothing to the others that are kept
-    impulse_is_unique: npt.NDArray[np.bool_]  # (m,) rows whose impulse no redundancy can change
+    rank: int
+    tol: float
+    method: str
+    rows: tuple[int, ...]
+    impulse_is_unique: npt.NDArray[np.bool_]
 
     @property
     def row_names(self) -> tuple[str, ...]:
@@ -70,24 +87,24 @@ class Redundancy:
 
     @cached_property
     def blocks(self) -> tuple[int, ...]:
-        """Blocks (joints, contacts) whose rows are all redundant: without them nothing would change."""
+        """Blocks (joints, contacts) with only redundant rows: removing them changes no motion."""
         ptr = self.problem.cones.ptr
         count = np.bincount([self.problem.block_of(i) for i in self.rows], minlength=self.problem.n_blocks)
         return tuple(int(i) for i in np.flatnonzero((count > 0) & (count == np.diff(ptr))))
 
     @property
     def block_names(self) -> tuple[str, ...]:
-        """Names of those blocks."""
+        """Names of the blocks with only redundant rows."""
         return tuple(map(self.problem.block_name, self.blocks))
 
     @property
     def slack_is_unique(self) -> bool:
-        """Slack and body velocities are the same in every solution."""
+        """Whether slack and body velocities are the same in every solution."""
         return self.problem.is_semidefinite and self.problem.law != "coulomb"
 
     @property
     def unique(self) -> tuple[str, ...]:
-        """What every solution shares, for a positive semidefinite A; compare nothing else."""
+        """Quantities that all solutions share, for a positive semidefinite A; compare only these."""
         if not self.slack_is_unique:
             return ()
         impulse = ("impulse",) if self.rank == self.problem.m else ()
@@ -107,7 +124,7 @@ class Redundancy:
 
 
 def redundancy(problem: Problem, *, tol: float = 1e-12) -> Redundancy:
-    """Rank of A, the rows that repeat others, and what is unique.
+    """Compute the rank of A, find the redundant rows, and list the quantities that are unique.
 
     Islands (rows that share no body, directly or through others) are decomposed separately. Up to 1,200 rows: by QR of
     J M^-1/2 and of J with column pivoting if J is given without compliance (nothing is squared); otherwise by Cholesky
@@ -119,51 +136,58 @@ def redundancy(problem: Problem, *, tol: float = 1e-12) -> Redundancy:
     Parameters
     ----------
     tol : float, default 1e-12
-        Share of a row's direction, in the metric of the masses, up to which what is new in it counts as nothing.
+        A row is redundant if the new fraction of its direction, in the metric of the masses, is at most this.
+
+    Returns
+    -------
+    Redundancy
 
     Raises
     ------
     InputError
         `tol` is not between 0 and 1.
     CapabilityError
-        Asymmetric or indefinite A with an island of more than 1,200 rows; numbers whose products are beyond float64.
+        A is asymmetric or indefinite and an island has more than 1,200 rows, or products of the numbers exceed float64.
     """
     check_problem(problem)
     if not check_float("tol", tol, low=0.0) < 1.0:
         raise InputError(f"tol is {tol}; a share from 0 to 1 is needed")
     if problem.precision == "float32":
-        tol = max(tol, SHARE_OF_FLOAT32)
+        tol = max(tol, MIN_NEW_FRACTION_FLOAT32)
     m = problem.m
     unique = np.ones(m, bool)
     dependent: list[int] = []
     used, methods = tol, set()
-    with np.errstate(all="ignore"):  # what is not finite is told below
+    with np.errstate(all="ignore"):  # Numbers that are not finite are reported below.
         scale = 1.0 / np.sqrt(problem.csr_data.d)
-        unit = _unit(problem, scale)
+        unit = _unit_diagonal_factors(problem, scale)
         scaled = sp.csr_array(sp.diags_array(unit) @ problem.csr @ sp.diags_array(unit))
-        moves = m and problem.matrix is None and problem.jacobian.shape[1]  # where J has no column A is zero
-        roots = _roots(problem) if moves and not np.any(problem.compliance) else ()
+        # A is zero if J has no column.
+        has_jacobian = m and problem.matrix is None and problem.jacobian.shape[1]
+        roots = _unit_row_roots(problem) if has_jacobian and not np.any(problem.compliance) else ()
     if not all(np.isfinite(part.data).all() for part in (scaled, *roots)):
         raise CapabilityError(
-            "the rank cannot be told: rows of unit size are beyond float64 (give the problem in other units)"
+            "the rank cannot be computed: rows of unit size exceed float64 (give the problem in other units)"
         )
     for island in rows_by_island(problem, np.arange(m + 1, dtype=np.int32)):
         a = scaled[island][:, island]
         sound = problem.is_semidefinite or (problem.is_symmetric and has_shifted_cholesky(a))
-        if problem.is_symmetric and len(island) <= DENSE:
-            found, limit, words = _dense_island(a.toarray(), [root[island] for root in roots], tol, sound)
+        if problem.is_symmetric and len(island) <= MAX_DENSE_ISLAND_ROWS:
+            dependent_rows, limit, descriptions = _dense_island(
+                a.toarray(), [root[island] for root in roots], tol, sound
+            )
             used = max(used, limit)
-            if len(found):
-                basis = _null_basis(a.toarray(), found)
+            if len(dependent_rows):
+                basis = _null_basis(a.toarray(), dependent_rows)
                 if unit is not scale:  # to the metric of d
                     basis = np.linalg.qr(basis * (unit[island] / scale[island])[:, None])[0]
-                unique[island] = np.abs(basis).max(axis=1) <= UNMOVED
+                unique[island] = np.abs(basis).max(axis=1) <= NULL_VECTOR_TOL
         else:
-            found, limit, words = _other_island(a, sound, tol)
+            dependent_rows, limit, descriptions = _other_island(a, sound, tol)
             used = max(used, limit)
-            unique[island] = len(found) == 0
-        methods.update(words)
-        dependent += island[found].tolist()
+            unique[island] = len(dependent_rows) == 0
+        methods.update(descriptions)
+        dependent += island[dependent_rows].tolist()
     return Redundancy(
         problem=problem,
         rank=m - len(dependent),
@@ -176,94 +200,108 @@ def redundancy(problem: Problem, *, tol: float = 1e-12) -> Redundancy:
 
 def _dense_island(
     a: FloatArray, roots: list[sp.csr_array], tol: float, sound: bool
-) -> tuple[Places, float, list[str]]:
-    """Find the dependent rows of a symmetric island, each of those before it if A is `sound`.
+) -> tuple[IndexArray, float, list[str]]:
+    """Find the dependent rows of a symmetric island; if A is `sound`, each depends on rows before it.
 
     Returns
     -------
-    rows; share of a row's direction that counts as nothing; how they were found, in words
+    rows, threshold of the new fraction of a direction that was used, descriptions of the methods
     """
     if not sound:
-        return _by_qr(_even(a), tol), tol, [f"QR with pivoting, {tol:.0e}"]
+        return _dependent_columns_by_qr(_equilibrate(a), tol), tol, [f"QR with pivoting, {tol:.0e}"]
     if not roots:
-        tol = max(tol, SHARE_OF_A)
-        tail, words = _by_cholesky(a, tol), [f"Cholesky with pivoting, {tol:.0e}"]
+        tol = max(tol, MIN_NEW_FRACTION_OF_A)
+        tail, descriptions = _dependent_rows_by_cholesky(a, tol), [f"Cholesky with pivoting, {tol:.0e}"]
     else:
-        # On the columns that the island has; one at least.
+        # Keep the columns that the island uses, at least one.
         own = [root[:, np.unique(np.append(root.indices, 0))] for root in roots]
-        tails = [_by_qr(root.toarray().T, tol) for root in own]
-        tail, words = min(tails, key=len), [f"QR of J M^-1/2 with pivoting, {tol:.0e}"]
+        tails = [_dependent_columns_by_qr(root.toarray().T, tol) for root in own]
+        tail, descriptions = min(tails, key=len), [f"QR of J M^-1/2 with pivoting, {tol:.0e}"]
         if len({len(t) for t in tails}) > 1:
-            words.append(
+            descriptions.append(
                 f"of {len(a)} rows {len(a) - len(tails[0])} by the masses and "
                 f"{len(a) - len(tails[1])} without them: the larger number counts"
             )
-    return _in_order(a, tail, max(tol, SHARE_OF_A)), tol, words
+    return _dependent_on_earlier_rows(a, tail, max(tol, MIN_NEW_FRACTION_OF_A)), tol, descriptions
 
 
-def _other_island(a: sp.csr_array, sound: bool, tol: float) -> tuple[Places, float, list[str]]:
-    """Dependent rows of a large or asymmetric island, the share that counts as nothing, how they were found."""
+def _other_island(a: sp.csr_array, sound: bool, tol: float) -> tuple[IndexArray, float, list[str]]:
+    """Find the dependent rows of a large or asymmetric island; return (rows, threshold, texts)."""
     n = a.shape[0]
     if sound:
         limit = max(tol, math.sqrt(PIVOT_TOL_PER_ROW * n))
-        return _by_sparse_cholesky(a, limit**2), limit, [f"sparse Cholesky, {limit:.0e}"]
-    if n > DENSE:
+        return _dependent_rows_by_sparse_cholesky(a, limit**2), limit, [f"sparse Cholesky, {limit:.0e}"]
+    if n > MAX_DENSE_ISLAND_ROWS:
         raise CapabilityError(
-            f"A is asymmetric or indefinite and {n} of its rows hang together; the rank of at most "
-            f"{DENSE} can be told: ask for parts, or for the symmetric part of A"
+            f"A is asymmetric or indefinite and {n} of its rows are coupled; the rank of at most "
+            f"{MAX_DENSE_ISLAND_ROWS} coupled rows can be computed: pass a smaller problem, or the symmetric part of A"
         )
-    return _by_qr(_even(a.toarray().T), tol), tol, [f"QR with pivoting, {tol:.0e}"]
+    return _dependent_columns_by_qr(_equilibrate(a.toarray().T), tol), tol, [f"QR with pivoting, {tol:.0e}"]
 
 
-def _unit(problem: Problem, scale: FloatArray) -> FloatArray:
-    """Factors (m,) that make the diagonal of A one: those of d, but where d is another number than a sound A_ii.
+def _unit_diagonal_factors(problem: Problem, scale: FloatArray) -> FloatArray:
+    """Compute factors (m,) that scale the diagonal of A to one.
 
-    Beside rows of very much heavier bodies (1e20 and more) d falls back to what stands beside A_ii. Where no entry of
-    the row is above sqrt(A_ii A_jj), as in every semidefinite A, A_ii is no rounding, and the row is scaled by it. So
-    is one of two rows that share a d, their mean, and have unlike units.
+    They are d^-1/2, unless d differs from a sound A_ii. Next to rows of very much heavier bodies (1e20 times and more),
+    d is the largest entry of the row instead of A_ii. If no entry of the row exceeds sqrt(A_ii A_jj), as in every
+    semidefinite A, A_ii is not a rounding error, and the row is scaled by it. The same holds for one of two rows that
+    share a d (their mean) although their units differ.
     """
     a = problem.csr
     own = a.diagonal()
-    beside = abs(a).max(axis=1).toarray().ravel() if problem.m else own
-    fallen = (own > 0.0) & ((own <= FALLS_BACK * beside) | (own * scale**2 <= SHARED))
-    if not fallen.any():
+    row_max = abs(a).max(axis=1).toarray().ravel() if problem.m else own
+    hidden = (own > 0.0) & (
+        (own <= MAX_HIDDEN_DIAGONAL * row_max) | (own * scale**2 <= MAX_SHARED_SCALE_FRACTION)
+    )
+    if not hidden.any():
         return scale
     with np.errstate(all="ignore"):
-        tried = np.where(own > 0.0, 1.0 / np.sqrt(np.where(own > 0.0, own, 1.0)), scale)
+        diagonal_scale = np.where(own > 0.0, 1.0 / np.sqrt(np.where(own > 0.0, own, 1.0)), scale)
         share = (
-            abs(sp.csr_array(sp.diags_array(tried) @ a @ sp.diags_array(tried))).max(axis=1).toarray().ravel()
+            abs(sp.csr_array(sp.diags_array(diagonal_scale) @ a @ sp.diags_array(diagonal_scale)))
+            .max(axis=1)
+            .toarray()
+            .ravel()
         )
-    return np.where(fallen & (share <= 1.0 + SOUND), tried, scale)
+    return np.where(hidden & (share <= 1.0 + SEMIDEFINITE_SLACK), diagonal_scale, scale)
 
 
-def _roots(problem: Problem) -> tuple[sp.csr_array, sp.csr_array]:
-    """Two matrices of unit rows whose rank is A's: J M^-1/2, and J with the same root of a unit mass in its place.
+def _unit_row_roots(problem: Problem) -> tuple[sp.csr_array, sp.csr_array]:
+    """Build two matrices of unit rows that have the rank of A: J M^-1/2, and J with unit masses in place of M.
 
-    Each hides what is small in it: the first what heavy bodies alone would feel, the second what is small in J.
+    Each hides what is small in it: the first hides motion that only heavy bodies have, the second small entries of J.
     """
-    whole = problem.velocity_form().jacobian
+    root_of_a = problem.velocity_form().jacobian
     if problem.generalized is not None:
-        bare = problem.generalized.jac
+        root_without_masses = problem.generalized.jac
     else:
         rows = problem.rows
         assert rows is not None
-        heavy = np.abs(rows.inv_inertia).max(axis=(1, 2)) if rows.n_bodies else np.zeros(0)
-        light = np.where(heavy > 0.0, heavy, 1.0)[:, None, None]
-        plain = replace(
+        largest_inv_inertia = np.abs(rows.inv_inertia).max(axis=(1, 2)) if rows.n_bodies else np.zeros(0)
+        inertia_unit = np.where(largest_inv_inertia > 0.0, largest_inv_inertia, 1.0)[:, None, None]
+        unit_mass_rows = replace(
             rows,
             inv_mass=(rows.inv_mass > 0.0).astype(float),
-            inv_inertia=rows.inv_inertia / light,
+            inv_inertia=rows.inv_inertia / inertia_unit,
             copy=False,
         )
-        bare = Problem(problem.b, problem.cones, rows=plain, copy=False).velocity_form().jacobian
-    for squared in (False, True):  # the largest entry first: squares of large ones overflow
-        size = np.sqrt((bare * bare).sum(axis=1)) if squared else abs(bare).max(axis=1).toarray().ravel()
-        bare = sp.csr_array(sp.diags_array(1.0 / np.where(size > 0.0, size, 1.0)) @ bare)
-    return whole, bare
+        root_without_masses = (
+            Problem(problem.b, problem.cones, rows=unit_mass_rows, copy=False).velocity_form().jacobian
+        )
+    for squared in (False, True):  # Divide by the largest entry first: squares of large entries overflow.
+        size = (
+            np.sqrt((root_without_masses * root_without_masses).sum(axis=1))
+            if squared
+            else abs(root_without_masses).max(axis=1).toarray().ravel()
+        )
+        root_without_masses = sp.csr_array(
+            sp.diags_array(1.0 / np.where(size > 0.0, size, 1.0)) @ root_without_masses
+        )
+    return root_of_a, root_without_masses
 
 
-def _by_qr(a: FloatArray, tol: float) -> Places:
-    """Find columns of `a` that depend on the others: what is left of them in QR with pivoting is at most `tol`."""
+def _dependent_columns_by_qr(a: FloatArray, tol: float) -> IndexArray:
+    """Find columns of `a` that depend on the others: their remainder in QR with pivoting is at most `tol` relative."""
     from scipy.linalg import qr
 
     r, order = qr(a, mode="r", pivoting=True)
@@ -272,25 +310,25 @@ def _by_qr(a: FloatArray, tol: float) -> Places:
     return np.sort(order[rank:])
 
 
-def _even(a: FloatArray) -> FloatArray:
-    """`a` with the largest entry of each row and column near 1, by factors that leave its rank."""
+def _equilibrate(a: FloatArray) -> FloatArray:
+    """Scale `a` so that the largest entry of each row and column is near 1; the rank does not change."""
     for axis in (0, 1, 0, 1, 0, 1, 0, 1):
-        most = np.abs(a).max(axis=axis, keepdims=True)
-        a = a / np.sqrt(np.where(most > 0.0, most, 1.0))
+        largest = np.abs(a).max(axis=axis, keepdims=True)
+        a = a / np.sqrt(np.where(largest > 0.0, largest, 1.0))
     return a
 
 
-def _by_cholesky(a: FloatArray, tol: float) -> Places:
-    """Rows of a semidefinite `a` (unit diagonal) that depend on the others, by Cholesky with pivoting."""
+def _dependent_rows_by_cholesky(a: FloatArray, tol: float) -> IndexArray:
+    """Find rows of a semidefinite `a` (unit diagonal) that depend on the others, by Cholesky with pivoting."""
     # Rounding alone leaves a pivot of about len(a) 2^-53.
     _, order, rank, _ = lapack.dpstrf(a, tol=max(tol**2, len(a) * 2.0**-52))
     return np.sort(order[rank:] - 1)
 
 
-def _by_sparse_cholesky(a: sp.csr_array, limit: float) -> Places:
+def _dependent_rows_by_sparse_cholesky(a: sp.csr_array, limit: float) -> IndexArray:
     """Return the dependent rows of a large semidefinite `a` (unit diagonal), by a sparse factor without pivoting.
 
-    Rows N with small pivots are left out. What is new in them beside the other rows, B, is
+    Rows N with small pivots are left out. Their Schur complement on the other rows, B, is
 
         S = A_NN - A_NB A_BB^-1 A_BN,   S z = (A z - A x)_N,   A_BB x_B = (A z)_B,   x_N = 0 = z_B
 
@@ -310,48 +348,54 @@ def _by_sparse_cholesky(a: sp.csr_array, limit: float) -> Places:
         panels.factor(values, np.ones(n), 0.0, pivot)
         left = panels.lost_rows()
         random, new = np.random.default_rng(0), np.zeros(len(left))
-        for _ in range(PROBES if len(left) else 0):
+        for _ in range(N_PROBE_VECTORS if len(left) else 0):
             z = np.zeros(n)
             z[left] = random.standard_normal(len(left))
             new = np.maximum(new, np.abs(product(z)))
-        some = np.flatnonzero(new > limit)
-        if len(some) <= DENSE:
+        maybe_new = np.flatnonzero(new > limit)
+        if len(maybe_new) <= MAX_DENSE_ISLAND_ROWS:
             break
     else:
         return left
-    block = np.zeros((len(some), len(some)))
-    for k, i in enumerate(left[some]):
+    block = np.zeros((len(maybe_new), len(maybe_new)))
+    for k, i in enumerate(left[maybe_new]):
         z = np.zeros(n)
         z[i] = 1.0
-        block[k] = product(z)[some]
-    some = some[block.diagonal() > limit]
+        block[k] = product(z)[maybe_new]
+    maybe_new = maybe_new[block.diagonal() > limit]
     block = block[np.ix_(block.diagonal() > limit, block.diagonal() > limit)]
-    if not len(some):
+    if not len(maybe_new):
         return left
-    dependent = _by_cholesky(np.asfortranarray(0.5 * (block + block.T)), math.sqrt(limit))
-    return np.delete(left, np.delete(some, dependent))
+    dependent = _dependent_rows_by_cholesky(np.asfortranarray(0.5 * (block + block.T)), math.sqrt(limit))
+    return np.delete(left, np.delete(maybe_new, dependent))
 
 
-def _in_order(a: FloatArray, tail: Places, tol: float) -> Places:
-    """As many rows as `tail`, each dependent on rows before it; `tail` itself where that cannot be told."""
+def _dependent_on_earlier_rows(a: FloatArray, tail: IndexArray, tol: float) -> IndexArray:
+    """Return as many rows as `tail` has, each dependent on rows before it; `tail` itself if the numbers differ."""
     if len(tail) == 0:
         return tail
     m = len(a)
     problem = Problem.linear(a, np.zeros(m))
     pivoting = Pivoting(problem.csr_data, m - 1, np.arange(m, dtype=np.int32), max(tol**2, m * 2.0**-52))
     pivoting.factor_all()
-    found = np.array(pivoting.skipped(), np.intp)
-    return found if len(found) == len(tail) else tail
+    dependent_rows = np.array(pivoting.skipped(), np.intp)
+    return dependent_rows if len(dependent_rows) == len(tail) else tail
 
 
-def _null_basis(a: FloatArray, found: Places) -> FloatArray:
-    """Orthonormal null vectors, from (-A_BB^-1 A_Bi, e_i) for each redundant row i."""
-    kept = np.setdiff1d(np.arange(len(a)), found)
-    vectors = np.zeros((len(a), len(found)))
-    vectors[found] = np.eye(len(found))
-    if len(kept):
-        _, share, info = lapack.dposv(a[np.ix_(kept, kept)], a[np.ix_(kept, found)])
+def _null_basis(a: FloatArray, dependent_rows: IndexArray) -> FloatArray:
+    """Compute orthonormal null vectors from (-A_BB^-1 A_Bi, e_i) for each redundant row i."""
+    independent_rows = np.setdiff1d(np.arange(len(a)), dependent_rows)
+    vectors = np.zeros((len(a), len(dependent_rows)))
+    vectors[dependent_rows] = np.eye(len(dependent_rows))
+    if len(independent_rows):
+        _, share, info = lapack.dposv(
+            a[np.ix_(independent_rows, independent_rows)], a[np.ix_(independent_rows, dependent_rows)]
+        )
         if info != 0:
-            share = np.linalg.lstsq(a[np.ix_(kept, kept)], a[np.ix_(kept, found)], rcond=None)[0]
-        vectors[kept] = -share
+            share = np.linalg.lstsq(
+                a[np.ix_(independent_rows, independent_rows)],
+                a[np.ix_(independent_rows, dependent_rows)],
+                rcond=None,
+            )[0]
+        vectors[independent_rows] = -share
     return np.linalg.qr(vectors)[0]

@@ -1,4 +1,4 @@
-"""How wrong the motion is, not only the impulse: distances to the solution, with a bound; several solutions.
+"""Errors of motions: distances of impulses from the solution with proved bounds, and problems with several solutions.
 
 ```python
 error = lv.motion_error(problem, solution.impulse)     # or solution.motion_error()

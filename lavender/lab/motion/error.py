@@ -1,4 +1,4 @@
-"""How wrong the motion is: distance of an impulse to the solution, in units of motion."""
+"""The error of a motion: the distance of an impulse from the solution, in units of motion."""
 
 from __future__ import annotations
 
@@ -12,56 +12,102 @@ import numpy as np
 from lavender.base.arrays import FloatArray
 from lavender.lab.motion.bound import difference
 from lavender.lab.motion.operator import U
-from lavender.lab.motion.reference import Reference, kept
+from lavender.lab.motion.reference import Reference, motion_cache
 from lavender.problem import Problem
 
-# Motions nearer than this are one, as a share of the constraints' own motion: a residual of 1e-10 moves by up to
-# 1e-7 of it on the worst conditioned piles of the suite.
-SAME = 1e-6
+# Motions at a distance below this fraction of the constraints' own motion count as the same: a residual of 1e-10
+# moves by up to 1e-7 of it on the worst conditioned piles of the suite.
+SAME_MOTION_FRACTION = 1e-6
 
+# Fmt: skip.
 NUMBERS = (
-    "kinetic", "energy", "speed", "spin", "rows", "bound", "bound_speed", "bound_spin", "moved",
-)  # fmt: skip
+    "kinetic",
+    "energy",
+    "speed",
+    "spin",
+    "rows",
+    "bound",
+    "bound_speed",
+    "bound_spin",
+    "moved",
+)
 
 
 @dataclass(frozen=True, eq=False)
 class MotionError:
-    """Distance of one impulse to the solution. None where a number means nothing; `str()` is one line."""
+    """Distance of one impulse from the solution; `str()` gives one line. A number without a meaning is None.
 
-    kinetic: float | None  # sqrt J, of the difference of body velocities; None where M is not known
-    energy: float | None  # sqrt J, with what compliance stores
-    relative: float | None  # -, over the same of the constraints' own motion M^-1 J^T lambda*
-    speed: float | None  # m/s, of the body that is furthest off; m/s or rad/s of a generalised velocity
-    spin: float | None  # rad/s, of the body that is furthest off; None in generalised coordinates
-    rows: float | None  # m/s (rad/s on angular rows), max |w - w*|
-    body: int  # that of `speed`, -1 without one
-    spin_body: int  # that of `spin`, -1 without one
-    row: int  # that of `rows`, -1 without one
-    bound: float | None  # sqrt J, `energy` is no more; see lavender.lab.motion.bound
-    bound_speed: float | None  # m/s, `speed` is no more
-    bound_spin: float | None  # rad/s, `spin` is no more
-    moved: float | None  # m/s, what the targets are moved by in the problem that the bound holds for
-    reference: Reference  # what was compared with
-    note: str  # why a number is missing
-    # Coulomb: the largest distance between two motions that both solve the problem, as far as they were searched.
-    spread: float | None = None  # sqrt J
-    spread_speed: float | None = None  # m/s, of a body; of a row where bodies are not known
-    count: int = 1  # motions that the distance is the shortest of
-    unique: str = ""  # why there is one motion alone; empty where nothing proves it
+    Parameters
+    ----------
+    kinetic : float or None, sqrt J
+        Of the difference of body velocities; None if M is not known.
+    energy : float or None, sqrt J
+        The same plus the energy stored in compliance.
+    relative : float or None
+        `kinetic` (or `energy`) divided by that of the constraints' own motion M^-1 J^T lambda*.
+    speed : float or None, m/s
+        Velocity error of the body with the largest one; m/s or rad/s of a generalised velocity.
+    spin : float or None, rad/s
+        Angular velocity error of the body with the largest one; None in generalised coordinates.
+    rows : float or None, m/s (rad/s on angular rows)
+        max |w - w*|.
+    body, spin_body, row : int
+        Body of `speed`, body of `spin`, and row of `rows`; -1 without one.
+    bound : float or None, sqrt J
+        Upper bound of `energy`; see `lavender.lab.motion.bound`.
+    bound_speed : float or None, m/s
+        Upper bound of `speed`.
+    bound_spin : float or None, rad/s
+        Upper bound of `spin`.
+    moved : float or None, m/s
+        Largest shift of a target in the problem that the bound holds for.
+    reference : Reference
+        The solution that the impulse was compared with.
+    note : str
+        Reason why a number is missing.
+    spread : float or None, sqrt J
+        Coulomb: largest distance between two motions that both solve the problem, as far as they were searched.
+    spread_speed : float or None, m/s
+        The same as a speed of a body, or of a row if bodies are not known.
+    count : int
+        Number of motions of which the nearest was taken.
+    unique : str
+        Criterion that proves that the motion is unique; empty if none does.
+    """
+
+    kinetic: float | None
+    energy: float | None
+    relative: float | None
+    speed: float | None
+    spin: float | None
+    rows: float | None
+    body: int
+    spin_body: int
+    row: int
+    bound: float | None
+    bound_speed: float | None
+    bound_spin: float | None
+    moved: float | None
+    reference: Reference
+    note: str
+    spread: float | None = None
+    spread_speed: float | None = None
+    count: int = 1
+    unique: str = ""
     _problem: Problem | None = field(default=None, repr=False)
 
     @property
     def body_name(self) -> str:
-        """Name of the body (the generalised velocity) that is furthest off, e.g. "body 3"; empty without one."""
+        """Name of the body (or generalised velocity) with the largest error, e.g. "body 3"; empty without one."""
         return (
-            kept(self._problem).operator.name(self.body)
+            motion_cache(self._problem).operator.name(self.body)
             if self._problem is not None and self.body >= 0
             else ""
         )
 
     @property
     def row_name(self) -> str:
-        """Name of the row that is furthest off, e.g. "contact 3, normal"; empty without one."""
+        """Name of the row with the largest error, e.g. "contact 3, normal"; empty without one."""
         return self._problem.row_name(self.row) if self._problem is not None and self.row >= 0 else ""
 
     def __str__(self) -> str:
@@ -72,7 +118,7 @@ class MotionError:
             parts.append(f"{self.kinetic if self.kinetic is not None else self.energy:.2e} sqrt(J)")
         if self.speed is not None:
             spin = "" if self.spin is None else f", {self.spin:.2g} rad/s"
-            unit = " m/s" if self.spin is not None else ""  # a generalised velocity is m/s or rad/s
+            unit = " m/s" if self.spin is not None else ""  # a generalised velocity may be in m/s or rad/s
             parts.append(f"{self.body_name or 'bodies'} {self.speed:.2g}{unit}{spin}")
         if self.rows is not None:
             parts.append(f"{self.row_name or 'rows'} {self.rows:.2g} m/s")
@@ -91,26 +137,27 @@ class MotionError:
 
 
 def measure(problem: Problem, x: FloatArray, reference: Reference) -> MotionError:
-    """The distance of an impulse x (m,) [N s] to one reference; None for what float64 cannot hold, as `note` says."""
-    found = told(_measured(problem, x, reference), NUMBERS)
-    if found.relative == math.inf:
-        words = "relative to next to nothing, as the solution moves no more"
-        return replace(found, note="; ".join(n for n in (found.note, words) if n))
-    return found
+    """Compute the distance of an impulse x (m,) [N s] from one reference; numbers beyond float64 are None."""
+    error = drop_non_finite(_compute_error(problem, x, reference), NUMBERS)
+    if error.relative == math.inf:
+        explanation = "relative to next to nothing, as the solution moves no more"
+        return replace(error, note="; ".join(n for n in (error.note, explanation) if n))
+    return error
 
 
-def told(found: MotionError, names: Sequence[str]) -> MotionError:
-    """None in the place of numbers that float64 cannot hold, which `note` names."""
-    beyond = [n for n in names if (value := getattr(found, n)) is not None and not math.isfinite(value)]
+def drop_non_finite(error: MotionError, names: Sequence[str]) -> MotionError:
+    """Replace numbers that are not finite by None and name them in `note`."""
+    beyond = [n for n in names if (value := getattr(error, n)) is not None and not math.isfinite(value)]
     if not beyond:
-        return found
-    note = "; ".join(n for n in (found.note, f"beyond float64: {', '.join(beyond)}") if n)
-    gone: dict[str, Any] = dict.fromkeys(beyond)
-    return replace(found, note=note, **gone)
+        return error
+    note = "; ".join(n for n in (error.note, f"beyond float64: {', '.join(beyond)}") if n)
+    missing: dict[str, Any] = dict.fromkeys(beyond)
+    return replace(error, note=note, **missing)
 
 
-def _measured(problem: Problem, x: FloatArray, reference: Reference) -> MotionError:
-    operator = kept(problem).operator
+def _compute_error(problem: Problem, x: FloatArray, reference: Reference) -> MotionError:
+    """Compute all numbers of a `MotionError` for which the reference suffices."""
+    operator = motion_cache(problem).operator
     delta, size = difference(operator, x, reference.impulse)
     notes = [reference.refusal and f"{reference.refusal}: no energies"]
     energies = reference.accepted and not reference.refusal
@@ -119,12 +166,12 @@ def _measured(problem: Problem, x: FloatArray, reference: Reference) -> MotionEr
     values: dict[str, Any] = dict.fromkeys((*NUMBERS, "relative"))
     values |= {"body": -1, "spin_body": -1, "row": -1}
     velocity = operator.velocity(delta, U * np.abs(delta))
-    speed = fast = np.zeros(0)
+    speed = max_speed = np.zeros(0)
     spin: FloatArray | None = None
-    swift: FloatArray | None = None
+    max_spin: FloatArray | None = None
     if velocity is not None:
         speed, spin = operator.lengths(velocity[0])
-        fast, swift = operator.lengths(np.abs(velocity[0]) + velocity[1])
+        max_speed, max_spin = operator.lengths(np.abs(velocity[0]) + velocity[1])
     if energies:
         own = operator.size(reference.impulse, np.zeros(problem.m))
         values |= {"kinetic": size.kinetic, "energy": size.energy}
@@ -135,38 +182,42 @@ def _measured(problem: Problem, x: FloatArray, reference: Reference) -> MotionEr
         )
     if reference.accepted:
         if velocity is not None:
-            values["body"], values["speed"] = _largest(speed)
+            values["body"], values["speed"] = _index_and_max(speed)
             if spin is not None:
-                values["spin_body"], values["spin"] = _largest(spin)
-        values["row"], values["rows"] = _largest(np.abs(operator.slack(delta)[0] + problem.b))
+                values["spin_body"], values["spin"] = _index_and_max(spin)
+        values["row"], values["rows"] = _index_and_max(np.abs(operator.slack(delta)[0] + problem.b))
     proof = reference.witness
     if proof is None and not reference.refusal:
         notes.append("no bound under Coulomb's law")
     if proof is not None:
-        values["bound"], values["moved"] = size.most + proof.radius, proof.moved
-        reach = operator.reach(proof.radius)
-        if reach is not None:
-            values["bound_speed"] = float(fast.max(initial=0.0)) * (1.0 + 8.0 * U) + reach[0]
-            if swift is not None and reach[1] is not None:
-                values["bound_spin"] = float(swift.max(initial=0.0)) * (1.0 + 8.0 * U) + reach[1]
+        values["bound"], values["moved"] = size.upper_bound + proof.radius, proof.moved
+        max_from_witness = operator.max_speeds(proof.radius)
+        if max_from_witness is not None:
+            values["bound_speed"] = float(max_speed.max(initial=0.0)) * (1.0 + 8.0 * U) + max_from_witness[0]
+            if max_spin is not None and max_from_witness[1] is not None:
+                values["bound_spin"] = (
+                    float(max_spin.max(initial=0.0)) * (1.0 + 8.0 * U) + max_from_witness[1]
+                )
     return MotionError(**values, reference=reference, note="; ".join(n for n in notes if n), _problem=problem)
 
 
-def in_own_rows(problem: Problem, x: FloatArray, found: MotionError) -> MotionError:
-    """`rows` and `row` where contacts are ellipses, whose disks the error was measured on; x (m,) [N s] theirs."""
-    if found.rows is None:
-        return found
-    delta = x - found.reference.impulse
-    w = (kept(problem.disk).operator.slack(delta)[0] + problem.disk.b) / problem.cones.stretch
-    row, rows = _largest(np.abs(w))
-    return told(replace(found, row=row, rows=rows), ("rows",))
+def in_rows_of_ellipses(problem: Problem, x: FloatArray, error: MotionError) -> MotionError:
+    """Convert `rows` and `row` of an error on the disks to the problem's ellipses; x (m,) [N s] is on the disks."""
+    if error.rows is None:
+        return error
+    delta = x - error.reference.impulse
+    w = (motion_cache(problem.disk).operator.slack(delta)[0] + problem.disk.b) / problem.cones.stretch
+    row, rows = _index_and_max(np.abs(w))
+    return drop_non_finite(replace(error, row=row, rows=rows), ("rows",))
 
 
 def _ratio(x: float, reference: float) -> float:
+    """Divide; 0 / 0 is 0 and x / 0 is inf."""
     return 0.0 if x == 0.0 else x / reference if reference > 0.0 and x < math.inf else math.inf
 
 
-def _largest(x: FloatArray) -> tuple[int, float]:
+def _index_and_max(x: FloatArray) -> tuple[int, float]:
+    """Return (index, value) of the largest number; (-1, 0) if there is none."""
     if not len(x):
         return -1, 0.0
     i = int(np.argmax(x))

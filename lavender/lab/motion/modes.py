@@ -1,13 +1,15 @@
-"""Every motion of a few contacts with one tangent: each open, stuck or sliding either way, one linear system a mode.
+"""Enumeration of all motions of a few contacts with one tangent; one linear system per mode of all contacts.
+
+Each contact is open, stuck, or slides in one of two directions, and each bounded row is at a bound or inside:
 
     open    lambda = 0                                      w_n >= 0
     stuck   w = 0                                           |lambda_t| <= mu lambda_n
     slides  w_n = 0,  lambda_t = -s mu lambda_n, s = +-1    s w_t >= 0,  lambda_n >= 0
     row     lambda at a bound, or w = 0                     w away from the bound, or lambda within
 
-A solution lies in one of these, so all modes together hold every solution: four to the power of the contacts. Where
-a mode's system is singular its solutions are x + N y; they are one motion where A N = 0, and where some y keeps to the
-inequalities. Two tangents have a circle of directions to slide in, which no list holds.
+Every solution is in one of these modes, so all modes together contain every solution: four to the power of the number
+of contacts. If a mode's system is singular, its solutions are x + N y; they are one motion if A N = 0 and some y
+satisfies the inequalities. With two tangents, a contact may slide in a continuum of directions, which cannot be listed.
 """
 
 from __future__ import annotations
@@ -20,128 +22,152 @@ import numpy as np
 from lavender.base.arrays import FloatArray
 from lavender.problem import Problem
 
-CONTACTS = 8
-MOST = 4**CONTACTS  # modes
-AT_ONCE = 4096  # systems in memory
-SINGULAR = 300  # singular modes with solutions along more than one direction: a linear program each
-SLOP = 1e-9  # of the largest number of a system: what rounding may do to an inequality
-NULL = 1e-11  # singular values of a scaled system, of the largest, that count as zero
+MAX_ENUMERATED_CONTACTS = 8  # Problems with more contacts are not enumerated.
+MAX_MODES = 4**MAX_ENUMERATED_CONTACTS  # Problems with more modes are not enumerated.
+MODES_PER_BATCH = 4096  # Number of systems that are in memory at once.
+# At most this many singular modes with several dimensions of solutions are examined, by a linear program each.
+MAX_SINGULAR_MODES = 300
+INEQUALITY_TOL = (
+    1e-9  # Rounding may violate an inequality by this fraction of the largest number of a system.
+)
+# Singular values of a scaled system count as zero if they are at most this fraction of the largest.
+NULL_VALUE_TOL = 1e-11
 
 
-class _Ways(NamedTuple):
-    """What a block can do, for each way: equations E x = e and inequalities F x >= f, x scaled impulses."""
+class _BlockModes(NamedTuple):
+    """The modes of one block: equations E x = e and inequalities F x >= f, with x the scaled impulses.
 
-    equal: FloatArray  # (ways, r, m)
-    rhs: FloatArray  # (ways, r)
-    above: FloatArray  # (ways, 3, m)
-    bound: FloatArray  # (ways, 3)
+    Parameters
+    ----------
+    equal : (modes, r, m)
+        E.
+    rhs : (modes, r)
+        e.
+    above : (modes, 3, m)
+        F.
+    bound : (modes, 3)
+        f.
+    """
+
+    equal: FloatArray
+    rhs: FloatArray
+    above: FloatArray
+    bound: FloatArray
 
 
-def enumerated(problem: Problem) -> tuple[list[FloatArray], bool] | None:
-    """Impulses (m,) [N s] of every mode that has a solution, and whether their motions are all there are.
+def enumerate_modes(problem: Problem) -> tuple[list[FloatArray], bool] | None:
+    """Compute the impulses (m,) [N s] of every mode that has a solution, and whether their motions are all motions.
 
-    None where the problem has more than eight contacts or 65,536 modes, a contact with friction in two tangents or
-    spin, or numbers beyond float64 on the way. Not all: a mode with motions next to each other without end, or too
-    many singular modes.
+    Returns None if the problem has more than eight contacts or 65,536 modes, a contact with friction in two tangents or
+    torsional friction, or if intermediate numbers exceed float64. The motions are not all if a mode has a continuum of
+    motions, or if too many modes are singular.
     """
     c = problem.cones
     contact = c.is_contact
-    flat = (np.diff(c.ptr) == 1 + c.n_together) & ((c.n_tangents <= 1) | (c.mu == 0.0))
-    if np.count_nonzero(contact) > CONTACTS or not np.all(flat[contact]):
+    one_tangent = (np.diff(c.ptr) == 1 + c.n_together) & ((c.n_tangents <= 1) | (c.mu == 0.0))
+    if np.count_nonzero(contact) > MAX_ENUMERATED_CONTACTS or not np.all(one_tangent[contact]):
         return None
     counts = np.where(contact, 2 + 2 * (c.n_tangents > 0) * (c.mu > 0.0), 1).astype(float)
-    sides = 1 + (c.lower < c.upper) * (0.0 + np.isfinite(c.lower) + np.isfinite(c.upper))
-    counts[~contact] = [float(np.prod(sides[c.ptr[i] : c.ptr[i + 1]])) for i in np.flatnonzero(~contact)]
-    if np.log(counts).sum() > np.log(MOST) + 1e-9:
+    bound_choices = 1 + (c.lower < c.upper) * (0.0 + np.isfinite(c.lower) + np.isfinite(c.upper))
+    counts[~contact] = [
+        float(np.prod(bound_choices[c.ptr[i] : c.ptr[i + 1]])) for i in np.flatnonzero(~contact)
+    ]
+    if np.log(counts).sum() > np.log(MAX_MODES) + 1e-9:
         return None
     with np.errstate(all="ignore"):
         scale = 1.0 / np.sqrt(problem.d)
         a = scale[:, None] * problem.dense() * scale
         b = scale * problem.b
-        unit = float(np.abs(b).max(initial=0.0)) or 1.0  # sqrt J: the largest number of a system is 1
+        unit = float(np.abs(b).max(initial=0.0)) or 1.0  # [sqrt J] scales the largest number of a system to 1
         b, scale = b / unit, unit * scale
-        ways = [w for i in range(c.n_blocks) for w in _ways(problem, i, a, b, scale)]
-    if not all(np.isfinite(part).all() for way in ways for part in way):
+        block_modes = [w for i in range(c.n_blocks) for w in _block_modes(problem, i, a, b, scale)]
+    if not all(np.isfinite(field).all() for modes in block_modes for field in modes):
         return None
-    found, whole = [], True
-    left = SINGULAR
-    for equal, rhs, above, bound in _systems(ways):
+    impulses, complete = [], True
+    remaining_singular = MAX_SINGULAR_MODES
+    for equal, rhs, above, bound in _mode_systems(block_modes):
         value = np.linalg.svd(equal, compute_uv=False)
-        regular = value[:, -1] > NULL * value[:, 0]
+        regular = value[:, -1] > NULL_VALUE_TOL * value[:, 0]
         x = np.linalg.solve(equal[regular], rhs[regular][:, :, None])[:, :, 0]
-        slop = SLOP * np.maximum(1.0, np.abs(x).max(axis=1, initial=0.0))
-        inside = np.all(np.einsum("kij,kj->ki", above[regular], x) >= bound[regular] - slop[:, None], axis=1)
-        found += list(scale * x[inside])
+        tolerance = INEQUALITY_TOL * np.maximum(1.0, np.abs(x).max(axis=1, initial=0.0))
+        inside = np.all(
+            np.einsum("kij,kj->ki", above[regular], x) >= bound[regular] - tolerance[:, None], axis=1
+        )
+        impulses += list(scale * x[inside])
         equal, rhs, above, bound = equal[~regular], rhs[~regular], above[~regular], bound[~regular]
         u, value, vt = np.linalg.svd(equal)
-        inverse = np.divide(1.0, value, out=np.zeros_like(value), where=value > NULL * value[:, :1])
+        inverse = np.divide(1.0, value, out=np.zeros_like(value), where=value > NULL_VALUE_TOL * value[:, :1])
         along = inverse * np.einsum("klj,kl->kj", u, rhs)
         x = np.einsum("kji,kj->ki", vt, along)
-        off = np.abs(np.einsum("kij,kj->ki", equal, x) - rhs).max(axis=1, initial=0.0)
-        for i in np.flatnonzero(off <= SLOP):
+        residual = np.abs(np.einsum("kij,kj->ki", equal, x) - rhs).max(axis=1, initial=0.0)
+        for i in np.flatnonzero(residual <= INEQUALITY_TOL):
             null = vt[i][inverse[i] == 0.0].T
-            left -= null.shape[1] > 1
-            if left < 0:
-                return found, False
-            y = _within(above[i] @ null, bound[i] - above[i] @ x[i] - SLOP)
+            remaining_singular -= null.shape[1] > 1
+            if remaining_singular < 0:
+                return impulses, False
+            y = _feasible_point(above[i] @ null, bound[i] - above[i] @ x[i] - INEQUALITY_TOL)
             if y is not None:
-                whole &= bool(np.abs(a @ null).max() <= SLOP)
-                found.append(scale * (x[i] + null @ y))
-    return found, whole
+                complete &= bool(np.abs(a @ null).max() <= INEQUALITY_TOL)
+                impulses.append(scale * (x[i] + null @ y))
+    return impulses, complete
 
 
-def _ways(problem: Problem, block: int, a: FloatArray, b: FloatArray, scale: FloatArray) -> Iterator[_Ways]:
+def _block_modes(
+    problem: Problem, block: int, a: FloatArray, b: FloatArray, scale: FloatArray
+) -> Iterator[_BlockModes]:
+    """Yield the modes of each row of a block, or of the contact."""
     c = problem.cones
-    one = np.eye(problem.m)
-    none, nothing = np.zeros(problem.m), 0.0
+    unit_row = np.eye(problem.m)
+    zero_row, zero = np.zeros(problem.m), 0.0
     start, end = c.ptr[block], c.ptr[block + 1]
     if not c.is_contact[block]:
         for i in range(start, end):
             low, high = c.lower[i] / scale[i], c.upper[i] / scale[i]
-            some = []
+            mode_list = []
             if low < high:
                 inside = [
-                    (one[i], low if np.isfinite(low) else None),
-                    (-one[i], -high if np.isfinite(high) else None),
+                    (unit_row[i], low if np.isfinite(low) else None),
+                    (-unit_row[i], -high if np.isfinite(high) else None),
                 ]
-                some.append(([(a[i], b[i])], [(x, y) for x, y in inside if y is not None]))
-                some += [([(one[i], low)], [(a[i], b[i])])] * bool(np.isfinite(low))
-                some += [([(one[i], high)], [(-a[i], -b[i])])] * bool(np.isfinite(high))
+                mode_list.append(([(a[i], b[i])], [(x, y) for x, y in inside if y is not None]))
+                mode_list += [([(unit_row[i], low)], [(a[i], b[i])])] * bool(np.isfinite(low))
+                mode_list += [([(unit_row[i], high)], [(-a[i], -b[i])])] * bool(np.isfinite(high))
             else:
-                some.append(([(one[i], low)], []))
-            yield _packed(some, problem.m)
+                mode_list.append(([(unit_row[i], low)], []))
+            yield _to_arrays(mode_list, problem.m)
         return
     n, mu = start, c.mu[block]
-    off = [(one[t], nothing) for t in range(start + 1, end)]
-    opened = ([(one[n], nothing), *off], [(a[n], b[n])])
+    no_friction = [(unit_row[t], zero) for t in range(start + 1, end)]
+    open_mode = ([(unit_row[n], zero), *no_friction], [(a[n], b[n])])
     if mu == 0.0 or end - start == 1:
-        yield _packed([opened, ([(a[n], b[n]), *off], [(one[n], nothing)])], problem.m)
+        yield _to_arrays([open_mode, ([(a[n], b[n]), *no_friction], [(unit_row[n], zero)])], problem.m)
         return
     t = start + 1
-    rub = mu * scale[n] / scale[t] * one[n]  # the bound of the scaled tangent
-    stuck = (
+    tangent_bound = mu * scale[n] / scale[t] * unit_row[n]  # the bound of the scaled tangent
+    stuck_mode = (
         [(a[n], b[n]), (a[t], b[t])],
-        [(one[n], nothing), (rub - one[t], nothing), (rub + one[t], nothing)],
+        [(unit_row[n], zero), (tangent_bound - unit_row[t], zero), (tangent_bound + unit_row[t], zero)],
     )
-    slide = [
+    slide_modes = [
         (
-            [(a[n], b[n]), (one[t] + s * rub, nothing)],
-            [(one[n], nothing), (s * a[t], s * b[t]), (none, nothing)],
+            [(a[n], b[n]), (unit_row[t] + s * tangent_bound, zero)],
+            [(unit_row[n], zero), (s * a[t], s * b[t]), (zero_row, zero)],
         )
         for s in (1.0, -1.0)
     ]
-    yield _packed([opened, stuck, *slide], problem.m)
+    yield _to_arrays([open_mode, stuck_mode, *slide_modes], problem.m)
 
 
-def _packed(some: list[Any], m: int) -> _Ways:
-    r = len(some[0][0])
-    out = _Ways(
-        np.zeros((len(some), r, m)),
-        np.zeros((len(some), r)),
-        np.zeros((len(some), 3, m)),
-        np.zeros((len(some), 3)),
+def _to_arrays(mode_list: list[Any], m: int) -> _BlockModes:
+    """Collect modes, as lists of equations and inequalities, in arrays."""
+    r = len(mode_list[0][0])
+    out = _BlockModes(
+        np.zeros((len(mode_list), r, m)),
+        np.zeros((len(mode_list), r)),
+        np.zeros((len(mode_list), 3, m)),
+        np.zeros((len(mode_list), 3)),
     )
-    for k, (equal, above) in enumerate(some):
+    for k, (equal, above) in enumerate(mode_list):
         for i, (x, y) in enumerate(equal):
             out.equal[k, i], out.rhs[k, i] = x, y
         for i, (x, y) in enumerate(above):
@@ -149,23 +175,24 @@ def _packed(some: list[Any], m: int) -> _Ways:
     return out
 
 
-def _systems(ways: list[_Ways]) -> Iterator[tuple[FloatArray, ...]]:
-    """E (k, m, m), e, F, f of all modes, some at a time."""
-    counts = [len(w.rhs) for w in ways]
-    for first in range(0, int(np.prod(counts)), AT_ONCE):
-        mode = np.unravel_index(np.arange(first, min(first + AT_ONCE, int(np.prod(counts)))), counts)
+def _mode_systems(block_modes: list[_BlockModes]) -> Iterator[tuple[FloatArray, ...]]:
+    """Yield E (k, m, m), e, F and f of all modes, MODES_PER_BATCH at a time."""
+    counts = [len(w.rhs) for w in block_modes]
+    for first in range(0, int(np.prod(counts)), MODES_PER_BATCH):
+        mode = np.unravel_index(np.arange(first, min(first + MODES_PER_BATCH, int(np.prod(counts)))), counts)
         yield tuple(
-            np.concatenate([w[part][i] for w, i in zip(ways, mode, strict=True)], axis=1) for part in range(4)
+            np.concatenate([w[field][i] for w, i in zip(block_modes, mode, strict=True)], axis=1)
+            for field in range(4)
         )
 
 
-def _within(g: FloatArray, h: FloatArray) -> FloatArray | None:
-    """Some y with G y >= h, or None."""
+def _feasible_point(g: FloatArray, h: FloatArray) -> FloatArray | None:
+    """Return a y with G y >= h, or None if there is none."""
     if g.shape[1] == 1:
         slope = g[:, 0]
-        low = np.max(h[slope > NULL] / slope[slope > NULL], initial=-np.inf)
-        high = np.min(h[slope < -NULL] / slope[slope < -NULL], initial=np.inf)
-        if low > high or np.any(h[np.abs(slope) <= NULL] > 0.0):
+        low = np.max(h[slope > NULL_VALUE_TOL] / slope[slope > NULL_VALUE_TOL], initial=-np.inf)
+        high = np.min(h[slope < -NULL_VALUE_TOL] / slope[slope < -NULL_VALUE_TOL], initial=np.inf)
+        if low > high or np.any(h[np.abs(slope) <= NULL_VALUE_TOL] > 0.0):
             return None
         return np.array([min(max(low, 0.0), high)])
     from scipy.optimize import linprog

@@ -1,8 +1,8 @@
-"""The motions that solve one problem: Coulomb's law may leave several, and no accuracy of a solver chooses.
+"""The motions that solve one problem: under Coulomb's law there may be several, and no solver accuracy selects one.
 
-Runs from different starts, in different orders, by different solvers end at solutions; those whose motions
-agree are one. A search finds motions, it does not prove that there are no more: `uniqueness` can, and up to eight
-contacts with one tangent are enumerated whole (`lavender/lab/motion/modes.py`).
+Runs from different starts, in different orders and by different solvers end at solutions; solutions with equal motions
+are one motion. A search finds motions but does not prove that there are no others: `uniqueness` can, and problems of up
+to eight contacts with one tangent are enumerated completely (`lavender/lab/motion/modes.py`).
 """
 
 from __future__ import annotations
@@ -27,9 +27,15 @@ from lavender.base.errors import CapabilityError, InputError, LavenderError
 from lavender.judge.residuals import residual
 from lavender.judge.solution import uninterrupted
 from lavender.lab.motion.bound import difference
-from lavender.lab.motion.error import SAME, MotionError, in_own_rows, measure, told
-from lavender.lab.motion.modes import enumerated
-from lavender.lab.motion.reference import Reference, as_reference, judged, kept
+from lavender.lab.motion.error import (
+    SAME_MOTION_FRACTION,
+    MotionError,
+    drop_non_finite,
+    in_rows_of_ellipses,
+    measure,
+)
+from lavender.lab.motion.modes import enumerate_modes
+from lavender.lab.motion.reference import Reference, as_reference, make_reference, motion_cache
 from lavender.lab.motion.reference import reference as reference_of
 from lavender.lab.motion.unique import uniqueness
 from lavender.problem import Problem, check_problem
@@ -38,33 +44,56 @@ from lavender.solvers.certify import softened
 from lavender.solvers.registry import available, get
 from lavender.solving.solve import solve
 
-RUNS = 12  # of a search, after `auto` itself
-SOLVERS = ("anderson", "newton", "sequential_impulses", "block_gauss_seidel", "admm", "nncg")
-ORDERS = ("given", "reverse", "random")
-ASKED = 1e-11  # relative residual asked of a run, which nobody but its own solver ends
-WORK = 2e9  # of `Data.work`, about nanoseconds: what the sweeps of one run may cost
-SWEEPS = (400, 20_000)  # least and most of one run
-CHOICES = ("nearest", "dissipation", "compliant")
-SOFTEST, STEP = 1.0, 0.1  # softness of "compliant" as a share of d, and what each round leaves of it
-HARDEST = 1e-12
-BESIDE = 1e-6  # -, of `Distance.relative_distance`: an enumerated end that rounding alone keeps from being a solution
-MANY = 100  # motions of an enumeration that are compared with each other
+N_SEARCH_RUNS = 12  # Number of runs of a search, in addition to `auto`'s.
+SEARCH_SOLVERS = ("anderson", "newton", "sequential_impulses", "block_gauss_seidel", "admm", "nncg")
+SEARCH_ORDERS = ("given", "reverse", "random")
+# Relative residual tolerance of a search run; it is below the floor, so a run ends when its solver stalls.
+SEARCH_TOL = 1e-11
+SWEEP_WORK_LIMIT = 2e9  # In units of `Data.work`, about nanoseconds: largest cost of the sweeps of one run.
+SWEEP_RANGE = (400, 20_000)  # Smallest and largest number of sweeps of one run.
+SELECTION_RULES = ("nearest", "dissipation", "compliant")
+# The rule "compliant" starts with a compliance of this multiple of d; each step multiplies the compliance by the second
+# number, down to the third.
+LARGEST_COMPLIANCE_FRACTION, COMPLIANCE_STEP = 1.0, 0.1
+SMALLEST_COMPLIANCE_FRACTION = 1e-12
+# An enumerated impulse that is not a solution because of rounding is within this `Distance.relative_distance` of one.
+NEAR_SOLUTION_FRACTION = 1e-6
+MAX_COMPARED_MOTIONS = 100  # At most this many motions of an enumeration are compared with each other.
 
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """One solution, as a motion. `str()` is one line."""
+    """One solution, as a motion; `str()` gives one line.
 
-    impulse: FloatArray = field(repr=False)  # (m,) N s
-    slack: FloatArray = field(repr=False)  # (m,) m/s, w
+    Parameters
+    ----------
+    impulse : (m,) N s
+    slack : (m,) m/s
+        w.
+    reference : Reference
+    relative : float
+        Relative residual.
+    energy : float, J
+        1/2 lambda.A lambda - b.lambda: the energy that the constraints add to the bodies if targets are at rest.
+    dissipation : float, J
+        -sum w.lambda over friction rows.
+    separation_speed : float, m/s
+        Largest normal slack of a contact with a normal impulse: the error of the cone law's convex relaxation.
+    count : int
+        Number of runs that ended here.
+    found_by : tuple of str
+        Solver, order and start of each of these runs.
+    """
+
+    impulse: FloatArray = field(repr=False)
+    slack: FloatArray = field(repr=False)
     reference: Reference = field(repr=False)
-    relative: float  # -, residual
-    energy: float  # J, 1/2 lambda.A lambda - b.lambda: what the constraints add to the bodies' energy at rest targets
-    dissipation: float  # J, -sum w.lambda over friction rows
-    # m/s, largest normal slack of a contact that presses: what the cone law pays for being convex
+    relative: float
+    energy: float
+    dissipation: float
     separation_speed: float
-    count: int  # runs that ended here
-    found_by: tuple[str, ...]  # their solvers, orders and starts
+    count: int
+    found_by: tuple[str, ...]
 
     def __str__(self) -> str:
         return (
@@ -74,32 +103,68 @@ class Motion:
 
 
 class Distance(NamedTuple):
-    """Of two motions."""
+    """Distance of two motions.
 
-    speed: float  # m/s of a body; of a row where bodies are not known
-    energy: float  # sqrt J, sqrt(1/2) |.|_A; m/s of a row where A is no energy
-    relative_distance: float  # -, that over the larger of the same of both
+    Parameters
+    ----------
+    speed : float, m/s
+        Largest difference of a body's velocity; of a row's if bodies are not known.
+    energy : float, sqrt J
+        sqrt(1/2) |.|_A of the difference; m/s of a row if A is not an energy.
+    relative_distance : float
+        `energy` divided by the larger of the two motions' energies.
+    """
+
+    speed: float
+    energy: float
+    relative_distance: float
 
 
 class Pick(NamedTuple):
-    """Where a solver ends without being told."""
+    """The motion at which a solver ends by itself.
 
-    motion: int  # place of the nearest one
-    distance: float  # m/s to it: more than rounding where the search has not found this motion
+    Parameters
+    ----------
+    motion : int
+        Index of the nearest motion.
+    distance : float, m/s
+        Distance from it: above rounding if the search has not found the solver's motion.
+    """
+
+    motion: int
+    distance: float
 
 
 @dataclass(frozen=True, eq=False)
 class SolutionSet:
-    """Motions that all solve one problem, most often found first; `str()` is a line each."""
+    """Motions that all solve one problem, most frequent first; `str()` gives one line for each.
+
+    Parameters
+    ----------
+    problem : Problem
+    motions : tuple of Motion
+    spread : float, m/s
+        Largest distance of two motions: of a body's velocity, or of a row's if bodies are not known.
+    spread_energy : float or None, sqrt J
+        Largest sqrt(1/2) |.|_A of a difference; None if A is not an energy.
+    unique : str
+        Criterion that proves that there is one motion; empty if none does.
+    runs : int
+        Number of runs that ended at a solution.
+    failed : int
+        Number of runs that did not.
+    all : bool
+        There are no other motions: it is proved, or every mode of the contacts was enumerated.
+    """
 
     problem: Problem = field(repr=False)
     motions: tuple[Motion, ...]
-    spread: float  # m/s, the largest distance of two: of a body, or of a row where bodies are not known
-    spread_energy: float | None  # sqrt J, sqrt(1/2) |.|_A of the same; None where A is no energy
-    unique: str  # the criterion that proves there is one; empty where none does
-    runs: int  # that ended at a solution
-    failed: int  # runs that did not
-    all: bool = False  # there are no others: proved, or every mode of the contacts was looked at
+    spread: float
+    spread_energy: float | None
+    unique: str
+    runs: int
+    failed: int
+    all: bool = False
 
     def __iter__(self) -> Iterator[Motion]:
         return iter(self.motions)
@@ -108,59 +173,59 @@ class SolutionSet:
         return len(self.motions)
 
     def __bool__(self) -> bool:
-        return True  # also where none was found: the search has been
+        return True  # A search without a result is a result, too.
 
     def __getitem__(self, i: Any) -> Any:
-        """Motion i, or a list of several."""
+        """Return motion i, or a list of motions."""
         i = resolve_index(i, len(self.motions), "motion")
         return [self.motions[j] for j in i] if isinstance(i, list) else self.motions[i]
 
     def select(self, choice: str, impulse: Any = None) -> Motion:
-        """One of the motions by a rule that has a name.
+        """Select one of the motions by a named rule.
 
         Parameters
         ----------
         choice : {"nearest", "dissipation", "compliant"}
-            Nearest to a warm start; the one in which friction takes most energy; the limit of vanishing
-            softness: compliance d s on every row, s from 1 to 1e-12 by tenths, each solved from the last, as
-            far as the search found where this path ends.
+            "nearest": nearest to a warm start. "dissipation": friction dissipates the most energy. "compliant": the
+            limit of vanishing compliance d s on every row, s from 1 to 1e-12 in factors of ten, each solved from the
+            one before; the motion found that is nearest to the end of this path.
         impulse : (m,) N s, optional
-            With "nearest": the warm start. Default: the problem's guess, else doing nothing.
+            With "nearest": the warm start. Default: the problem's guess, otherwise the zero impulse.
 
         Raises
         ------
         InputError
-            No such choice, a wrong impulse, or no motion to choose from.
+            Unknown `choice`, wrong `impulse`, or no motion was found.
         """
-        choice = check_choice("choice", choice, CHOICES)
+        choice = check_choice("choice", choice, SELECTION_RULES)
         if not self.motions:
             raise InputError("no run ended at a solution; there is nothing to choose from")
         if choice == "dissipation":
             return max(self.motions, key=lambda motion: motion.dissipation)
         p = self.problem
         if choice == "compliant":
-            return self.nearest(compliant(p))
+            return self.nearest(solve_with_vanishing_compliance(p))
         if impulse is None:
             impulse = p.start() if p.guess is None else p.guess
         return self.nearest(p.impulse_array(impulse))
 
     def nearest(self, impulse: FloatArray) -> Motion:
-        """The motion at the least distance from an impulse (m,) [N s]."""
+        """Return the motion at the smallest distance from an impulse (m,) [N s]."""
         return min(self.motions, key=lambda motion: distance(self.problem, impulse, motion.impulse).energy)
 
     def picks(
-        self, solvers: Iterable[str] | None = None, *, tol: float = 1e-9, max_iter: int = SWEEPS[1]
+        self, solvers: Iterable[str] | None = None, *, tol: float = 1e-9, max_iter: int = SWEEP_RANGE[1]
     ) -> dict[str, Pick | None]:
-        """Which motion each solver ends at without being told; None where it does not get to `tol`.
+        """Return the motion at which each solver ends by itself; None if the solver does not reach `tol`.
 
         Parameters
         ----------
         solvers : names, optional
-            Default: all that take the problem here.
+            Default: all available solvers that accept the problem.
         tol : float
-            Relative residual asked of them, or twice the floor.
+            Relative residual tolerance, at least twice the round-off floor.
         max_iter : int
-            Budget of those that sweep; the others keep their own.
+            Largest number of iterations of solvers that sweep; the others keep their own limits.
         """
         p = self.problem
         out: dict[str, Pick | None] = {}
@@ -191,81 +256,93 @@ class SolutionSet:
         return "\n".join([head, *(f"  {i}: {motion}" for i, motion in enumerate(self.motions))])
 
 
-@np.errstate(over="ignore", invalid="ignore")  # what is not finite is no solution
-def find_solutions(problem: Problem, n: int = RUNS, seed: int = 0, *, always: bool = False) -> SolutionSet:
-    """The motions that solve a problem: from several starts, in several orders, by several solvers, or all of them.
+@np.errstate(over="ignore", invalid="ignore")  # Impulses that are not finite are not solutions.
+def find_solutions(
+    problem: Problem, n: int = N_SEARCH_RUNS, seed: int = 0, *, always: bool = False
+) -> SolutionSet:
+    """Find the motions that solve a problem, by enumeration or from several starts, orders and solvers.
 
-    Up to eight contacts with at most one tangent each are enumerated: `SolutionSet.all` is then true, and no run is
-    needed. Otherwise there are at least those that are found.
+    Problems of up to eight contacts with at most one tangent each are enumerated: `SolutionSet.all` is then true, and
+    no run is needed. Otherwise the motions that are found are a lower bound of their number.
 
     Parameters
     ----------
     problem : Problem
     n : int, default 12
-        Runs, after the one of `auto`; none where the motion is proved to be unique, or all are enumerated.
+        Number of runs after `auto`'s; none if the motion is proved to be unique, or all motions are enumerated.
     seed : int, default 0
-        Of starts and random orders: equal seeds give equal results.
+        Seed of starts and random orders: equal seeds give equal results.
     always : bool, default False
-        Search also where one motion is proved: to test the proof.
+        Search also if the motion is proved to be unique: to test the proof.
 
     Returns
     -------
     SolutionSet
-        Kept with the problem, for `motion_error`.
+        Stored with the problem, for `motion_error`.
 
     Raises
     ------
     InputError
-        `n` or `seed` is no whole number, or negative; `always` is neither True nor False.
+        `n` or `seed` is not an integer or is negative; `always` is not a bool.
     """
     check_problem(problem)
     n, seed, always = check_int("n", n), check_int("seed", seed, high=None), check_bool("always", always)
     proof = uniqueness(problem)
-    own = reference_of(problem)
-    found = [(own, "auto")] if own.accepted else []
-    failed = 0 if own.accepted else 1
-    whole = bool(proof)
-    if (always or not proof) and (modes := enumerated(problem)) is not None:
+    reference = reference_of(problem)
+    found = [(reference, "auto")] if reference.accepted else []
+    failed = 0 if reference.accepted else 1
+    complete = bool(proof)
+    if (always or not proof) and (modes := enumerate_modes(problem)) is not None:
         best_last = sorted(modes[0], key=lambda x: -residual(problem, x).relative)
-        single = {_rounded(problem, x): x for x in best_last}  # modes that share a motion
-        ends = [judged(problem, x, "every mode") for x in list(single.values())[:MANY]]
+        # Modes with the same motion have one entry.
+        distinct = {_motion_key(problem, x): x for x in best_last}
+        ends = [
+            make_reference(problem, x, "every mode") for x in list(distinct.values())[:MAX_COMPARED_MOTIONS]
+        ]
         solved = [end for end in ends if end.accepted]
         found += [(end, "every mode") for end in solved]
-        # what rounding lets pass an inequality lies beside a motion that it would otherwise have missed
-        beside = (
+        # An impulse that passes an inequality only by rounding must be next to a solution; else the list has a gap.
+        distances = (
             min((distance(problem, e.impulse, s.impulse).relative_distance for s in solved), default=1.0)
             for e in ends
         )
-        whole |= modes[1] and len(single) <= MANY and max(beside, default=1.0) < BESIDE
-    if always or not whole:
-        for label, impulse in search(problem, own, n, seed):
-            candidate = judged(problem, impulse, label)
+        complete |= (
+            modes[1]
+            and len(distinct) <= MAX_COMPARED_MOTIONS
+            and max(distances, default=1.0) < NEAR_SOLUTION_FRACTION
+        )
+    if always or not complete:
+        for label, impulse in search(problem, reference, n, seed):
+            candidate = make_reference(problem, impulse, label)
             if candidate.accepted:
                 found.append((candidate, label))
             else:
                 failed += 1
-    merged = _merge(problem, found)
+    merged = _merge_equal_motions(problem, found)
     speed, energy = 0.0, 0.0
-    for i, one in enumerate(merged):
-        for two in merged[:i]:
-            apart = distance(problem, one.impulse, two.impulse)
-            speed, energy = max(speed, apart.speed), max(energy, apart.energy)
+    for i, first in enumerate(merged):
+        for second in merged[:i]:
+            pair_distance = distance(problem, first.impulse, second.impulse)
+            speed, energy = max(speed, pair_distance.speed), max(energy, pair_distance.energy)
     result = SolutionSet(
         problem=problem,
         motions=tuple(merged),
         spread=speed,
-        spread_energy=None if own.refusal else energy,
+        spread_energy=None if reference.refusal else energy,
         unique=proof.reason if proof else "",
         runs=len(found),
         failed=failed,
-        all=whole,
+        all=complete,
     )
-    kept(problem).motions = result
+    motion_cache(problem).motions = result
     return result
 
 
-def _rounded(problem: Problem, x: FloatArray) -> bytes:
-    """w to 1e-9 of the largest |b|, in m/s and in sqrt(J): heavy bodies that move slowly move all the same."""
+def _motion_key(problem: Problem, x: FloatArray) -> bytes:
+    """Return a key of a motion: w rounded to 1e-9 of the largest |b|, in m/s and in sqrt(J).
+
+    The second scale distinguishes slow motions of heavy bodies.
+    """
     parts = []
     for unit in (np.ones(problem.m), 1.0 / np.sqrt(problem.d)):
         largest = float(np.max(np.abs(unit * problem.b), initial=0.0)) or 1.0
@@ -273,16 +350,16 @@ def _rounded(problem: Problem, x: FloatArray) -> bytes:
     return np.concatenate(parts).tobytes()
 
 
-def get_solutions(problem: Problem, n: int = RUNS) -> SolutionSet:
-    """The motions that were searched already, whatever their number of runs, or a search of `n` runs."""
-    return kept(problem).motions or find_solutions(problem, n)
+def get_solutions(problem: Problem, n: int = N_SEARCH_RUNS) -> SolutionSet:
+    """Return the motions of an earlier search, whatever its number of runs, or search with `n` runs."""
+    return motion_cache(problem).motions or find_solutions(problem, n)
 
 
 def branch(problem: Problem, impulse: Any) -> Reference:
-    """The solution that an impulse (m,) [N s] leads to: sweeps from it to the floor, then `newton` where they stop.
+    """Return the solution that an impulse (m,) [N s] leads to: by sweeps to the floor, then by `newton` if they stall.
 
-    Where Coulomb's law leaves several motions, this is the one that a solver stopped early was on its way to.
-    Kept by nobody; `accepted` says whether it is a solution.
+    If Coulomb's law has several motions, this is the one that a solver stopped early would have reached. It is not
+    stored with the problem; `accepted` shows whether it is a solution.
     """
     check_problem(problem)
     found = None
@@ -290,8 +367,12 @@ def branch(problem: Problem, impulse: Any) -> Reference:
     for name in ("anderson", "newton"):
         if name not in available(problem):
             continue
-        end = uninterrupted(solve(problem, name, impulse=x, tol=ASKED))
-        new = judged(problem, end.impulse, f"{name} from it") if np.isfinite(end.impulse).all() else None
+        end = uninterrupted(solve(problem, name, impulse=x, tol=SEARCH_TOL))
+        new = (
+            make_reference(problem, end.impulse, f"{name} from it")
+            if np.isfinite(end.impulse).all()
+            else None
+        )
         if new is not None and (found is None or new.residual.relative < found.residual.relative):
             found = new
         if found is not None and found.accepted:
@@ -299,79 +380,90 @@ def branch(problem: Problem, impulse: Any) -> Reference:
     return reference_of(problem) if found is None else found
 
 
-def compliant(problem: Problem) -> FloatArray:
-    """Where softness that vanishes leads: compliance s d on every row, s from 1 to 1e-12, then none; (m,) [N s]."""
-    x, s = problem.start(), SOFTEST
-    while s >= HARDEST:
+def solve_with_vanishing_compliance(problem: Problem) -> FloatArray:
+    """Solve with compliance s d on every row, s from 1 to 1e-12, then with none, each from the last; (m,) [N s]."""
+    x, s = problem.start(), LARGEST_COMPLIANCE_FRACTION
+    while s >= SMALLEST_COMPLIANCE_FRACTION:
         x = np.array(
             uninterrupted(solve(softened(problem, s * problem.d), "auto", impulse=x, tol=1e-12)).impulse
         )
-        s *= STEP
+        s *= COMPLIANCE_STEP
     return np.array(uninterrupted(solve(problem, "auto", impulse=x, tol=1e-13)).impulse)
 
 
-def search(problem: Problem, own: Reference, n: int, seed: int) -> Iterator[tuple[str, FloatArray]]:
-    """n runs: what each was, and where it ended."""
+def search(problem: Problem, reference: Reference, n: int, seed: int) -> Iterator[tuple[str, FloatArray]]:
+    """Run n solves; yield the label of each and the impulse (m,) [N s] at which it ended."""
     here = set(available(problem))
-    solvers = [name for name in SOLVERS if name in here] or ["auto"]
+    solvers = [name for name in SEARCH_SOLVERS if name in here] or ["auto"]
     if "sequential_impulses" not in here and "pgs" in here:
         solvers.append("pgs")
     rng = np.random.default_rng(seed)
-    budget = int(min(max(WORK / max(1, problem.data.work), SWEEPS[0]), SWEEPS[1]))
+    budget = int(min(max(SWEEP_WORK_LIMIT / max(1, problem.data.work), SWEEP_RANGE[0]), SWEEP_RANGE[1]))
     for i in range(n):
-        turn, which = divmod(i, len(solvers))
+        cycle, which = divmod(i, len(solvers))
         spec = get(solvers[which])
         options: dict[str, Any] = {}
         label = spec.name
         if spec.order:
-            options["order"] = ORDERS[(i + turn) % len(ORDERS)]
+            options["order"] = SEARCH_ORDERS[(i + cycle) % len(SEARCH_ORDERS)]
             label += f" {options['order']}"
             if options["order"] == "random":
                 options["seed"] = int(rng.integers(2**31))
-        # Two turns start where nobody has moved anything, in different orders; a solver without orders starts anew.
-        start = _start(problem, own, rng, max(turn - spec.order, 0))
+        # The first two cycles start from rest, in different orders; a solver without orders gets a new start each
+        # cycle.
+        start = _start(problem, reference, rng, max(cycle - spec.order, 0))
         limit = budget if spec.resumable else spec.max_iter
         try:
             end = uninterrupted(
-                solve(problem, spec.name, impulse=start[1], tol=ASKED, max_iter=limit, **options)
+                solve(problem, spec.name, impulse=start[1], tol=SEARCH_TOL, max_iter=limit, **options)
             )
-        except LavenderError:  # refused after a look at the numbers
+        except LavenderError:  # The solver rejected the numbers of this problem.
             continue
         if np.isfinite(end.impulse).all():
             yield f"{label} from {start[0]}", end.impulse
 
 
-def _start(problem: Problem, own: Reference, rng: np.random.Generator, i: int) -> tuple[str, FloatArray]:
-    """A start and its name: doing nothing, the guess, then the reference with its normals and tangents at random."""
+def _start(
+    problem: Problem, reference: Reference, rng: np.random.Generator, i: int
+) -> tuple[str, FloatArray]:
+    """Return start i and its name: first the guess (or the zero impulse), then random changes of the reference."""
     if i == 0:
         return ("doing nothing", problem.start()) if problem.guess is None else ("the guess", problem.guess)
     c = problem.cones
-    x = own.impulse * rng.lognormal(sigma=0.7, size=problem.m)
-    size = float(np.median(np.abs(own.impulse[own.impulse != 0.0]))) if own.impulse.any() else 1.0
+    x = reference.impulse * rng.lognormal(sigma=0.7, size=problem.m)
+    size = (
+        float(np.median(np.abs(reference.impulse[reference.impulse != 0.0])))
+        if reference.impulse.any()
+        else 1.0
+    )
     normal, tangents = c.normal_rows, c.friction_rows
     x[normal] = np.maximum(x[normal], size * rng.random(len(normal)))
     x[tangents] = size * rng.normal(size=int(tangents.sum()))
     return "a random start", project(c, x)
 
 
-def _merge(problem: Problem, found: list[tuple[Reference, str]]) -> list[Motion]:
-    """One motion of all that agree, the best solved of each; most often found first."""
+def _merge_equal_motions(problem: Problem, found: list[tuple[Reference, str]]) -> list[Motion]:
+    """Merge solutions with equal motions into one `Motion`, the best solved of each; most frequent first."""
     groups: list[list[tuple[Reference, str]]] = []
-    for one in found:
+    for first in found:
         for group in groups:
-            if distance(problem, one[0].impulse, group[0][0].impulse).relative_distance <= SAME:
-                group.append(one)
+            if (
+                distance(problem, first[0].impulse, group[0][0].impulse).relative_distance
+                <= SAME_MOTION_FRACTION
+            ):
+                group.append(first)
                 break
         else:
-            groups.append([one])
+            groups.append([first])
     out = []
     for group in groups:
         best = min((reference for reference, _ in group), key=lambda r: r.residual.relative)
-        out.append(_motion(problem, best, tuple(label for _, label in group)))
+        out.append(_make_motion(problem, best, tuple(label for _, label in group)))
     return sorted(out, key=lambda motion: -motion.count)
 
 
-def _motion(problem: Problem, reference: Reference, labels: tuple[str, ...]) -> Motion:
+def _make_motion(problem: Problem, reference: Reference, labels: tuple[str, ...]) -> Motion:
+    """Build a `Motion` from a solution and the labels of the runs that found it."""
     x = reference.impulse
     w = residual(problem, x).slack
     normal, friction = problem.cones.normal_rows, problem.cones.friction_rows
@@ -389,69 +481,73 @@ def _motion(problem: Problem, reference: Reference, labels: tuple[str, ...]) -> 
     )
 
 
-@np.errstate(over="ignore", invalid="ignore")  # of impulses at the edge of float64
+@np.errstate(over="ignore", invalid="ignore")  # Impulses may be at the limit of float64.
 def distance(problem: Problem, x: ArrayLike, y: ArrayLike) -> Distance:
-    """How far apart the motions of two impulses (m,) [N s] are."""
-    own = kept(problem)
-    operator = own.operator
+    """Compute the distance between the motions of two impulses (m,) [N s]."""
+    cache = motion_cache(problem)
+    operator = cache.operator
     x, y = problem.impulse_array(x, "x"), problem.impulse_array(y, "y")
     delta, size = difference(operator, x, y)
     velocity = operator.velocity(delta, np.zeros(problem.m))
     rows = np.abs(operator.slack(delta)[0] + problem.b)
     speed = rows if velocity is None else operator.lengths(velocity[0])[0]
-    fastest = float(np.max(speed, initial=0.0))
-    if own.refusal:
-        far = float(np.max(rows, initial=0.0))
-        whole = max(float(np.max(np.abs(operator.slack(z)[0] + problem.b), initial=0.0)) for z in (x, y))
+    max_speed = float(np.max(speed, initial=0.0))
+    if cache.refusal:
+        energy = float(np.max(rows, initial=0.0))
+        largest = max(float(np.max(np.abs(operator.slack(z)[0] + problem.b), initial=0.0)) for z in (x, y))
     else:
-        far = size.energy
-        whole = max(operator.size(z, np.zeros(problem.m)).energy for z in (x, y))
-    return Distance(fastest, far, far / whole if whole > 0.0 else (0.0 if far == 0.0 else np.inf))
+        energy = size.energy
+        largest = max(operator.size(z, np.zeros(problem.m)).energy for z in (x, y))
+    return Distance(
+        max_speed, energy, energy / largest if largest > 0.0 else (0.0 if energy == 0.0 else np.inf)
+    )
 
 
 def motion_error(problem: Problem, impulse: Any, reference: Any = None) -> MotionError:
-    """How wrong the motion of an impulse is: its distance to the solution, with a bound.
+    """Compute the error of an impulse's motion: its distance from the solution, with a bound.
 
     With lambda* the reference and M^-1 J^T (lambda - lambda*) the difference dv of body velocities,
 
         kinetic = sqrt(1/2 dv.M dv)        energy = sqrt(1/2 (lambda - lambda*).A (lambda - lambda*))
 
-    so that two impulses which differ by what moves nothing (a table on four legs) are at distance 0. The
-    bound needs no trust in the reference: with e the judge's error of lambda* and targets moved by d e,
-    the solution is within sqrt(1/2) |e|_A of it (proof in `lavender.lab.motion.bound`).
+    so that two impulses with a difference that moves nothing (a table on four legs) have distance 0. The bound does not
+    depend on trust in the reference: with e the judge's error of lambda* and targets moved by d e, the solution is
+    within sqrt(1/2) |e|_A of it (proof in `lavender.lab.motion.bound`).
 
     Parameters
     ----------
     problem : Problem
     impulse : (m,) N s
     reference : (m,) N s, Solution or Reference, optional
-        What stands for the solution. Default: what `auto` finds at the floor, solved for once and kept
-        with the problem; under Coulomb's law the nearest of the motions that `lavender.find_solutions` finds and of the
-        one that the impulse itself leads to.
+        The solution to compare with. Default: the result of `auto` at the round-off floor, solved once and stored with
+        the problem; under Coulomb's law the nearest of the motions that `lavender.find_solutions` finds and of the one
+        that the impulse itself leads to.
 
     Returns
     -------
     MotionError
-        No estimate where the reference is no solution (relative above 1e-10 and above twice its floor); no
-        energies where A is asymmetric or indefinite; no bound under Coulomb's law. `note` says so.
+        Estimates are None if the reference is not a solution (relative above 1e-10 and above twice its floor);
+        energies if A is asymmetric or indefinite; bounds under Coulomb's law. `note` gives the reason.
 
     Raises
     ------
     InputError
-        An impulse or reference of the wrong length, or one that is not finite.
+        An impulse or reference has a wrong length or is not finite.
     CapabilityError
-        Generalised coordinates in which M couples more than 2000 velocities.
+        M couples more than 2000 generalised velocities.
     """
     check_problem(problem)
     x = problem.on_disk(problem.impulse_array(impulse))
-    if problem.cones.has_ellipse:  # measured on its disks
+    if problem.cones.has_ellipse:  # The motion is measured on its disks.
         if reference is not None and not isinstance(reference, Reference):
-            given = problem.impulse_array(getattr(reference, "impulse", reference), "reference")
-            reference = problem.on_disk(given)
-        found = motion_error(problem.disk, x, reference)
+            impulse_of_reference = problem.impulse_array(
+                getattr(reference, "impulse", reference), "reference"
+            )
+            reference = problem.on_disk(impulse_of_reference)
+        error = motion_error(problem.disk, x, reference)
         with np.errstate(over="ignore", invalid="ignore"):
-            return in_own_rows(problem, x, found)
-    with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is told in `note`
+            return in_rows_of_ellipses(problem, x, error)
+    with np.errstate(over="ignore", invalid="ignore"):  # `note` names numbers that are not finite.
         if reference is not None:
             return measure(problem, x, as_reference(problem, reference))
         if problem.law != "coulomb":
@@ -459,24 +555,27 @@ def motion_error(problem: Problem, impulse: Any, reference: Any = None) -> Motio
         return nearest(problem, x, get_solutions(problem))
 
 
-def nearest(problem: Problem, x: FloatArray, found: SolutionSet) -> MotionError:
-    """The distance of an impulse x (m,) to the nearest of several motions, and of the one that it leads to."""
-    references = [motion.reference for motion in found]
-    spread, energy = found.spread, found.spread_energy
-    if not found.unique:
+def nearest(problem: Problem, x: FloatArray, solutions: SolutionSet) -> MotionError:
+    """Compute the distance of an impulse x (m,) from the nearest of several motions and of the one that it leads to."""
+    references = [motion.reference for motion in solutions]
+    spread, energy = solutions.spread, solutions.spread_energy
+    if not solutions.unique:
         own = branch(problem, x)
-        far = [distance(problem, own.impulse, motion.impulse) for motion in found]
-        if own.accepted and all(d.relative_distance > SAME for d in far):
+        distances = [distance(problem, own.impulse, motion.impulse) for motion in solutions]
+        if own.accepted and all(d.relative_distance > SAME_MOTION_FRACTION for d in distances):
             references.append(own)
-            spread = max([spread, *(d.speed for d in far)])
-            energy = None if energy is None else max([energy, *(d.energy for d in far)])
+            spread = max([spread, *(d.speed for d in distances)])
+            energy = None if energy is None else max([energy, *(d.energy for d in distances)])
     if not references:
         return measure(problem, x, reference_of(problem))
-    best = min((measure(problem, x, reference) for reference in references), key=_distance)
-    made = replace(best, spread=energy, spread_speed=spread, count=len(references), unique=found.unique)
-    return told(made, ("spread", "spread_speed"))
+    best = min((measure(problem, x, reference) for reference in references), key=_error_key)
+    nearest_error = replace(
+        best, spread=energy, spread_speed=spread, count=len(references), unique=solutions.unique
+    )
+    return drop_non_finite(nearest_error, ("spread", "spread_speed"))
 
 
-def _distance(error: MotionError) -> float:
+def _error_key(error: MotionError) -> float:
+    """Return the sort key of an error: its energy, else its row error, else inf."""
     known = error.energy if error.energy is not None else error.rows
     return math.inf if known is None else known

@@ -1,4 +1,4 @@
-"""The solution that motions are compared with: found once per problem, judged, and kept with it, or beside its file.
+"""The solution that motions are compared with: solved once per problem, judged, and stored with it or its file.
 
 `pile.npz.reference` holds the solution of `pile.npz`, judged when it is read.
 """
@@ -25,32 +25,48 @@ from lavender.lab.motion.bound import Witness, witness
 from lavender.problem import Problem, check_problem
 from lavender.solving.solve import solve
 
-SOLVER = "auto"
-ASKED = 1e-15  # relative residual asked of it: it stops at the floor by itself
-ACCEPTED = 1e-10  # relative residual that makes a reference, as does the floor
-PROOF = "proof: "  # who solved what `enclosed` gives
-SUFFIX = ".reference"  # of a problem's file name
-CONVEX = ("linear", "lcp", "cone")
+REFERENCE_SOLVER = "auto"
+REFERENCE_TOL = (
+    1e-15  # Relative residual tolerance of the reference solve; it is below the floor, where `auto` stops.
+)
+REFERENCE_MAX_RESIDUAL = (
+    1e-10  # An impulse is accepted as a reference up to this relative residual, or at its floor.
+)
+PROOF = "proof: "  # Prefix of `Reference.solver` for an impulse that `enclose_reference` stored.
+REFERENCE_SUFFIX = ".reference"  # Appended to a problem's file name.
+CONVEX_LAWS = ("linear", "lcp", "cone")
 
 
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """An impulse that stands for the solution, or the best that was found. `str()` is one line."""
+    """An impulse that is compared with as the solution, or the best that was found; `str()` gives one line.
 
-    impulse: FloatArray = field(repr=False)  # (m,) N s
+    Parameters
+    ----------
+    impulse : (m,) N s
+    residual : Residual
+    solver : str
+        The solver that found it, and its message, e.g. "auto: direct 1 factorisations".
+    refusal : str
+        Reason why energies cannot be computed: asymmetric or indefinite A; empty if they can.
+    witness : Witness or None
+        The bound that it proves; None under Coulomb's law, or if `refusal` is not empty.
+    """
+
+    impulse: FloatArray = field(repr=False)
     residual: Residual
-    solver: str  # who found it, e.g. "auto: direct 1 factorisations"
-    refusal: str  # why there are no energies: asymmetric or indefinite A; empty where there are
-    witness: Witness | None = field(repr=False)  # what it proves; None under Coulomb's law, or where refused
+    solver: str
+    refusal: str
+    witness: Witness | None = field(repr=False)
 
     @property
     def accepted(self) -> bool:
-        """Near enough to a solution that distances to it are told: relative <= 1e-10, or at the floor."""
-        return self.residual.relative <= ACCEPTED or self.residual.at_floor
+        """Whether distances to it are reported: its relative residual is at most 1e-10, or at its floor."""
+        return self.residual.relative <= REFERENCE_MAX_RESIDUAL or self.residual.at_floor
 
     @property
     def enclosed(self) -> bool:
-        """An exact solution, rounded, that was enclosed with proof."""
+        """Whether it is an exact solution, rounded, that was enclosed with a proof."""
         return self.solver.startswith(PROOF)
 
     def __str__(self) -> str:
@@ -62,22 +78,22 @@ class Reference:
 
 
 @dataclass
-class Kept:
-    """Everything that this room keeps with a problem."""
+class MotionCache:
+    """Results about motions that are stored with a problem; `motions` is the `SolutionSet` of a search."""
 
     operator: operators.Operator
     refusal: str
     reference: Reference | None = None
-    motions: Any = None  # `SolutionSet` of a search, or None
+    motions: Any = None
 
 
-def kept(problem: Problem) -> Kept:
-    """What is kept with a problem, made when first asked for.
+def motion_cache(problem: Problem) -> MotionCache:
+    """Return the motion cache of a problem; it is created at the first call.
 
     Raises
     ------
     CapabilityError
-        A problem with ellipses, whose motion is that of its disks.
+        The problem has ellipses; its motion is computed on its disks.
     """
     check_problem(problem)
     if problem.cones.has_ellipse:
@@ -85,103 +101,106 @@ def kept(problem: Problem) -> Kept:
             "the motions of ellipses are those of problem.disk: give that, and impulses as problem.on_disk(impulse)"
         )
     with problem.derived.lock:
-        own = problem.derived.cache.get(__name__)
-        if own is None:
-            operator = operators.make(problem)
-            own = problem.derived.cache[__name__] = Kept(operator, operator.refusal() or "")
-        return own
+        cache = problem.derived.cache.get(__name__)
+        if cache is None:
+            operator = operators.make_operator(problem)
+            cache = problem.derived.cache[__name__] = MotionCache(operator, operator.refusal() or "")
+        return cache
 
 
 def reference(problem: Problem) -> Reference:
-    """The problem's reference; solved for by `auto` when first asked, then kept with the problem.
+    """Return the problem's reference; `auto` solves for it at the first call, and it is stored with the problem.
 
-    The best that was found, also where it is no solution: ask `accepted`.
+    It is the best impulse that was found, even if it is not a solution: see `Reference.accepted`.
     """
-    own = kept(problem)
-    if own.reference is None:
-        found = uninterrupted(solve(problem, SOLVER, tol=ASKED))
-        own.reference = judged(problem, found.impulse, f"{SOLVER}: {found.message}")
-    return own.reference
+    cache = motion_cache(problem)
+    if cache.reference is None:
+        best = uninterrupted(solve(problem, REFERENCE_SOLVER, tol=REFERENCE_TOL))
+        cache.reference = make_reference(problem, best.impulse, f"{REFERENCE_SOLVER}: {best.message}")
+    return cache.reference
 
 
 def adopt(problem: Problem, impulse: Any, solver: str = "given") -> Reference:
-    """Judge an impulse (m,) [N s] and keep it as the problem's reference if it is better than the one kept."""
-    own = kept(problem)
-    new = judged(problem, problem.impulse_array(impulse, "reference"), solver)
-    if own.reference is None or new.residual.relative < own.reference.residual.relative:
-        own.reference = new
-    return own.reference
+    """Judge an impulse (m,) [N s] and store it as the problem's reference if it is better than the stored one."""
+    cache = motion_cache(problem)
+    new = make_reference(problem, problem.impulse_array(impulse, "reference"), solver)
+    if cache.reference is None or new.residual.relative < cache.reference.residual.relative:
+        cache.reference = new
+    return cache.reference
 
 
-@np.errstate(over="ignore", invalid="ignore")  # of impulses at the edge of float64
-def judged(problem: Problem, impulse: FloatArray, solver: str) -> Reference:
-    """A reference of an impulse that is finite and of the right length."""
-    own = kept(problem)
+@np.errstate(over="ignore", invalid="ignore")  # Impulses may be at the limit of float64.
+def make_reference(problem: Problem, impulse: FloatArray, solver: str) -> Reference:
+    """Judge an impulse (m,) [N s], finite and of the right length, and build its `Reference`."""
+    cache = motion_cache(problem)
     impulse = read_only(np.array(impulse))
     proof = None
-    if not own.refusal and problem.law in CONVEX:
-        proof = witness(problem, own.operator, impulse)
-    return Reference(impulse, residual(problem, impulse, "float64"), solver, own.refusal, proof)
+    if not cache.refusal and problem.law in CONVEX_LAWS:
+        proof = witness(problem, cache.operator, impulse)
+    return Reference(impulse, residual(problem, impulse, "float64"), solver, cache.refusal, proof)
 
 
-def as_reference(problem: Problem, given: Any) -> Reference:
-    """A reference of what a caller gave: one already, a Solution, or an impulse (m,) [N s]."""
-    solver, impulse = "given", given
-    if isinstance(given, Reference):
-        if given.residual._problem is problem:
-            return given
-        solver, impulse = given.solver, given.impulse  # of another problem, or an equal one: judged anew
-    elif isinstance(given, Solution):
-        solver, impulse = given.solver.name, given.impulse
-    return judged(problem, problem.impulse_array(impulse, "reference"), solver)
+def as_reference(problem: Problem, value: Any) -> Reference:
+    """Convert a Reference, a Solution or an impulse (m,) [N s] to a `Reference` of this problem."""
+    solver, impulse = "given", value
+    if isinstance(value, Reference):
+        if value.residual._problem is problem:
+            return value
+        # The reference belongs to another or to an equal problem: judge its impulse again.
+        solver, impulse = value.solver, value.impulse
+    elif isinstance(value, Solution):
+        solver, impulse = value.solver.name, value.impulse
+    return make_reference(problem, problem.impulse_array(impulse, "reference"), solver)
 
 
-# -- beside files -----------------------------------------------------------------------------------------
+# -- files ------------------------------------------------------------------------------------------------
 
 
-def _beside(path: str | PathLike[str]) -> Path:
+def _reference_path(path: str | PathLike[str]) -> Path:
+    """Return the path of the reference file of a problem's file."""
     path = Path(path)
-    return path.with_name(path.name + SUFFIX)
+    return path.with_name(path.name + REFERENCE_SUFFIX)
 
 
 def save_reference(
     problem: Problem, path: str | PathLike[str], impulse: FloatArray | None = None, source: str = "given"
 ) -> Path:
-    """Write a problem's reference beside its file `path`: an impulse (m,) [N s] and who says so, else the one kept.
+    """Write a problem's reference next to its file `path` and return the path of the reference.
 
-    If none is kept, it is solved for. InputError where nothing solved the problem: then there is nothing to keep.
+    The reference is `impulse` (m,) [N s] with its `source`, or by default the stored one, which is solved for if there
+    is none. Raises InputError if nothing solved the problem.
     """
-    out = check_writable(_beside(path))
+    out = check_writable(_reference_path(path))
     if impulse is not None:
-        kept(problem.disk).reference = judged(problem.disk, impulse, source)
-    found = reference(problem.disk)
-    if not found.accepted:
-        raise InputError(f"{path}: nothing reached the floor ({found}); there is no reference to write")
+        motion_cache(problem.disk).reference = make_reference(problem.disk, impulse, source)
+    best = reference(problem.disk)
+    if not best.accepted:
+        raise InputError(f"{path}: nothing reached the floor ({best}); there is no reference to write")
     buffer = BytesIO()
-    np.savez(buffer, impulse=found.impulse, solver=np.array(found.solver))
+    np.savez(buffer, impulse=best.impulse, solver=np.array(best.solver))
     write_bytes(out, buffer.getvalue())
     return out
 
 
 def load_reference(problem: Problem, path: str | PathLike[str]) -> Reference | None:
-    """Keep the reference beside a problem's file, if there is one and it solves this problem by the judge.
+    """Load the reference of a problem's file and store it with the problem, if it exists and solves the problem.
 
-    None without a file, and where what it holds solves another problem: then the reference is solved for anew.
+    Returns None if there is no file, or if the impulse solves another problem: the reference is then solved for again.
     """
-    place, problem = _beside(path), problem.disk
-    if not place.is_file():
+    location, problem = _reference_path(path), problem.disk
+    if not location.is_file():
         return None
     try:
-        with closing(npz.Archive(place)) as data:
+        with closing(npz.Archive(location)) as data:
             impulse, solver = np.asarray(data["impulse"], float), str(data.scalar("solver"))
     except (InputError, ValueError, TypeError) as error:
         raise InputError(
-            f"{str(place)!r} holds no reference ({error}); delete it, or write it again with `lavender reference`"
+            f"{str(location)!r} holds no reference ({error}); delete it, or write it again with `lavender reference`"
         ) from None
     if impulse.shape != (problem.m,) or not np.isfinite(impulse).all():
         return None
-    found = judged(problem, impulse, solver)
-    if not found.accepted:
+    best = make_reference(problem, impulse, solver)
+    if not best.accepted:
         return None
-    kept(problem).reference = found
-    return found
+    motion_cache(problem).reference = best
+    return best

@@ -1,12 +1,12 @@
-"""Scenes whose motion is known, measured in every stepper and in the engines of others.
+"""Scenes with known motion, measured in every stepper of LavenderSim and in other engines.
 
-Each phenomenon is data: parameters with ranges, a truth with its derivation, quantities with bounds. An engine gives
-poses over time, and the measure is taken of them, the same for all.
+A phenomenon is data: parameters with ranges, an exact motion with its derivation, quantities with bounds. An engine
+returns poses over time, from which the quantities are measured, in the same way for all engines.
 """
 
 from lavender.lab.phenomena.engines import ENGINE_VARIANTS, EngineVariant
 from lavender.lab.phenomena.parts import Parameter, Phenomenon, Quantity, Record, Track
-from lavender.lab.phenomena.running import PHENOMENA, chosen, run, select_variants
+from lavender.lab.phenomena.running import PHENOMENA, run, select_phenomena, select_variants
 
 __all__ = [
     "ENGINE_VARIANTS",
@@ -17,7 +17,7 @@ __all__ = [
     "Quantity",
     "Record",
     "Track",
-    "chosen",
     "run",
+    "select_phenomena",
     "select_variants",
 ]

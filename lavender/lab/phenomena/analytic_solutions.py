@@ -1,4 +1,4 @@
-"""Closed forms behind the phenomena that need more than a line."""
+"""Analytic solutions of phenomena that need more than a line."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from lavender.lab.phenomena.parts import GRAVITY
 
 
 def pendulum_period(inertia: float, torque: float, angle: float) -> float:
-    """Period [s] of a pendulum of `inertia` about its hinge [kg m^2], let go at `angle` [rad] from below.
+    """Compute the period [s] of a pendulum of `inertia` about its hinge [kg m^2], released at `angle` [rad] from below.
 
     From I phi'^2/2 = m g l (cos phi - cos phi0), `torque` = m g l [N m]:
 
@@ -23,10 +23,10 @@ def pendulum_period(inertia: float, torque: float, angle: float) -> float:
 
 
 def flip_period(inertia: FloatArray, omega: FloatArray) -> float:
-    """Period [s] after which a free body has its angular velocity again, in its own axes.
+    """Compute the period [s] after which the angular velocity of a free body repeats, in the body's axes.
 
-    Euler's equations with energy E and momentum L have the elliptic functions of Jacobi as solution (Landau, Lifshitz,
-    Mechanics, section 37); with I1 < I2 < I3, and 1 and 3 exchanged where L^2 < 2 E I2:
+    Euler's equations with energy E and momentum L have Jacobi's elliptic functions as solutions (Landau, Lifshitz,
+    Mechanics, section 37); with I1 < I2 < I3, and 1 and 3 exchanged if L^2 < 2 E I2:
 
         T = 4 K(k) sqrt(I1 I2 I3/((I3 - I2)(L^2 - 2 E I1))),   k^2 = (I2 - I1)(2 E I3 - L^2)/((I3 - I2)(L^2 - 2 E I1))
     """
@@ -36,19 +36,19 @@ def flip_period(inertia: FloatArray, omega: FloatArray) -> float:
     i1, i2, i3 = sorted(inertia.tolist())
     if l2 < twice_energy * i2:
         i1, i3 = i3, i1
-    below = (i3 - i2) * (l2 - twice_energy * i1)
-    k2 = (i2 - i1) * (twice_energy * i3 - l2) / below
-    return 4.0 * float(ellipk(k2)) * math.sqrt(i1 * i2 * i3 / below)
+    moment = (i3 - i2) * (l2 - twice_energy * i1)
+    k2 = (i2 - i1) * (twice_energy * i3 - l2) / moment
+    return 4.0 * float(ellipk(k2)) * math.sqrt(i1 * i2 * i3 / moment)
 
 
 def tipping_time(width: float, height: float, slope: float, angle: float) -> float:
-    """Time [s] in which a box on a slope tips by `angle` [rad] about its lower edge; inf where it stands.
+    """Compute the time [s] in which a box on a slope tips by `angle` [rad] about its lower edge; inf if it stands.
 
     With r half the diagonal, beta = atan(w/h) the lean at which it balances and eps = atan(slope) - beta:
 
         phi'' = (3 g/(4 r)) sin(eps + phi)       so       phi'^2 = (3 g/(2 r)) (cos eps - cos(eps + phi))
 
-    and t is the integral of d phi/phi', with phi = u^2 without a pole at 0.
+    and t is the integral of d phi/phi', with phi = u^2, which removes the pole at 0.
     """
     eps = math.atan(slope) - math.atan(width / height)
     if eps <= 0.0:
@@ -56,18 +56,19 @@ def tipping_time(width: float, height: float, slope: float, angle: float) -> flo
     r = 0.5 * math.hypot(width, height)
     points, weights = np.polynomial.legendre.leggauss(200)
     u = 0.5 * math.sqrt(angle) * (points + 1.0)
-    # cos eps - cos(eps + phi), without the loss of digits
+    # cos eps - cos(eps + phi), without cancellation.
     fall = 2.0 * np.sin(eps + 0.5 * u * u) * np.sin(0.5 * u * u)
     speed = np.sqrt(1.5 * GRAVITY / r * fall)
     return float(0.5 * math.sqrt(angle) * (weights * 2.0 * u / speed).sum())
 
 
 def arch_thrust(stones: int, lean: float, thick: float) -> tuple[float, float]:
-    """Least and largest thrust at the apex of a pointed arch that all its joints bear, over the weight of a stone.
+    """Compute the smallest and the largest thrust at the apex of a pointed arch, divided by the weight of a stone.
 
-    A leg is `stones` blocks of length 1 on a skewback, at `lean` [rad] from upright; both legs meet at their upper
-    inner edges, where by symmetry the thrust H is level. A joint at distance D from the top bears the weight D of D
-    blocks. The resultant must pass it within its thickness t; moments about its inner and its outer edge say
+    All joints bear a thrust between these. A leg is `stones` blocks of length 1 on a skewback, at `lean` [rad] from
+    upright; both legs meet at their upper inner edges, at which the thrust H is horizontal by symmetry. A joint at
+    distance D from the top bears the weight D of D blocks. The resultant must pass it within its thickness t; moments
+    about its inner and its outer edge give
 
         H >= (D tan a - t)/2,        H (D cos a - t sin a) <= D (D sin a + t cos a)/2
 
@@ -75,16 +76,16 @@ def arch_thrust(stones: int, lean: float, thick: float) -> tuple[float, float]:
     """
     s, c = math.sin(lean), math.cos(lean)
     d = np.arange(1, stones + 1, dtype=float)
-    below, arm = d * (d * s + thick * c) / 2.0, d * c - thick * s
-    most = np.divide(below, arm, out=np.full_like(arm, np.inf), where=arm > 0.0)
-    return max(0.0, float(((d * math.tan(lean) - thick) / 2.0).max())), float(most.min())
+    moment, arm = d * (d * s + thick * c) / 2.0, d * c - thick * s
+    largest_thrust = np.divide(moment, arm, out=np.full_like(arm, np.inf), where=arm > 0.0)
+    return max(0.0, float(((d * math.tan(lean) - thick) / 2.0).max())), float(largest_thrust.min())
 
 
 def thinnest_arch(stones: int, lean: float) -> float:
-    """Thickness, over the length of a stone, below which `arch_thrust` leaves no thrust, by halving."""
+    """Compute the thickness, in lengths of a stone, below which `arch_thrust` leaves no thrust, by bisection."""
     low, high = 0.0, float(stones)
     for _ in range(60):
         middle = 0.5 * (low + high)
-        least, most = arch_thrust(stones, lean, middle)
-        low, high = (low, middle) if least <= most else (middle, high)
+        smallest_thrust, largest_thrust = arch_thrust(stones, lean, middle)
+        low, high = (low, middle) if smallest_thrust <= largest_thrust else (middle, high)
     return high

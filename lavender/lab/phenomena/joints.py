@@ -14,41 +14,43 @@ from lavender.lab.phenomena.parts import GRAVITY, Parameter, Phenomenon, Quantit
 from lavender.sim.scene import Scene
 from lavender.sim.scene.parts import quaternion
 
-ROD = (0.1, 0.1, 1.0)  # m
-BLOCK = (0.2, 0.6, 1.0)  # m, of the free body
-TURNS = 3  # periods of it
+ROD_SIZE = (0.1, 0.1, 1.0)  # m
+FREE_BODY_SIZE = (0.2, 0.6, 1.0)  # m
+FREE_ROTATION_PERIODS = 3  # The free rotation is simulated for this many periods of the flip.
 
 
-def _zeros(time: FloatArray, x: FloatArray) -> FloatArray:
-    """Times at which x changes sign, between two samples by a straight line."""
+def _zero_times(time: FloatArray, x: FloatArray) -> FloatArray:
+    """Compute the times at which x changes sign, by linear interpolation between samples."""
     i = np.flatnonzero(x[1:] * x[:-1] < 0.0)
-    found: FloatArray = time[i] + (time[i + 1] - time[i]) * x[i] / (x[i] - x[i + 1])
-    return found
+    times: FloatArray = time[i] + (time[i + 1] - time[i]) * x[i] / (x[i] - x[i + 1])
+    return times
 
 
 def _pendulum(p: Values, more: Mapping[str, Any]) -> Scene:
+    """Build a rod on a hinge, released at rest."""
     scene = Scene(**{"gravity": GRAVITY, **more})
-    half = 0.5 * ROD[2]
-    place = (half * math.sin(p["angle"]), 0.0, -half * math.cos(p["angle"]))
-    rod = scene.add_box(ROD, position=place, quaternion=quaternion((0.0, 1.0, 0.0), -p["angle"]))
+    half = 0.5 * ROD_SIZE[2]
+    position = (half * math.sin(p["angle"]), 0.0, -half * math.cos(p["angle"]))
+    rod = scene.add_box(ROD_SIZE, position=position, quaternion=quaternion((0.0, 1.0, 0.0), -p["angle"]))
     scene.add_joint("hinge", -1, rod, anchor=(0.0, 0.0, 0.0), axis=(0.0, 1.0, 0.0))
     return scene
 
 
 def period_of(p: Values) -> float:
-    """Of a rod on a hinge, from its angle at rest [s]."""
-    about = (ROD[0] ** 2 + ROD[2] ** 2) / 12 + ROD[2] ** 2 / 4
-    return pendulum_period(about, 0.5 * GRAVITY * ROD[2], p["angle"])
+    """Compute the exact period [s] of the rod on a hinge."""
+    inertia_about_hinge = (ROD_SIZE[0] ** 2 + ROD_SIZE[2] ** 2) / 12 + ROD_SIZE[2] ** 2 / 4
+    return pendulum_period(inertia_about_hinge, 0.5 * GRAVITY * ROD_SIZE[2], p["angle"])
 
 
-def _swings(p: Values, track: Track) -> dict[str, float]:
+def _measure_swings(p: Values, track: Track) -> dict[str, float]:
+    """Measure the errors of energy and period of the pendulum."""
     x, v = track.positions[:, 0], track.velocities[:, 0]
-    zeros = _zeros(track.time, np.arctan2(x[:, 0], -x[:, 2]))[:11]
+    zeros = _zero_times(track.time, np.arctan2(x[:, 0], -x[:, 2]))[:11]
     period = 2.0 * float(np.diff(zeros).mean()) if len(zeros) > 1 else math.inf
-    own = (ROD[0] ** 2 + ROD[2] ** 2) / 12
-    energy = 0.5 * (v[:, :3] ** 2).sum(axis=1) + 0.5 * own * v[:, 4] ** 2
-    energy += GRAVITY * (x[:, 2] + 0.5 * ROD[2])
-    start = 0.5 * GRAVITY * ROD[2] * (1.0 - math.cos(p["angle"]))
+    inertia = (ROD_SIZE[0] ** 2 + ROD_SIZE[2] ** 2) / 12
+    energy = 0.5 * (v[:, :3] ** 2).sum(axis=1) + 0.5 * inertia * v[:, 4] ** 2
+    energy += GRAVITY * (x[:, 2] + 0.5 * ROD_SIZE[2])
+    start = 0.5 * GRAVITY * ROD_SIZE[2] * (1.0 - math.cos(p["angle"]))
     late = track.time >= track.time[-1] - 2.0 * period_of(p)
     return {
         "period": abs(period / period_of(p) - 1.0),
@@ -56,57 +58,62 @@ def _swings(p: Values, track: Track) -> dict[str, float]:
     }
 
 
-def _free(p: Values, more: Mapping[str, Any]) -> Scene:
+def _free_body(p: Values, more: Mapping[str, Any]) -> Scene:
+    """Build a free body that spins."""
     scene = Scene(**{"gravity": 0.0, **more})
-    scene.add_box(BLOCK, angular_velocity=spin_of(p))
+    scene.add_box(FREE_BODY_SIZE, angular_velocity=spin_of(p))
     return scene
 
 
 def spin_of(p: Values) -> tuple[float, float, float]:
-    """First angular velocity of the free body."""
+    """Return the initial angular velocity of the free body [rad/s]."""
     return (p["aside"] * p["spin"], p["spin"], 0.0)
 
 
 def moments_of_inertia() -> FloatArray:
-    """Of the free body, of mass 1, about its axes."""
-    x, y, z = (s * s for s in BLOCK)
+    """Return the moments of inertia of the free body, of mass 1, about its axes [kg m^2]."""
+    x, y, z = (s * s for s in FREE_BODY_SIZE)
     return np.array([y + z, x + z, x + y]) / 12.0
 
 
 def flip_of(p: Values) -> float:
-    """Period in which the free body turns over and back [s]."""
+    """Compute the exact period [s] in which the free body flips over and back."""
     return flip_period(moments_of_inertia(), np.array(spin_of(p)))
 
 
-def _rotation(p: Values, track: Track) -> dict[str, float]:
+def _measure_rotation(p: Values, track: Track) -> dict[str, float]:
+    """Measure the errors of momentum, energy and period of the free rotation."""
     axes = np.stack([track.axis(0, i) for i in range(3)], axis=1)  # (k, axis, world)
     omega = np.einsum("kaw,kw->ka", axes, track.velocities[:, 0, 3:])
     energy = 0.5 * omega**2 @ moments_of_inertia()
     momentum = np.einsum("ka,kaw->kw", omega * moments_of_inertia(), axes)
-    zeros = _zeros(track.time, omega[:, 1])
+    zeros = _zero_times(track.time, omega[:, 1])
     flips = 2.0 * float(np.diff(zeros).mean()) if len(zeros) > 1 else math.inf
-    away = np.linalg.norm(momentum - momentum[0], axis=1).max() / np.linalg.norm(momentum[0])
+    momentum_error = np.linalg.norm(momentum - momentum[0], axis=1).max() / np.linalg.norm(momentum[0])
     return {
         "period": abs(flips / flip_of(p) - 1.0),
         "energy": float(np.abs(energy / energy[0] - 1.0).max()),
-        "momentum": float(away),
+        "momentum": float(momentum_error),
     }
 
 
 def _chain(p: Values, more: Mapping[str, Any]) -> Scene:
+    """Build a chain that hangs at rest."""
     more = {"gravity": GRAVITY, **more}
     return Scene("chain", n=int(p["links"]), tip_mass=p["ratio"], angle=0.0, **more)
 
 
-def _hangs(p: Values, track: Track) -> dict[str, float]:
+def _measure_hanging_chain(p: Values, track: Track) -> dict[str, float]:
+    """Measure the largest gap of a joint, and the error of the tension in the first joint."""
     scene = _chain(p, {})
     late = np.flatnonzero(track.time >= track.time[-1] - 1.0)
 
     def point(body: int, anchor: FloatArray) -> FloatArray:
+        """Return the world positions of an anchor in the last second."""
         if body < 0:
             return np.broadcast_to(anchor, (len(late), 3))
-        turned = sum(track.axis(body, i)[late] * anchor[i] for i in range(3))
-        return np.asarray(track.positions[late, body] + turned)
+        rotated = sum(track.axis(body, i)[late] * anchor[i] for i in range(3))
+        return np.asarray(track.positions[late, body] + rotated)
 
     gap = max(
         float(np.linalg.norm(point(j.b, j.anchor_b) - point(j.a, j.anchor_a), axis=1).max())
@@ -116,14 +123,14 @@ def _hangs(p: Values, track: Track) -> dict[str, float]:
     return {"gap": gap, "tension": abs(track.force / weight - 1.0)}
 
 
-JOINTS = (
+JOINT_PHENOMENA = (
     Phenomenon(
         name="pendulum",
         title="a rod on a hinge",
-        why="what a stepper adds or takes of energy is heard in every mechanism",
-        truth="period 4 sqrt(I/(m g l)) K(sin(phi0/2)) from the integral of energy, which stays",
+        why="a stepper that adds or removes energy changes every mechanism",
+        truth="period 4 sqrt(I/(m g l)) K(sin(phi0/2)) from the integral of energy, which is constant",
         parameters={
-            "angle": Parameter(1.0, 0.05, 3.0, "of the start, from below [rad]"),
+            "angle": Parameter(1.0, 0.05, 3.0, "initial angle from below [rad]"),
             "swings": Parameter(100, 1, 1000, "number of them"),
         },
         cases=({}, {"angle": 2.5, "swings": 20}),
@@ -134,13 +141,13 @@ JOINTS = (
         needs=frozenset({"hinge"}),
         build=_pendulum,
         seconds=lambda p: p["swings"] * period_of(p),
-        measure=_swings,
+        measure=_measure_swings,
     ),
     Phenomenon(
         name="free_rotation",
         title="a free asymmetric body near its middle axis",
         why="drones, satellites and thrown rackets; the explicit step gains energy, the implicit one loses it",
-        truth="energy and momentum stay; the flip has the period of Jacobi's elliptic functions (Landau, Lifshitz, 37)",
+        truth="energy and momentum are constant; the period of flips by elliptic functions (Landau, Lifshitz, 37)",
         parameters={
             "spin": Parameter(5.0, 0.1, 50.0, "about the middle axis [rad/s]"),
             "aside": Parameter(0.05, 1e-3, 0.5, "spin about the axis of the largest moment, over it [-]"),
@@ -152,14 +159,14 @@ JOINTS = (
             Quantity("period", "", 0.01, "relative, of the flips in three periods"),
         ),
         needs=frozenset({"box"}),
-        build=_free,
-        seconds=lambda p: TURNS * flip_of(p),
-        measure=_rotation,
+        build=_free_body,
+        seconds=lambda p: FREE_ROTATION_PERIODS * flip_of(p),
+        measure=_measure_rotation,
     ),
     Phenomenon(
         name="chain_load",
         title="a chain that carries a load of many links",
-        why="cranes and ropes: sweeps see one link at a time, so heavy loads tear chains apart",
+        why="cranes and ropes: sweeps update one link at a time, so heavy loads tear chains apart",
         truth="no gap, and the first joint bears the weight of all links, sum of m g",
         parameters={
             "ratio": Parameter(100.0, 1.0, 1e4, "mass of the load over that of a link [-]"),
@@ -167,12 +174,12 @@ JOINTS = (
         },
         cases=({"ratio": 1.0}, {"ratio": 100.0}, {"ratio": 1e4}),
         quantities=(
-            Quantity("gap", "m", 1e-3, "largest of a joint over the last of 5 s; the slop of contacts"),
-            Quantity("tension", "", 0.01, "relative, at the end; nan where an engine does not tell it"),
+            Quantity("gap", "m", 1e-3, "largest gap of a joint in the last of 5 s; the slop of contacts"),
+            Quantity("tension", "", 0.01, "relative, at the end; nan if an engine does not return it"),
         ),
         needs=frozenset({"ball joint"}),
         build=_chain,
         seconds=lambda p: 5.0,
-        measure=_hangs,
+        measure=_measure_hanging_chain,
     ),
 )

@@ -1,4 +1,4 @@
-"""What a phenomenon is, and what an engine gives of it: plain data."""
+"""Data types of phenomena: a phenomenon, its parameters and quantities, an engine's motion, and a record."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Values = Mapping[str, float]
 
 @dataclass(frozen=True)
 class Parameter:
-    """A number of a scene: default, range, meaning with unit. A default without a point is a count."""
+    """A parameter of a scene: default, range, meaning with unit. If the default is an int, the parameter is a count."""
 
     default: float
     low: float
@@ -28,124 +28,190 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Quantity:
-    """A number that is measured, as distance from the truth; `bound` is the largest that passes."""
+    """A measured number, as distance from its exact value.
+
+    Parameters
+    ----------
+    name, unit : str
+    bound : float
+        Largest value that passes.
+    text : str
+        Meaning, and the reason of the bound.
+    """
 
     name: str
     unit: str
     bound: float
-    text: str  # what it is, and the reason of the bound
+    text: str
 
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """What an engine did of a scene, sampled in equal times; bodies in the scene's order, static ones too."""
+    """Motion of a scene in an engine, at equidistant times; bodies in the scene's order, including static ones.
 
-    time: FloatArray  # (k,) s, 0 first
-    positions: FloatArray  # (k, n, 3) m
-    quaternions: FloatArray  # (k, n, 4) w x y z
-    velocities: FloatArray  # (k, n, 6) m/s, rad/s, world
-    force: float = float("nan")  # N, of the first joint at the end, where the engine tells it
-    cpu: float = float("nan")  # s of CPU for a second of simulation
-    setting: str = ""  # step, substeps and sweeps, as run
+    Parameters
+    ----------
+    time : (k,) s
+        Starts at 0.
+    positions : (k, n, 3) m
+    quaternions : (k, n, 4)
+        w x y z.
+    velocities : (k, n, 6) m/s, rad/s
+        In the world frame.
+    force : float, N
+        Force of the first joint at the end; nan if the engine does not return it.
+    cpu : float, s
+        CPU time per second of simulation.
+    setting : str
+        Step, substeps and sweeps of the run.
+    """
+
+    time: FloatArray
+    positions: FloatArray
+    quaternions: FloatArray
+    velocities: FloatArray
+    force: float = float("nan")
+    cpu: float = float("nan")
+    setting: str = ""
 
     def moved(self, body: int) -> FloatArray:
-        """Way of a body from where it began (k, 3) [m]."""
-        way: FloatArray = self.positions[:, body] - self.positions[0, body]
-        return way
+        """Return the displacement (k, 3) [m] of a body from its initial position."""
+        displacement: FloatArray = self.positions[:, body] - self.positions[0, body]
+        return displacement
 
     def axis(self, body: int, axis: int) -> FloatArray:
-        """A body's own axis in the world (k, 3)."""
+        """Return a body's axis (k, 3) in the world frame."""
         from scipy.spatial.transform import Rotation
 
-        turned: FloatArray = Rotation.from_quat(self.quaternions[:, body], scalar_first=True).as_matrix()[
+        rotated: FloatArray = Rotation.from_quat(self.quaternions[:, body], scalar_first=True).as_matrix()[
             ..., axis
         ]
-        return turned
+        return rotated
 
 
 @dataclass(frozen=True)
 class Phenomenon:
-    """A scene whose motion is known."""
+    """A scene with known motion.
+
+    Parameters
+    ----------
+    name, title : str
+    why : str
+        Reason why it matters.
+    truth : str
+        The exact motion and its derivation.
+    parameters : mapping of str to Parameter
+    cases : tuple of mappings
+        Parameter values that a run measures.
+    quantities : tuple of Quantity
+        The table shows the first.
+    needs : frozenset of str
+        Features that an engine must have: "box", "sphere", "spin", "rolling", "ball joint", "hinge".
+    build : callable
+        Builds the scene from parameter values and from scene parameters that the engine prescribes.
+    seconds : callable
+        Returns the simulated time [s].
+    measure : callable
+        Computes the quantities from a track.
+    interval : float, s
+        Time between two samples.
+    """
 
     name: str
     title: str
-    why: str  # it matters
-    truth: str  # with its derivation
+    why: str
+    truth: str
     parameters: Mapping[str, Parameter]
-    cases: tuple[Values, ...]  # that a run measures
-    quantities: tuple[Quantity, ...]  # the first stands in the table
-    needs: frozenset[str]  # of an engine: "box", "sphere", "spin", "rolling", "ball joint", "hinge"
-    # of parameters, and of what an engine asks of the scene
+    cases: tuple[Values, ...]
+    quantities: tuple[Quantity, ...]
+    needs: frozenset[str]
     build: Callable[[Values, Mapping[str, Any]], Scene]
-    seconds: Callable[[Values], float]  # simulated
+    seconds: Callable[[Values], float]
     measure: Callable[[Values, Track], dict[str, float]]
-    interval: float = 1.0 / 60.0  # s between two samples
+    interval: float = 1.0 / 60.0
 
-    def values(self, given: Mapping[str, Any] | None = None) -> dict[str, float]:
-        """Every parameter, as given or by default.
+    def values(self, overrides: Mapping[str, Any] | None = None) -> dict[str, float]:
+        """Return the values of all parameters: defaults replaced by `overrides`.
 
         Raises
         ------
         UnknownName
-            A parameter that it does not have.
+            A name is not a parameter of this phenomenon.
         InputError
-            A value outside its range.
+            A value is outside its range.
         """
-        given = given or {}
-        for name in given:
+        overrides = overrides or {}
+        for name in overrides:
             if name not in self.parameters:
                 raise UnknownName(f"parameter of {self.name!r}", name, self.parameters)
-        found: dict[str, float] = {}
+        values: dict[str, float] = {}
         for name, p in self.parameters.items():
             label = f"{name} of {self.name!r} ({p.text})"
-            x = given.get(name, p.default)
+            x = overrides.get(name, p.default)
             if isinstance(p.default, int):
-                found[name] = check_int(label, x, int(p.low), int(p.high))
+                values[name] = check_int(label, x, int(p.low), int(p.high))
             else:
-                found[name] = check_float(label, x, low=p.low, high=p.high)
-        return found
+                values[name] = check_float(label, x, low=p.low, high=p.high)
+        return values
 
-    def scene(self, given: Mapping[str, Any] | None = None, **more: Any) -> Scene:
-        """The scene; `more`: parameters of every scene, such as dt and stepper."""
-        return self.build(self.values(given), more)
+    def scene(self, overrides: Mapping[str, Any] | None = None, **more: Any) -> Scene:
+        """Build the scene; `more` holds parameters that all scenes have, such as dt and stepper."""
+        return self.build(self.values(overrides), more)
 
 
 @dataclass(frozen=True)
 class Record:
-    """One phenomenon in one engine with one case."""
+    """One case of a phenomenon in one engine.
+
+    Parameters
+    ----------
+    phenomenon, engine : str
+    case : dict
+        Parameter values.
+    values : dict
+        Measured quantities by name; nan if the engine does not return one.
+    passed : bool
+        All quantities are within their bounds.
+    cpu : float, s
+        CPU time per second of simulation.
+    setting : str
+        Step, substeps and sweeps of the run.
+    note : str
+        Reason why there are no values.
+    """
 
     phenomenon: str
     engine: str
     case: dict[str, float]
-    values: dict[str, float] = field(default_factory=dict)  # by name of quantity; nan: not told by the engine
+    values: dict[str, float] = field(default_factory=dict)
     passed: bool = False
-    cpu: float = float("nan")  # s of CPU for a second of simulation
+    cpu: float = float("nan")
     setting: str = ""
-    note: str = ""  # why there are no values
+    note: str = ""
 
     def value(self, name: str) -> float:
-        """A measured number; nan without one."""
+        """Return a measured number, nan if there is none."""
         return self.values.get(name, float("nan"))
 
 
 def crossing(time: FloatArray, x: FloatArray, level: float) -> float:
-    """Time at which x (k,) first falls below `level`, between two samples by a straight line; inf where it does not."""
+    """Compute the time at which x (k,) first falls below `level`, by linear interpolation; inf if it does not."""
     below = np.flatnonzero(x < level)
     if not len(below):
         return float("inf")
     i = int(below[0])
     if i == 0:
         return float(time[0])
-    part = (x[i - 1] - level) / (x[i - 1] - x[i])
-    return float(time[i - 1] + part * (time[i] - time[i - 1]))
+    fraction = (x[i - 1] - level) / (x[i - 1] - x[i])
+    return float(time[i - 1] + fraction * (time[i] - time[i - 1]))
 
 
-# A body of a tower has fallen once it is lower than at its start by more than this share of an edge.
+# A body of a tower has fallen if it is lower than at its start by more than this fraction of an edge.
 FALL_DROP_EDGES = 0.5
 
 
 def has_fallen(start: FloatArray, now: FloatArray, edge: float = 1.0) -> bool:
-    """Return whether a body of a tower has fallen, or is at no finite place.
+    """Return whether a body of a tower has fallen, or its position is not finite.
 
     Parameters
     ----------
@@ -157,8 +223,8 @@ def has_fallen(start: FloatArray, now: FloatArray, edge: float = 1.0) -> bool:
     return not (start[:, 2] - now[:, 2]).max() <= FALL_DROP_EDGES * edge
 
 
-def judged(phenomenon: Phenomenon, engine: str, case: dict[str, float], track: Track) -> Record:
-    """Measure a track. One with poses that are not finite is a note."""
+def measure_track(phenomenon: Phenomenon, engine: str, case: dict[str, float], track: Track) -> Record:
+    """Measure the quantities of a track; if poses are not finite, the record has a note instead."""
     head: dict[str, Any] = {"phenomenon": phenomenon.name, "engine": engine, "case": case}
     head |= {"cpu": track.cpu, "setting": track.setting}
     bad = [

@@ -1,4 +1,4 @@
-"""Measure phenomena in engines. Third-party engines run in another process, whose end is a note in the record."""
+"""Measure phenomena in engines. Third-party engines run in another process; if it ends, the record has a note."""
 
 from __future__ import annotations
 
@@ -10,42 +10,44 @@ from lavender.base import subprocesses
 from lavender.base.arrays import check_float, check_sequence
 from lavender.base.errors import CapabilityError, InputError, UnknownName, check_name
 from lavender.base.subprocesses import ProcessBackend, ProcessEnded, RemoteError
-from lavender.lab.phenomena.engines import ENGINE_VARIANTS, EngineVariant, follow, make
-from lavender.lab.phenomena.friction import FRICTION
-from lavender.lab.phenomena.joints import JOINTS
-from lavender.lab.phenomena.parts import Phenomenon, Record, Track, judged
-from lavender.lab.phenomena.stacks import STACKS
+from lavender.lab.phenomena.engines import ENGINE_VARIANTS, EngineVariant, make_engine, record_track
+from lavender.lab.phenomena.friction import FRICTION_PHENOMENA
+from lavender.lab.phenomena.joints import JOINT_PHENOMENA
+from lavender.lab.phenomena.parts import Phenomenon, Record, Track, measure_track
+from lavender.lab.phenomena.stacks import STACK_PHENOMENA
 from lavender.sim.scene import Scene
 
 #: Name -> phenomenon, in the order of the table.
-PHENOMENA: dict[str, Phenomenon] = {p.name: p for p in (*FRICTION, *JOINTS, *STACKS)}
-LIMIT = 120.0  # s. A third-party engine that takes longer for one case is killed.
-MAX_TRACK_SIZE = 2**30  # bytes. A process that sends a larger track is killed.
+PHENOMENA: dict[str, Phenomenon] = {
+    p.name: p for p in (*FRICTION_PHENOMENA, *JOINT_PHENOMENA, *STACK_PHENOMENA)
+}
+TRACK_TIME_LIMIT = 120.0  # [s] A third-party engine that takes longer for one case is killed.
+MAX_TRACK_SIZE = 2**30  # [bytes] A process that sends a larger track is killed.
 
 
 class EngineProcess(ProcessBackend):
-    """Steps scenes in another process, and in a new one after it ended; `limit` [s] is for one track."""
+    """Steps scenes in another process, which is started again if it ended; `limit` [s] is for one track."""
 
-    def __init__(self, limit: float = LIMIT) -> None:
+    def __init__(self, limit: float = TRACK_TIME_LIMIT) -> None:
         super().__init__(simulate)
         self.limit = limit
 
     def track(self, variant: EngineVariant, scene: Scene, seconds: float, interval: float) -> Track | str:
-        """Return the motion that the engine computes, or why there is none."""
+        """Return the motion that the engine computes, or the reason why there is none."""
         try:
             self.start()
         except ProcessEnded as error:
             return f"its process does not start: {error}"
         try:
-            answer, (time, place, turn, speed) = self.call(
+            answer, (time, positions, quaternions, velocities) = self.call(
                 variant.name, scene, seconds, interval, timeout=self.limit, max_bytes=MAX_TRACK_SIZE
             )
             k, n = len(time), len(scene.bodies)
             return Track(
                 time=time,
-                positions=place.reshape(k, n, 3),
-                quaternions=turn.reshape(k, n, 4),
-                velocities=speed.reshape(k, n, 6),
+                positions=positions.reshape(k, n, 3),
+                quaternions=quaternions.reshape(k, n, 4),
+                velocities=velocities.reshape(k, n, 6),
                 force=float(answer["force"]),
                 cpu=float(answer["cpu"]),
                 setting=str(answer["setting"]),
@@ -64,16 +66,16 @@ class EngineProcess(ProcessBackend):
 
 def simulate(name: str, scene: Scene, seconds: float, interval: float) -> subprocesses.Answer:
     """Step a scene with the engine of that name, in the process of `EngineProcess`."""
-    engine = make(ENGINE_VARIANTS[name], scene)
+    engine = make_engine(ENGINE_VARIANTS[name], scene)
     try:
-        track = follow(engine, seconds, interval)
+        track = record_track(engine, seconds, interval)
     finally:
         engine.close()
     answer = {"force": track.force, "cpu": track.cpu, "setting": track.setting}
     return answer, [track.time, track.positions, track.quaternions, track.velocities]
 
 
-def chosen(names: Sequence[str] = ()) -> list[Phenomenon]:
+def select_phenomena(names: Sequence[str] = ()) -> list[Phenomenon]:
     """Return phenomena by name, all of them if no name is given.
 
     Raises
@@ -98,13 +100,17 @@ def select_variants(
         There is no such stepper or engine.
     """
     found: list[EngineVariant] = []
-    for what, given, own in (("stepper", steppers, True), ("engine", engines, False)):
-        some = [w for w in ENGINE_VARIANTS.values() if (w.module == "own") == own]
-        names = {n for w in some for n in (w.name, w.name.split()[0])}
-        for name in given if given is not None else ():
+    for kind, requested, own in (("stepper", steppers, True), ("engine", engines, False)):
+        candidates = [w for w in ENGINE_VARIANTS.values() if (w.module == "own") == own]
+        names = {n for w in candidates for n in (w.name, w.name.split()[0])}
+        for name in requested if requested is not None else ():
             if name not in names:
-                raise UnknownName(what, name, sorted(names))
-        found += [w for w in some if given is None or w.name in given or w.name.split()[0] in given]
+                raise UnknownName(kind, name, sorted(names))
+        found += [
+            w
+            for w in candidates
+            if requested is None or w.name in requested or w.name.split()[0] in requested
+        ]
     return found
 
 
@@ -114,7 +120,7 @@ def run(
     steppers: Sequence[str] | None = None,
     engines: Sequence[str] | None = (),
     parameters: Mapping[str, Any] | None = None,
-    limit: float = LIMIT,
+    limit: float = TRACK_TIME_LIMIT,
     show: Callable[[Record], None] = lambda record: None,
     keep: Callable[[Record, Track], None] = lambda record, track: None,
 ) -> list[Record]:
@@ -151,16 +157,16 @@ def run(
         limit = check_float("limit", limit, above=0.0)
     plan = [
         (p, case)
-        for p in chosen(names)
+        for p in select_phenomena(names)
         for case in map(p.values, p.cases if parameters is None else (parameters,))
     ]
-    variants = select_variants(steppers, engines)
-    if not variants:
+    selected = select_variants(steppers, engines)
+    if not selected:
         raise InputError("no stepper and no engine to measure; name one, or leave steppers to its default")
     found = []
     process = EngineProcess(limit)
     try:
-        for variant in variants:
+        for variant in selected:
             for record in _measure(variant, plan, process, keep):
                 found.append(record)
                 show(record)
@@ -175,27 +181,31 @@ def _measure(
     process: EngineProcess,
     keep: Callable[[Record, Track], None],
 ) -> Iterator[Record]:
-    lack = variant.missing()
+    """Measure all cases of the plan in one engine variant; a case that it cannot run gets a note."""
+    reason = variant.missing()
     for phenomenon, case in plan:
-        note = lack or next((variant.cannot[x] for x in sorted(phenomenon.needs) if x in variant.cannot), "")
-        found = note or _one(variant, phenomenon, case, process)
+        note = reason or next(
+            (variant.cannot[x] for x in sorted(phenomenon.needs) if x in variant.cannot), ""
+        )
+        found = note or _simulate_case(variant, phenomenon, case, process)
         if isinstance(found, str):
             yield Record(phenomenon.name, variant.name, case, note=found)
         else:
-            record = judged(phenomenon, variant.name, case, found)
+            record = measure_track(phenomenon, variant.name, case, found)
             if not record.note:
                 keep(record, found)
             yield record
 
 
-def _one(
+def _simulate_case(
     variant: EngineVariant, phenomenon: Phenomenon, case: dict[str, float], process: EngineProcess
 ) -> Track | str:
+    """Simulate one case, third-party engines in the other process; return the reason if that fails."""
     seconds = phenomenon.seconds(case)
     try:
         scene = phenomenon.scene(case, **variant.scene)
         if variant.module != "own":
             return process.track(variant, scene, seconds, phenomenon.interval)
-        return follow(make(variant, scene), seconds, phenomenon.interval)
+        return record_track(make_engine(variant, scene), seconds, phenomenon.interval)
     except (InputError, CapabilityError) as error:  # The stepper does not support the scene.
         return str(error)

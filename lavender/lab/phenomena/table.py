@@ -1,4 +1,4 @@
-"""Records as a table: a row for each variant, a column for each phenomenon, and where ours lose."""
+"""Tables of records: a row per engine variant, a column per phenomenon; and the cases of lavender out of bound."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from lavender.lab.phenomena.parts import Phenomenon, Record
 from lavender.lab.phenomena.running import PHENOMENA
 
 
-def _number(x: float, unit: str) -> str:
+def _format_number(x: float, unit: str) -> str:
+    """Format a number with its unit, or as a percentage if it has none."""
     if math.isinf(x):
         return "never"
     text = "0" if x < 1e-12 else f"{x:.1e}" if x < 1e-3 or x >= 1e4 else f"{x:.2g}"
@@ -19,60 +20,67 @@ def _number(x: float, unit: str) -> str:
     return f"{text} {unit}".strip()
 
 
-def _groups(records: Sequence[Record]) -> dict[tuple[str, str], list[Record]]:
-    found: dict[tuple[str, str], list[Record]] = {}
+def _group_records(records: Sequence[Record]) -> dict[tuple[str, str], list[Record]]:
+    """Group records by (engine, phenomenon)."""
+    lines: dict[tuple[str, str], list[Record]] = {}
     for r in records:
-        found.setdefault((r.engine, r.phenomenon), []).append(r)
-    return found
+        lines.setdefault((r.engine, r.phenomenon), []).append(r)
+    return lines
 
 
-def _worst(some: Sequence[Record], phenomenon: Phenomenon) -> float:
-    return max(r.value(phenomenon.quantities[0].name) for r in some)
+def _worst_value(group: Sequence[Record], phenomenon: Phenomenon) -> float:
+    """Return the largest value of the phenomenon's first quantity."""
+    return max(r.value(phenomenon.quantities[0].name) for r in group)
 
 
-def _cell(some: Sequence[Record], phenomenon: Phenomenon) -> str:
-    ran = [r for r in some if not r.note]
-    if not ran:
+def _format_cell(group: Sequence[Record], phenomenon: Phenomenon) -> str:
+    """Format a cell of the table: worst value, and the number of cases that passed; bold unless all did."""
+    measured = [r for r in group if not r.note]
+    if not measured:
         return "–"
-    passed = sum(r.passed for r in some)
-    text = _number(_worst(ran, phenomenon), phenomenon.quantities[0].unit)
-    text = f"{text}, {passed}/{len(some)}"
-    return text if passed == len(some) else f"**{text}**"
+    passed = sum(r.passed for r in group)
+    text = _format_number(_worst_value(measured, phenomenon), phenomenon.quantities[0].unit)
+    text = f"{text}, {passed}/{len(group)}"
+    return text if passed == len(group) else f"**{text}**"
 
 
 def table(records: Sequence[Record]) -> str:
-    """Markdown: worst value of the first quantity and cases that passed of those run; bold where one did not."""
-    groups = _groups(records)
+    """Build a Markdown table: worst value of the first quantity, cases that passed of those run; bold if one failed."""
+    groups = _group_records(records)
     names = [n for n in PHENOMENA if any(key[1] == n for key in groups)]
     lines = [f"| | {' | '.join(names)} |", "|---" * (len(names) + 1) + "|"]
     for variant in ENGINE_VARIANTS:
         if any(key[0] == variant for key in groups):
-            cells = [_cell(groups[variant, n], PHENOMENA[n]) if (variant, n) in groups else "" for n in names]
+            cells = [
+                _format_cell(groups[variant, n], PHENOMENA[n]) if (variant, n) in groups else ""
+                for n in names
+            ]
             lines.append(f"| {variant} | {' | '.join(cells)} |")
     return "\n".join(lines)
 
 
 def notes(records: Sequence[Record]) -> list[str]:
-    """Why cells are empty or cases have no values, one line for each variant and reason."""
-    found: dict[tuple[str, str], list[str]] = {}
+    """Return one line per engine variant and reason why cells are empty or cases have no values."""
+    lines: dict[tuple[str, str], list[str]] = {}
     for r in records:
-        if r.note and r.phenomenon not in found.setdefault((r.engine, r.note), []):
-            found[r.engine, r.note].append(r.phenomenon)
-    return [f"{engine}: {', '.join(which)}: {note}" for (engine, note), which in found.items()]
+        if r.note and r.phenomenon not in lines.setdefault((r.engine, r.note), []):
+            lines[r.engine, r.note].append(r.phenomenon)
+    return [f"{engine}: {', '.join(which)}: {note}" for (engine, note), which in lines.items()]
 
 
 def out_of_bound_cases(records: Sequence[Record]) -> list[str]:
-    """Return a line for each of our steppers and phenomenon with cases out of their bounds."""
-    found = []
-    for (variant, name), some in _groups(records).items():
-        bad = [r for r in some if not r.passed and not r.note]
+    """Return one line per lavender stepper and phenomenon with cases out of bound."""
+    lines = []
+    for (variant, name), group in _group_records(records).items():
+        bad = [r for r in group if not r.passed and not r.note]
         if ENGINE_VARIANTS[variant].module != "own" or not bad:
             continue
         phenomenon = PHENOMENA[name]
-        out = [q for q in phenomenon.quantities if any(r.value(q.name) > q.bound for r in bad)]
-        words = ", ".join(
-            f"{q.name} {_number(max(r.value(q.name) for r in bad), q.unit)} (bound {_number(q.bound, q.unit)})"
-            for q in out
+        exceeded = [q for q in phenomenon.quantities if any(r.value(q.name) > q.bound for r in bad)]
+        worst = {q.name: max(r.value(q.name) for r in bad) for q in exceeded}
+        measurements = ", ".join(
+            f"{q.name} {_format_number(worst[q.name], q.unit)} (bound {_format_number(q.bound, q.unit)})"
+            for q in exceeded
         )
         cases = [r.case for r in bad]
         others = sorted(
@@ -80,26 +88,28 @@ def out_of_bound_cases(records: Sequence[Record]) -> list[str]:
             - {r.engine for r in records if r.phenomenon == name and r.case in cases and not r.passed}
         )
         within = f"; within it: {', '.join(others)}" if others else "; no engine is within it"
-        found.append(f"{name}, {variant}: {len(bad)} of {len(some)} cases out, {words}{within}")
-    return found
+        lines.append(f"{name}, {variant}: {len(bad)} of {len(group)} cases out, {measurements}{within}")
+    return lines
 
 
-def line(r: Record) -> str:
-    """One record in one line."""
+def format_record(r: Record) -> str:
+    """Format one record as one line."""
     phenomenon = PHENOMENA[r.phenomenon]
     head = f"{r.engine}: {r.phenomenon} ({', '.join(f'{k} {v:g}' for k, v in r.case.items())})"
     if r.note:
         return f"{head}: {r.note}"
-    words = ", ".join(f"{q.name} {_number(r.value(q.name), q.unit)}" for q in phenomenon.quantities)
-    return f"{head}: {words}{'' if r.passed else ' – out of bound'}"
+    measurements = ", ".join(
+        f"{q.name} {_format_number(r.value(q.name), q.unit)}" for q in phenomenon.quantities
+    )
+    return f"{head}: {measurements}{'' if r.passed else ' – out of bound'}"
 
 
-def described(phenomena: Sequence[Phenomenon]) -> str:
-    """What each phenomenon is: truth, bounds, parameters."""
+def describe_phenomena(phenomena: Sequence[Phenomenon]) -> str:
+    """Describe each phenomenon: exact motion, bounds, parameters."""
     parts = []
     for p in phenomena:
-        parts += [f"{p.name}: {p.title}", f"  why: {p.why}", f"  truth: {p.truth}"]
-        parts += [f"  {q.name}: at most {_number(q.bound, q.unit)}; {q.text}" for q in p.quantities]
+        parts += [f"{p.name}: {p.title}", f"  why: {p.why}", f"  exact motion: {p.truth}"]
+        parts += [f"  {q.name}: at most {_format_number(q.bound, q.unit)}; {q.text}" for q in p.quantities]
         parts += [
             f"  --set {k}={x.default:g}: {x.text}, {x.low:g} to {x.high:g}" for k, x in p.parameters.items()
         ]

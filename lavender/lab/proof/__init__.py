@@ -1,24 +1,27 @@
-"""Proofs that an exact solution stands beside an answer: how far away at most, in balls of interval arithmetic.
+"""Proofs that an exact solution lies within a computed distance of an answer, in interval arithmetic (balls).
 
-On the case of each block (a row inside its bounds or at one of them; a contact open or loaded, each part of its
-friction sticking or sliding) the conditions are equations in the impulses that are not fixed by the case,
+Each block has a case: a row is inside its bounds or at one of them; a contact is open or loaded, and each of its
+friction components sticks or slides. The case fixes some impulses; the others satisfy the equations
 
     free, loaded, sticks     w_i = A_i lambda - b_i = 0
-    loaded, cone law         w_n = sum_g s_g,    s_g = |c w_g| over the sliding parts g, c the reach of its rows
+    loaded, cone law         w_n = sum_g s_g,    s_g = |c w_g| over sliding components g, c their friction coefficients
     slides                   lambda_i s_g + c_i^2 w_i lambda_n = 0                                        (1)
 
-and inequalities in the rest: lambda within its bounds, w >= 0 at a lower one, |lambda_g / c| <= lambda_n, and where a
-contact is open w_n >= 0 (Coulomb) or w_n >= sum |c w_g| (cone law). With x~ an approximate zero, Y ~ F'(x~)^-1 and a
-box X around x~,
+and the inequalities lambda within its bounds, w >= 0 at a lower bound, |lambda_g / c| <= lambda_n, and, if a contact
+is open, w_n >= 0 (Coulomb) or w_n >= sum |c w_g| (cone law). With x~ an approximate zero, Y ~ F'(x~)^-1 and a box X
+around x~,
 
     K(X) = x~ - Y F(x~) + (I - Y F'(X)) (X - x~)  inside X   =>   F has one zero in X                      (2)
 
-(Krawczyk 1969; Neumaier 1990, theorem 5.1.8), F in ball arithmetic on the problem's float64 numbers as exact ones;
-where each inequality holds over the box of the zero, it is a solution. Rows that depend on others exactly, target
-included, keep the impulse that they were given: the impulses are one of a family, the velocities are those of all.
-Balls cannot tell a zero from a small number: a row that carries nothing and has w = 0 is proven where it depends, as
-exactly, on rows that have, or where a solution in rational numbers says so (nothing slides, up to RATIONAL unknowns);
-else it is named as on the boundary of two cases, unless a proof begins from an answer of OTHERS, inside of a family.
+(Krawczyk 1969; Neumaier 1990, theorem 5.1.8). F is evaluated in ball arithmetic, and the problem's float64 numbers
+count as exact. If each inequality holds over the box of the zero, the zero is a solution. Rows that depend on others
+exactly, target included, keep the impulse of the answer: the impulses are then one of a family, and all members have
+the same velocities.
+
+Ball arithmetic cannot distinguish a zero from a small number. A row with zero impulse and w = 0 is proven if it
+depends, also exactly, on rows with non-zero impulse, or if a solution in rational numbers shows it (nothing slides, at
+most MAX_RATIONAL_UNKNOWNS unknowns). Otherwise it is named as on the boundary of two cases, unless a proof that starts
+from an answer of INTERIOR_SOLVERS, inside a family, succeeds.
 
 Needs python-flint (extra `proof`).
 """
@@ -33,20 +36,22 @@ from lavender.base.errors import CapabilityError
 from lavender.judge import certificates
 from lavender.judge.residuals import residual
 from lavender.judge.solution import Solution
-from lavender.lab.motion.reference import PROOF, judged, kept, reference
-from lavender.lab.proof.numbers import balls
+from lavender.lab.motion.reference import PROOF, make_reference, motion_cache, reference
+from lavender.lab.proof.numbers import ball_precision
 from lavender.lab.proof.search import Enclosure, Search
 from lavender.problem import Problem, check_problem
 from lavender.solving.solve import solve
 
-__all__ = ["Enclosure", "enclosed", "prove", "require"]
+__all__ = ["Enclosure", "enclose_reference", "prove", "require_python_flint"]
 
-BITS = (128, 256)  # of the balls: what the first leave undecided the second try
-# Where impulses are a family, an answer at its edge is between two cases; these end inside of it.
-OTHERS = ("newton", "admm")
-OTHERS_ROWS = 2000
-SECONDS = 10.0  # for each of them
-NEAR = 1e-6  # of the largest b: from the velocities of the answer
+# [bits] A case that is undecided with the first precision is tried again with the second.
+PRECISIONS = (128, 256)
+# If impulses are a family, an answer at the family's edge is between two cases; these solvers end inside it.
+INTERIOR_SOLVERS = ("newton", "admm")
+INTERIOR_SOLVERS_MAX_ROWS = 2000  # Larger problems are not solved again with INTERIOR_SOLVERS.
+PROOF_SOLVE_TIME_LIMIT = 10.0  # [s] Time limit of each additional solve.
+# A proof from another answer counts only if its velocities agree with the first answer to this fraction of max |b|.
+SAME_VELOCITY_TOL = 1e-6
 # If an answer without a proof has a larger relative residual, the problem may have no solution.
 UNSOLVED_RESIDUAL = 1e-6
 
@@ -57,28 +62,28 @@ def prove(problem: Problem, solution: Any) -> Enclosure:
     Parameters
     ----------
     problem : Problem
-        Its float64 numbers count as exact: A and b, or J, M^-1 or M, compliance, b, bounds and coefficients; of bodies
-        J as float64 has it.
+        Its float64 numbers count as exact: A and b, or J, M^-1 or M, compliance, b, bounds and coefficients; for
+        bodies, J as computed in float64.
     solution : Solution or (m,) array_like, N s
-        The answer, of any solver; near enough to tell which contacts stick, slide and are open.
+        The answer of any solver, accurate enough to show which contacts stick, slide and are open.
 
     Returns
     -------
     Enclosure
-        Not proven is a result: `reason` says which block is undecided, or what else was in the way. `infeasible`: a
-        certificate, of the answer or of `auto`, proves that there is no solution.
+        An unproven answer is a result, too: `reason` names the undecided block, or the obstacle. `infeasible`: a
+        certificate, of the answer or of `auto`, proves that the problem has no solution.
 
     Raises
     ------
     SolverUnavailable
         python-flint is not installed.
     CapabilityError
-        More than LARGEST unknowns of J and M that are coupled with each other.
+        More than 2,000 unknowns of J and M are coupled with each other.
 
     Notes
     -----
     python-flint has one precision for the whole process. Proofs in several threads therefore run one after the other,
-    and another thread's own balls have the precision of the proof while one runs.
+    and balls that another thread computes meanwhile have the precision of the proof.
 
     R. Krawczyk 1969, Computing 4, 187-201; A. Neumaier 1990, Interval Methods for Systems of Equations; F. Johansson
     2017, Arb, IEEE Trans. Computers 66, 1281-1292.
@@ -93,60 +98,60 @@ def prove(problem: Problem, solution: Any) -> Enclosure:
     """
     check_problem(problem)
     answer = solution.impulse if isinstance(solution, Solution) else solution
-    given = problem.impulse_array(answer)
+    start = problem.impulse_array(answer)
     if isinstance(solution, Solution) and solution.certificate is not None:
-        refuted = _infeasible(problem, solution.certificate)
+        refuted = _check_certificate(problem, solution.certificate)
         if refuted.infeasible:
             return refuted
-    found = _searched(problem, given, given)
-    if found.boundary and problem.m <= OTHERS_ROWS:
-        for name in OTHERS:
+    enclosure = _prove_from(problem, start, start)
+    if enclosure.boundary and problem.m <= INTERIOR_SOLVERS_MAX_ROWS:
+        for name in INTERIOR_SOLVERS:
             try:
-                other = solve(problem, name, tol=1e-12, time_limit=SECONDS)
+                other = solve(problem, name, tol=1e-12, time_limit=PROOF_SOLVE_TIME_LIMIT)
             except CapabilityError:
                 continue
-            # Of the same motion: where Coulomb's law has several, another one says nothing of the answer.
-            again = _searched(problem, other.impulse, given)
-            if again.proven and again.velocity_radius <= NEAR * float(abs(problem.b).max()):
+            # The velocities must agree: under Coulomb's law, another motion proves nothing about this answer.
+            again = _prove_from(problem, other.impulse, start)
+            if again.proven and again.velocity_radius <= SAME_VELOCITY_TOL * float(abs(problem.b).max()):
                 return again
-    if not found.proven and not residual(problem, given).relative <= UNSOLVED_RESIDUAL:
-        other = solve(problem, time_limit=SECONDS)
+    if not enclosure.proven and not residual(problem, start).relative <= UNSOLVED_RESIDUAL:
+        other = solve(problem, time_limit=PROOF_SOLVE_TIME_LIMIT)
         if other.certificate is not None:
-            refuted = _infeasible(problem, other.certificate)
-            return refuted if refuted.infeasible else found
-    return found
+            refuted = _check_certificate(problem, other.certificate)
+            return refuted if refuted.infeasible else enclosure
+    return enclosure
 
 
-def _infeasible(problem: Problem, certificate: FloatArray) -> Enclosure:
+def _check_certificate(problem: Problem, certificate: FloatArray) -> Enclosure:
     """Check a certificate (m,) on the problem's numbers as exact ones."""
     proof = certificates.prove(problem, certificate)
     holds = not proof.reason and proof.impulse_bound == math.inf
     return Enclosure(False, reason=proof.reason or proof.message, infeasible=holds)
 
 
-def _searched(problem: Problem, start: FloatArray, given: FloatArray) -> Enclosure:
-    """The enclosure that a search from one answer ends with, beside another."""
-    for bits in BITS:
-        with balls(bits) as flint:
-            search = Search(flint, problem, start, given)
-            found = search.run()
-        if found.proven or search.singular:
+def _prove_from(problem: Problem, start: FloatArray, answer: FloatArray) -> Enclosure:
+    """Search an enclosure from the impulse `start` (m,) [N s] and measure its distance from `answer` (m,) [N s]."""
+    for bits in PRECISIONS:
+        with ball_precision(bits) as flint:
+            search = Search(flint, problem, start, answer)
+            enclosure = search.run()
+        if enclosure.proven or search.singular:
             break
-    return found
+    return enclosure
 
 
-def enclosed(problem: Problem) -> Enclosure:
-    """Enclose an exact solution near the reference of the problem's motions, and keep it as that reference."""
+def enclose_reference(problem: Problem) -> Enclosure:
+    """Enclose an exact solution near the problem's motion reference and store it as that reference."""
     problem = problem.disk
-    found = prove(problem, reference(problem).impulse)
-    if found.impulse is not None:
-        kept(problem).reference = judged(
-            problem, found.impulse, f"{PROOF}an exact solution within {found.velocity_radius:.1e} m/s"
+    enclosure = prove(problem, reference(problem).impulse)
+    if enclosure.impulse is not None:
+        motion_cache(problem).reference = make_reference(
+            problem, enclosure.impulse, f"{PROOF}an exact solution within {enclosure.velocity_radius:.1e} m/s"
         )
-    return found
+    return enclosure
 
 
-def require() -> None:
-    """Raise SolverUnavailable where python-flint is not installed."""
-    with balls(BITS[0]):
+def require_python_flint() -> None:
+    """Raise SolverUnavailable if python-flint is not installed."""
+    with ball_precision(PRECISIONS[0]):
         pass

@@ -1,4 +1,4 @@
-"""Rows that depend on others exactly: found modulo a prime, held to the rank of J in whole numbers."""
+"""Rows that depend on others exactly: found modulo a prime, confirmed by the rank of J over the integers."""
 
 from __future__ import annotations
 
@@ -14,128 +14,144 @@ from lavender.base.lu import sparse_lu
 
 
 class Tangled(Exception):
-    """Rows that depend on each other, too many to tell from rounding."""
+    """Too many rows depend on each other to rounding to decide whether they do so exactly."""
 
 
-SPARSE = 1000  # rows above which the factor is sparse: it does not take the farthest row first
+# Above this many rows the factor is sparse; it does not eliminate the row with the largest pivot first.
+MAX_DENSE_GRAM_ROWS = 1000
 
-DEPENDS = 1e-10  # of a row's length squared, to the span of those before it: depends on them to rounding
+# A row depends on others to rounding if its squared distance from their span is at most this fraction of its squared
+# length.
+ROUNDING_DEPENDENCE_TOL = 1e-10
 
-SHIFT = 1e-13  # of the diagonal: what a row that depends on others keeps of itself
+SPARSE_GRAM_SHIFT = 1e-13  # Fraction of the diagonal that is added to it; dependent rows keep this pivot.
 
 
-def pivots(j: Any) -> tuple[Any, int]:
-    """An order of the rows of J in which those that depend on others to rounding come last, and how many do not."""
+def order_by_dependence(j: Any) -> tuple[Any, int]:
+    """Order the rows of J such that those that depend on others to rounding come last; return also how many do not."""
     size = np.maximum(np.sqrt(j.multiply(j).sum(axis=1)), np.finfo(float).tiny)
     unit = sp.csr_array(sp.diags_array(1.0 / size) @ j)
     gram = sp.csc_array(unit @ unit.T)
     m = gram.shape[0]
-    if m <= SPARSE:
-        _, order, rank, _ = lapack.dpstrf(gram.toarray(), tol=DEPENDS)
+    if m <= MAX_DENSE_GRAM_ROWS:
+        _, order, rank, _ = lapack.dpstrf(gram.toarray(), tol=ROUNDING_DEPENDENCE_TOL)
         return np.concatenate([np.sort(order[:rank]), np.sort(order[rank:])]) - 1, int(rank)
-    shifted = gram + SHIFT * sp.eye_array(m)
+    shifted = gram + SPARSE_GRAM_SHIFT * sp.eye_array(m)
     options = {"SymmetricMode": True}
     factor = sparse_lu(shifted, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
     # Pivots of a Cholesky factor: the squared distances of rows from the span of those before them.
-    alone = abs(factor.U.diagonal()[factor.perm_c]) > DEPENDS
-    return np.concatenate([np.flatnonzero(alone), np.flatnonzero(~alone)]), int(np.count_nonzero(alone))
+    independent = abs(factor.U.diagonal()[factor.perm_c]) > ROUNDING_DEPENDENCE_TOL
+    return np.concatenate([np.flatnonzero(independent), np.flatnonzero(~independent)]), int(
+        np.count_nonzero(independent)
+    )
 
 
 PRIME = 2**61 - 1
 
-EXACT = 600  # rank up to which rows that look dependent are held to it in whole numbers: seconds
+# Up to this rank, rows that look dependent are confirmed over the integers, which takes seconds.
+MAX_INTEGER_RANK = 600
 
 
 def dependencies(flint: Any, j: Any, target: FloatArray, sure: int = 0) -> tuple[Any, Any]:
-    """Rows of J that are independent of those before them, and others whose target contradicts theirs: exactly.
+    """Return rows of J that are independent of those before them, and dependent rows with contradicting targets.
 
-    Rows that are independent modulo a prime are so. Where they span all columns that they reach, the others depend on
-    them; else the rank in whole numbers says so, with the targets as one more column for those that contradict nothing.
-    The first `sure` rows are independent to rounding: as many of them as columns that they reach are taken for a basis,
-    which the inverse of their equations proves.
+    Rows that are independent modulo a prime are independent. If they span all columns that they use, the other rows
+    depend on them; otherwise the rank over the integers decides, with the targets as one more column for the rows that
+    contradict nothing. The first `sure` rows are independent to rounding: if a component has as many of them as
+    columns, they are its basis, which the inverse of their equations proves.
 
     Raises
     ------
     Tangled
-        Rows whose rank modulo a prime is above EXACT and below the number of their columns.
+        The rank of some rows modulo a prime is above MAX_INTEGER_RANK and below the number of their columns.
     """
     _, label = sp.csgraph.connected_components(
         sp.block_array([[None, j != 0], [(j != 0).T, None]]).astype(float), directed=False
     )
-    kept, contradict = [], []
+    independent_rows, contradict = [], []
     for k in np.unique(label[: j.shape[0]]):
         rows = np.flatnonzero(label[: j.shape[0]] == k)
         columns = np.flatnonzero(label[j.shape[0] :] == k)
         basis = rows[rows < sure]
         if len(basis) == len(columns) and not target[rows].any():
-            kept.append(basis)
+            independent_rows.append(basis)
             continue
-        found = _dependent(flint, j[rows][:, columns], target[rows])
-        if found is None:
+        split = _split_component(flint, j[rows][:, columns], target[rows])
+        if split is None:
             raise Tangled(rows)
-        kept.append(rows[found[0]])
-        contradict.append(rows[found[1]])
-    return np.sort(np.concatenate(kept)), np.sort(np.concatenate([np.zeros(0, np.int64), *contradict]))
+        independent_rows.append(rows[split[0]])
+        contradict.append(rows[split[1]])
+    return np.sort(np.concatenate(independent_rows)), np.sort(
+        np.concatenate([np.zeros(0, np.int64), *contradict])
+    )
 
 
-def _dependent(flint: Any, j: Any, target: FloatArray) -> tuple[list[int], list[int]] | None:
+def _split_component(flint: Any, j: Any, target: FloatArray) -> tuple[list[int], list[int]] | None:
+    """Return (independent rows, rows that contradict them) of one component of J, or None if its rank is too large."""
     m, n = j.shape
-    whole = _whole(np.column_stack([j.toarray(), target]))
+    integer_rows = _integer_rows(np.column_stack([j.toarray(), target]))
     prime = PRIME
     while True:
         reduced, rank = flint.nmod_mat(
-            n, m, [row[k] % prime for k in range(n) for row in whole], prime
+            n, m, [row[k] % prime for k in range(n) for row in integer_rows], prime
         ).rref()
-        kept: list[int] = []
+        independent_rows: list[int] = []
         for k in range(m):
-            if len(kept) < rank and int(reduced[len(kept), k]) != 0:
-                kept.append(k)
-        others = sorted(set(range(m)) - set(kept))
+            if len(independent_rows) < rank and int(reduced[len(independent_rows), k]) != 0:
+                independent_rows.append(k)
+        others = sorted(set(range(m)) - set(independent_rows))
         if not others or (rank == n and not target.any()):
-            return kept, []
-        made = [(i, k) for i in range(rank) for k in others if int(reduced[i, k]) != 0]
-        goal = [(i, whole[k][n]) for i, k in enumerate(kept) if whole[k][n]]
-        left = {k: (whole[k][n] - sum(int(reduced[i, k]) * t for i, t in goal)) % prime for k in others}
-        held = [_spanned(flint, whole, part, left) for part in _parted(m, [(kept[i], k) for i, k in made])]
-        if None in held:
+            return independent_rows, []
+        entries = [(i, k) for i in range(rank) for k in others if int(reduced[i, k]) != 0]
+        targets = [(i, integer_rows[k][n]) for i, k in enumerate(independent_rows) if integer_rows[k][n]]
+        residuals = {
+            k: (integer_rows[k][n] - sum(int(reduced[i, k]) * t for i, t in targets)) % prime for k in others
+        }
+        proofs = [
+            _depends_exactly(flint, integer_rows, rows, residuals)
+            for rows in _connected_sets(m, [(independent_rows[i], k) for i, k in entries])
+        ]
+        if None in proofs:
             return None
-        if all(held):
-            return kept, [k for k in others if left[k]]
-        prime = next(
-            p for p in count(prime + 2, 2) if flint.fmpz(p).is_prime()
-        )  # this one divides what is not 0
+        if all(proofs):
+            return independent_rows, [k for k in others if residuals[k]]
+        # The present prime divides an entry that is not zero: try the next one.
+        prime = next(p for p in count(prime + 2, 2) if flint.fmpz(p).is_prime())
 
 
-def _parted(m: int, pairs: list[tuple[int, int]]) -> list[Any]:
-    """Sets of rows, of m, that pairs join; a row that is in none stands by itself."""
+def _connected_sets(m: int, pairs: list[tuple[int, int]]) -> list[Any]:
+    """Partition `m` rows into sets that pairs connect; a row without a pair is a set of its own."""
     at = tuple(np.array(pairs, np.int64).reshape(-1, 2).T)
     joined = sp.coo_array((np.ones(len(pairs)), at), shape=(m, m))
     n, label = sp.csgraph.connected_components(joined, directed=False)
     return [np.flatnonzero(label == k).tolist() for k in range(n)]
 
 
-def _spanned(flint: Any, whole: list[list[int]], rows: list[int], left: dict[int, int]) -> bool | None:
-    """Whether rows depend on those without `left`, targets (the last column) too where that is 0; None: too many."""
-    base = [k for k in rows if k not in left]
-    if len(base) == len(rows):
+def _depends_exactly(
+    flint: Any, integer_rows: list[list[int]], rows: list[int], residuals: dict[int, int]
+) -> bool | None:
+    """Whether the rows in `residuals` depend on the others, targets included if theirs is 0; None: too many."""
+    independent = [k for k in rows if k not in residuals]
+    if len(independent) == len(rows):
         return True
-    if len(base) > EXACT:
+    if len(independent) > MAX_INTEGER_RANK:
         return None
-    agree = [whole[k] for k in rows if not left.get(k)]
-    return _rank(flint, [whole[k][:-1] for k in rows]) == len(base) == _rank(flint, agree)
+    agree = [integer_rows[k] for k in rows if not residuals.get(k)]
+    return _rank(flint, [integer_rows[k][:-1] for k in rows]) == len(independent) == _rank(flint, agree)
 
 
 def _rank(flint: Any, rows: list[list[int]]) -> int:
+    """Return the rank of an integer matrix, its zero columns removed."""
     live = [k for k in range(len(rows[0])) if any(row[k] for row in rows)] if rows else []
     return int(flint.fmpz_mat(len(rows), len(live), [row[k] for row in rows for k in live]).rank())
 
 
-def _whole(a: FloatArray) -> list[list[int]]:
-    """Each row times a power of two, in whole numbers."""
-    share, power = np.frexp(a)
+def _integer_rows(a: FloatArray) -> list[list[int]]:
+    """Multiply each row by a power of two that makes its numbers integers, exactly."""
+    mantissa, power = np.frexp(a)
     power = np.where(a != 0.0, power, power.max(axis=1, keepdims=True, initial=0))
     power -= power.min(axis=1, keepdims=True, initial=power.max(initial=0))
-    digits = (share * 2.0**53).astype(np.int64)
+    digits = (mantissa * 2.0**53).astype(np.int64)
     return [
         [x << p for x, p in zip(row, by, strict=True)]
         for row, by in zip(digits.tolist(), power.tolist(), strict=True)

@@ -1,12 +1,12 @@
-"""The zero of one island's equations: found by Newton's method in balls, enclosed by Krawczyk's test.
+"""The zero of one island's equations: found by Newton's method in ball arithmetic, enclosed by Krawczyk's test.
 
-The slope over a box is held as float64 numbers with how far they may be off, and the rows of an inverse are
-solved for in portions: each sum of k products of float64 numbers p_i q_i is off by at most
+The Jacobian F' over a box (the slope) is held as float64 numbers with error bounds, and the rows of an inverse are
+computed in portions. Each sum of k products of float64 numbers p_i q_i has an error of at most
 
     k UNIT / (1 - k UNIT) sum |p_i q_i|                                                                 (3)
 
-in any order (Higham 2002, section 3.1), so that |I - Y F'| needs no arithmetic but float64's. Where that does not
-contract, few unknowns are tried by an inverse in balls.
+in any order (Higham 2002, section 3.1), so |I - Y F'| needs only float64 arithmetic. If that does not contract and the
+island is small, an inverse in balls is tried.
 """
 
 from __future__ import annotations
@@ -20,38 +20,44 @@ import numpy as np
 from lavender.base.arrays import FloatArray
 from lavender.base.lazy_import import sparse as sp
 from lavender.base.lu import sparse_lu
-from lavender.lab.proof.numbers import UNIT, largest, upper_end
-from lavender.lab.proof.operator import DENSE, Part, Rounded, wider
+from lavender.lab.proof.numbers import UNIT, max_abs, upper_end
+from lavender.lab.proof.operator import MAX_DENSE_FLOAT_ROWS, Part, Rounded, round_up
 
-PRECISE = 200  # unknowns up to which an inverse in more than float64 is tried
+MAX_BALL_INVERSE_UNKNOWNS = (
+    200  # Up to this many unknowns, an inverse in more than float64 precision is tried.
+)
 
-PORTION = 4_000_000  # numbers of the inverse that are held at once
+MAX_INVERSE_ENTRIES = (
+    4_000_000  # Largest number of entries of the inverse that are in memory at once (32 MB).
+)
 
-SLOW = 1e-9  # of the largest b: a speed that an answer may have where the solution sticks
+# A friction component with a speed of at most this fraction of the largest b may stick in the solution.
+STICKING_SPEED_FRACTION = 1e-9
 
-EXTENT = 10  # enlargements of X
+MAX_BOX_ENLARGEMENTS = 10  # The box X is enlarged at most this often.
 
-TINY = 2.0**-300  # beside numbers scaled to 1: more than all that underflows
+# Larger than all numbers that underflow next to numbers that are scaled to about 1.
+UNDERFLOW_BOUND = 2.0**-300
 
 
 class Sticks(Exception):
-    """Parts of friction that hardly slide, or whose speed has no sign."""
+    """Some friction `components` hardly slide, or their speed may be zero."""
 
-    def __init__(self, parts: list[Any]) -> None:
-        self.parts = parts
+    def __init__(self, components: list[Any]) -> None:
+        self.components = components
 
 
 class NoZero(Exception):
-    """No box proves a zero; `slope` (n, n) at the answer."""
+    """No box proves a zero; `slope` (n, n) is F' at the answer."""
 
     def __init__(self, slope: Any) -> None:
         self.slope = slope
 
 
 class Island:
-    """Equations (1) of some rows: `part` of A, sliding parts of friction with their normals.
+    """Equations (1) of some rows: `part` of A, sliding friction components with their normals.
 
-    `lam` are the impulses of all rows, `base` their slacks without the impulses of these.
+    `lam` holds the impulses of all rows, `base` their slacks without the impulses of these rows.
     """
 
     def __init__(
@@ -66,48 +72,50 @@ class Island:
         self.flint, self.part, self.sliding, self.cone, self.lam = flint, part, sliding, cone, lam
         self.number = flint.arb
         which = part.which.tolist()
-        self.place = {r: k for k, r in enumerate(which)}
+        self.index = {r: k for k, r in enumerate(which)}
         self.base = [base[r] for r in which]
 
     def value(self, x: list[Any]) -> tuple[list[Any], Any]:
-        """F and, of the sliding parts, their w and s."""
-        number, place = self.number, self.place
+        """Compute F, and (w, s) of each sliding component."""
+        number, index = self.number, self.index
         w = [p + q for p, q in zip(self.part.times(x), self.base, strict=True)]
         out, speeds = list(w), []
         for first, part in self.sliding:
-            z = [number(c) * w[place[r]] for r, c in zip(part.rows, part.reach, strict=True)]
+            z = [number(c) * w[index[r]] for r, c in zip(part.rows, part.coefficients, strict=True)]
             s = sum((q * q for q in z), number(0.0)).sqrt() if len(z) > 1 else abs(z[0])
             speeds.append((w, s))
-            normal = x[place[first]] if first in place else self.lam[first]
-            for r, c in zip(part.rows, part.reach, strict=True):
+            normal = x[index[first]] if first in index else self.lam[first]
+            for r, c in zip(part.rows, part.coefficients, strict=True):
                 c2 = number(c) * number(c)
-                out[place[r]] = x[place[r]] * s + c2 * w[place[r]] * normal
-            if self.cone and first in place:
-                out[place[first]] -= s
+                out[index[r]] = x[index[r]] * s + c2 * w[index[r]] * normal
+            if self.cone and first in index:
+                out[index[first]] -= s
         return out, speeds
 
     def slope(self, x: list[Any], speeds: Any) -> tuple[dict[Any, Any], dict[Any, Any]]:
-        """Entries of `left` that are not those of I, and of `right`, in F' = left A + right over a box."""
-        number, place = self.number, self.place
+        """Return the entries of `left` that differ from I, and those of `right`, in F' = left A + right over a box."""
+        number, index = self.number, self.index
         left: dict[Any, Any] = {}
         right: dict[Any, Any] = {}
         for (first, part), (w, s) in zip(self.sliding, speeds, strict=True):
-            at = [(place[r], number(c) * number(c)) for r, c in zip(part.rows, part.reach, strict=True)]
-            share = [c2 * w[k] / s for k, c2 in at]  # ds = share . dw
-            normal = x[place[first]] if first in place else self.lam[first]
+            at = [
+                (index[r], number(c) * number(c)) for r, c in zip(part.rows, part.coefficients, strict=True)
+            ]
+            gradient = [c2 * w[k] / s for k, c2 in at]  # ds = gradient . dw
+            normal = x[index[first]] if first in index else self.lam[first]
             for k, c2 in at:
-                for (q, _), ds in zip(at, share, strict=True):
+                for (q, _), ds in zip(at, gradient, strict=True):
                     left[k, q] = x[k] * ds + (c2 * normal if q == k else 0)
                 right[k, k] = s
-                if first in place:
-                    right[k, place[first]] = c2 * w[k]
-            if self.cone and first in place:
-                for (q, _), ds in zip(at, share, strict=True):
-                    left[place[first], q] = -ds
+                if first in index:
+                    right[k, index[first]] = c2 * w[k]
+            if self.cone and first in index:
+                for (q, _), ds in zip(at, gradient, strict=True):
+                    left[index[first], q] = -ds
         return left, right
 
     def floats(self, x: list[Any], speeds: Any) -> Rounded:
-        """The slope as float64 numbers, and how far they may be off."""
+        """Return the slope as float64 numbers with error bounds."""
         a, n = self.part.bounded, len(x)
         if not self.sliding:
             return a
@@ -116,12 +124,12 @@ class Island:
             left.setdefault((k, k), self.number(1.0))
         (p, dp), (r, dr) = (_bounded(entries, n) for entries in (left, right))
         size = abs(p) @ abs(a.near)
-        rounding = 2.0 * (_most(p) + 2) * UNIT  # (3)
+        rounding = 2.0 * (_max_row_entries(p) + 2) * UNIT  # (3)
         off = abs(p) @ a.off + dp @ (abs(a.near) + a.off) + dr + rounding * (size + abs(r))
-        return Rounded(p @ a.near + r, wider(off))
+        return Rounded(p @ a.near + r, round_up(off))
 
     def balls(self, x: list[Any], speeds: Any) -> Any:
-        """The slope as a matrix of balls."""
+        """Return the slope as a matrix of balls."""
         a, n = self.part.exact, len(x)
         if not self.sliding:
             return a
@@ -133,42 +141,50 @@ class Island:
             added[k, q] = v
         return full * a + added
 
-    def enclose(self, given: list[float], most: float) -> list[Any]:
-        """Balls that hold one zero, the only one in them.
+    def enclose(self, answer: list[float], velocity_scale: float) -> list[Any]:
+        """Compute balls that contain exactly one zero of the equations, starting from the impulses `answer` [N s].
 
         Raises
         ------
         Sticks
-            Parts that have no speed, or at the answer no more than SLOW of `most` [m/s].
+            Components have zero speed, or speeds of at most STICKING_SPEED_FRACTION of `velocity_scale` [m/s] at the
+            answer.
         NoZero
+            No box proves a zero.
         """
         number = self.number
-        start = [number(x) for x in given]
+        start = [number(x) for x in answer]
         for inverse in (FloatInverse, BallInverse):
             try:
-                with np.errstate(over="ignore", invalid="ignore"):  # what is not finite proves nothing
-                    found = self._krawczyk(*self._newton(start, inverse))
+                with np.errstate(
+                    over="ignore", invalid="ignore"
+                ):  # Numbers that are not finite prove nothing.
+                    enclosure = self._krawczyk(*self._newton(start, inverse))
             except ZeroDivisionError:
-                found = None
-            if found is not None:
-                return found
-            if len(start) > PRECISE:
+                enclosure = None
+            if enclosure is not None:
+                return enclosure
+            if len(start) > MAX_BALL_INVERSE_UNKNOWNS:
                 break
-        # What hardly slides at the answer may stick.
+        # A component that hardly slides at the answer may stick.
         _, speeds = self.value(start)
-        slow = [p for (_, p), (_, s) in zip(self.sliding, speeds, strict=True) if not s > SLOW * most]
+        slow = [
+            p
+            for (_, p), (_, s) in zip(self.sliding, speeds, strict=True)
+            if not s > STICKING_SPEED_FRACTION * velocity_scale
+        ]
         if slow:
             raise Sticks(slow)
         raise NoZero(self.floats(start, speeds).near)
 
     def _newton(self, x: list[Any], kind: Any) -> tuple[list[Any], Any]:
-        """Middles near a zero, and the inverse of the slope there."""
+        """Run Newton's method; return the midpoints near a zero, and the inverse of the slope there."""
         inverse, moved, last = None, math.inf, math.inf
         small = 2.0 ** (-0.75 * self.flint.ctx.prec)
         for step in range(30):
             value, speeds = self.value(x)
             if any(not (s > 0) for _, s in speeds):
-                break  # its case is wrong, or on the boundary
+                break  # The component's case is wrong, or it is on the boundary of two.
             if (
                 inverse is None
                 or moved > (1e-3 if self.sliding else 0.1) * last
@@ -177,39 +193,39 @@ class Island:
                 inverse = kind(self, x, speeds)
             move = inverse.times(value)
             x = [(p - q).mid() for p, q in zip(x, move, strict=True)]
-            size, last, moved = largest(x), moved, largest(move)
+            size, last, moved = max_abs(x), moved, max_abs(move)
             if not math.isfinite(moved):
                 raise ZeroDivisionError
             if step > 1 and (moved <= small * size or (step > 9 and moved > 0.1 * last)):
                 break
         _, speeds = self.value(x)
-        still = [part for (_, part), (_, s) in zip(self.sliding, speeds, strict=True) if not s > 0]
-        if still:
-            raise Sticks(still)
+        sticking = [part for (_, part), (_, s) in zip(self.sliding, speeds, strict=True) if not s > 0]
+        if sticking:
+            raise Sticks(sticking)
         return x, inverse
 
     def _krawczyk(self, x: list[Any], inverse: Any) -> list[Any] | None:
-        """Balls around x by (2), None where no box is found."""
+        """Return balls around x by (2), or None if no box is found."""
         number = self.number
         value, speeds = self.value(x)
-        wide = np.full(len(x), 2.0 ** (-0.6 * self.flint.ctx.prec) * largest(x) + 2.0**-900)
-        for _ in range(EXTENT):
-            box = [p + number(0.0, q) for p, q in zip(x, wide.tolist(), strict=True)]
+        half_width = np.full(len(x), 2.0 ** (-0.6 * self.flint.ctx.prec) * max_abs(x) + 2.0**-900)
+        for _ in range(MAX_BOX_ENLARGEMENTS):
+            box = [p + number(0.0, q) for p, q in zip(x, half_width.tolist(), strict=True)]
             _, speeds = self.value(box) if self.sliding else (None, [])
             if all(s > 0 for _, s in speeds):
-                reach = inverse.reach(box, speeds, value, wide)
-                if (reach < wide).all():
-                    return [p + number(0.0, q) for p, q in zip(x, reach.tolist(), strict=True)]
-                wide = 4.0 * np.maximum(wide, reach)
+                box_radius = inverse.radius(box, speeds, value, half_width)
+                if (box_radius < half_width).all():
+                    return [p + number(0.0, q) for p, q in zip(x, box_radius.tolist(), strict=True)]
+                half_width = 4.0 * np.maximum(half_width, box_radius)
             else:
-                wide = 0.25 * wide
-            if not np.isfinite(wide).all():
+                half_width = 0.25 * half_width
+            if not np.isfinite(half_width).all():
                 break
         return None
 
 
 class BallInverse:
-    """Y in balls: the inverse of the slope's middle."""
+    """Y in balls: the inverse of the slope's midpoint."""
 
     def __init__(self, island: Island, x: list[Any], speeds: Any) -> None:
         self.island = island
@@ -217,14 +233,14 @@ class BallInverse:
         self.inverse = island.balls(x, speeds).mid().inv().mid()
 
     def times(self, value: list[Any]) -> list[Any]:
-        """Y F, middles."""
+        """Compute the midpoints of Y F."""
         return (self.inverse * self.matrix(len(value), 1, value)).mid().entries()
 
-    def reach(self, box: list[Any], speeds: Any, value: list[Any], wide: FloatArray) -> FloatArray:
-        """|Y F| + |I - Y F'(X)| (X - x), rounded up."""
+    def radius(self, box: list[Any], speeds: Any, value: list[Any], half_width: FloatArray) -> FloatArray:
+        """Compute |Y F| + |I - Y F'(X)| (X - x), rounded up."""
         n = len(box)
         unit = self.matrix(n, n, np.eye(n).ravel().tolist())
-        ball = self.matrix(n, 1, [self.island.number(0.0, q) for q in wide.tolist()])
+        ball = self.matrix(n, 1, [self.island.number(0.0, q) for q in half_width.tolist()])
         newton = self.inverse * self.matrix(n, 1, value)
         away = (unit - self.inverse * self.island.balls(box, speeds)) * ball - newton
         return np.array([upper_end(q) for q in away.entries()])
@@ -237,14 +253,14 @@ class FloatInverse:
         self.island = island
         near = island.floats(x, speeds).near
         with np.errstate(all="ignore"):
-            self.column = _power(np.sqrt(_largest(near, 0)))
-            self.row = _power(_largest(_scaled(near, np.ones(len(x)), self.column), 1))
+            self.column = _scaling_powers(np.sqrt(_max_abs(near, 0)))
+            self.row = _scaling_powers(_max_abs(_scaled(near, np.ones(len(x)), self.column), 1))
             near = _scaled(near, self.row, self.column)
-            self.whole: Any = None
+            self.dense_inverse: Any = None
             self.factor: Any = None
             try:
                 if isinstance(near, np.ndarray):
-                    self.whole = np.linalg.inv(near)
+                    self.dense_inverse = np.linalg.inv(near)
                 elif np.isfinite(near.data).all():
                     options = {"SymmetricMode": True}
                     self.factor = sparse_lu(
@@ -256,75 +272,79 @@ class FloatInverse:
                 raise ZeroDivisionError from None
 
     def times(self, value: list[Any]) -> list[Any]:
-        """Y F, middles."""
+        """Compute the midpoints of Y F."""
         right = self.row * np.array([float(q) for q in value])
-        move = self.column * (self.factor.solve(right) if self.whole is None else self.whole @ right)
+        move = self.column * (
+            self.factor.solve(right) if self.dense_inverse is None else self.dense_inverse @ right
+        )
         return [self.island.number(q) for q in move.tolist()]
 
     def _rows(self, n: int) -> Iterator[tuple[int, FloatArray]]:
-        """Rows of Y as columns, in portions."""
-        if self.whole is not None:
-            yield 0, self.whole.T
+        """Yield rows of Y as columns, in portions that fit MAX_INVERSE_ENTRIES, with the index of the first."""
+        if self.dense_inverse is not None:
+            yield 0, self.dense_inverse.T
             return
-        step = max(1, PORTION // n)
+        step = max(1, MAX_INVERSE_ENTRIES // n)
         for first in range(0, n, step):
             last = min(first + step, n)
             unit = np.zeros((n, last - first), order="F")
             unit[np.arange(first, last), np.arange(last - first)] = 1.0
             yield first, self.factor.solve(unit, trans="T")
 
-    @np.errstate(under="ignore")  # TINY is more
-    def reach(self, box: list[Any], speeds: Any, value: list[Any], wide: FloatArray) -> FloatArray:
-        """|Y F| + |I - Y F'(X)| (X - x), rounded up; inf where numbers are beyond float64."""
+    @np.errstate(under="ignore")  # UNDERFLOW_BOUND accounts for underflow.
+    def radius(self, box: list[Any], speeds: Any, value: list[Any], half_width: FloatArray) -> FloatArray:
+        """Compute |Y F| + |I - Y F'(X)| (X - x), rounded up; inf if float64 cannot represent the numbers."""
         slope, n = self.island.floats(box, speeds), len(box)
         near, off = (_scaled(a, self.row, self.column) for a in slope)
         before, after = (a.ravel() if isinstance(a, np.ndarray) else a.data for a in (slope.near, near))
-        live = abs(np.concatenate([self.row, self.column, after[before != 0.0]]))
+        nonzero = abs(np.concatenate([self.row, self.column, after[before != 0.0]]))
         out = np.full(n, math.inf)
-        if not ((live > TINY) & (live < 1.0 / TINY)).all():
-            return out  # numbers whose products float64 does not hold
-        turned = near.T if isinstance(near, np.ndarray) else near.T.tocsr()
-        k = 2.0 * (_most(turned) + 3) * UNIT  # (3)
-        r = wider(wide / self.column)
-        f = wider(self.row * np.array([upper_end(q) for q in value]))
-        t = f + (k * abs(near) + wider(off)) @ r + TINY * r.sum()
+        if not ((nonzero > UNDERFLOW_BOUND) & (nonzero < 1.0 / UNDERFLOW_BOUND)).all():
+            return out  # Products of these numbers overflow or underflow.
+        transposed = near.T if isinstance(near, np.ndarray) else near.T.tocsr()
+        k = 2.0 * (_max_row_entries(transposed) + 3) * UNIT  # (3)
+        r = round_up(half_width / self.column)
+        f = round_up(self.row * np.array([upper_end(q) for q in value]))
+        t = f + (k * abs(near) + round_up(off)) @ r + UNDERFLOW_BOUND * r.sum()
         for first, y in self._rows(n):
-            p = turned @ y
+            p = transposed @ y
             p[np.arange(first, first + y.shape[1]), np.arange(y.shape[1])] -= 1.0
             out[first : first + y.shape[1]] = abs(p).T @ r + abs(y).T @ t
-        out = self.column * (out + TINY * r.sum()) * (1.0 + 8.0 * (n + 8) * UNIT)
+        out = self.column * (out + UNDERFLOW_BOUND * r.sum()) * (1.0 + 8.0 * (n + 8) * UNIT)
         return np.where(np.isfinite(out), out, math.inf)
 
 
-def _power(size: FloatArray) -> FloatArray:
-    """Powers of two that scale these to about 1."""
+def _scaling_powers(size: FloatArray) -> FloatArray:
+    """Return powers of two that scale `size` to about 1."""
     return np.exp2(-np.round(np.log2(np.where(size > 0.0, size, 1.0))))
 
 
 def _scaled(a: Any, row: FloatArray, column: FloatArray) -> Any:
+    """Multiply the rows and the columns of `a` by factors."""
     if isinstance(a, np.ndarray):
         return row[:, None] * a * column
     data = a.data * np.repeat(row, np.diff(a.indptr)) * column[a.indices]
     return sp.csr_array((data, a.indices, a.indptr), shape=a.shape)
 
 
-def _largest(a: Any, axis: int) -> FloatArray:
+def _max_abs(a: Any, axis: int) -> FloatArray:
+    """Return the largest magnitude along an axis."""
     size = abs(a).max(axis=axis)
     return np.asarray(size if isinstance(a, np.ndarray) else size.toarray().ravel())
 
 
-def _most(a: Any) -> int:
-    """Numbers in the fullest row."""
+def _max_row_entries(a: Any) -> int:
+    """Return the largest number of non-zero entries in a row."""
     count = np.count_nonzero(a, axis=1) if isinstance(a, np.ndarray) else np.diff(a.indptr)
     return int(count.max())
 
 
 def _bounded(entries: dict[Any, Any], n: int) -> tuple[Any, Any]:
-    """Matrices of float64 numbers of balls, and of how far they are off."""
+    """Return the float64 midpoints of balls as an (n, n) matrix, and a matrix of bounds of their errors."""
     at = tuple(np.array(list(entries), np.int64).reshape(-1, 2).T)
     near = [float(v.mid()) for v in entries.values()]
     off = [upper_end(v - x) for v, x in zip(entries.values(), near, strict=True)]
-    if n > DENSE:
+    if n > MAX_DENSE_FLOAT_ROWS:
         return tuple(sp.csr_array((np.array(v), at), shape=(n, n)) for v in (near, off))
     out = np.zeros((2, n, n))
     out[0][at], out[1][at] = near, off

@@ -1,4 +1,4 @@
-"""Balls and rational numbers of python-flint: what is proved is proved in these."""
+"""Ball arithmetic and rational numbers of python-flint, in which proofs are computed."""
 
 from __future__ import annotations
 
@@ -12,25 +12,25 @@ import numpy as np
 
 from lavender.base.errors import SolverUnavailable
 
-UNIT = 2.0**-53
+UNIT = 2.0**-53  # Unit round-off of float64.
 
-_precision_lock = (
-    RLock()
-)  # Held while python-flint's precision, one for the whole process, is that of a proof.
+# Held while a proof sets python-flint's precision, which is one for the whole process.
+_precision_lock = RLock()
 
 
-def _forked() -> None:
+def _replace_lock_after_fork() -> None:
+    """Create a new lock in a forked child: no thread of the child could release the old one."""
     global _precision_lock
-    _precision_lock = RLock()  # A fork's child has no thread that could release the other one.
+    _precision_lock = RLock()
 
 
-if hasattr(os, "register_at_fork"):  # not on Windows
-    os.register_at_fork(after_in_child=_forked)
+if hasattr(os, "register_at_fork"):  # It does not exist on Windows.
+    os.register_at_fork(after_in_child=_replace_lock_after_fork)
 
 
 @contextmanager
-def balls(bits: int) -> Iterator[Any]:
-    """Set the precision of python-flint to `bits` and restore it at the end; one thread at a time.
+def ball_precision(bits: int) -> Iterator[Any]:
+    """Set the precision of python-flint to `bits` until the context ends; one thread at a time.
 
     Raises
     ------
@@ -52,54 +52,54 @@ def balls(bits: int) -> Iterator[Any]:
 
 
 class Balls:
-    """Numbers and matrices of balls."""
+    """Factories of balls and of matrices of balls."""
 
     def __init__(self, flint: Any) -> None:
         self.number, self.matrix = flint.arb, flint.arb_mat
 
 
 class Rationals:
-    """Numbers and matrices of rational numbers."""
+    """Factories of rational numbers and of matrices of them."""
 
     def __init__(self, flint: Any) -> None:
         self.matrix, self._flint = flint.fmpq_mat, flint
 
     def number(self, x: float) -> Any:
-        """The rational number that a float is."""
+        """Return the rational number that equals a float."""
         return self._flint.fmpq(*x.as_integer_ratio())
 
 
-def matrix(kind: Any, a: Any) -> Any:
-    """A sparse matrix in numbers of a kind, dense."""
+def to_dense(kind: Any, a: Any) -> Any:
+    """Convert a sparse matrix to a dense matrix of balls or rationals."""
     dense = a.toarray()
     return kind.matrix(*dense.shape, [kind.number(x) for x in dense.ravel().tolist()])
 
 
-def times(kind: Any, a: Any, x: list[Any], at: Any) -> list[Any]:
-    """Sparse times vector; `at`: the entries of x that are not zero, None: all."""
+def sparse_times(kind: Any, a: Any, x: list[Any], at: Any) -> list[Any]:
+    """Multiply a sparse matrix by a vector; `at` lists the entries of x that are not zero, None means all."""
     out, zero = [], kind.number(0.0)
-    live = None if at is None else np.isin(a.indices, at)
+    used = None if at is None else np.isin(a.indices, at)
     data, indices, ptr = a.data.tolist(), a.indices.tolist(), a.indptr.tolist()
     for i in range(a.shape[0]):
         total = zero
         for k in range(ptr[i], ptr[i + 1]):
-            if (live is None or live[k]) and data[k] != 0.0:
+            if (used is None or used[k]) and data[k] != 0.0:
                 total = total + kind.number(data[k]) * x[indices[k]]
         out.append(total)
     return out
 
 
 def upper_end(x: Any) -> float:
-    """No less than |x| for any number of a ball; the float of an upper end may be rounded down."""
+    """Return a float that is at least |x| for every number of a ball; converting the upper end may round it down."""
     up = abs(x).upper()
     return 0.0 if up == 0 else float(up) * (1.0 + 2.0**-50) + 2.0**-1070
 
 
-def largest(x: list[Any]) -> float:
-    """The size of the largest of some numbers."""
+def max_abs(x: list[Any]) -> float:
+    """Return the largest magnitude of some numbers, 0 if there are none."""
     return max((abs(float(q)) for q in x), default=0.0)
 
 
 def sign_of(x: Any) -> int:
-    """+1 where certainly x >= 0, -1 where certainly x < 0, else 0."""
+    """Return +1 if certainly x >= 0, -1 if certainly x < 0, else 0."""
     return 1 if x >= 0 else -1 if x < 0 else 0

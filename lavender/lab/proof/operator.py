@@ -1,4 +1,4 @@
-"""A of float64 numbers that are taken as exact."""
+"""The operator A of float64 numbers that count as exact, in balls, in rationals and in float64 with error bounds."""
 
 from __future__ import annotations
 
@@ -10,58 +10,61 @@ import numpy as np
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import CapabilityError
 from lavender.base.lazy_import import sparse as sp
-from lavender.lab.proof.numbers import UNIT, Balls, matrix, times, upper_end
+from lavender.lab.proof.numbers import UNIT, Balls, sparse_times, to_dense, upper_end
 from lavender.problem import Problem
 from lavender.problem.derived import cached_property
 
-LARGEST = 2000  # coupled unknowns of J and M, whose M^-1 is dense, in balls: a minute, 0.3 GB
+# Largest number of coupled unknowns of J and M: M^-1 is a dense matrix of balls: about a minute and 0.3 GB.
+MAX_COUPLED_UNKNOWNS = 2000
 
-SMALL = 64  # rows up to which A is dense balls
+MAX_DENSE_BALL_ROWS = 64  # Up to this many rows, A is a dense matrix of balls.
 
-DENSE = 300  # rows up to which float64 numbers are dense
+MAX_DENSE_FLOAT_ROWS = 300  # Up to this many rows, float64 matrices are dense.
 
-RANGE = 2.0**300  # of numbers whose products of three float64 holds
+# Products of three numbers between 1 / this and this neither overflow nor underflow in float64.
+PRODUCT_RANGE = 2.0**300
 
 
 class Rounded(NamedTuple):
-    """Float64 numbers and how far they may be off: arrays up to DENSE rows, sparse above."""
+    """Float64 numbers and bounds of their errors: arrays up to MAX_DENSE_FLOAT_ROWS rows, sparse matrices above."""
 
     near: Any
     off: Any
 
 
 def _in_range(a: Any) -> bool:
+    """Whether all non-zero numbers are in PRODUCT_RANGE."""
     live = abs(a.data[a.data != 0.0])
-    return bool(((live > 1.0 / RANGE) & (live < RANGE)).all())
+    return bool(((live > 1.0 / PRODUCT_RANGE) & (live < PRODUCT_RANGE)).all())
 
 
-def wider(x: Any) -> Any:
-    """More than these, which are rounded sums of nothing negative."""
+def round_up(x: Any) -> Any:
+    """Return upper bounds of sums that were rounded; no summand is negative."""
     return x * (1.0 + 1e-9)
 
 
 class Part:
-    """A of some rows and columns: exactly, times balls, and as float64 numbers with a bound."""
+    """A of some rows and columns: in exact balls, times balls, and as float64 numbers with error bounds."""
 
     def __init__(self, operator: Operator, kind: Balls, which: Any) -> None:
         self.which, self._operator, self._kind = which, operator, kind
-        self.dense = len(which) <= SMALL or operator.problem.generalized is not None
+        self.dense = len(which) <= MAX_DENSE_BALL_ROWS or operator.problem.generalized is not None
         if not self.dense:
             self._matrices = self._factors()
             self.dense = not all(map(_in_range, self._matrices)) and operator.transposed is not None
         if self.dense:
-            if len(which) > LARGEST:
+            if len(which) > MAX_COUPLED_UNKNOWNS:
                 raise CapabilityError(
-                    f"{len(which)} unknowns of J and M are coupled with each other; up to {LARGEST} are proven"
+                    f"{len(which)} unknowns of J and M are coupled; up to {MAX_COUPLED_UNKNOWNS} are proven"
                 )
             return
-        self._numbers = [_numbers(kind, f) for f in self._matrices]
+        self._numbers = [_row_entries(kind, f) for f in self._matrices]
         theta = operator.problem.compliance
         self._theta = np.zeros(len(which)) if theta is None else theta[which]
         self._soft = [kind.number(t) for t in self._theta.tolist()]
 
     def _factors(self) -> list[Any]:
-        """Matrices whose product, with the compliance, is A: the last one first."""
+        """Return the factors of A without compliance, in the order in which they are applied to x."""
         operator = self._operator
         rows = operator.rows[self.which]
         if operator.transposed is None:
@@ -76,7 +79,7 @@ class Part:
         return self._operator.block(self._kind, self.which)
 
     def times(self, x: list[Any]) -> list[Any]:
-        """A x."""
+        """Compute A x."""
         if self.dense:
             return list((self.exact * self._kind.matrix(len(x), 1, x)).entries())
         y = x
@@ -86,7 +89,7 @@ class Part:
 
     @cached_property
     def bounded(self) -> Rounded:
-        """A as float64 numbers, and how far they may be off."""
+        """A as float64 numbers with error bounds."""
         if self._operator.transposed is None:
             a = self._operator.rows[self.which][:, self.which]
             return self._bounded(a, abs(a) * 0.0)
@@ -95,28 +98,30 @@ class Part:
             near = [float(x.mid()) for x in entries]
             off = [upper_end(x - y) for x, y in zip(entries, near, strict=True)]
             both = (np.array(v).reshape(n, n) for v in (near, off))
-            return Rounded(*(v if n <= DENSE else sp.csr_array(v) for v in both))
+            return Rounded(*(v if n <= MAX_DENSE_FLOAT_ROWS else sp.csr_array(v) for v in both))
         _, inner, j = self._matrices
         soft, inner_size, size = sp.diags_array(self._theta), abs(inner), abs(j)
         half, half_size = j @ inner, size @ inner_size
-        k = int(np.diff(j.indptr).max() + np.diff(half.indptr).max()) + 2  # sums of sums of so many products
+        # Each entry is a sum of sums of at most k products.
+        k = int(np.diff(j.indptr).max() + np.diff(half.indptr).max()) + 2
         off = 2.0 * k * UNIT * (half_size @ size.T + soft)
-        return self._bounded(half @ j.T + soft, wider(off))
+        return self._bounded(half @ j.T + soft, round_up(off))
 
     def _bounded(self, near: Any, off: Any) -> Rounded:
-        dense = len(self.which) <= DENSE
+        """Build a `Rounded` of dense or sparse matrices, by the number of rows."""
+        dense = len(self.which) <= MAX_DENSE_FLOAT_ROWS
         return Rounded(*(a.toarray() if dense else sp.csr_array(a) for a in (near, off)))
 
 
-def _numbers(kind: Any, a: Any) -> list[list[tuple[Any, int]]]:
-    """The entries of each row of a sparse matrix, in numbers of a kind."""
+def _row_entries(kind: Any, a: Any) -> list[list[tuple[Any, int]]]:
+    """Return (number, column) of the entries of each row of a sparse matrix, as balls or rationals."""
     entries = list(zip([kind.number(x) for x in a.data.tolist()], a.indices.tolist(), strict=True))
     ptr = a.indptr.tolist()
     return [entries[s:e] for s, e in pairwise(ptr)]
 
 
 class Operator:
-    """A of float64 numbers that are taken as exact: its rows times impulses, and blocks of it, in numbers of a kind."""
+    """A of float64 numbers that count as exact: products with impulses, and blocks, in balls or rationals."""
 
     def __init__(self, problem: Problem) -> None:
         self.problem: Any = problem
@@ -125,62 +130,64 @@ class Operator:
             self.inverse = problem.rows.inverse_mass_matrix().tocsr()
         self.transposed = self.rows.T.tocsr() if problem.matrix is None else None
         self.target, self.v = self._targets()
-        self._mass: dict[Any, Any] = {}  # M^-1, by kind of number
-        self._bias: dict[Any, list[Any]] = {}  # b
+        self._mass: dict[Any, Any] = {}  # M^-1 for balls and for rationals
+        self._bias: dict[Any, list[Any]] = {}  # b for balls and for rationals
 
     def _targets(self) -> tuple[FloatArray, FloatArray | None]:
-        """What b was made of, target - J v*: a target that is nothing but rounding is 0. (b, None) of a matrix."""
+        """Split b = target - J v*: return (target, v*), rounding noise of a target set to 0; (b, None) for a matrix."""
         problem = self.problem
         if problem.matrix is not None:
             return problem.b, None
         v = problem.rows.v_free.ravel() if problem.generalized is None else problem.generalized.v_free
         target = problem.b + self.rows @ v
-        dust = 4.0 * UNIT * (abs(self.rows) @ abs(v) * (1 + np.diff(self.rows.indptr)) + abs(problem.b))
-        return np.where(abs(target) <= dust, 0.0, target), v
+        rounding_bound = (
+            4.0 * UNIT * (abs(self.rows) @ abs(v) * (1 + np.diff(self.rows.indptr)) + abs(problem.b))
+        )
+        return np.where(abs(target) <= rounding_bound, 0.0, target), v
 
     def soft(self, row: int) -> bool:
-        """Whether a row has a compliance."""
+        """Whether a row has compliance."""
         return self.transposed is not None and bool(self.problem.compliance[row] > 0.0)
 
     def bias(self, kind: Any) -> list[Any]:
-        """b of exact numbers."""
+        """Compute b from targets and v*, exactly."""
         if type(kind) in self._bias:
             return self._bias[type(kind)]
         out = [kind.number(x) for x in self.target.tolist()]
         if self.v is not None:
-            moved = times(kind, self.rows, [kind.number(x) for x in self.v.tolist()], None)
-            out = [x - y for x, y in zip(out, moved, strict=True)]
+            velocity = sparse_times(kind, self.rows, [kind.number(x) for x in self.v.tolist()], None)
+            out = [x - y for x, y in zip(out, velocity, strict=True)]
         self._bias[type(kind)] = out
         return out
 
-    def weighed(self, kind: Any, right: Any) -> Any:
-        """M^-1 times a matrix of balls or rationals (nv, k)."""
+    def apply_inverse_mass(self, kind: Any, right: Any) -> Any:
+        """Multiply M^-1 by a matrix (nv, k) of balls or rationals."""
         generalized = self.problem.generalized
         if generalized is None:
-            return matrix(kind, self.inverse) * right
+            return to_dense(kind, self.inverse) * right
         if type(kind) not in self._mass:
-            self._mass[type(kind)] = matrix(kind, generalized.mass).inv()
+            self._mass[type(kind)] = to_dense(kind, generalized.mass).inv()
         return self._mass[type(kind)] * right
 
     def block(self, kind: Any, which: Any) -> Any:
-        """A of these rows and columns."""
+        """Compute A of the rows and columns `which`, as a dense matrix."""
         if self.transposed is None:
-            return matrix(kind, self.rows[which][:, which])
+            return to_dense(kind, self.rows[which][:, which])
         part = self.rows[which]
         used = np.unique(part.indices)
         if self.problem.generalized is None:
             inner = self.inverse[used][:, used]
-            j = matrix(kind, part[:, used])
-            a = j * matrix(kind, inner) * j.transpose()
+            j = to_dense(kind, part[:, used])
+            a = j * to_dense(kind, inner) * j.transpose()
         else:
-            j = matrix(kind, part)
-            a = j * self.weighed(kind, j.transpose())
+            j = to_dense(kind, part)
+            a = j * self.apply_inverse_mass(kind, j.transpose())
         for k, i in enumerate(which.tolist()):
             a[k, k] += kind.number(float(self.problem.compliance[i]))
         return a
 
     def pattern(self, which: Any) -> Any:
-        """Where A of these rows and columns may be other than 0: float64 may round a sum of products to 0."""
+        """Return a sparsity pattern that contains A's: float64 may round a sum of products to 0."""
         if self.transposed is None:
             return (self.rows[which][:, which] != 0).astype(float)
         generalized = self.problem.generalized
@@ -193,19 +200,21 @@ class Operator:
         return j @ inner.astype(float) @ j.T
 
     def slack(self, kind: Any, impulse: list[Any]) -> list[Any]:
-        """w = A lambda - b of all rows."""
+        """Compute w = A lambda - b of all rows."""
         problem, number = self.problem, kind.number
-        # A ball about 0 is not 0; `!=` would have to be certain.
+        # A ball around 0 may contain other numbers, and `!=` is true only if it is certain: select entries by `not ==`.
         at = np.flatnonzero(~np.array([x == 0 for x in impulse], bool))
         if self.transposed is None:
-            a = times(kind, self.rows, impulse, at)
+            a = sparse_times(kind, self.rows, impulse, at)
         else:
-            pulled = times(kind, self.transposed, impulse, at)
+            generalized_impulse = sparse_times(kind, self.transposed, impulse, at)
             if problem.generalized is None:
-                moved = times(kind, self.inverse, pulled, None)
+                velocity = sparse_times(kind, self.inverse, generalized_impulse, None)
             else:
-                moved = self.weighed(kind, kind.matrix(len(pulled), 1, pulled)).entries()
-            a = times(kind, self.rows, moved, None)
+                velocity = self.apply_inverse_mass(
+                    kind, kind.matrix(len(generalized_impulse), 1, generalized_impulse)
+                ).entries()
+            a = sparse_times(kind, self.rows, velocity, None)
         theta = [0.0] * problem.m if problem.compliance is None else problem.compliance.tolist()
         return [
             x + number(t) * y - b if t else x - b
@@ -213,7 +222,7 @@ class Operator:
         ]
 
     def semidefinite(self) -> bool:
-        """Proof that x.A x >= 0 for every x, of exact numbers."""
+        """Prove that x.A x >= 0 for every x, with the numbers as exact; False if the proof fails."""
         problem = self.problem
         if problem.matrix is not None:
             return _semidefinite(problem.dense())
@@ -223,7 +232,7 @@ class Operator:
 
 
 def _semidefinite(a: FloatArray) -> bool:
-    """Whether Cholesky of symmetric matrices (..., n, n) less c I runs through, c what it may round.
+    """Whether Cholesky factorisation of the symmetric (..., n, n) matrices a - c I succeeds; c bounds its rounding.
 
     S. M. Rump 2006, Verification of positive definiteness, BIT 46, 433-452: c = g tr(A) / (1 - g), g = (n + 2) UNIT.
     """
@@ -235,7 +244,7 @@ def _semidefinite(a: FloatArray) -> bool:
     a = a / np.exp2(np.ceil(np.log2(np.where(scale > 0.0, scale, 1.0)))) + empty[..., None] * eye
     trace = np.trace(a, axis1=-2, axis2=-1)[..., None, None]
     try:
-        # Twice as much: of the trace, of the subtraction and of what underflows, too.
+        # Twice the bound covers the rounding of the trace, of the subtraction and underflow.
         np.linalg.cholesky(a - 2.0 * (n + 3) * UNIT * np.maximum(trace, 1.0) * eye)
     except np.linalg.LinAlgError:
         return False

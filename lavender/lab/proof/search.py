@@ -1,4 +1,4 @@
-"""The search for cases of blocks whose equations have a solution, and its enclosure."""
+"""The search for a case of each block such that the equations of all cases have a solution, and its enclosure."""
 
 from __future__ import annotations
 
@@ -11,78 +11,111 @@ import numpy as np
 from lavender.base.arrays import FloatArray, read_only
 from lavender.base.lazy_import import sparse as sp
 from lavender.lab.motion import uniqueness
-from lavender.lab.proof.dependence import Tangled, dependencies, pivots
+from lavender.lab.proof.dependence import Tangled, dependencies, order_by_dependence
 from lavender.lab.proof.island import Island, NoZero, Sticks
 from lavender.lab.proof.numbers import UNIT, Balls, Rationals, sign_of, upper_end
 from lavender.lab.proof.operator import Operator, Part
 from lavender.problem import Problem
 
-RATIONAL = 100  # unknowns up to which boundaries are decided in rational numbers, where nothing slides
+# Up to this many unknowns, if nothing slides, boundaries of two cases are decided in rational numbers.
+MAX_RATIONAL_UNKNOWNS = 100
 
-NAMED = 2000  # unknowns up to which a singular direction is looked for
+MAX_SINGULAR_DIRECTION_UNKNOWNS = (
+    2000  # Up to this many unknowns, a singular direction is computed to name blocks.
+)
 
-SMALL = 32  # unknowns that are not parted into islands
+MAX_SINGLE_ISLAND_UNKNOWNS = 32  # Up to this many unknowns, the equations are not split into islands.
 
-ROUNDS = 30  # changes of cases, as in an active-set method
+MAX_CASE_CHANGES = 30  # The cases change at most this often, as in an active-set method.
 
 
 @dataclass(frozen=True, eq=False)
 class Enclosure:
-    """An exact solution of the problem's own numbers and how far from an answer it is, or that there is none.
+    """An exact solution of the problem's float64 numbers and its distance from an answer, or a proof that none exists.
 
-    `str()` is a line.
+    `str()` gives one line.
+
+    Parameters
+    ----------
+    proven : bool
+        An exact solution is enclosed.
+    impulse_radius : float, N s
+        Largest |lambda_i - lambda_i*| of a row, rounded up; inf if nothing is proven.
+    velocity_radius : float, m/s
+        Largest |w_i - w_i*| of a row, rounded up; inf if nothing is proven.
+    unique : bool
+        All solutions have the same velocities: proved for convex laws; under Coulomb's law only by `motion.uniqueness`.
+    reason : str
+        If nothing is proven: the cause and a remedy. If it is proven: rows with impulses of a family.
+    impulse : (m,) N s, or None
+        The exact solution, rounded.
+    boundary : tuple of str
+        Names of degenerate blocks: between two cases, dependent to rounding, or singular.
+    infeasible : bool
+        A certificate proves that the problem has no solution; `reason` names the blocks.
     """
 
-    proven: bool  # an exact solution is enclosed
-    # N s: largest |lambda_i - lambda_i*| of a row, rounded up; inf where nothing is proven
+    proven: bool
     impulse_radius: float = math.inf
-    velocity_radius: float = math.inf  # m/s: largest |w_i - w_i*| of a row
-    unique: bool = (
-        False  # no other solution has other velocities: convex laws; Coulomb's only by `motion.uniqueness`
-    )
-    # why nothing is proven, and what would be needed; where it is: rows whose impulses are one of a family
+    velocity_radius: float = math.inf
+    unique: bool = False
     reason: str = ""
-    impulse: FloatArray | None = field(default=None, repr=False)  # (m,) N s, the exact one rounded
-    # degenerate blocks by name: between two cases, dependent to rounding, or singular
+    impulse: FloatArray | None = field(default=None, repr=False)
     boundary: tuple[str, ...] = ()
-    infeasible: bool = (
-        False  # a certificate proves that the problem has no solution; `reason` names the blocks
-    )
+    infeasible: bool = False
 
     def __str__(self) -> str:
         if self.infeasible:
             return self.reason
         if not self.proven:
             return f"not proven: {self.reason}"
-        words = "velocities unique" if self.unique else "perhaps one of several motions"
+        explanation = "velocities unique" if self.unique else "perhaps one of several motions"
         more = f"; {self.reason}" if self.reason else ""
         return (
             f"proven: an exact solution within {self.impulse_radius:.1e} N s, {self.velocity_radius:.1e} m/s of "
-            f"each row, {words}{more}"
+            f"each row, {explanation}{more}"
         )
 
 
 @dataclass
-class _Part:
+class _FrictionComponent:
+    """A friction component: its rows and case."""
+
     rows: list[int]
-    reach: list[float]  # c of each row
+    coefficients: list[float]  # c of each row
     slides: bool = False
 
 
 @dataclass
 class _Block:
-    """A bounded row (no normal), or a contact: its case."""
+    """A bounded row or a contact, and its case.
+
+    Parameters
+    ----------
+    index : int
+        Block of the problem.
+    first : int
+        Its first row: the normal of a contact.
+    parts : list of _FrictionComponent, or None
+        Friction components of a contact; None for a row.
+    loaded : bool
+        A contact has an impulse; a row is inside its bounds.
+    at : float, N s
+        Bound at which a row is that is not inside its bounds.
+    touches : bool
+        The block is at its bound, or open, and perhaps w = 0, too.
+    """
 
     index: int
     first: int
-    parts: list[_Part] | None = None  # None: a row
-    loaded: bool = True  # of a contact; of a row: inside its bounds
-    at: float = 0.0  # N s, where a row is not inside
-    touches: bool = False  # at its bound, or open, and perhaps w = 0 too
+    components: list[_FrictionComponent] | None = None
+    loaded: bool = True
+    at: float = 0.0
+    touches: bool = False
 
 
 class _Undecided(Exception):
-    """A condition that balls or the number of rounds leave open."""
+    """Balls, or the maximum number of case changes, leave a condition undecided."""
 
     def __init__(self, reason: str, boundary: tuple[str, ...] = ()) -> None:
         super().__init__(reason)
@@ -90,30 +123,36 @@ class _Undecided(Exception):
 
 
 class Search:
-    """Cases of all blocks, their equations, and the changes of cases that inequalities ask for."""
+    """The cases of all blocks, their equations, and the changes of cases that inequalities require.
 
-    def __init__(self, flint: Any, problem: Problem, given: FloatArray, answer: FloatArray) -> None:
+    The search starts from the impulse `start` (m,) [N s]; distances are measured from `answer` (m,) [N s].
+    """
+
+    def __init__(self, flint: Any, problem: Problem, start: FloatArray, answer: FloatArray) -> None:
         self.flint, self.problem = flint, problem
-        self.given, self.answer = given, answer  # where it begins, and what distances are from
+        self.start, self.answer = start, answer
         self.operator, self.cone = Operator(problem), problem.law == "cone"
-        self.blocks = self._cases()
+        self.blocks = self._initial_cases()
         self.family: Any = np.zeros(0, np.int64)
-        self.singular = False  # in float64: more bits do not help
-        self.still: Any = np.zeros(0, np.int32)  # rows of blocks that touch: w = 0, by rows it depends on
+        self.singular = False  # The equations are singular in float64: a higher precision does not help.
+        # Rows of touching blocks that have w = 0 by rows they depend on.
+        self.still: Any = np.zeros(0, np.int32)
 
     # -- cases ----------------------------------------------------------------------------------
 
-    def _cases(self) -> list[_Block]:
-        """From the point that one update would project: inside a bound or beyond it."""
+    def _initial_cases(self) -> list[_Block]:
+        """Choose the case of each block by the point that one update would project: inside a bound or beyond it."""
         cones = self.problem.cones
-        lam, w, d = self.given, self.problem.slack(self.given), self.problem.d
-        parts: dict[int, list[_Part]] = {}
+        lam, w, d = self.start, self.problem.slack(self.start), self.problem.d
+        components: dict[int, list[_FrictionComponent]] = {}
         contact, reaches = cones.is_contact, cones.reach
         for i, rows in cones.parts():
-            reach = reaches[rows]
-            if (reach > 0.0).any():
-                live = rows[reach > 0.0]
-                parts.setdefault(i, []).append(_Part(live.tolist(), reach[reach > 0.0].tolist()))
+            coefficients = reaches[rows]
+            if (coefficients > 0.0).any():
+                positive = rows[coefficients > 0.0]
+                components.setdefault(i, []).append(
+                    _FrictionComponent(positive.tolist(), coefficients[coefficients > 0.0].tolist())
+                )
         out = []
         for i, (first, end) in enumerate(zip(cones.ptr[:-1].tolist(), cones.ptr[1:].tolist(), strict=True)):
             if not contact[i]:
@@ -122,32 +161,38 @@ class Search:
                     inside = (low < x or low == -math.inf) and (x < high or high == math.inf)
                     out.append(_Block(i, r, None, inside, float(low if x <= low else high)))
                 continue
-            own = parts.get(i, [])
-            speed = [math.hypot(*(c * w[r] for r, c in zip(p.rows, p.reach, strict=True))) for p in own]
+            own = components.get(i, [])
+            speed = [
+                math.hypot(*(c * w[r] for r, c in zip(p.rows, p.coefficients, strict=True))) for p in own
+            ]
             shifted = w[first] - (sum(speed) if self.cone else 0.0)
             block = _Block(i, first, own, lam[first] - shifted / d[first] > 0.0)
-            for part in own:
-                step = max(d[r] for r in part.rows)
-                y = [(lam[r] - w[r] / step) / c for r, c in zip(part.rows, part.reach, strict=True)]
-                part.slides = math.hypot(*y) > lam[first]
+            for component in own:
+                step = max(d[r] for r in component.rows)
+                y = [
+                    (lam[r] - w[r] / step) / c
+                    for r, c in zip(component.rows, component.coefficients, strict=True)
+                ]
+                component.slides = math.hypot(*y) > lam[first]
             out.append(block)
         return out
 
     def run(self) -> Enclosure:
-        """Change cases until a solution is enclosed, or say why none is."""
+        """Change cases until a solution is enclosed; return why none is if the search ends before."""
         try:
             tried: set[tuple[Any, ...]] = set()
             before: tuple[Any, ...] = ()
-            exactly = False  # in rational numbers, once balls cannot tell
-            for _ in range(ROUNDS):
+            exactly = False  # Continue in rational numbers once balls do not decide.
+            for _ in range(MAX_CASE_CHANGES):
                 key = tuple(
-                    (b.loaded, b.at, b.touches, tuple(p.slides for p in b.parts or ())) for b in self.blocks
+                    (b.loaded, b.at, b.touches, tuple(p.slides for p in b.components or ()))
+                    for b in self.blocks
                 )
                 if key in tried:
-                    turned = [
+                    alternating = [
                         b for b, one, other in zip(self.blocks, key, before, strict=True) if one != other
                     ]
-                    raise self._undecided(turned, "between two cases, which change in turns")
+                    raise self._undecided_error(alternating, "between two cases, which change in turns")
                 tried.add(key)
                 before = key
                 try:
@@ -155,54 +200,59 @@ class Search:
                 except _Recase:
                     continue
                 if not (exactly and self.exact):
-                    boundary = self._changed(lam, w)
+                    boundary = self._change_wrong_cases(lam, w)
                     exactly = bool(boundary) and self.exact
                 if exactly:
-                    boundary = self._changed(*self.solve(Rationals(self.flint)))
+                    boundary = self._change_wrong_cases(*self.solve(Rationals(self.flint)))
                 if boundary == []:
-                    return self.told(lam, w)
+                    return self.make_enclosure(lam, w)
                 if boundary:
-                    raise self._undecided(
+                    raise self._undecided_error(
                         boundary, f"on the boundary of two cases, closer than {self.flint.ctx.prec} bits tell"
                     )
-            raise _Undecided(f"cases still change after {ROUNDS} rounds; a more accurate answer is needed")
+            raise _Undecided(
+                f"cases still change after {MAX_CASE_CHANGES} rounds; a more accurate answer is needed"
+            )
         except _Undecided as undecided:
             return Enclosure(False, reason=str(undecided), boundary=undecided.boundary)
 
-    def _undecided(self, blocks: list[_Block], words: str) -> _Undecided:
+    def _undecided_error(self, blocks: list[_Block], explanation: str) -> _Undecided:
+        """Create the exception that names blocks and says why they are undecided."""
         names = tuple(dict.fromkeys(self.problem.row_name(block.first) for block in blocks))
-        return _Undecided(f"{_listed(names)}: {words}", names)
+        return _Undecided(f"{_join_names(names)}: {explanation}", names)
 
     # -- equations ------------------------------------------------------------------------------
 
-    def _unknown(self) -> tuple[Any, list[Any]]:
-        """Rows that the case does not fix, and the impulses of all (floats where fixed)."""
+    def _split_unknown_and_fixed(self) -> tuple[Any, list[Any]]:
+        """Return the rows that the case does not fix, and the impulses of all rows (floats if fixed)."""
         fixed = [0.0] * self.problem.m
         unknown = []
         for block in self.blocks:
-            if block.parts is None:
+            if block.components is None:
                 if block.loaded:
                     unknown.append(block.first)
                 else:
                     fixed[block.first] = block.at
             elif block.loaded:
-                unknown += [block.first, *(r for part in block.parts for r in part.rows)]
+                unknown += [block.first, *(r for component in block.components for r in component.rows)]
         return np.array(sorted(unknown), np.int64), fixed
 
     def solve(self, kind: Any = None) -> tuple[list[Any], list[Any]]:
-        """Balls that hold a zero of the equations, or the zero in rationals: impulses and slack of all rows."""
+        """Compute balls that contain a zero of the equations, or the zero in rationals: (lam, w) of all rows."""
         kind = Balls(self.flint) if kind is None else kind
         self.number = kind.number
-        unknown, fixed = self._unknown()
-        free = self._independent(unknown, fixed)
+        unknown, fixed = self._split_unknown_and_fixed()
+        free = self._independent_rows(unknown, fixed)
         self.family = np.setdiff1d(unknown, free)
         for r in self.family.tolist():
-            fixed[r] = float(self.given[r])
+            fixed[r] = float(self.start[r])
         lam = [kind.number(x) for x in fixed]
         base = self.operator.slack(kind, lam)
-        islands = self._islands(free)
-        slides = any(part.slides for block in self.blocks if block.loaded for part in block.parts or ())
-        self.exact = not slides and max(map(len, islands), default=0) <= RATIONAL
+        islands = self._split_islands(free)
+        slides = any(
+            component.slides for block in self.blocks if block.loaded for component in block.components or ()
+        )
+        self.exact = not slides and max(map(len, islands), default=0) <= MAX_RATIONAL_UNKNOWNS
         for which in islands:
             if isinstance(kind, Rationals):
                 right = kind.matrix(len(which), 1, [-base[r] for r in which.tolist()])
@@ -211,27 +261,28 @@ class Search:
                 ):
                     lam[r] = x
             else:
-                self._island(which, lam, base)
+                self._enclose_island(which, lam, base)
         return lam, self.operator.slack(kind, lam)
 
-    def _islands(self, free: Any) -> list[Any]:
-        if len(free) <= SMALL:
+    def _split_islands(self, free: Any) -> list[Any]:
+        """Split the free rows into sets that A and contacts do not couple."""
+        if len(free) <= MAX_SINGLE_ISLAND_UNKNOWNS:
             return [free] if len(free) else []
         graph = self.operator.pattern(free)
         block = np.searchsorted(self.problem.cones.ptr, free, side="right")
-        together = sp.coo_array((np.ones(len(free)), (np.arange(len(free)), block))).tocsr()
-        graph = graph + together @ together.T
+        same_block = sp.coo_array((np.ones(len(free)), (np.arange(len(free)), block))).tocsr()
+        graph = graph + same_block @ same_block.T
         n, label = sp.csgraph.connected_components(graph, directed=False)
         return [free[label == k] for k in range(n)]
 
-    def _independent(self, unknown: Any, fixed: list[float]) -> Any:
-        """A largest set of rows with w = 0 whose J is independent; the others must depend on it exactly, b too."""
+    def _independent_rows(self, unknown: Any, fixed: list[float]) -> Any:
+        """Return a maximal set of rows with w = 0 and independent J; the others must depend on it exactly, b too."""
         still = set(unknown.tolist())
         for block in self.blocks:
-            for part in block.parts or ():
-                if part.slides:
-                    still -= set(part.rows)
-            if self.cone and block.parts and any(part.slides for part in block.parts):
+            for component in block.components or ():
+                if component.slides:
+                    still -= set(component.rows)
+            if self.cone and block.components and any(component.slides for component in block.components):
                 still.discard(block.first)
         j = self.operator.rows
         if self.operator.transposed is None:
@@ -245,38 +296,38 @@ class Search:
         rows, self.still = np.array(sorted(still), np.int64), touching[:0]
         if not len(rows):
             return unknown
-        first, numerical = pivots(j[rows])
+        first, numerical = order_by_dependence(j[rows])
         if numerical == len(rows) and not len(touching):
             return unknown
         own = rows[first]
-        while True:  # w = 0 of rows with load; not of one that touches, which must depend on them alone
+        while True:  # Rows with load have w = 0; a touching row has it only if it depends on rows with load.
             rows = np.concatenate([own, touching])
             try:
-                found = dependencies(self.flint, j[rows], self.operator.target[rows], numerical)
+                split = dependencies(self.flint, j[rows], self.operator.target[rows], numerical)
             except Tangled as tangled:
                 if len(touching):
                     touching = touching[:0]
                     continue
-                raise self._named(
+                raise self._dependent_rows_error(
                     rows[tangled.args[0]],
                     "depend on each other to rounding, too many to tell whether exactly",
                 ) from None
-            kept, contradict = (rows[k] for k in found)
-            left = np.setdiff1d(touching, kept)
+            independent, contradict = (rows[k] for k in split)
+            left = np.setdiff1d(touching, independent)
             if len(left) == len(touching):
                 break
             touching = left
         wrong = np.setdiff1d(contradict, touching)
         if len(wrong):
-            self._open(wrong)
+            self._fix_bounded_rows(wrong)
         self.still = np.setdiff1d(touching, contradict)
-        return np.setdiff1d(unknown, np.setdiff1d(rows, kept))
+        return np.setdiff1d(unknown, np.setdiff1d(rows, independent))
 
-    def _open(self, rows: Any) -> None:
-        """Rows that cannot all have w = 0, by exact numbers: one that is bounded by itself carries nothing instead."""
+    def _fix_bounded_rows(self, rows: Any) -> None:
+        """Fix a bounded row at its bound if rows cannot all have w = 0 exactly; raise an error if none is bounded."""
         opened = False
         for block in self.blocks:
-            if block.loaded and block.first in rows and not block.parts:
+            if block.loaded and block.first in rows and not block.components:
                 low, high = (
                     float(self.problem.cones.lower[block.first]),
                     float(self.problem.cones.upper[block.first]),
@@ -286,67 +337,72 @@ class Search:
                 block.loaded, block.at, opened = False, low if math.isfinite(low) else high, True
         if opened:
             raise _Recase
-        raise self._named(rows, "depend on other rows to rounding and contradict them in the last bits")
+        raise self._dependent_rows_error(
+            rows, "depend on other rows to rounding and contradict them in the last bits"
+        )
 
-    def _named(self, rows: Any, words: str) -> _Undecided:
+    def _dependent_rows_error(self, rows: Any, explanation: str) -> _Undecided:
+        """Create the exception for rows that depend on each other to rounding."""
         names = tuple(self.problem.row_name(int(r)) for r in rows)
-        words += "; which carry load hangs on these (a compliance on them decides it)"
-        return _Undecided(f"{_listed(names)}: {words}", names)
+        explanation += "; which carry load hangs on these (a compliance on them decides it)"
+        return _Undecided(f"{_join_names(names)}: {explanation}", names)
 
-    def _island(self, which: Any, lam: list[Any], base: list[Any]) -> None:
+    def _enclose_island(self, which: Any, lam: list[Any], base: list[Any]) -> None:
         """Enclose the impulses of `which`, by (2), into `lam`."""
         own = set(which.tolist())
         sliding = [
-            (block.first, part)
+            (block.first, component)
             for block in self.blocks
-            if block.parts
+            if block.components
             and block.loaded
-            and (block.first in own or any(r in own for p in block.parts for r in p.rows))
-            for part in block.parts
-            if part.slides
+            and (block.first in own or any(r in own for p in block.components for r in p.rows))
+            for component in block.components
+            if component.slides
         ]
         part = Part(self.operator, Balls(self.flint), which)
         island = Island(self.flint, part, sliding, self.cone, lam, base)
         try:
-            found = island.enclose(self.given[which].tolist(), float(abs(self.problem.b).max()))
+            enclosure = island.enclose(self.start[which].tolist(), float(abs(self.problem.b).max()))
         except Sticks as slow:
-            for one in slow.parts:
+            for one in slow.components:
                 one.slides = False
             raise _Recase from None
         except NoZero as error:
-            raise self._singular(which, error.slope) from None
-        for r, x in zip(which.tolist(), found, strict=True):
+            raise self._singular_error(which, error.slope) from None
+        for r, x in zip(which.tolist(), enclosure, strict=True):
             lam[r] = x
 
-    def _singular(self, which: Any, slope: Any) -> _Undecided:
-        """Names the blocks whose impulses the equations do not fix, if they are singular."""
+    def _singular_error(self, which: Any, slope: Any) -> _Undecided:
+        """Create the exception that names the blocks that have impulses not fixed by singular equations."""
         rows = which[:0]
         slope = slope if isinstance(slope, np.ndarray) else slope.toarray()
-        if len(which) <= NAMED and np.isfinite(slope).all():
+        if len(which) <= MAX_SINGULAR_DIRECTION_UNKNOWNS and np.isfinite(slope).all():
             _, size, direction = np.linalg.svd(
                 slope / np.maximum(abs(slope).max(axis=1, keepdims=True), UNIT)
             )
             if size[-1] <= 1e-12 * size[0]:
                 self.singular = True
                 rows = which[abs(direction[-1]) > 0.1 * abs(direction[-1]).max()]
-        words = "no box proves a zero: the answer is too far from a solution, or two solutions are near"
+        explanation = "no box proves a zero: the answer is too far from a solution, or two solutions are near"
         if len(rows):
-            words = (
+            explanation = (
                 "their equations are singular to rounding; a family of solutions, or one between two cases"
             )
         first = self.problem.cones.ptr[np.searchsorted(self.problem.cones.ptr, rows, side="right") - 1]
         names = tuple(dict.fromkeys(self.problem.row_name(int(r)) for r in first))
-        return _Undecided(f"{_listed(names) or f'{len(which)} impulses that are coupled'}: {words}", names)
+        return _Undecided(
+            f"{_join_names(names) or f'{len(which)} impulses that are coupled'}: {explanation}", names
+        )
 
     # -- inequalities ---------------------------------------------------------------------------
 
-    def _changed(self, lam: list[Any], w: list[Any]) -> list[_Block] | None:
-        """Change the cases that are certainly wrong: None; else the blocks whose inequalities cannot be told."""
+    def _change_wrong_cases(self, lam: list[Any], w: list[Any]) -> list[_Block] | None:
+        """Change cases that are certainly wrong and return None; otherwise return the blocks that are undecided."""
         changed, boundary = False, []
         cones, number = self.problem.cones, self.number
         for block in self.blocks:
             r = block.first
-            if block.parts is None:
+            if block.components is None:
                 low, high = float(cones.lower[r]), float(cones.upper[r])
                 if block.loaded:
                     below = sign_of(lam[r] - number(low)) if math.isfinite(low) else 1
@@ -370,12 +426,12 @@ class Search:
                         boundary.append(block)
                 continue
             speeds = [
-                sum(((number(c) * w[k]) ** 2 for k, c in zip(p.rows, p.reach, strict=True)), 0 * w[r])
-                for p in block.parts
+                sum(((number(c) * w[k]) ** 2 for k, c in zip(p.rows, p.coefficients, strict=True)), 0 * w[r])
+                for p in block.components
             ]
             if not block.loaded:
                 sign = sign_of(w[r])
-                # w_n >= sum s; one root of the sum of squares where there is one part
+                # The condition is w_n >= sum s; with a single component, squares are compared and no root is needed.
                 if self.cone and sign > 0:
                     sign = (
                         sign_of(w[r] * w[r] - speeds[0])
@@ -386,34 +442,37 @@ class Search:
                     block.loaded = changed = True
                 elif not sign and not block.touches:
                     block.touches = changed = True
-                elif not sign and ((self.cone and block.parts) or r not in self.still):
+                elif not sign and ((self.cone and block.components) or r not in self.still):
                     boundary.append(block)
                 continue
             sign = sign_of(lam[r])
             if sign <= 0:
                 block.loaded, block.touches, changed = False, not sign, True
                 continue
-            for part in block.parts:
-                if part.slides:
-                    continue  # |lambda / c| = lambda_n by (1), against w by its sign
+            for component in block.components:
+                if component.slides:
+                    continue  # |lambda / c| = lambda_n by (1), against w by its sign.
                 y = sum(
-                    ((lam[k] / number(c)) ** 2 for k, c in zip(part.rows, part.reach, strict=True)),
+                    (
+                        (lam[k] / number(c)) ** 2
+                        for k, c in zip(component.rows, component.coefficients, strict=True)
+                    ),
                     0 * lam[r],
                 )
                 sign = sign_of(lam[r] * lam[r] - y)
                 if sign < 0:
-                    part.slides = changed = True
+                    component.slides = changed = True
                 elif not sign:
                     boundary.append(block)
         return None if changed else boundary
 
     def _root(self, square: Any) -> Any:
-        """A ball that holds the root; a ball of a square may reach below 0."""
+        """Compute a ball that contains the root; the ball of a square may extend below 0."""
         square = self.flint.arb(square)
         return square.sqrt() if square > 0 else square.abs_upper().sqrt() * self.flint.arb(0.5, 0.5)
 
-    def told(self, lam: list[Any], w: list[Any]) -> Enclosure:
-        """The enclosure of balls of impulses and slacks."""
+    def make_enclosure(self, lam: list[Any], w: list[Any]) -> Enclosure:
+        """Build the `Enclosure` of balls of impulses and slacks."""
         kind = Balls(self.flint)
         own = self.operator.slack(kind, [kind.number(x) for x in self.answer.tolist()])
         off = max((upper_end(x - g) for x, g in zip(lam, self.answer.tolist(), strict=True)), default=0.0)
@@ -423,7 +482,7 @@ class Search:
         reason = ""
         if len(self.family):
             names = tuple(self.problem.row_name(int(r)) for r in self.family)
-            reason = f"the impulses of {_listed(names)} are one of a family"
+            reason = f"the impulses of {_join_names(names)} are one of a family"
         convex = self.problem.law != "coulomb"
         unique = self.operator.semidefinite() if convex else uniqueness(self.problem.disk).proved
         return Enclosure(
@@ -437,8 +496,9 @@ class Search:
 
 
 class _Recase(Exception):
-    """Cases of blocks were changed before there was a zero."""
+    """The cases of some blocks were changed before a zero was found."""
 
 
-def _listed(names: tuple[str, ...]) -> str:
+def _join_names(names: tuple[str, ...]) -> str:
+    """Join up to four names."""
     return ", ".join(names[:4]) + (" and others" if len(names) > 4 else "")

@@ -1,4 +1,4 @@
-"""Problems that say why they are there: families with parameters, and what their solution is known to be.
+"""Test problems with the reason for each and its known solution: parametric families, named cases, and sets of cases.
 
 ```python
 from lavender import suite
@@ -65,6 +65,7 @@ __all__ = [
     "walking",
 ]
 
+# Models of each package in the set "robots".
 ROBOTS = {
     "gymnasium": ("ant", "half_cheetah", "hopper", "humanoid", "humanoidstandup", "pusher_v5", "walker2d_v5"),
     "dm_control": (
@@ -79,8 +80,8 @@ ROBOTS = {
     ),
 }
 
-#: Lists of cases by name. "default" is what `lavender report` runs with no files: one case for each thing that
-#: separates solvers, small enough for all of them.
+#: Sets of cases by name. `lavender report` without files runs "default": one case for each property that separates
+#: solvers, small enough for all of them.
 SETS: dict[str, tuple[str, ...]] = {
     "default": (
         "two_particles",
@@ -125,7 +126,7 @@ SETS: dict[str, tuple[str, ...]] = {
 
 
 def families() -> dict[str, str]:
-    """Every family: its name with parameters and their defaults, and one line."""
+    """Return {"name(parameter=default, ...)": one-line summary} of every family."""
     out = {}
     for f in FAMILIES.values():
         shown = [f"{n}={spell(p.default)}" for n, p in f.signature.parameters.items() if n not in f.preset]
@@ -134,14 +135,14 @@ def families() -> dict[str, str]:
 
 
 def case(text: str) -> Case:
-    """The case of a name such as "stack(n=64)"; parameters that are left out take their defaults.
+    """Build the case of a name such as "stack(n=64)"; missing parameters have their defaults.
 
     Raises
     ------
     UnknownName
-        No such family or parameter; the nearest are listed.
+        The family or parameter is unknown; the nearest names are listed.
     InputError
-        Not a name with parameters, or a value out of range.
+        The text is not a name with parameters, or a value is out of range.
     """
     name, values = parse(text)
     if name not in FAMILIES:
@@ -150,25 +151,25 @@ def case(text: str) -> Case:
 
 
 def cases(text: str) -> Iterator[Case]:
-    """The cases of a set ("default", "@hard"), or the one case of that name; made one by one.
+    """Build the cases of a set ("default", "@hard") one by one, or the single case of that name.
 
     Raises
     ------
     UnknownName, InputError
-        As `case`, at once.
+        As `case`, when called.
     """
-    if (chosen := names(text)) == (text,):
+    if (selected := names(text)) == (text,):
         return iter([case(text)])
-    return (case(one) for one in chosen)
+    return (case(name) for name in selected)
 
 
 def names(text: str) -> tuple[str, ...]:
-    """The names of a set's cases ("default", "@hard"), or this one alone.
+    """Return the names of a set's cases ("default", "@hard"), or the given name alone.
 
     Raises
     ------
     UnknownName
-        No such set.
+        The set is unknown.
     """
     if not isinstance(text, str):
         raise UnknownName("set of cases", text, SETS)
@@ -179,5 +180,5 @@ def names(text: str) -> tuple[str, ...]:
 
 
 def default() -> list[Case]:
-    """What `lavender report` runs when no file is named."""
+    """Build the cases that `lavender report` runs if no file is named."""
     return list(cases("default"))

@@ -1,4 +1,4 @@
-"""From bodies and contact points to factored rows, all at once. Unit: kg, m, s; one time step."""
+"""Build problem rows from bodies and contact points. Units: kg, m, s; one time step."""
 
 from __future__ import annotations
 
@@ -14,29 +14,29 @@ from lavender.problem import Problem
 from lavender.problem.rows import Rows
 
 GRAVITY = 9.81  # m/s^2, along -z
-STEP = 0.01  # s
-FALL = GRAVITY * STEP  # m/s, speed that one step of gravity adds
+STEP_SIZE = 0.01  # s
+FALL_SPEED = GRAVITY * STEP_SIZE  # m/s, speed that gravity adds in one step
 
-FRICTIONS = ("none", "coulomb", "cone")
+FRICTION_LAWS = ("none", "coulomb", "cone")
 
 
-def each(function: Callable[[float], float], x: Any) -> FloatArray:
-    """A function of `math` of every number: the last bits of NumPy's own hang on the processor's vectors."""
+def map_scalar(function: Callable[[float], float], x: Any) -> FloatArray:
+    """Apply a function of `math` to every number: the last bits of NumPy's functions depend on the processor."""
     return np.array([function(value) for value in x.ravel().tolist()]).reshape(x.shape)
 
 
 class Bodies:
-    """Bodies with isotropic inertia; v_free holds one step of gravity."""
+    """Bodies with isotropic inertia; v_free holds the velocity after one step of gravity."""
 
     def __init__(self, position: Any, mass: Any, inertia_per_mass: float) -> None:
         self.position = np.asarray(position, float).reshape(-1, 3)  # (n, 3) m
         self.mass = np.broadcast_to(np.asarray(mass, float), (len(self.position),)).copy()  # (n,) kg
         self.inertia = inertia_per_mass * self.mass  # (n,) kg m^2
         self.v_free = np.zeros((len(self.mass), 6))  # (n, 6) m/s, rad/s
-        self.v_free[:, 2] = -FALL
+        self.v_free[:, 2] = -FALL_SPEED
 
     def rows(self, contacts: Contacts | None = None, **more: Any) -> Rows:
-        """These bodies with joints or contacts; point masses (no inertia) do not turn."""
+        """Build the rows of these bodies with joints or contacts; point masses (no inertia) do not rotate."""
         if contacts is not None:
             more |= dict(zip(("arm_a", "arm_b"), contacts.arms(self.position), strict=True))
             more |= {"normal": contacts.normal, "tangent": contacts.tangent(), "contact_body": contacts.body}
@@ -48,7 +48,7 @@ class Bodies:
 
 
 class Contacts:
-    """Contact points: normal (c, 3) from body a to body b, `body` (c, 2), -1 = ground."""
+    """Contact points: normal (c, 3) from body a to body b, `body` (c, 2), -1 for the ground."""
 
     def __init__(self, body: Any, point: Any, normal: Any) -> None:
         self.body: IntArray = np.asarray(body, np.int32).reshape(-1, 2)
@@ -56,7 +56,7 @@ class Contacts:
         self.normal: FloatArray = np.broadcast_to(np.asarray(normal, float), self.point.shape).copy()
 
     def arms(self, position: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """From the centre of a, and of b, to the point; zero for the ground."""
+        """Compute the arms from the centres of a and b to the points, (c, 3) each [m]; zero for the ground."""
         a, b = (
             np.where(side[:, None] >= 0, self.point - position[np.maximum(side, 0)], 0.0)
             for side in (self.body[:, 0], self.body[:, 1])
@@ -64,7 +64,7 @@ class Contacts:
         return a, b
 
     def tangent(self) -> FloatArray:
-        """n x e_x, or n x e_y where n is close to e_x; unit."""
+        """Compute unit tangents (c, 3): n x e_x, or n x e_y if n is close to e_x."""
         other = np.where(np.abs(self.normal[:, :1]) < 0.7, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
         t = np.cross(self.normal, other)
         return t / np.linalg.norm(t, axis=1, keepdims=True)
@@ -73,15 +73,15 @@ class Contacts:
 def contact_problem(
     bodies: Bodies, contacts: Contacts, friction: str = "none", mu: Any = 0.5, target: Any = 0.0, **more: Any
 ) -> Problem:
-    """Contacts without friction, or with two tangents and the law "coulomb" or "cone".
+    """Build a problem of contacts without friction, or with two tangents and the law "coulomb" or "cone".
 
     Raises
     ------
     InputError
-        Another word for `friction`.
+        `friction` is none of these.
     """
-    if friction not in FRICTIONS:
-        raise InputError(f"friction is {friction!r}; {', '.join(FRICTIONS)} are known")
+    if friction not in FRICTION_LAWS:
+        raise InputError(f"friction is {friction!r}; {', '.join(FRICTION_LAWS)} are known")
     rows = bodies.rows(contacts)
     if friction == "none":
         return Problem.from_rows(rows, target, **more)
@@ -89,14 +89,14 @@ def contact_problem(
 
 
 def joint_problem(bodies: Bodies, body: Any, jac: Any, size: int, target: Any = 0.0, **more: Any) -> Problem:
-    """Joints of `size` rows each: jac (k size, 12), body (k, 2)."""
+    """Build a problem of joints of `size` rows each: jac (k size, 12), body (k, 2)."""
     ptr = np.arange(0, len(jac) + 1, size, dtype=np.int32)
     rows = bodies.rows(jac=np.asarray(jac, float), joint_ptr=ptr, joint_body=np.asarray(body, np.int32))
     return Problem.from_rows(rows, target, **more)
 
 
 def manifold(body: Any, centre: Any, half_x: Any) -> Contacts:
-    """Four corner points of horizontal rectangles, 1 m along y: body (k, 2), centre (k, 3), half widths; normals up."""
+    """Place four corner points on horizontal rectangles, 1 m along y: body (k, 2), centre (k, 3) [m]; normals up."""
     sign = np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]], float)
     half = np.broadcast_to(np.asarray(half_x, float), (len(body),))
     point = np.repeat(np.asarray(centre, float), 4, axis=0)
@@ -106,33 +106,33 @@ def manifold(body: Any, centre: Any, half_x: Any) -> Contacts:
 
 
 def tower(n: int) -> tuple[FloatArray, IntArray, FloatArray]:
-    """Unit bodies on each other: positions (n, 3), pairs (n, 2) from the ground on, and feet (n, 3) [m]."""
+    """Place unit bodies on each other: positions (n, 3), body pairs (n, 2) from the ground up, contacts (n, 3) [m]."""
     k = np.arange(n)
-    foot = np.stack([0.0 * k, 0.0 * k, k], 1)
-    return foot + np.array([0.0, 0.0, 0.5]), np.stack([k - 1, k], 1), foot
+    contact_point = np.stack([0.0 * k, 0.0 * k, k], 1)
+    return contact_point + np.array([0.0, 0.0, 0.5]), np.stack([k - 1, k], 1), contact_point
 
 
-def sideways(bodies: Bodies, speed: float, seed: int = 5) -> None:
-    """Add a horizontal velocity of `speed` [m/s] to every body, each in a direction of its own."""
+def add_horizontal_velocity(bodies: Bodies, speed: float, seed: int = 5) -> None:
+    """Add a horizontal velocity of `speed` [m/s] to every body, each in its own random direction."""
     angle = np.random.default_rng(seed).uniform(0.0, 2.0 * np.pi, len(bodies.mass))
-    bodies.v_free[:, 0] += speed * each(math.cos, angle)
-    bodies.v_free[:, 1] += speed * each(math.sin, angle)
+    bodies.v_free[:, 0] += speed * map_scalar(math.cos, angle)
+    bodies.v_free[:, 1] += speed * map_scalar(math.sin, angle)
 
 
 def static_loads(bodies: Bodies, contacts: Contacts) -> FloatArray:
-    """Guess of the normal impulses (c,) [N s]: each body's load shared equally by the contacts below it."""
+    """Guess the normal impulses (c,) [N s]: the contacts below a body carry equal parts of its load."""
     z = np.append(bodies.position[:, 2], -np.inf)  # the ground is index -1
     a, b = contacts.body.T
     upper = np.where(z[b] > z[a], b, a)
     lower = np.where(z[b] > z[a], a, b)
     order = np.argsort(upper, kind="stable")
     first = np.searchsorted(upper[order], np.arange(len(bodies.mass) + 1))
-    load = np.append(bodies.mass * FALL, 0.0)
+    load = np.append(bodies.mass * FALL_SPEED, 0.0)
     impulse = np.zeros(len(upper))
     for k in np.argsort(-bodies.position[:, 2], kind="stable"):
         below = order[first[k] : first[k + 1]]
         if len(below):
-            share = load[k] / len(below)
-            impulse[below] = share
-            np.add.at(load, lower[below], share)
+            load_per_contact = load[k] / len(below)
+            impulse[below] = load_per_contact
+            np.add.at(load, lower[below], load_per_contact)
     return impulse

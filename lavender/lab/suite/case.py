@@ -1,4 +1,4 @@
-"""A case: a problem, why it is there, and what its solution is known to be; cases by name and parameters."""
+"""A test case: a problem, the property that it tests, its known solution; and case names with parameters."""
 
 from __future__ import annotations
 
@@ -16,41 +16,71 @@ from lavender.problem import Problem
 from lavender.problem.derived import cached_property
 
 P = ParamSpec("P")
-MAX_SIZE = 10**7  # of a whole-number parameter: larger ones are typing errors that would fill the memory
+MAX_SIZE = 10**7  # Largest integer parameter: larger ones are typing errors that would fill the memory.
 
 
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """A solution that no solver of this package is asked to confirm by itself."""
+    """A solution that is known independently of this package's solvers.
 
-    impulse: FloatArray | None  # (m,) N s, rounded to float64; None: there is no solution
-    source: str  # how it is known, e.g. "closed form"
-    compare: str = "impulse"  # what is unique: "impulse" (and slack), "slack" (A singular), "error" (neither)
-    certificate: FloatArray | None = None  # (m,), where there is no solution
+    Parameters
+    ----------
+    impulse : (m,) N s, or None
+        The solution, rounded to float64; None if the problem has no solution.
+    source : str
+        How it is known, e.g. "closed form".
+    compare : {"impulse", "slack", "error", "nothing"}
+        Unique quantities, which tests compare: "impulse" (and slack), "slack" (A is singular), "error" (neither is
+        unique: only the judge's error), "nothing" (no solution).
+    certificate : (m,) or None
+        Proof that there is no solution.
+    """
+
+    impulse: FloatArray | None
+    source: str
+    compare: str = "impulse"
+    certificate: FloatArray | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """One problem of the suite. `reference` is computed when first asked for."""
+    """One problem of the suite. `reference` is computed at the first access.
 
-    name: str  # "pyramid(k=10, mass_ratio=1e6)": `case(name)` makes it again
+    Parameters
+    ----------
+    name : str
+        Such as "pyramid(k=10, mass_ratio=1e6)"; `case(name)` builds the case again.
+    problem : Problem
+    reason : str
+        The property that it tests, in one line.
+    family : str
+        Name of the function that builds it.
+    parameters : mapping
+        Its parameters.
+    expect : str
+        Result that solvers are expected to have.
+    solve_reference : callable, optional
+        Computes the reference.
+    """
+
+    name: str
     problem: Problem
-    reason: str  # one line: what it tests
+    reason: str
     family: str
     parameters: Mapping[str, Any]
-    expect: str = ""  # what is expected of whom
+    expect: str = ""
     solve_reference: Callable[[], Reference] | None = field(default=None, repr=False)
 
     @cached_property
     def reference(self) -> Reference | None:
-        """What the solution is known to be, or None where only the judge can say."""
+        """Known solution, or None if only the judge can assess an answer."""
         return None if self.solve_reference is None else self.solve_reference()
 
     def __str__(self) -> str:
         return f"{self.name}: {self.reason}"
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Copied or pickled it is made again."""
+        """Copy and unpickle a case by building it again."""
         from lavender.lab.suite import case
 
         return case, (self.name,)
@@ -58,7 +88,7 @@ class Case:
 
 @dataclass(frozen=True, eq=False)
 class Draft:
-    """What a family function gives; `family` adds name and parameters."""
+    """Return value of a family function; the decorator `family` adds name and parameters."""
 
     problem: Problem
     reason: str
@@ -68,28 +98,41 @@ class Draft:
 
 @dataclass(frozen=True)
 class Family:
-    """A function of the suite by name."""
+    """A family function under one of its names.
+
+    Parameters
+    ----------
+    name : str
+    make : callable
+        Builds the case of all parameters.
+    signature : inspect.Signature
+        Signature of the family function.
+    preset : mapping
+        Parameters that the name fixes, e.g. friction="coulomb".
+    summary : str
+        First line of the function's docstring.
+    """
 
     name: str
     make: Callable[..., Case]
     signature: inspect.Signature
-    preset: Mapping[str, Any]  # what the name itself says, e.g. friction="coulomb"
+    preset: Mapping[str, Any]
     summary: str
 
-    def case(self, **given: Any) -> Case:
-        """The case of these parameters; the others take their defaults."""
+    def case(self, **parameters: Any) -> Case:
+        """Build the case of these parameters; the others have their defaults."""
         known = [name for name in self.signature.parameters if name not in self.preset]
-        for name in given:
+        for name in parameters:
             if name not in known:
                 raise UnknownName(f"parameter of {self.name}", name, known)
-        return self.make(**self.preset, **given)
+        return self.make(**self.preset, **parameters)
 
 
 FAMILIES: dict[str, Family] = {}
 
 
-def family(**twins: Mapping[str, Any]) -> Callable[[Callable[P, Draft]], Callable[P, Case]]:
-    """Register a function under its name, and under other names with some parameters fixed."""
+def family(**aliases: Mapping[str, Any]) -> Callable[[Callable[P, Draft]], Callable[P, Case]]:
+    """Register a function under its name, and under aliases with some parameters fixed."""
 
     def decorate(function: Callable[P, Draft]) -> Callable[P, Case]:
         name = function.__name__
@@ -99,10 +142,12 @@ def family(**twins: Mapping[str, Any]) -> Callable[[Callable[P, Draft]], Callabl
         @functools.wraps(function)
         def make(*args: P.args, **kwargs: P.kwargs) -> Case:
             bound = signature.bind(*args, **kwargs)
-            given = frozenset(bound.arguments)
+            explicit = frozenset(bound.arguments)
             bound.apply_defaults()
-            values = {n: _check(name, signature.parameters[n], v) for n, v in bound.arguments.items()}
-            text = _text(name, values, given)
+            values = {
+                n: _convert_parameter(name, signature.parameters[n], v) for n, v in bound.arguments.items()
+            }
+            text = _spell_name(name, values, explicit)
             try:
                 draft = function(**values)  # type: ignore[call-arg]
             except MemoryError as error:
@@ -119,31 +164,31 @@ def family(**twins: Mapping[str, Any]) -> Callable[[Callable[P, Draft]], Callabl
                 solve_reference=draft.reference,
             )
 
-        for alias, preset in {name: {}, **twins}.items():
+        for alias, preset in {name: {}, **aliases}.items():
             FAMILIES[alias] = Family(alias, make, signature, MappingProxyType(dict(preset)), summary)
         return make
 
     return decorate
 
 
-def _check(name: str, parameter: inspect.Parameter, value: Any) -> Any:
-    """The value in the type that the signature declares."""
-    wanted = parameter.annotation
-    what = f"{name}: {parameter.name} is {value!r}"
-    if wanted is str:
+def _convert_parameter(name: str, parameter: inspect.Parameter, value: Any) -> Any:
+    """Convert a value to the type that the signature declares, or raise InputError."""
+    expected_type = parameter.annotation
+    prefix = f"{name}: {parameter.name} is {value!r}"
+    if expected_type is str:
         if not isinstance(value, str):
-            raise InputError(f"{what}; a word is needed")
+            raise InputError(f"{prefix}; a word is needed")
         return value
-    found = check_float(f"{name}: {parameter.name}", value)
-    if wanted is int:
-        if found != int(found) or not 0 <= found <= MAX_SIZE:
-            raise InputError(f"{what}; a whole number from 0 to {MAX_SIZE} is needed")
-        return int(found)
-    return found
+    converted = check_float(f"{name}: {parameter.name}", value)
+    if expected_type is int:
+        if converted != int(converted) or not 0 <= converted <= MAX_SIZE:
+            raise InputError(f"{prefix}; a whole number from 0 to {MAX_SIZE} is needed")
+        return int(converted)
+    return converted
 
 
-def _text(name: str, values: Mapping[str, Any], given: frozenset[str]) -> str:
-    """A name that gives these parameters: what was asked for, spelled in one way."""
+def _spell_name(name: str, values: Mapping[str, Any], explicit: frozenset[str]) -> str:
+    """Spell the canonical name of these parameters; it shows explicit values and values that are not the default."""
     best = name
     preset: Mapping[str, Any] = {}
     for alias in FAMILIES.values():
@@ -154,13 +199,13 @@ def _text(name: str, values: Mapping[str, Any], given: frozenset[str]) -> str:
     shown = [
         f"{n}={spell(v)}"
         for n, v in values.items()
-        if n not in preset and (n in given or v != parameters[n].default)
+        if n not in preset and (n in explicit or v != parameters[n].default)
     ]
     return f"{best}({', '.join(shown)})" if shown else best
 
 
 def spell(value: Any) -> str:
-    """A value as it stands in names: the shortest text that gives the same number."""
+    """Return the shortest text of a value in a case name that gives the same number."""
     if not isinstance(value, float):
         return str(value)
     mantissa, _, exponent = f"{value:.16e}".partition("e")
@@ -172,12 +217,12 @@ def spell(value: Any) -> str:
 
 
 def parse(text: str) -> tuple[str, dict[str, Any]]:
-    """Name and parameters of "pyramid(k=10, mass_ratio=1e6)"; words need no quotes.
+    """Split "pyramid(k=10, mass_ratio=1e6)" into name and parameters; strings need no quotes.
 
     Raises
     ------
     InputError
-        Not a name with parameters in brackets.
+        The text is not a name with parameters in brackets.
     """
     problem = InputError(
         f"{text!r} is not a case; write a name with parameters, such as pyramid(k=10, mass_ratio=1e6)"
@@ -196,15 +241,16 @@ def parse(text: str) -> tuple[str, dict[str, Any]]:
     for keyword in node.keywords:
         if keyword.arg is None or keyword.arg in values:
             raise problem
-        values[keyword.arg] = _value(keyword.value, problem)
+        values[keyword.arg] = _evaluate_parameter(keyword.value, problem)
     return node.func.id, values
 
 
-def _value(node: ast.expr, problem: InputError) -> Any:
+def _evaluate_parameter(node: ast.expr, problem: InputError) -> Any:
+    """Evaluate a literal or a bare word of a parameter; raise `problem` for anything else."""
     if isinstance(node, ast.Name):
         return node.id
     if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub):
-        value = _value(node.operand, problem)
+        value = _evaluate_parameter(node.operand, problem)
         if isinstance(value, (int, float)):
             return -value
     if (

@@ -1,9 +1,8 @@
-"""Families of problems with parameters: stacks, pyramids, piles, chains, and small ones to look at.
+"""Families of problems with parameters: stacks, pyramids, piles, chains, and small problems to examine by hand.
 
-Each function gives a `Case`; the same parameters give the same bits. Names ending in F have friction
-(`boxes`, `stackF(n=64)` is `stack(n=64, friction="coulomb")`); `sliding` [m/s] pushes every body sideways,
-each in its own direction, without which most frictional contacts stick and Coulomb's law and its convex
-relaxation have the same answer.
+Each function builds a `Case`; equal parameters give equal bits. Names that end in F have friction: `stackF(n=64)` is
+`stack(n=64, friction="coulomb")`. `sliding` [m/s] adds a horizontal velocity to every body, each in its own direction;
+without it most frictional contacts stick, and Coulomb's law and its convex relaxation have the same solution.
 """
 
 from __future__ import annotations
@@ -16,57 +15,58 @@ import numpy as np
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import InputError
 from lavender.lab.suite.build import (
-    FALL,
+    FALL_SPEED,
     Bodies,
     Contacts,
+    add_horizontal_velocity,
     contact_problem,
-    each,
     joint_problem,
     manifold,
-    sideways,
+    map_scalar,
     static_loads,
     tower,
 )
 from lavender.lab.suite.case import Draft, Reference, family
-from lavender.lab.suite.exact import at_rest, solve_boxed, solve_linear
+from lavender.lab.suite.exact import solve_boxed, solve_linear, solve_rest_impulse
 from lavender.problem import Problem
 from lavender.solving.solve import solve
 
 WITH_FRICTION = {"friction": "coulomb"}
-MU = 0.5
-SPHERE, BOX, PEBBLE, ROD = 0.1, 1.0 / 6.0, 0.1, 0.1  # inertia / mass [m^2]
+FRICTION_COEFFICIENT = 0.5
+# Moment of inertia divided by mass of each kind of body [m^2].
+SPHERE, BOX, PEBBLE, ROD = 0.1, 1.0 / 6.0, 0.1, 0.1
 
 
-def at_least(least: int, **sizes: int) -> None:
-    """Refuse sizes below `least`."""
+def check_minimum(minimum: int, **sizes: int) -> None:
+    """Raise InputError if a size is below `minimum`."""
     for name, value in sizes.items():
-        if value < least:
-            raise InputError(f"{name} is {value}; at least {least} is needed")
+        if value < minimum:
+            raise InputError(f"{name} is {value}; at least {minimum} is needed")
 
 
-def positive(**values: float) -> None:
-    """Refuse values that are not above 0."""
+def check_positive(**values: float) -> None:
+    """Raise InputError if a value is not above 0."""
     for name, value in values.items():
         if not value > 0.0:
             raise InputError(f"{name} is {value}; a number above 0 is needed")
 
 
 def rest_reference(problem: Problem) -> Callable[[], Reference]:
-    """The reference of bodies that stay where they are: w = 0."""
+    """Return the function that computes the reference of bodies that stay at rest: w = 0."""
     return lambda: Reference(
-        at_rest(problem), "at rest: impulses from a linear program, proved in 100 bits", "slack"
+        solve_rest_impulse(problem), "at rest: impulses from a linear program, proved in 100 bits", "slack"
     )
 
 
 def boxed_reference(problem: Problem, compare: str = "slack") -> Callable[[], Reference]:
-    """The reference of a boxed LCP: sweeps propose the active set, and what they propose is proved."""
+    """Return the function that computes a boxed LCP's reference: sweeps propose the active set, which is proved."""
 
-    def proved() -> Reference:
+    def solve_reference() -> Reference:
         candidate = solve(problem, "pgs", tol=1e-10, max_iter=50_000).impulse
         source = "active set from sweeps, solved and proved in 100 bits"
         return Reference(solve_boxed(problem, candidate), source, compare)
 
-    return proved
+    return solve_reference
 
 
 # -- stacks ---------------------------------------------------------------------------------------
@@ -76,24 +76,24 @@ def boxed_reference(problem: Problem, compare: str = "slack") -> Callable[[], Re
 def stack(n: int = 64, mass_ratio: float = 1.0, friction: str = "none", sliding: float = 0.0) -> Draft:
     """n spheres in a column, one contact between neighbours; the top one weighs `mass_ratio` times the others.
 
-    A is tridiagonal with condition number near n^2 (and mass_ratio on top). Frictionless and in one step
-    of gravity, contact i carries what is above it: lambda_i = g h sum of masses above.
+    A is tridiagonal with condition number near n^2 (times a factor of mass_ratio). Without friction and after one step
+    of gravity, contact i carries the bodies above it: lambda_i = g h sum of masses above.
     """
-    at_least(1, n=n)
-    positive(mass_ratio=mass_ratio)
+    check_minimum(1, n=n)
+    check_positive(mass_ratio=mass_ratio)
     mass = np.ones(n)
     mass[-1] = mass_ratio
-    position, pairs, foot = tower(n)
+    position, pairs, contact_point = tower(n)
     bodies = Bodies(position, mass, SPHERE)
-    sideways(bodies, sliding)
-    contacts = Contacts(pairs, foot, [0.0, 0.0, 1.0])
-    problem = contact_problem(bodies, contacts, friction, MU)
+    add_horizontal_velocity(bodies, sliding)
+    contacts = Contacts(pairs, contact_point, [0.0, 0.0, 1.0])
+    problem = contact_problem(bodies, contacts, friction, FRICTION_COEFFICIENT)
     reason = "information must travel from the ground to the top: sweeps grow as n^2, a tridiagonal factorisation as n"
     if friction != "none" and sliding != 0.0:
         return Draft(problem, reason)
 
     def closed_form() -> Reference:
-        load = FALL * np.cumsum(mass[::-1])[::-1]
+        load = FALL_SPEED * np.cumsum(mass[::-1])[::-1]
         impulse = np.zeros(problem.m)
         impulse[problem.cones.ptr[:-1]] = load
         return Reference(impulse, "closed form: the weight above")
@@ -108,8 +108,8 @@ def box_stack(n: int = 10, mass_ratio: float = 1.0, friction: str = "none", slid
     Four normals of one face have rank 3 (twelve rows with friction have rank 6): impulses are not unique,
     velocities are. With friction every body also gets a small random velocity, so that contacts slide and lift.
     """
-    bodies, contacts = _column(n, mass_ratio)
-    problem = _boxes(bodies, contacts, friction, sliding)
+    bodies, contacts = _cube_column(n, mass_ratio)
+    problem = _box_problem(bodies, contacts, friction, sliding)
     reason = (
         "redundant: four points where three would do, so A is singular; heavy on light makes sweeps stall"
     )
@@ -117,7 +117,7 @@ def box_stack(n: int = 10, mass_ratio: float = 1.0, friction: str = "none", slid
         return Draft(problem, reason)
 
     def closed_form() -> Reference:
-        load = FALL * np.cumsum(bodies.mass[::-1])[::-1]
+        load = FALL_SPEED * np.cumsum(bodies.mass[::-1])[::-1]
         return Reference(
             np.repeat(0.25 * load, 4), "closed form: the weight above, a quarter on each point", "slack"
         )
@@ -125,13 +125,14 @@ def box_stack(n: int = 10, mass_ratio: float = 1.0, friction: str = "none", slid
     return Draft(problem, reason, closed_form)
 
 
-def _column(n: int, mass_ratio: float) -> tuple[Bodies, Contacts]:
-    at_least(1, n=n)
-    positive(mass_ratio=mass_ratio)
+def _cube_column(n: int, mass_ratio: float) -> tuple[Bodies, Contacts]:
+    """Build the bodies and contacts of a column of unit cubes."""
+    check_minimum(1, n=n)
+    check_positive(mass_ratio=mass_ratio)
     mass = np.ones(n)
     mass[-1] = mass_ratio
-    position, pairs, foot = tower(n)
-    return Bodies(position, mass, BOX), manifold(pairs, foot, 0.5)
+    position, pairs, contact_point = tower(n)
+    return Bodies(position, mass, BOX), manifold(pairs, contact_point, 0.5)
 
 
 @family(pyramidF=WITH_FRICTION)
@@ -142,19 +143,20 @@ def pyramid(
     sliding: float = 0.0,
     bottom_ratio: float = 1.0,
 ) -> Draft:
-    """k rows of unit cubes, each standing on two below, four points per pair; the top weighs `mass_ratio`.
+    """k rows of unit cubes, each on two cubes below, four points per pair; the top one weighs `mass_ratio`.
 
     4 k^2 contacts on 3 k (k + 1) degrees of freedom: redundant. `bottom_ratio` makes the lowest row heavy.
     """
-    bodies, contacts = _triangle(k, mass_ratio, bottom_ratio)
-    problem = _boxes(bodies, contacts, friction, sliding)
+    bodies, contacts = _cube_pyramid(k, mass_ratio, bottom_ratio)
+    problem = _box_problem(bodies, contacts, friction, sliding)
     reason = "more contacts than degrees of freedom, loads that spread sideways, heavy on light"
     return Draft(problem, reason, rest_reference(problem) if friction == "none" else None)
 
 
-def _triangle(k: int, mass_ratio: float, bottom_ratio: float = 1.0) -> tuple[Bodies, Contacts]:
-    at_least(1, k=k)
-    positive(mass_ratio=mass_ratio, bottom_ratio=bottom_ratio)
+def _cube_pyramid(k: int, mass_ratio: float, bottom_ratio: float = 1.0) -> tuple[Bodies, Contacts]:
+    """Build the bodies and contacts of a pyramid of unit cubes."""
+    check_minimum(1, k=k)
+    check_positive(mass_ratio=mass_ratio, bottom_ratio=bottom_ratio)
     row = np.repeat(np.arange(k), k - np.arange(k))
     first = np.concatenate([[0], np.cumsum(k - np.arange(k))])  # first box of each row
     column = np.arange(len(row)) - first[row]
@@ -165,7 +167,7 @@ def _triangle(k: int, mass_ratio: float, bottom_ratio: float = 1.0) -> tuple[Bod
     bodies = Bodies(np.stack([x, 0.0 * x, 0.5 + row], 1), mass, BOX)
     above = np.flatnonzero(row > 0)
     left = first[row[above] - 1] + column[above]
-    # Ground contacts, then for every box above its left and its right support.
+    # First the ground contacts, then for every other box its left and its right support.
     pairs = np.concatenate([
         np.stack([np.full(k, -1), np.arange(k)], 1),
         np.stack([np.stack([left, left + 1], 1).ravel(), np.repeat(above, 2)], 1),
@@ -177,15 +179,16 @@ def _triangle(k: int, mass_ratio: float, bottom_ratio: float = 1.0) -> tuple[Bod
     return bodies, manifold(pairs, centre, 0.5 * (high - low))
 
 
-def _boxes(bodies: Bodies, contacts: Contacts, friction: str, sliding: float) -> Problem:
+def _box_problem(bodies: Bodies, contacts: Contacts, friction: str, sliding: float) -> Problem:
+    """Build a problem of boxes; with friction, some contacts slide and some lift."""
     if friction != "none":
-        # Some contacts slide, some lift.
-        _shake(bodies)
-    sideways(bodies, sliding)
-    return contact_problem(bodies, contacts, friction, MU)
+        _add_random_velocity(bodies)
+    add_horizontal_velocity(bodies, sliding)
+    return contact_problem(bodies, contacts, friction, FRICTION_COEFFICIENT)
 
 
-def _shake(bodies: Bodies) -> None:
+def _add_random_velocity(bodies: Bodies) -> None:
+    """Add a small random velocity to every body."""
     bodies.v_free += 0.05 * np.random.default_rng(3).standard_normal(bodies.v_free.size).reshape(-1, 6)
 
 
@@ -199,16 +202,16 @@ def granular(n: int = 4, friction: str = "none", sliding: float = 0.0, seed: int
     n = 4, 9, 18 give 299, 3,402 and 27,570 contacts (seed 7). Well conditioned and three-dimensional: sparse
     factorisations fill in, sweeps converge fast.
     """
-    at_least(1, n=n)
+    check_minimum(1, n=n)
     bodies, contacts = _pile(n, seed)
-    sideways(bodies, sliding)
-    problem = contact_problem(bodies, contacts, friction, MU)
-    reason = "a large well-conditioned pile: the home ground of sweeps, where factorisations fill in"
+    add_horizontal_velocity(bodies, sliding)
+    problem = contact_problem(bodies, contacts, friction, FRICTION_COEFFICIENT)
+    reason = "a large well-conditioned pile: sweeps converge fast, factorisations fill in"
     return Draft(problem, reason, boxed_reference(problem) if friction == "none" else None)
 
 
 def _pile(n: int, seed: int) -> tuple[Bodies, Contacts]:
-    """Site by site (x slowest): face neighbours, 30 % of the edge neighbours, walls; arithmetic after all draws."""
+    """Build a pile site by site (x slowest): face neighbours, 30 % of the edge neighbours, walls; compute last."""
     rng = np.random.default_rng(seed)
     count = n**3
     grid = np.stack(np.meshgrid(*[np.arange(n)] * 3, indexing="ij"), -1).reshape(-1, 3)
@@ -218,8 +221,8 @@ def _pile(n: int, seed: int) -> tuple[Bodies, Contacts]:
     edges = ((1, 1, 0), (1, 0, 1), (0, 1, 1), (1, -1, 0), (1, 0, -1), (0, 1, -1))
     step = np.array([n * n, n, 1])
 
-    def inside(offsets: tuple[tuple[int, int, int], ...]) -> list[list[int]]:
-        # Bodies that a site's offsets lead to, -1 outside the box; (count, len(offsets)).
+    def neighbours(offsets: tuple[tuple[int, int, int], ...]) -> list[list[int]]:
+        """Return the bodies at each site's offsets, -1 outside the box; (count, len(offsets))."""
         to = grid[:, None, :] + np.array(offsets)
         ok = np.all((to >= 0) & (to < n), axis=2)
         return np.where(ok, to @ step, -1).tolist()
@@ -232,11 +235,11 @@ def _pile(n: int, seed: int) -> tuple[Bodies, Contacts]:
     ground[:, 3] &= ~ground[:, 2]
     axes = np.array([[1.0, 0, 0], [-1.0, 0, 0], [0, 1.0, 0], [0, -1.0, 0], [0, 0, 1.0]])
     body: list[tuple[int, int]] = []
-    wall: list[int] = []  # which wall, -1 between pebbles
-    draws: list[FloatArray] = []  # 6 numbers between pebbles, 3 at a wall
+    wall: list[int] = []  # index of the wall, -1 between pebbles
+    draws: list[FloatArray] = []  # 6 random numbers between pebbles, 3 at a wall
     walls_of = [np.flatnonzero(g).tolist() for g in ground]
     random, normal = rng.random, rng.standard_normal
-    for a, (face, edge) in enumerate(zip(inside(faces), inside(edges), strict=True)):
+    for a, (face, edge) in enumerate(zip(neighbours(faces), neighbours(edges), strict=True)):
         near = [b for b in face if b >= 0]
         if near:
             draws.append(normal(6 * len(near)))
@@ -257,21 +260,21 @@ def _pile(n: int, seed: int) -> tuple[Bodies, Contacts]:
     start = np.concatenate([[0], np.cumsum(np.where(between, 6, 3))])[:-1]
     jitter = flat[start[:, None] + np.arange(3)]
     second = flat[np.minimum(start[:, None] + 3, len(flat) - 3) + np.arange(3)]
-    one, two = np.maximum(pair[:, 0], 0), pair[:, 1]
-    away = position[two] - position[one]
-    away /= np.where(between, np.linalg.norm(away, axis=1), 1.0)[:, None]
-    away += 0.25 * jitter
-    away /= np.linalg.norm(away, axis=1, keepdims=True)
+    first_body, second_body = np.maximum(pair[:, 0], 0), pair[:, 1]
+    separation = position[second_body] - position[first_body]
+    separation /= np.where(between, np.linalg.norm(separation, axis=1), 1.0)[:, None]
+    separation += 0.25 * jitter
+    separation /= np.linalg.norm(separation, axis=1, keepdims=True)
     flat_wall = axes[np.maximum(side, 0)]
     point = np.where(
         between[:, None],
-        0.5 * (position[one] + position[two]) + 0.08 * second,
-        position[two] - 0.5 * flat_wall + 0.05 * jitter,
+        0.5 * (position[first_body] + position[second_body]) + 0.08 * second,
+        position[second_body] - 0.5 * flat_wall + 0.05 * jitter,
     )
     bodies = Bodies(position, mass, PEBBLE)
     bodies.v_free = 0.05 * normal(6 * count).reshape(-1, 6)
-    bodies.v_free[:, 2] -= FALL
-    return bodies, Contacts(pair, point, np.where(between[:, None], away, flat_wall))
+    bodies.v_free[:, 2] -= FALL_SPEED
+    return bodies, Contacts(pair, point, np.where(between[:, None], separation, flat_wall))
 
 
 # -- joints ---------------------------------------------------------------------------------------
@@ -279,19 +282,21 @@ def _pile(n: int, seed: int) -> tuple[Bodies, Contacts]:
 
 @family()
 def chain(n: int = 33, tip_mass: float = 1.0) -> Draft:
-    """n rods in a slack zig-zag arm from a fixed point, ball joints of 3 rows, the last one weighs `tip_mass`.
+    """n rods in a slack zig-zag arm from a fixed point, ball joints of 3 rows, the last rod weighs `tip_mass`.
 
-    Half-bandwidth 5. Little tension travels: the easy chain.
+    Half-bandwidth 5. The tension is small: the easy chain.
     """
-    at_least(1, n=n)
-    positive(tip_mass=tip_mass)
+    check_minimum(1, n=n)
+    check_positive(tip_mass=tip_mass)
     k = np.arange(n)
-    link = np.stack([0.8 + 0.0 * k, 0.3 * each(math.cos, k), -0.5 + 0.3 * each(math.sin, 1.7 * k)], 1)
+    link = np.stack(
+        [0.8 + 0.0 * k, 0.3 * map_scalar(math.cos, k), -0.5 + 0.3 * map_scalar(math.sin, 1.7 * k)], 1
+    )
     problem = _chain(link, tip_mass, 0.02)
     return Draft(
         problem,
-        "bilateral and banded, little tension: easy for everything that knows the band",
-        _linear(problem),
+        "bilateral and banded with little tension: easy for every solver that uses the band",
+        _linear_reference(problem),
     )
 
 
@@ -301,19 +306,20 @@ def hang(n: int = 33, tip_mass: float = 1.0) -> Draft:
 
     Half-bandwidth 5; the condition number grows as n^2 and with tip_mass: the hard chain.
     """
-    at_least(1, n=n)
-    positive(tip_mass=tip_mass)
+    check_minimum(1, n=n)
+    check_positive(tip_mass=tip_mass)
     k = np.arange(n)
-    link = np.stack([1e-4 * each(math.cos, k), 1e-4 * each(math.sin, 1.7 * k), -1.0 + 0.0 * k], 1)
+    link = np.stack([1e-4 * map_scalar(math.cos, k), 1e-4 * map_scalar(math.sin, 1.7 * k), -1.0 + 0.0 * k], 1)
     problem = _chain(link, tip_mass, 1e-4)
     return Draft(
         problem,
         "tension through the whole chain: sweeps need n^2 times tip_mass, a band factorisation n",
-        _linear(problem),
+        _linear_reference(problem),
     )
 
 
 def _chain(link: FloatArray, tip_mass: float, jitter: float) -> Problem:
+    """Build a chain of rods along `link` (n, 3) with ball joints."""
     n = len(link)
     link = link / np.linalg.norm(link, axis=1, keepdims=True)
     anchor = np.concatenate([np.zeros((1, 3)), np.cumsum(link, axis=0)])
@@ -321,13 +327,13 @@ def _chain(link: FloatArray, tip_mass: float, jitter: float) -> Problem:
     mass[-1] = tip_mass
     bodies = Bodies(0.5 * (anchor[1:] + anchor[:-1]), mass, ROD)
     bodies.v_free = jitter * np.random.default_rng(11).standard_normal(6 * n).reshape(-1, 6)
-    bodies.v_free[:, 2] -= FALL
+    bodies.v_free[:, 2] -= FALL_SPEED
     body = np.stack([np.arange(n) - 1, np.arange(n)], 1)
     return joint_problem(bodies, body, ball_joints(bodies.position, body, anchor[:-1]), 3)
 
 
 def ball_joints(position: FloatArray, body: np.ndarray, anchor: FloatArray) -> FloatArray:
-    """Jacobian (3 k, 12) of ball joints: the anchor of b moves as the anchor of a does."""
+    """Compute the Jacobian (3 k, 12) of ball joints: the anchors on bodies a and b have the same velocity."""
     k = len(body)
     jac = np.zeros((k, 3, 12))
     for side, (sign, at) in enumerate(((-1.0, 0), (1.0, 6))):
@@ -341,12 +347,13 @@ def ball_joints(position: FloatArray, body: np.ndarray, anchor: FloatArray) -> F
     return jac.reshape(-1, 12)
 
 
-def product(a: FloatArray, b: FloatArray) -> FloatArray:
-    """a @ b, summed in the order of the index: the same bits on every processor, which BLAS has not."""
+def ordered_matmul(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Compute a @ b, summed in the order of the index: unlike BLAS, it has the same bits on every processor."""
     return np.asarray(sum(np.multiply.outer(column, row) for column, row in zip(a.T, b, strict=True)))
 
 
-def _linear(problem: Problem) -> Callable[[], Reference]:
+def _linear_reference(problem: Problem) -> Callable[[], Reference]:
+    """Return the function that computes the reference of a linear problem."""
     return lambda: Reference(solve_linear(problem), "factorised in float64, refined in 100 bits")
 
 
@@ -361,12 +368,12 @@ def two_particles(m1: float = 1.0, m2: float = 2.0, drift: float = 0.01) -> Draf
         b = target - J v*,   target = -drift / h               [m/s]: closes the error C = drift in one step
         lambda = b / A                                         [N s], along n on 2, against n on 1
 
-    The reduced mass 1/A answers: the impulse of a rod is its closing speed times m1 m2 / (m1 + m2).
+    The reduced mass 1/A determines the result: the impulse of a rod is its closing speed times m1 m2 / (m1 + m2).
     """
-    positive(m1=m1, m2=m2)
+    check_positive(m1=m1, m2=m2)
     x = np.array([[0.0, 0.0, 0.0], [0.6, 0.0, 0.8]])
     bodies = Bodies(x, [m1, m2], 0.0)
-    bodies.v_free[0, :3], bodies.v_free[1, :3] = [0.3, 0.0, -FALL], [0.0, 0.1, -FALL]
+    bodies.v_free[0, :3], bodies.v_free[1, :3] = [0.3, 0.0, -FALL_SPEED], [0.0, 0.1, -FALL_SPEED]
     n = x[1] - x[0]  # its length is 1: 0.36 + 0.64
     jac = np.concatenate([-n, np.zeros(3), n, np.zeros(3)])[None]
     problem = joint_problem(bodies, [[0, 1]], jac, 1, target=-drift / 0.01, names=["rod"])
@@ -375,10 +382,10 @@ def two_particles(m1: float = 1.0, m2: float = 2.0, drift: float = 0.01) -> Draf
     def closed_form() -> Reference:
         return Reference(np.array([closing / (1.0 / m1 + 1.0 / m2)]), "closed form: b / (1/m1 + 1/m2)")
 
-    return Draft(problem, "one row, one number: everything can be checked by hand", closed_form)
+    return Draft(problem, "one row, one number: everything can be computed by hand", closed_form)
 
 
-# -- small and plain ------------------------------------------------------------------------------
+# -- small problems -------------------------------------------------------------------------------
 
 
 @family()
@@ -394,16 +401,16 @@ def toy_stack(kick: float = 1.0, friction: str = "none") -> Draft:
         raise InputError(f"kick is {kick}; upwards (0 or more) is needed")
     if friction not in ("none", "box"):
         raise InputError(f"friction is {friction!r}; none, box are known")
-    position, pairs, foot = tower(n)
+    position, pairs, contact_point = tower(n)
     bodies = Bodies(position, 1.0, SPHERE)
     bodies.v_free[4, 2] += kick
-    contacts = Contacts(pairs, foot, [0.0, 0.0, 1.0])
+    contacts = Contacts(pairs, contact_point, [0.0, 0.0, 1.0])
     reason = "eight contacts that fit on a page, one of which must open"
     if friction == "none":
         problem = contact_problem(bodies, contacts)
         return Draft(problem, reason, boxed_reference(problem, "impulse"))
     bodies.v_free[:, 0] = 0.05 * np.arange(1, n + 1)
-    problem = _boxed(bodies, contacts)
+    problem = _boxed_friction_problem(bodies, contacts)
     return Draft(problem, reason + ", with friction bounded by fixed loads", boxed_reference(problem))
 
 
@@ -413,26 +420,26 @@ def random_spd(n: int = 100, condition: float = 1e6, seed: int = 0) -> Draft:
 
     b = A x with x of standard normal entries, so that every eigenvector matters.
     """
-    at_least(1, n=n)
+    check_minimum(1, n=n)
     if not condition >= 1.0:
         raise InputError(f"condition is {condition}; 1 or more is needed")
     rng = np.random.default_rng(seed)
-    # Twelve digits of each eigenvalue, the last of which no library's power decides.
-    a = np.zeros((n, n))  # before the work: it may not fit
+    # Each eigenvalue has twelve digits, so that the last bits of a library's power function do not matter.
+    a = np.zeros((n, n))  # allocated before the eigenvalues are computed: it may not fit into memory
     np.fill_diagonal(a, [float(f"{condition**power:.12g}") for power in np.linspace(-1.0, 0.0, n)])
-    # turned in random planes, until every vector has a part of every other
+    # Rotate in random planes until every vector has a component along every other.
     for _ in range(4 * n.bit_length()):
         i, j = rng.permutation(n)[: n - n % 2].reshape(2, -1)
         t = rng.uniform(-1.0, 1.0, (len(i), 1))
         c, s = (1.0 - t * t) / (1.0 + t * t), 2.0 * t / (1.0 + t * t)
-        for side in (a, a.T):
-            side[i], side[j] = c * side[i] - s * side[j], s * side[i] + c * side[j]
+        for view in (a, a.T):
+            view[i], view[j] = c * view[i] - s * view[j], s * view[i] + c * view[j]
     a = 0.5 * (a + a.T)
-    problem = Problem.linear(a, product(a, rng.standard_normal(n)))
+    problem = Problem.linear(a, ordered_matmul(a, rng.standard_normal(n)))
     return Draft(
         problem,
-        "no structure, only a condition number: what separates direct from iterative",
-        _linear(problem),
+        "no structure, only a condition number, which separates direct from iterative solvers",
+        _linear_reference(problem),
     )
 
 
@@ -440,33 +447,33 @@ def random_spd(n: int = 100, condition: float = 1e6, seed: int = 0) -> Draft:
 def boxed_friction(
     n: int = 4, scene: str = "box_stack", mass_ratio: float = 1.0, sliding: float = 0.5
 ) -> Draft:
-    """Contacts whose tangents are bounded by mu times an estimated load: a square, so a boxed LCP.
+    """Contacts with tangents bounded by mu times an estimated load: a square, so a boxed LCP.
 
-    Every QP solver takes it, and the exact solution is unique in velocities. Scenes: box_stack, pyramid, granular,
-    of size n.
+    Every QP solver accepts it, and the exact solution has unique velocities. Scenes: box_stack, pyramid, granular, of
+    size n.
     """
     if scene == "box_stack":
-        bodies, contacts = _column(n, mass_ratio)
-        _shake(bodies)
+        bodies, contacts = _cube_column(n, mass_ratio)
+        _add_random_velocity(bodies)
     elif scene == "pyramid":
-        bodies, contacts = _triangle(n, mass_ratio)
-        _shake(bodies)
+        bodies, contacts = _cube_pyramid(n, mass_ratio)
+        _add_random_velocity(bodies)
     elif scene == "granular":
-        at_least(1, n=n)
+        check_minimum(1, n=n)
         bodies, contacts = _pile(n, 7)
     else:
         raise InputError(f"scene is {scene!r}; box_stack, pyramid, granular are known")
-    sideways(bodies, sliding)
-    problem = _boxed(bodies, contacts)
+    add_horizontal_velocity(bodies, sliding)
+    problem = _boxed_friction_problem(bodies, contacts)
     return Draft(
         problem,
-        "friction that every QP solver takes: a boxed LCP with finite bounds",
+        "friction that every QP solver accepts: a boxed LCP with finite bounds",
         boxed_reference(problem),
     )
 
 
-def _boxed(bodies: Bodies, contacts: Contacts) -> Problem:
-    """Rows n, t1, t2 per contact as one block of bounded rows; tangents within mu times the static load."""
+def _boxed_friction_problem(bodies: Bodies, contacts: Contacts) -> Problem:
+    """Build rows n, t1, t2 per contact as one block of bounded rows; tangents within mu times the static load."""
     arm_a, arm_b = contacts.arms(bodies.position)
     n, t = contacts.normal, contacts.tangent()
     axes = np.stack([n, t, np.cross(n, t)], 1)  # (c, 3, 3)
@@ -475,7 +482,7 @@ def _boxed(bodies: Bodies, contacts: Contacts) -> Problem:
         -axes * moving[:, 0], -np.cross(arm_a[:, None], axes) * moving[:, 0],
         axes * moving[:, 1], np.cross(arm_b[:, None], axes) * moving[:, 1],
     ], axis=2)  # fmt: skip
-    bound = MU * static_loads(bodies, contacts)
+    bound = FRICTION_COEFFICIENT * static_loads(bodies, contacts)
     high = np.stack([np.full(len(n), np.inf), bound, bound], 1)
     low = np.stack([np.zeros(len(n)), -bound, -bound], 1)
     names = [f"contact {i}" for i in range(len(n))]

@@ -1,4 +1,4 @@
-"""Hard cases of friction, as those of `lavender.lab.suite.hard`: what slides, sticks or stands by friction alone."""
+"""Hard cases of friction, like those of `lavender.lab.suite.hard`: bodies that slide, stick or are held by friction."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import InputError
-from lavender.lab.suite.build import FALL, Bodies, Contacts, contact_problem, each, manifold
+from lavender.lab.suite.build import FALL_SPEED, Bodies, Contacts, contact_problem, manifold, map_scalar
 from lavender.lab.suite.case import Draft, Reference, family
-from lavender.lab.suite.families import BOX, at_least, positive, rest_reference
-from lavender.lab.suite.hard import EXACT
+from lavender.lab.suite.families import BOX, check_minimum, check_positive, rest_reference
+from lavender.lab.suite.hard import EXPECT_EXACT
 from lavender.problem import Problem
 
 
@@ -19,14 +19,14 @@ from lavender.problem import Problem
 def slider(mu: float = 0.3, speed: float = 0.5, angle: float = 10.0, friction: str = "coulomb") -> Draft:
     """A point mass sliding across the slope of a ramp of `angle` [degrees]: one contact, solved by hand.
 
-    Coulomb: lambda_n = m g h cos angle; it sticks where mu lambda_n >= m |v_t|, else friction opposes v_t. The convex
+    Coulomb: lambda_n = m g h cos angle; it sticks if mu lambda_n >= m |v_t|, otherwise friction opposes v_t. The convex
     relaxation lifts off: with v_t along t, w_n = mu w_t.
     """
     if mu < 0.0:
         raise InputError(f"mu is {mu}; 0 or more is needed")
     a = np.deg2rad(angle)
     bodies = Bodies([[0.0, 0.0, 0.0]], 1.0, 0.0)
-    bodies.v_free[0, :3] = [speed, -FALL * math.sin(a), -FALL * math.cos(a)]
+    bodies.v_free[0, :3] = [speed, -FALL_SPEED * math.sin(a), -FALL_SPEED * math.cos(a)]
     contacts = Contacts([[-1, 0]], np.zeros((1, 3)), [0.0, 0.0, 1.0])
     problem = contact_problem(bodies, contacts, friction, mu)
 
@@ -42,26 +42,30 @@ def slider(mu: float = 0.3, speed: float = 0.5, angle: float = 10.0, friction: s
             n = max(0.0, (b[0] + mu * size) / (1.0 + mu * mu))
         return Reference(np.array([n, *(mu * n * direction)]), "closed form: slides")
 
-    return Draft(problem, "every friction coefficient: stick, slip, none, sand paper", closed_form)
+    return Draft(problem, "friction coefficients from 0 to 10: sticking and sliding", closed_form)
 
 
 @family()
 def ramp(angle: float = 20.0, mu: float = 0.5) -> Draft:
-    """A cube on four points of a ramp of `angle` [degrees]; tan 26.6 = 0.5 is where it begins to slide."""
+    """A cube on four points of a ramp of `angle` [degrees]; with mu = 0.5 it slides above arctan 0.5 = 26.6 degrees."""
     a = np.deg2rad(angle)
     bodies = Bodies([[0.0, 0.0, 0.5]], 1.0, BOX)
-    bodies.v_free[0, :3] = [FALL * math.sin(a), 0.0, -FALL * math.cos(a)]
+    bodies.v_free[0, :3] = [FALL_SPEED * math.sin(a), 0.0, -FALL_SPEED * math.cos(a)]
     problem = contact_problem(bodies, manifold([[-1, 0]], [[0.0, 0.0, 0.0]], 0.5), "coulomb", mu)
 
     def closed_form() -> Reference:
-        n, t = FALL * math.cos(a), min(FALL * math.sin(a), mu * FALL * math.cos(a))
-        # Friction at the foot tips the cube forwards: the front pair carries t/2 more than half, of lever 1/2.
+        n, t = FALL_SPEED * math.cos(a), min(FALL_SPEED * math.sin(a), mu * FALL_SPEED * math.cos(a))
+        # Friction at the bottom face tips the cube forwards: the front pair carries t/2 more than half, of lever 1/2.
         rear, front = 0.25 * n - 0.25 * t, 0.25 * n + 0.25 * t
         normal = np.array([rear, rear, front, front])
         along = problem.rows.tangent @ np.array([1.0, 0.0, 0.0])  # type: ignore[union-attr]
         across = np.cross(problem.rows.normal, problem.rows.tangent) @ np.array([1.0, 0.0, 0.0])  # type: ignore[union-attr]
-        share = -t * normal / n
-        return Reference(np.stack([normal, share * along, share * across], 1).ravel(), "closed form", "slack")
+        friction_per_normal = -t * normal / n
+        return Reference(
+            np.stack([normal, friction_per_normal * along, friction_per_normal * across], 1).ravel(),
+            "closed form",
+            "slack",
+        )
 
     return Draft(
         problem,
@@ -72,10 +76,10 @@ def ramp(angle: float = 20.0, mu: float = 0.5) -> Draft:
 
 @family()
 def threshold(above: float = 0.0) -> Draft:
-    """A point mass pushed with (1 + above) times what friction can hold: between stick and slip."""
+    """A point mass pushed with (1 + above) times the friction limit: between sticking and sliding."""
     bodies = Bodies([[0.0, 0.0, 0.0]], 1.0, 0.0)
-    push = (1.0 + above) * 0.5 * FALL
-    bodies.v_free[0, :2] = [0.6 * push, 0.8 * push]
+    push_speed = (1.0 + above) * 0.5 * FALL_SPEED
+    bodies.v_free[0, :2] = [0.6 * push_speed, 0.8 * push_speed]
     contacts = Contacts([[-1, 0]], np.zeros((1, 3)), [0.0, 0.0, 1.0])
     problem = contact_problem(bodies, contacts, "coulomb", 0.5)
 
@@ -87,7 +91,7 @@ def threshold(above: float = 0.0) -> Draft:
 
     return Draft(
         problem,
-        "at the edge of the disk, where the projection has a kink",
+        "at the edge of the disk, where the projection is not differentiable",
         closed_form,
     )
 
@@ -96,29 +100,32 @@ def threshold(above: float = 0.0) -> Draft:
 def anisotropic(ratio: float = 10.0, speed: float = 3.0) -> Draft:
     """One contact with A = diag(1, 1, ratio), mu = 0.5, pushed along (1, 1) with `speed`: sticks at 0.1, slides at 3.
 
-    Sliding, lambda_t = (A_tt + s)^-1 b_t with s >= 0 such that |lambda_t| = mu lambda_n: one unknown. A step 1/A_ii per
-    tangent followed by the radial projection stops at a wrong point; a step 1/min(A_ii) cycles.
+    If it slides, lambda_t = (A_tt + s)^-1 b_t with s >= 0 such that |lambda_t| = mu lambda_n: one unknown. A step
+    1/A_ii per tangent followed by the radial projection stops at a wrong point; a step 1/min(A_ii) cycles.
     """
-    positive(ratio=ratio)
+    check_positive(ratio=ratio)
     b = np.array([1.0, speed, speed * ratio**0.5])
     problem = Problem.contact(np.diag([1.0, 1.0, ratio]), b, [0.5])
 
     def secular() -> Reference:
-        return Reference(_secular(b, ratio), "secular equation")
+        return Reference(_solve_secular_equation(b, ratio), "secular equation")
 
     return Draft(
-        problem, "tangents of unequal mass: where the usual disk projections are wrong or cycle", secular
+        problem, "tangents of unequal mass, for which common disk projections are wrong or cycle", secular
     )
 
 
-def _secular(b: FloatArray, ratio: float) -> FloatArray:
+def _solve_secular_equation(b: FloatArray, ratio: float) -> FloatArray:
+    """Solve the secular equation of the sliding contact; (3,) [N s]."""
     from scipy.optimize import brentq
 
     radius, mass = 0.5 * b[0], np.array([1.0, ratio])
     if np.hypot(*(b[1:] / mass)) <= radius:
         return np.append(b[0], b[1:] / mass)
-    most = float(np.hypot(*b[1:])) / radius
-    s = brentq(lambda s: np.hypot(*(b[1:] / (mass + s))) - radius, 0.0, most, xtol=1e-300, rtol=2.0**-50)
+    upper_limit = float(np.hypot(*b[1:])) / radius
+    s = brentq(
+        lambda s: np.hypot(*(b[1:] / (mass + s))) - radius, 0.0, upper_limit, xtol=1e-300, rtol=2.0**-50
+    )
     return np.append(b[0], b[1:] / (mass + s))
 
 
@@ -127,16 +134,16 @@ def painleve(slide: float = 3.0, lift: float = 0.1) -> Draft:
     """A rod sliding on its tip, mu = 2: A_nn - mu A_nt < 0, so that sliding presses the rod into the ground.
 
     Length 2, mass 1, inclined by 1.2 rad, one tangent: A = [[1 + 3 c^2, 3 c s], [3 c s, 1 + 3 s^2]], c, s of 1.2.
-    Free it would lift off with `lift` and slide with `slide` [m/s]. Open (lambda = 0) is a solution; so may be
-    stick and slip: `lavender.find_solutions` has all of them.
+    Without contact it would lift off with `lift` and slide with `slide` [m/s]. Open (lambda = 0) is a solution;
+    sticking and sliding may be solutions, too: `lavender.find_solutions` finds all of them.
     """
-    positive(lift=lift)
+    check_positive(lift=lift)
     c, s = math.cos(1.2), math.sin(1.2)
     a = np.array([[1.0 + 3.0 * c * c, 3.0 * c * s], [3.0 * c * s, 1.0 + 3.0 * s * s]])
     problem = Problem.contact(a, [-lift, -slide], [2.0])
     return Draft(
         problem,
-        "Painleve: several solutions, all right",
+        "Painleve: several solutions, all correct",
         lambda: Reference(np.zeros(2), "open: nothing approaches", "error"),
     )
 
@@ -144,33 +151,38 @@ def painleve(slide: float = 3.0, lift: float = 0.1) -> Draft:
 @family()
 def arch(n: int = 9, mu: float = 0.6) -> Draft:
     """n voussoirs of a half circle (radius 5 m, 1 m thick), four points between neighbours."""
-    at_least(3, n=n)
+    check_minimum(3, n=n)
     angle = np.pi * np.arange(n + 1) / n
     middle = 0.5 * (angle[1:] + angle[:-1])
-    position = np.stack([-5.0 * each(math.cos, middle), 0.0 * middle, 5.0 * each(math.sin, middle)], 1)
+    position = np.stack(
+        [-5.0 * map_scalar(math.cos, middle), 0.0 * middle, 5.0 * map_scalar(math.sin, middle)], 1
+    )
     bodies = Bodies(position, 1.0, 0.3)
     k = np.arange(n + 1)
     pairs = np.stack([np.where(k == 0, -1, k - 1), np.where(k == n, -1, k)], 1)
-    # Joint k looks along the arch; the corner points are at radii 4.5 and 5.5, half a metre either side.
+    # Joint k has its normal along the arch; its corner points are at radii 4.5 and 5.5 m and y = -0.5 and 0.5 m.
     radius, side = (g.ravel() for g in np.meshgrid([4.5, 5.5], [-0.5, 0.5], indexing="ij"))
-    along, up = each(math.cos, angle), each(math.sin, angle)
+    along, up = map_scalar(math.cos, angle), map_scalar(math.sin, angle)
     point = np.stack([
         (-along[:, None] * radius).ravel(), np.tile(side, n + 1), (up[:, None] * radius).ravel()
     ], 1)  # fmt: skip
     normal = np.repeat(np.stack([up, 0.0 * angle, along], 1), 4, axis=0)
     problem = contact_problem(bodies, Contacts(np.repeat(pairs, 4, axis=0), point, normal), "coulomb", mu)
     return Draft(
-        problem, "held up by friction and thrust alone: errors show as a sag", rest_reference(problem), EXACT
+        problem,
+        "held by friction and thrust alone: errors appear as a sag",
+        rest_reference(problem),
+        EXPECT_EXACT,
     )
 
 
 @family()
 def card_house(levels: int = 3, mu: float = 0.7) -> Draft:
     """A house of cards: leaning pairs, cards across their tops, the next level on those; two points per edge."""
-    at_least(1, levels=levels)
+    check_minimum(1, levels=levels)
     lean = np.deg2rad(20.0)
     d, h = math.sin(lean), math.cos(lean)
-    half = 0.02  # m, between the edges at a top
+    half = 0.02  # m, half the distance between the edges at a top
     position: list[list[float]] = []
     contacts: list[tuple[int, int, list[float], list[float]]] = []
 
@@ -182,7 +194,7 @@ def card_house(levels: int = 3, mu: float = 0.7) -> Draft:
         contacts.extend((a, b, [x, y, z], normal) for y in (-0.4, 0.4))
 
     up, right = [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]
-    floor: dict[int, int] = {}  # card under the pair
+    cards_below: dict[int, int] = {}  # card below each pair
     spacing = 2.0 * (d + half)
     for level in range(levels):
         z = level * h
@@ -191,19 +203,19 @@ def card_house(levels: int = 3, mu: float = 0.7) -> Draft:
         for j in range(pairs):
             x = spacing * (j + 0.5 * level)
             left, other = add(x - half - 0.5 * d, z + 0.5 * h), add(x + half + 0.5 * d, z + 0.5 * h)
-            base = floor.get(j, -1)
+            base = cards_below.get(j, -1)
             edge(base, left, x - half - d, z, up)
             edge(base, other, x + half + d, z, up)
             edge(left, other, x, z + h, right)
             cards.append((x, left, other))
-        floor = {}
+        cards_below = {}
         for j in range(pairs - 1):
-            (x, _, one), (y, two, _) = cards[j], cards[j + 1]
+            (x, _, left_card), (y, right_card, _) = cards[j], cards[j + 1]
             across = add(0.5 * (x + y), z + h)
-            edge(one, across, x + half, z + h, up)
-            edge(two, across, y - half, z + h, up)
-            floor[j] = across
+            edge(left_card, across, x + half, z + h, up)
+            edge(right_card, across, y - half, z + h, up)
+            cards_below[j] = across
     bodies = Bodies(position, 1.0, 0.1)
     a, b, point, normal = zip(*contacts, strict=True)
     problem = contact_problem(bodies, Contacts(np.stack([a, b], 1), point, normal), "coulomb", mu)
-    return Draft(problem, "stands by friction only, over several levels", rest_reference(problem), EXACT)
+    return Draft(problem, "held by friction only, over several levels", rest_reference(problem), EXPECT_EXACT)

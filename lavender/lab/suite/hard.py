@@ -1,8 +1,8 @@
-"""Hard cases: each takes one thing to its extreme, with a reference that no solver has to vouch for.
+"""Hard cases: each takes one property to its extreme, with a reference that does not depend on a solver.
 
-References are closed forms, exact integers, enumerations, or solutions proved in 100 bits
-(`lavender.lab.suite.exact`). Where none is known (sliding at large mass ratios), `reference` is None and the
-judge alone speaks. `SET` is what `lavender report hard` runs.
+References are closed forms, exact integers, enumerations, or solutions proved in 100 bits (`lavender.lab.suite.exact`).
+If none is known (sliding at large mass ratios), `reference` is None and only the judge assesses answers. `SET` lists
+the cases of `lavender report hard`.
 """
 
 from __future__ import annotations
@@ -13,33 +13,33 @@ import numpy as np
 
 from lavender.base.errors import InputError
 from lavender.lab.suite.build import (
-    FALL,
+    FALL_SPEED,
     Bodies,
     Contacts,
+    add_horizontal_velocity,
     contact_problem,
-    each,
     joint_problem,
     manifold,
-    sideways,
+    map_scalar,
     tower,
 )
 from lavender.lab.suite.case import Draft, Reference, family
 from lavender.lab.suite.exact import solve_linear
 from lavender.lab.suite.families import (
     BOX,
-    MU,
+    FRICTION_COEFFICIENT,
     SPHERE,
-    at_least,
     ball_joints,
-    positive,
-    product,
+    check_minimum,
+    check_positive,
+    ordered_matmul,
     rest_reference,
 )
 from lavender.problem import Problem
 from lavender.problem.rows import Rows
 
-EXACT = "reaches the floor: newton, direct, auto"
-SWEEPS_STALL = "sweeps stall; " + EXACT
+EXPECT_EXACT = "reaches the floor: newton, direct, auto"
+EXPECT_SWEEPS_STALL = "sweeps stall; " + EXPECT_EXACT
 
 SET = (
     # Mass ratios.
@@ -51,7 +51,7 @@ SET = (
     *(f"big_boxF(mass_ratio={r}, sliding=0.5)" for r in ("1", "400")),
     *(f"chain(n=33, tip_mass={r})" for r in ("1e4", "1e8")),
     *(f"hang(n=33, tip_mass={r})" for r in ("1", "1e4", "1e8")),
-    # Long ways.
+    # Long paths from the ground to the load.
     "stack(n=10)", "stack(n=100)", "stack(n=1000)", "chain(n=1000)", "hang(n=100)", "hang(n=1000)", "hang(n=10000)",
     # Redundancy.
     *(f"duplicated(k={k})" for k in (2, 3, 8, 64)),
@@ -70,7 +70,7 @@ SET = (
     "stackF(n=10, sliding=0.5)", "box_stackF(n=10, sliding=0.5)", "pyramidF(k=6, sliding=0.5)",
     "pyramidF(k=6, mass_ratio=1e3, sliding=0.5)", "pyramidF(k=6, mass_ratio=1e6, sliding=0.5)",
     "granularF(n=4, sliding=0.5)", "box_stackF(n=10, mass_ratio=1e6)",
-    # Numbers.
+    # Special numbers.
     *(f"diagonal(kind={k})" for k in ("zero", "negative", "negligible")),
     *(f"units(kg={k}, m={m}, s={s})" for k, m, s in (("1e12", 1, 1), ("1e-12", 1, 1), (1, "1e6", 1), (1, 1, "1e-6"))),
     "least_speeds", *(f"degenerate_lcp(n={n})" for n in (8, 40)), "degenerate_lcp(n=40, asymmetric=1)",
@@ -88,15 +88,15 @@ def big_box(mass_ratio: float = 400.0, friction: str = "none", sliding: float = 
 
     400 is the ratio of equal density in a plane.
     """
-    positive(mass_ratio=mass_ratio)
+    check_positive(mass_ratio=mass_ratio)
     bodies = Bodies([[-5.0, 0.0, 0.5], [5.0, 0.0, 0.5], [0.0, 0.0, 11.0]], [1.0, 1.0, mass_ratio], BOX)
     bodies.inertia[2] *= 400.0
-    sideways(bodies, sliding)
+    add_horizontal_velocity(bodies, sliding)
     pairs = [[-1, 0], [-1, 1], [0, 2], [1, 2]]
     centre = [[-5.0, 0.0, 0.0], [5.0, 0.0, 0.0], [-5.0, 0.0, 1.0], [5.0, 0.0, 1.0]]
-    problem = contact_problem(bodies, manifold(pairs, centre, 0.5), friction, MU)
+    problem = contact_problem(bodies, manifold(pairs, centre, 0.5), friction, FRICTION_COEFFICIENT)
     rest = rest_reference(problem) if friction == "none" or sliding == 0.0 else None
-    return Draft(problem, "heavy on light with levers of ten metres", rest, SWEEPS_STALL)
+    return Draft(problem, "heavy on light with levers of ten metres", rest, EXPECT_SWEEPS_STALL)
 
 
 @family()
@@ -105,13 +105,13 @@ def duplicated(k: int = 8) -> Draft:
 
     Undamped Jacobi has the factor k - 1: it cycles for k = 2 and diverges for k of 3 and more.
     """
-    at_least(1, k=k)
+    check_minimum(1, k=k)
     bodies = Bodies([[0.0, 0.0, 0.5]], 1.0, SPHERE)
     contacts = Contacts(np.tile([-1, 0], (k, 1)), np.zeros((k, 3)), [0.0, 0.0, 1.0])
     problem = contact_problem(bodies, contacts)
 
     def closed_form() -> Reference:
-        return Reference(np.full(k, FALL / k), "closed form: the weight, shared", "slack")
+        return Reference(np.full(k, FALL_SPEED / k), "closed form: the weight, shared", "slack")
 
     return Draft(problem, "the same row many times: Jacobi diverges unless damped, A has rank 1", closed_form)
 
@@ -119,13 +119,13 @@ def duplicated(k: int = 8) -> Draft:
 @family(slabF={"friction": "coulomb"})
 def slab(n: int = 5, friction: str = "none", sliding: float = 0.0) -> Draft:
     """A slab of 10 kg on n x n points: rank 3 (6 with friction), however many points."""
-    at_least(2, n=n)
+    check_minimum(2, n=n)
     x = np.linspace(-1.0, 1.0, n)
     point = np.stack([*(g.ravel() for g in np.meshgrid(x, x)), np.zeros(n * n)], 1)
     bodies = Bodies([[0.1, 0.05, 0.2]], 10.0, 0.35)
-    sideways(bodies, sliding)
+    add_horizontal_velocity(bodies, sliding)
     problem = contact_problem(
-        bodies, Contacts(np.tile([-1, 0], (n * n, 1)), point, [0.0, 0.0, 1.0]), friction, MU
+        bodies, Contacts(np.tile([-1, 0], (n * n, 1)), point, [0.0, 0.0, 1.0]), friction, FRICTION_COEFFICIENT
     )
     rest = rest_reference(problem) if friction == "none" or sliding == 0.0 else None
     return Draft(problem, "a body on many points: only three of them are needed", rest)
@@ -135,24 +135,25 @@ def slab(n: int = 5, friction: str = "none", sliding: float = 0.0) -> Draft:
 def four_bar(tilt: float = 0.3) -> Draft:
     """A closed loop: three bars and the ground, four parallel hinges of five rows, in a tilted plane.
 
-    20 rows on 18 degrees of freedom that still move in one: rank 17. An engine that trusts its pivots drifts.
+    20 rows on 18 degrees of freedom with one remaining degree of freedom: rank 17. Trusting the pivots causes drift.
     """
     anchor = np.array([[0.0, 0.0, 0.0], [0.3, 0.0, 1.0], [1.4, 0.0, 1.3], [1.5, 0.0, 0.0]])
     c, s = math.cos(tilt), math.sin(tilt)
-    turn = np.array([[c, -s, 0.0], [c * s, c * c, -s], [s * s, s * c, c]])  # about z, then about x
-    anchor = product(anchor, turn.T)
+    rotation = np.array([[c, -s, 0.0], [c * s, c * c, -s], [s * s, s * c, c]])  # about z, then about x
+    anchor = ordered_matmul(anchor, rotation.T)
     bodies = Bodies(0.5 * (anchor[1:] + anchor[:-1]), [1.0, 2.0, 1.0], 0.1)
     body = np.array([[-1, 0], [0, 1], [1, 2], [2, -1]])
     ball = ball_joints(bodies.position, body, anchor).reshape(4, 3, 12)
-    across = turn.T[[0, 2]]  # of the hinge, which is y: omega_b - omega_a has no part there
-    turning = np.zeros((4, 2, 12))
+    # Perpendicular to the hinge axis y: omega_b - omega_a is zero along these.
+    hinge_normals = rotation.T[[0, 2]]
+    hinge_rows = np.zeros((4, 2, 12))
     for joint, (a, b) in enumerate(body):
         for row in range(2):
             if a >= 0:
-                turning[joint, row, 3:6] = -across[row]
+                hinge_rows[joint, row, 3:6] = -hinge_normals[row]
             if b >= 0:
-                turning[joint, row, 9:12] = across[row]
-    jac = np.concatenate([ball, turning], axis=1).reshape(-1, 12)
+                hinge_rows[joint, row, 9:12] = hinge_normals[row]
+    jac = np.concatenate([ball, hinge_rows], axis=1).reshape(-1, 12)
     problem = joint_problem(bodies, body, jac, 5, names=[f"hinge {i}" for i in range(4)])
     return Draft(
         problem,
@@ -165,10 +166,10 @@ def four_bar(tilt: float = 0.3) -> Draft:
 @family()
 def ring(n: int = 8) -> Draft:
     """A closed ring of n rods in a tilted circle, ball joints, hung at one point: a cycle of 3 n + 3 rows."""
-    at_least(3, n=n)
+    check_minimum(3, n=n)
     angle = 2.0 * np.pi * np.arange(n + 1) / n
-    along = each(math.cos, angle)
-    anchor = np.stack([each(math.sin, angle), 0.2 * along, -1.0 + along], 1)
+    along = map_scalar(math.cos, angle)
+    anchor = np.stack([map_scalar(math.sin, angle), 0.2 * along, -1.0 + along], 1)
     bodies = Bodies(0.5 * (anchor[1:] + anchor[:-1]), 1.0, 0.1)
     body = np.stack([np.arange(n) - 1, np.arange(n)], 1)
     body[0, 0] = n - 1
@@ -187,15 +188,14 @@ def ring(n: int = 8) -> Draft:
 
 @family()
 def near_parallel(angle: float = 1e-4) -> Draft:
-    """A point mass on two planes whose normals differ by 2 x `angle` [rad]: A = [[1, c], [c, 1]], c = cos 2 angle."""
-    positive(angle=angle)
+    """A point mass on two planes, normals 2 x `angle` [rad] apart: A = [[1, c], [c, 1]], c = cos 2 angle."""
+    check_positive(angle=angle)
     problem = _on_two_planes(math.sin(angle), math.cos(angle))
-    unique = (
-        "impulse" if angle > 1e-3 else "slack"
-    )  # 1 - c^2 = 4 angle^2 amplifies the rounding of the normals
+    # 1 - c^2 = 4 angle^2 amplifies the rounding of the normals.
+    unique = "impulse" if angle > 1e-3 else "slack"
 
     def closed_form() -> Reference:
-        return Reference(np.full(2, 0.5 * FALL / math.cos(angle)), "closed form: symmetric", unique)
+        return Reference(np.full(2, 0.5 * FALL_SPEED / math.cos(angle)), "closed form: symmetric", unique)
 
     return Draft(
         problem, "two contacts that are almost one: A is singular to float64 below 1e-8", closed_form
@@ -204,12 +204,12 @@ def near_parallel(angle: float = 1e-4) -> Draft:
 
 @family()
 def wedge(angle: float = 1e-4) -> Draft:
-    """A point mass falls into a slot whose two walls are `angle` [rad] from vertical: impulses 1 / (2 sin angle)."""
-    positive(angle=angle)
+    """A point mass falls into a slot with two walls at `angle` [rad] from vertical: impulses 1 / (2 sin angle)."""
+    check_positive(angle=angle)
     problem = _on_two_planes(math.cos(angle), math.sin(angle))
 
     def closed_form() -> Reference:
-        impulse = 0.5 * FALL / problem.rows.normal[:, 2]  # type: ignore[union-attr]
+        impulse = 0.5 * FALL_SPEED / problem.rows.normal[:, 2]  # type: ignore[union-attr]
         return Reference(impulse, "closed form: symmetric")
 
     return Draft(
@@ -218,6 +218,7 @@ def wedge(angle: float = 1e-4) -> Draft:
 
 
 def _on_two_planes(x: float, z: float) -> Problem:
+    """Build a point mass on two planes with normals (x, 0, z) and (-x, 0, z)."""
     bodies = Bodies([[0.0, 0.0, 0.0]], 1.0, 0.0)
     contacts = Contacts([[-1, 0], [-1, 0]], np.zeros((2, 3)), [[x, 0.0, z], [-x, 0.0, z]])
     return contact_problem(bodies, contacts)
@@ -228,17 +229,17 @@ def _on_two_planes(x: float, z: float) -> Problem:
 
 @family()
 def diagonal(kind: str = "zero", n: int = 12) -> Draft:
-    """An LCP with zero, negative or negligible diagonal entries, made from its solution in small integers.
+    """An LCP with zero, negative or negligible diagonal entries, built from its solution in small integers.
 
-    Sweeps divide by the largest entry of the row instead and need not converge; pivoting does not care.
+    Sweeps divide by the largest entry of the row instead and need not converge; pivoting is not affected.
     """
-    at_least(2, n=n)
+    check_minimum(2, n=n)
     value = {"zero": 0.0, "negative": -1.0, "negligible": 2.0**-60}.get(kind)
     if value is None:
         raise InputError(f"kind is {kind!r}; zero, negative, negligible are known")
     rng = np.random.default_rng(2)
     a = rng.integers(-3, 4, (n, n)).astype(float)
-    # skew part: monotone apart from the diagonal
+    # The off-diagonal part is skew: A is monotone except for the diagonal.
     a = np.triu(a, 1) - np.triu(a, 1).T + np.diag(np.full(n, 4.0))
     a[np.arange(0, n, 3), np.arange(0, n, 3)] = value
     active = np.arange(n) % 2 == 0
@@ -247,22 +248,22 @@ def diagonal(kind: str = "zero", n: int = 12) -> Draft:
         impulse[::3] = 0.0  # 2^-60 times an integer would not be exact in b
         active[::3] = False
     slack = np.where(active, 0, rng.integers(1, 5, n)).astype(float)
-    problem = Problem.lcp(a, a @ impulse - slack)  # exact: small integers
+    problem = Problem.lcp(a, a @ impulse - slack)  # The product is exact: the numbers are small integers.
     return Draft(
         problem,
-        f"{kind} diagonal entries: legal, and a sweep has nothing to divide by",
-        lambda: Reference(impulse, "made from it, in integers", "error"),
-        "solvers that cannot take it refuse, or say that they did not converge",
+        f"{kind} diagonal entries: legal, but a sweep cannot divide by them",
+        lambda: Reference(impulse, "built from it, in integers", "error"),
+        "solvers that do not accept it raise an error or report that they did not converge",
     )
 
 
 @family()
 def units(kg: float = 1e12, m: float = 1.0, s: float = 1.0, n: int = 5) -> Draft:
-    """The box stack in other units: masses times kg, lengths times m, times times s. No relative error may move."""
-    positive(kg=kg, m=m, s=s)
-    at_least(1, n=n)
-    position, pairs, foot = tower(n)
-    bodies, contacts = Bodies(position, 1.0, BOX), manifold(pairs, foot, 0.5)
+    """The box stack in other units, masses times kg, lengths times m, times times s: relative errors stay."""
+    check_positive(kg=kg, m=m, s=s)
+    check_minimum(1, n=n)
+    position, pairs, contact_point = tower(n)
+    bodies, contacts = Bodies(position, 1.0, BOX), manifold(pairs, contact_point, 0.5)
     arm_a, arm_b = contacts.arms(bodies.position)
     speed = np.repeat([m / s, 1.0 / s], 3)
     rows = Rows(
@@ -278,16 +279,16 @@ def units(kg: float = 1e12, m: float = 1.0, s: float = 1.0, n: int = 5) -> Draft
     problem = Problem.from_rows(rows)
 
     def closed_form() -> Reference:
-        load = FALL * kg * m / s * (n - np.arange(n))
+        load = FALL_SPEED * kg * m / s * (n - np.arange(n))
         return Reference(np.repeat(0.25 * load, 4), "closed form: the weight above", "slack")
 
-    return Draft(problem, "tolerances with a hidden unit show", closed_form)
+    return Draft(problem, "reveals tolerances with a hidden unit", closed_form)
 
 
 @family()
 def least_speeds(n: int = 8) -> Draft:
-    """A stack whose speeds are the least that a problem may have: lambda_i = (n - i) 2^-199, exactly."""
-    at_least(1, n=n)
+    """A stack with the smallest speeds that a problem may have: lambda_i = (n - i) 2^-199, exactly."""
+    check_minimum(1, n=n)
     a = 2.0 * np.eye(n) - np.eye(n, k=1) - np.eye(n, k=-1)
     a[0, 0] = 1.0
     b = np.zeros(n)
@@ -295,35 +296,35 @@ def least_speeds(n: int = 8) -> Draft:
     problem = Problem.lcp(a, b)
     return Draft(
         problem,
-        "no tolerance in units sees them, so a careless norm calls anything a solution",
+        "below every tolerance with a unit, so that an absolute norm accepts any answer",
         lambda: Reference(np.arange(n, 0, -1.0) * 2.0**-199, "exact"),
     )
 
 
 @family()
 def degenerate_lcp(n: int = 40, seed: int = 0, asymmetric: int = 0) -> Draft:
-    """A random P-matrix LCP, a third of whose rows have lambda = w = 0; in small integers, so exact."""
-    at_least(1, n=n)
+    """A random P-matrix LCP in small integers, hence exact; a third of its rows have lambda = w = 0."""
+    check_minimum(1, n=n)
     rng = np.random.default_rng(seed)
     g = rng.integers(-2, 3, (n, n + 2)).astype(float)
     a = g @ g.T + np.eye(n)
     if asymmetric:
         skew = np.triu(rng.integers(-3, 4, (n, n)), 1).astype(float)
         a += skew - skew.T
-    state = rng.integers(0, 3, n)  # 0 carries, 1 separates, 2 touches
+    state = rng.integers(0, 3, n)  # 0: impulse, 1: separating, 2: touching without an impulse
     impulse = np.where(state == 0, rng.integers(1, 9, n), 0).astype(float)
     slack = np.where(state == 1, rng.integers(1, 9, n), 0).astype(float)
     problem = Problem.lcp(a, a @ impulse - slack)
     return Draft(
         problem,
-        "rows that touch without pressing: active sets flicker, strict complementarity fails",
-        lambda: Reference(impulse, "made from it, in integers"),
+        "rows that touch without an impulse: active sets change often, strict complementarity fails",
+        lambda: Reference(impulse, "built from it, in integers"),
     )
 
 
 @family()
 def infeasible(kind: str = "squeeze") -> Draft:
-    """No solution: "squeeze" drives floor and ceiling through a body; "joints" holds one row at two speeds.
+    """No solution: "squeeze" moves floor and ceiling through a body; "joints" prescribes two speeds for one row.
 
     y with A y = 0 and b.y > 0 proves it: the two rows pull the body apart without moving it.
     """
@@ -343,9 +344,9 @@ def infeasible(kind: str = "squeeze") -> Draft:
         raise InputError(f"kind is {kind!r}; squeeze, joints are known")
     return Draft(
         problem,
-        "no impulse does it: CONVERGED would be a lie, INFEASIBLE needs a proof",
+        "no impulse satisfies it: CONVERGED would be wrong, INFEASIBLE needs a proof",
         lambda: Reference(None, "A y = 0, b.y > 0", "nothing", certificate=proof),
-        "INFEASIBLE with a certificate, or any honest status but CONVERGED",
+        "INFEASIBLE with a certificate, or another correct status than CONVERGED",
     )
 
 

@@ -1,6 +1,6 @@
-"""Steps that others ask for: of LavenderSim's scenes, of robots, and predictive control of a walk.
+"""Steps of other programs: of LavenderSim's scenes, of robot models, and of predictive control of a walk.
 
-Models of robots are those that other packages install; nothing of theirs is copied.
+Robot models are read from other packages that are installed; none of their files are copied.
 """
 
 from __future__ import annotations
@@ -12,20 +12,20 @@ from pathlib import Path
 import numpy as np
 
 from lavender.base.errors import SolverUnavailable, UnknownName, check_name
+from lavender.lab.suite.build import GRAVITY
 from lavender.lab.suite.case import Draft, family, parse
-from lavender.lab.suite.families import at_least, positive, product
+from lavender.lab.suite.families import check_minimum, check_positive, ordered_matmul
 from lavender.problem import Problem
 
-GRAVITY = 9.81  # m/s^2
 #: Licence of each package's models.
 LICENCES = {"gymnasium": "MIT", "dm_control": "Apache-2.0"}
-FOLDERS = {"gymnasium": "envs/mujoco/assets", "dm_control": "suite"}
-CONES = {"pyramidal": 0, "elliptic": 1}
+MODEL_FOLDERS = {"gymnasium": "envs/mujoco/assets", "dm_control": "suite"}
+MUJOCO_CONES = {"pyramidal": 0, "elliptic": 1}
 
 
 @family()
 def engine_step(scene: str = "pyramid", at: int = 30) -> Draft:
-    """The problem of a scene's substep after `at` steps of LavenderSim at its defaults, without its warm start."""
+    """The problem of a scene's substep after `at` steps of LavenderSim with default options, without its warm start."""
     from lavender.sim.engine import Simulation
     from lavender.sim.scene import SCENES, Scene
 
@@ -35,37 +35,38 @@ def engine_step(scene: str = "pyramid", at: int = 30) -> Draft:
         simulation.step()
     problem = dataclasses.replace(simulation.constraint_problem(), guess=None, key=None)
     return Draft(
-        problem, f"{scene} in motion: contacts as an engine finds them, some of which have just closed"
+        problem,
+        f"{scene} in motion: contacts of an engine's collision detection, some of which have just closed",
     )
 
 
 @family()
 def walking(n: int = 16, dt: float = 0.1, height: float = 0.8, foot: float = 0.1, seed: int = 0) -> Draft:
-    """Predictive control of a walk: n jerks of the centre of mass that keep the pressure inside of the feet.
+    """Predictive control of a walk: n jerks of the centre of mass that keep the centre of pressure inside the feet.
 
     min 1/2 |z - z_ref|^2 + 1/2 1e-4 |u|^2 over jerks u [m/s^3], z = c - (height/g) c'' the centre of pressure [m], in
     the foot of each instant: 2 n bounded rows over n variables (P.-B. Wieber 2006, Humanoids, 137-142, eqs. 7-10).
     """
-    at_least(1, n=n)
-    positive(dt=dt, height=height, foot=foot)
+    check_minimum(1, n=n)
+    check_positive(dt=dt, height=height, foot=foot)
     rng = np.random.default_rng([seed, 0x77616C6B])
-    move = np.array([[1.0, dt, dt * dt / 2], [0.0, 1.0, dt], [0.0, 0.0, 1.0]])
-    push, pressure = np.array([dt**3 / 6, dt * dt / 2, dt]), np.array([1.0, 0.0, -height / GRAVITY])
+    transition = np.array([[1.0, dt, dt * dt / 2], [0.0, 1.0, dt], [0.0, 0.0, 1.0]])
+    jerk_effect, pressure = np.array([dt**3 / 6, dt * dt / 2, dt]), np.array([1.0, 0.0, -height / GRAVITY])
     state = np.array([0.0, rng.normal(scale=0.2), 0.0])
     free, by_jerk = np.empty(n), np.zeros((n, n))
-    ways = np.zeros((3, n))  # of the state by each jerk
+    by_each_jerk = np.zeros((3, n))  # effect of each jerk on the state
     for k in range(n):
-        state, ways = product(move, state), product(move, ways)
-        ways[:, k] = push
-        free[k], by_jerk[k] = product(pressure, state), product(pressure, ways)
-    middle = 0.2 * ((np.arange(n) + rng.integers(8)) // 8) + rng.normal(scale=0.01, size=n)
+        state, by_each_jerk = ordered_matmul(transition, state), ordered_matmul(transition, by_each_jerk)
+        by_each_jerk[:, k] = jerk_effect
+        free[k], by_jerk[k] = ordered_matmul(pressure, state), ordered_matmul(pressure, by_each_jerk)
+    foot_centre = 0.2 * ((np.arange(n) + rng.integers(8)) // 8) + rng.normal(scale=0.01, size=n)
     problem = Problem.from_qp(
-        product(by_jerk.T, by_jerk) + 1e-4 * np.eye(n),
-        product(by_jerk.T, free - middle),
+        ordered_matmul(by_jerk.T, by_jerk) + 1e-4 * np.eye(n),
+        ordered_matmul(by_jerk.T, free - foot_centre),
         G=np.vstack([by_jerk, -by_jerk]),
-        h=np.concatenate([middle + 0.5 * foot - free, free - middle + 0.5 * foot]),
+        h=np.concatenate([foot_centre + 0.5 * foot - free, free - foot_centre + 0.5 * foot]),
     )
-    return Draft(problem, "a quadratic program of control: dense rows that come in pairs, few of which bind")
+    return Draft(problem, "a quadratic program of control: dense rows in pairs, few of which are active")
 
 
 # -- robots -----------------------------------------------------------------------------------------------
@@ -75,34 +76,34 @@ def walking(n: int = 16, dt: float = 0.1, height: float = 0.8, foot: float = 0.1
 def robot(package: str = "gymnasium", model: str = "ant", cone: str = "pyramidal", at: int = 200) -> Draft:
     """A MuJoCo model of gymnasium or dm_control after `at` steps under controls drawn by seed 0.
 
-    The numbers are those of one version of MuJoCo and of the package (`versions`).
+    The numbers depend on the versions of MuJoCo and of the package (`versions`).
     """
-    path, known = _find(package, model), tuple(CONES)
+    path, known = _find_model_file(package, model), tuple(MUJOCO_CONES)
     check_name("cone", cone, known)
     import mujoco
 
     from lavender.io import from_mujoco
 
     m = mujoco.MjModel.from_xml_path(str(path))
-    m.opt.cone = CONES[cone]
+    m.opt.cone = MUJOCO_CONES[cone]
     d, rng = mujoco.MjData(m), np.random.default_rng(0)
     for _ in range(at):
         d.ctrl[:] = rng.uniform(-1.0, 1.0, m.nu)
         mujoco.mj_step(m, d)
     mujoco.mj_forward(m, d)
     problem = dataclasses.replace(from_mujoco(m, d), guess=None)
-    return Draft(problem, f"{model} of {package}, thrown about: few rows that share many velocities")
+    return Draft(problem, f"{model} of {package} under random controls: few rows that share many velocities")
 
 
 def package_of(name: str) -> str:
-    """The package that the model of a case's name is in; empty where the name alone makes it."""
+    """Return the package of models that a case's name needs; empty if it needs none."""
     if name.partition("(")[0] != "robot":
         return ""
     return str(parse(name)[1].get("package", "gymnasium"))
 
 
 def missing(package: str) -> str:
-    """What has to be installed for the models of a package; empty where all is there."""
+    """Return a message about packages that must be installed for the models of `package`; empty if none is missing."""
     absent = [name for name in ("mujoco", package) if package and find_spec(name) is None]
     return (
         f"robots of {package} need {' and '.join(absent)}: pip install 'lavender-contact[robots]'"
@@ -112,18 +113,19 @@ def missing(package: str) -> str:
 
 
 def versions(package: str) -> str:
-    """Versions of MuJoCo and of a package of models; empty for none."""
+    """Return the versions of MuJoCo and of a package of models; empty for no package."""
     from importlib.metadata import version
 
     return ", ".join(f"{name} {version(name)}" for name in ("mujoco", package)) if package else ""
 
 
-def _find(package: str, model: str) -> Path:
-    check_name("package of models", package, FOLDERS)
-    spec, told = find_spec(package), missing(package)
-    if told or spec is None or not spec.submodule_search_locations:
-        raise SolverUnavailable(told)
-    folder = Path(spec.submodule_search_locations[0]) / FOLDERS[package]
+def _find_model_file(package: str, model: str) -> Path:
+    """Return the path of a model file, or raise SolverUnavailable or UnknownName."""
+    check_name("package of models", package, MODEL_FOLDERS)
+    spec, message = find_spec(package), missing(package)
+    if message or spec is None or not spec.submodule_search_locations:
+        raise SolverUnavailable(message)
+    folder = Path(spec.submodule_search_locations[0]) / MODEL_FOLDERS[package]
     path = folder / f"{model}.xml"
     if not path.is_file():
         raise UnknownName(f"model of {package}", model, sorted(p.stem for p in folder.glob("*.xml")))

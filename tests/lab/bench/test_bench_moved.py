@@ -11,7 +11,7 @@ from lavender.lab.bench.record import from_json, to_json
 from lavender.lab.bench.running.runner import add_motion_error
 from lavender.lab.collection import difficulty
 from lavender.lab.motion.reference import as_reference
-from lavender.lab.proof import enclosed
+from lavender.lab.proof import enclose_reference
 from lavender.lab.report import write
 
 SHORT = {"budgets": (4,), "repeats": 1, "orders": (), "time_limit": 60.0}
@@ -71,7 +71,7 @@ def test_motions_are_measured_from_an_exact_solution_and_a_claim_beyond_its_resi
     assert page.count(near) == page.count(border) == 1  # a column of the table of difficulty
     # A judge that finds no error in an answer that is wrong: only the exact solution tells.
     problem = suite.case("granular(n=2)").problem
-    enclosed(problem)
+    enclose_reference(problem)
     wrong = 0.9 * lv.solve(problem, tol=1e-9).impulse
     record = next(r for r in records if r.case == "granular(n=2)")
     assert add_motion_error(record, problem, wrong).claim_check == "confirmed"  # its residual says so

@@ -14,7 +14,7 @@ from random_problems import as_matrix, dragged, random_contact_problem, random_g
 
 import lavender as lv
 from lavender import suite
-from lavender.lab.motion.modes import enumerated
+from lavender.lab.motion.modes import enumerate_modes
 from lavender.lab.motion.multiple_solutions import distance, search
 
 LAWS = ("linear", "lcp", "cone")
@@ -307,7 +307,7 @@ def test_a_box_without_a_unique_impulse_has_its_motion_by_all_modes():
     problem = lv.Problem.from_jacobian(
         np.array(jac, float), np.diag([1, 1, 1 / 6]), [0.3, -0.16, 0.0], cones=cones
     )
-    impulses, whole = enumerated(problem)
+    impulses, whole = enumerate_modes(problem)
     assert whole
     assert impulses
     assert all(lv.residual(problem, x).relative < 1e-7 for x in impulses)

@@ -14,7 +14,7 @@ import lavender as lv
 from lavender import suite
 from lavender.lab import proof
 from lavender.lab.proof import dependence, island, operator, search
-from lavender.lab.proof.numbers import Balls, Rationals, balls
+from lavender.lab.proof.numbers import Balls, Rationals, ball_precision
 from lavender.lab.proof.operator import Operator
 from tests import proof_twin
 from tests.kkt_truth import Exact
@@ -103,7 +103,7 @@ def test_an_answer_at_the_edge_of_a_family_of_impulses_is_proven_from_inside_of_
     found = lv.prove(problem, edge)
     assert found.proven and found.velocity_radius < 1e-9
     assert abs(found.impulse - edge.impulse).max() <= found.impulse_radius  # of this answer, not of the other
-    monkeypatch.setattr(proof, "OTHERS", ())
+    monkeypatch.setattr(proof, "INTERIOR_SOLVERS", ())
     assert lv.prove(problem, edge).boundary == ("row 12", "row 21")
 
 
@@ -132,11 +132,11 @@ def test_proofs_in_threads_keep_their_precision_and_that_of_the_caller():
     before, seen = flint.ctx.prec, []
 
     def other():
-        with balls(256):
+        with ball_precision(256):
             seen.append(flint.ctx.prec)
 
     thread = threading.Thread(target=other)
-    with balls(128):
+    with ball_precision(128):
         thread.start()
         thread.join(0.2)  # s, for the other one to begin, if it could
         assert (seen, flint.ctx.prec) == ([], 128)
@@ -168,7 +168,12 @@ def test_a_twin_in_rational_numbers_finds_nothing_false(first):
 @pytest.mark.slow
 def test_sparse_numbers_prove_nothing_false_either(monkeypatch):
     """Small problems by the way of large ones: sparse float64 numbers with bounds, rows of the inverse in portions."""
-    for where, name in ((operator, "SMALL"), (operator, "DENSE"), (island, "DENSE"), (island, "PORTION")):
+    for where, name in (
+        (operator, "MAX_DENSE_BALL_ROWS"),
+        (operator, "MAX_DENSE_FLOAT_ROWS"),
+        (island, "MAX_DENSE_FLOAT_ROWS"),
+        (island, "MAX_INVERSE_ENTRIES"),
+    ):
         monkeypatch.setattr(where, name, 1)
     tried = [proof_twin.attack(seed) for seed in range(200, 230)]
     assert not [wrong for _, _, wrong in tried if wrong]
@@ -255,9 +260,9 @@ def test_an_arithmetic_with_one_rounding_turned_is_caught(monkeypatch, name, tur
 def test_balls_of_a_linear_problem_hold_its_rational_solution(monkeypatch, inverse):
     """And their middles are not that solution."""
     monkeypatch.setattr(island, "FloatInverse", getattr(island, inverse))
-    reach = island.FloatInverse.reach
+    reach = island.FloatInverse.radius
     for share, held in ((1.0, True), (0.0, False)):
-        monkeypatch.setattr(island.FloatInverse, "reach", lambda *a, share=share: share * reach(*a))
+        monkeypatch.setattr(island.FloatInverse, "radius", lambda *a, share=share: share * reach(*a))
         inside = []
         for seed in range(8):
             problem = suite.case(f"random_spd(n=6, condition=1e4, seed={seed})").problem

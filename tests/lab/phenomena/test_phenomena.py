@@ -15,12 +15,20 @@ from broken_engines import simulate as simulate_broken
 
 import lavender as lv
 from lavender.base.errors import LavenderError
-from lavender.lab.phenomena import ENGINE_VARIANTS, PHENOMENA, Record, Track, chosen, run, select_variants
+from lavender.lab.phenomena import (
+    ENGINE_VARIANTS,
+    PHENOMENA,
+    Record,
+    Track,
+    run,
+    select_phenomena,
+    select_variants,
+)
 from lavender.lab.phenomena import table as tables
-from lavender.lab.phenomena.engines import PACKAGES_OF_NODE, follow, make, versions_of_node
+from lavender.lab.phenomena.engines import PACKAGES_OF_NODE, make_engine, record_track, versions_of_node
 from lavender.lab.phenomena.engines.node import JsonLines
 from lavender.lab.phenomena.engines.tree import collision_shape
-from lavender.lab.phenomena.parts import crossing, judged
+from lavender.lab.phenomena.parts import crossing, measure_track
 from lavender.lab.phenomena.running import EngineProcess
 from lavender.sim.scene.steppers import STEPPERS
 
@@ -114,7 +122,7 @@ def test_what_the_page_says_of_a_stepper_is_what_it_does(stepper):
 def test_the_exact_solver_keeps_every_bound_of_the_first_case(name):
     # it dissipates what swings, at first order in the step: a pendulum it does not keep
     (record,) = run([name], steppers=["impulses newton"], parameters=dict(PHENOMENA[name].cases[0]))
-    assert record.passed, tables.line(record)
+    assert record.passed, tables.format_record(record)
 
 
 @pytest.mark.parametrize(
@@ -125,8 +133,10 @@ def test_friction_of_four_fifths_is_out_of_a_bound(name, of):
     p, values = PHENOMENA[name], PHENOMENA[name].values()
     weak = {of: 0.8 * values[of]} | ({"slope": values["slope"] / 0.8} if name == "slide" else {})  # of mu
     scene = p.scene(values | weak, stepper="impulses")
-    track = follow(make(ENGINE_VARIANTS["impulses newton"], scene), p.seconds(values), p.interval)
-    assert not judged(p, "weak", values, track).passed
+    track = record_track(
+        make_engine(ENGINE_VARIANTS["impulses newton"], scene), p.seconds(values), p.interval
+    )
+    assert not measure_track(p, "weak", values, track).passed
 
 
 @pytest.mark.parametrize("stepper", STEPPERS)
@@ -137,9 +147,9 @@ def test_a_pendulum_loses_less_in_shorter_steps(stepper):
     for substeps in (4, 16):
         scene = p.scene(case, stepper=stepper, dt=1 / 60, substeps=substeps)
         left.append(
-            p.measure(case, follow(make(ENGINE_VARIANTS[stepper], scene), p.seconds(case), p.interval))[
-                "energy"
-            ]
+            p.measure(
+                case, record_track(make_engine(ENGINE_VARIANTS[stepper], scene), p.seconds(case), p.interval)
+            )["energy"]
         )
     assert left[1] < 0.5 * left[0]
 
@@ -149,7 +159,7 @@ def test_what_stands_and_what_falls_are_told_apart():
     for name, key in (("tipping", "slope"), ("overhang", "reach"), ("arch", "thickness")):
         for value in (0.95, 1.05):
             (record,) = run([name], steppers=["impulses newton"], parameters={key: value})
-            assert record.value("wrong side") == 0.0, tables.line(record)
+            assert record.value("wrong side") == 0.0, tables.format_record(record)
 
 
 def test_a_track_that_stays_where_it_began_is_wrong_about_what_moves():
@@ -167,7 +177,7 @@ def test_a_track_that_stays_where_it_began_is_wrong_about_what_moves():
         still = Track(
             t, np.tile(x, (len(t), 1, 1)), np.tile(q, (len(t), 1, 1)), np.zeros((len(t), len(x), 6))
         )
-        assert not judged(p, "still", values, still).passed, name
+        assert not measure_track(p, "still", values, still).passed, name
 
 
 def test_crossings():
@@ -186,7 +196,7 @@ def test_every_engine_starts_as_the_scene_says_and_falls_as_it_should(variant):
         if any(x in one.cannot for x in p.needs):
             continue
         scene = p.scene(first(name))
-        engine = make(one, scene)
+        engine = make_engine(one, scene)
         try:
             x, q, v = engine.state()
             moves = np.array([not b.is_static for b in scene.bodies])
@@ -201,9 +211,9 @@ def test_every_engine_starts_as_the_scene_says_and_falls_as_it_should(variant):
     free = lv.Scene(friction=0.3)
     free.add_plane()
     free.add_box((0.4, 0.2, 0.3), position=(0, 0, 9), velocity=(1, 2, 3))
-    engine = make(one, free)
+    engine = make_engine(one, free)
     try:
-        track = follow(engine, 0.5, 1 / 60)
+        track = record_track(engine, 0.5, 1 / 60)
     finally:
         engine.close()
     fall = track.positions[-1, 1] - [0, 0, 9] - track.time[-1] * np.array([1, 2, 3])
@@ -220,7 +230,7 @@ def test_what_an_engine_cannot_build_is_said(variant):
     rough.add_box(friction=0.3)
     for scene, word in ((lv.Scene("four_bar"), "loop"), (soft, "rigid"), (rough, "one friction")):
         with pytest.raises(lv.CapabilityError, match=word):
-            make(ENGINE_VARIANTS[variant], scene)
+            make_engine(ENGINE_VARIANTS[variant], scene)
 
 
 def test_a_static_box_is_refused_where_an_engines_file_makes_none():
@@ -348,7 +358,7 @@ def under_node(monkeypatch, tmp_path):
 
     def made(*said):
         monkeypatch.setattr(Answers, "said", said)
-        return make(ENGINE_VARIANTS["rapier"], PHENOMENA["stick"].scene())
+        return make_engine(ENGINE_VARIANTS["rapier"], PHENOMENA["stick"].scene())
 
     return made
 
@@ -358,10 +368,10 @@ def test_poses_that_an_engine_under_node_loses_are_a_note(under_node):
     state = [0.0, 0.0, 0.0, 1.0, *[0.0] * 9] * 2
     lost = [*state[:13], None, *state[14:]]  # JSON has no nan
     engine = under_node(*({"cpu": 0.5, "state": x} for x in (state, state, lost)))
-    track = follow(engine, 3 / 60, 1 / 60)
+    track = record_track(engine, 3 / 60, 1 / 60)
     assert len(track.time) == 3  # it ends with what is not finite
     assert track.cpu == pytest.approx(1.0 / (2 / 60))  # of the other process, without what building took
-    assert "not finite from 0.0333 s" in judged(p, "rapier", p.values(), track).note
+    assert "not finite from 0.0333 s" in measure_track(p, "rapier", p.values(), track).note
 
 
 def test_what_an_engine_under_node_says_is_told(under_node):
@@ -404,7 +414,7 @@ def test_a_program_is_asked_by_lines_and_its_end_is_told():
 def test_a_stepper_that_does_not_take_a_scene_is_a_note_and_the_others_go_on():
     found = run(["spin_down"], steppers=["xpbd", "impulses"], parameters={})
     notes = {r.engine: r.note for r in found}
-    assert "spin" in notes["xpbd"]
+    assert "torsional friction" in notes["xpbd"]
     assert not notes["impulses"]
 
 
@@ -415,7 +425,7 @@ def test_a_limit_that_is_none_is_refused(limit):
 
 
 def test_names_of_engine_variants():
-    assert [p.name for p in chosen(["stick", "stop", "stick"])] == ["stick", "stop"]
+    assert [p.name for p in select_phenomena(["stick", "stop", "stick"])] == ["stick", "stop"]
     assert {w.name for w in select_variants(["soft_step"], [])} == {"soft_step", "soft_step 16x4"}
     assert [w.name for w in select_variants([], ["pybullet 4x100"])] == ["pybullet 4x100"]
     assert len(select_variants()) == len(ENGINE_VARIANTS)

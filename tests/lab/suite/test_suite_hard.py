@@ -38,7 +38,7 @@ def test_a_cube_on_a_ramp_slides_with_the_speed_of_the_textbook(angle):
     case = ramp(angle=angle)
     a = np.deg2rad(angle)
     v = case.problem.velocity(case.reference.impulse)[0]
-    expected = build.FALL * max(0.0, np.sin(a) - 0.5 * np.cos(a))
+    expected = build.FALL_SPEED * max(0.0, np.sin(a) - 0.5 * np.cos(a))
     assert v[0] == pytest.approx(expected, abs=1e-16)
     assert np.abs(v[1:]).max() <= 1e-16  # it neither lifts nor tips
     judged = lv.residual(case.problem, case.reference.impulse)
@@ -49,7 +49,7 @@ def test_the_threshold_is_between_stick_and_slip():
     for above in (-1e-9, 1e-9):
         case = threshold(above=above)
         w = case.problem.slack(case.reference.impulse)
-        assert np.hypot(w[1], w[2]) == pytest.approx(max(0.0, above) * 0.5 * build.FALL, abs=1e-17)
+        assert np.hypot(w[1], w[2]) == pytest.approx(max(0.0, above) * 0.5 * build.FALL_SPEED, abs=1e-17)
 
 
 def test_painleve_has_three_solutions():
@@ -74,7 +74,7 @@ def test_structures_stand(name):
     v = case.problem.velocity(case.reference.impulse)
     # Loads of tens of kilograms on bodies of one: rounding of impulses is 1e-15 of a metre per second each.
     assert np.abs(v).max() <= 1e-12
-    assert np.linalg.norm(case.problem.rows.v_free) >= build.FALL
+    assert np.linalg.norm(case.problem.rows.v_free) >= build.FALL_SPEED
     if case.problem.law == "coulomb":
         weaker = suite.case(name.rstrip(")") + (", " if "(" in name else "(") + "mu=0.01)")
         with pytest.raises(lv.InputError, match="at rest"):  # friction is what holds them

@@ -1,1 +1,1 @@
-"""Running solvers on cases: what to measure, one clock, processes of their own, many workers."""
+"""Run solvers on cases: plans, time measurement, isolated processes, distribution to workers."""

@@ -1,6 +1,6 @@
-"""Time the lines that a report would print alternately: each repetition runs every line on every case once.
+"""Time the calls that a report would print alternately: each repetition makes every call on every case once.
 
-Disturbances of the machine then meet all lines alike, and differences between repetitions are the noise of a rerun.
+Disturbances of the machine then affect all calls equally, and differences between repetitions are the noise of a rerun.
 """
 
 from __future__ import annotations
@@ -22,20 +22,21 @@ from lavender.lab.bench.running.runner import Runner, Watch, is_foreign, open_ru
 from lavender.lab.bench.running.timing import (
     Ask,
     Task,
-    just_written,
+    copy_into_new_arrays,
+    make_outcome,
+    make_record,
     measure_calibration_time,
-    outcome_of,
-    record_of,
 )
 from lavender.lab.bench.store import Records, Store
 
-USUAL_REPETITIONS, MIN_REPETITIONS, MAX_REPETITIONS = 7, 3, 41
-EXTRA_TIME = 3.0  # s, of all cases together; more than the usual repetitions are made only within this time
-TIME_LIMITS = 20.0  # time limits of the plan that all repetitions may take together, above the minimum
-CASES_IN_MEMORY = 32  # cases that are loaded at the same time
-MAX_SIZE_RATIO = (
-    10  # problems are timed as one batch if the largest has at most this multiple of the smallest's rows
-)
+DEFAULT_REPETITIONS, MIN_REPETITIONS, MAX_REPETITIONS = 7, 3, 41
+# [s] Time of all cases together; more than DEFAULT_REPETITIONS are made only within it.
+EXTRA_REPETITION_TIME = 3.0
+# All repetitions together may take this multiple of the plan's time limit; MIN_REPETITIONS are always made.
+TIME_LIMIT_MULTIPLE = 20.0
+CASES_IN_MEMORY = 32  # Number of cases that are loaded at the same time.
+# Problems are timed as one batch if the largest has at most this multiple of the smallest's rows.
+MAX_SIZE_RATIO = 10
 
 RecordsByKey = dict[tuple[Any, ...], list[Record]]  # records of one measurement, one of each repetition
 Cases = Sequence[tuple[Item, CaseInfo]]
@@ -54,15 +55,16 @@ def time_alternately(
     memory: int | None = None,
     reuse: bool = True,
 ) -> Records:
-    """Time lines alternately on cases that `lavender.lab.bench.run` has described in `known`.
+    """Time calls alternately on cases that `lavender.lab.bench.run` has described in `known`.
 
-    Records that `store` holds are reused if the same lines were timed on the same cases.
+    Records in `store` are reused if the same calls were timed on the same cases.
 
     Parameters
     ----------
-    cases, plan, store, watch, isolate, memory, reuse : as `lavender.lab.bench.run`
+    cases, plan, store, watch, isolate, memory, reuse
+        See `lavender.lab.bench.run`.
     asks : sequence of Ask
-        Of timing mode "call" on single cases, "steps" over sequences, "batch" on either.
+        Calls of timing mode "call" on single cases, "steps" over sequences, "batch" on either.
     known : Records
 
     Returns
@@ -71,7 +73,7 @@ def time_alternately(
         `known`, with the new records.
     """
     this = list(known.runs.values())[-1]
-    names = list(dict.fromkeys(ask.solver for ask in asks))
+    names = list(dict.fromkeys(call.solver for call in asks))
     with open_runner(this, plan, names, store, watch, isolate, memory, reuse) as runner:
         runner.out = known
         described = [(i, known.cases[i.name]) for i in resolve(cases) if i.name in known.cases]
@@ -84,15 +86,19 @@ def time_alternately(
             if item.sequence:
                 sequences.setdefault(item.sequence, []).append((item, info))
         for part in (*parts, *sequences.values()):
-            share = len(part) / len(described)
-            alternation.measure_part(part, share * TIME_LIMITS * plan.time_limit, share * EXTRA_TIME)
+            fraction = len(part) / len(described)
+            alternation.measure_part(
+                part,
+                fraction * TIME_LIMIT_MULTIPLE * plan.time_limit,
+                fraction * EXTRA_REPETITION_TIME,
+            )
             for item, _ in part:
                 item.forget()
     return known
 
 
 class _Alternation:
-    """Repeats all lines on the cases of a part; `interleave_group` identifies lines and cases timed together."""
+    """Repeats all calls on the cases of a part; `interleave_group` identifies calls and cases timed together."""
 
     def __init__(self, runner: Runner, asks: Sequence[Ask], interleave_group: str) -> None:
         self.runner, self.asks, self.interleave_group = runner, asks, interleave_group
@@ -103,93 +109,100 @@ class _Alternation:
                 runner.report_progress(record.case, record.solver, record, True)
 
     def measure_part(self, part: Cases, limit: float, extra: float) -> None:
-        """Repeat all lines on some cases or one sequence: at most `limit` [s], above the usual number `extra` [s]."""
+        """Repeat all calls on some cases or one sequence: at most `limit` [s], above the default number `extra` [s]."""
         is_sequence = bool(part[0][0].sequence)
         asks = [a for a in self.asks if a.timing_mode == "batch" or (a.timing_mode == "steps") == is_sequence]
-        accepted = {ask: [(i, info) for i, info in part if self.accepts(ask, i)] for ask in asks}
+        accepted = {call: [(i, info) for i, info in part if self.accepts(call, i)] for call in asks}
         records: RecordsByKey = {}
-        begun = perf_counter()
+        start_time = perf_counter()
         for repetition in range(MAX_REPETITIONS):
-            spent = perf_counter() - begun
-            allowed = limit if repetition < USUAL_REPETITIONS else min(limit, extra)
-            if repetition >= MIN_REPETITIONS and spent > allowed:
+            elapsed = perf_counter() - start_time
+            allowed = limit if repetition < DEFAULT_REPETITIONS else min(limit, extra)
+            if repetition >= MIN_REPETITIONS and elapsed > allowed:
                 break
             first = repetition % len(asks) if asks else 0
             order = asks[first:] + asks[:first]
             if is_sequence:
-                for ask in order:
-                    self.time_steps(ask, accepted[ask], records)
+                for call in order:
+                    self.time_steps(call, accepted[call], records)
             else:
                 for item, info in part:
-                    for ask in order:
-                        if ask.timing_mode != "batch" and any(info is other for _, other in accepted[ask]):
-                            self.add(records, self.time_case(ask, item, info, None)[0])
-            for ask in order:
-                if ask.timing_mode == "batch" and _is_batch(accepted[ask], is_sequence):
-                    self.time_batch(ask, accepted[ask], records)
+                    for call in order:
+                        if call.timing_mode != "batch" and any(info is other for _, other in accepted[call]):
+                            self.add(records, self.time_case(call, item, info, None)[0])
+            for call in order:
+                if call.timing_mode == "batch" and _is_batch(accepted[call], is_sequence):
+                    self.time_batch(call, accepted[call], records)
         for repeated in records.values():
             self.runner.keep(_merge(repeated))
 
-    def accepts(self, ask: Ask, item: Item) -> bool:
-        spec = self.runner.specs[ask.solver]
-        if is_foreign(spec) and (ask.timing_mode == "batch" or ask.mode == "time"):
-            return False  # a process of its own adds its start, or takes no limit
+    def accepts(self, call: Ask, item: Item) -> bool:
+        """Whether the solver of a call can be timed on a case."""
+        spec = self.runner.specs[call.solver]
+        if is_foreign(spec) and (call.timing_mode == "batch" or call.mode == "time"):
+            return False  # An isolated process adds its start to the time, or has no time limit.
         return spec.refuses(item.problem) is None
 
-    def make_task(self, ask: Ask, info: CaseInfo) -> Task:
-        """Return one repetition of a line on one case."""
+    def make_task(self, call: Ask, info: CaseInfo) -> Task:
+        """Return the task of one repetition of a call on one case."""
         more = {
-            "time_limit": ask.time_limit or self.runner.plan.time_limit,
-            "repeats": 1 if ask.timing_mode == "steps" else 2,
+            "time_limit": call.time_limit or self.runner.plan.time_limit,
+            "repeats": 1 if call.timing_mode == "steps" else 2,
             "interleave_group": self.interleave_group,
             "guarded": False,
         }
-        return Task.of(info, ask, **more)
+        return Task.of(info, call, **more)
 
     def add(self, records: RecordsByKey, record: Record | None) -> None:
+        """Collect a record unless it was stored before."""
         if record is not None and record.key not in self.known:
             records.setdefault(record.key, []).append(record)
 
-    def time_case(self, ask: Ask, item: Item, info: CaseInfo, before: Any) -> tuple[Record | None, Any]:
-        task = self.make_task(ask, info)
-        if task.key in self.known and ask.start != "carried":
+    def time_case(self, call: Ask, item: Item, info: CaseInfo, before: Any) -> tuple[Record | None, Any]:
+        """Time a call on a case, starting from the step `before`; return its record and its impulses."""
+        task = self.make_task(call, info)
+        if task.key in self.known and call.start != "carried":
             return None, None
-        record, after = self.runner.measure_step(item.problem, task, self.runner.specs[ask.solver], before)
-        self.runner.report_progress(info.case, ask.solver, record)
+        record, after = self.runner.measure_step(item.problem, task, self.runner.specs[call.solver], before)
+        self.runner.report_progress(info.case, call.solver, record)
         return record, after
 
-    def time_steps(self, ask: Ask, steps: Cases, records: RecordsByKey) -> None:
-        if ask.timing_mode == "batch" or all(
-            self.make_task(ask, info).key in self.known for _, info in steps
+    def time_steps(self, call: Ask, steps: Cases, records: RecordsByKey) -> None:
+        """Time a call on all steps of a sequence, unless their records were stored before."""
+        if call.timing_mode == "batch" or all(
+            self.make_task(call, info).key in self.known for _, info in steps
         ):
             return
         before = None
         for item, info in steps:
-            record, before = self.time_case(ask, item, info, before)
+            record, before = self.time_case(call, item, info, before)
             self.add(records, record)
 
-    def time_batch(self, ask: Ask, cases: Cases, records: RecordsByKey) -> None:
-        """Time one call of `solve_many`: each problem's record has its share of the time."""
-        tasks = [self.make_task(ask, info) for _, info in cases]
+    def time_batch(self, call: Ask, cases: Cases, records: RecordsByKey) -> None:
+        """Time one call of `solve_many`; each problem's record has an equal part of the time."""
+        tasks = [self.make_task(call, info) for _, info in cases]
         if all(task.key in self.known for task in tasks):
             return
-        problems = [just_written(item.problem, ask.start) for item, _ in cases]
+        problems = [copy_into_new_arrays(item.problem, call.start) for item, _ in cases]
         calibration_time = measure_calibration_time()
-        begun = perf_counter()
+        start_time = perf_counter()
         try:
-            solutions = solve_many(problems, ask.solver, tol=ask.tol, max_iter=ask.max_iter or None)
-        except Exception as error:  # as in `attempt`: it costs its own records
+            solutions = solve_many(problems, call.solver, tol=call.tol, max_iter=call.max_iter or None)
+        except Exception as error:  # Only the records of this call are lost.
             for task in tasks:
                 self.add(
                     records, task.record(status="ERROR", message=f"{type(error).__name__}: {error}"[:500])
                 )
             return
-        share = (perf_counter() - begun) / len(cases)
+        time_per_problem = (perf_counter() - start_time) / len(cases)
         for task, s in zip(tasks, solutions, strict=True):
-            self.add(records, record_of(task, s, outcome_of(s, [s], [share], calibration_time)))
+            self.add(
+                records, make_record(task, s, make_outcome(s, [s], [time_per_problem], calibration_time))
+            )
 
 
 def _is_batch(cases: Cases, is_sequence: bool) -> bool:
+    """Whether cases are timed as one batch: steps of a sequence, or problems of similar size."""
     rows = [info.rows for _, info in cases]
     return len(rows) > 1 and (is_sequence or max(rows) <= MAX_SIZE_RATIO * min(rows))
 

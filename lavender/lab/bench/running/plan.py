@@ -1,4 +1,4 @@
-"""Define what is measured: tolerances, budgets, starts and orders, and the sequence of measurements of a solver."""
+"""Define the measurements of a run: tolerances, budgets, starts and orders, and their sequence for a solver."""
 
 from __future__ import annotations
 
@@ -16,13 +16,12 @@ from lavender.problem import Problem
 from lavender.problem.ordering import SWEEP_ORDERS
 from lavender.solvers.registry import SolverSpec
 
-# A motion error is reached by solves to tighter and tighter residuals: the first, the last, and their maximum number.
+# A motion error is reached by solves to ever tighter residuals: first and last residual, largest number of solves.
 FIRST_TOL, LAST_TOL, MAX_SPEED_TRIES = 1e-2, 1e-13, 6
-SEQUENCE_TIME_LIMIT = 5.0  # s, of one pass over a sequence.
-UNLIMITED = 10_000_000  # Iterations of a run to a tolerance: the time limit ends it first.
-HANG_LIMIT = (
-    60.0  # s, after which a campaign kills the process of another package's solver and records KILLED
-)
+DEFAULT_SEQUENCE_TIME_LIMIT = 5.0  # [s] Time limit of one pass over a sequence.
+UNLIMITED_ITERATIONS = 10_000_000  # Iteration limit of a run to a tolerance; the time limit ends it first.
+# [s] After this time, a campaign kills the process of a third-party solver and records KILLED.
+HANG_LIMIT = 60.0
 
 FORMER_PLAN_FIELDS = {
     name.removeprefix("plan."): new for name, new in RENAMED_FIELDS.items() if name.startswith("plan.")
@@ -32,41 +31,53 @@ FORMER_PLAN_FIELDS = {
 @reject_former_names(**FORMER_PLAN_FIELDS)
 @dataclass(frozen=True)
 class Plan:
-    """How each solver is run on each case.
+    """Parameters of the runs of each solver on each case.
 
     Parameters
     ----------
-    tolerances : relative residuals to reach, each a solve with that `tol`
-    budgets : exact iteration counts (`tol=0`), for solvers that can stop anywhere
-    repeats : solves of each kind; minimum and median are recorded. Repeats end early once they have
-        taken `time_limit` together. Steps of a sequence of more than twenty are solved once.
-    time_limit : s, of one solve
-    sequence_time_limit : s, of one solver over all steps of a sequence with one budget or tolerance. The remaining
-        steps are not solved, and a note says so.
-    warm : also start from the problem's guess, where it has one that is no answer already
-    orders : sweep orders beside "given", each at the middle budget, for solvers that take an order;
-        "random:3" is random with seed 3
-    motion : measure the motion error, from a reference that is solved once for each case
-    prove : compare motions with an exact solution where one is enclosed (`lavender.prove`); implies `motion`. A claim
-        that is further from it than the claim's own residual allows is contradicted
-    velocity_tolerances : m/s, motion errors to reach; implies `motion`. Each solver is given the residual
-        that is predicted to reach it, and a smaller one while it misses, at most `MAX_SPEED_TRIES` times
-    times : s, in which the report is asked to name a solver
-    sweeps : of `budgets`, those with which the report is asked to name one
+    tolerances : sequence of float
+        Relative residuals to reach, each by a solve with this `tol`.
+    budgets : sequence of int
+        Exact iteration counts (`tol=0`), for solvers that can stop after any iteration.
+    repeats : int
+        Number of solves of each kind, of which minimum and median are recorded. Repeats end when they have taken
+        `time_limit` together. Steps of sequences of more than twenty steps are solved once.
+    time_limit : float, s
+        Of one solve.
+    sequence_time_limit : float, s
+        Of one solver over all steps of a sequence at one budget or tolerance. The remaining steps are not solved, and a
+        note says so.
+    warm : bool
+        Also start from the problem's guess, unless it is an answer.
+    orders : sequence of str
+        Sweep orders in addition to "given", each at the middle budget, for solvers with a sweep order; "random:3" is
+        random with seed 3.
+    motion : bool
+        Measure the motion error, from a reference that is solved once for each case.
+    prove : bool
+        Compare motions with an exact solution if one is enclosed (`lavender.prove`); implies `motion`. A claim is
+        contradicted if its distance from the solution is larger than its residual allows.
+    velocity_tolerances : sequence of float, m/s
+        Motion errors to reach; implies `motion`. Each solver is run to the residual that is estimated to reach them,
+        with tighter residuals if it does not, at most `MAX_SPEED_TRIES` times per tolerance.
+    times : sequence of float, s
+        Time budgets for which the report recommends a solver.
+    sweeps : sequence of int
+        Budgets for which the report recommends a solver.
 
     Raises
     ------
     InputError
-        A tolerance, budget, count or limit that is not positive, a senseless seed.
+        A tolerance, budget, count or limit is not positive, or a seed is invalid.
     UnknownName
-        An order that does not exist.
+        An order does not exist.
     """
 
     tolerances: Sequence[float] = (1e-3, 1e-6, 1e-9)
     budgets: Sequence[int] = (4, 8, 16, 32, 64)
     repeats: int = 3
     time_limit: float = 1.0
-    sequence_time_limit: float = SEQUENCE_TIME_LIMIT
+    sequence_time_limit: float = DEFAULT_SEQUENCE_TIME_LIMIT
     warm: bool = True
     orders: Sequence[str] = ("reverse", "symmetric", "random:0", "random:1", "random:2")
     campaign: bool = False
@@ -78,8 +89,8 @@ class Plan:
 
     def __post_init__(self) -> None:
         for name in ("tolerances", "budgets", "orders", "velocity_tolerances", "times", "sweeps"):
-            given = check_sequence(name, getattr(self, name), "words" if name == "orders" else "numbers")
-            object.__setattr__(self, name, tuple(given))
+            entries = check_sequence(name, getattr(self, name), "words" if name == "orders" else "numbers")
+            object.__setattr__(self, name, tuple(entries))
         for name, values in (
             ("tolerance", self.tolerances),
             ("velocity tolerance", self.velocity_tolerances),
@@ -99,8 +110,8 @@ class Plan:
             if name not in SWEEP_ORDERS:
                 raise UnknownName("order", name, SWEEP_ORDERS)
             if seed and not (name == "random" and seed.isdecimal()):
-                raise InputError(f"order {word!r}: only random takes a seed, a whole number: random:3")
-        # each once: what stands twice would be run twice, and move the middle
+                raise InputError(f"order {word!r}: only random has a seed, an integer: random:3")
+        # Remove duplicates: a value given twice would be run twice and change the middle value.
         for name in ("tolerances", "velocity_tolerances"):
             object.__setattr__(
                 self, name, tuple(sorted({float(x) for x in getattr(self, name)}, reverse=True))
@@ -112,11 +123,11 @@ class Plan:
         object.__setattr__(self, "orders", tuple(dict.fromkeys(self.orders)))
         object.__setattr__(self, "motion", self.motion or self.prove or bool(self.velocity_tolerances))
 
-    timing_mode = "call"  # what of a single problem is timed, as `Record.timing_mode`
+    timing_mode = "call"  # value of `Record.timing_mode` for single problems
 
     def iteration_limit(self) -> int:
         """Return the maximum number of iterations of a run to a tolerance."""
-        return UNLIMITED
+        return UNLIMITED_ITERATIONS
 
     def as_dict(self) -> dict[str, Any]:
         """Return the fields, for the description of a run."""
@@ -125,14 +136,15 @@ class Plan:
     def measure(
         self, info: CaseInfo, problem: Problem, spec: SolverSpec, make: Callable[[Task], Record]
     ) -> None:
-        """Measure one solver on one case; each record decides which measurement follows.
+        """Measure one solver on one case; each record decides the next measurement.
 
-        To a tolerance: an exact solver once, at the tightest tolerance; others at each tolerance, loosest first. A
-        resumable solver, or one that ran out of time, gets no tighter tolerance than the one that it missed: the
-        iterates would be the same. Then budgets, then sweep orders at the middle budget.
+        First come runs to a tolerance: an exact solver once, at the tightest tolerance; others at each tolerance, the
+        loosest first. A solver that can be resumed, or that ran out of time, gets no tighter tolerance than one that it
+        missed: its iterates would be the same. Then follow budgets, then sweep orders at the middle budget.
         """
 
-        def one(mode: str, tol: float, max_iter: int, start: str, **options: Any) -> Record:
+        def measure_one(mode: str, tol: float, max_iter: int, start: str, **options: Any) -> Record:
+            """Make one measurement."""
             ask = Ask(
                 spec.name, mode, tol, max_iter, start=start, timing_mode="" if options else self.timing_mode
             )
@@ -142,26 +154,28 @@ class Plan:
         starts = ["cold"]
         if self.warm and info.guess == "start" and spec.impulse and not spec.exact:
             starts.append("warm")
-        most = self.iteration_limit() if spec.resumable else 0
+        max_iterations = self.iteration_limit() if spec.resumable else 0
         for start in starts:
             for tolerance in self.tolerances[-1:] if spec.exact else self.tolerances:
-                record = one("tol", tolerance, most, start)
+                record = measure_one("tol", tolerance, max_iterations, start)
                 if not record.relative <= tolerance and (
                     spec.resumable or _rules_out_tighter_tolerances(record)
                 ):
                     break
             if not spec.exact:
-                self._to_speeds(partial(one, "tol", max_iter=most, start=start))
+                self._to_speeds(partial(measure_one, "tol", max_iter=max_iterations, start=start))
             if spec.resumable and not spec.exact:
                 for n in self.budgets:
-                    one("budget", 0.0, n, start)
+                    measure_one("budget", 0.0, n, start)
         if spec.order and self.budgets and not spec.exact:
             middle = self.budgets[len(self.budgets) // 2]
             for word in self.orders:
                 name, _, seed = word.partition(":")
                 if name in ("bottom_up", "top_down") and problem.rows is None:
-                    continue  # without bodies nobody knows the ground
-                one("budget", 0.0, middle, "cold", order=name, **({"seed": int(seed)} if seed else {}))
+                    continue  # Without bodies there is no direction up.
+                measure_one(
+                    "budget", 0.0, middle, "cold", order=name, **({"seed": int(seed)} if seed else {})
+                )
 
     def _to_speeds(self, solve_to: Callable[[float], Record]) -> None:
         """Solve to each velocity tolerance. The ratio of motion error to residual is taken from the previous solve."""
@@ -173,7 +187,7 @@ class Plan:
                     speed = math.inf if last.motion_speed is None else last.motion_speed
                     if speed <= tolerance:
                         break
-                    # Neither this tolerance nor a tighter one: the residual was missed, or no motion error is known.
+                    # No tighter tolerance can be reached: the residual was missed, or no motion error is known.
                     if not (last.relative <= tol and speed < math.inf) or tol <= LAST_TOL:
                         return
                     tol = max(LAST_TOL, min(0.3 * tol, 0.5 * last.relative * tolerance / speed))
@@ -183,21 +197,23 @@ class Plan:
 @reject_former_names(**FORMER_PLAN_FIELDS)
 @dataclass(frozen=True)
 class CampaignPlan(Plan):
-    """How each solver is run without timing: runs end after a number of iterations, never by the clock.
+    """Parameters of runs without times, which end after a number of iterations and not by the clock.
 
     Its records do not depend on the machine's load or the number of workers.
 
     Parameters
     ----------
-    cap : maximum number of iterations of a run to a tolerance
-    time_limit : s, after which the process of another package's solver is killed; only its own record depends on it
+    cap : int
+        Largest number of iterations of a run to a tolerance.
+    time_limit : float, s
+        After this time the process of a third-party solver is killed; only its own record depends on it.
     """
 
     repeats: int = 1
     time_limit: float = HANG_LIMIT
     cap: int = 20_000
     campaign: bool = True
-    timing_mode = ""  # nothing is timed
+    timing_mode = ""  # No times are measured.
 
     def iteration_limit(self) -> int:
         """Return `cap`."""
@@ -205,18 +221,20 @@ class CampaignPlan(Plan):
 
 
 def list_passes(plan: Plan, spec: SolverSpec) -> list[Ask]:
-    """Return the passes over a sequence: each budget and tolerance, cold and carried."""
-    most = UNLIMITED if spec.resumable else 0
-    asked = [
-        ("tol", tolerance, most) for tolerance in (plan.tolerances[-1:] if spec.exact else plan.tolerances)
-    ]
+    """Return the passes over a sequence: each budget and tolerance, from a cold start and with carried impulses."""
+    max_iterations = UNLIMITED_ITERATIONS if spec.resumable else 0
+    tolerances = plan.tolerances[-1:] if spec.exact else plan.tolerances
+    targets = [("tol", tolerance, max_iterations) for tolerance in tolerances]
     if spec.resumable and not spec.exact:
-        asked = [*(("budget", 0.0, n) for n in plan.budgets), *asked]
+        targets = [*(("budget", 0.0, n) for n in plan.budgets), *targets]
     starts = ("cold", "carried") if spec.impulse and not spec.exact else ("cold",)
-    return [Ask(spec.name, *what, timing_mode="steps", start=start) for start in starts for what in asked]
+    return [
+        Ask(spec.name, *target, timing_mode="steps", start=start) for start in starts for target in targets
+    ]
 
 
 def _rules_out_tighter_tolerances(record: Record) -> bool:
+    """Whether a run that missed its tolerance shows that tighter tolerances cannot be reached either."""
     return record.status in ("TIME_LIMIT", "KILLED", "ERROR", "INFEASIBLE") or record.status.startswith(
         "CRASHED"
     )

@@ -25,7 +25,7 @@ from lavender.judge.states import states_of
 from lavender.lab import motion
 from lavender.lab.bench import machine
 from lavender.lab.bench.cases import Item, Source, describe, fingerprint, resolve, resolve_again
-from lavender.lab.bench.record import CaseInfo, Entry, Record, Run, Skip, asked_of
+from lavender.lab.bench.record import CaseInfo, Entry, Record, Run, Skip, describe_target
 from lavender.lab.bench.running.plan import CampaignPlan, Plan, list_passes
 from lavender.lab.bench.running.timing import Ask, Task, measure, one_thread
 from lavender.lab.bench.running.worker import Worker
@@ -34,7 +34,7 @@ from lavender.lab.bench.store import Records, Store, opened
 from lavender.lab.motion import load_reference
 from lavender.lab.motion.bound import separation
 from lavender.lab.motion.reference import as_reference
-from lavender.lab.proof import enclosed
+from lavender.lab.proof import enclose_reference
 from lavender.problem import Problem, check_problem
 from lavender.solvers import registry
 from lavender.solvers.registry import SolverSpec
@@ -80,7 +80,7 @@ def add_motion_error(record: Record, problem: Problem, impulse: Any) -> Record:
         motion.motion_error(problem, impulse) if found is None else motion.nearest(problem, impulse, found)
     )
     speed = error.rows if error.speed is None else error.speed
-    told = replace(record, motion_error=error.relative, motion_speed=speed, bound=error.bound)
+    with_motion = replace(record, motion_error=error.relative, motion_speed=speed, bound=error.bound)
     reference = error.reference
     if (
         record.claims
@@ -94,8 +94,8 @@ def add_motion_error(record: Record, problem: Problem, impulse: Any) -> Record:
                 f"says {record.status}, {apart:.1e} sqrt(J) from the exact solution, {allowed:.1e} allowed"
             )
             conflict = record.status_conflict or words
-            return replace(told, claim_check=CONTRADICTED, status_conflict=conflict)
-    return told
+            return replace(with_motion, claim_check=CONTRADICTED, status_conflict=conflict)
+    return with_motion
 
 
 def add_solution_hash(record: Record, problem: Problem, impulse: FloatArray) -> Record:
@@ -120,7 +120,7 @@ def is_foreign(spec: SolverSpec) -> bool:
 
 
 def solver_names(names: str | Sequence[str] | None) -> list[str]:
-    """Return the names of the solvers to run: those that are given, each of them installed, or every installed one.
+    """Return the names of the solvers to run: the named ones, each of them installed, or every installed solver.
 
     Raises
     ------
@@ -151,40 +151,46 @@ def run(
     into: list[Records] | None = None,
     reuse: bool = True,
 ) -> Records:
-    """Measure every solver that takes a case, on every case.
+    """Measure every solver on every case that it accepts.
 
     Parameters
     ----------
-    cases : files, folders, names of the suite, problems; all of `lavender.lab.suite.default()` if none
-    solvers : names; every installed one if None. One that refuses a case is skipped with its reason; where another
-        is the same method with bounds (`pgs` for `gauss_seidel`), that one is run, but not in a campaign.
-    plan : Plan
-        `Plan()` if None; `CampaignPlan()` with several workers or a cluster, which measure no times.
+    cases : files, folders, names of the suite, problems
+        Default: `lavender.lab.suite.default()`.
+    solvers : names, optional
+        Default: every installed solver. A solver that refuses a case is skipped with its reason; its bounded variant
+        (`pgs` for `gauss_seidel`) is run instead if there is one, but not in a campaign.
+    plan : Plan, optional
+        Default: `Plan()`, or with several workers or a cluster, which measure no times, `CampaignPlan()`.
     store : Store or path of a `.jsonl` file, optional
-        Keeps each record when it is made; a measurement that it holds already, from the same machine,
-        versions and plan, is not made again.
-    workers : number of processes; 1: this one, -1: one for each core. A cluster has as many as it has.
-    backend : a backend of joblib: "loky" (processes here), "dask" (of the current dask.distributed client,
-        or of DASK_SCHEDULER_ADDRESS), "ray"; "dask=ADDRESS" and "ray=ADDRESS" connect to a cluster
+        Stores each record when it is made; a measurement that it holds from the same machine, versions and plan is not
+        repeated.
+    workers : int
+        Number of processes; 1: this one, -1: one for each core. A cluster determines its own number.
+    backend : str
+        Backend of joblib: "loky" (processes here), "dask" (of the current dask.distributed client, or of
+        DASK_SCHEDULER_ADDRESS), "ray"; "dask=ADDRESS" and "ray=ADDRESS" connect to a cluster.
     watch : callable (Event), optional
-    isolate : run solvers that other packages bring in a process of their own; workers always do
-    memory : bytes, optional
-        Limit of that process. If None: half of the machine's memory, shared by the workers here or by the cores of a
-        machine of a cluster.
+    isolate : bool
+        Run third-party solvers in another process; workers always do.
+    memory : int, bytes, optional
+        Memory limit of that process. Default: half of the machine's memory, shared by the workers here or by the cores
+        of a machine of a cluster.
     into : list, optional
-        Receives the records before the first is made, for those who stop the run and want what there is.
-    reuse : do not repeat measurements that `store` holds
+        Receives the records before the first is made, so that they are available if the run is interrupted.
+    reuse : bool
+        Do not repeat measurements that `store` holds.
 
     Returns
     -------
     Records
-        Of this run: those made and those found, in the order of cases and solvers. Those of a campaign have no times.
+        New and reused records of this run, in the order of cases and solvers. Records of a campaign have no times.
 
     Raises
     ------
     InputError
-        A backend that joblib does not have here, another number of workers than -1 or 1 to 4096, several workers with a
-        plan that measures times, or workers that were lost again and again.
+        joblib does not have the backend here, the number of workers is not -1 or 1 to 4096, several workers have a plan
+        that measures times, or workers were lost repeatedly.
     """
     check_workers(workers)
     spread = workers != 1 or backend != "loky"
@@ -216,7 +222,7 @@ def open_runner(
     reuse: bool = True,
 ) -> Iterator[Runner]:
     """Open the store and a process for other packages' solvers, and limit BLAS to one thread; see `run`."""
-    with opened(store) as kept, Worker(memory) as worker, one_thread():  # describing a case computes too
+    with opened(store) as kept, Worker(memory) as worker, one_thread():  # Describing a case uses BLAS, too.
         yield Runner(this, plan, names, kept, watch, worker if isolate else None, reuse)
 
 
@@ -302,8 +308,8 @@ class Runner:
             known.setdefault((record.case, record.solver), []).append(record)
         pairs: list[Pair] = []
         for item, name in product(items, self.names):
-            # A name or path is read again by the worker: a cluster shares the files, or the suite.
-            source = item.source if item.given is None else replace(item.given, copy=False)
+            # The worker reads a name or path again: a cluster shares the files or the suite.
+            source = item.source if item.in_memory is None else replace(item.in_memory, copy=False)
             records = tuple(known.get((item.name, name), ()))
             info = self.described.get(item.name)
             pairs.append(
@@ -357,10 +363,14 @@ class Runner:
             if self.plan.motion:
                 load_reference(item.problem, item.source)
             if self.plan.prove:
-                found = enclosed(item.problem)
-                told = f"within {found.velocity_radius:.1e} m/s" if found.proven else f"none: {found.reason}"
-                info = replace(info, proof=told)
-        except Exception as error:  # a file may make a reader raise anything; it costs its own case
+                enclosure = enclose_reference(item.problem)
+                proof = (
+                    f"within {enclosure.velocity_radius:.1e} m/s"
+                    if enclosure.proven
+                    else f"none: {enclosure.reason}"
+                )
+                info = replace(info, proof=proof)
+        except Exception as error:  # A reader may raise any exception; only its own case is lost.
             self.keep(
                 Skip(self.this.run, item.name, "", describe_load_error(item.source, error), item.sequence)
             )
@@ -371,7 +381,7 @@ class Runner:
         return info
 
     def measure_case(self, item: Item, info: CaseInfo | None = None) -> None:
-        """Measure every solver on a case that is no step of a sequence; `info` describes it, if it is known already."""
+        """Measure every solver on a case outside sequences; `info` is its description, if it is known."""
         if info is not None:
             self.keep(info)
         else:
@@ -396,15 +406,15 @@ class Runner:
         for name in self.names:
             spec = self.select_solver(items[0].sequence, name, [item for item, _ in steps])
             if spec is not None:
-                for ask in list_passes(self.plan, spec):
+                for call in list_passes(self.plan, spec):
                     self.report_progress(items[0].sequence, spec.name)
-                    self.measure_pass(steps, spec, ask)
+                    self.measure_pass(steps, spec, call)
             self.done += len(items)
 
-    def measure_pass(self, steps: list[tuple[Item, CaseInfo]], spec: SolverSpec, ask: Ask) -> None:
+    def measure_pass(self, steps: list[tuple[Item, CaseInfo]], spec: SolverSpec, call: Ask) -> None:
         """Measure one pass. It ends, with a note, when its steps have taken `Plan.sequence_time_limit` together."""
         repeats = self.plan.repeats if len(steps) <= MAX_REPEATED_STEPS else 1
-        tasks = [Task.of(info, ask, repeats=repeats, time_limit=self.plan.time_limit) for _, info in steps]
+        tasks = [Task.of(info, call, repeats=repeats, time_limit=self.plan.time_limit) for _, info in steps]
         problems = [item for item, _ in steps]
         limit, spent, made = self.plan.sequence_time_limit, 0.0, 0
         for task in tasks:
@@ -415,8 +425,8 @@ class Runner:
             self.out.add(record)
             self.report_progress(task.case, spec.name, record, True)
         before: tuple[Problem, FloatArray] | None = None
-        if ask.start == "carried" and 0 < made < len(tasks) and spent <= limit:
-            # An earlier run was stopped in this pass: solve its steps again, unrecorded, for the impulses of the last.
+        if call.start == "carried" and 0 < made < len(tasks) and spent <= limit:
+            # An earlier run was stopped in this pass: solve its steps again, unrecorded, for the last step's impulses.
             for item, task in zip(problems[:made], tasks, strict=False):
                 again = replace(task, repeats=1)
                 before = self.measure_step(item.problem, again, spec, before)[1]
@@ -433,12 +443,14 @@ class Runner:
             self.report_progress(record.case, spec.name, record)
             spent, made = spent + _elapsed_time(record), made + 1
         if made < len(tasks):
-            asked = asked_of(ask.mode, ask.tol, ask.max_iter)
+            asked = describe_target(call.mode, call.tol, call.max_iter)
             reason = (
                 f"stopped after {made} of {len(tasks)} steps, which took more than the pass limit of {limit:.3g} s "
                 "together (--sequence-time-limit)"
             )
-            self.keep(Skip(self.this.run, f"{problems[0].sequence}, {asked}, {ask.start}", spec.name, reason))
+            self.keep(
+                Skip(self.this.run, f"{problems[0].sequence}, {asked}, {call.start}", spec.name, reason)
+            )
 
     def measure_step(
         self, problem: Problem, task: Task, spec: SolverSpec, before: tuple[Problem, FloatArray] | None
@@ -452,10 +464,10 @@ class Runner:
         record, impulse = self.make_record(problem, task, spec, start)
         return record, None if impulse is None else (problem, impulse)
 
-    def select_solver(self, case: str, name: str, given: Sequence[Item | Problem]) -> SolverSpec | None:
+    def select_solver(self, case: str, name: str, items: Sequence[Item | Problem]) -> SolverSpec | None:
         """Return the solver to run for `name`, or its method with bounds if it refuses a case, or None, with a note."""
         spec = self.specs[name]
-        for problem in (item.problem if isinstance(item, Item) else item for item in given):
+        for problem in (item.problem if isinstance(item, Item) else item for item in items):
             reason = spec.refuses(problem)
             if reason:
                 break
@@ -464,7 +476,7 @@ class Runner:
         # A pair of a campaign has only records of its own solver.
         other = None if self.plan.campaign else spec.standing_in(problem)
         if other is not None and other.name in self.names:
-            other = None  # is run under its own name
+            other = None  # It is run under its own name.
         self.keep(Skip(self.this.run, case, name, f"{name} → {other.name}: {reason}" if other else reason))
         return other
 
@@ -491,9 +503,8 @@ class Runner:
     def make_record(self, problem: Problem, task: Task, spec: SolverSpec, impulse: Any) -> tuple[Record, Any]:
         """Solve a task, here or in the process for other packages; return its record and impulses (m,) [N s]."""
         if self.plan.campaign and not is_foreign(spec):
-            task = replace(
-                task, time_limit=math.inf
-            )  # the clock ends only processes of other packages' solvers
+            # The clock ends only processes of other packages' solvers.
+            task = replace(task, time_limit=math.inf)
         if self.worker is not None and is_foreign(spec):
             record, found = self.worker.measure(replace(problem, copy=False), task, impulse)
         else:
@@ -523,7 +534,7 @@ def _group_sequences(items: list[Item]) -> list[tuple[str, list[Item]]]:
 
 
 def describe_load_error(source: str, error: Exception) -> str:
-    """Return why a case is left out, with the type of an error that the reader did not raise on purpose."""
+    """Return the reason why a case is left out, with the type of an unexpected error."""
     text = str(error)
     if not isinstance(error, (LavenderError, OSError)):
         text = f"{type(error).__name__}: {text}"
@@ -548,7 +559,7 @@ class Pair:
 
 @dataclass(frozen=True)
 class Order:
-    """What every worker needs besides its pair."""
+    """Data that all workers need."""
 
     plan: Plan
     run: Run
@@ -558,7 +569,8 @@ class Order:
 
 @cache
 def _isolated_worker(memory: int) -> Worker:
-    return Worker(memory)  # one in each worker, kept between pairs
+    """Return the process for third-party solvers, one in each worker, which all pairs use."""
+    return Worker(memory)
 
 
 @contextlib.contextmanager
@@ -575,11 +587,12 @@ def _register(specs: tuple[SolverSpec, ...]) -> Iterator[None]:
             registry.registered.update(before)
 
 
-_last_case: tuple[Any, Item | None, CaseInfo | None] = None, None, None  # pairs of a case come together
+# The case of the last pair: pairs of a case are consecutive.
+_last_case: tuple[Any, Item | None, CaseInfo | None] = None, None, None
 
 
 def measure_in_worker(pair: Pair, order: Order) -> tuple[int, list[Entry]]:
-    """Return the index of a pair and its entries. Runs in a worker, on one thread: pairs run side by side."""
+    """Measure a pair in a worker, on one thread as pairs run in parallel; return its index and its entries."""
     global _last_case
     shared = machine.memory_share(os.cpu_count() or 1) if order.memory is None else order.memory
     with _register(order.local), one_thread(pair.solver):

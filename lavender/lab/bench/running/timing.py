@@ -1,10 +1,10 @@
-"""Time a solve: the only module that does.
+"""Time a solve; no other module does.
 
-The timed call is the line that a report prints, `lv.solve(problem, "name", tol=...)`, with the judge. The arrays of its
-problem were written just before, as a simulator leaves them, and other work has used the caches since. A guarded solve
-under the time limit runs first; if it does not end, its own time is recorded. If `Task.timing_mode` is empty,
-only `prepare` and `solve` are timed, without the judge, on a problem of which nothing is computed yet. BLAS and OpenMP
-use one thread, and the garbage collector is off.
+The timed call is the one that a report prints, `lv.solve(problem, "name", tol=...)`, including the judge. The arrays of
+its problem were written just before, as a simulator leaves them, and other work has used the caches since. A guarded
+solve under the time limit runs first; if it does not end, its own time is recorded. If `Task.timing_mode` is empty,
+only `prepare` and `solve` are timed, without the judge, on a problem from which nothing is derived yet. BLAS and
+OpenMP use one thread, and the garbage collector is off.
 """
 
 from __future__ import annotations
@@ -33,26 +33,44 @@ from lavender.solvers import registry
 from lavender.solving.outcome import finish
 from lavender.solving.solve import prepare, solve
 
-MAX_WARM_UP_TIME = 5e-3  # s; a line that took longer is not called once more to warm the caches.
-CLAIMS = (Status.CONVERGED, Status.ROUNDOFF_LIMIT, Status.INFEASIBLE)
+MAX_WARM_UP_TIME = 5e-3  # [s] A call that took longer is not repeated to warm the caches.
+CLAIM_STATUSES = (Status.CONVERGED, Status.ROUNDOFF_LIMIT, Status.INFEASIBLE)
 
 
 @dataclass(frozen=True)
 class Ask:
-    """A line to time on all cases that the solver accepts."""
+    """A call to time on all cases that the solver accepts.
+
+    Parameters
+    ----------
+    solver : str
+    mode : {"tol", "budget", "time"}
+    tol : float
+    max_iter : int
+        0 means the solver's default.
+    time_limit : float, s
+        Of one solve; 0 means the plan's.
+    timing_mode : str
+        See `Record.timing_mode`.
+    start : {"cold", "warm", "carried"}
+    """
 
     solver: str
-    mode: str  # "tol" | "budget" | "time"
+    mode: str
     tol: float
-    max_iter: int = 0  # 0: the solver's own default
-    time_limit: float = 0.0  # s, of one solve; 0: that of the plan
-    timing_mode: str = "call"  # as `Record.timing_mode`
+    max_iter: int = 0
+    time_limit: float = 0.0
+    timing_mode: str = "call"
     start: str = "cold"
 
 
 @dataclass(frozen=True)
 class Task:
-    """One measurement: an `Ask` on a case."""
+    """One measurement: an `Ask` on a case.
+
+    `guarded`: a solve under the time limit comes first. `lead` [s] is the time that the call takes before the solve, to
+    carry impulses. The other fields are those of a `Record`.
+    """
 
     run: str
     case: str
@@ -68,8 +86,8 @@ class Task:
     step: int = -1
     timing_mode: str = ""
     interleave_group: str = ""
-    guarded: bool = True  # a solve under the time limit comes first
-    lead: float = 0.0  # s, that the line takes before its call: carrying impulses
+    guarded: bool = True
+    lead: float = 0.0
 
     @property
     def key(self) -> tuple[Any, ...]:
@@ -77,18 +95,18 @@ class Task:
         return measurement_key(self)
 
     @classmethod
-    def of(cls, info: CaseInfo, ask: Ask, **more: Any) -> Task:
-        """Return the task of an `Ask` on a case."""
-        return cls(run=info.run, case=info.case, sha=info.sha, step=info.step, **{**vars(ask), **more})
+    def of(cls, info: CaseInfo, call: Ask, **arguments: Any) -> Task:
+        """Create the task of an `Ask` on a case."""
+        return cls(run=info.run, case=info.case, sha=info.sha, step=info.step, **{**vars(call), **arguments})
 
-    def record(self, **what: Any) -> Record:
-        """Return a record of this task."""
+    def record(self, **results: Any) -> Record:
+        """Create a record of this task with `results`."""
         order, seed = str(self.options.get("order", "given")), int(self.options.get("seed", 0))
-        same = {name: getattr(self, name) for name in _SHARED}
-        return Record(**{**same, "options": dict(self.options)}, order=order, seed=seed, **what)
+        shared = {name: getattr(self, name) for name in _SHARED}
+        return Record(**{**shared, "options": dict(self.options)}, order=order, seed=seed, **results)
 
 
-#: Fields of a task that its record has, too; `repeats` of a record are those that were made.
+#: Fields that a task and its record have in common; `repeats` of a record is the number that were made.
 _SHARED = {f.name for f in fields(Task)} & {f.name for f in fields(Record)} - {"repeats"}
 
 
@@ -110,7 +128,8 @@ def _warm_up(solver: str) -> None:
 
 @cache
 def _thread_pools(solver: str) -> Any:
-    # Searching for the libraries takes a few milliseconds: once for each solver, after its own and SciPy's are loaded.
+    """Return the controller of the BLAS and OpenMP libraries that are loaded with a solver."""
+    # The search takes some milliseconds: do it once per solver, after its own libraries and SciPy's are loaded.
     from threadpoolctl import ThreadpoolController
 
     import_numerics()
@@ -125,36 +144,60 @@ def one_thread(solver: str = "") -> Iterator[None]:
 
 
 @contextmanager
-def _undisturbed(solver: str) -> Iterator[None]:
+def _stable_timing(solver: str) -> Iterator[None]:
     """Limit BLAS and OpenMP to one thread and turn the garbage collector off."""
-    collects = gc.isenabled()
+    was_enabled = gc.isenabled()
     gc.disable()
     try:
         with one_thread(solver):
             yield
     finally:
-        if collects:
+        if was_enabled:
             gc.enable()
 
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """Result of the repeats of one measurement, before it is judged."""
+    """Result of the repeats of one measurement, before it is judged.
 
-    impulse: FloatArray  # (m,) N s
-    certificate: FloatArray | None  # (m,), with INFEASIBLE
-    status: str  # name of a Status
+    Parameters
+    ----------
+    impulse : (m,) N s
+    certificate : (m,) or None
+        With INFEASIBLE.
+    status : str
+        Name of a Status.
+    iterations : int
+    work : mapping
+    message, form : str
+    setups, solves : tuple of float, s
+        Times of each repeat.
+    times : tuple of float, s
+        Time of the call of each repeat; empty if the guarded solve did not end.
+    calibration_time : float or None, s
+        See `Record.calibration_time`.
+    backend_time : float or None, s
+        Time in the backend's own solve.
+    residual_per_repeat : tuple of float
+        Relative residual of each repeat, in mode "time".
+    status_conflict : str
+        As in a Solution.
+    """
+
+    impulse: FloatArray
+    certificate: FloatArray | None
+    status: str
     iterations: int
     work: Mapping[str, int]
     message: str
     form: str
-    setups: tuple[float, ...]  # s, of each repeat
-    solves: tuple[float, ...]  # s
-    times: tuple[float, ...]  # s, of the line of each repeat; none where the guard did not end
-    calibration_time: float | None  # s
-    backend_time: float | None = None  # s, in the backend's own solve
-    residual_per_repeat: tuple[float, ...] = ()  # relative residual of each repeat, in mode "time"
-    status_conflict: str = ""  # as in a Solution
+    setups: tuple[float, ...]
+    solves: tuple[float, ...]
+    times: tuple[float, ...]
+    calibration_time: float | None
+    backend_time: float | None = None
+    residual_per_repeat: tuple[float, ...] = ()
+    status_conflict: str = ""
 
 
 def measure(problem: Problem, task: Task, impulse: Any = None) -> tuple[Record, FloatArray | None]:
@@ -169,72 +212,77 @@ def measure(problem: Problem, task: Task, impulse: Any = None) -> tuple[Record, 
 
     Returns
     -------
-    Record, and the final impulses (m,) [N s], or None
+    Record, and the final impulses (m,) [N s] or None
 
     Raises
     ------
     KeyboardInterrupt
-        By Ctrl-C; nothing is recorded.
+        Ctrl-C was pressed; nothing is recorded.
     """
-    return judged(problem, task, attempt(problem, task, impulse))
+    return judge_outcome(problem, task, attempt(problem, task, impulse))
 
 
 def attempt(problem: Problem, task: Task, impulse: Any = None) -> Outcome | str:
     """Run the solver of a task in this process. Return an exception as text."""
-    runs: list[tuple[Solution, float]] = []  # with the time of the line
+    runs: list[tuple[Solution, float]] = []  # (solution, time of the call)
     calibration_times: list[float] = []
     backend_times: list[float] = []
     guard: Solution | None = None
     try:
         _warm_up(task.solver)
-        with _undisturbed(task.solver):
-            begun = perf_counter()
+        with _stable_timing(task.solver):
+            start_time = perf_counter()
             if task.timing_mode and task.guarded:
-                # A plug-in may test nothing: then its own budget ends its line, and a larger one never would.
+                # A plug-in may not test convergence: run it with its own iteration limit first, as a larger one might
+                # never be reached.
                 tests = registry.get(task.solver).builtin or task.mode != "tol"
                 guard = uninterrupted(
                     _prepare_and_solve(problem, task if tests else replace(task, max_iter=0), impulse)
                 )
                 if not tests and _ended_by_budget(guard, task):
                     guard = uninterrupted(_prepare_and_solve(problem, task, impulse))
-            left = max(1, task.repeats - (guard is not None))
-            while left and (guard is None or guard.status is not Status.TIME_LIMIT):
+            remaining = max(1, task.repeats - (guard is not None))
+            while remaining and (guard is None or guard.status is not Status.TIME_LIMIT):
                 calibration_times.append(measure_calibration_time())
                 if not task.timing_mode:
                     parts = uninterrupted(_prepare_and_solve(problem, task, impulse))
                     runs.append((parts, parts.setup_time + parts.solve_time))
                 else:
-                    with measure_backend_time(task.solver) as spent:
+                    with measure_backend_time(task.solver) as time_in_backend:
                         runs.append(_time_call(problem, task, impulse, guard))
-                    backend_times += [sum(spent)] if spent else []
-                if task.interleave_group:  # Keep the last call only: a simulator also repeats one call.
-                    left, runs = left if perf_counter() - begun < MAX_WARM_UP_TIME else 1, runs[-1:]
-                left -= 1
-                if runs[-1][0].status is Status.TIME_LIMIT or perf_counter() - begun > task.time_limit:
-                    left = 0 if task.mode != "time" else left
+                    backend_times += [sum(time_in_backend)] if time_in_backend else []
+                # When alternating, a quick call is made twice, as a simulator repeats the same call.
+                if task.interleave_group:
+                    remaining, runs = (
+                        remaining if perf_counter() - start_time < MAX_WARM_UP_TIME else 1,
+                        runs[-1:],
+                    )
+                remaining -= 1
+                if runs[-1][0].status is Status.TIME_LIMIT or perf_counter() - start_time > task.time_limit:
+                    remaining = 0 if task.mode != "time" else remaining
             solution = runs[-1][0] if runs else guard
             if guard is None and task.timing_mode and _ended_by_budget(solution, task):
-                # More iterations than the solver's own limit: they are asked for, under the guard.
+                # The solve needs more iterations than the solver's default limit: repeat it with a guarded solve.
                 return attempt(problem, replace(task, guarded=True), impulse)
     except Exception as error:
-        # A backend may raise anything; it costs its own record, never the run.
+        # A backend may raise any exception; only its own record is lost.
         return f"{type(error).__name__}: {error}".strip()
     assert solution is not None  # there is at least one repeat
-    made = [s for s, _ in runs] or [solution]
-    found = outcome_of(
-        solution, made, [t for _, t in runs], min(calibration_times, default=None), task.mode == "time"
+    repeats = [s for s, _ in runs] or [solution]
+    outcome = make_outcome(
+        solution, repeats, [t for _, t in runs], min(calibration_times, default=None), task.mode == "time"
     )
-    return replace(found, backend_time=min(backend_times, default=None))
+    return replace(outcome, backend_time=min(backend_times, default=None))
 
 
-def outcome_of(
+def make_outcome(
     solution: Solution,
-    made: list[Solution],
+    repeats: list[Solution],
     times: list[float],
     calibration_time: float | None,
     keeps_residuals: bool = False,
 ) -> Outcome:
-    """Return the outcome of the repeats `made`, the last of which is `solution`."""
+    """Create the outcome of the repeats, the last of which is `solution`."""
     return Outcome(
         impulse=solution.impulse,
         certificate=solution.certificate,
@@ -244,15 +292,16 @@ def outcome_of(
         message=solution.message,
         form=solution.solver.form,
         status_conflict=solution.status_conflict[:500],
-        setups=tuple(s.setup_time for s in made),
-        solves=tuple(s.solve_time for s in made),
+        setups=tuple(s.setup_time for s in repeats),
+        solves=tuple(s.solve_time for s in repeats),
         times=tuple(times),
         calibration_time=calibration_time,
-        residual_per_repeat=tuple(float(s.residual.relative) for s in made) if keeps_residuals else (),
+        residual_per_repeat=tuple(float(s.residual.relative) for s in repeats) if keeps_residuals else (),
     )
 
 
 def _ended_by_budget(solution: Solution | None, task: Task) -> bool:
+    """Whether a run to a tolerance ended at the iteration limit of its task."""
     assert solution is not None
     return (
         task.mode == "tol"
@@ -262,80 +311,80 @@ def _ended_by_budget(solution: Solution | None, task: Task) -> bool:
     )
 
 
-_NUMBERS = np.arange(2.0**15)  # 256 KiB: more than a first cache holds
+_LOOP_NUMBERS = np.arange(2.0**15)  # 256 KiB: more than a first-tolerance cache holds
 
 
 def measure_calibration_time() -> float:
     """Return the time [s] of a loop of fixed work, which measures the machine's current speed and uses the caches."""
-    begun = perf_counter()
+    start_time = perf_counter()
     total = 0.0
     for i in range(500):
         total += 0.5 * i
     for _ in range(4):
-        total += float(_NUMBERS.sum())
-    return perf_counter() - begun
+        total += float(_LOOP_NUMBERS.sum())
+    return perf_counter() - start_time
 
 
-def just_written(problem: Problem, start: str) -> Problem:
-    """Return the problem in newly written arrays, with nothing derived from them, as a simulator leaves it.
+def copy_into_new_arrays(problem: Problem, start: str) -> Problem:
+    """Copy the problem into newly written arrays, with nothing derived from them, as a simulator leaves it.
 
-    With `start` "cold" the guess that came with it is removed, as in the printed line.
+    With `start` "cold", its guess is removed, as in the printed call.
     """
     rows = None if problem.rows is None else replace(problem.rows, copy=True)
     return replace(problem, rows=rows, guess=None if start == "cold" else problem.guess, copy=True)
 
 
 def _time_call(problem: Problem, task: Task, impulse: Any, guard: Solution | None) -> tuple[Solution, float]:
-    """Run the line once and return its solution and time [s]."""
-    more = {**task.options, **make_call_arguments(task, 0 if guard is None else guard.iterations)}
-    fresh = just_written(problem, task.start)
+    """Make the call once and return its solution and time [s]."""
+    arguments = {**task.options, **make_call_arguments(task, 0 if guard is None else guard.iterations)}
+    fresh = copy_into_new_arrays(problem, task.start)
     if task.start == "carried":
-        more["impulse"] = problem.start() if impulse is None else impulse
-    begun = perf_counter()
-    solution = solve(fresh, task.solver, **more)
-    return uninterrupted(solution), perf_counter() - begun + task.lead
+        arguments["impulse"] = problem.start() if impulse is None else impulse
+    start_time = perf_counter()
+    solution = solve(fresh, task.solver, **arguments)
+    return uninterrupted(solution), perf_counter() - start_time + task.lead
 
 
-def judged(problem: Problem, task: Task, found: Outcome | str) -> tuple[Record, FloatArray | None]:
+def judge_outcome(problem: Problem, task: Task, outcome: Outcome | str) -> tuple[Record, FloatArray | None]:
     """Judge an outcome on `problem`; return its record, and its impulses (m,) [N s] if they are finite."""
-    if isinstance(found, str):
-        return task.record(status=ERROR, message=found[:500]), None
-    solution = solution_of(problem, task, found)
+    if isinstance(outcome, str):
+        return task.record(status=ERROR, message=outcome[:500]), None
+    solution = make_solution(problem, task, outcome)
     impulse = solution.impulse if np.isfinite(solution.impulse).all() else None
-    return record_of(task, solution, found), impulse
+    return make_record(task, solution, outcome), impulse
 
 
-def solution_of(problem: Problem, task: Task, found: Outcome) -> Solution:
-    """Return the solution of an outcome, judged on `problem`."""
+def make_solution(problem: Problem, task: Task, outcome: Outcome) -> Solution:
+    """Judge an outcome on `problem` and return its solution."""
     claim = Claim(
-        Status[found.status],
-        found.iterations,
-        found.work,
-        found.message,
-        found.form,
-        certificate=found.certificate,
+        Status[outcome.status],
+        outcome.iterations,
+        outcome.work,
+        outcome.message,
+        outcome.form,
+        certificate=outcome.certificate,
     )
     return finish(
         problem,
         registry.get(task.solver),
         dict(task.options),
-        np.array(found.impulse),
+        np.array(outcome.impulse),
         claim,
         task.tol,
-        found.setups[-1],
-        found.solves[-1],
+        outcome.setups[-1],
+        outcome.solves[-1],
         None,
-        refutation=found.status_conflict.removeprefix("says INFEASIBLE, "),
+        refutation=outcome.status_conflict.removeprefix("says INFEASIBLE, "),
     )
 
 
 def _prepare_and_solve(problem: Problem, task: Task, impulse: Any) -> Solution:
-    """Prepare and solve under the time limit."""
-    fresh = replace(problem, copy=False)  # nothing is derived yet: forming A is set-up
-    more = {"isolate": False} if "isolate" in registry.get(task.solver).accepts else {}
-    # a run has processes of its own for these
-    prepared = prepare(fresh, task.solver, **{**more, **task.options})
-    get_reference(fresh)  # E0, V0: the judge's, outside the clocks
+    """Prepare and solve a task under its time limit."""
+    fresh = replace(problem, copy=False)  # Nothing is derived yet: forming A is part of the set-up.
+    arguments = {"isolate": False} if "isolate" in registry.get(task.solver).accepts else {}
+    # The run isolates third-party solvers itself.
+    prepared = prepare(fresh, task.solver, **{**arguments, **task.options})
+    get_reference(fresh)  # The judge's reference energies are computed before the clocks start.
     if task.start == "cold":
         impulse = fresh.start()
     elif task.start == "warm":
@@ -348,10 +397,10 @@ def _prepare_and_solve(problem: Problem, task: Task, impulse: Any) -> Solution:
     )
 
 
-def record_of(task: Task, s: Solution, found: Outcome) -> Record:
+def make_record(task: Task, s: Solution, outcome: Outcome) -> Record:
     """Return the record of repeats that ended in the solution `s`."""
-    setups, solves = found.setups, found.solves
-    both = found.times or [a + b for a, b in zip(setups, solves, strict=True)]
+    setups, solves = outcome.setups, outcome.solves
+    times = outcome.times or [a + b for a, b in zip(setups, solves, strict=True)]
     r = s.residual
     return task.record(
         status=s.status.name,
@@ -364,21 +413,21 @@ def record_of(task: Task, s: Solution, found: Outcome) -> Record:
         success=bool(s.success) and task.mode == "tol",
         claim_check=s.claim_check,
         status_conflict=s.status_conflict,
-        claims=s.status in CLAIMS,
+        claims=s.status in CLAIM_STATUSES,
         iterations=int(s.iterations),
         work={k: int(v) for k, v in s.work.items()},
         form=s.solver.form,
         message=s.message[:500],
-        repeats=len(both),
+        repeats=len(times),
         setup_min=min(setups),
         setup_median=statistics.median(setups),
         solve_min=min(solves),
         solve_median=statistics.median(solves),
-        time_min=min(both),
-        time_median=statistics.median(both),
-        times=found.times if task.timing_mode else (),
-        residual_per_repeat=found.residual_per_repeat,
-        calibration_time=found.calibration_time,
+        time_min=min(times),
+        time_median=statistics.median(times),
+        times=outcome.times if task.timing_mode else (),
+        residual_per_repeat=outcome.residual_per_repeat,
+        calibration_time=outcome.calibration_time,
         load=machine.running(),
-        backend_time_min=found.backend_time,
+        backend_time_min=outcome.backend_time,
     )

@@ -19,8 +19,8 @@ from lavender.base.subprocesses import ProcessBackend, ProcessEnded, RemoteError
 from lavender.judge.solution import Solution, Status
 from lavender.lab.bench.cases import fingerprint
 from lavender.lab.bench.machine import memory_share
-from lavender.lab.bench.record import CRASHED, ERROR, KILLED, Record, plain, values_in
-from lavender.lab.bench.running.timing import Outcome, Task, attempt, judged, solution_of
+from lavender.lab.bench.record import CRASHED, ERROR, KILLED, Record, parse_fields, to_jsonable
+from lavender.lab.bench.running.timing import Outcome, Task, attempt, judge_outcome, make_solution
 from lavender.problem import Problem
 from lavender.solvers import registry
 from lavender.solving.solve import Prepared, seconds_of, solve
@@ -57,7 +57,7 @@ class Worker:
     def measure(self, problem: Problem, task: Task, impulse: Any = None) -> tuple[Record, FloatArray | None]:
         """Equivalent to `lavender.lab.bench.running.timing.measure`, in the worker."""
         try:
-            return judged(problem, task, self._run(problem, task, impulse))
+            return judge_outcome(problem, task, self._run(problem, task, impulse))
         except TaskFailed as failure:
             return task.record(status=failure.status, message=failure.text), None
 
@@ -72,7 +72,7 @@ class Worker:
         outcome = self._run(problem, task, None)
         if isinstance(outcome, str):
             raise TaskFailed(ERROR, outcome)
-        return solution_of(problem, task, outcome)
+        return make_solution(problem, task, outcome)
 
     def _run(self, problem: Problem, task: Task, impulse: Any) -> Outcome | str:
         """Return the outcome of a task, or the text of the exception that the solver raised."""
@@ -169,7 +169,7 @@ def run_task(problem: Problem | None, task: Task, impulse: Any) -> subprocesses.
     message, form = (str(x)[: subprocesses.MAX_ERROR_LENGTH] for x in (outcome.message, outcome.form))
     outcome = replace(outcome, message=message, form=form)
     answer = {
-        f.name: plain(getattr(outcome, f.name)) for f in fields(outcome) if f.name not in OUTCOME_ARRAYS
+        f.name: to_jsonable(getattr(outcome, f.name)) for f in fields(outcome) if f.name not in OUTCOME_ARRAYS
     }
     return answer, [getattr(outcome, name) for name in OUTCOME_ARRAYS]
 
@@ -191,7 +191,7 @@ def parse_outcome(
     ValueError
         The answer has other fields, counts or sizes, or times longer than `elapsed`.
     """
-    values = values_in(Outcome, answer)
+    values = parse_fields(Outcome, answer)
     if values.get("status") not in Status.__members__:
         raise ValueError("no status")
     if len(arrays) != 2 or arrays[0] is None or any(x is not None and len(x) != m for x in arrays):

@@ -53,7 +53,9 @@ def map_unordered(
         lost = (*lost, KilledWorker, FutureCancelledError)
     parent = os.getpid() if backend == "loky" else 0  # 0: workers belong to a cluster
     with joblib.parallel_config(backend=backend, n_jobs=workers):
-        calls = (joblib.delayed(_call_in_worker)(parent, function, given) for given in arguments)
+        calls = (
+            joblib.delayed(_call_in_worker)(parent, function, call_arguments) for call_arguments in arguments
+        )
         try:
             try:
                 parallel = joblib.Parallel(return_as="generator_unordered", batch_size=1)
@@ -78,11 +80,11 @@ def map_unordered(
             return
 
 
-def _call_in_worker(parent: int, function: Callable[..., Any], given: tuple[Any, ...]) -> Any:
+def _call_in_worker(parent: int, function: Callable[..., Any], call_arguments: tuple[Any, ...]) -> Any:
     """Call the function in a worker, which ends when its parent does."""
     if parent and parent != os.getpid():
         _end_with(parent)
-    return function(*given)
+    return function(*call_arguments)
 
 
 @cache

@@ -1,4 +1,4 @@
-"""One file for each engine: `Engine(scene, **options)` steps a scene; a variant is an engine with a setting."""
+"""Engines, one file each: `Engine(scene, **options)` steps a scene. A `EngineVariant` is an engine with settings."""
 
 from __future__ import annotations
 
@@ -20,78 +20,95 @@ from lavender.lab.phenomena.parts import Track
 from lavender.sim.scene import Scene
 from lavender.sim.scene.steppers import STEPPERS
 
-PACKAGES_OF_NODE = {"rapier": "@dimforge/rapier3d-compat", "jolt": "jolt-physics"}  # engine -> package of npm
-NO_TORSION = {"spin": "it has no friction against spinning"}
-NO_SPIN = "its friction against spinning has no radius that could be given"
-NO_ROLLING = "it has no friction against rolling"
+PACKAGES_OF_NODE = {"rapier": "@dimforge/rapier3d-compat", "jolt": "jolt-physics"}  # engine -> npm package
+NO_TORSION = {"spin": "it has no torsional friction"}
+NO_PATCH_RADIUS = "its torsional friction has no radius parameter"
+NO_ROLLING = "it has no rolling friction"
 
 
 class Stepping:
-    """One engine with one scene."""
+    """One engine with one scene; `dt` [s] is the time of one `step`, `setting` describes step, substeps and sweeps."""
 
     scene: Scene
-    dt = 0.0  # s, of one `step`
-    setting = ""  # step, substeps and sweeps, as run
+    dt = 0.0
+    setting = ""
 
     def step(self) -> Any:
-        """One step of dt."""
+        """Make one step of dt."""
         raise NotImplementedError
 
     def advance(self, steps: int) -> None:
-        """So many steps."""
+        """Make `steps` steps."""
         for _ in range(steps):
             self.step()
 
     def clock(self) -> float:
-        """CPU time that the steps took, from any moment on [s]."""
+        """Return the CPU time [s] of the steps so far, from an arbitrary zero."""
         return process_time()
 
     def state(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Positions (n, 3) [m], quaternions (n, 4) w x y z, velocities (n, 6) [m/s, rad/s] in the world."""
+        """Return positions (n, 3) [m], quaternions (n, 4) w x y z, world velocities (n, 6) [m/s, rad/s]."""
         raise NotImplementedError
 
-    def placed(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """A state with every body at rest where the scene has it."""
+    def initial_state(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return a state with every body at rest at its position in the scene."""
         x, q = (
             np.array([getattr(b, name) for b in self.scene.bodies]) for name in ("position", "quaternion")
         )
         return x, q, np.zeros((len(x), 6))
 
     def force(self) -> float:
-        """Force of the first joint [N]; nan where the engine does not tell it."""
+        """Return the force of the first joint [N]; nan if the engine does not provide it."""
         return float("nan")
 
-    def left(self) -> tuple[int, float, float]:
-        """What the last step left: contacts, deepest penetration or gap of a joint [m], the judge's relative residual.
+    def last_step_quality(self) -> tuple[int, float, float]:
+        """Return the number of contacts, the largest penetration or joint gap [m], and the relative residual.
 
-        The latter is nan where the engine's problem is not known.
+        They belong to the last step. The residual is the judge's; it is nan if the engine's problem is not known.
         """
         raise NotImplementedError
 
     def close(self) -> None:
-        """Let go of what the engine holds."""
+        """Release the resources of the engine."""
 
 
 @dataclass(frozen=True)
 class EngineVariant:
-    """An engine with a setting: its own defaults, or one that is recommended."""
+    """An engine with settings: its defaults, or recommended ones.
+
+    Parameters
+    ----------
+    name : str
+    module : str
+        File of this folder.
+    package : str
+        Module that it needs; empty for none.
+    options : mapping
+        Options of `Engine`.
+    text : str
+        Description of the settings.
+    scene : mapping
+        Scene parameters that it prescribes, for lavender's own steppers.
+    cannot : mapping of str to str
+        Unsupported feature of a scene -> reason.
+    """
 
     name: str
-    module: str  # of this folder
-    package: str  # module that it needs; empty: none
+    module: str
+    package: str
     options: Mapping[str, Any]
-    text: str  # the setting, in words
-    scene: Mapping[str, Any] = field(default_factory=dict)  # asked of the scene, of our own steppers
-    cannot: Mapping[str, str] = field(default_factory=dict)  # feature of a scene -> why not
+    text: str
+    scene: Mapping[str, Any] = field(default_factory=dict)
+    cannot: Mapping[str, str] = field(default_factory=dict)
 
     def missing(self) -> str:
-        """What it lacks here; empty where it can run."""
-        lack = lacks(self.package)
-        return f"not installed: {lack}" if lack else ""
+        """Return the reason why it cannot run here; empty if it can."""
+        hint = installation_hint(self.package)
+        return f"not installed: {hint}" if hint else ""
 
 
-def lacks(package: str) -> str:
-    """How a package of Python or of npm would be installed; empty where it is here, or none is asked for."""
+def installation_hint(package: str) -> str:
+    """Return the command that installs a Python or npm package; empty if it is installed, or no package is needed."""
     if package in PACKAGES_OF_NODE.values():
         return missing_in_node(package)
     if not package or importlib.util.find_spec(package):
@@ -100,52 +117,58 @@ def lacks(package: str) -> str:
 
 
 def node_folder(package: str) -> Path | None:
-    """Where npm has put a package: in node_modules of the current folder, or a folder of NODE_PATH; None: nowhere."""
-    more = filter(None, os.environ.get("NODE_PATH", "").split(os.pathsep))
-    found = (Path(place) / package for place in ("node_modules", *more))
-    return next((p.resolve() for p in found if (p / "package.json").is_file()), None)
+    """Return the folder of an npm package, in ./node_modules or a folder of NODE_PATH; None if there is none."""
+    search_path = filter(None, os.environ.get("NODE_PATH", "").split(os.pathsep))
+    candidates = (Path(folder) / package for folder in ("node_modules", *search_path))
+    return next((p.resolve() for p in candidates if (p / "package.json").is_file()), None)
 
 
 def versions_of_node() -> dict[str, str]:
-    """Version of each package of npm that is here."""
-    places = {name: place for name in PACKAGES_OF_NODE.values() if (place := node_folder(name))}
+    """Return the version of each npm package that is installed."""
+    folders = {name: folder for name in PACKAGES_OF_NODE.values() if (folder := node_folder(name))}
     return {
-        name: str(json.loads((place / "package.json").read_text(encoding="utf-8"))["version"])
-        for name, place in places.items()
+        name: str(json.loads((folder / "package.json").read_text(encoding="utf-8"))["version"])
+        for name, folder in folders.items()
     }
 
 
 def missing_in_node(package: str) -> str:
-    """What a package of npm lacks to run here; empty where it can."""
+    """Return the reason why an npm package cannot run here; empty if it can."""
     if shutil.which("node") is None:
         return "it runs under Node, https://nodejs.org"
     return "" if node_folder(package) else f"npm install {package} in this folder, or its folder in NODE_PATH"
 
 
-FINE = {"substeps": 16, "solver_iterations": 4}
+# Options of the finer setting of lavender's steppers.
+FINE_STEPS = {"substeps": 16, "solver_iterations": 4}
 
 
-def _own() -> list[EngineVariant]:
-    found = []
+def _own_variants() -> list[EngineVariant]:
+    """Build the variants of lavender's own steppers."""
+    variants = []
     for name, spec in STEPPERS.items():
-        cannot = {} if spec.spin else {"spin": "the stepper has no spin friction"}
+        cannot = {} if spec.spin else {"spin": "the stepper has no torsional friction"}
         cannot |= {} if spec.rolling else {"rolling": "the stepper has no rolling friction"}
         settings: list[tuple[str, dict[str, Any], str]] = [
-            (name, {}, "4 substeps of 16 sweeps"), (f"{name} 16x4", FINE, "16 substeps of 4 sweeps"),
+            (name, {}, "4 substeps of 16 sweeps"), (f"{name} 16x4", FINE_STEPS, "16 substeps of 4 sweeps"),
         ]  # fmt: skip
         if spec.solvers:
             newton = {"solver": "newton", "substeps": 4}
             settings.append((f"{name} newton", newton, "4 substeps, Newton to 1e-6"))
-        for full, more, words in settings:
-            asked = {"stepper": name, "dt": 1 / 60, **more}
-            found.append(EngineVariant(full, "own", "", {}, f"1/60 s, {words}", scene=asked, cannot=cannot))
-    return found
+        for full_name, overrides, description in settings:
+            parameters = {"stepper": name, "dt": 1 / 60, **overrides}
+            variants.append(
+                EngineVariant(
+                    full_name, "own", "", {}, f"1/60 s, {description}", scene=parameters, cannot=cannot
+                )
+            )
+    return variants
 
 
-_PATCHES = {"spin": NO_SPIN, "rolling": NO_ROLLING}
+_NO_PATCH_FRICTION = {"spin": NO_PATCH_RADIUS, "rolling": NO_ROLLING}
 _JOLT, _RAPIER = PACKAGES_OF_NODE["jolt"], PACKAGES_OF_NODE["rapier"]
-#: Engines of others.
-_OTHERS = (
+#: Third-party engines.
+_THIRD_PARTY_VARIANTS = (
     *(
         EngineVariant(
             f"mujoco {cone}{' noslip' if noslip else ''}", "mujoco", "mujoco", {"cone": cone, "noslip": noslip},
@@ -156,17 +179,15 @@ _OTHERS = (
     EngineVariant("pybullet", "bullet", "pybullet", {"sweeps": 50, "substeps": 1}, "1/240 s, 50 sweeps"),
     EngineVariant("pybullet 4x100", "bullet", "pybullet", {"sweeps": 100, "substeps": 4}, "1/240 s in 4 of 100 sweeps"),
     EngineVariant("drake", "drake", "pydrake", {"approximation": "lagged", "hydroelastic": False},
-        "1 ms, point contacts: its defaults", cannot=_PATCHES),
+        "1 ms, point contacts: its defaults", cannot=_NO_PATCH_FRICTION),
     EngineVariant("drake lagged", "drake", "pydrake", {"approximation": "lagged", "hydroelastic": True},
-        "1 ms, hydroelastic bodies of 1e8 Pa", cannot=_PATCHES),
+        "1 ms, hydroelastic bodies of 1e8 Pa", cannot=_NO_PATCH_FRICTION),
     EngineVariant("drake sap", "drake", "pydrake", {"approximation": "sap", "hydroelastic": True},
-        "1 ms, SAP, hydroelastic bodies of 1e8 Pa", cannot=_PATCHES),
+        "1 ms, SAP, hydroelastic bodies of 1e8 Pa", cannot=_NO_PATCH_FRICTION),
     EngineVariant("lavendersim", "lavender_sim", "lavendersim", {"sweeps": 22}, "1/60 s in 4 of 22 sweeps"),
     EngineVariant("lavendersim 64", "lavender_sim", "lavendersim", {"sweeps": 64}, "1/60 s in 4 of 64 sweeps"),
     EngineVariant("rapier", "node", _RAPIER, {"engine": "rapier", "iterations": 4},
         "1/60 s, 4 iterations: its defaults", cannot=NO_TORSION),
-    EngineVariant("rapier 16", "node", _RAPIER, {"engine": "rapier", "iterations": 16}, "1/60 s, 16 iterations",
-        cannot=NO_TORSION),
     EngineVariant("jolt", "node", _JOLT, {"engine": "jolt", "sweeps": 10, "substeps": 1, "gyroscopic": False},
         "1/60 s, 10 sweeps: its defaults", cannot=NO_TORSION),
     EngineVariant("jolt 4", "node", _JOLT, {"engine": "jolt", "sweeps": 10, "substeps": 4, "gyroscopic": True},
@@ -178,43 +199,45 @@ _OTHERS = (
     EngineVariant("newton vbd", "newton", "newton", {"solver": "VBD", "iterations": 10},
         "1/60 s in 4 of 10 iterations, its default", cannot=NO_TORSION),
 )  # fmt: skip
-#: Variants of engines by name; lavender's own steppers come first.
-ENGINE_VARIANTS: dict[str, EngineVariant] = {variant.name: variant for variant in (*_own(), *_OTHERS)}
+#: Name -> engine variant; lavender's own come first.
+ENGINE_VARIANTS: dict[str, EngineVariant] = {
+    variant.name: variant for variant in (*_own_variants(), *_THIRD_PARTY_VARIANTS)
+}
 
 
-def engine(module: str, scene: Scene, **options: Any) -> Stepping:
-    """The engine of a file of this folder with a scene."""
-    made: Stepping = importlib.import_module(f"lavender.lab.phenomena.engines.{module}").Engine(
+def create_engine(module: str, scene: Scene, **options: Any) -> Stepping:
+    """Create the engine of a file of this folder with a scene."""
+    created: Stepping = importlib.import_module(f"lavender.lab.phenomena.engines.{module}").Engine(
         scene, **options
     )
-    return made
+    return created
 
 
-def make(variant: EngineVariant, scene: Scene) -> Stepping:
-    """Create the engine of a variant for a scene."""
-    return engine(variant.module, scene, **variant.options)
+def make_engine(variant: EngineVariant, scene: Scene) -> Stepping:
+    """Create the engine of a variant with a scene."""
+    return create_engine(variant.module, scene, **variant.options)
 
 
-def follow(engine: Stepping, seconds: float, interval: float) -> Track:
-    """Step for so long, a sample every `interval` seconds, in whole steps; a state that is not finite is the last."""
-    every = max(1, round(interval / engine.dt))
-    samples = max(2, int(np.ceil(seconds / (every * engine.dt) - 1e-9)))
-    states, spent, done = [engine.state()], 0.0, 0
+def record_track(engine: Stepping, seconds: float, interval: float) -> Track:
+    """Step an engine for `seconds` and record a state every `interval` [s], in whole steps, up to one not finite."""
+    steps_per_sample = max(1, round(interval / engine.dt))
+    samples = max(2, int(np.ceil(seconds / (steps_per_sample * engine.dt) - 1e-9)))
+    states, cpu_time, n_steps = [engine.state()], 0.0, 0
     for _ in range(samples):
         begin = engine.clock()
-        engine.advance(every)
-        spent += engine.clock() - begin
-        done += every
+        engine.advance(steps_per_sample)
+        cpu_time += engine.clock() - begin
+        n_steps += steps_per_sample
         states.append(engine.state())
         if not all(np.isfinite(x).all() for x in states[-1]):
             break
     x, q, v = (np.array(part, float) for part in zip(*states, strict=True))
     return Track(
-        time=np.arange(len(states), dtype=float) * (every * engine.dt),
+        time=np.arange(len(states), dtype=float) * (steps_per_sample * engine.dt),
         positions=x,
         quaternions=q,
         velocities=v,
         force=engine.force(),
-        cpu=spent / (done * engine.dt),
+        cpu=cpu_time / (n_steps * engine.dt),
         setting=engine.setting,
     )

@@ -37,12 +37,12 @@ from lavender.lab.phenomena.engines import Stepping
 from lavender.lab.phenomena.engines.tree import collision_shape, parents, relative
 from lavender.sim.scene import Body, Plane, Scene, Sphere
 
-MODULUS = 1e8  # Pa, of compliant bodies
-DISSIPATION = 10.0  # s/m
+MODULUS = 1e8  # [Pa] Hydroelastic modulus of compliant bodies.
+DISSIPATION = 10.0  # [s/m] Hunt-Crossley dissipation of hydroelastic contacts.
 
 
 class Engine(Stepping):
-    """`Simulator.AdvanceTo` by 1 ms."""
+    """`Simulator.AdvanceTo` with steps of 1 ms."""
 
     def __init__(self, scene: Scene, approximation: str, hydroelastic: bool) -> None:
         self.scene, self.hydroelastic, self.dt = scene, hydroelastic, 1e-3
@@ -56,9 +56,9 @@ class Engine(Stepping):
             getattr(DiscreteContactApproximation, "k" + approximation.capitalize())
         )
         plant.mutable_gravity_field().set_gravity_vector(np.asarray(scene.parameters.gravity))
-        self.bodies: list[Any] = [self._add(i) for i in range(scene.n_bodies)]
+        self.bodies: list[Any] = [self._add_body(i) for i in range(scene.n_bodies)]
         for i in self.up:
-            self._join(i)
+            self._add_joint(i)
         plant.Finalize()
         diagram = builder.Build()
         self.simulator = Simulator(diagram)
@@ -68,53 +68,59 @@ class Engine(Stepping):
                 plant.SetFreeBodyPose(self.context, self.bodies[i], _pose(body.position, body.quaternion))
                 plant.SetFreeBodySpatialVelocity(
                     self.context, self.bodies[i],
-                    SpatialVelocity(w=_any(body.angular_velocity), v=_any(body.velocity)),
+                    SpatialVelocity(w=_as_drake_array(body.angular_velocity), v=_as_drake_array(body.velocity)),
                 )  # fmt: skip
         self.simulator.Initialize()
         self.steps = 0
 
     def _material(self, rigid: bool) -> ProximityProperties:
-        mu, made = self.scene.parameters.friction, ProximityProperties()
+        """Build the contact properties of a body."""
+        mu, created = self.scene.parameters.friction, ProximityProperties()
         AddContactMaterial(
             dissipation=DISSIPATION if self.hydroelastic else None,
             friction=CoulombFriction(mu, mu),
-            properties=made,
+            properties=created,
         )
         if self.hydroelastic and rigid:
-            AddRigidHydroelasticProperties(1.0, made)
+            AddRigidHydroelasticProperties(1.0, created)
         elif self.hydroelastic:
-            AddCompliantHydroelasticProperties(0.1, MODULUS, made)
-        return made
+            AddCompliantHydroelasticProperties(0.1, MODULUS, created)
+        return created
 
-    def _add(self, i: int) -> Any:
+    def _add_body(self, i: int) -> Any:
+        """Add a body to the plant and return it; a plane belongs to the world: return None."""
         body = self.scene.bodies[i]
         shape = collision_shape(body, "drake", static=False)
         if isinstance(shape, Plane):
-            normal = _any(shape.normal)
-            pose = HalfSpace.MakePose(normal, _any(shape.offset * normal))
+            normal = _as_drake_array(shape.normal)
+            pose = HalfSpace.MakePose(normal, _as_drake_array(shape.offset * normal))
             ground = self.plant.world_body()
             self.plant.RegisterCollisionGeometry(ground, pose, HalfSpace(), f"b{i}", self._material(True))
             return None
-        about = np.diag(body.inertia) / body.mass
-        unit = UnitInertia(*about)
-        made = self.plant.AddRigidBody(f"b{i}", SpatialInertia(body.mass, _any(np.zeros(3)), unit))
+        unit = UnitInertia(*(np.diag(body.inertia) / body.mass))
+        created = self.plant.AddRigidBody(
+            f"b{i}", SpatialInertia(body.mass, _as_drake_array(np.zeros(3)), unit)
+        )
         if not self.up:
             solid = DrakeSphere(shape.radius) if isinstance(shape, Sphere) else DrakeBox(*shape.size)
             self.plant.RegisterCollisionGeometry(
-                made, RigidTransform(), solid, f"b{i}", self._material(False)
+                created, RigidTransform(), solid, f"b{i}", self._material(False)
             )
-        return made
+        return created
 
-    def _join(self, i: int) -> None:
+    def _add_joint(self, i: int) -> None:
+        """Add the joint of body i to its parent."""
         joint, plant = self.up[i], self.plant
-        above: Body | None = None if joint.a < 0 else self.scene.bodies[joint.a]
-        _, turn = relative(above, self.scene.bodies[i])
-        base = plant.world_frame() if above is None else self.bodies[joint.a].body_frame()
-        own = self.bodies[i].body_frame()
-        first = plant.AddFrame(FixedOffsetFrame(f"f{i}", base, _pose(joint.anchor_a, turn)))
-        second = plant.AddFrame(FixedOffsetFrame(f"m{i}", own, RigidTransform(_any(joint.anchor_b))))
+        parent: Body | None = None if joint.a < 0 else self.scene.bodies[joint.a]
+        _, quaternion = relative(parent, self.scene.bodies[i])
+        base = plant.world_frame() if parent is None else self.bodies[joint.a].body_frame()
+        child_frame = self.bodies[i].body_frame()
+        first = plant.AddFrame(FixedOffsetFrame(f"f{i}", base, _pose(joint.anchor_a, quaternion)))
+        second = plant.AddFrame(
+            FixedOffsetFrame(f"m{i}", child_frame, RigidTransform(_as_drake_array(joint.anchor_b)))
+        )
         if joint.kind == "hinge":
-            plant.AddJoint(RevoluteJoint(joint.name, first, second, _any(joint.axis_b), 0.0))
+            plant.AddJoint(RevoluteJoint(joint.name, first, second, _as_drake_array(joint.axis_b), 0.0))
         else:
             plant.AddJoint(BallRpyJoint(joint.name, first, second, 0.0))
 
@@ -125,7 +131,7 @@ class Engine(Stepping):
 
     def state(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """See `Stepping.state`."""
-        x, q, v = self.placed()
+        x, q, v = self.initial_state()
         for i, body in enumerate(self.bodies):
             if body is None:
                 continue
@@ -136,10 +142,14 @@ class Engine(Stepping):
         return x, q, v
 
 
-def _any(x: Any) -> Any:
-    # its stubs ask for arrays of a type that NumPy has no name for
+def _as_drake_array(x: Any) -> Any:
+    """Convert to an array of untyped shape: Drake's stubs need an array type that NumPy has no name for."""
     return np.asarray(x, float)
 
 
-def _pose(place: FloatArray, turn: FloatArray) -> RigidTransform:
-    return RigidTransform(RotationMatrix(Quaternion(_any(turn / np.linalg.norm(turn)))), _any(place))
+def _pose(position: FloatArray, quaternion: FloatArray) -> RigidTransform:
+    """Build a pose of a position (3,) [m] and a quaternion (4,)."""
+    return RigidTransform(
+        RotationMatrix(Quaternion(_as_drake_array(quaternion / np.linalg.norm(quaternion)))),
+        _as_drake_array(position),
+    )

@@ -18,11 +18,12 @@ from lavender.sim.scene.parts import rotation
 
 
 def _text(x: Any) -> str:
+    """Format numbers for an MJCF attribute."""
     return " ".join(repr(float(v)) for v in x)
 
 
-def _tie(joint: Joint) -> str:
-    # The first body must not be the world; the anchor is in its frame.
+def _equality(joint: Joint) -> str:
+    """Build the equality constraint of a joint: the first body must not be the world, the anchor is in its frame."""
     first, second, anchor = (
         (joint.b, joint.a, joint.anchor_b) if joint.a < 0 else (joint.a, joint.b, joint.anchor_a)
     )
@@ -31,18 +32,18 @@ def _tie(joint: Joint) -> str:
 
 
 class Engine(Stepping):
-    """`mj_step`, by default of 2 ms with Newton to 1e-8.
+    """`mj_step`, 2 ms with Newton to 1e-8 by default.
 
     Parameters
     ----------
     cone : {"pyramidal", "elliptic"}
     noslip : int
-        Its iterations.
+        Number of noslip iterations.
     dt : float, optional, s
     sweeps : int, optional
-        PGS with so many at tolerance 0, in place of Newton.
+        If given, PGS with this many iterations and tolerance 0 replaces Newton.
     tree : bool
-        Joints are those of a tree; False: equalities between free bodies.
+        True: joints of a tree. False: equality constraints between free bodies.
     """
 
     def __init__(
@@ -64,29 +65,30 @@ class Engine(Stepping):
         option = (
             f'<option cone="{cone}" noslip_iterations="{noslip}" gravity="{_text(p.gravity)}"{step}{solver}/>'
         )
-        room = "64M" if tree else "1G"  # of contacts and rows between free bodies
-        self.apart = ' contype="0" conaffinity="0"' if scene.joints else ""
+        memory = "64M" if tree else "1G"  # for contacts and constraint rows
+        self.no_collision = ' contype="0" conaffinity="0"' if scene.joints else ""
         trees = "".join(self._body(i) for i in range(scene.n_bodies) if i not in self.up or self.up[i].a < 0)
         self.model = mujoco.MjModel.from_xml_string(
-            f"<mujoco>{option}<size memory='{room}'/><default><geom {friction}{spin}/></default>"
-            f"<worldbody>{trees}</worldbody><equality>{''.join(map(_tie, ties))}</equality></mujoco>"
+            f"<mujoco>{option}<size memory='{memory}'/><default><geom {friction}{spin}/></default>"
+            f"<worldbody>{trees}</worldbody><equality>{''.join(map(_equality, ties))}</equality></mujoco>"
         )
         self.data = mujoco.MjData(self.model)
         self.dt = float(self.model.opt.timestep)
-        how = f"{sweeps} sweeps" if sweeps else "Newton"
-        self.setting = f"{1e3 * self.dt:.3g} ms, {how}, {cone}" + (f", noslip {noslip}" if noslip else "")
+        method = f"{sweeps} sweeps" if sweeps else "Newton"
+        self.setting = f"{1e3 * self.dt:.3g} ms, {method}, {cone}" + (f", noslip {noslip}" if noslip else "")
         self.ids = [
             mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_BODY, f"b{i}") for i in range(scene.n_bodies)
         ]
         for i, body in enumerate(scene.bodies):
             if i not in self.up and not body.is_static:
                 at = self.model.jnt_dofadr[self.model.body_jntadr[self.ids[i]]]
-                # of a free joint the spin is in the body's frame
-                spun = rotation(body.quaternion).T @ body.angular_velocity
-                self.data.qvel[at : at + 6] = np.concatenate([body.velocity, spun])
+                # The angular velocity of a free joint is in the body's frame.
+                angular_velocity = rotation(body.quaternion).T @ body.angular_velocity
+                self.data.qvel[at : at + 6] = np.concatenate([body.velocity, angular_velocity])
         mujoco.mj_forward(self.model, self.data)
 
     def _body(self, i: int) -> str:
+        """Build the MJCF element of a body with its children."""
         body, joint = self.scene.bodies[i], self.up.get(i)
         shape = collision_shape(body, "mujoco")
         if isinstance(shape, Plane):
@@ -96,27 +98,28 @@ class Engine(Stepping):
             geom = f'type="sphere" size="{shape.radius!r}"'
         else:
             geom = f'type="box" size="{_text(0.5 * np.asarray(shape.size))}"'
-        above = None if joint is None or joint.a < 0 else self.scene.bodies[joint.a]
-        place, turn = relative(above, body)
+        parent = None if joint is None or joint.a < 0 else self.scene.bodies[joint.a]
+        position, quaternion = relative(parent, body)
         tie = "" if body.is_static else "<freejoint/>"
-        geom += self.apart if not body.is_static else ""
+        geom += self.no_collision if not body.is_static else ""
         if joint is not None:
             kind = f'type="hinge" axis="{_text(joint.axis_b)}"' if joint.kind == "hinge" else 'type="ball"'
             tie = f'<joint {kind} pos="{_text(joint.anchor_b)}"/>'
-        inside = "".join(self._body(j) for j, other in self.up.items() if other.a == i)
+        children = "".join(self._body(j) for j, other in self.up.items() if other.a == i)
         weight = f' mass="{body.mass!r}"' if body.mass else ""
-        return f'<body name="b{i}" pos="{_text(place)}" quat="{_text(turn)}">{tie}<geom {geom}{weight}/>{inside}</body>'
+        pose = f'pos="{_text(position)}" quat="{_text(quaternion)}"'
+        return f'<body name="b{i}" {pose}>{tie}<geom {geom}{weight}/>{children}</body>'
 
     def step(self) -> None:
         """See `Stepping.step`."""
         mujoco.mj_step(self.model, self.data)
 
     def problem(self) -> Problem:
-        """The constraint problem of the last step."""
+        """Return the constraint problem of the last step."""
         return from_mujoco(self.model, self.data, name=f"mujoco {self.scene.name}")
 
-    def left(self) -> tuple[int, float, float]:
-        """See `Stepping.left`."""
+    def last_step_quality(self) -> tuple[int, float, float]:
+        """See `Stepping.last_step_quality`."""
         d = self.data
         depth = max(0.0, -float(d.contact.dist[: d.ncon].min())) if d.ncon else 0.0
         if self.scene.joints:
@@ -124,12 +127,12 @@ class Engine(Stepping):
         return int(d.ncon), depth, residual(self.problem(), impulse(self.model, d)).relative
 
     def state(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """See `Stepping.state`; poses belong to the velocities of the same time."""
+        """See `Stepping.state`; velocities are computed for the time of the poses."""
         mujoco.mj_kinematics(self.model, self.data)
         mujoco.mj_comPos(self.model, self.data)
         mujoco.mj_comVel(self.model, self.data)
-        v, one = np.zeros((len(self.ids), 6)), np.zeros(6)
+        v, body_velocity = np.zeros((len(self.ids), 6)), np.zeros(6)
         for k, i in enumerate(self.ids):
-            mujoco.mj_objectVelocity(self.model, self.data, mujoco.mjtObj.mjOBJ_BODY, i, one, 0)
-            v[k] = np.roll(one, 3)  # it gives spin first
+            mujoco.mj_objectVelocity(self.model, self.data, mujoco.mjtObj.mjOBJ_BODY, i, body_velocity, 0)
+            v[k] = np.roll(body_velocity, 3)  # MuJoCo returns the angular velocity first.
         return self.data.xpos[self.ids].copy(), self.data.xquat[self.ids].copy(), v

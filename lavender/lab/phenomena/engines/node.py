@@ -1,4 +1,4 @@
-"""Run engines that npm installs: the Node program `served.mjs` steps them, each by its own file in this folder."""
+"""Engines that npm installs: the Node program `served.mjs` steps them, each by its own file in this folder."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ SCRIPT = Path(__file__).with_name("served.mjs")
 
 
 class JsonLines:
-    """A program that answers each line of JSON with one.
+    """A program that answers each line of JSON with one line of JSON.
 
     It has no time limit: its parent is a `ProcessBackend`, which is killed together with it.
     """
@@ -45,9 +45,9 @@ class JsonLines:
         return json.loads(line)
 
     def close(self) -> None:
-        """Kill the program: it has nothing to lose."""
+        """Kill the program; it has no data to save."""
         self._process.kill()
-        with contextlib.suppress(OSError):  # It closed a pipe itself.
+        with contextlib.suppress(OSError):  # The program closed a pipe itself.
             self._process.communicate()
 
 
@@ -56,7 +56,7 @@ class Engine(Stepping):
 
     def __init__(self, scene: Scene, engine: str, dt: float = 1.0 / 60.0, **options: float) -> None:
         parents(scene, engine)  # raises if the scene is not a tree
-        self.dt, self.spent = dt, 0.0
+        self.dt, self.cpu_time = dt, 0.0
         self.setting = f"{1e3 * dt:.3g} ms, {', '.join(f'{k} {v}' for k, v in options.items())}"
         p = scene.parameters
         request = {
@@ -76,17 +76,18 @@ class Engine(Stepping):
             raise LavenderError(f"{engine}: {missing_in_node(PACKAGES_OF_NODE[engine])}")
         self.program = JsonLines(["node", str(SCRIPT), engine, str(folder)])
         self._call({"scene": request, "options": {"dt": self.dt, **options}})
-        self.spent = 0.0
+        self.cpu_time = 0.0
 
     def _call(self, message: Any) -> None:
+        """Send a message, raise errors of its answer, and store the time and state that it returns."""
         answer = self.program.call(message)
         if "cannot" in answer:
             raise CapabilityError(str(answer["cannot"]))
         if "error" in answer:
             raise LavenderError(str(answer["error"]))
-        self.spent += float(answer["cpu"])
-        # null, for what is not finite, becomes nan
-        self.seen = np.array(answer["state"], float).reshape(-1, 13)
+        self.cpu_time += float(answer["cpu"])
+        # null, a number that is not finite, becomes nan.
+        self.states = np.array(answer["state"], float).reshape(-1, 13)
 
     def step(self) -> None:
         """See `Stepping.step`."""
@@ -97,12 +98,12 @@ class Engine(Stepping):
         self._call({"steps": steps})
 
     def clock(self) -> float:
-        """See `Stepping.clock`: the time of the other process."""
-        return self.spent
+        """See `Stepping.clock`; it is the time of the other process."""
+        return self.cpu_time
 
     def state(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """See `Stepping.state`; the engines keep 32 bits."""
-        return self.seen[:, :3], self.seen[:, 3:7], self.seen[:, 7:]
+        """See `Stepping.state`; the engines compute in float32."""
+        return self.states[:, :3], self.states[:, 3:7], self.states[:, 7:]
 
     def close(self) -> None:
         """See `Stepping.close`."""
@@ -110,6 +111,7 @@ class Engine(Stepping):
 
 
 def _body(body: Body, engine: str) -> dict[str, Any]:
+    """Build the JSON description of a body."""
     shape = collision_shape(body, engine, static=False)
     if isinstance(shape, Plane):
         shape_data: dict[str, Any] = {"kind": "plane", "normal": list(shape.normal), "offset": shape.offset}

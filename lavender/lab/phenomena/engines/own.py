@@ -1,4 +1,4 @@
-"""LavenderSim with a stepper; the scene says which."""
+"""LavenderSim with the stepper of the scene's parameters."""
 
 from __future__ import annotations
 
@@ -11,33 +11,33 @@ from lavender.sim.scene import Scene
 
 
 class Engine(Stepping):
-    """`Simulation.step` with its observation."""
+    """`Simulation.step` and its observation."""
 
     def __init__(self, scene: Scene) -> None:
         self.scene, self.sim = scene, Simulation(scene)
         p = scene.parameters
         self.dt, self.substep = p.dt, p.dt / p.substeps
-        self.seen = self.sim.reset()[0]
+        self.observation = self.sim.reset()[0]
         work = f"{self.sim.solver_iterations} sweeps" if p.solver == "sequential_impulses" else p.solver
         self.setting = f"{1e3 * p.dt:.3g} ms in {p.substeps} of {work}"
-        self.over = False
+        self.has_ended = False
 
     def step(self) -> None:
-        """See `Stepping.step`; after a body was lost nothing follows."""
-        if not self.over:
-            self.seen, _, self.over, _, _ = self.sim.step()
+        """See `Stepping.step`; after a body is lost, the state no longer changes."""
+        if not self.has_ended:
+            self.observation, _, self.has_ended, _, _ = self.sim.step()
 
     def state(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """See `Stepping.state`."""
-        return self.seen["positions"], self.seen["quaternions"], self.seen["velocities"]
+        return self.observation["positions"], self.observation["quaternions"], self.observation["velocities"]
 
-    def left(self) -> tuple[int, float, float]:
-        """See `Stepping.left`."""
+    def last_step_quality(self) -> tuple[int, float, float]:
+        """See `Stepping.last_step_quality`."""
         gap = np.abs(self.sim.state.a["joint_error"]).max(initial=0.0)
-        depth = max(self.seen["contacts"]["depth"].max(initial=0.0), gap)
-        return int(self.seen["solver"][2]), float(depth), float(self.sim.residual()["relative"])
+        depth = max(self.observation["contacts"]["depth"].max(initial=0.0), gap)
+        return int(self.observation["solver"][2]), float(depth), float(self.sim.residual()["relative"])
 
     def force(self) -> float:
-        """See `Stepping.force`; the first joint is a ball's three rows."""
-        rows = self.seen["joint_impulses"][:3]
+        """See `Stepping.force`; the first joint must be a ball joint with three rows."""
+        rows = self.observation["joint_impulses"][:3]
         return float(np.linalg.norm(rows)) / self.substep if len(rows) == 3 else float("nan")

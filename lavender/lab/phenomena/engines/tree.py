@@ -1,4 +1,4 @@
-"""Joints of a scene as a tree, for engines of reduced coordinates: each body has one parent at most."""
+"""Joints of a scene as a tree, for engines in reduced coordinates: each body has at most one parent."""
 
 from __future__ import annotations
 
@@ -11,27 +11,27 @@ from lavender.sim.scene.parts import rotation
 
 
 def parents(scene: Scene, engine: str) -> dict[int, Joint]:
-    """Body -> joint to its parent, which stands before it.
+    """Return {body: joint to its parent}; a parent has a smaller index than its children.
 
     Raises
     ------
     CapabilityError
-        A loop, a soft joint, a motor, or a distance joint.
+        The scene has a loop, a soft joint, a motor or a distance joint; restitution or friction of single bodies.
     """
-    found: dict[int, Joint] = {}
+    joint_of: dict[int, Joint] = {}
     for joint in scene.joints:
-        if joint.b in found or joint.b <= joint.a:
-            raise CapabilityError(f"{joint.name} closes a loop; {engine} takes joints of a tree")
+        if joint.b in joint_of or joint.b <= joint.a:
+            raise CapabilityError(f"{joint.name} closes a loop; {engine} accepts joints of a tree")
         if joint.kind == "distance" or joint.hertz or joint.motor_speed is not None:
-            raise CapabilityError(f"{joint.name}: {engine} takes rigid balls and hinges without a motor")
-        found[joint.b] = joint
+            raise CapabilityError(f"{joint.name}: {engine} accepts rigid balls and hinges without a motor")
+        joint_of[joint.b] = joint
     if scene.parameters.restitution or any(b.friction is not None or b.restitution for b in scene.bodies):
-        raise CapabilityError(f"{engine} takes one friction for all bodies, and no restitution")
-    return found
+        raise CapabilityError(f"{engine} accepts one friction for all bodies, and no restitution")
+    return joint_of
 
 
 def collision_shape(body: Body, engine: str, static: bool = True) -> Plane | Sphere | Box:
-    """What a body is in contacts; CapabilityError of none, and of a static one that is no plane unless `static`."""
+    """Return the collision shape; CapabilityError if there is none, or if a static one is no plane and not `static`."""
     shape = body.shape
     if shape is None or (body.is_static and not static and not isinstance(shape, Plane)):
         raise CapabilityError(f"{body.name} has no shape that {engine} could be given")
@@ -39,15 +39,15 @@ def collision_shape(body: Body, engine: str, static: bool = True) -> Plane | Sph
 
 
 def relative(parent: Body | None, child: Body) -> tuple[FloatArray, FloatArray]:
-    """Place (3,) [m] and quaternion (4,) of a child in its parent's frame; None is the world."""
+    """Compute position (3,) [m] and quaternion (4,) of a child in its parent's frame; None is the world."""
     if parent is None:
         return child.position, child.quaternion
-    place: FloatArray = rotation(parent.quaternion).T @ (child.position - parent.position)
+    position: FloatArray = rotation(parent.quaternion).T @ (child.position - parent.position)
     w, v = parent.quaternion[0], -parent.quaternion[1:]
     s, u = child.quaternion[0], child.quaternion[1:]
-    return place, np.concatenate([[w * s - v @ u], w * u + s * v + np.cross(v, u)])
+    return position, np.concatenate([[w * s - v @ u], w * u + s * v + np.cross(v, u)])
 
 
 def xyzw(q: FloatArray) -> list[float]:
-    """A quaternion (4,) w x y z with w last."""
+    """Reorder a quaternion (4,) w x y z to x y z w."""
     return [*map(float, q[1:]), float(q[0])]
