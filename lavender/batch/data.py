@@ -62,7 +62,7 @@ class Batch(Sequence[Problem]):
         Blocks of each world, or of the concatenated rows of all worlds, without padding rows.
     compliance : as target, 1/kg, optional
     mu : (n, k) or ragged one array of all blocks, optional
-        Coefficients of friction of each world, which replace those of the cones.
+        Coefficients of friction of each world, which replace `cones.mu`.
     friction : {"coulomb", "cone"}
     count : (n,) int, optional
         Number of rows of each world, if J (n, m, nv) is padded to m rows at the end.

@@ -99,7 +99,7 @@ class Many:
 
     @property
     def worst_row(self) -> np.ndarray:
-        """Row of the largest velocity error (n,), as an index in its world; -1 if there is none."""
+        """Row of the largest velocity error (n,), as an index in its world; -1 for a world without rows."""
         self._judge_late_worlds()
         return read_only(self._worlds.worst[:-1])
 
@@ -202,7 +202,7 @@ class Residuals(Many):
     Parameters
     ----------
     relative, energy, velocity_error, impulse_error, roundoff_floor : (n,)
-        As for `Solutions`; the floor is that of `precision`.
+        As for `Solutions`; the floor depends on `precision`.
     worst_row : (n,) int
     precision : {"float64", "float32"} or sequence of them
     threshold : float, m/s
@@ -285,7 +285,7 @@ def residual_many(
     Returns
     -------
     Residuals
-        Numbers that are bit-identical to those of `residual` for each world.
+        Results that are bit-identical to `residual` for each world.
 
     Raises
     ------

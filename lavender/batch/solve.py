@@ -1,4 +1,4 @@
-"""Solve many problems in one call, with results that are bit-identical to those of `solve`, in arrays.
+"""Solve many problems in one call, with results that are bit-identical to `solve`, in arrays.
 
 The compiled loop of `lavender/batch/residuals.py` solves the problems that it supports; every other problem is solved
 by a single `solve`. A `Solution` is built at its first access.
@@ -287,7 +287,7 @@ def solve_many(
     errors: str = "raise",
     **options: Any,
 ) -> Solutions:
-    """Solve many problems, with results that are bit-identical to those of `solve` for any number of threads.
+    """Solve many problems, with results that are bit-identical to `solve` for any number of threads.
 
     Parameters
     ----------

@@ -277,7 +277,7 @@ class QP(_ScaledProblem):
         return np.clip(lam, c.lower, c.upper, out=lam)
 
     def direction(self, x: FloatArray | None, zeta: FloatArray | None) -> FloatArray | None:
-        """Compute a certificate (m,) of infeasibility from a backend's certificate; None if there is none.
+        """Compute a certificate (m,) of infeasibility from a backend's certificate; None without a valid one.
 
         In the impulse form x is a direction in which the objective is unbounded, in the velocity form zeta are
         multipliers that prove that the rows contradict each other.
@@ -355,7 +355,7 @@ def choose_form(problem: Problem, form: str, definite: bool = False) -> str:
     Raises
     ------
     InputError
-        There is no such form.
+        The form is unknown.
     CapabilityError
         "velocity" for a problem without rows.
     """

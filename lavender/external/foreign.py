@@ -152,7 +152,7 @@ class State:
 
     @property
     def best(self) -> tuple[float, FloatArray] | None:
-        """Best iterate that the solver reports, with its judged residual; None if there is no valid one."""
+        """Best iterate that the solver reports, with its judged residual; None without a valid one."""
         best = getattr(self.state, "best", None)
         if not isinstance(best, tuple) or len(best) != 2 or not isinstance(best[1], np.ndarray):
             return None

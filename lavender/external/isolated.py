@@ -116,7 +116,7 @@ def call_backend(
 
 
 def _take_idle() -> ProcessBackend | None:
-    """Return a process that runs and has no call; None if there is none."""
+    """Return a running process without a call, or None."""
     while True:
         try:
             process = idle_processes.pop()

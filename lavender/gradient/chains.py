@@ -1,4 +1,4 @@
-"""Chain rules: from the coefficients of rows to those of contacts, and from J and M^-1 to the arrays of bodies."""
+"""Chain rules: from coefficients of rows to coefficients of contacts, and from J and M^-1 to the arrays of bodies."""
 
 from __future__ import annotations
 

@@ -143,7 +143,7 @@ def result_shapes(arrays: Sequence[Any]) -> tuple[tuple[int, ...], tuple[int, ..
 
 
 def make_step(arrays: Sequence[Any], cones: Cones | None, friction: str, solver: str, tol: float) -> Step:
-    """Build the `Step` of these arrays; without cones, all rows are those of contacts, one for each value of mu."""
+    """Build the `Step` of these arrays; without cones, all rows belong to contacts, one for each value of mu."""
     m, k = arrays[0].shape[-2], arrays[3].shape[-1]
     if cones is None:
         if (m or k) and (k == 0 or m % k or not 1 <= m // k <= 3):

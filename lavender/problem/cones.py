@@ -451,7 +451,7 @@ class Cones:
         Raises
         ------
         UnknownName
-            There is no such shape.
+            The shape is unknown.
         InputError
             "box" with a contact of two tangents and spin, or with a round cone; "disk" with a box that has no friction
             along one tangent.

@@ -1,4 +1,4 @@
-"""Check coefficients of friction, and convert them to those of disks, ellipses and boxes."""
+"""Check coefficients of friction, and convert them for disks, ellipses and boxes."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from lavender.base.errors import InputError, check_name
 # Shapes of the bound of two tangents: their norm is bounded, or each tangent separately.
 SHAPES = ("disk", "box")
 # In a box, mu_1 = 0 with mu_2 > 0 is stored as this multiple of mu_2, because only mu_2 / mu_1 is stored: impulses so
-# small vanish by rounding in any sum with those of mu_2. The ratio of an ellipse must be larger.
+# small vanish by rounding in any sum with impulses along the second tangent. The ratio of an ellipse must be larger.
 MIN_COEFFICIENT_RATIO = 2.0**-60
 
 

@@ -88,7 +88,7 @@ def block_order(
     Raises
     ------
     UnknownName
-        There is no such order.
+        The order is unknown.
     InputError
         The array is not a permutation; `ground` is out of range, or given with an order that does not use it.
     CapabilityError

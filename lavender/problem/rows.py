@@ -256,7 +256,7 @@ class Rows:
             contacts = np.flatnonzero(rows >= 0)
             dense[rows[contacts]] = 0.0
             dense[rows[contacts], 3:6], dense[rows[contacts], 9:12] = -axis[contacts], axis[contacts]
-        # entries that are not zero, without those of static bodies
+        # nonzero entries in columns of moving bodies
         is_stored = np.repeat(body >= 0, 6, axis=1) & (dense != 0.0)
         columns = (6 * body[:, [0, 1], None] + np.arange(6)).reshape(m, 12)
         indptr = np.concatenate([[0], np.cumsum(is_stored.sum(axis=1))])
