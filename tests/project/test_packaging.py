@@ -229,7 +229,9 @@ def test_what_is_being_written_is_in_no_distribution(tmp_path):
     code = "from pathlib import Path; from lavender.sim.web import compile; "
     code += "Path.write_bytes = lambda *what: print(*what); "
     done = python(
-        "-c", code + "Path.replace = Path.unlink = lambda *_, **__: 0; compile.write_atomically(Path('a.wasm'), b'')"
+        "-c",
+        code
+        + "Path.replace = Path.unlink = lambda *_, **__: 0; compile.write_atomically(Path('a.wasm'), b'')",
     )
     names += [done.stdout.split()[0], "a.h", "a.wasm"]
     for folder in ("lavender/sim/web", "docs"):
