@@ -193,7 +193,7 @@ def test_dense_factors_solve_what_numpy_solves_with_the_same_bits_at_any_width(n
     problem = lv.Problem.lcp(a, rng.normal(size=n))
     r, x, y = rng.normal(size=n), [], []
     for wide in (True, False):
-        with mock.patch.multiple(systems, WIDE=wide, DENSE_ROWS=1000):
+        with mock.patch.multiple(systems, USE_WIDE_LANES=wide, MAX_ALWAYS_DENSE_ROWS=1000):
             system = make_system(problem, "impulse")
         assert system.dense
         system.solve.v[:] = 1e12  # W = 1e-12
@@ -316,7 +316,7 @@ def test_free_rows_of_few_entries_are_solved_with_all_the_others(even, seed):
     r = rng.normal(size=200)
     system.solve.p[:] = free
     assert system.solve.factor("natural", eps)
-    assert system.sparse.instead is None, "panels serve"
+    assert system.sparse.superlu_solve is None, "panels serve"
     expected = np.linalg.solve(np.where(free[:, None], h, 0.0) + np.diag(np.where(free, eps, 1.0)), r)
     np.testing.assert_allclose(
         system.solve.solve("natural", r), expected, rtol=0, atol=1e-11 * np.abs(expected).max()
