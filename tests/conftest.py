@@ -143,7 +143,7 @@ def interrupted_newton(monkeypatch) -> list[float]:
         if len(looks) == 5:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(newton, "WATCHED", 0.0)
+    monkeypatch.setattr(newton, "INTERRUPT_CHECK_INTERVAL", 0.0)
     for system in (MatrixSystem, VelocitySystem):
         monkeypatch.setattr(system, "took", interrupt)
     return looks

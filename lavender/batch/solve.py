@@ -21,17 +21,17 @@ from lavender.judge.residuals import judge_impulse, reading_time
 from lavender.judge.solution import CONTRADICTED, Solution, Status, uninterrupted
 from lavender.problem import Problem
 from lavender.problem.derived import cached_property
-from lavender.solvers.loop import LEAST
+from lavender.solvers.loop import MIN_TIME_LIMIT
 from lavender.solvers.registry import SolverSpec, get
 from lavender.solving.solve import (
-    COUNTED,
-    NO_TURN,
+    COST_PER_SECOND,
+    NO_STAGE_MESSAGE,
+    check_accepted,
     check_budget,
-    check_taken,
-    rest_of,
-    seconds_of,
+    check_time_limit,
+    compute_late_fields,
+    create_unjudged,
     solve,
-    unjudged,
 )
 from lavender_ext.batch.many import CODE, NUMBER, PLACE, Hand
 from lavender_ext.judge.measure import all_finite
@@ -231,7 +231,9 @@ class Solutions(Many, Sequence[Solution]):
         except LavenderError as error:
             raise self._make_fault(i, error) from None
         start = self._impulse[self._rows(i)]
-        return unjudged(problem, self._spec, self._options, start, self.tol, f"{NO_TURN}, unjudged")
+        return create_unjudged(
+            problem, self._spec, self._options, start, self.tol, f"{NO_STAGE_MESSAGE}, unjudged"
+        )
 
     def _make_solution(self, i: int) -> Solution:
         """Build the solution of a world that the compiled loop processed."""
@@ -254,7 +256,7 @@ class Solutions(Many, Sequence[Solution]):
         judgement = judge_impulse(problem, impulse).refine(self.tol)
         is_start = self._worlds.code[i] in (CODE["late"], CODE["started"])
         counts = None if is_start else self._counts(problem, i)
-        fields = rest_of(problem, self._spec, judgement, counts, self.start(i), status)
+        fields = compute_late_fields(problem, self._spec, judgement, counts, self.start(i), status)
         solved_relative = float(self._worlds.numbers[NUMBER["relative"], i])
         # Equal data have bit-identical residuals.
         if status is Status.CONVERGED and judgement.relative != solved_relative:
@@ -325,7 +327,7 @@ def solve_many(
     """
     worlds = check_problems(problems, errors)
     threads = check_int("threads", threads, 1, None)
-    spec, limit = get(solver), seconds_of(time_limit)
+    spec, limit = get(solver), check_time_limit(time_limit)
     deadline = NEVER if limit == np.inf else Deadline(limit)
     check_budget(spec, tol, max_iter)
     starts, invalid_starts = _check_starts(worlds, impulse, impulses, errors)
@@ -346,7 +348,9 @@ def solve_many(
             return int(hand.solve(tol, *limits))
         if deadline.passed(0.0):
             return int(hand.judge(tol, False, True))
-        return int(hand.solve(tol, *limits, COUNTED * (deadline.remaining(LEAST) or LEAST)))
+        return int(
+            hand.solve(tol, *limits, COST_PER_SECOND * (deadline.remaining(MIN_TIME_LIMIT) or MIN_TIME_LIMIT))
+        )
 
     def solve_single(i: int) -> None:
         # The problem of the first late world of a batch is built, so that a solver that does not accept it raises an
@@ -359,16 +363,20 @@ def solve_many(
             return
         problem, start = worlds[i], solutions.start(i)
         if small is not None and solutions._worlds.code[i] == CODE["tried"] and not deadline.is_set:
-            small.in_vain(problem, start, tol, solutions._counts(problem, i))
+            small.record_failure(problem, start, tol, solutions._counts(problem, i))
         if deadline.is_set:
             if not isinstance(worlds, Batch):
                 deadline.reserve(-LATE_WORLD_TIME)
             if deadline.passed():
-                check_taken(problem, spec, deadline)
-                unsolved = unjudged(problem, spec, options, start, tol, f"{NO_TURN}, unjudged")
+                check_accepted(problem, spec, deadline)
+                unsolved = create_unjudged(
+                    problem, spec, options, start, tol, f"{NO_STAGE_MESSAGE}, unjudged"
+                )
                 solutions.store_late(i, unsolved)
                 return
-        solution = solve(problem, solver, impulse=start, time_limit=deadline.remaining(LEAST), **more)
+        solution = solve(
+            problem, solver, impulse=start, time_limit=deadline.remaining(MIN_TIME_LIMIT), **more
+        )
         is_judged = solution.status is not Status.TIME_LIMIT or "residual" in vars(solution)
         store = solutions.store if is_judged else solutions.store_late
         store(i, solution if "callback" in options else uninterrupted(solution))

@@ -53,7 +53,7 @@ def check(
     from lavender.judge.residuals import AT_FLOOR, CLOSE
     from lavender.lab import bench
     from lavender.lab.check import cross_check
-    from lavender.solving.solve import seconds_of
+    from lavender.solving.solve import check_time_limit
 
     one_thread()
     for name in files:
@@ -67,7 +67,7 @@ def check(
     bench.solver_names([*(solvers or ()), reference])
     check_float("tol", tol, low=0.0)
     check_float("threshold", threshold, low=0.0)
-    seconds_of(time_limit)
+    check_time_limit(time_limit)
     for item in bench.resolve(files):
         with errors(item):
             comparison = cross_check(

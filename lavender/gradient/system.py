@@ -12,8 +12,8 @@ from lavender.base.errors import CapabilityError
 from lavender.base.lazy_import import sparse as sp
 from lavender.base.lu import sparse_lu
 from lavender.problem import Problem
-from lavender.solvers.factors import WIDE
-from lavender.solvers.newton_systems.systems import is_full
+from lavender.solvers.factors import USE_WIDE_LANES
+from lavender.solvers.newton_systems.systems import is_dense_faster
 from lavender_ext.derivative.linear import Linear
 from lavender_ext.factor.sparse import SparsePanels, free_part
 
@@ -51,7 +51,7 @@ class System:
     def __init__(self, problem: Problem, linear: Linear) -> None:
         self.problem, self.linear, self.n = problem, linear, linear.rows
         is_symmetric = self.n > MAX_KERNEL_ROWS and not linear.slides and problem.is_symmetric
-        if is_symmetric and not is_full(problem.csr.nnz, problem.m, True):
+        if is_symmetric and not is_dense_faster(problem.csr.nnz, problem.m, True):
             factor = self._factor_symmetric
         else:
             factor = self._factor_dense if self.n <= MAX_DENSE_ROWS else self._factor_lu
@@ -83,7 +83,7 @@ class System:
     def _factor_symmetric(self, shift: float) -> Solve | None:
         """Factor G = H, which is symmetric because no contact slides."""
         indptr, indices, data = self._form_h()
-        panels = SparsePanels(indptr, indices, False, WIDE)
+        panels = SparsePanels(indptr, indices, False, USE_WIDE_LANES)
         failed = panels.factor(data, np.ones(self.n), shift, MIN_PIVOT_RATIO)
         return None if failed else lambda r, transpose: panels.solve(r)
 

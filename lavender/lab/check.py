@@ -22,7 +22,7 @@ from lavender.lab.bench.running.worker import TaskFailed, Worker, solve_isolated
 from lavender.lab.motion.bound import separation
 from lavender.problem import Problem, check_problem
 from lavender.solvers.registry import available, get, known, specs
-from lavender.solving.solve import check_budget, seconds_of
+from lavender.solving.solve import check_budget, check_time_limit
 
 REFERENCES = ("osqp", "clarabel", "piqp", "direct")
 CONE_REFERENCES = ("clarabel_cone", "block_gauss_seidel")  # for relaxed friction, which is not a QP
@@ -228,7 +228,7 @@ def cross_check(
     """
     check_problem(problem)
     check_budget(specs()["auto"], tol, max_iter)
-    seconds_of(time_limit)
+    check_time_limit(time_limit)
     if problem.guess is not None:  # All solvers start from the zero impulse.
         problem = replace(problem, guess=None, copy=False)
     if isinstance(solvers, str):

@@ -24,9 +24,9 @@ from lavender.problem import Problem, QPSolution
 from lavender.problem.generalized import Generalized
 from lavender.problem.program import QuadraticProgram
 from lavender.solvers.registry import get
-from lavender.solvers.small import told
+from lavender.solvers.small import describe_stages
 from lavender.solving.outcome import finish
-from lavender.solving.solve import seconds_of, solve
+from lavender.solving.solve import check_time_limit, solve
 
 MAX_SOLVES = 5  # solves of one constraint problem, each with a smaller tol
 MIN_TOL = 1e-15  # the smallest tol of such a solve
@@ -93,7 +93,7 @@ def solve_qp(
             "constraint problem alone"
         )
     begun = perf_counter()
-    tol, end = check_float("tol", tol, low=0.0), begun + seconds_of(time_limit)
+    tol, end = check_float("tol", tol, low=0.0), begun + check_time_limit(time_limit)
     start = options.pop("impulse", None)
     is_auto = isinstance(solver, str) and solver == "auto"
     if is_auto and tol > 0.0 and not options and not qp.is_singular:
@@ -177,7 +177,7 @@ def _solve_definite(problem: Problem, tol: float, end: float, impulse: Any) -> Q
         answer = other
     stages = tuple(stage for solution in ran for stage in solution.stages)
     work = MappingProxyType(summed(solution.work for solution in ran))
-    message = f"{told(stages)}; {answer.solution.message}".rstrip("; ")
+    message = f"{describe_stages(stages)}; {answer.solution.message}".rstrip("; ")
     answer.solution.__dict__.update(stages=stages, work=work, message=message)
     return answer
 
@@ -202,7 +202,7 @@ def _solve_by_backend(problem: Problem, tol: float, end: float, impulse: Any) ->
         solution.status if certificate is not None else Status.STALLED,
         solution.iterations,
         solution.work,
-        told(solution.stages),
+        describe_stages(solution.stages),
         certificate=None if certificate is None else qp.of_rows(certificate),
         stages=solution.stages,
     )

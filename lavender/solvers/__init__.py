@@ -1,4 +1,4 @@
-"""The table of built-in solvers. A new solver is one file here and one line in this table."""
+"""Table of the built-in solvers. A new solver needs a file in this folder and a line in the table."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from lavender.solvers.registry import SolverSpec
 
 __all__ = ["SPECS", "spec_of"]
 
-# File in this folder, with its SPEC; from the exact to the plain.
+# Files in this folder with a SPEC, from exact to simple methods.
 _TABLE = (
     "auto",
     "direct",
@@ -26,11 +26,11 @@ _TABLE = (
     "gauss_seidel",
 )
 
-SPECS: tuple[SolverSpec, ...]  # of all, imported when they are first asked for
+SPECS: tuple[SolverSpec, ...]  # The specs of all solvers; `__getattr__` imports them at the first access.
 
 
 def spec_of(name: str) -> SolverSpec | None:
-    """The spec of one solver, whose file is imported now if it was not before; None if it is not in the table."""
+    """Return the spec of one solver, importing its file if necessary; None if it is not in the table."""
     return import_locked(f"{__name__}.{name}").SPEC if name in _TABLE else None
 
 

@@ -1,4 +1,4 @@
-"""What `nncg` and `anderson` share: sweeps over rows of A, body velocities or J and M, by `pgs` or by exact blocks."""
+"""Base class of `nncg` and `anderson`: sweeps over rows of A, bodies or J and M, with `pgs` or exact blocks."""
 
 from __future__ import annotations
 
@@ -9,18 +9,20 @@ from lavender.base.errors import InputError, check_name
 from lavender.judge.solution import Claim
 from lavender.problem import Problem
 from lavender.problem.ordering import Order, block_order
-from lavender.solvers.setup_times import forming
-from lavender.solvers.sweeping import Sweeping, SweepState, over, plan_of, reads_whitened, swept
+from lavender.solvers.setup_times import forming_time
+from lavender.solvers.sweeping import Sweeping, SweepState, form_name, plan_of, reads_whitened, swept_data
 from lavender_ext.accelerate import accelerated
 from lavender_ext.core.order import SYMMETRIC
 
 SWEEPS = ("pgs", "blocks")
-LARGEST_MEMORY = 16
-PATIENCE = 500  # iterations: on mass ratios the residual of a conjugate gradient rises for hundreds first
-# Entries of A for each row, and in all, up to which its rows are faster than body velocities (measured: 1.65 times as
-# fast at 300 to 8,000 rows of 16 entries, 1.4 at 1,600 of 26, 1.1 to 1.25 at 27,570 of 17, which leave the
-# second-level cache).
-NEIGHBOURS, ENTRIES = 40, 600_000
+MAX_MEMORY = 16
+# Iterations without progress before an accelerated sweep stalls. With large mass ratios, the residual of a conjugate
+# gradient first rises for hundreds of iterations.
+ACCELERATED_PATIENCE = 500
+# Sweeps use the rows of A instead of body velocities up to this many entries per row and in total. Measured: rows of A
+# are 1.65 times as fast at 300 to 8,000 rows of 16 entries, 1.4 times at 1,600 rows of 26, 1.1 to 1.25 times at 27,570
+# rows of 17, which exceed the second-level cache.
+MAX_ENTRIES_PER_ROW, MAX_SWEPT_ENTRIES = 40, 600_000
 CONVEX_OPTION = "iterations under the cone law first, for piles that stick; default 0"
 SWEEP_OPTION = (
     "'pgs' or 'blocks' (each contact and joint solved exactly); default: pgs, blocks for the cone law"
@@ -28,19 +30,19 @@ SWEEP_OPTION = (
 
 
 class AcceleratedState(SweepState):
-    """A sweep state with the memory of the acceleration."""
+    """State of an accelerated sweep, with the memory of the acceleration."""
 
     def __init__(
         self, problem: Problem, data: Any, order: Order, exact: bool, memory: int, convex: int, keeps: bool
     ) -> None:
         sweeps = accelerated.AcceleratedSweeps(data, *plan_of(order), exact, memory, convex, keeps)
-        super().__init__(problem, data, order, sweeps, PATIENCE)
+        super().__init__(problem, data, order, sweeps, ACCELERATED_PATIENCE)
         self.exact = exact
 
 
 @dataclass(frozen=True)
 class Accelerated(Sweeping):
-    """Life cycle of an accelerated sweep; `memory` 0 is nncg."""
+    """Base class of accelerated sweeps; a `_memory` of 0 is nncg."""
 
     sweep: str | None = None
     convex: int = 0
@@ -54,16 +56,19 @@ class Accelerated(Sweeping):
         return False
 
     def prepare(self, problem: Problem) -> AcceleratedState:
-        """Order, memory, and each block's own part of A where blocks are solved exactly."""
+        """Build the state: sweep order, memory, and the diagonal blocks of A if blocks are solved exactly."""
         self._check(problem)
         state: AcceleratedState = super().prepare(problem)
         return state
 
     def _forming(self, problem: Problem) -> float:
-        over_a = _entries(problem) is not None or not (problem.rows is not None or reads_whitened(problem))
-        return forming(problem) if over_a else 0.0
+        over_a = _max_entries(problem) is not None or not (
+            problem.rows is not None or reads_whitened(problem)
+        )
+        return forming_time(problem) if over_a else 0.0
 
     def _check(self, problem: Problem) -> None:
+        """Raise InputError if the options `sweep` and `convex` are not valid for the problem."""
         if self.sweep is not None:
             check_name("sweep", self.sweep, SWEEPS)
         if self.sweep == "pgs" and problem.law == "cone":
@@ -79,38 +84,39 @@ class Accelerated(Sweeping):
         convex = self.convex if problem.law == "coulomb" else 0
         return AcceleratedState(problem, data, order, exact, self._memory, convex, self._keeps)
 
-    def _told(self, state: AcceleratedState, claim: Claim, again: int) -> Claim:
+    def _complete_claim(self, state: AcceleratedState, claim: Claim, restarts: int) -> Claim:
+        """Add the counts of sweeps and restarts, and the name of the form, to a claim."""
         done = claim.iterations
-        work = {"sweeps": 2 * done if state.order.mode == SYMMETRIC else done, "restarts": again}
+        work = {"sweeps": 2 * done if state.order.mode == SYMMETRIC else done, "restarts": restarts}
         sweep = "blocks" if state.exact else "pgs"
-        return replace(claim, work=work, form=f"{sweep} on {over(state.data)}")
+        return replace(claim, work=work, form=f"{sweep} on {form_name(state.data)}")
 
 
-def as_given(solver: Accelerated, problem: Problem) -> AcceleratedState:
-    """The state of sweeps over the form that is given: A is not formed."""
+def state_as_given(solver: Accelerated, problem: Problem) -> AcceleratedState:
+    """Return the state of sweeps over the form in which the problem was given: A is not formed."""
     return solver._over(problem, block_order(problem, solver.order), problem.metric)
 
 
 def operator(problem: Problem) -> Any:
-    """The form that sweeps run over: rows of A if contacts have one row and few neighbours, otherwise as given.
+    """Return the data that sweeps run over: rows of A if contacts have one row and few neighbours, else `swept`.
 
     For contacts of one row, rows of A cost as much as body velocities, and mixing does not recompute velocities.
     """
-    return swept(problem) if _entries(problem) is None else problem.csr_data
+    return swept_data(problem) if _max_entries(problem) is None else problem.csr_data
 
 
 def sweep_work(problem: Problem) -> int:
-    """Rough number of multiply-adds of one sweep, over what it runs over (`Data.work`), without forming that."""
-    entries = _entries(problem)
+    """Estimate the multiply-adds of one sweep over the data of `operator` (`Data.work`), without forming A."""
+    entries = _max_entries(problem)
     if entries is None and problem.generalized is not None and not reads_whitened(problem):
         entries = min(int(problem.metric.entries_of_a), problem.m**2)
-    return int(swept(problem).work) if entries is None else entries + 4 * problem.m
+    return int(swept_data(problem).work) if entries is None else entries + 4 * problem.m
 
 
-def _entries(problem: Problem) -> int | None:
-    """The most entries of A for which sweeps over its rows are faster than over body velocities."""
+def _max_entries(problem: Problem) -> int | None:
+    """Return the number of entries of A if sweeps over its rows are faster than over body velocities, else None."""
     rows = problem.rows
     if rows is None or problem.law != "lcp" or rows.n_joints or problem.m > problem.n_blocks:
         return None
     entries = int(problem._n_couplings)
-    return entries if entries <= min(NEIGHBOURS * problem.m, ENTRIES) else None
+    return entries if entries <= min(MAX_ENTRIES_PER_ROW * problem.m, MAX_SWEPT_ENTRIES) else None

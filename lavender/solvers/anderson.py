@@ -12,18 +12,18 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from lavender.base.arrays import check_int
-from lavender.solvers._accelerated import CONVEX_OPTION, LARGEST_MEMORY, SWEEP_OPTION, Accelerated
+from lavender.solvers._accelerated import CONVEX_OPTION, MAX_MEMORY, SWEEP_OPTION, Accelerated
 from lavender.solvers.registry import SolverSpec
 
 
 @dataclass(frozen=True)
 class Anderson(Accelerated):
-    """Anderson-accelerated sweeps; `order`, `ground`, `seed` as in `lavender.problem.ordering`."""
+    """Anderson-accelerated sweeps; `order`, `ground` and `seed` as in `lavender.problem.ordering`."""
 
     memory: int = 5
 
     def __post_init__(self) -> None:
-        check_int("memory", self.memory, 1, LARGEST_MEMORY)
+        check_int("memory", self.memory, 1, MAX_MEMORY)
 
     @property
     def _memory(self) -> int:

@@ -1,36 +1,41 @@
-"""Chooses and combines other solvers: this tree, by two counted costs (`costs.py`).
+"""Select and combine other solvers: the following decision tree, with two estimated costs (`costs.py`).
 
-    the start is a solution     nothing is done
-    a program with a singular P PROGRAM_BACKENDS, one after the other, and a certificate by a linear program if none
-                                finds a solution
-    a small problem             at most 64 rows, or small islands under friction, or velocities that cost less than 100
-                                sweeps, but not many contacts of bodies: one compiled call (`small.py`); if that does
-                                not solve it, as any other
-    a matrix                    `direct`: linear to its end, bounded rows of a narrow band for ROUNDS times the
-                                factorisations that `newton` is counted for; as long, but after sweeps, bounded rows
-                                of a matrix that is not symmetric
-    sweeps (`anderson`)         SWEEPS before an analysis tells Newton's cost, then for as long as that, or until they
-                                predict that they will cost more; linear rows and, but for a matrix, bounded ones and
-                                cones only where MANY cost less than it; of a matrix each contact is solved exactly
-    a loose pile                contacts of PILE rows or more under Coulomb's law, nearly each of another pair: for as
-                                much again, sweeps of a conjugate gradient (`nncg`), at first of the cone law, but not
-                                of what rolls
-    Newton's method (`newton`)  for up to MOST times its cost: over bodies or rows; of J and M over velocities and over
-                                rows of A, the cheaper first; what stalls from another's impulse begins from nothing
-    a certificate               of J and M with a rigid row: does the least violation prove that none solves it? After
-                                SURE times that cost, or MOST where it costs more; of others under Coulomb's law, if
-                                more than NEAR is left: does a linear program?
-    alternately                 with doubled work, until no solver gains in two stages: `newton` (of J and M also over
-                                rows, at up to MOST times the cost or LITTLE; sooner if the compiled call failed, or
-                                before the end), `admm` (of J and M once a factor of A costs no more), `nncg`, and
-                                sweeps as long as these gain; all together LAST times Newton's cost, no longer than LONG
-    at last                     a certificate of others, by a linear program, if none was asked (`certify.py`)
+    the start is a solution     nothing runs
+    a program with a singular P `PROGRAM_BACKENDS`, one after the other; a linear program searches for a certificate if
+                                none finds a solution
+    a small problem             one compiled call (`small.py`), for at most 64 rows, for small islands with friction,
+                                and for J and M if Newton's method costs less than 100 sweeps and few contacts are
+                                between bodies; if it fails, the problem is treated as any other
+    a matrix                    `direct`: linear systems without a limit; bounded rows of a narrow band with up to
+                                DIRECT_BUDGET_RATIO times the factorisations expected for `newton`; bounded rows of an
+                                asymmetric matrix with the same budget, but after sweeps
+    sweeps (`anderson`)         EXPECTED_SWEEPS before an analysis gives Newton's cost, then up to that cost, or until
+                                the predicted cost of the remaining sweeps exceeds it. Linear problems, and bounded rows
+                                and cones that are not given as a matrix, are swept only if MIN_SWEEPS_PER_NEWTON
+                                sweeps cost less than Newton's method. Contacts of a matrix are solved exactly
+    a loose pile                at least MIN_PILE_ROWS contact rows under Coulomb's law, nearly all between different
+                                pairs: for the same cost again, conjugate gradients over sweeps (`nncg`), first under
+                                the cone law unless there is rolling or torsional friction
+    Newton's method (`newton`)  up to NEWTON_BUDGET_RATIO times its cost: over bodies or rows; for J and M over
+                                velocities and over rows of A, the cheaper one first. If it stalls from the impulse of
+                                another solver, it starts again from zero
+    a certificate               for J and M with a rigid row, from the smallest violation, after RELIABLE_BUDGET_RATIO
+                                times Newton's cost over velocities (NEWTON_BUDGET_RATIO if another form is cheaper);
+                                for other problems under Coulomb's law by a linear program, if the residual is above
+                                NEAR_SOLUTION_RESIDUAL
+    alternation                 with doubled work in each round, until no solver improves the residual in two stages:
+                                `newton` (for J and M also over rows, within NEWTON_BUDGET_RATIO times the cost or
+                                MIN_ROW_FORM_BUDGET; earlier if the compiled call failed, or before the end), `admm`
+                                (for J and M once a factor of A costs no more), `nncg`, and sweeps while they improve;
+                                in total TOTAL_BUDGET_RATIO times Newton's cost and at most MAX_ALTERNATION_COST
+    the end                     a linear program searches for a certificate if none was tried (`certify.py`)
 
-Each goes on where it stopped, and the result is the best impulse of all. Costs are counted, never timed, so the same
-problem is solved in the same way on every machine. Under a time limit the tree is the same, but whoever factors begins
-only if a result would be there in time, all are swept first where SURE times its cost do not fit, sweeps before it
-have at most half of what is left, and sweeps have the rest if it had no time.
-`Solution.stages` lists what ran, `lavender.explain` what would run.
+Each solver continues where it stopped, and the result is the best impulse of all. Costs are estimated, never measured,
+so the same problem is solved in the same way on every machine. With a time limit, the tree is the same with these
+exceptions: a factorising solver starts only if its result is expected in time; sweeps come first in every case if
+RELIABLE_BUDGET_RATIO times Newton's cost does not fit; sweeps before Newton's method use at most half of the remaining
+time; sweeps use the rest if Newton's method has no time. `Solution.stages` lists the stages that ran,
+`lavender.explain` the stages that would run.
 """
 
 from __future__ import annotations
@@ -50,241 +55,314 @@ from lavender.judge.solution import Claim, Status
 from lavender.problem import OPERATORS, Problem
 from lavender.problem.derived import cached_property
 from lavender.solvers import costs
-from lavender.solvers.certify import LINEAR_PROGRAM, certify, least_violation, linear_programs
-from lavender.solvers.islands import pairs
-from lavender.solvers.newton import WARM, NewtonState
+from lavender.solvers.certify import MIN_LINEAR_PROGRAM_COST, certify, least_violation, linear_programs
+from lavender.solvers.islands import count_pairs
+from lavender.solvers.newton import WARM_START_MAX_RESIDUAL, NewtonState
 from lavender.solvers.registry import SMALL_ROWS, Solver, SolverSpec, get, specs
-from lavender.solvers.setup_times import first_factor, formed_once, forming, over_rows, sweeping
-from lavender.solvers.small import AUTO, NO_TIME, QUARTER, call_ends_within
-from lavender.solvers.solve_log import GAIN, SolveLog
-from lavender.solvers.steps import METHODS, NEAR, PROBE, Iterations, Newton, Step, Sweeps, setup_time
+from lavender.solvers.setup_times import (
+    first_factor_time,
+    first_sweep_time,
+    formation_time,
+    forming_time,
+    row_setup_time,
+)
+from lavender.solvers.small import AUTO, ISLANDS_TIME_FRACTION, NO_TIME_MESSAGE, call_ends_within
+from lavender.solvers.solve_log import MIN_GAIN_RATIO, SolveLog
+from lavender.solvers.steps import (
+    METHODS,
+    NEAR_SOLUTION_RESIDUAL,
+    SWEEPS_TIME_FRACTION,
+    Iterations,
+    Newton,
+    Step,
+    Sweeps,
+    setup_time,
+)
 
-MOST = 10.0  # times its counted cost, that Newton's method has before both go in turn
-ROUNDS = 4.0  # times the factorisations that Newton's method is counted for, that `direct` has
-TURNS = 6  # that all have with doubled work
-LAST = 200.0  # times Newton's counted cost, that all have together
-LONG = 6e10  # ns of counted cost that turns have at most, and Newton's method, if SURE times its own are not more
-MANY = 200.0  # sweeps that cost less come before Newton's method where it is sure to end
-FEW, SPARSE = 32.0, 0.05  # sweeps before a factor that may fill, of a matrix of at most this share of entries
-LITTLE = 5e6  # ns of Newton's method over rows, which are worth a trial in any case
-PILE = 390  # rows of contacts, below which Newton's method ends sooner than sweeps of a conjugate gradient before it
-BAND = 100  # half bandwidth up to which `direct` comes first, if it is at most a quarter of the rows
-SURE = 4.0  # times the counted cost, within which nine in ten end
-EARLY = 0.25  # of the counted cost, after which an interior point has an impulse that is worth having
-# Sweeps start from a given guess up to this relative residual, even if doing nothing has less, because the guess tells
-# which rows are free.
-STALE = 1e3
-# A quadratic program with a singular P is solved by the first of these that is installed and solves it; osqp always
-# is installed.
+# Newton's method may use this multiple of its estimated cost before solvers alternate.
+NEWTON_BUDGET_RATIO = 10.0
+# `direct` may use this multiple of the factorisations that Newton's method is expected to need.
+DIRECT_BUDGET_RATIO = 4.0
+MAX_ALTERNATIONS = 6  # Largest number of rounds of alternation, each with twice the work of the round before.
+TOTAL_BUDGET_RATIO = 200.0  # All solvers together may use this multiple of Newton's estimated cost.
+# Largest estimated cost [ns] of the alternation, and of Newton's method unless RELIABLE_BUDGET_RATIO times its cost is
+# more.
+MAX_ALTERNATION_COST = 6e10
+# If Newton's method converges reliably, sweeps precede it only if this many cost less than it.
+MIN_SWEEPS_PER_NEWTON = 200.0
+# Sweeps before the first factor of a sparse matrix, which may fill, and the largest fraction of nonzeros of such a one.
+SWEEPS_BEFORE_SPARSE_FACTOR, SPARSE_FRACTION = 32.0, 0.05
+# Newton's method over rows may use at least this estimated cost [ns], however much cheaper another form is.
+MIN_ROW_FORM_BUDGET = 5e6
+# Below this many contact rows, Newton's method is faster than conjugate-gradient sweeps and then Newton's method.
+MIN_PILE_ROWS = 390
+# `direct` runs first up to this half bandwidth, if that is at most a quarter of the rows.
+MAX_DIRECT_BAND = 100
+RELIABLE_BUDGET_RATIO = 4.0  # Within this multiple of the estimated cost, nine of ten problems converge.
+# Fraction of the estimated cost after which an interior point has an impulse that improves on sweeps.
+EARLY_RESULT_FRACTION = 0.25
+# Sweeps start from the given impulse up to this relative residual, even if the zero impulse has a smaller one, because
+# the given impulse shows which rows are free.
+MAX_START_RESIDUAL = 1e3
+# A quadratic program with a singular P is solved by the first of these that is installed and solves it; osqp is always
+# installed.
 PROGRAM_BACKENDS = ("piqp", "clarabel", "osqp")
-ONE_CALL = 200  # iterations that a problem of few rows, solved in one call, takes, unless its path is long
+# The compiled call is only made if at least this many iterations are allowed; it usually needs fewer.
+MIN_ITERATIONS_FOR_COMPILED_CALL = 200
 
 
 @dataclass(frozen=True)
 class Stage:
-    """One line of the tree."""
+    """One stage of the tree.
 
-    solver: str  # of METHODS
-    iterations: float  # at most
-    cost: float  # ns, of these as counted
+    Parameters
+    ----------
+    solver : str
+        Name in `METHODS`, or "certificate".
+    iterations : float
+        Largest number of iterations.
+    cost : float, ns
+        Estimated cost of these iterations.
+    why : str
+        Reason, for `lavender.explain`.
+    least : float
+        Sweeps stop if they predict that more than this number remain.
+    """
+
+    solver: str
+    iterations: float
+    cost: float
     why: str
-    least: float = inf  # sweeps that may be predicted to be left
+    least: float = inf
 
 
 class Tree:
-    """What `auto` does with a problem, line by line, and the costs that it compares [ns]."""
+    """The stages of `auto` for a problem, as an iterable, and the costs that it compares [ns].
 
-    begun = 0.0  # ns, of sweeps before Newton's method
-    left = 0.0  # ns, for turns; who takes the lines gives back what did not run
-    tried = False  # velocities of J and M, in the compiled call
-    swept = False  # in vain, in turn
-    best = nan  # relative residual, as who takes the lines tells
+    The caller sets `best`, the relative residual so far, and adds the cost of stages that it skips to `remaining_cost`.
+    """
+
+    cost_before_newton = 0.0  # Cost [ns] of the sweeps before Newton's method.
+    remaining_cost = 0.0  # Cost [ns] that remains for the alternation.
+    compiled_call_failed = False  # The compiled call over velocities of J and M has failed.
+    sweeps_failed = False  # Sweeps did not improve the residual in the alternation.
+    best = nan
 
     def __init__(self, problem: Problem, deadline: Deadline = NEVER) -> None:
         self.problem, self.law, self.deadline = problem, problem.law, deadline
 
     @cached_property
     def sweep(self) -> float:
-        """One sweep."""
+        """Cost of one sweep [ns]."""
         return costs.sweep_cost(self.problem)
 
     @cached_property
-    def least(self) -> float:
-        """Newton's method at least, told without its analysis."""
-        return costs.newton_cost(costs.least(self.problem), self.law)
+    def min_newton_cost(self) -> float:
+        """Lower bound of the cost of Newton's method [ns], without its analysis."""
+        return costs.newton_cost(costs.min_count(self.problem), self.law)
 
     @cached_property
     def states(self) -> dict[str, NewtonState]:
-        """Newton's method after its analysis, the cheaper form first; none where it takes no form or has no time."""
-        able = get("newton").refuses(self.problem) is None and not self.is_late
-        return self.prepared("newton") if able else {}
+        """States of Newton's method after its analysis, the cheaper form first; empty if it is refused or too late."""
+        is_possible = get("newton").refuses(self.problem) is None and not self.is_late
+        return self.prepare_newton("newton") if is_possible else {}
 
-    def prepared(self, name: str) -> dict[str, NewtonState]:
-        """Newton's method in this form after its analysis, by name; nothing where that breaks down."""
+    def prepare_newton(self, name: str) -> dict[str, NewtonState]:
+        """Return {name: state} of Newton's method in this form after its analysis; empty if that breaks down."""
         try:
             return {name: get("newton").load()(**METHODS[name][1]).prepare(self.problem)}
         except BREAKDOWN:
             return {}
 
     @cached_property
-    def formed(self) -> float:
-        """Newton's method over rows of an A that is yet to be formed of J and M, at least; inf where that cannot be."""
+    def row_form_cost(self) -> float:
+        """Lower bound of the cost [ns] of Newton's method over an A formed of J and M; inf if that is not possible."""
         p, state = self.problem, self.states.get("newton")
         if state is None or state.general is None or p.cones.has_round:
             return inf
-        return costs.newton_cost(costs.formed(p), self.law)
+        return costs.newton_cost(costs.formed_count(p), self.law)
 
-    def add_rows(self, most: float) -> bool:
-        """Analyse A of J and M as well, if that is counted to cost less and has time; last comes what has failed."""
+    def add_row_form(self, max_cost: float) -> bool:
+        """Analyse A of J and M, too, if its Newton's method costs less than `max_cost` [ns] and has time.
+
+        A form that has failed in the compiled call becomes the last one. Return whether a form was added.
+        """
         p, states = self.problem, self.states
-        if "newton over rows" in states or self.formed >= most or self.is_late:
+        if "newton over rows" in states or self.row_form_cost >= max_cost or self.is_late:
             return False
-        if self.deadline.is_set and self.deadline.passed(over_rows(p) + 3.0 * forming(p)):
+        if self.deadline.is_set and self.deadline.passed(row_setup_time(p) + 3.0 * forming_time(p)):
             return False
-        both = states | self.prepared("newton over rows")
+        both = states | self.prepare_newton("newton over rows")
+        failed = self.compiled_call_failed
         self.states = dict(
-            sorted(both.items(), key=lambda of: (self.tried and of[1].general is not None, of[1].cost))
+            sorted(both.items(), key=lambda item: (failed and item[1].general is not None, item[1].cost))
         )
         return len(both) > len(states)
 
     @property
     def newton(self) -> float:
-        """Newton's method, inf where there is none."""
+        """Cost of Newton's method [ns] in its cheapest form; inf if it is not possible."""
         return min((state.cost for state in self.states.values()), default=inf)
 
     @property
     def is_late(self) -> bool:
-        """Nobody who factors would have a result in time."""
-        return not self.has_time("newton", self.least)
+        """Whether no factorising solver can return a result before the deadline."""
+        return not self.has_time("newton", self.min_newton_cost)
 
     def has_time(self, name: str, cost: float, before: float = 0.0) -> bool:
-        """Whether who factors, at this cost, would have a result in time if begun after `before` [ns].
+        """Return whether a factorising solver of this cost [ns] has a result in time if it starts after `before` [ns].
 
-        Each factorisation of an interior point brings one; under Coulomb's law, and in `direct`, only the last does.
+        An interior point has a result after each factorisation; under Coulomb's law, and in `direct`, only at the end.
         """
         if not self.deadline.is_set:
             return True
-        needed = 1e-9 * (before + (1.0 if name == "direct" or self.law == "coulomb" else EARLY) * cost)
+        needed = 1e-9 * (
+            before + (1.0 if name == "direct" or self.law == "coulomb" else EARLY_RESULT_FRACTION) * cost
+        )
         if name == "newton" and "states" in vars(self):
             return not self.deadline.passed(needed)
         return not self.deadline.passed(setup_time(name, self.problem) + needed)
 
     @property
     def pivots(self) -> str:
-        """Bounded rows of a matrix of which `direct` needs little: a factor of a narrow band, or of free rows alone."""
-        p, band = self.problem, min(BAND, self.problem.m // 4)
+        """Reason to use `direct` for bounded rows of a matrix, "a narrow band" or "not symmetric", else empty."""
+        p, band = self.problem, min(MAX_DIRECT_BAND, self.problem.m // 4)
         if p.matrix is None or self.law != "lcp":
             return ""
         entries = len(p._compressed[1])
         if p.is_symmetric:
             return "a narrow band" if entries <= (2 * band + 1) * p.m and max(p.bandwidth) <= band else ""
-        return "not symmetric" if entries > SPARSE * p.m**2 else ""
+        return "not symmetric" if entries > SPARSE_FRACTION * p.m**2 else ""
 
     @cached_property
     def is_loose(self) -> bool:
-        """Contacts under Coulomb's law, nearly each between another pair of bodies or of trees of M: sweeps then decide
-        what sticks.
+        """Whether nearly every contact under Coulomb's law is between another pair of bodies or of trees of M.
+
+        Sweeps then determine quickly which contacts stick.
         """
         p = self.problem
-        if self.law != "coulomb" or np.count_nonzero(p.cones.contact_rows) < PILE:
+        if self.law != "coulomb" or np.count_nonzero(p.cones.contact_rows) < MIN_PILE_ROWS:
             return False
-        return 4 * pairs(p) > 3 * p.n_blocks
+        return 4 * count_pairs(p) > 3 * p.n_blocks
 
     def __iter__(self) -> Iterator[Stage]:
-        """The lines."""
+        """Yield the stages in order; each is only needed if the stages before it did not solve the problem."""
         if self.problem.matrix is not None and self.law == "linear":
             p = self.problem
-            if len(p._compressed[1]) < SPARSE * p.m**2 and max(p.bandwidth) > BAND:
-                yield Stage("anderson", FEW, FEW * self.sweep, "a sparse matrix whose factor may fill", FEW)
-            yield Stage("direct", inf, self.least, "linear, a matrix")
-        pivots, most = self.pivots, ROUNDS * costs.factorisations(self.law)
+            if len(p._compressed[1]) < SPARSE_FRACTION * p.m**2 and max(p.bandwidth) > MAX_DIRECT_BAND:
+                yield Stage(
+                    "anderson",
+                    SWEEPS_BEFORE_SPARSE_FACTOR,
+                    SWEEPS_BEFORE_SPARSE_FACTOR * self.sweep,
+                    "a sparse matrix whose factor may fill",
+                    SWEEPS_BEFORE_SPARSE_FACTOR,
+                )
+            yield Stage("direct", inf, self.min_newton_cost, "linear, a matrix")
+        pivots, max_factorisations = self.pivots, DIRECT_BUDGET_RATIO * costs.factorisations(self.law)
         if pivots == "a narrow band":
-            yield Stage("direct", most, self.least, f"bounded rows, {pivots}")
-        # Fill is most of what a factor costs, and only an analysis tells it: before it, as many as are usual.
-        yield from self.sweeps_first(max(self.least, costs.SWEEPS * self.sweep))
-        yield from self.sweeps_first(min(self.newton, self.formed))
-        self.add_rows(max(MOST * self.newton, LITTLE) if self.tried else self.newton)
+            yield Stage("direct", max_factorisations, self.min_newton_cost, f"bounded rows, {pivots}")
+        # Fill determines the cost of a factor, and only an analysis gives it: before it, the usual number of sweeps.
+        yield from self.sweeps_first(max(self.min_newton_cost, costs.EXPECTED_SWEEPS * self.sweep))
+        yield from self.sweeps_first(min(self.newton, self.row_form_cost))
+        row_form_budget = max(NEWTON_BUDGET_RATIO * self.newton, MIN_ROW_FORM_BUDGET)
+        self.add_row_form(row_form_budget if self.compiled_call_failed else self.newton)
         yield from self.sweeps_first(self.newton)
         if pivots == "not symmetric":
-            yield Stage("direct", most, self.newton, f"bounded rows, {pivots}")
+            yield Stage("direct", max_factorisations, self.newton, f"bounded rows, {pivots}")
         if self.problem.generalized is not None and not np.all(self.problem.compliance):
-            of = self.states.get("newton")  # over velocities, as the least violation is found
-            cost = self.newton if of is None else of.cost
-            sooner = cost <= max(MOST * self.newton, LITTLE)
-            yield from islice(self.factorisations(SURE if sooner else MOST), 1)
+            velocity_state = self.states.get("newton")  # The smallest violation is found over velocities.
+            cost = self.newton if velocity_state is None else velocity_state.cost
+            is_cheap = cost <= max(NEWTON_BUDGET_RATIO * self.newton, MIN_ROW_FORM_BUDGET)
+            budget_ratio = RELIABLE_BUDGET_RATIO if is_cheap else NEWTON_BUDGET_RATIO
+            yield from islice(self.factorisations(budget_ratio), 1)
             yield Stage("certificate", 1.0, cost, "whether the least violation proves that there is none")
-        yield from self.factorisations(MOST)
-        self.add_rows(max(MOST * self.newton, LITTLE))
-        if self.law == "coulomb" and self.problem.generalized is None and self.best > NEAR:
-            yield Stage("certificate", 1.0, LINEAR_PROGRAM, "whether a linear program proves it")
-        most = max((state.cost for state in self.states.values()), default=costs.SWEEPS * self.sweep)
-        self.left = min((LAST - MOST) * min(most, max(self.newton, LITTLE)), LONG) - self.begun
-        for k in range(TURNS):
+        yield from self.factorisations(NEWTON_BUDGET_RATIO)
+        self.add_row_form(max(NEWTON_BUDGET_RATIO * self.newton, MIN_ROW_FORM_BUDGET))
+        if self.law == "coulomb" and self.problem.generalized is None and self.best > NEAR_SOLUTION_RESIDUAL:
+            yield Stage("certificate", 1.0, MIN_LINEAR_PROGRAM_COST, "whether a linear program proves it")
+        unit = max((state.cost for state in self.states.values()), default=costs.EXPECTED_SWEEPS * self.sweep)
+        unit = min(unit, max(self.newton, MIN_ROW_FORM_BUDGET))
+        total = min((TOTAL_BUDGET_RATIO - NEWTON_BUDGET_RATIO) * unit, MAX_ALTERNATION_COST)
+        self.remaining_cost = total - self.cost_before_newton
+        for k in range(MAX_ALTERNATIONS):
             before = self.best
-            for stage in self.in_turn(2.0**k):
-                if self.left < 1.0:  # ns
+            for stage in self.alternate(2.0**k):
+                if self.remaining_cost < 1.0:  # [ns]
                     return
-                share = min(1.0, self.left / stage.cost)
-                self.left -= share * stage.cost
-                yield replace(stage, iterations=share * stage.iterations, cost=share * stage.cost)
-            # From near a solution rows take a few of their factorisations.
-            more = MOST if self.best <= WARM else 1.0
-            if k > 0 and self.best > GAIN * before and not self.add_rows(more * self.left):
+                fraction = min(1.0, self.remaining_cost / stage.cost)
+                self.remaining_cost -= fraction * stage.cost
+                yield replace(stage, iterations=fraction * stage.iterations, cost=fraction * stage.cost)
+            # Near a solution, the row form needs only a few of its factorisations.
+            ratio = NEWTON_BUDGET_RATIO if self.best <= WARM_START_MAX_RESIDUAL else 1.0
+            no_gain = k > 0 and self.best > MIN_GAIN_RATIO * before
+            if no_gain and not self.add_row_form(ratio * self.remaining_cost):
                 return
 
     def factorisations(self, times: float) -> Iterator[Stage]:
-        """Newton's method for so many times its counted cost."""
+        """Yield stages of Newton's method, in all its forms, with this multiple of their estimated costs."""
         for name, state in self.states.items():
-            share = min(times, max(SURE, LONG / state.cost))
-            why = f"{share:.3g} times its counted cost of {seconds(1e-9 * state.cost)}"
-            yield Stage(name, share * state.steps, share * state.cost, why)
+            ratio = min(times, max(RELIABLE_BUDGET_RATIO, MAX_ALTERNATION_COST / state.cost))
+            why = f"{ratio:.3g} times its counted cost of {seconds(1e-9 * state.cost)}"
+            yield Stage(name, ratio * state.steps, ratio * state.cost, why)
 
     def sweeps_first(self, newton: float) -> Iterator[Stage]:
-        """For Newton's cost: first what that is at least, then what it is counted for, of J and M once A is formed."""
-        cost = newton - self.begun
-        # Newton's method then takes what it is counted for, if that is there.
-        sure = self.law == "linear" or (self.law != "coulomb" and self.problem.matrix is None)
-        sure = sure and not self.deadline.passed(1e-9 * SURE * newton)
-        pays = not sure or MANY * self.sweep <= newton
-        if pays and 0.0 < cost < inf and not self.problem.cones.has_round:
-            self.begun += cost
+        """Yield sweeps up to Newton's cost `newton` [ns], of which earlier sweeps are subtracted.
+
+        The callers first pass a lower bound of the cost, then the cost after the analysis, then that with the row form.
+        """
+        cost = newton - self.cost_before_newton
+        # Newton's method then converges within its estimated cost, if that fits the time limit.
+        is_reliable = self.law == "linear" or (self.law != "coulomb" and self.problem.matrix is None)
+        is_reliable = is_reliable and not self.deadline.passed(1e-9 * RELIABLE_BUDGET_RATIO * newton)
+        sweeps_pay = not is_reliable or MIN_SWEEPS_PER_NEWTON * self.sweep <= newton
+        if sweeps_pay and 0.0 < cost < inf and not self.problem.cones.has_round:
+            self.cost_before_newton += cost
             why = f"{seconds(1e-9 * cost)} of what newton costs"
             yield self.sweeps(cost, why, newton)
             if self.is_loose:
-                rolls = self.problem.cones.has_more_parts
-                yield self.iterations("nncg" if rolls else "nncg from the cone law", cost, why)
+                has_rolling = self.problem.cones.has_more_parts
+                yield self.iterations("nncg" if has_rolling else "nncg from the cone law", cost, why)
 
-    def sweeps(self, cost: float, why: str, most: float = inf) -> Stage:
-        """Sweeps of so much cost, as long as no more than `most` is predicted to be left."""
-        return Stage("anderson", cost / self.sweep, cost, why, most / self.sweep)
+    def sweeps(self, cost: float, why: str, max_remaining: float = inf) -> Stage:
+        """Return a stage of sweeps of this cost [ns]; it stops if it predicts more than `max_remaining` [ns]."""
+        return Stage("anderson", cost / self.sweep, cost, why, max_remaining / self.sweep)
 
     def iterations(self, name: str, cost: float, why: str) -> Stage:
-        """Of a solver of which each costs as much as two sweeps."""
+        """Return a stage of this cost [ns] of a solver whose iterations cost as much as two sweeps."""
         return Stage(name, 0.5 * cost / self.sweep, cost, why)
 
-    def in_turn(self, times: float) -> Iterator[Stage]:
-        """All, with so many times the work of Newton's method before."""
-        cost = times * MOST * (self.newton if self.newton < inf else costs.SWEEPS * self.sweep)
-        why = f"in turn, {times * MOST:g} times newton's cost"
-        yield from self.factorisations(times * MOST)
+    def alternate(self, times: float) -> Iterator[Stage]:
+        """Yield one round of all solvers, with this multiple of the cost of Newton's method before."""
+        cost = (
+            times
+            * NEWTON_BUDGET_RATIO
+            * (self.newton if self.newton < inf else costs.EXPECTED_SWEEPS * self.sweep)
+        )
+        why = f"in turn, {times * NEWTON_BUDGET_RATIO:g} times newton's cost"
+        yield from self.factorisations(times * NEWTON_BUDGET_RATIO)
         p = self.problem
-        # A of J and M that no line has formed, and its first factor, whatever else is known of A.
-        formed = 0.0 if p.generalized is None or "newton over rows" in self.states else formed_once(p)
-        if p.generalized is None or 1e9 * (formed + first_factor(p.m, float(p.metric.entries_of_a))) <= cost:
+        # Time to form A of J and M if no stage did, and its first factor; it does not depend on cached data.
+        time_to_form = (
+            0.0 if p.generalized is None or "newton over rows" in self.states else formation_time(p)
+        )
+        if (
+            p.generalized is None
+            or 1e9 * (time_to_form + first_factor_time(p.m, float(p.metric.entries_of_a))) <= cost
+        ):
             yield self.iterations("admm", cost, why)
         yield self.iterations("nncg", cost, why)
-        if not self.swept and not self.problem.cones.has_round:
+        if not self.sweeps_failed and not self.problem.cones.has_round:
             before = self.best
             yield self.sweeps(cost, why)
-            self.swept = self.best > GAIN * before
+            self.sweeps_failed = self.best > MIN_GAIN_RATIO * before
 
 
 @dataclass(frozen=True)
 class Auto(Solver):
-    """Chooses and combines other solvers; the solution's message and `stages` name them."""
+    """Select and combine other solvers; the solution's message and `stages` name them."""
 
     def prepare(self, problem: Problem) -> Problem:
-        """Nothing."""
+        """Return the problem: nothing is prepared."""
         return problem
 
     def start_workers(self, problem: Problem, time_limit: float) -> None:
@@ -299,33 +377,33 @@ class Auto(Solver):
         deadline, failed = Deadline(time_limit), list[tuple[str, Claim]]()
         if problem.has_singular_program:
             return run_backends(problem, impulse, max_iter, tol, deadline)
-        if max_iter >= ONE_CALL and call_ends_within(problem, deadline.remaining()):
-            share = 1.0 if problem.m <= SMALL_ROWS else QUARTER
-            found, counts = AUTO.attempt(problem, impulse, tol, share * deadline.nanoseconds())
-            if found is not None and found.relative <= tol:
-                claim = AUTO.claim(problem, counts, impulse, found.relative)
+        if max_iter >= MIN_ITERATIONS_FOR_COMPILED_CALL and call_ends_within(problem, deadline.remaining()):
+            fraction = 1.0 if problem.m <= SMALL_ROWS else ISLANDS_TIME_FRACTION
+            result, counts = AUTO.attempt(problem, impulse, tol, fraction * deadline.nanoseconds())
+            if result is not None and result.relative <= tol:
+                claim = AUTO.claim(problem, counts, impulse, result.relative)
                 if claim.iterations <= max_iter:
-                    impulse[:] = found.impulse
+                    impulse[:] = result.impulse
                     return claim
-            failed = AUTO.failed(problem, counts)
+            failed = AUTO.failed_claims(problem, counts)
         if problem.m == 0:
             return Claim(Status.CONVERGED, 0, {}, "nothing to solve")
-        if deadline.passed(sweeping(problem)):
-            return Claim(Status.TIME_LIMIT, 0, {}, NO_TIME)
+        if deadline.passed(first_sweep_time(problem)):
+            return Claim(Status.TIME_LIMIT, 0, {}, NO_TIME_MESSAGE)
         tree = Tree(problem, deadline)
-        tree.tried = bool(failed) and problem.generalized is not None
+        tree.compiled_call_failed = bool(failed) and problem.generalized is not None
         log = SolveLog(problem, tol, max_iter, deadline)
         log.offer(impulse)
         if log.best > 1.0:
-            log.given = impulse.copy() if log.best < STALE else None
-            log.offer(problem.start())  # doing nothing is better
+            log.bad_start = impulse.copy() if log.best < MAX_START_RESIDUAL else None
+            log.offer(problem.start())  # The zero impulse is better.
         try:
             if max_iter > 0 and log.best > tol and not log.done():
                 for name, claim in failed:
                     log.note(name, claim, log.best)
                 solve(log, tree)
         except KeyboardInterrupt:
-            log.interrupted = True  # the best impulse goes back all the same
+            log.interrupted = True  # The best impulse is returned all the same.
         except BREAKDOWN as error:
             log.failure = format_error(error)
         if log.best > tol and log.result is not None:
@@ -336,17 +414,17 @@ class Auto(Solver):
 
 
 def program_backends() -> list[SolverSpec]:
-    """Return the installed of PROGRAM_BACKENDS."""
+    """Return the specs of the installed `PROGRAM_BACKENDS`."""
     return [get(name) for name in PROGRAM_BACKENDS if not specs()[name].missing()]
 
 
-@np.errstate(all="ignore")  # what overflows is judged
+@np.errstate(all="ignore")  # Results that overflow are judged.
 def run_backends(
     problem: Problem, impulse: FloatArray, max_iter: int, tol: float, deadline: Deadline
 ) -> Claim:
-    """Solve a program with a singular P by the first backend that reaches tol, or look for a certificate.
+    """Solve a program with a singular P by the first backend that reaches tol, or search for a certificate.
 
-    If none reaches tol, the result is the one with the least error of the program.
+    If none reaches tol, the result is the one with the smallest error of the program.
     """
     log, start = SolveLog(problem, tol, max_iter, deadline), impulse.copy()
     log.offer(impulse)
@@ -376,7 +454,7 @@ def run_backends(
         impulse[:] = log.impulse
     else:
         impulse[:] = best
-        if claim.status is Status.ROUNDOFF_LIMIT:  # true of the impulse of the log
+        if claim.status is Status.ROUNDOFF_LIMIT:  # This is only true for the impulse of the log.
             claim = replace(claim, status=Status.STALLED)
     return claim
 
@@ -387,15 +465,15 @@ def program_error(problem: Problem, impulse: FloatArray) -> float:
     return error if error == error else inf
 
 
-@np.errstate(all="ignore")  # what overflows is judged
+@np.errstate(all="ignore")  # Results that overflow are judged.
 def solve(log: SolveLog, tree: Tree) -> None:
-    """The lines of the tree, until one solves the problem or none has more to do."""
+    """Run the stages of the tree until one solves the problem or no stage remains; then search for a certificate."""
     steps: dict[str, Step] = {}
     if log.deadline.is_set and tree.is_late and not log.problem.cones.has_round:
         Sweeps("anderson", log).finish()
         return
     lines = iter(tree)
-    while not log.done():  # before the next line counts what it needs
+    while not log.done():  # Checked before the tree computes the costs of the next stage.
         stage = next(lines, None)
         if stage is None:
             break
@@ -405,39 +483,41 @@ def solve(log: SolveLog, tree: Tree) -> None:
             continue
         step = steps.get(stage.solver)
         if step is None:
-            step = steps[stage.solver] = make(stage.solver, log, tree)
+            step = steps[stage.solver] = make_step(stage.solver, log, tree)
         if log.deadline.is_set and not step.over:
             if isinstance(step, Sweeps):
-                if not tree_goes_on(tree, steps, min(stage.cost, PROBE * log.deadline.nanoseconds())):
+                if not tree_goes_on(
+                    tree, steps, min(stage.cost, SWEEPS_TIME_FRACTION * log.deadline.nanoseconds())
+                ):
                     step.finish()
                     return
             elif step.name == "direct" or isinstance(step, Newton):
                 cost = step.state.cost if isinstance(step, Newton) else stage.cost
                 step.over = step.late = not tree.has_time(METHODS[stage.solver][0], cost)
             elif step.state is None:
-                step.over = log.deadline.passed(SURE * setup_time(stage.solver, log.problem))
+                step.over = log.deadline.passed(RELIABLE_BUDGET_RATIO * setup_time(stage.solver, log.problem))
         if step.over:
-            tree.left += stage.cost
+            tree.remaining_cost += stage.cost
         else:
             step.least = stage.least
             step.run(stage.iterations)
             tree.best = log.best
-    if log.best > log.tol and log.certificate is None and (log.left > 0 or log.vain):
+    if log.best > log.tol and log.certificate is None and (log.left > 0 or log.last_stage_failed):
         certify(log)
 
 
 def tree_goes_on(tree: Tree, steps: dict[str, Step], cost: float) -> bool:
-    """Whether after work of this cost [ns] anybody who factors would still have a result in time, or all have ended."""
+    """Return whether a factorising solver can have a result in time after work of this cost [ns], or all have ended."""
     if "states" not in vars(tree):
-        return tree.has_time("newton", tree.least, cost)
-    able = [name for name in tree.states if name not in steps or not steps[name].over]
-    if tree.states and not able and not any(steps[name].late for name in tree.states):
+        return tree.has_time("newton", tree.min_newton_cost, cost)
+    unfinished = [name for name in tree.states if name not in steps or not steps[name].over]
+    if tree.states and not unfinished and not any(steps[name].late for name in tree.states):
         return True
-    return bool(able) and tree.has_time("newton", tree.newton, cost)
+    return bool(unfinished) and tree.has_time("newton", tree.newton, cost)
 
 
-def make(name: str, log: SolveLog, tree: Tree) -> Step:
-    """The step of this name."""
+def make_step(name: str, log: SolveLog, tree: Tree) -> Step:
+    """Create the step of this name; Newton's method gets the state of the tree."""
     kinds = {"anderson": Sweeps, "direct": Step, "newton": Newton, "newton over rows": Newton}
     step = kinds.get(name, Iterations)(name, log)
     if isinstance(step, Newton):

@@ -1,12 +1,12 @@
-"""Block Gauss-Seidel: one contact or joint after the other, each solved exactly with all others fixed.
+"""Block Gauss-Seidel: contacts and joints are solved exactly one after the other, with all others fixed.
 
     find lam_i:   w_i = A_ii lam_i + q_i complementary to lam_i,   q_i = sum_{j != i} A_ij lam_j - b_i
 
 A contact is open, sticks, or slips in the direction that a scalar Newton iteration finds
-(`lavender_ext/local/exact.pxd`). The rows of a joint are a small boxed problem, solved by pivoting. So normal and
-friction of one contact are solved together, unlike in `pgs`; different contacts are still coupled only by sweeps. Works
-on the rows of A, on body velocities if the problem has rows, on J and M if that costs less than A. `work["fallbacks"]`
-counts blocks without an exact solution, which got the update of `pgs` instead.
+(`lavender_ext/local/exact.pxd`). The rows of a joint are a small boxed problem, solved by pivoting. Unlike in `pgs`,
+normal and friction of one contact are solved together; different contacts are coupled only by sweeps. The sweeps use
+body velocities if the problem has rows, J and M if that costs less than forming A, and otherwise the rows of A.
+`work["fallbacks"]` counts blocks without an exact solution, which are updated as in `pgs` instead.
 """
 
 from __future__ import annotations
@@ -17,24 +17,24 @@ from lavender.judge.solution import Claim
 from lavender.problem import Problem
 from lavender.problem.ordering import Order
 from lavender.solvers.registry import SolverSpec
-from lavender.solvers.setup_times import forming
-from lavender.solvers.sweeping import Sweeping, SweepState, over, plan_of, reads_whitened, swept
+from lavender.solvers.setup_times import forming_time
+from lavender.solvers.sweeping import Sweeping, SweepState, form_name, plan_of, reads_whitened, swept_data
 from lavender_ext.sweep import serial
 
 
 @dataclass(frozen=True)
 class BlockGaussSeidel(Sweeping):
-    """Block Gauss-Seidel; `order`, `ground`, `seed` as in `lavender.problem.ordering`."""
+    """Block Gauss-Seidel; `order`, `ground` and `seed` as in `lavender.problem.ordering`."""
 
     def _forming(self, problem: Problem) -> float:
-        return forming(problem) if problem.rows is None and not reads_whitened(problem) else 0.0
+        return forming_time(problem) if problem.rows is None and not reads_whitened(problem) else 0.0
 
     def _state(self, problem: Problem, order: Order, before: SweepState | None) -> SweepState:
-        data = swept(problem)
+        data = swept_data(problem)
         return SweepState(problem, data, order, serial.Sweeps(data, *plan_of(order), exact=True))
 
-    def _told(self, state: SweepState, claim: Claim, again: int) -> Claim:
-        return replace(claim, work={**claim.work, "fallbacks": again}, form=over(state.data))
+    def _complete_claim(self, state: SweepState, claim: Claim, fallbacks: int) -> Claim:
+        return replace(claim, work={**claim.work, "fallbacks": fallbacks}, form=form_name(state.data))
 
 
 SPEC = SolverSpec(

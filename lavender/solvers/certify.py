@@ -1,14 +1,17 @@
-"""A certificate that a problem has no solution, which `auto` looks for if all candidates fail; and who fights.
+"""Search for certificates that a problem has no solution, and for conflicting constraints, after all solvers failed.
 
-    A^T y <= 0 (= 0 on free rows),  y >= 0 (any sign there),  b.y > 0
+    A^T y <= 0 (= 0 on free rows),  y >= 0 (any sign on free rows),  b.y > 0
 
-On a contact y is along the normal, as Coulomb's law requires, and z = A^T y satisfies z_n + mu |z_t| <= 0. The sum of
-|z_t| replaces its norm: every certificate found this way is valid, but with two tangents a few are not found.
+On a contact, y has only a normal component, as Coulomb's law requires, and z = A^T y satisfies z_n + mu |z_t| <= 0. The
+sum of |z_t| replaces its norm in the linear program: every certificate found is valid, but with two tangents a few are
+missed.
 
-Of Coulomb friction the convex relaxation is asked at last. A y of its that leaves the normals proves nothing for
-Coulomb's law, but tells who fights: with a compliance on the rows of y no such y is left (`conflict_of`).
+With Coulomb friction, the convex relaxation is tried last. A direction y of the relaxation that has tangential
+components proves nothing for Coulomb's law, but it shows which blocks conflict: a compliance on the rows of y removes
+it (`conflict_of`).
 
-Of J and M it is what the least violation of J v = target needs (`least_violation`), whatever M is.
+With J and M, the certificate is computed from the smallest violation of J v = target (`least_violation`), which does
+not depend on M.
 
 One infeasible island makes the problem infeasible. The unsolved islands are tried one by one, because an upper bound in
 another island does not matter.
@@ -33,48 +36,64 @@ from lavender.problem.ordering import blocks_by_island
 from lavender.solvers.islands import islands, restrict, rows_of
 from lavender.solvers.newton_systems import general
 from lavender.solvers.registry import get
-from lavender.solvers.setup_times import loading
+from lavender.solvers.setup_times import loading_time
 from lavender.solvers.solve_log import SolveLog
-from lavender_ext.core.checks import LEAST, MOST
+from lavender_ext.core.checks import LEAST as MIN_NUMBER
+from lavender_ext.core.checks import MOST as MAX_NUMBER
 from lavender_ext.judge.measure import by_island
 
-CERTIFICATE_ROWS = (
-    3000  # rows up to which a linear program is asked for a certificate, of all islands together
-)
-LINEAR = "linear program"  # in turns
-LINEAR_PROGRAM = 5e6  # ns that scipy takes for the smallest
-CERTIFICATE_STEPS = 100  # of the simplex method for each row at most
-RELAXATION_STEPS = 150  # factorisations that the relaxation has for its proof
-SOFT_STEPS = 300  # and a problem with a compliance
-SOFT = 1e-4, 1e-2  # of d: compliances that are tried
-NEARLY_RIGID = 1e-6, 1e-8, 1e-10  # of d: compliances under which the violation is least
-CLOSE = 1e-6  # tol of these impulses
-DUST = 1e-6  # of the largest y in the metric of D: below, a row of a difference takes no part
+# Linear programs are used up to this many rows of all islands together.
+CERTIFICATE_ROWS = 3000
+LINEAR_PROGRAM_STAGE = "linear program"  # Name of the stage in the solution.
+MIN_LINEAR_PROGRAM_COST = 5e6  # Time [ns] that scipy needs for the smallest program.
+SIMPLEX_STEPS_PER_ROW = 100  # Largest number of simplex steps per row.
+MAX_RELAXATION_STEPS = 150  # Largest number of factorisations for a proof of the convex relaxation,
+MAX_SOFTENED_STEPS = 300  # and for the solution of a problem with additional compliance.
+TRIED_COMPLIANCES = 1e-4, 1e-2  # Additional compliances that are tried, as multiples of d.
+# Compliances of the problems whose solutions approach the smallest violation, as multiples of d.
+NEARLY_RIGID_COMPLIANCES = 1e-6, 1e-8, 1e-10
+VIOLATION_TOLERANCE = 1e-6  # Relative residual of the solutions of these problems.
+# Rows of a direction below this fraction of its largest entry in the metric of D are set to zero.
+NEGLIGIBLE_ROW_FRACTION = 1e-6
 
 
 @dataclass(frozen=True)
 class Conflict:
-    """Rows that ask for what cannot be, of a problem or of its convex relaxation."""
+    """Conflicting constraints of a problem whose convex relaxation has no solution.
 
-    proof: Proof  # of the relaxation
-    blocks: tuple[int, ...]  # that take part
-    soft_rows: tuple[int, ...]  # whose compliance gives an answer; empty: none of SOFT does
-    compliance: float  # 1/kg, the largest of them
-    soft: str  # their blocks, by name
+    Parameters
+    ----------
+    proof : Proof
+        Proof that the relaxation has no solution.
+    blocks : tuple of int
+        Conflicting blocks.
+    soft_rows : tuple of int
+        Rows for which an additional compliance gives a solvable problem; empty if no tried compliance does.
+    compliance : float, 1/kg
+        Largest of these compliances.
+    soft : str
+        Names of the blocks of these rows.
+    """
+
+    proof: Proof
+    blocks: tuple[int, ...]
+    soft_rows: tuple[int, ...]
+    compliance: float
+    soft: str
 
     @property
     def advice(self) -> str:
-        """What to do, in words."""
+        """Recommended compliance, as a sentence; empty if there is none."""
         if not self.soft_rows:
             return ""
         return f"a compliance of {self.compliance:.1g} 1/kg on {self.soft} gives an answer"
 
 
-@np.errstate(all="ignore")  # what overflows is judged
+@np.errstate(all="ignore")  # Results that overflow are judged.
 def conflict_of(problem: Problem, tol: float, deadline: Deadline | None = None) -> Conflict | None:
-    """Who fights in a problem whose convex relaxation is proved to have no solution; None where it is not."""
+    """Return the conflicting constraints if the convex relaxation is proved to have no solution, else None."""
     inner = problem.relaxed("cone")
-    claim = _newton(inner, RELAXATION_STEPS, tol, deadline)[1]
+    claim = _run_newton(inner, MAX_RELAXATION_STEPS, tol, deadline)[1]
     if claim is None or claim.certificate is None:
         return None
     proof = prove(inner, claim.certificate, tol, deadline)
@@ -85,33 +104,34 @@ def conflict_of(problem: Problem, tol: float, deadline: Deadline | None = None) 
     tries = [
         (np.concatenate([np.arange(first[i], last[i]) for i in soft]), proof.conflict.split(" against ")[0])
     ]
-    if contacts:  # others may fight as well, of which this proof says nothing
+    if contacts:  # Other contacts may conflict, too; this proof does not contain them.
         tries.append((np.flatnonzero(problem.cones.contact_rows), "all contacts"))
-    for rows, told in tries:
-        for share in SOFT:
-            more = np.zeros(problem.m)
-            more[rows] = share * problem.d[rows]
+    for rows, names in tries:
+        for fraction in TRIED_COMPLIANCES:
+            compliance = np.zeros(problem.m)
+            compliance[rows] = fraction * problem.d[rows]
             try:
-                softer = softened(problem, more)
-            except InputError:  # A or the compliance is at the most that the door lets in
+                softer = soften(problem, compliance)
+            except InputError:  # A number exceeds the largest one that a problem may have.
                 continue
-            if _newton(softer, SOFT_STEPS, tol, deadline)[0] <= tol:
-                return Conflict(proof, joints + contacts, tuple(map(int, rows)), float(more.max()), told)
+            if _run_newton(softer, MAX_SOFTENED_STEPS, tol, deadline)[0] <= tol:
+                largest = float(compliance.max())
+                return Conflict(proof, joints + contacts, tuple(map(int, rows)), largest, names)
     return Conflict(proof, joints + contacts, (), 0.0, "")
 
 
-def softened(problem: Problem, more: FloatArray) -> Problem:
-    """With so much compliance (m,) [1/kg] more."""
+def soften(problem: Problem, compliance: FloatArray) -> Problem:
+    """Return the problem with an additional compliance (m,) [1/kg]."""
     if problem.matrix is None:
         assert problem.compliance is not None
-        return replace(problem, compliance=problem.compliance + more)
-    return replace(problem, matrix=(problem.csr + sp.diags_array(more)).tocsr())
+        return replace(problem, compliance=problem.compliance + compliance)
+    return replace(problem, matrix=(problem.csr + sp.diags_array(compliance)).tocsr())
 
 
-def _newton(
+def _run_newton(
     problem: Problem, steps: int, tol: float, deadline: Deadline | None
 ) -> tuple[float, Claim | None]:
-    """Relative residual and claim of Newton's method from nothing; inf, None where it does not take the problem."""
+    """Run Newton's method from zero; return (relative residual, claim), or (inf, None) if it refuses the problem."""
     spec, left = get("newton"), None if deadline is None else deadline.remaining()
     if spec.refuses(problem) is not None or (left is not None and left <= 0.0):
         return np.inf, None
@@ -122,53 +142,56 @@ def _newton(
     return residual(problem, impulse).relative, claim
 
 
-@np.errstate(all="ignore")  # what overflows is judged
-def without_dust(y: FloatArray, d: FloatArray) -> FloatArray:
-    """Of a direction (m,) the rows that take part, in the metric of d (m,)."""
+@np.errstate(all="ignore")  # Results that overflow are judged.
+def drop_negligible_rows(y: FloatArray, d: FloatArray) -> FloatArray:
+    """Return a direction y (m,) with small entries, in the metric of d (m,), set to zero."""
     size = np.sqrt(d) * np.abs(y)
-    return np.where(size > DUST * size.max(), y, 0.0)
+    return np.where(size > NEGLIGIBLE_ROW_FRACTION * size.max(), y, 0.0)
 
 
 def least_violation(log: SolveLog) -> None:
-    """Of J and M: the motion that violates J v = target least, near that of the best impulse.
+    """Search for a certificate of a problem with J and M, from the motion with the smallest violation of J v = target.
 
-    With a diagonal mass C in the place of M and compliances eps d, the impulses lambda(eps) of
+    With a diagonal mass C instead of M and compliances eps d, the impulses lambda(eps) of
 
         min 1/2 (v' - v).C (v' - v) + 1/2 |violation|^2 / (eps d)
 
-    grow as y / eps + a constant where some violation is left, and then J^T y = 0, b.y > 0. A difference of two is a y
-    to many digits, and the judge polishes it. Rows of a compliance may be violated, so eps is 1 there and y 0. Under
-    Coulomb's law the same without friction.
+    grow as y / eps + constant if a violation remains, and then J^T y = 0 and b.y > 0. The difference of two of them
+    gives y to many digits, and the judge refines it. Rows with compliance may be violated: their eps is 1 and their y
+    is 0. Under Coulomb's law, friction is left out.
     """
-    problem, of = log.problem, log.problem.generalized
-    assert of is not None and problem.compliance is not None
-    v, cones = np.clip(of.change(log.impulse), -MOST, MOST), problem.cones
+    problem, generalized = log.problem, log.problem.generalized
+    assert generalized is not None and problem.compliance is not None
+    v, cones = np.clip(generalized.change(log.impulse), -MAX_NUMBER, MAX_NUMBER), problem.cones
     if problem.law == "coulomb":
         cones = replace(cones, mu=0.0 * cones.mu, rolling=0.0 * cones.rolling)
-    squares = of.jac.multiply(of.jac).tocsr()
+    squares = generalized.jac.multiply(generalized.jac).tocsr()
     mass = squares.T @ (1.0 / np.maximum(squares.sum(axis=1), np.finfo(float).tiny))
-    mass[mass < LEAST] = 1.0  # of what no row moves, or dust alone
+    mass[mass < MIN_NUMBER] = 1.0  # No row moves these velocities, or only by rounding noise.
     d = squares @ (1.0 / mass)
-    y = lam = np.zeros(of.m)
-    yields = problem.compliance > 0.0
+    y = lam = np.zeros(generalized.m)
+    has_compliance = problem.compliance > 0.0
     try:
         rigid = Problem.from_jacobian(
-            of.jac, sp.diags_array(mass), v, target=problem.b, cones=cones, friction="cone"
+            generalized.jac, sp.diags_array(mass), v, target=problem.b, cones=cones, friction="cone"
         )
-    except InputError:  # beside J of 1e47 a C of 1 is as nothing
+    except InputError:  # For example, C = 1 is negligible if J is 1e47.
         return
-    for share in NEARLY_RIGID:
-        eps = np.where(yields, 1.0, share) * d
-        soft = replace(rigid, compliance=np.where(eps < LEAST, 0.0, eps))  # rows of dust are empty
+    for fraction in NEARLY_RIGID_COMPLIANCES:
+        eps = np.where(has_compliance, 1.0, fraction) * d
+        soft = replace(rigid, compliance=np.where(eps < MIN_NUMBER, 0.0, eps))  # Negligible rows are empty.
         kernel = general.prepare(soft)
-        if kernel is None or log.ends_late(LINEAR_PROGRAM):
+        if kernel is None or log.ends_late(MIN_LINEAR_PROGRAM_COST):
             return
         before, lam = lam, lam.copy()
-        steps = SOFT_STEPS * max(1, kernel.islands)
-        if general.run(soft, kernel, lam, steps, CLOSE, log.time_left).status is Status.INTERRUPTED:
+        steps = MAX_SOFTENED_STEPS * max(1, kernel.islands)
+        if (
+            general.run(soft, kernel, lam, steps, VIOLATION_TOLERANCE, log.time_left).status
+            is Status.INTERRUPTED
+        ):
             raise KeyboardInterrupt
-        for y in (lam - before, lam):  # the second where rows pushed more under the eps before
-            y = without_dust(np.where(yields, 0.0, y), d)
+        for y in (lam - before, lam):  # The second one if rows had larger impulses with the previous eps.
+            y = drop_negligible_rows(np.where(has_compliance, 0.0, y), d)
             outside = (np.isfinite(cones.upper) & (y > 0.0)) | (np.isfinite(cones.lower) & (y < 0.0))
             if not outside.any():
                 break
@@ -178,11 +201,11 @@ def least_violation(log: SolveLog) -> None:
     log.note("least violation", Claim(Status.STALLED, 0, {"certificates": 1}, certificate=y), log.best)
 
 
-@np.errstate(all="ignore")  # what overflows is judged
+@np.errstate(all="ignore")  # Results that overflow are judged.
 def certify(log: SolveLog) -> None:
-    """Look for a certificate that a problem has no solution; under Coulomb's law, else of its relaxation."""
+    """Search for a certificate that a problem has no solution; under Coulomb's law, also for the convex relaxation."""
     problem = log.problem
-    if problem.generalized is None and LINEAR not in [stage.solver for stage in log.stages]:
+    if problem.generalized is None and LINEAR_PROGRAM_STAGE not in [stage.solver for stage in log.stages]:
         linear_programs(log)
     if (
         log.certificate is None
@@ -194,16 +217,16 @@ def certify(log: SolveLog) -> None:
 
 
 def linear_programs(log: SolveLog) -> None:
-    """A certificate for rows of bodies or of any A, without upper bounds."""
+    """Search for a certificate by linear programs, for unsolved islands of bodies or of any A without upper bounds."""
     problem = log.problem
-    if log.best < 1e-6 or log.ends_late(LINEAR_PROGRAM + 1e9 * loading("scipy.optimize")):
+    if log.best < 1e-6 or log.ends_late(MIN_LINEAR_PROGRAM_COST + 1e9 * loading_time("scipy.optimize")):
         return
-    asked = 0
-    for part, rows in _parts(log):
-        asked += part.m
-        if asked > CERTIFICATE_ROWS or log.ends_late(LINEAR_PROGRAM):
+    total_rows = 0
+    for part, rows in _unsolved_islands(log):
+        total_rows += part.m
+        if total_rows > CERTIFICATE_ROWS or log.ends_late(MIN_LINEAR_PROGRAM_COST):
             return
-        if not _is_open(part):
+        if not _has_simple_bounds(part):
             continue
         y = find_direction(part, log.deadline)
         proof = None
@@ -211,25 +234,25 @@ def linear_programs(log: SolveLog) -> None:
             proof = np.zeros(problem.m)
             proof[rows] = y
         claim = Claim(Status.STALLED, 0, {"certificates": 1}, certificate=proof)
-        log.note(LINEAR, claim, log.best)
+        log.note(LINEAR_PROGRAM_STAGE, claim, log.best)
         if log.certificate is not None:
             return
 
 
-def _parts(log: SolveLog) -> Any:
-    """Unsolved islands and their rows, the smallest first; the whole problem if there is only one."""
+def _unsolved_islands(log: SolveLog) -> Any:
+    """Yield (problem, rows) of each unsolved island, the smallest first, or the whole problem if it is one island."""
     problem = log.problem
     count, label = islands(problem)
     if count <= 1:
         yield problem, slice(None)
         return
     blocks = blocks_by_island(count, label)
-    for i in sorted(_wrong(log, label), key=lambda i: len(blocks[i])):
+    for i in sorted(_unsolved_labels(log, label), key=lambda i: len(blocks[i])):
         rows = rows_of(problem, blocks[i])
         yield restrict(problem, blocks[i], rows), rows
 
 
-def _wrong(log: SolveLog, label: IntArray) -> IntArray:
+def _unsolved_labels(log: SolveLog, label: IntArray) -> IntArray:
     """Return the islands whose relative residual is above the tolerance."""
     own, table = by_island(log.problem.metric, log.impulse)
     if len(table) == 1:
@@ -237,18 +260,24 @@ def _wrong(log: SolveLog, label: IntArray) -> IntArray:
     return np.unique(label[(table[:, 0] > log.tol)[own]])
 
 
-def _is_open(problem: Problem) -> bool:
-    """Every row is free, or bounded by 0 below alone."""
+def _has_simple_bounds(problem: Problem) -> bool:
+    """Return whether every row is free or has only the lower bound 0."""
     cones = problem.cones
     free = np.isneginf(cones.lower) & np.isposinf(cones.upper)
     return bool(np.all(free | ((cones.lower == 0.0) & np.isposinf(cones.upper))))
 
 
 def find_direction(problem: Problem, deadline: Deadline) -> FloatArray | None:
-    """Find a direction y (m,) by a linear program, to be checked; None if a row has another bound than 0 below."""
-    if not _is_open(problem):
+    """Compute a direction y (m,) by a linear program; the caller checks it.
+
+    Returns
+    -------
+    (m,) or None
+        None if a row has a bound other than 0 below, a number is not finite, or the program has no solution.
+    """
+    if not _has_simple_bounds(problem):
         return None
-    from scipy.optimize import linprog  # 0.1 s to import, needed only here
+    from scipy.optimize import linprog  # The import takes 0.1 s and is only needed here.
 
     # max b.y, A^T y + R u <= 0 (= 0 on free rows), |A^T y| <= u on tangents, 0 <= y <= 1, in units of d.
     cones = problem.cones
@@ -270,19 +299,19 @@ def find_direction(problem: Problem, deadline: Deadline) -> FloatArray | None:
     level = sp.hstack([at[free], rim[free]]).tocsr()
     low = np.concatenate([np.where(free, -1.0, 0.0), np.zeros(rim.shape[1])])
     high = np.concatenate([np.where(tangent, 0.0, 1.0), np.full(rim.shape[1], np.inf)])
-    if problem.compliance is not None:  # y.A y = 0 has none of these
+    if problem.compliance is not None:  # y.A y = 0 requires y = 0 on rows with compliance.
         low[: problem.m][problem.compliance > 0.0] = high[: problem.m][problem.compliance > 0.0] = 0.0
     gain = np.concatenate([scale * problem.b, np.zeros(rim.shape[1])])
-    options: dict[str, Any] = {"maxiter": CERTIFICATE_STEPS * problem.m}
+    options: dict[str, Any] = {"maxiter": SIMPLEX_STEPS_PER_ROW * problem.m}
     if deadline.is_set:
         options["time_limit"] = deadline.remaining(1e-3)
-    found = linprog(
+    result = linprog(
         -gain, A_ub=above, b_ub=np.zeros(above.shape[0]), A_eq=level, b_eq=np.zeros(level.shape[0]),
         bounds=np.stack([low, high], 1), method="highs", options=options,
     )  # fmt: skip
-    if found.x is None:
+    if result.x is None:
         return None
-    x = found.x[: problem.m]
+    x = result.x[: problem.m]
     y: FloatArray = np.where((x > 0.0) | free, x, 0.0) * scale
     return y
 
@@ -290,18 +319,18 @@ def find_direction(problem: Problem, deadline: Deadline) -> FloatArray | None:
 def check_infeasible(
     problem: Problem, claim: Claim, tol: float, deadline: Deadline
 ) -> tuple[Claim, bool, str]:
-    """Check the claim of another package's solver or a plug-in that a problem has no solution.
+    """Check the claim of another package's solver or of a plug-in that a problem has no solution.
 
-    If its certificate does not hold, `auto` looks for one.
+    If its certificate is not valid, `auto` searches for one.
 
     Returns
     -------
     Claim
-        With the certificate that `auto` found, if it found one.
+        The claim, with the certificate of `auto` if that found one.
     bool
-        Whether the certificate of this claim holds.
+        Whether the certificate of the returned claim is valid.
     str
-        Which solution `auto` found instead; empty without one.
+        Description of the solution that `auto` found instead, or empty.
     """
     if claim.certificate is not None and not prove(problem, claim.certificate, tol, deadline).reason:
         return claim, True, ""
@@ -309,12 +338,12 @@ def check_infeasible(
     if problem.m > CERTIFICATE_ROWS or (left is not None and left <= 0.0):
         return claim, False, ""
     solver, impulse = spec.load()(), problem.start()
-    found = solver.run(solver.prepare(problem), impulse, spec.max_iter, tol, left)
-    if found.status is Status.INTERRUPTED:
+    own_claim = solver.run(solver.prepare(problem), impulse, spec.max_iter, tol, left)
+    if own_claim.status is Status.INTERRUPTED:
         raise KeyboardInterrupt
-    if found.certificate is not None and not prove(problem, found.certificate, tol, deadline).reason:
-        words = f"{claim.message}; auto found the certificate".removeprefix("; ")
-        return replace(claim, certificate=found.certificate, message=words), True, ""
+    if own_claim.certificate is not None and not prove(problem, own_claim.certificate, tol, deadline).reason:
+        message = f"{claim.message}; auto found the certificate".removeprefix("; ")
+        return replace(claim, certificate=own_claim.certificate, message=message), True, ""
     relative = residual(problem, impulse, "float64").relative
-    words = f"auto found a solution to a relative residual of {relative:.1e}"
-    return claim, False, words if relative <= tol else ""
+    solution = f"auto found a solution to a relative residual of {relative:.1e}"
+    return claim, False, solution if relative <= tol else ""

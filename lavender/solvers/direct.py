@@ -2,21 +2,22 @@
 
     linear   A lambda = b by band, dense or sparse factorisation, then lambda <- lambda - A^-1 w (refinement)
     boxed    w = A lambda - b complementary to lower <= lambda <= upper: guess the set of free rows (all rows of a
-             narrow band, otherwise those that a few sweeps leave free), solve for them, exchange the rows of the
-             wrong sign, repeat (`lavender_ext/pivot/principal.pyx`)
-    singular the same on A + s D, s = 1e-10, around the last solution c: (A + s D) lambda = b + s D c. A fixed
-             point solves A itself (proximal point method). Once the set of free rows no longer changes, each pass is
-             one step of refinement: it multiplies the error along an eigenvector of eigenvalue sigma by
-             s / (s + sigma). On a problem without a solution the passes diverge along some y >= 0 with A y = 0,
-             b.y > 0, which is the certificate.
+             narrow band, otherwise the rows that are free after a few sweeps), solve for them, exchange the rows with
+             the wrong sign, repeat (`lavender_ext/pivot/principal.pyx`)
+    singular the same on A + s D, s = 1e-10, around the last solution c: (A + s D) lambda = b + s D c. A fixed point
+             solves A itself (proximal point method). Once the set of free rows no longer changes, each pass is one step
+             of refinement: it multiplies the error along an eigenvector of eigenvalue sigma by s / (s + sigma). If the
+             problem has no solution, the passes diverge along some y >= 0 with A y = 0 and b.y > 0, which is the
+             certificate.
 
 All of this runs in `lavender_ext/pivot/direct.pyx`.
 
-Positive definite A: finite and exact to rounding, for any `tol`. Singular positive semidefinite A: the message says so;
-if refinement does not reach rounding, the status is STALLED, with the best iterate. Linear systems that are asymmetric
-or indefinite are factored by LU with pivoting; if that is singular, an SVD gives the rank. Bounded rows with an
-asymmetric A are exchanged with LU: finite unless the exchanges cycle, which no decreasing energy excludes. Box friction
-becomes such rows (`polyhedral.py`); if its exchanges cycle, complementary pivots follow.
+For a positive definite A, the method is finite and exact to rounding, for any `tol`. A singular positive semidefinite A
+is reported in the message; if refinement does not reach rounding, the status is STALLED, with the best iterate. Linear
+systems that are asymmetric or indefinite are factored by LU with pivoting; if that is singular, an SVD gives the rank.
+Bounded rows with an asymmetric A are exchanged with LU: this is finite unless the exchanges cycle, which no decreasing
+energy excludes. Box friction is converted to such rows (`polyhedral.py`); if the exchanges cycle, complementary pivots
+follow.
 """
 
 from __future__ import annotations
@@ -28,32 +29,50 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray
 from lavender.base.deadline import Deadline
-from lavender.judge.certificates import MAX_POLISHED_SLACK, check_certificate
+from lavender.judge.certificates import MAX_POLISHED_SLACK as CERTIFICATE_TOLERANCE
+from lavender.judge.certificates import check_certificate
 from lavender.judge.residuals import MAX_EXCUSED_RESIDUAL, judge_impulse, store_result
 from lavender.judge.solution import Claim, Status, summed
 from lavender.problem import Problem
-from lavender.solvers.factors import SMALL_SIZE, GeneralFactor, PanelsLU
+from lavender.solvers.factors import MAX_COMPILED_FACTOR_ROWS, GeneralFactor, PanelsLU
 from lavender.solvers.pivoting import PivotState
 from lavender.solvers.registry import Solver, SolverSpec
-from lavender.solvers.setup_times import factored, over_rows
+from lavender.solvers.setup_times import first_solve_time, row_setup_time
 from lavender.solvers.small import DIRECT
 from lavender_ext.judge import measure
 from lavender_ext.pivot.direct import CIRCLES, PASSED, SPENT
 from lavender_ext.pivot.principal import INDEFINITE, SMALL, SOLVED, STUCK
 
-GOOD = 1e-13  # relative residual at which refinement ends, where the floor allows it
-BATCH = 32  # rounds between two checks of the clock and the residual
-OVER = (SOLVED, INDEFINITE, SPENT, CIRCLES)  # turns of the kernel that are the last
+REFINEMENT_RESIDUAL = (
+    1e-13  # Refinement ends at this relative residual, or at the round-off floor if that is larger.
+)
+ROUNDS_PER_CHECK = 32  # Rounds of exchanges between two checks of the clock and the residual.
+FINAL_CODES = (SOLVED, INDEFINITE, SPENT, CIRCLES)  # Codes of the kernel after which no round follows.
 
 
 @dataclass
 class DirectState:
-    """Factor of a linear system, or the rows of a boxed one; for one solve, which `run` continues."""
+    """State of one solve, which `run` continues.
+
+    Parameters
+    ----------
+    problem : Problem
+    pivot : PivotState, optional
+        Rows of a boxed or symmetric problem.
+    general : GeneralFactor or PanelsLU, optional
+        Factor of an asymmetric or indefinite linear system.
+    failed_factorisations : int
+        Factorisations before `general` that failed.
+    is_running : bool
+        Whether `run` was called.
+    note : str
+        Part of the message.
+    """
 
     problem: Problem
     pivot: PivotState | None = None
     general: GeneralFactor | PanelsLU | None = None
-    begun: int = 0  # factorisations before `general` that came to nothing
+    failed_factorisations: int = 0
     is_running: bool = False
     note: str = ""
 
@@ -62,11 +81,11 @@ class DirectState:
 class Direct(Solver):
     """Direct solution of linear systems and of boxed LCPs, positive semidefinite or asymmetric."""
 
-    patience: ClassVar[bool] = True  # to go on where pivoting on one shift is stuck
-    exact: ClassVar[bool] = True  # to rounding, whatever the tolerance
+    patience: ClassVar[bool] = True  # Continue if pivoting on one shift is stuck.
+    exact: ClassVar[bool] = True  # Solve to rounding, whatever the tolerance.
 
     def fallback(self) -> Solver:
-        """What follows where exchanges go round in circles on friction as bounded rows: one pivot after the other."""
+        """Return Lemke's method, which continues if exchanges cycle on friction written as bounded rows."""
         from lavender.solvers.lemke import Lemke
 
         return Lemke()
@@ -74,22 +93,22 @@ class Direct(Solver):
     needs_scipy = True
 
     def setup_time(self, problem: Problem) -> float:
-        """What `prepare` takes [s], as counted."""
-        return factored(problem) if problem.law == "linear" else over_rows(problem)
+        """Estimate the time of `prepare` [s]."""
+        return first_solve_time(problem) if problem.law == "linear" else row_setup_time(problem)
 
     def prepare(self, problem: Problem, like: PivotState | None = None) -> DirectState:
         linear = problem.law == "linear"
-        if linear and not problem.is_symmetric and problem.m > SMALL_SIZE:
-            return _unsymmetric(problem)
+        if linear and not problem.is_symmetric and problem.m > MAX_COMPILED_FACTOR_ROWS:
+            return _factor_asymmetric(problem)
         state = DirectState(problem, PivotState(problem, like))
         if linear and state.pivot is not None:
             outcome = state.pivot.rows.factor_all()
             if outcome == INDEFINITE:
-                return _general(problem, "A is indefinite")
+                return _factor_general(problem, "A is indefinite")
             if not problem.is_symmetric:
                 state.note = "A is not symmetric"
                 if outcome != SOLVED:
-                    return _general(problem, state.note)
+                    return _factor_general(problem, state.note)
         return state
 
     def update(self, state: DirectState, problem: Problem) -> DirectState:
@@ -114,30 +133,31 @@ class Direct(Solver):
             assert state.pivot is not None
             return run.pivoting(state.pivot)
         finally:
-            run.put_best()
+            run.store_best()
 
 
 @dataclass(frozen=True)
-class Enough(Direct):
-    """For calls by `auto` with free rows only: a solution that meets the tolerance is not refined."""
+class SufficientDirect(Direct):
+    """Direct solver for `auto` with only free rows: a solution that meets the tolerance is not refined."""
 
     exact: ClassVar[bool] = False
 
 
-@np.errstate(all="ignore")  # what overflows is judged
-def _unsymmetric(problem: Problem) -> DirectState:
-    """LU by panels where A has few entries, else with pivoting."""
+@np.errstate(all="ignore")  # Results that overflow are judged.
+def _factor_asymmetric(problem: Problem) -> DirectState:
+    """Factor an asymmetric A by panels if it is sparse and that succeeds, else by LU with pivoting."""
     why = "A is not symmetric"
-    if not PanelsLU.takes(problem):
-        return _general(problem, why)
+    if not PanelsLU.accepts(problem):
+        return _factor_general(problem, why)
     factor = PanelsLU(problem)
     if factor.usable:
         return DirectState(problem, general=factor, note=why)
-    return replace(_general(problem, f"{why}; LU by panels lost a pivot"), begun=1)
+    return replace(_factor_general(problem, f"{why}; LU by panels lost a pivot"), failed_factorisations=1)
 
 
-@np.errstate(all="ignore")  # what overflows is judged
-def _general(problem: Problem, why: str) -> DirectState:
+@np.errstate(all="ignore")  # Results that overflow are judged.
+def _factor_general(problem: Problem, why: str) -> DirectState:
+    """Factor A by LU that reveals the rank; `why` begins the message."""
     factor = GeneralFactor(problem)
     if not factor.usable:
         why += "; LU is singular and A too large for a decomposition that reveals its rank"
@@ -147,7 +167,7 @@ def _general(problem: Problem, why: str) -> DirectState:
 
 
 class _Run:
-    """One solve: the best judged iterate so far, and the work done."""
+    """One call of `run`: the best judged iterate so far, and the work done."""
 
     def __init__(
         self,
@@ -159,53 +179,57 @@ class _Run:
         solver: Direct,
     ) -> None:
         self.patient = solver.patience
-        # Relative residual that is good whatever the floor.
-        self.least = GOOD if solver.exact else max(GOOD, tol)
+        # A relative residual up to this value is sufficient, whatever the round-off floor is.
+        self.sufficient_residual = REFINEMENT_RESIDUAL if solver.exact else max(REFINEMENT_RESIDUAL, tol)
         self.state, self.problem, self.impulse = state, state.problem, impulse
         self.max_iter, self.tol = max_iter, tol
         self.deadline = deadline
-        self.kept: measure.Judged | None = None
-        self.late = False  # no round was begun, as it would have ended after the deadline
+        self.best_pass: measure.Judged | None = None
+        self.late = False  # No round was started, because it would have ended after the deadline.
         self.iterations = 0
         self.work: dict[str, int] = {}
-        self.told: dict[str, int] = {}  # what the rows did in the runs before
+        self.reported: dict[str, int] = {}  # Work of the rows in earlier runs.
         self.notes = [state.note] if state.note else []
 
     # -- judging ---------------------------------------------------------------------------------
 
     def judge(self, x: FloatArray) -> float:
-        """Relative residual of x, which must not change any more; the best becomes the result."""
-        found = judge_impulse(self.problem, x)
-        self.keep(found)
-        relative: float = found.relative
+        """Return the relative residual of x (m,), which must not change afterwards; the best x becomes the result."""
+        result = judge_impulse(self.problem, x)
+        self.offer(result)
+        relative: float = result.relative
         return relative
 
-    def keep(self, found: measure.Judged | None) -> None:
-        if found is not None and found.relative < self.best:
-            self.kept = found
+    def offer(self, result: measure.Judged | None) -> None:
+        """Store a judged iterate if it is the best so far."""
+        if result is not None and result.relative < self.best:
+            self.best_pass = result
 
     @property
     def best(self) -> float:
         """Relative residual of the best iterate."""
-        return np.inf if self.kept is None else self.kept.relative
+        return np.inf if self.best_pass is None else self.best_pass.relative
 
     @property
     def floor(self) -> float:
-        return 0.0 if self.kept is None else self.kept.roundoff_floor
+        """Round-off floor of the best iterate."""
+        return 0.0 if self.best_pass is None else self.best_pass.roundoff_floor
 
-    def put_best(self) -> None:
+    def store_best(self) -> None:
+        """Copy the best iterate to the impulse and remember its residual."""
         pivot = self.state.pivot
         if pivot is not None and pivot.rows.relative < self.best:
-            self.keep(pivot.rows.best)  # an error, or Ctrl-C, ended it between two rounds
-        if self.kept is not None:
-            self.impulse[:] = self.kept.impulse
-            store_result(self.problem, self.kept)
+            self.offer(pivot.rows.best)  # An error or Ctrl-C ended the run between two rounds.
+        if self.best_pass is not None:
+            self.impulse[:] = self.best_pass.impulse
+            store_result(self.problem, self.best_pass)
 
-    def good(self) -> bool:
-        return self.best <= max(self.least, min(self.floor, MAX_EXCUSED_RESIDUAL))
+    def is_good(self) -> bool:
+        """Return whether the best residual is sufficient or at the round-off floor."""
+        return self.best <= max(self.sufficient_residual, min(self.floor, MAX_EXCUSED_RESIDUAL))
 
-    def at_floor(self) -> bool:
-        return self.kept is not None and self.kept.above_floor <= self.tol
+    def is_at_floor(self) -> bool:
+        return self.best_pass is not None and self.best_pass.above_floor <= self.tol
 
     @property
     def out_of_time(self) -> bool:
@@ -213,37 +237,41 @@ class _Run:
         return self.late or (pivot is not None and pivot.rows.late) or self.deadline.passed()
 
     @property
-    def pivoted(self) -> dict[str, int]:
-        """What the rows did in this run."""
+    def pivot_work(self) -> dict[str, int]:
+        """Work of the rows in this run."""
         work = {} if self.state.pivot is None else self.state.pivot.rows.work
-        return {kind: n - self.told.get(kind, 0) for kind, n in work.items() if n > self.told.get(kind, 0)}
+        return {
+            kind: n - self.reported.get(kind, 0) for kind, n in work.items() if n > self.reported.get(kind, 0)
+        }
 
     def claim(self, status: Status, **more: Any) -> Claim:
+        """Return a claim with this status, the work and the notes."""
         state = self.state
-        work, form = self.work | self.pivoted, "LU" if state.pivot is None else state.pivot.form
+        work, form = self.work | self.pivot_work, "LU" if state.pivot is None else state.pivot.form
         return Claim(status, self.iterations, work, "; ".join(self.notes), form=form, **more)
 
     def verdict(self) -> Claim:
-        """What the best iterate deserves, when nothing is left to do."""
+        """Return the claim for the best iterate when no step remains."""
         if self.best <= self.tol:
             return self.claim(Status.CONVERGED)
-        if self.at_floor():
+        if self.is_at_floor():
             return self.claim(Status.ROUNDOFF_LIMIT)
         return self.claim(Status.STALLED)
 
     # -- linear systems that are not symmetric definite -------------------------------------------
 
-    @np.errstate(all="ignore")  # what overflows is judged
+    @np.errstate(all="ignore")  # Results that overflow are judged.
     def linear_general(self, factor: GeneralFactor | PanelsLU) -> Claim:
+        """Solve and refine a linear system with an LU factor; search for a certificate if A is singular."""
         problem = self.problem
         self.iterations = 1
-        self.work = {"factorisations": 1 + self.state.begun}
+        self.work = {"factorisations": 1 + self.state.failed_factorisations}
         if not factor.usable:
             return self.claim(Status.NUMERICAL_ERROR)
         singular = factor.rank < problem.m
         x = np.zeros(problem.m)
         if singular:
-            x = self.impulse if self.kept is None else self.kept.impulse
+            x = self.impulse if self.best_pass is None else self.best_pass.impulse
         w = np.empty(problem.m)
         previous = np.inf
         for k in range(8):
@@ -251,15 +279,15 @@ class _Run:
             x = x - factor.solve(w)
             relative = self.judge(x)
             self.work["refinements"] = k
-            if self.good() or not relative < 0.5 * previous:
+            if self.is_good() or not relative < 0.5 * previous:
                 break
             previous = relative
         if isinstance(factor, PanelsLU):
-            rounded = self.good() or self.at_floor()
+            rounded = self.is_good() or self.is_at_floor()
             if not rounded and not self.out_of_time:
                 return self.general(f"{self.notes[0]}; LU by panels did not refine")
-        elif not self.good() and singular:
-            # What least squares in the metric of D leaves of b is orthogonal to the range of A.
+        elif not self.is_good() and singular:
+            # The residual of least squares in the metric of D is orthogonal to the range of A.
             measure.slack(problem.csr_data, x, w)
             proof = self.certificate(-w / problem.csr_data.d) or self.certificate(factor.outside(problem.b))
             if proof is not None:
@@ -267,10 +295,10 @@ class _Run:
         return self.verdict()
 
     def general(self, why: str) -> Claim:
-        """A linear system by LU that tells the rank."""
-        before = self.work | self.pivoted
-        before.pop("rank", None)  # not a count: the claim's is of a decomposition
-        self.state = _general(self.problem, why)
+        """Solve a linear system again by LU that reveals the rank."""
+        before = self.work | self.pivot_work
+        before.pop("rank", None)  # The rank is not a count; the new decomposition gives it.
+        self.state = _factor_general(self.problem, why)
         self.notes = [self.state.note]
         assert isinstance(self.state.general, GeneralFactor)
         claim = self.linear_general(self.state.general)
@@ -278,67 +306,70 @@ class _Run:
 
     # -- symmetric A, and bounded rows -------------------------------------------------------------
 
-    @np.errstate(all="ignore")  # what overflows is judged
+    @np.errstate(all="ignore")  # Results that overflow are judged.
     def pivoting(self, pivot: PivotState) -> Claim:
-        """Turns of the kernel, on from where the last run of this state has stopped."""
+        """Run rounds of the kernel, continuing where the last run of this state stopped."""
         rows, before = pivot.rows, pivot.rows.n_rounds
         pivot.set_deadline(self.deadline)
         late = False
         if self.state.is_running:
-            self.told = rows.work
+            self.reported = rows.work
         else:
             late = pivot.too_late_to_sweep(self.deadline)
-            rows.begin(self.impulse, self.least, 0 if late else pivot.sweeps)
+            rows.begin(self.impulse, self.sufficient_residual, 0 if late else pivot.sweeps)
             self.state.is_running = True
         while True:
-            most = 0 if late else min(BATCH, self.max_iter - self.iterations)
-            code, self.late = pivot.advance(self.deadline, most)
+            max_rounds = 0 if late else min(ROUNDS_PER_CHECK, self.max_iter - self.iterations)
+            code, self.late = pivot.advance(self.deadline, max_rounds)
             self.iterations = rows.n_rounds - before
             if code == SMALL and rows.passes == 0:
                 self.note_singular(pivot, self.patient or pivot.symmetric)
             proof = self.certificate(rows.changed) if code in (PASSED, SPENT) else None
             if proof is not None:
                 return proof
-            if code in OVER or self.gives_up(code, rows.passes > 0 or not pivot.symmetric):
-                self.keep(rows.best)
+            if code in FINAL_CODES or self.must_give_up(code, rows.passes > 0 or not pivot.symmetric):
+                self.offer(rows.best)
                 return self.end(pivot, code)
             if self.iterations >= self.max_iter or self.out_of_time:
-                self.keep(rows.best)
+                self.offer(rows.best)
                 return self.out_of_budget()
 
-    def gives_up(self, code: int, is_shifted: bool) -> bool:
+    def must_give_up(self, code: int, is_shifted: bool) -> bool:
+        """Return whether the solver stops because it is not patient and pivoting makes no progress."""
         return not self.patient and (code == STUCK or (code == SMALL and is_shifted))
 
     def end(self, pivot: PivotState, code: int) -> Claim:
-        """What the rows deserve after the last turn."""
+        """Return the claim after the final code of the kernel."""
         if code == CIRCLES:
-            return self.circling()
+            return self.end_in_cycle()
         if self.problem.law != "linear":
             return self.indefinite(pivot.symmetric) if code == INDEFINITE else self.verdict()
-        met = self.best <= self.tol or self.at_floor() or self.out_of_time
+        met = self.best <= self.tol or self.is_at_floor() or self.out_of_time
         if code == SOLVED or (code == SPENT and pivot.symmetric and met):
             return self.verdict()
         return self.general("A is indefinite" if pivot.symmetric else "A is not symmetric")
 
-    def circling(self) -> Claim:
-        self.notes.append(
-            "exchanges go round in circles, and A is not symmetric: no energy to descend on; see lemke"
-        )
+    def end_in_cycle(self) -> Claim:
+        """Return the claim after exchanges that cycle."""
+        self.notes.append("the exchanges cycle, and A is not symmetric: no energy decreases; see lemke")
         if not self.best <= 1.0:
             self.judge(self.problem.start())
         return self.verdict()
 
     def out_of_budget(self) -> Claim:
+        """Return the claim after the last iteration or the deadline."""
         if not self.best <= 1.0:
             self.judge(self.problem.start())
         return self.claim(Status.TIME_LIMIT if self.iterations < self.max_iter else Status.MAX_ITERATIONS)
 
     def indefinite(self, symmetric: bool = True) -> Claim:
+        """Return the claim for bounded rows with an A that cannot be factored."""
         why = "A is indefinite" if symmetric else "A is not symmetric, and singular under every shift,"
         self.notes.append(f"{why} on the free rows: no solution by this method, see lemke")
         return self.claim(Status.NUMERICAL_ERROR)
 
     def note_singular(self, pivot: PivotState, shifted: bool) -> None:
+        """Add a note that A is singular, with its rank for linear systems."""
         if self.problem.law == "linear":
             rank = pivot.rank()
             self.notes.append(f"A is singular, rank {rank} of {self.problem.m}")
@@ -347,7 +378,7 @@ class _Run:
             self.notes.append("A is singular on the free rows" + ": shifted and refined" * shifted)
 
     def certificate(self, step: FloatArray) -> Claim | None:
-        """INFEASIBLE where `step`, cut to the directions the bounds allow, proves it."""
+        """Return an INFEASIBLE claim if `step` (m,), restricted to the directions that the bounds allow, proves it."""
         c = self.problem.cones
         y = np.where(np.isfinite(c.upper), np.minimum(step, 0.0), step)
         y = np.where(np.isfinite(c.lower), np.maximum(y, 0.0), y)
@@ -358,8 +389,8 @@ class _Run:
         y[np.abs(y) < 1e-13] = 0.0
         length = np.sqrt(self.problem.d)
         pull = self.problem.csr @ y if self.problem.is_symmetric else np.zeros(1)
-        if np.any(np.sign(y) * pull > MAX_POLISHED_SLACK * (length @ np.abs(y)) * length):
-            return None  # an impulse without an end meets b.y there, beyond what a solver rounds
+        if np.any(np.sign(y) * pull > CERTIFICATE_TOLERANCE * (length @ np.abs(y)) * length):
+            return None  # An unbounded impulse along y meets b.y, up to more than rounding.
         if check_certificate(self.problem, y, self.tol, self.deadline) is not None:
             return None
         self.notes.append("no impulse meets every row: certificate found")

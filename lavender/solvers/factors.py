@@ -1,13 +1,13 @@
-"""Factorisations: which one a matrix gets under `direct`, and one interface over them, `factor` and `solve`.
+"""Factorisations of `direct`: selection by the matrix, and a common interface with `factor` and `solve`.
 
-    band     LDL^T by diagonals in compiled code (small matrices, and any of small bandwidth)
+    band     LDL^T by diagonals in compiled code (small matrices, and matrices of small bandwidth)
     dense    Cholesky of a full matrix
-    sparse   Cholesky by dense panels of a permuted matrix, in compiled code as well (`lavender_ext/factor/sparse.pyx`)
-    general  LU where A is not symmetric definite: with pivoting (LAPACK getrf, or SuperLU; compiled for few rows), or
-             first by such panels, rows exchanged inside each, where A has few entries and theirs a symmetric pattern
+    sparse   Cholesky by dense panels of a permuted matrix, in compiled code (`lavender_ext/factor/sparse.pyx`)
+    general  LU if A is not symmetric positive definite: with pivoting (LAPACK getrf, or SuperLU; compiled for few
+             rows), or first by panels with row exchanges inside each panel if A is sparse with a symmetric pattern
 
-A pivot of at most 1e-13 d_i counts as zero: some hundred roundings of A_ii, and below what a mass ratio of
-1e8 leaves.
+A pivot of at most 1e-13 d_i counts as zero: this is some hundred roundings of A_ii, and less than the pivots of a mass
+ratio of 1e8.
 """
 
 from __future__ import annotations
@@ -25,68 +25,73 @@ from lavender.problem import Problem
 from lavender.solvers.setup_times import dense_work
 from lavender_ext.factor.sparse import FullCholesky, SparsePanels, free_part, is_mirrored
 
-TINY = 1e-13  # -, of d
-SMALL_SIZE = 64  # rows up to which factors stay in the compiled loop, and beat those that Python hands it
-SMALL_BAND = 40  # half bandwidth up to which it beats the others
-DENSE_SHARE = 0.1  # of nonzeros, from which dense Cholesky beats sparse
-PANELS_SHARE = 0.25  # of nonzeros, up to which panels are looked at for a linear system
-# ns: of a compiled band for each row and square of its width; of a full Cholesky a call, and for each multiply-add and
-# entry (LAPACK's on one thread, 0.7 to 1 of ours); of panels, their analysis included, a call, and for each nonzero of
-# A, as many times more as it has some thousand rows.
-BAND, FULL, DENSE, DENSE_ENTRY = 0.4, 20e3, 0.03, 3.0
-PANELS, PANELS_ENTRY, PANELS_ROWS = 20e3, 17.0, 8000.0
-PANELS_WORK = 0.2  # ns a multiply-add of panels, once these are counted
-DENSE_LIMIT = 6000  # rows, 288 MB
-WIDE = os.environ.get("LAVENDER_BASELINE", "0") in ("", "0")  # four lanes where there are: the same bits
-GENERAL_LIMIT = 2000  # rows up to which a singular matrix that is not symmetric is decomposed as a dense one
+PIVOT_TOLERANCE = 1e-13  # Pivots of at most this multiple of d_i count as zero [-].
+# Up to this many rows, factors are computed in the compiled loop, which is faster than factors by Python.
+MAX_COMPILED_FACTOR_ROWS = 64
+MAX_COMPILED_BAND = 40  # Largest half bandwidth for which the compiled band factor is the fastest.
+MIN_DENSE_FRACTION = 0.1  # From this fraction of nonzeros, dense Cholesky is faster than sparse.
+MAX_PANELS_FRACTION = 0.25  # Up to this fraction of nonzeros, panels are considered for a linear system.
+# Costs [ns]: of a compiled band, per row and square of its width; of a full Cholesky, per call, multiply-add and entry
+# (LAPACK on one thread takes 0.7 to 1 times as long); of panels with their analysis, per call and per nonzero of A,
+# which grows by 1 + rows / PANELS_GROWTH_ROWS.
+BAND_WORK_COST, DENSE_CALL_COST, DENSE_WORK_COST, DENSE_ENTRY_COST = 0.4, 20e3, 0.03, 3.0
+PANELS_CALL_COST, PANELS_ENTRY_COST, PANELS_GROWTH_ROWS = 20e3, 17.0, 8000.0
+PANELS_WORK_COST = 0.2  # Cost [ns] per multiply-add of panels, after their analysis.
+MAX_DENSE_ROWS = 6000  # Largest dense matrix: 288 MB.
+# Use vectors of four numbers if the processor has them; the bits are the same.
+USE_WIDE_LANES = os.environ.get("LAVENDER_BASELINE", "0") in ("", "0")
+MAX_DENSE_RANK_ROWS = (
+    2000  # Up to this many rows, the rank of a singular asymmetric matrix is computed densely.
+)
 
 
-def choose(problem: Problem) -> tuple[str, int, IntArray | None]:
-    """Factorisation, half bandwidth and order of elimination (None: as given) for a symmetric A; by structure alone."""
-    kept: tuple[str, int, IntArray | None] | None = problem.derived.cache.get(__name__)
-    if kept is None:
-        kept = problem.derived.cache[__name__] = _choose(problem)
-    return kept
+def choose_factorisation(problem: Problem) -> tuple[str, int, IntArray | None]:
+    """Return factorisation, half bandwidth and elimination order (None: as given) of a symmetric A by its structure."""
+    choice: tuple[str, int, IntArray | None] | None = problem.derived.cache.get(__name__)
+    if choice is None:
+        choice = problem.derived.cache[__name__] = _choose(problem)
+    return choice
 
 
 def _choose(problem: Problem) -> tuple[str, int, IntArray | None]:
+    """Compute the choice of `choose_factorisation`."""
     m = problem.m
     band = max(problem.bandwidth)
-    if m <= SMALL_SIZE:
+    if m <= MAX_COMPILED_FACTOR_ROWS:
         return "band", band, None
     nnz = len(problem._compressed[1])
-    if problem.law == "linear" and nnz <= PANELS_SHARE * m * m:
-        # One factor: by what it costs.
-        narrow = BAND * m * float(band + 1) ** 2
-        full = FULL + dense_cost(m)
-        if panels_cost(nnz, m) < min(narrow, full if m <= DENSE_LIMIT else np.inf):
+    if problem.law == "linear" and nnz <= MAX_PANELS_FRACTION * m * m:
+        # Only one factor is needed: the cheapest one is chosen.
+        narrow = BAND_WORK_COST * m * float(band + 1) ** 2
+        full = DENSE_CALL_COST + dense_cost(m)
+        if panels_cost(nnz, m) < min(narrow, full if m <= MAX_DENSE_ROWS else np.inf):
             return "sparse", m - 1, None
         return ("band", band, None) if narrow <= full else ("dense", m - 1, None)
-    if band <= SMALL_BAND:
+    if band <= MAX_COMPILED_BAND:
         return "band", band, None
-    if nnz >= DENSE_SHARE * m * m and m <= DENSE_LIMIT:
+    if nnz >= MIN_DENSE_FRACTION * m * m and m <= MAX_DENSE_ROWS:
         return "dense", m - 1, None
-    # A band has at most 2 band + 1 nonzeros a row: a row of more is in none so narrow.
-    if np.diff(problem._compressed[0]).max() <= 2 * SMALL_BAND + 1:
+    # A row of a narrow band has at most 2 band + 1 nonzeros.
+    if np.diff(problem._compressed[0]).max() <= 2 * MAX_COMPILED_BAND + 1:
         order = narrow_order(problem)
         band = permuted_band(problem, order)
-        if band <= SMALL_BAND:
+        if band <= MAX_COMPILED_BAND:
             return "band", band, order
     return "sparse", m - 1, None
 
 
 def dense_cost(m: int) -> float:
-    """Of one full Cholesky factor of m rows [ns], without the call."""
-    return DENSE * dense_work(m) + DENSE_ENTRY * float(m) ** 2
+    """Return the cost of one full Cholesky factor of m rows [ns], without the call."""
+    return DENSE_WORK_COST * dense_work(m) + DENSE_ENTRY_COST * float(m) ** 2
 
 
 def panels_cost(nnz: int, m: int) -> float:
-    """Of one factor by panels [ns], of a symmetric matrix of m rows and nnz entries."""
-    return PANELS + PANELS_ENTRY * nnz * (1.0 + m / PANELS_ROWS)
+    """Return the cost of one factor by panels [ns] of a symmetric matrix of m rows and nnz entries."""
+    return PANELS_CALL_COST + PANELS_ENTRY_COST * nnz * (1.0 + m / PANELS_GROWTH_ROWS)
 
 
 def narrow_order(problem: Problem) -> IntArray:
-    """Rows of A in an order of small bandwidth: reverse Cuthill-McKee."""
+    """Return an order of the rows of A with small bandwidth: reverse Cuthill-McKee."""
     from scipy.sparse.csgraph import reverse_cuthill_mckee
 
     order = reverse_cuthill_mckee(problem.csr, symmetric_mode=problem.is_symmetric)
@@ -94,19 +99,22 @@ def narrow_order(problem: Problem) -> IntArray:
 
 
 def permuted_band(problem: Problem, order: IntArray) -> int:
-    """Half bandwidth of A with its rows in that order."""
-    place = np.empty(problem.m, np.int64)
-    place[order] = np.arange(problem.m)
+    """Return the half bandwidth of A with its rows in that order."""
+    position = np.empty(problem.m, np.int64)
+    position[order] = np.arange(problem.m)
     a = problem.csr
-    row = np.repeat(place, np.diff(a.indptr))
-    return int(np.abs(row - place[a.indices]).max(initial=0))
+    row = np.repeat(position, np.diff(a.indptr))
+    return int(np.abs(row - position[a.indices]).max(initial=0))
 
 
 class Factor(Protocol):
-    """Factorisation of A_FF + shift D_FF for changing free sets."""
+    """Interface of a factorisation of A_FF + shift D_FF for changing free sets F."""
 
     def factor(self, place: IntArray, n_free: int, shift: float) -> int:
-        """Factor the rows with place >= 0, one at least, in order of rows; how many pivots are not above TINY d."""
+        """Factor the rows with place >= 0, in order; return how many pivots are not above PIVOT_TOLERANCE d.
+
+        There must be at least one such row.
+        """
         ...
 
     def solve(self, rhs: FloatArray) -> FloatArray:
@@ -115,7 +123,7 @@ class Factor(Protocol):
 
 
 class DenseFactor:
-    """Cholesky, A = L L^T."""
+    """Dense Cholesky factor, A = L L^T."""
 
     def __init__(self, problem: Problem) -> None:
         self.a = problem.dense()
@@ -127,7 +135,7 @@ class DenseFactor:
         d = self.d[free]
         if shift > 0.0:
             a.flat[:: n_free + 1] += shift * d
-        self.full = FullCholesky(a, TINY * d, WIDE)
+        self.full = FullCholesky(a, PIVOT_TOLERANCE * d, USE_WIDE_LANES)
         return self.full.lost
 
     def solve(self, rhs: FloatArray) -> FloatArray:
@@ -135,19 +143,19 @@ class DenseFactor:
 
 
 class Panels:
-    """Factors of matrices of one symmetric pattern, L L^T and L U in one order, which is found at first use."""
+    """Factors L L^T and L U of matrices of one symmetric pattern, in one order, which is computed at the first use."""
 
     def __init__(self, indptr: IntArray, indices: IntArray) -> None:
-        self.pattern, self.made = (indptr, indices), dict[bool, SparsePanels]()
+        self.pattern, self.analyses = (indptr, indices), dict[bool, SparsePanels]()
 
     def analysed(self, lu: bool) -> SparsePanels:
-        """What factors and solves, with its multiply-adds as `work`; no number is looked at."""
-        if lu not in self.made:
-            self.made[lu] = SparsePanels(*self.pattern, lu, WIDE, self.made.get(not lu))
-        return self.made[lu]
+        """Return the analysed panels of L U or L L^T, with their multiply-adds as `work`; numbers are not read."""
+        if lu not in self.analyses:
+            self.analyses[lu] = SparsePanels(*self.pattern, lu, USE_WIDE_LANES, self.analyses.get(not lu))
+        return self.analyses[lu]
 
     def work(self, lu: bool = False) -> float:
-        """Multiply-adds of one factor, inf where it has more entries than can be counted."""
+        """Return the multiply-adds of one factor; inf if it has more entries than can be counted."""
         try:
             return float(self.analysed(lu).work)
         except OverflowError:
@@ -155,38 +163,38 @@ class Panels:
 
 
 class SparseFactor:
-    """Cholesky by panels, in an order of least degree."""
+    """Cholesky factor by panels, in an order of minimum degree."""
 
     def __init__(self, problem: Problem) -> None:
         self.d = problem.csr_data.d
         self.m = problem.m
-        self.pattern = rows_of(mirrored(problem.csr))
-        self.whole = Panels(*self.pattern[:2])
+        self.pattern = rows_of(mirror_pattern(problem.csr))
+        self.full_panels = Panels(*self.pattern[:2])
 
     def factor(self, place: IntArray, n_free: int, shift: float) -> int:
         indptr, indices, data = self.pattern
         if n_free == self.m:
-            self.panels, d = self.whole.analysed(False), self.d
+            self.panels, d = self.full_panels.analysed(False), self.d
         else:
             indptr, indices, data = free_part(indptr, indices, data, place, n_free)
-            self.panels, d = SparsePanels(indptr, indices, False, WIDE), self.d[place >= 0]
-        return self.panels.factor(data, d, shift, TINY)
+            self.panels, d = SparsePanels(indptr, indices, False, USE_WIDE_LANES), self.d[place >= 0]
+        return self.panels.factor(data, d, shift, PIVOT_TOLERANCE)
 
     def solve(self, rhs: FloatArray) -> FloatArray:
         return self.panels.solve(rhs)
 
 
-def mirrored(matrix: sp.csr_array) -> sp.csr_array:
-    """The same in sorted rows, with an entry, if only 0, at (j, i) wherever there is one at (i, j)."""
+def mirror_pattern(matrix: sp.csr_array) -> sp.csr_array:
+    """Return the matrix with sorted rows and a symmetric pattern: entries of 0 are added if necessary."""
     if is_mirrored(*rows_of(matrix)[:2]):
         return matrix
     a = sp.coo_array(matrix)
-    where = (np.concatenate([a.row, a.col]), np.concatenate([a.col, a.row]))
-    return sp.csr_array((np.concatenate([a.data, np.zeros(a.nnz)]), where), shape=a.shape)
+    positions = (np.concatenate([a.row, a.col]), np.concatenate([a.col, a.row]))
+    return sp.csr_array((np.concatenate([a.data, np.zeros(a.nnz)]), positions), shape=a.shape)
 
 
 def rows_of(matrix: Any) -> tuple[Any, Any, Any]:
-    """(ptr, index, value) of sorted rows, as the kernels read them."""
+    """Return (ptr, index, value) of the sorted rows in the types of the kernels."""
     matrix.sort_indices()
     value = np.ascontiguousarray(matrix.data if matrix.nnz else np.zeros(1), np.float64)
     index = np.ascontiguousarray(matrix.indices if matrix.nnz else np.zeros(1), np.int32)
@@ -194,13 +202,13 @@ def rows_of(matrix: Any) -> tuple[Any, Any, Any]:
 
 
 def _scaled(problem: Problem) -> tuple[FloatArray, sp.csr_array]:
-    """D^-1/2 (m,), and D^-1/2 A D^-1/2."""
+    """Return D^-1/2 (m,) and D^-1/2 A D^-1/2."""
     scale = 1.0 / np.sqrt(problem.csr_data.d)
     return scale, sp.csr_array(sp.diags_array(scale) @ problem.csr @ sp.diags_array(scale))
 
 
 def _superlu(a: sp.csc_array) -> tuple[Any, FloatArray]:
-    """LU with pivoting and the sizes of its pivots; one of 0 alone where it is exactly singular."""
+    """Return LU with pivoting and the magnitudes of its pivots; (None, [0]) if the matrix is exactly singular."""
     try:
         lu = sparse_lu(a)
         return lu, np.abs(lu.U.diagonal())
@@ -209,12 +217,12 @@ def _superlu(a: sp.csc_array) -> tuple[Any, FloatArray]:
 
 
 class LUFactor:
-    """LU of D^-1/2 A_FF D^-1/2, of an A that is not symmetric."""
+    """LU factor of D^-1/2 A_FF D^-1/2 for an asymmetric A."""
 
     def __init__(self, problem: Problem) -> None:
         m = problem.m
         self.scale, scaled = _scaled(problem)
-        self.sparse = problem.csr.nnz < DENSE_SHARE * m * m or m > DENSE_LIMIT
+        self.sparse = problem.csr.nnz < MIN_DENSE_FRACTION * m * m or m > MAX_DENSE_ROWS
         self.a: Any = scaled if self.sparse else scaled.toarray()
         if self.sparse:
             import_numerics("scipy.sparse.linalg")
@@ -230,14 +238,14 @@ class LUFactor:
         self.lu: Any = (lu, pivot)
         if info != 0:
             return n_free
-        return int(np.count_nonzero(~(np.abs(np.diagonal(lu)) > TINY)))
+        return int(np.count_nonzero(~(np.abs(np.diagonal(lu)) > PIVOT_TOLERANCE)))
 
     def _factor_sparse(self, shift: float) -> int:
         a = sp.csc_array(self.a[self.free][:, self.free])
         if shift > 0.0:
             a = sp.csc_array(a + shift * sp.eye_array(len(self.free)))
         self.lu, pivot = _superlu(a)
-        return len(self.free) if self.lu is None else int(np.count_nonzero(~(pivot > TINY)))
+        return len(self.free) if self.lu is None else int(np.count_nonzero(~(pivot > PIVOT_TOLERANCE)))
 
     def solve(self, rhs: FloatArray) -> FloatArray:
         scale = self.scale[self.free]
@@ -247,37 +255,37 @@ class LUFactor:
 
 
 class PanelsLU:
-    """LU of D^-1/2 A D^-1/2 by panels: what pivoting across them would have saved, refinement has to end.
+    """LU factor of D^-1/2 A D^-1/2 by panels. Refinement replaces the missing pivoting across panels.
 
     Attributes
     ----------
     usable : bool
-        No pivot is lost to rounding.
+        Whether no pivot is lost to rounding.
     """
 
     def __init__(self, problem: Problem) -> None:
         indptr, indices, data = problem._compressed
-        self.panels = SparsePanels(indptr, indices, True, WIDE)
+        self.panels = SparsePanels(indptr, indices, True, USE_WIDE_LANES)
         self.rank = problem.m
-        self.usable = self.panels.factor(data, problem.csr_data.d, 0.0, TINY) == 0
+        self.usable = self.panels.factor(data, problem.csr_data.d, 0.0, PIVOT_TOLERANCE) == 0
 
     @staticmethod
-    def takes(problem: Problem) -> bool:
-        """Few entries, and (i, j) is one wherever (j, i) is."""
+    def accepts(problem: Problem) -> bool:
+        """Return whether A is sparse with a symmetric pattern."""
         indptr, indices, _ = problem._compressed
-        return len(indices) <= PANELS_SHARE * problem.m**2 and is_mirrored(indptr, indices)
+        return len(indices) <= MAX_PANELS_FRACTION * problem.m**2 and is_mirrored(indptr, indices)
 
     def solve(self, rhs: FloatArray) -> FloatArray:
         return self.panels.solve(rhs)
 
 
 class GeneralFactor:
-    """LU of A scaled to D^-1/2 A D^-1/2, with a rank-revealing path where that is singular.
+    """LU factor of D^-1/2 A D^-1/2, with a singular value decomposition if that is singular.
 
     Attributes
     ----------
     rank : int
-        m, or the rank found by QR with column pivoting; -1 where A is singular and too large for that.
+        m, or the rank from the decomposition; -1 if A is singular and too large for it.
     """
 
     def __init__(self, problem: Problem) -> None:
@@ -285,7 +293,7 @@ class GeneralFactor:
         self.scale, scaled = _scaled(problem)
         self.lu: Any = None
         self.dense: FloatArray | None = None
-        if problem.csr.nnz >= DENSE_SHARE * m * m or m <= SMALL_SIZE:
+        if problem.csr.nnz >= MIN_DENSE_FRACTION * m * m or m <= MAX_COMPILED_FACTOR_ROWS:
             self._factor_dense(scaled.toarray())
         else:
             self._factor_sparse(sp.csc_array(scaled))
@@ -294,37 +302,40 @@ class GeneralFactor:
         lu, pivot, info = lapack.dgetrf(a)
         norm = np.abs(a).sum(axis=0).max(initial=0.0)
         rcond = lapack.dgecon(lu, norm)[0] if info == 0 and len(a) else float(len(a) == 0)
-        if rcond <= TINY * max(1, len(a)) / 10.0:
+        if rcond <= PIVOT_TOLERANCE * max(1, len(a)) / 10.0:
             self._reveal(a)
         else:
             self.lu = (lu, pivot)
 
     def _factor_sparse(self, a: sp.csc_array) -> None:
         self.lu, pivot = _superlu(a)
-        if pivot.min(initial=np.inf) > TINY * max(1.0, pivot.max(initial=0.0)):
+        if pivot.min(initial=np.inf) > PIVOT_TOLERANCE * max(1.0, pivot.max(initial=0.0)):
             return
         self.lu = None
-        if a.shape[0] <= GENERAL_LIMIT:
+        if a.shape[0] <= MAX_DENSE_RANK_ROWS:
             self._reveal(a.toarray())
         else:
             self.rank = -1
 
     def _reveal(self, a: FloatArray) -> None:
-        # A P = Q R; the rank is where |R_ii| falls to rounding. Least squares of least norm in the metric of D.
+        """Decompose a singular A: rank, and least squares of minimum norm in the metric of D."""
         self.dense = a
         u, s, vt = np.linalg.svd(a)
-        self.rank = int(np.count_nonzero(s > len(a) * TINY / 10.0 * s[0])) if len(s) and s[0] > 0.0 else 0
+        self.rank = (
+            int(np.count_nonzero(s > len(a) * PIVOT_TOLERANCE / 10.0 * s[0])) if len(s) and s[0] > 0.0 else 0
+        )
         self.svd = (u[:, : self.rank], s[: self.rank], vt[: self.rank])
         self.null = u[:, self.rank :]
 
     def outside(self, rhs: FloatArray) -> FloatArray:
-        """The part y of D^-1 rhs with A^T y = 0, from the left singular vectors; 0 where they are not known."""
+        """Return the part y of D^-1 rhs with A^T y = 0, from the left singular vectors; 0 if they are not known."""
         if self.dense is None:
             return np.zeros_like(rhs)
         return self.scale * (self.null @ (self.null.T @ (self.scale * rhs)))
 
     @property
     def usable(self) -> bool:
+        """Whether a factor exists."""
         return self.lu is not None or self.dense is not None
 
     def solve(self, rhs: FloatArray) -> FloatArray:

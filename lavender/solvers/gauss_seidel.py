@@ -10,7 +10,7 @@ from lavender.solvers.sor import SOR
 
 @dataclass(frozen=True)
 class GaussSeidel(SOR):
-    """Gauss-Seidel; `order`, `ground`, `seed` as in `lavender.problem.ordering`."""
+    """Gauss-Seidel; `order`, `ground` and `seed` as in `lavender.problem.ordering`."""
 
     omega: float = field(default=1.0, init=False)
 

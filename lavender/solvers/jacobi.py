@@ -15,13 +15,13 @@ from lavender.base.arrays import check_float
 from lavender.problem import Problem
 from lavender.problem.ordering import block_order
 from lavender.solvers.registry import SolverSpec
-from lavender.solvers.setup_times import summed
-from lavender.solvers.sweeping import SweepState, Swept, plan_of
+from lavender.solvers.setup_times import row_sums_time
+from lavender.solvers.sweeping import SweepSolver, SweepState, plan_of
 from lavender_ext.sweep import serial
 
 
 @dataclass(frozen=True)
-class Jacobi(Swept):
+class Jacobi(SweepSolver):
     """Damped (projected) Jacobi.
 
     Parameters
@@ -37,8 +37,8 @@ class Jacobi(Swept):
             check_float("omega", self.omega, above=0.0)
 
     def setup_time(self, problem: Problem) -> float:
-        """What `prepare` takes [s], as counted."""
-        return summed(problem)
+        """Estimate the time of `prepare` [s]."""
+        return row_sums_time(problem)
 
     def prepare(self, problem: Problem) -> SweepState:
         data, order = problem.csr_data, block_order(problem)

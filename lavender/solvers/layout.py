@@ -1,7 +1,7 @@
-"""A problem with rows copied in sweep order, so that a sweep reads memory from front to back.
+"""Copy a problem with its rows in sweep order, so that a sweep reads memory from front to back.
 
-Blocks are in the order of the sweep, and bodies are numbered by `ordering.body_ranks`. A block reads the same
-values, so the impulses have the same bits; only sums over all rows have another order.
+Blocks are in the order of the sweep, and bodies are numbered by `ordering.body_ranks`. A block reads the same values,
+so the impulses have the same bits; only sums over all rows have another order.
 """
 
 from __future__ import annotations
@@ -17,41 +17,52 @@ from lavender.problem.ordering import Order, body_ranks
 from lavender_ext.core.blocks import Blocks
 from lavender_ext.core.problem import Data
 
-# Contacts from which the copy pays: their arrays exceed the second-level cache (measured: 1.0 to 1.1 times as
-# fast at 10,000, twice at 100,000).
-LARGE = 8_000
+# From this many contacts, the copy is faster, because the arrays exceed the second-level cache (measured: 1.0 to 1.1
+# times as fast at 10,000 contacts, twice as fast at 100,000).
+MIN_CONTACTS_FOR_COPY = 8_000
 
 
 @dataclass(frozen=True)
 class Layout:
-    """The problem in sweep order, and where its rows came from."""
+    """A problem in sweep order, with the permutation of its rows and bodies.
 
-    data: Any  # lavender_ext.core.problem.Data
-    rows: np.ndarray  # (m,) intp, row of the problem at each place
-    place: np.ndarray  # (m,) intp, place of each row
-    rank: IntArray  # (n,) place of each body
+    Parameters
+    ----------
+    data : lavender_ext.core.problem.Data
+    rows : (m,) intp
+        Row of the problem at each position.
+    position : (m,) intp
+        Position of each row.
+    rank : (n,) int32
+        Position of each body.
+    """
 
-    def take(self, impulse: FloatArray) -> FloatArray:
-        """Impulse (m,) in sweep order; a new array."""
+    data: Any
+    rows: np.ndarray
+    position: np.ndarray
+    rank: IntArray
+
+    def to_sweep_order(self, impulse: FloatArray) -> FloatArray:
+        """Return an impulse (m,) in sweep order as a new array."""
         return np.take(impulse, self.rows, mode="clip")
 
-    def put(self, laid: FloatArray, impulse: FloatArray) -> None:
-        """Impulse (m,) of sweep order into the problem's order."""
-        np.take(laid, self.place, out=impulse, mode="clip")
+    def from_sweep_order(self, sweep_impulse: FloatArray, impulse: FloatArray) -> None:
+        """Copy an impulse (m,) in sweep order to `impulse` (m,) in the problem's order."""
+        np.take(sweep_impulse, self.position, out=impulse, mode="clip")
 
 
-def pays(problem: Problem, order: Order) -> bool:
-    """Whether the copy pays: a large problem, swept in a fixed order that is not its own, joints first."""
+def copy_pays(problem: Problem, order: Order) -> bool:
+    """Return whether the copy is faster: a large problem with a fixed order other than its own, joints first."""
     rows = problem.rows
-    if rows is None or order.is_given or not order.is_fixed or rows.n_contacts < LARGE:
+    if rows is None or order.is_given or not order.is_fixed or rows.n_contacts < MIN_CONTACTS_FOR_COPY:
         return False
     return bool(np.all(order.blocks[: rows.n_joints] < rows.n_joints))
 
 
-def lay_out(problem: Problem, blocks: IntArray, before: Layout | None = None) -> Layout:
-    """`problem` with its blocks in the order `blocks` (k,), joints first.
+def copy_in_order(problem: Problem, blocks: IntArray, before: Layout | None = None) -> Layout:
+    """Copy `problem` with its blocks in the order `blocks` (k,), joints first.
 
-    `before`: of a problem of the same structure, in the same order.
+    `before` is the layout of a problem of the same structure in the same order, whose permutations are reused.
     """
     r, c = problem.rows, problem.cones
     assert r is not None
@@ -62,27 +73,30 @@ def lay_out(problem: Problem, blocks: IntArray, before: Layout | None = None) ->
     np.cumsum(size, out=ptr[1:])
     if before is None:
         rows = np.arange(problem.m) + np.repeat(c.ptr[blocks] - ptr[:-1], size)
-        place = np.empty(problem.m, np.intp)
-        place[rows] = np.arange(problem.m)
+        position = np.empty(problem.m, np.intp)
+        position[rows] = np.arange(problem.m)
         ranks = body_ranks(problem)
     else:
-        rows, place, ranks = before.rows, before.place, before.rank
+        rows, position, ranks = before.rows, before.position, before.rank
     joint, contact = blocks[:kj], blocks[kj:] - kj
-    rank = np.append(ranks, np.int32(-1))  # a static body, -1, stays -1
+    rank = np.append(ranks, np.int32(-1))  # A static body, -1, stays -1.
     body = np.argsort(rank[:-1])
-    given = _apart(
+    arrays = _copy_to_separate_pages(
         *c._take_blocks(blocks)._blocks.arrays, problem.b[rows],
         r.jac[rows[:mj]], rank[r.joint_body[joint]], r.normal[contact], r.tangent[contact], r.arm_a[contact],
         r.arm_b[contact], rank[r.contact_body[contact]], r.inv_mass[body], r.inv_inertia[body],
         problem.compliance[rows],
     )  # fmt: skip
-    data = Data(Blocks(*given[:7]), given[7], FRICTION_LAWS.index(problem.friction), rows=tuple(given[8:]))
-    return Layout(data, rows, place, ranks)
+    data = Data(Blocks(*arrays[:7]), arrays[7], FRICTION_LAWS.index(problem.friction), rows=tuple(arrays[8:]))
+    return Layout(data, rows, position, ranks)
 
 
-def _apart(*arrays: np.ndarray) -> list[np.ndarray]:
-    # Large arrays begin on a page each. A sweep reads them side by side: at the same place of a page they would
-    # share a few sets of the first-level cache (measured: apart 3 to 12 % faster at 100,000 contacts).
+def _copy_to_separate_pages(*arrays: np.ndarray) -> list[np.ndarray]:
+    """Copy arrays to different offsets from a page boundary.
+
+    A sweep reads the arrays in parallel. Large arrays begin on a page boundary; equal offsets would share a few sets of
+    the first-level cache (measured: separate offsets are 3 to 12 % faster at 100,000 contacts).
+    """
     out = []
     for i, array in enumerate(arrays):
         skip = 320 * i

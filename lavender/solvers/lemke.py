@@ -4,10 +4,10 @@
 
 The path ends at z = 0, a solution, or on a secondary ray. For copositive-plus M (which includes positive semidefinite
 M) a ray proves that there is no solution; its direction is the certificate, which is checked before INFEASIBLE is
-returned. All of it runs in `lavender_ext/pivot/lemke.pyx`, which also transforms bounded rows into nonnegative ones.
-If a path ends on a ray that proves nothing, or is lost to rounding, another covering vector c is tried. After each
-path the exchanges of `direct` solve for the free rows on A itself. Ties are broken lexicographically, which excludes
-cycles in exact arithmetic.
+returned. The method runs in `lavender_ext/pivot/lemke.pyx`, which also transforms bounded rows into nonnegative ones.
+If a path ends on a ray that proves nothing, or fails by rounding, another covering vector c is tried. After each path,
+the exchanges of `direct` solve for the free rows on A itself. Ties are broken lexicographically, which excludes cycles
+in exact arithmetic.
 """
 
 from __future__ import annotations
@@ -22,24 +22,25 @@ from lavender.judge.certificates import check_certificate
 from lavender.judge.residuals import store_result
 from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
-from lavender.solvers.certify import CERTIFICATE_ROWS, LINEAR_PROGRAM, find_direction
+from lavender.solvers.certify import CERTIFICATE_ROWS, MIN_LINEAR_PROGRAM_COST, find_direction
 from lavender.solvers.pivoting import PivotState
 from lavender.solvers.polyhedral import count_rows
 from lavender.solvers.registry import Solver, SolverSpec
-from lavender.solvers.setup_times import loading, over_rows
+from lavender.solvers.setup_times import loading_time, row_setup_time
 from lavender_ext.pivot import lemke
 from lavender_ext.pivot.lemke import DONE, LATE, RAY
 
 RAY_MESSAGE = (
-    "ended on a secondary ray: this method cannot go on, and a solution may exist (auto looks further)"
+    "ended on a secondary ray: this method cannot continue, but a solution may exist (auto tries others)"
 )
-LIMIT = 2000  # rows: a dictionary of 32 MB
-ENTRY = 1e-9  # s for each entry of the dictionary in a pivot
-LAID_OUT, ELIMINATED = 5e-8, 5e-10  # s for each of the first one; for each that a free row's pivot touches
+MAX_LEMKE_ROWS = 2000  # Largest number of rows: a dictionary of 32 MB.
+PIVOT_ENTRY_TIME = 1e-9  # Time [s] per entry of the dictionary in a pivot.
+# Time [s] per entry of the dictionary: to build it, and to eliminate one free row.
+DICTIONARY_ENTRY_TIME, ELIMINATION_ENTRY_TIME = 5e-8, 5e-10
 
 
 def _sizes(problem: Problem) -> tuple[int, int]:
-    """(rows of the dictionary, free rows)."""
+    """Return the number of rows of the dictionary and the number of free rows."""
     c = problem.cones
     low, high = np.isfinite(c.lower), np.isfinite(c.upper)
     return problem.m + int(np.count_nonzero(low & high)), int(np.count_nonzero(~low & ~high))
@@ -47,13 +48,13 @@ def _sizes(problem: Problem) -> tuple[int, int]:
 
 @dataclass(frozen=True)
 class Lemke(Solver):
-    """Lemke's complementary pivoting; no options."""
+    """Lemke's complementary pivoting, without options."""
 
     needs_scipy = True
 
     def setup_time(self, problem: Problem) -> float:
-        """What `prepare` takes [s], as counted."""
-        return over_rows(problem)
+        """Estimate the time of `prepare` [s]."""
+        return row_setup_time(problem)
 
     def prepare(self, problem: Problem) -> PivotState:
         return PivotState(problem)
@@ -73,7 +74,7 @@ class Lemke(Solver):
             return Claim(Status.MAX_ITERATIONS if state.problem.m else Status.CONVERGED, 0, {"pivots": 0})
         deadline = Deadline(time_limit)
         n, free = _sizes(state.problem)
-        if deadline.passed(LAID_OUT * n**2 + ELIMINATED * free * n**2):
+        if deadline.passed(DICTIONARY_ENTRY_TIME * n**2 + ELIMINATION_ENTRY_TIME * free * n**2):
             return Claim(
                 Status.TIME_LIMIT, 0, {"pivots": 0}, "the dictionary alone would take longer", form="dense"
             )
@@ -82,19 +83,19 @@ class Lemke(Solver):
         paths.begin(impulse)
         try:
             return self._follow(
-                state, paths, max_iter, tol, deadline, max(1, int(CHUNK_TIME / (ENTRY * n * n)))
+                state, paths, max_iter, tol, deadline, max(1, int(CHUNK_TIME / (PIVOT_ENTRY_TIME * n * n)))
             )
         finally:
             paths.judge()
-            found = state.rows.best
-            if found is not None:
-                impulse[:] = found.impulse
-                store_result(state.problem, found)
+            best = state.rows.best
+            if best is not None:
+                impulse[:] = best.impulse
+                store_result(state.problem, best)
 
     def _follow(
         self, state: PivotState, paths: lemke.Lemke, max_iter: int, tol: float, deadline: Deadline, chunk: int
     ) -> Claim:
-        """At most `max_iter` pivots, `chunk` of them between two checks of the clock."""
+        """Do at most `max_iter` pivots, `chunk` of them between two checks of the clock, and return the claim."""
         rows, message = state.rows, ""
         certificate: FloatArray | None = None
         while True:
@@ -131,24 +132,27 @@ class Lemke(Solver):
 
 def _certificate(problem: Problem, tol: float, deadline: Deadline) -> FloatArray | None:
     """Return a certificate (m,) of a linear program for a problem on which the method itself failed, or None."""
-    if problem.m > CERTIFICATE_ROWS or deadline.passed(1e-9 * LINEAR_PROGRAM + loading("scipy.optimize")):
+    if problem.m > CERTIFICATE_ROWS or deadline.passed(
+        1e-9 * MIN_LINEAR_PROGRAM_COST + loading_time("scipy.optimize")
+    ):
         return None
     y = find_direction(problem, deadline)
     return y if y is not None and check_certificate(problem, y, tol, deadline) is None else None
 
 
 def _direction(y: FloatArray) -> FloatArray | None:
-    """The direction y (m,) of a ray, its largest entry 1."""
+    """Return the direction y (m,) of a ray with its largest entry 1, or None if it is zero or not finite."""
     size = np.abs(y).max(initial=0.0)
     return y / size if 0.0 < size < np.inf else None
 
 
 def _refusal(problem: Problem) -> str | None:
+    """Return a reason not to accept the problem if its dictionary is too large, else None."""
     rows = count_rows(problem)
-    if rows > LIMIT:
-        means = "" if rows == problem.m else f", its friction as bounded rows {rows}"
+    if rows > MAX_LEMKE_ROWS:
+        converted = "" if rows == problem.m else f", its friction as bounded rows {rows}"
         return (
-            f"holds a dense dictionary, for at most {LIMIT} rows; this problem has {problem.m}{means}: "
+            f"holds a dense dictionary, for at most {MAX_LEMKE_ROWS} rows; this problem has {problem.m}{converted}: "
             "use direct, newton or pgs"
         )
     return None

@@ -1,4 +1,4 @@
-"""Chunks, clock, history and Ctrl-C around one solver's `run`, and the best of what came of it.
+"""Call a solver's `run` in chunks, with clock, history and Ctrl-C, and select the best of its results.
 
 A chunk lasts about 10 ms. Chunks do not change the result, because every solver checks convergence at fixed numbers
 of iterations.
@@ -40,55 +40,82 @@ from lavender.solvers.registry import Solver, State
 from lavender_ext.judge.measure import same_bits
 from lavender_ext.judge.watch import Watch
 
-LEAST = 1e-6  # s, what is left of a limit for a solver that is called at all
-SHARE = 0.7  # of what is left, for a chunk at the pace of the last
-FIRST_CHUNK = 256  # iterations: 10 ms at 40 us each, slower than any compiled sweep of few rows
+MIN_TIME_LIMIT = 1e-6  # Smallest time limit [s] that is passed to a solver.
+# A chunk uses at most this fraction of the remaining time, at the speed of the chunk before.
+CHUNK_TIME_FRACTION = 0.7
+# Largest number of iterations of the first chunk: 10 ms at 40 us each; compiled sweeps of few rows are faster.
+FIRST_CHUNK_ITERATIONS = 256
 Callback = Callable[[int, FloatArray, Residual], Any]
-Record = tuple[int, float, float, float, float]  # iterations, s, relative, energy, velocity
-BOUND_ROUNDING = (
-    1e-12  # Impulses closer to their bounds than this share are within them: projections round as much.
-)
-NOTHING_DONE = Claim(MAX_ITERATIONS, 0)
+Record = tuple[int, float, float, float, float]  # iterations, time [s], relative, energy, velocity
+# Impulses whose relative distance to their bounds is at most this are within them: projections round as much.
+BOUND_ROUNDING = 1e-12
+EMPTY_CLAIM = Claim(MAX_ITERATIONS, 0)
 
 
 @dataclass
 class Loop:
-    """Chunks, clock, history and Ctrl-C around one solver's `run`."""
+    """Loop around one solver's `run`, with chunks, clock, history and Ctrl-C.
+
+    Parameters
+    ----------
+    problem : Problem
+    solver : Solver
+    state : object
+        State of the solver.
+    impulse : (m,) N s
+        Start; replaced by the result in place.
+    tol : float, -
+    deadline : Deadline
+    callback : callable, optional
+    records : list, optional
+        Records of the history, which are appended.
+    time : float, s
+        Time of the solver, without the judge.
+    done : int
+        Iterations.
+    work : dict
+    broken : bool
+        Whether the solver raised an arithmetic error.
+    next_record : int
+        Iterations at the next record.
+    pace : float, s
+        Estimated upper bound of the time of an iteration; inf: the first chunk measures it.
+    """
 
     problem: Problem
     solver: Solver
     state: Any
-    impulse: FloatArray  # (m,) N s, in place
+    impulse: FloatArray
     tol: float
     deadline: Deadline
     callback: Callback | None = None
     records: list[Record] | None = None
-    time: float = 0.0  # s, of the solver alone
-    done: int = 0  # iterations
+    time: float = 0.0
+    done: int = 0
     work: dict[str, int] = field(default_factory=dict)
-    broken: bool = False  # the solver did not return
-    next_record: int = 0  # iterations
-    pace: float = inf  # s that an iteration takes at most, as counted; inf: the first one tells
+    broken: bool = False
+    next_record: int = 0
+    pace: float = inf
 
     def run_once(self, max_iter: int) -> Claim:
-        """In one call, of a solver that cannot be continued."""
+        """Run a solver that cannot be continued, in one call."""
         start_point = self.impulse.copy()
         watch = Stopwatch()
         try:
             try:
-                claim = self.call(max_iter, self.deadline.remaining(LEAST))
+                claim = self.call(max_iter, self.deadline.remaining(MIN_TIME_LIMIT))
             finally:
                 self.time = watch.seconds
             if not self.broken:
                 return claim
         except KeyboardInterrupt:
             claim = Claim(INTERRUPTED, 0, {}, "Ctrl-C")
-        # It was in the middle of whatever it does.
+        # The impulse may be an intermediate result.
         self.impulse[:] = best_of_islands(self.problem, (start_point,), (self.impulse,), self.tol)
         return claim
 
     def call(self, max_iter: int, time_limit: float | None) -> Claim:
-        """Run at most so many iterations of the solver; an arithmetic breakdown becomes a claim."""
+        """Run at most `max_iter` iterations of the solver; an arithmetic error becomes a NUMERICAL_ERROR claim."""
         try:
             return self.solver.run(self.state, self.impulse, max_iter, self.tol, time_limit)
         except BREAKDOWN as error:
@@ -96,19 +123,19 @@ class Loop:
             return Claim(NUMERICAL_ERROR, 0, {}, format_error(error))
 
     def run(self, max_iter: int) -> Claim:
-        """In chunks; the result is the best of what was checked."""
-        claim = self.chunks(max_iter)
+        """Run in chunks; the result is the best of the iterates that the solver has checked."""
+        claim = self.run_chunks(max_iter)
         self._keep_best()
         return claim
 
-    def chunks(self, max_iter: int) -> Claim:
-        """So many iterations in all, or fewer where the solver, the clock, the callback or Ctrl-C ends them."""
-        # About a nanosecond per unit of work: the first guess, then measured. Capped, for solvers in Python.
-        chunk = min(FIRST_CHUNK, max(1, int(CHUNK_TIME * 1e9) // max(1, self.problem.metric.work)))
+    def run_chunks(self, max_iter: int) -> Claim:
+        """Run `max_iter` iterations in total, or fewer if the solver, the clock, the callback or Ctrl-C ends them."""
+        # The first guess is a nanosecond per unit of work, with a limit for solvers in Python; then time is measured.
+        chunk = min(FIRST_CHUNK_ITERATIONS, max(1, int(CHUNK_TIME * 1e9) // max(1, self.problem.metric.work)))
         records = self.records is not None or self.callback is not None
-        claim = NOTHING_DONE
+        claim = EMPTY_CLAIM
         if self.deadline.is_set:
-            chunk = max(1, min(chunk, int(self._aim() / self.pace)))
+            chunk = max(1, min(chunk, int(self._chunk_time() / self.pace)))
         try:
             if self.deadline.is_set:
                 watch = Stopwatch()
@@ -130,12 +157,12 @@ class Loop:
                 if claim.status is not MAX_ITERATIONS:
                     break
                 if claim.iterations < 1:
-                    claim = Claim(STALLED, 0, {}, f"did none of the {n} iterations that it was asked for")
+                    claim = Claim(STALLED, 0, {}, f"did none of the {n} requested iterations")
                     break
                 if stopped:
                     claim = Claim(INTERRUPTED, 0, {}, "stopped by the callback")
                     break
-                # What is more than half over is not begun.
+                # An iteration is not started if less than half of it fits.
                 if self.deadline.passed(0.5 * elapsed / claim.iterations):
                     claim = Claim(TIME_LIMIT, 0, {}, claim.message)
                     break
@@ -146,32 +173,33 @@ class Loop:
         return self._total(claim)
 
     def _next_chunk(self, n: int, elapsed: float) -> int:
-        return max(1, min(8 * n, int(n * self._aim() / max(elapsed, 1e-7))))
+        return max(1, min(8 * n, int(n * self._chunk_time() / max(elapsed, 1e-7))))
 
-    def _aim(self) -> float:
+    def _chunk_time(self) -> float:
+        """Return the intended time of the next chunk [s]."""
         left = self.deadline.remaining()
-        return CHUNK_TIME if left is None else min(CHUNK_TIME, SHARE * left)
+        return CHUNK_TIME if left is None else min(CHUNK_TIME, CHUNK_TIME_FRACTION * left)
 
-    def not_worse(self, start: FloatArray, or_zero: bool = True) -> None:
-        """Keep the best of the result, the start and, with `or_zero`, the zero impulse in each island.
+    def restore_better(self, start: FloatArray, or_zero: bool = True) -> None:
+        """Replace the result, unless it meets tol, by the best of result, start and zero impulse in each island.
 
-        A result that meets tol stays as it is.
+        The zero impulse is only considered with `or_zero`.
         """
         problem = self.problem
-        found = find_stored(problem, self.impulse) or judge_impulse(problem, self.impulse.copy())
-        if found.relative > self.tol:
-            found = best_of(problem, found, start, self.tol, or_zero)
-        store_result(problem, found)
-        self.impulse[:] = found.impulse
+        result = find_stored(problem, self.impulse) or judge_impulse(problem, self.impulse.copy())
+        if result.relative > self.tol:
+            result = best_of(problem, result, start, self.tol, or_zero)
+        store_result(problem, result)
+        self.impulse[:] = result.impulse
 
     def _keep_best(self) -> None:
-        # A solver whose residual may rise keeps its best checked iterate; a budget (tol = 0) means the last one.
+        """Replace the last iterate by the best one that the solver has checked; with tol = 0, keep the last."""
         if self.tol == 0.0:
             return
         state: State = self.state
         watch = getattr(state, "watch", None)
         if isinstance(watch, Watch):
-            # The rows of a state may be in another order than those of its problem.
+            # The state may have its rows in another order than the problem.
             getattr(state, "keep_best", watch.keep_best)(self.impulse, self.tol)
             return
         best = getattr(state, "best", None)
@@ -179,24 +207,25 @@ class Loop:
             return
         last = find_stored(self.problem, self.impulse) or judge_impulse(self.problem, self.impulse.copy())
         if last.relative <= self.tol:
-            store_result(self.problem, last)  # for the result
+            store_result(self.problem, last)
         else:
             self.impulse[:] = best_of_islands(self.problem, (best[1],), (self.impulse,), self.tol)
 
     def _record(self) -> bool:
+        """Record the residual and call the callback; return whether the callback stops the solve."""
         r = residual(self.problem, self.impulse, "float64")
         if self.records is not None:
             self.records.append((self.done, self.time, r.relative, r.energy, r.velocity))
-        self.next_record = self.done + max(1, self.done >> 3)  # 1, 2, ... 16, then an eighth more each time
+        self.next_record = self.done + max(1, self.done >> 3)  # 1, 2, ... 16, then steps of an eighth.
         return bool(self.callback(self.done, self.impulse.copy(), r)) if self.callback is not None else False
 
     def _total(self, claim: Claim) -> Claim:
         if claim.iterations == self.done and claim.work == self.work:
-            return claim  # of a single chunk
+            return claim  # There was only one chunk.
         return replace(claim, iterations=self.done, work=self.work)
 
     def recorded(self) -> History | None:
-        """The history, where one was asked for."""
+        """Return the history, or None if it was not requested."""
         if self.records is None:
             return None
         if not self.records or self.records[-1][0] != self.done:
@@ -205,17 +234,17 @@ class Loop:
         return History(np.array(columns[0], np.int64), *(np.array(c, float) for c in columns[1:]))
 
 
-def best_of(problem: Problem, found: Any, start: FloatArray | None, tol: float, or_zero: bool = True) -> Any:
-    """Return a pass of the judge over the best of `found`, the start (m,) and the zero impulse in each island.
+def best_of(problem: Problem, result: Any, start: FloatArray | None, tol: float, or_zero: bool = True) -> Any:
+    """Return the judge's pass over the best of `result`, the start (m,) and the zero impulse in each island.
 
-    What rounding alone keeps from tol is left as it is. An impulse outside its bounds is projected onto them first.
+    A result within the round-off floor of tol is returned unchanged. An impulse outside its bounds is projected first.
     """
-    if found.above_floor <= tol:
-        return found
-    first, own = problem._start if start is None else start, found.impulse
-    with np.errstate(all="ignore"):  # impulses that overflow are judged below
+    if result.above_floor <= tol:
+        return result
+    first, own = problem._start if start is None else start, result.impulse
+    with np.errstate(all="ignore"):  # Impulses that overflow are judged below.
         inside = project(problem.cones, own)
     if not np.allclose(inside, own, rtol=BOUND_ROUNDING, atol=0.0):
         own = inside
     best = best_of_islands(problem, (first, problem._start) if or_zero else (first,), (own,), tol)
-    return found if same_bits(best, found.impulse) else judge_impulse(problem, best)
+    return result if same_bits(best, result.impulse) else judge_impulse(problem, best)

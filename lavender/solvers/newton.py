@@ -3,25 +3,25 @@
     z = D^1/2 lambda,   H = D^-1/2 A D^-1/2,   s = H z - g complementary to z on every block
 
 0. A warm start over bodies is judged first. If at most 64 sweeps (counted in `work`), or one banded factorisation of
-   joints without other rows, can bring it to tol, these run (`warm_start.py`).
+   joints without other rows, can solve it to tol, these run (`warm_start.py`).
 1. Bounded rows: active-set exchanges (Newton's method on the natural map) from the warm start and from the solution of
    H z = g.
 2. A cold-started Mehrotra interior point. As soon as the active rows are identified, the solution on them is computed
    to the floor of float64.
 3. If rows are nearly dependent and 1 and 2 fail: both again, with the augmented system of the bodies.
 4. Coulomb friction: a proximal Newton method on the Alart-Curnier map, and interior points on De Saxce's form of the
-   law, whose convex problem changes with every step. Where these stall, a path of smoothed problems (Chen, Mangasarian
-   1996) is followed, each step by the coordinate that changes fastest (Rheinboldt 1986), through folds where contacts
-   pass from stick to slip.
+   law, whose convex problem changes with every step. If these stall, a path of smoothed problems (Chen, Mangasarian
+   1996) is followed, each step by the coordinate that changes fastest (Rheinboldt 1986), through folds at which
+   contacts change from stick to slip.
 
 Problems in generalised coordinates are first solved over their velocities (`newton_systems/general.py`), without
-forming A, unless a full A is counted to cost less than a tenth of that (few rows of a soft body). If that fails, 1 to 4
-follow over the rows of A, unless form="velocity". Where velocities stand for bodies, of which two at most meet in every
-block (free bodies of an engine), 1 to 4 are over these bodies, at once under Coulomb's law and where many contacts are
-rigid (`SmallCall.may_cost`).
+forming A, unless a full A is estimated to cost less than a tenth of that (few rows of a soft body). If that fails, 1 to
+4 follow over the rows of A, unless form="velocity". If the velocities belong to bodies and every block couples at most
+two of them (free bodies of an engine), 1 to 4 use these bodies; under Coulomb's law, and if many contacts are rigid,
+they do so from the start (`SmallCall.cost_limit`).
 
 1 to 4 are compiled (`lavender_ext/newton/plan.pxd`) and run one factorisation at a time; in between, Python checks the
-clock, Ctrl-C and certificates. `newton_systems/` makes their linear systems. Form "velocity" factors I + K^T V K over
+clock, Ctrl-C and certificates. `newton_systems/` builds their linear systems. Form "velocity" factors I + K^T V K over
 the bodies and does not square J; "impulse" factors over the rows.
 """
 
@@ -40,77 +40,96 @@ from lavender.judge.certificates import check_certificate
 from lavender.judge.residuals import compute_relative
 from lavender.judge.solution import Claim, Status, counted, summed
 from lavender.problem import OPERATORS, Problem
-from lavender.solvers.costs import SOFT, STEPS, Count, factorisations, newton_cost
+from lavender.solvers.costs import RIGID_STEP_RATIO, SOFT_STEP_RATIO, Count, factorisations, newton_cost
 from lavender.solvers.newton_systems import general
-from lavender.solvers.newton_systems.systems import System, bodies_of, is_dense, make_system
+from lavender.solvers.newton_systems.systems import System, find_bodies, make_system, use_dense_matrix
 from lavender.solvers.registry import Solver, SolverSpec
 from lavender.solvers.setup_times import (
-    analysed,
+    analysis_time,
+    body_setup_time,
     dense_work,
-    formed_once,
-    over_bodies,
-    over_rows,
-    over_velocities,
+    formation_time,
+    row_setup_time,
+    velocity_setup_time,
 )
 from lavender.solvers.small import NEWTON
-from lavender.solvers.warm_start import claim_of, warm_start
+from lavender.solvers.warm_start import make_warm_start_claim, warm_start
 from lavender_ext.core.method import OUTCOMES
 from lavender_ext.newton.solve import COUNTED
 
 FORMS = ("auto", "velocity", "impulse")
-CHEAPER = 10.0  # times what rows of A cost, from which on velocities are left for them
-ONE = Count("velocities", 1.0, 0.0, 0.0, steps=SOFT)  # a multiply-add of theirs, at least
-ROWS = 3000  # up to which A is formed where velocities did not end it
-WATCHED = 0.05  # s between two looks at Ctrl-C, as factors are counted
-TIME_SHARE = 0.5  # of the time left that one turn may take
+# The row form is used if the velocity form is estimated to cost more than this multiple of it.
+VELOCITY_MAX_COST_RATIO = 10.0
+# Smallest count of one multiply-add over velocities.
+VELOCITY_UNIT_COUNT = Count("velocities", 1.0, 0.0, 0.0, steps=SOFT_STEP_RATIO)
+MAX_FORMED_ROWS = (
+    3000  # If the velocity form fails, A is formed and the row form continues up to this many rows.
+)
+INTERRUPT_CHECK_INTERVAL = 0.05  # Longest estimated time [s] between two checks for Ctrl-C.
+STAGE_TIME_FRACTION = 0.5  # A single stage may use at most this fraction of the remaining time.
 _ENDS = {
     OUTCOMES["reached"]: Status.CONVERGED,
     OUTCOMES["floor"]: Status.ROUNDOFF_LIMIT,
     OUTCOMES["stuck"]: Status.STALLED,
 }
-WARM = 1e-3  # relative residual from which rows of A go on from what velocities left
+# The row form starts from the result of the velocity form up to this relative residual, else from the default start.
+WARM_START_MAX_RESIDUAL = 1e-3
 
 
 @dataclass
 class NewtonState:
-    """The linear system of a problem, made once."""
+    """The linear system of a problem, built once.
+
+    Parameters
+    ----------
+    problem : Problem
+    system : System or None
+        None if no row can move, or in generalised coordinates.
+    general : lavender_ext.driver.driver.Driver, optional
+        Driver in generalised coordinates.
+    begun : bool
+        Whether `advance` was called.
+    """
 
     problem: Problem
-    system: System | None  # None where nothing moves
-    general: Any = None  # lavender_ext.driver.driver.Driver, in generalised coordinates
-    begun: bool = False  # by `turn`
+    system: System | None
+    general: Any = None
+    begun: bool = False
 
     @property
     def count(self) -> Count:
-        """One step: what is factored, by the analysis, and what is read beside it."""
+        """Counts of one step, from the analysis of the matrix."""
         problem, system = self.problem, self.system
         read = float(problem.metric.work)
         if self.general is not None:
-            soft, law = self.general.soft, problem.law
-            steps = SOFT if soft and law != "linear" else 1.0 if soft or law == "lcp" else STEPS
+            is_soft, law = self.general.soft, problem.law
+            if is_soft and law != "linear":
+                steps = SOFT_STEP_RATIO
+            else:
+                steps = 1.0 if is_soft or law == "lcp" else RIGID_STEP_RATIO
             return Count("velocities", self.general.work, read, 0.0, steps=steps)
         if system is None:
             return Count("dense", 0.0, 0.0, float(problem.m))
         if system.form == "velocity":
             return Count("bodies", system.work, read, float(problem.m))
-        made = 0.0 if problem.generalized is None else 1e9 * formed_once(problem)
+        set_up = 0.0 if problem.generalized is None else 1e9 * formation_time(problem)
         return Count(
             "dense" if system.dense else "panels",
             system.work,
             system.entries,
             float(problem.m),
-            made,
+            set_up,
         )
 
     @property
     def steps(self) -> float:
-        """Iterations that it is counted to take: over velocities each is one of an island."""
+        """Expected number of iterations; over velocities, an iteration is a step of one island."""
         islands = 1 if self.general is None else max(1, self.general.islands)
         return factorisations(self.problem.law, self.count.form) * self.count.steps * islands
 
     @property
     def cost(self) -> float:
-        """What it is counted to take to the end [ns]."""
+        """Estimated cost to the end [ns]."""
         return newton_cost(self.count, self.problem.law)
 
 
@@ -121,8 +140,8 @@ class Newton(Solver):
     Parameters
     ----------
     form : {"auto", "velocity", "impulse"}
-        Unknowns of the factorisation: velocities (needs J and M) or the rows of A. "auto": velocities where
-        they are known, but for J and M whose rows of A are counted to cost less than a tenth of them.
+        Unknowns of the factorisation: velocities (needs J and M) or the rows of A. "auto": velocities if the problem
+        has them, unless the rows of A are estimated to cost less than a tenth.
     """
 
     form: str = "auto"
@@ -130,21 +149,30 @@ class Newton(Solver):
     needs_scipy = True
 
     def setup_time(self, problem: Problem) -> float:
-        """What `prepare` takes [s], as counted."""
+        """Estimate the time of `prepare` [s]."""
         if problem.generalized is not None and self.form != "impulse":
-            return over_velocities(problem)
+            return velocity_setup_time(problem)
         bodies = problem.rows is not None and problem.rows.n_bodies > 0 and self.form != "impulse"
         if bodies:
-            return over_bodies(problem)
-        few = not is_dense(problem.max_entries, problem.m, problem.law == "cone")
-        return over_rows(problem) + (analysed(problem) if few else 0.0)
+            return body_setup_time(problem)
+        is_sparse = not use_dense_matrix(problem.max_entries, problem.m, problem.law == "cone")
+        return row_setup_time(problem) + (analysis_time(problem) if is_sparse else 0.0)
 
     def prepare(self, problem: Problem) -> NewtonState:
-        """The system of a problem."""
+        """Build the linear system of a problem, or the driver over its velocities."""
         return self._prepare(problem, None)
 
-    @np.errstate(all="ignore")  # what overflows is judged
+    @np.errstate(all="ignore")  # Results that overflow are judged.
     def _prepare(self, problem: Problem, like: System | None) -> NewtonState:
+        """Choose the form and build the state; `like` is a system whose layout may be reused.
+
+        Raises
+        ------
+        InputError
+            form="velocity" for a problem given as a matrix.
+        CapabilityError
+            The matrix over the velocities is too large for form="velocity" or for round cones.
+        """
         check_choice("form", self.form, FORMS)
         if self.form == "velocity" and problem.matrix is not None:
             raise InputError(
@@ -156,18 +184,18 @@ class Newton(Solver):
         bodies = kernel = None
         over_velocities = problem.generalized is not None and self.form != "impulse"
         if over_velocities:
-            most = CHEAPER * _rows_of_j(problem) if self.form == "auto" else inf
-            kernel = general.prepare(problem, most / newton_cost(ONE, problem.law))
-            if kernel is not None and NewtonState(problem, None, kernel).cost > most:
+            max_cost = VELOCITY_MAX_COST_RATIO * _full_row_form_cost(problem) if self.form == "auto" else inf
+            kernel = general.prepare(problem, max_cost / newton_cost(VELOCITY_UNIT_COUNT, problem.law))
+            if kernel is not None and NewtonState(problem, None, kernel).cost > max_cost:
                 kernel = None
-        if self.form != "impulse" and (kernel is None or NEWTON.may_cost(problem, kernel) == 0.0):
-            bodies = bodies_of(problem)  # interior points are the shorter way
+        if self.form != "impulse" and (kernel is None or NEWTON.cost_limit(problem, kernel) == 0.0):
+            bodies = find_bodies(problem)  # Interior points over bodies are then faster.
         if bodies is None and kernel is not None:
             return NewtonState(problem, None, kernel)
         if bodies is None and over_velocities and self.form == "velocity":
             raise CapabilityError(
                 f"form='velocity' accepts a matrix of {general.MAX_MATRIX_ENTRIES:.1e} values over the velocities of "
-                "island (dense or with the factor's own fill); this problem has a larger one: use form='impulse' "
+                "an island (dense or with the factor's own fill); this problem has a larger one: use form='impulse' "
                 "or sweeps"
             )
         if problem.cones.has_round:
@@ -180,10 +208,10 @@ class Newton(Solver):
         return NewtonState(problem, system if system.solve.m else None)
 
     def update(self, state: NewtonState, problem: Problem) -> NewtonState:
-        """The same of new numbers: between the same bodies the order of elimination stays."""
+        """Build the state for new numbers; the elimination order is reused between the same bodies."""
         return self._prepare(problem, state.system)
 
-    @np.errstate(all="ignore")  # what overflows is judged
+    @np.errstate(all="ignore")  # Results that overflow are judged.
     def run(
         self,
         state: NewtonState,
@@ -196,10 +224,10 @@ class Newton(Solver):
         if problem.m == 0:
             return Claim(Status.CONVERGED, 0)
         if state.general is not None:
-            return self._run_general(state, impulse, max_iter, tol, time_limit)
+            return self._run_over_velocities(state, impulse, max_iter, tol, time_limit)
         return self._run_system(problem, system, impulse, max_iter, tol, time_limit)
 
-    @np.errstate(all="ignore")  # what overflows is judged
+    @np.errstate(all="ignore")  # Results that overflow are judged.
     def advance(
         self,
         state: NewtonState,
@@ -209,48 +237,55 @@ class Newton(Solver):
         time_limit: float | None = None,
         left: int | None = None,
     ) -> Claim:
-        """n steps, or a few more up to `left`, on from where the last turn ended; the first from `impulse` (m,).
+        """Run about n steps, at most `left`, continuing where the last call ended; the first starts at `impulse` (m,).
 
-        Over generalised velocities nothing follows over rows.
+        Over generalised velocities, the row form does not follow.
         """
-        again, state.begun = state.begun, True
+        is_continued, state.begun = state.begun, True
         if state.general is None:
             return self._run_system(
-                state.problem, state.system, impulse, n, tol, time_limit, again, left or SPEC.max_iter
+                state.problem, state.system, impulse, n, tol, time_limit, is_continued, left or SPEC.max_iter
             )
-        claim = general.run(state.problem, state.general, impulse, n, tol, time_limit, again)
+        claim = general.run(state.problem, state.general, impulse, n, tol, time_limit, is_continued)
         if claim.status is Status.MAX_ITERATIONS and state.general.how != OUTCOMES["more"]:
             return Claim(Status.STALLED, claim.iterations, claim.work)
         return claim
 
-    def _run_general(
+    def _run_over_velocities(
         self, state: NewtonState, impulse: FloatArray, max_iter: int, tol: float, time_limit: float | None
     ) -> Claim:
+        """Solve over generalised velocities; if that fails, continue over bodies or over the rows of A.
+
+        The row form runs only if iterations remain and A has at most `MAX_FORMED_ROWS` rows. `impulse` (m,) [N s] holds
+        the better of the two results on return.
+        """
         problem, deadline = state.problem, Deadline(time_limit)
         claim = general.run(problem, state.general, impulse, max_iter, tol, time_limit)
-        left = max_iter - claim.iterations
-        if claim.status not in (Status.STALLED, Status.NUMERICAL_ERROR, Status.DIVERGED) or left <= 0:
+        remaining = max_iter - claim.iterations
+        if claim.status not in (Status.STALLED, Status.NUMERICAL_ERROR, Status.DIVERGED) or remaining <= 0:
             return claim
-        bodies = bodies_of(problem)
-        if bodies is None and (self.form == "velocity" or problem.m > ROWS or problem.cones.has_round):
+        bodies = find_bodies(problem)
+        if bodies is None and (
+            self.form == "velocity" or problem.m > MAX_FORMED_ROWS or problem.cones.has_round
+        ):
             return claim
         w, e = np.empty(problem.m), np.empty(problem.m)
         best, above = compute_relative(problem, impulse, w, e, True)
         if above <= tol:
             return claim
         before = impulse.copy()
-        if not best <= WARM:
+        if not best <= WARM_START_MAX_RESIDUAL:
             impulse[:] = problem.start()
         system = make_system(problem, "impulse" if bodies is None else "velocity", bodies=bodies)
-        more = self._run_system(
-            problem, system if system.solve.m else None, impulse, left, tol, deadline.remaining(1e-3)
+        second = self._run_system(
+            problem, system if system.solve.m else None, impulse, remaining, tol, deadline.remaining(1e-3)
         )
         if not compute_relative(problem, impulse, w, e)[0] <= best:
             impulse[:] = before
-        work = summed((claim.work, more.work))
-        form = f"{claim.form}, then {more.form or 'impulse'}"
-        total = claim.iterations + more.iterations
-        return Claim(more.status, total, work, more.message, form=form, certificate=more.certificate)
+        work = summed((claim.work, second.work))
+        form = f"{claim.form}, then {second.form or 'impulse'}"
+        total = claim.iterations + second.iterations
+        return Claim(second.status, total, work, second.message, form=form, certificate=second.certificate)
 
     def _run_system(
         self,
@@ -260,90 +295,106 @@ class Newton(Solver):
         max_iter: int,
         tol: float,
         time_limit: float | None,
-        again: bool = False,
-        more: int | None = None,
+        is_continued: bool = False,
+        max_total: int | None = None,
     ) -> Claim:
+        """Run the stages over bodies or rows, after a warm start over bodies; see `_run_stages`."""
         if system is None:
             system = make_system(problem, "impulse")
             impulse[:] = system.solve.fixed
             return Claim(Status.STALLED, 0, {"factorisations": 0}, "no row can move")
-        sweeps = worked = 0
-        before = system.solve.done if again else 0
-        if self.form == "auto" and problem.rows is not None and not again:
-            how, sweeps, worked = warm_start(problem, impulse, tol, max_iter, time_limit)
-            claim = claim_of(how, sweeps, worked)
-            if claim is not None and general.confirmed(problem, impulse, tol):
+        sweeps = warm_factorisations = 0
+        before = system.solve.done if is_continued else 0
+        if self.form == "auto" and problem.rows is not None and not is_continued:
+            code, sweeps, warm_factorisations = warm_start(problem, impulse, tol, max_iter, time_limit)
+            claim = make_warm_start_claim(code, sweeps, warm_factorisations)
+            if claim is not None and general.is_confirmed(problem, impulse, tol):
                 return claim
-        max_iter -= worked
-        status, certificate = _stages(problem, system, impulse, max_iter, tol, time_limit, again, more)
+        max_iter -= warm_factorisations
+        status, certificate = _run_stages(
+            problem, system, impulse, max_iter, tol, time_limit, is_continued, max_total
+        )
         solve = system.solve
-        factorisations = worked + solve.done - before
+        factorisations = warm_factorisations + solve.done - before
         message = ", ".join(
-            counted(count, what) for count, what in zip(solve.ran, COUNTED, strict=True) if count
+            counted(count, kind) for count, kind in zip(solve.ran, COUNTED, strict=True) if count
         )
         work = {"factorisations": factorisations} | ({"sweeps": sweeps} if sweeps else {})
         return Claim(status, factorisations, work, message, form=system.form, certificate=certificate)
 
 
-def _rows_of_j(problem: Problem) -> float:
-    """What Newton's method over a full A of J and M is counted to take [ns]; inf where it does not take that."""
+def _full_row_form_cost(problem: Problem) -> float:
+    """Return the estimated cost [ns] of Newton's method over a full A of J and M; inf if that is not possible."""
     m = float(problem.m)
-    if m > ROWS or problem.cones.has_round:
+    if m > MAX_FORMED_ROWS or problem.cones.has_round:
         return inf
-    rows = Count("dense", dense_work(problem.m), m * m, m, 1e9 * formed_once(problem))
+    rows = Count("dense", dense_work(problem.m), m * m, m, 1e9 * formation_time(problem))
     return newton_cost(rows, problem.law)
 
 
-def _stages(
+def _run_stages(
     problem: Problem,
     system: System,
     impulse: FloatArray,
     max_iter: int,
     tol: float,
     time_limit: float | None,
-    again: bool = False,
-    more: int | None = None,
+    is_continued: bool = False,
+    max_total: int | None = None,
 ) -> tuple[Status, FloatArray | None]:
-    """Turns of at most n factorisations on `impulse`, in place, with a look at the clock and at Ctrl-C in between.
+    """Run `max_iter` factorisations on `impulse` (m,) in place, and check the clock and Ctrl-C in between.
 
-    `again`: on from where an earlier call has stopped; `more`: a later one may go on from where this one stops.
+    Parameters
+    ----------
+    is_continued : bool
+        Continue where an earlier call stopped.
+    max_total : int, optional
+        If given, a later call may continue where this one stops, with at most this many factorisations in total.
+
+    Returns
+    -------
+    Status
+    (m,) array or None
+        A certificate, or a direction that bounds the impulses.
     """
     deadline = Deadline(time_limit)
     solve, certificate, proven = system.solve, None, False
     late = interrupted = False
     system.set_deadline(deadline)
-    last = max_iter + (solve.done if again else 0)
-    if not again:
-        solve.start(impulse, tol, SPEC.max_iter if more else max_iter)
-    if more:
-        solve.allow(more)
+    last = max_iter + (solve.done if is_continued else 0)
+    if not is_continued:
+        solve.start(impulse, tol, SPEC.max_iter if max_total else max_iter)
+    if max_total:
+        solve.allow(max_total)
     try:
         while True:
             before = solve.done
-            most = WATCHED / max(system.seconds, 1e-6)
+            steps = INTERRUPT_CHECK_INTERVAL / max(system.seconds, 1e-6)
             left, watch = deadline.remaining(), Stopwatch()
             if left is not None:
-                # Of the first the pace is only counted.
-                most = min(most, TIME_SHARE * left / max(system.seconds, 1e-9)) if solve.done else 1.0
+                # The time of the first factorisation is only estimated, so only one is run.
+                steps = (
+                    min(steps, STAGE_TIME_FRACTION * left / max(system.seconds, 1e-9)) if solve.done else 1.0
+                )
                 if left <= system.seconds:
                     late = True
                     solve.stop()
             try:
-                end = solve.step(max(1, int(min(most, last - before) if more else most)), impulse)
-            except TooLate:  # the best iterate is there
+                end = solve.step(max(1, int(min(steps, last - before) if max_total else steps)), impulse)
+            except TooLate:  # The best iterate is returned.
                 late, end = True, OUTCOMES["spent"]
                 solve.stop()
             if solve.done > before:
-                system.took(watch.seconds / (solve.done - before))
+                system.record_factor_time(watch.seconds / (solve.done - before))
             if end == OUTCOMES["certificate"]:
                 certificate = solve.direction
                 proven = check_certificate(problem, certificate, tol, deadline) is None
                 if proven:
                     solve.prove()
-            elif end != OUTCOMES["more"] or (more and solve.done >= last):
+            elif end != OUTCOMES["more"] or (max_total and solve.done >= last):
                 break
     except KeyboardInterrupt:
-        interrupted = True  # the best iterate goes back all the same
+        interrupted = True  # The best iterate is returned all the same.
         solve.stop()
         solve.step(1, impulse)
     if interrupted:
@@ -353,13 +404,14 @@ def _stages(
     if end == OUTCOMES["more"]:
         return Status.MAX_ITERATIONS, None
     if end == OUTCOMES["spent"]:
-        if more and not late:
-            return Status.STALLED, certificate  # none may follow
+        if max_total and not late:
+            return Status.STALLED, certificate  # No factorisation may follow.
         return (Status.TIME_LIMIT if late and solve.done < last else Status.MAX_ITERATIONS), None
     return _ENDS[end], certificate
 
 
 def _refusal(problem: Problem) -> str | None:
+    """Return a reason not to accept round cones without J and M, else None."""
     if problem.cones.has_round and problem.generalized is None:
         return "takes round cones of more than two tangents with J and M alone (Problem.from_jacobian)"
     return None

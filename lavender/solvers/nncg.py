@@ -26,7 +26,7 @@ RESTARTS = ("growth", "against")
 
 @dataclass(frozen=True)
 class NNCG(Accelerated):
-    """Nonsmooth nonlinear conjugate gradients; `order`, `ground`, `seed` as in `lavender.problem.ordering`."""
+    """Nonsmooth nonlinear conjugate gradients; `order`, `ground` and `seed` as in `lavender.problem.ordering`."""
 
     restart: str = "growth"
 

@@ -1,4 +1,4 @@
-"""Projected Gauss-Seidel: updates one block after the other with the current w = A lambda - b.
+"""Projected Gauss-Seidel: update one block after the other with the current w = A lambda - b.
 
     row       lambda <- clip(lambda - w / d, lower, upper)
     contact   lambda_n <- max(0, lambda_n - w_n / d_n), then the tangents together with one scalar step
@@ -20,11 +20,11 @@ from lavender.judge.solution import Claim
 from lavender.problem import Problem
 from lavender.problem.ordering import Order
 from lavender.solvers.registry import SolverSpec
-from lavender.solvers.setup_times import forming
+from lavender.solvers.setup_times import forming_time
 from lavender.solvers.sweeping import (
     Sweeping,
     SweepState,
-    over,
+    form_name,
     plan_of,
     reads_whitened,
 )
@@ -35,19 +35,19 @@ _NONE = np.empty(0, np.int32)
 
 @dataclass(frozen=True)
 class PGS(Sweeping):
-    """Projected Gauss-Seidel; `order`, `ground`, `seed` as in `lavender.problem.ordering`."""
+    """Projected Gauss-Seidel; `order`, `ground` and `seed` as in `lavender.problem.ordering`."""
 
-    def _told(self, state: SweepState, claim: Claim, again: int) -> Claim:
-        return replace(claim, form=over(state.data)) if state.data.is_general else claim
+    def _complete_claim(self, state: SweepState, claim: Claim, count: int) -> Claim:
+        return replace(claim, form=form_name(state.data)) if state.data.is_general else claim
 
     def _forming(self, problem: Problem) -> float:
-        return 0.0 if reads_whitened(problem) else forming(problem)
+        return 0.0 if reads_whitened(problem) else forming_time(problem)
 
     def _state(self, problem: Problem, order: Order, before: Any) -> SweepState:
         if reads_whitened(problem):
             return SweepState(problem, problem.metric, order)
         data, (blocks, *rest) = problem.csr_data, plan_of(order)
-        # The same bits with or without an order; without one the kernel skips two lookups a row.
+        # The bits are the same with and without an order; without one, the kernel skips two lookups per row.
         row_by_row = data.single_rows and order.is_given
         return SweepState(problem, data, order, serial.Sweeps(data, _NONE if row_by_row else blocks, *rest))
 

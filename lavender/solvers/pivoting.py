@@ -1,4 +1,4 @@
-"""The rows of one problem for `lavender_ext/pivot/direct.pyx`, and the factor that serves them there."""
+"""State of pivoting methods: the rows of a problem for `lavender_ext/pivot/direct.pyx`, and their factorisation."""
 
 from __future__ import annotations
 
@@ -10,36 +10,40 @@ from lavender.base.lazy_import import import_numerics
 from lavender.judge.residuals import get_reference
 from lavender.problem import Problem
 from lavender.solvers.factors import (
-    BAND,
-    SMALL_SIZE,
-    TINY,
+    BAND_WORK_COST,
+    MAX_COMPILED_FACTOR_ROWS,
+    PIVOT_TOLERANCE,
     DenseFactor,
     Factor,
     LUFactor,
     SparseFactor,
-    choose,
+    choose_factorisation,
     dense_cost,
     narrow_order,
     permuted_band,
 )
-from lavender.solvers.setup_times import DENSE, dense_work, first_factor, sparse_work
+from lavender.solvers.setup_times import DENSE_FACTOR_WORK_TIME, dense_work, first_factor_time, sparse_work
 from lavender_ext.pivot.direct import Pivoting
 
-SWEEP = 4e-9  # s for each nonzero of a sweep both ways and its slack, likewise
-SWEEPS, MOST_SWEEPS = 2, 24  # symmetric sweeps of Gauss-Seidel that guess the free rows, at least and at most
-SHARE = 0.5  # of what a factor costs, that they may; a multiply-add of theirs takes a nanosecond
+SWEEP_ENTRY_TIME = 4e-9  # Time [s] per nonzero of a symmetric sweep with its slack.
+# Smallest and largest number of symmetric Gauss-Seidel sweeps that guess the free rows.
+MIN_GUESS_SWEEPS, MAX_GUESS_SWEEPS = 2, 24
+# These sweeps may cost this fraction of a factor; a multiply-add of a sweep takes a nanosecond.
+GUESS_COST_FRACTION = 0.5
 
 
-class Timed:
-    """A factorisation by Python, which does not begin if it would end after the deadline."""
+class TimedFactor:
+    """A factorisation by Python that does not start if it would end after the deadline."""
 
     def __init__(self, inner: Factor, seconds: float) -> None:
         self.inner = inner
-        self.seconds = seconds  # of the next factor: the first by structure, then as long as the last took
+        self.seconds = (
+            seconds  # Time [s] of the next factor: estimated for the first, then that of the last one.
+        )
         self.deadline = Deadline()
 
     def factor(self, place: IntArray, n_free: int, shift: float) -> int:
-        """As `Factor`, of no row too; -1 if it was not begun."""
+        """Factor as `Factor.factor`, also for zero rows; return -1 if it was not started."""
         if n_free == 0:
             return 0
         if self.deadline.passed(self.seconds):
@@ -50,66 +54,73 @@ class Timed:
         return small
 
     def solve(self, rhs: FloatArray) -> FloatArray:
-        """Of the free rows, (n_free,)."""
+        """Solve for the free rows, (n_free,)."""
         return self.inner.solve(rhs)
 
 
 class PivotState:
-    """A problem's rows, free or at a bound, and the factorisation that serves them."""
+    """The rows of a problem, free or at a bound, and their factorisation."""
 
     chosen: tuple[str, int, IntArray | None]
 
     def __init__(self, problem: Problem, like: PivotState | None = None) -> None:
         self.problem = problem
         self.symmetric = problem.is_symmetric
-        if problem.m > SMALL_SIZE:
-            import_numerics()  # for factors, and for proofs that there is no solution
+        if problem.m > MAX_COMPILED_FACTOR_ROWS:
+            import_numerics()  # Factors and certificates need it.
         factor: Factor | None = None
         if self.symmetric:
             same = like is not None and like.symmetric and _same_pattern(like.problem, problem)
-            self.chosen = like.chosen if like is not None and same else choose(problem)
+            self.chosen = like.chosen if like is not None and same else choose_factorisation(problem)
             self.form, band, order = self.chosen
             if self.form != "band":
                 band = -1
                 factor = DenseFactor(problem) if self.form == "dense" else SparseFactor(problem)
         else:
             self.chosen = self.form, band, order = "LU", problem.m - 1, None
-            if problem.m > SMALL_SIZE:
+            if problem.m > MAX_COMPILED_FACTOR_ROWS:
                 band, factor = -1, LUFactor(problem)
-        #: The factor takes a matrix of few entries.
+        #: Whether the factor is sparse.
         self.is_sparse = self.form == "sparse" or (isinstance(factor, LUFactor) and factor.sparse)
-        self.outside = None if factor is None else Timed(factor, self._expected())
+        self.outside = None if factor is None else TimedFactor(factor, self._first_factor_time())
         get_reference(problem)
-        # Of one round [s], all rows free, where the factor is compiled; then as long as the last took.
-        self.seconds = 1e-9 * BAND * problem.m * (band + 1.0) ** 2 + SWEEP * problem.csr_data.work
+        # Time [s] of one round with a compiled factor: estimated for all rows free, then that of the last round.
+        self.seconds = (
+            1e-9 * BAND_WORK_COST * problem.m * (band + 1.0) ** 2 + SWEEP_ENTRY_TIME * problem.csr_data.work
+        )
         self.rows = Pivoting(
-            problem.csr_data, band, order, TINY, problem.metric, self.outside, problem.law == "linear", self.symmetric
+            problem.csr_data, band, order, PIVOT_TOLERANCE, problem.metric, self.outside, problem.law == "linear",
+            self.symmetric,
         )  # fmt: skip
 
-    def _expected(self) -> float:
-        """What the first factor takes [s], by structure."""
-        seconds = first_factor(self.problem.m, len(self.problem._compressed[1]) if self.is_sparse else np.inf)
+    def _first_factor_time(self) -> float:
+        """Estimate the time of the first factor [s] from the structure."""
+        seconds = first_factor_time(
+            self.problem.m, len(self.problem._compressed[1]) if self.is_sparse else np.inf
+        )
         if self.symmetric:
             return seconds
-        return 2.0 * (max(seconds, _filled(self.problem)) if self.is_sparse else seconds)
+        return 2.0 * (max(seconds, _filled_factor_time(self.problem)) if self.is_sparse else seconds)
 
     @property
     def sweeps(self) -> int:
-        """Symmetric sweeps that guess the free rows: few before a compiled factor, else a share of its cost."""
+        """Number of symmetric sweeps that guess the free rows: few before a compiled factor, else by its cost."""
         if self.outside is None:
-            return SWEEPS
+            return MIN_GUESS_SWEEPS
         m, data = self.problem.m, self.problem.csr_data
         factor = dense_cost(m)
         if self.is_sparse:
             factor = min(factor, sparse_work(self.problem.csr.nnz, m))
-        return int(min(max(SWEEPS, SHARE * factor / (2.0 * data.work)), MOST_SWEEPS))
+        return int(
+            min(max(MIN_GUESS_SWEEPS, GUESS_COST_FRACTION * factor / (2.0 * data.work)), MAX_GUESS_SWEEPS)
+        )
 
     def too_late_to_sweep(self, deadline: Deadline) -> bool:
-        """Whether the sweeps before the first factor would end after the deadline."""
-        return deadline.passed(self.sweeps * SWEEP * self.problem.csr_data.work)
+        """Return whether the sweeps before the first factor would end after the deadline."""
+        return deadline.passed(self.sweeps * SWEEP_ENTRY_TIME * self.problem.csr_data.work)
 
-    def advance(self, deadline: Deadline, most: int) -> tuple[int, bool]:
-        """Run the rounds, at most `most`, that are expected to end before the deadline.
+    def advance(self, deadline: Deadline, max_rounds: int) -> tuple[int, bool]:
+        """Run at most `max_rounds` rounds that are expected to end before the deadline.
 
         Returns
         -------
@@ -117,17 +128,17 @@ class PivotState:
             Code of `Pivoting.advance`, and whether no round fits.
         """
         left, before, watch = deadline.remaining(), self.rows.n_rounds, Stopwatch()
-        if left is None or self.outside is not None:  # which asks the clock itself
-            return self.rows.advance(most), most == 0
+        if left is None or self.outside is not None:  # `TimedFactor` checks the clock itself.
+            return self.rows.advance(max_rounds), max_rounds == 0
         n = int(left / self.seconds)
-        n = min(most, max(1, n // 2) if n else 0)  # then it is asked again
+        n = min(max_rounds, max(1, n // 2) if n else 0)  # Half of the rounds that fit; the caller continues.
         code = self.rows.advance(n)
         if self.rows.n_rounds > before:
             self.seconds = watch.seconds / (self.rows.n_rounds - before)
         return code, n == 0
 
     def set_deadline(self, deadline: Deadline) -> None:
-        """Let no factor by Python begin that is expected to end after `deadline`."""
+        """Start no factor by Python that is expected to end after `deadline`."""
         if self.outside is not None:
             self.outside.deadline = deadline
 
@@ -139,12 +150,13 @@ class PivotState:
         return int(self.rows.rank)
 
 
-def _filled(problem: Problem) -> float:
-    """Of LU [s] as wide as an order of small bandwidth leaves it: what entries alone do not tell, fill is."""
+def _filled_factor_time(problem: Problem) -> float:
+    """Estimate the time [s] of a banded LU in an order of small bandwidth, which includes the fill."""
     width = float(permuted_band(problem, narrow_order(problem)) + 1)
-    return DENSE * problem.m * min(width * width, dense_work(problem.m) / problem.m)
+    return DENSE_FACTOR_WORK_TIME * problem.m * min(width * width, dense_work(problem.m) / problem.m)
 
 
 def _same_pattern(p: Problem, q: Problem) -> bool:
+    """Return whether A has the same sparsity pattern in both problems."""
     a, b = p.csr, q.csr
     return np.array_equal(a.indptr, b.indptr) and np.array_equal(a.indices, b.indices)

@@ -34,7 +34,7 @@ TABLES = ("lavender.solvers", "lavender.external")
 class SmallCall(Protocol):
     """Compiled call that solves a small problem with the bits of `run`, or leaves it to `run`."""
 
-    def in_vain(
+    def record_failure(
         self, problem: Problem, impulse: FloatArray | None, tol: float, counts: tuple[int, ...]
     ) -> None:
         """Record that the call from `impulse` failed after work `counts`, so that it is not repeated before `run`."""
@@ -48,11 +48,11 @@ class SmallCall(Protocol):
         """Options of the compiled call for matrices and bodies."""
 
     def attempt(
-        self, problem: Problem, impulse: FloatArray | None, tol: float, most: float = ...
+        self, problem: Problem, impulse: FloatArray | None, tol: float, max_cost: float = ...
     ) -> tuple[Any, Any]:
         """Return (judged result or None, work counts), from `impulse` (m,) [N s] or from the zero impulse.
 
-        The result is None if the call did not converge; `most` [ns] limits its estimated cost.
+        The result is None if the call did not converge; `max_cost` [ns] limits its estimated cost.
         """
 
     def claim(

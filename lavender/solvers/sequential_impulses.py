@@ -18,25 +18,24 @@ from lavender.base.arrays import FloatArray
 from lavender.judge.solution import Claim
 from lavender.problem import Problem
 from lavender.problem.ordering import Order
-from lavender.solvers.layout import Layout, lay_out
-from lavender.solvers.layout import pays as layout_pays
+from lavender.solvers.layout import Layout, copy_in_order, copy_pays
 from lavender.solvers.registry import SolverSpec
 from lavender.solvers.sweeping import Sweeping, SweepState, plan_of
 from lavender_ext.sweep import serial
 
 
 class ImpulseState(SweepState):
-    """A sweep state over bodies: v = M^-1 J^T lambda is formed once and kept by the sweeps.
+    """State of sweeps over bodies: v = M^-1 J^T lambda is formed once and updated by the sweeps.
 
-    A large problem with an order of its own is copied in that order; the impulse of the sweeps is then `laid`.
+    A large problem with an order of its own is copied in that order; the sweeps then use `sweep_impulse`.
     """
 
-    laid: FloatArray | None = None  # (m,) impulse in sweep order, as the last run left it
+    sweep_impulse: FloatArray | None = None  # (m,) N s, in sweep order, as the last run left it.
     layout: Layout | None
 
-    def __init__(self, problem: Problem, order: Order, before: ImpulseState | None) -> None:
-        layout, sweeps = (None, None) if before is None else (before.layout, before.sweeps)
-        self.layout = lay_out(problem, order.blocks, layout) if layout_pays(problem, order) else None
+    def __init__(self, problem: Problem, order: Order, earlier: ImpulseState | None) -> None:
+        layout, sweeps = (None, None) if earlier is None else (earlier.layout, earlier.sweeps)
+        self.layout = copy_in_order(problem, order.blocks, layout) if copy_pays(problem, order) else None
         data, swept = problem.data, order
         if self.layout is not None:
             data = self.layout.data
@@ -47,32 +46,33 @@ class ImpulseState(SweepState):
 
     @property
     def best(self) -> tuple[float, FloatArray | None]:
-        relative, laid = super().best
-        if laid is None or self.layout is None:
-            return relative, laid
-        impulse = np.empty_like(laid)
-        self.layout.put(laid, impulse)
+        """(relative residual, impulse (m,) [N s]) of the best check, in the problem's order."""
+        relative, ordered = super().best
+        if ordered is None or self.layout is None:
+            return relative, ordered
+        impulse = np.empty_like(ordered)
+        self.layout.from_sweep_order(ordered, impulse)
         return relative, impulse
 
     def keep_best(self, impulse: FloatArray, tol: float) -> None:
-        """Replace `impulse` (m,), unless it meets tol, by the best of each island of it and of all checks."""
+        """Replace `impulse` (m,), unless it meets tol, by the best of it and all checked iterates in each island."""
         if self.layout is None:
             self.watch.keep_best(impulse, tol)
             return
-        laid = self.layout.take(impulse)
-        self.watch.keep_best(laid, tol)
-        self.layout.put(laid, impulse)
+        ordered = self.layout.to_sweep_order(impulse)
+        self.watch.keep_best(ordered, tol)
+        self.layout.from_sweep_order(ordered, impulse)
 
 
 @dataclass(frozen=True)
 class SequentialImpulses(Sweeping):
-    """Matrix-free projected Gauss-Seidel; `order`, `ground`, `seed` as in `lavender.problem.ordering`."""
+    """Matrix-free projected Gauss-Seidel; `order`, `ground` and `seed` as in `lavender.problem.ordering`."""
 
     def _forming(self, problem: Problem) -> float:
         return 0.0
 
-    def _state(self, problem: Problem, order: Order, before: ImpulseState | None) -> ImpulseState:
-        return ImpulseState(problem, order, before)
+    def _state(self, problem: Problem, order: Order, earlier: ImpulseState | None) -> ImpulseState:
+        return ImpulseState(problem, order, earlier)
 
     def run(
         self,
@@ -84,12 +84,12 @@ class SequentialImpulses(Sweeping):
     ) -> Claim:
         lam = impulse
         if state.layout is not None:
-            if state.laid is None:
-                state.laid = state.layout.take(impulse)
-            lam = state.laid
+            if state.sweep_impulse is None:
+                state.sweep_impulse = state.layout.to_sweep_order(impulse)
+            lam = state.sweep_impulse
         claim = super().run(state, lam, max_iter, tol)
         if state.layout is not None:
-            state.layout.put(lam, impulse)
+            state.layout.from_sweep_order(lam, impulse)
         return claim
 
 

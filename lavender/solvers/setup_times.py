@@ -1,7 +1,8 @@
-"""What set-ups take [s], counted from a problem's size before any of it is done: asked under a time limit alone.
+"""Estimate the times of set-ups [s] from a problem's size, before they start; only used with a time limit.
 
-A set-up cannot be stopped, so one that does not fit in the time left is not begun. Rates are of one core of 2023, half
-as much again as `python -m benchmarks limits` finds on problems of the suite, dense matrices, and J and M.
+A set-up cannot be interrupted, so one that does not fit in the remaining time is not started. The rates are for one
+core of 2023, 1.5 times the values that `python -m benchmarks limits` measures on problems of the suite, dense matrices,
+and J and M.
 """
 
 from __future__ import annotations
@@ -14,44 +15,47 @@ from lavender.problem import Problem
 from lavender.solvers.registry import SMALL_ROWS, SolverSpec
 from lavender_ext.factor.sparse import bandwidth
 
-START = 5e-5  # s, of each
-EACH, FORMED, PRODUCT = 1.2e-7, 1.2e-8, 2.5e-9  # of A: each row and entry of bodies, each product of J and M
-# s for each entry of A: laid out for a factor by Python, all of them at once where there are no others; row sums.
-LAID_OUT, WHOLE, SUMMED = 3e-8, 9e-9, 6e-9
-CALLS = 3e-4  # s of SciPy's calls where A is laid out by its entries
-# s for each entry of A with an order of its own and what it fills, as many times more as its band has some thousand
-# rows; where every entry is there, which is one panel.
-ANALYSED, BAND, PANEL = 6e-8, 1500.0, 1e-9
-# s for each multiply-add of a sweep (`Data.work`): of an elimination of bodies, one of velocities, and an order.
-BODIES, VELOCITIES, ORDERED = 3e-8, 4.5e-8, 1e-7
-SWEPT = 1.5e-9  # s for each multiply-add of a sweep, of its room and of itself
-LOADING, SCIPY = 0.3, ("scipy.sparse", "scipy.linalg.lapack")  # s of a part of SciPy; what factors need
-DENSE, SPARSE = 1.5e-10, 1e-9  # s for each multiply-add of a first factor
-# s of `Problem.disk` over J and M: its calls, each row, each entry of J; and over a matrix, each entry of A.
+START_TIME = 5e-5  # Constant part of each set-up [s].
+# Forming A [s]: per row, per entry of A of bodies, and per product of entries of J and M.
+FORM_ROW_TIME, FORM_ENTRY_TIME, FORM_PRODUCT_TIME = 1.2e-7, 1.2e-8, 2.5e-9
+# Time per entry of A [s]: to lay it out for a factor by Python, the same for a full matrix, and to sum its rows.
+LAYOUT_ENTRY_TIME, FULL_LAYOUT_ENTRY_TIME, ROW_SUM_ENTRY_TIME = 3e-8, 9e-9, 6e-9
+SCIPY_CALLS_TIME = 3e-4  # Time of SciPy's calls to lay out a sparse A [s].
+# Analysis of A for a factor: time per entry [s], which grows by 1 + bandwidth / ANALYSIS_BANDWIDTH; time per entry [s]
+# of a full matrix, which is one panel.
+ANALYSIS_ENTRY_TIME, ANALYSIS_BANDWIDTH, FULL_ANALYSIS_ENTRY_TIME = 6e-8, 1500.0, 1e-9
+# Time per multiply-add of a sweep (`Data.work`) [s]: of an elimination of bodies, of velocities, and of an order.
+BODY_ELIMINATION_TIME, VELOCITY_ELIMINATION_TIME, ORDER_TIME = 3e-8, 4.5e-8, 1e-7
+SWEEP_SETUP_TIME = 1.5e-9  # Time per multiply-add of a sweep [s], for its workspace and the first sweep.
+# Time to import a module of SciPy [s], and the modules that factorisations need.
+IMPORT_TIME, SCIPY_MODULES = 0.3, ("scipy.sparse", "scipy.linalg.lapack")
+# Time per multiply-add of a first factor [s].
+DENSE_FACTOR_WORK_TIME, SPARSE_FACTOR_WORK_TIME = 1.5e-10, 1e-9
+# Time of `Problem.disk` [s] over J and M: constant, per row, per entry of J; and over a matrix, per entry of A.
 DISK_J, DISK_J_ROW, DISK_J_ENTRY = 1e-4, 3e-8, 2.5e-9
 DISK_A, DISK_A_ROW, DISK_A_ENTRY = 1.5e-4, 4e-8, 8e-9
 
 
-def forming(problem: Problem) -> float:
-    """A, where it is not known yet."""
+def forming_time(problem: Problem) -> float:
+    """Estimate the time [s] to form A; 0 if it is known."""
     if problem.m == 0 or problem.matrix is not None or "_compressed" in problem.__dict__:
         return 0.0
-    return formed_once(problem)
+    return formation_time(problem)
 
 
-def formed_once(problem: Problem) -> float:
-    """A of J and M or bodies, known or not: a count of the data alone."""
+def formation_time(problem: Problem) -> float:
+    """Estimate the time [s] to form A of J and M or of bodies, from the data only, whether A is known or not."""
     if problem.rows is None:
-        entries = PRODUCT * float(problem.metric.products_of_a)
+        entries = FORM_PRODUCT_TIME * float(problem.metric.products_of_a)
     else:
-        entries = FORMED * problem.max_entries
-    return START + EACH * problem.m + entries
+        entries = FORM_ENTRY_TIME * problem.max_entries
+    return START_TIME + FORM_ROW_TIME * problem.m + entries
 
 
 def estimate_disk_time(problem: Problem) -> float:
-    """Estimate the time [s] of making `problem.disk`; 0 if it is known, or if the problem has no ellipses.
+    """Estimate the time [s] to build `problem.disk`; 0 if it is known, or if the problem has no ellipses.
 
-    Nothing is worked out for the estimate but the numbers of bodies, and these only after their own time is counted.
+    The estimate itself computes only the couplings of bodies, whose time the caller has checked before.
     """
     if not problem.cones.has_ellipse or "_disk" in problem.__dict__:
         return 0.0
@@ -59,87 +63,94 @@ def estimate_disk_time(problem: Problem) -> float:
         of_j = len(problem.generalized.operator.jac[1])
         return DISK_J + DISK_J_ROW * problem.m + DISK_J_ENTRY * of_j
     entries = problem.max_entries if problem.matrix is None else problem.matrix.size
-    made = DISK_A + DISK_A_ROW * problem.m + DISK_A_ENTRY * entries
-    return made + forming(problem) + loading("scipy.sparse")
+    setup = DISK_A + DISK_A_ROW * problem.m + DISK_A_ENTRY * entries
+    return setup + forming_time(problem) + loading_time("scipy.sparse")
 
 
 def estimate_refusal_time(problem: Problem, spec: SolverSpec) -> float:
-    """Estimate the time [s] of `SolverSpec.refusal`: adapters of other packages read a whole matrix."""
+    """Estimate the time [s] of `SolverSpec.refusal`: adapters of other packages read a complete matrix."""
     if not spec.external or problem.matrix is None or "_scan" in problem.__dict__:
         return 0.0
     return residuals.setup_time(problem) + residuals.READ_TIME_PER_ENTRY * float(problem.matrix.size)
 
 
-def loading(*modules: str) -> float:
-    """Parts of SciPy that this process has not loaded yet."""
-    return LOADING * sum(module not in sys.modules for module in modules)
+def loading_time(*modules: str) -> float:
+    """Estimate the time [s] to import those of the modules of SciPy that are not imported yet."""
+    return IMPORT_TIME * sum(module not in sys.modules for module in modules)
 
 
-def compared(problem: Problem) -> float:
-    """Whether A is symmetric, where it is not known yet."""
-    known = problem.matrix is None or "_scan" in problem.__dict__
-    return 0.0 if known else residuals.READ_TIME_PER_ENTRY * problem.max_entries
+def comparison_time(problem: Problem) -> float:
+    """Estimate the time [s] to check whether A is symmetric; 0 if it is known."""
+    find_known_relative = problem.matrix is None or "_scan" in problem.__dict__
+    return 0.0 if find_known_relative else residuals.READ_TIME_PER_ENTRY * problem.max_entries
 
 
-def over_rows(problem: Problem) -> float:
-    """A, whether it is symmetric, and a matrix that a solver makes of it."""
+def row_setup_time(problem: Problem) -> float:
+    """Estimate the time [s] to form A, check its symmetry, and lay it out for a solver."""
     entries = problem.max_entries
-    loaded = loading(*SCIPY) if problem.m > SMALL_ROWS else 0.0
+    imports = loading_time(*SCIPY_MODULES) if problem.m > SMALL_ROWS else 0.0
     full = entries == float(problem.m) ** 2
-    laid_out = WHOLE * entries if full else CALLS + LAID_OUT * entries
-    return START + forming(problem) + compared(problem) + laid_out + loaded
+    layout = FULL_LAYOUT_ENTRY_TIME * entries if full else SCIPY_CALLS_TIME + LAYOUT_ENTRY_TIME * entries
+    return START_TIME + forming_time(problem) + comparison_time(problem) + layout + imports
 
 
-def analysed(problem: Problem) -> float:
-    """An order of elimination of A, and what it fills; rows of one block are one node."""
+def analysis_time(problem: Problem) -> float:
+    """Estimate the time [s] of an elimination order of A and its fill; the rows of a block are one node."""
     entries, m = problem.max_entries, float(problem.m)
     if entries == m * m:
-        return PANEL * entries
+        return FULL_ANALYSIS_ENTRY_TIME * entries
     is_known = problem.matrix is not None or "_compressed" in problem.__dict__
     band = max(bandwidth(*problem._compressed[:2])) if is_known else m
-    return ANALYSED * entries * (problem.n_blocks / m) * (1.0 + band / BAND)
+    return ANALYSIS_ENTRY_TIME * entries * (problem.n_blocks / m) * (1.0 + band / ANALYSIS_BANDWIDTH)
 
 
-def summed(problem: Problem) -> float:
-    """A, and sums of its rows by SciPy."""
-    return forming(problem) + SUMMED * problem.max_entries + START + loading("scipy.sparse")
+def row_sums_time(problem: Problem) -> float:
+    """Estimate the time [s] to form A and to sum its rows with SciPy."""
+    return (
+        forming_time(problem)
+        + ROW_SUM_ENTRY_TIME * problem.max_entries
+        + START_TIME
+        + loading_time("scipy.sparse")
+    )
 
 
-def factored(problem: Problem) -> float:
-    """The same with its first factor, of all rows."""
-    return over_rows(problem) + first_factor(problem.m, problem.max_entries)
+def first_solve_time(problem: Problem) -> float:
+    """Estimate the time [s] of `row_setup_time` and the first factor of all rows."""
+    return row_setup_time(problem) + first_factor_time(problem.m, problem.max_entries)
 
 
 def dense_work(m: int) -> float:
-    """Multiply-adds of one factor of m rows, every entry a number."""
+    """Return the multiply-adds of one factor of a full matrix of m rows."""
     return m**3 / 3.0
 
 
 def sparse_work(entries: float, m: int) -> float:
-    """Those of one in an order of its own, as size tells before an analysis counts them: fill grows with it."""
+    """Estimate the multiply-adds of a sparse factor from its size, before an analysis; fill grows with the size."""
     return 100.0 * entries * (1.0 + m / 1000.0)
 
 
-def first_factor(m: int, entries: float = inf) -> float:
-    """A first factor of m rows, of few entries where these are given."""
-    return min(DENSE * dense_work(m), SPARSE * sparse_work(entries, m))
+def first_factor_time(m: int, entries: float = inf) -> float:
+    """Estimate the time [s] of a first factor of m rows; sparse if `entries` is given and that is faster."""
+    return min(DENSE_FACTOR_WORK_TIME * dense_work(m), SPARSE_FACTOR_WORK_TIME * sparse_work(entries, m))
 
 
-def over_bodies(problem: Problem) -> float:
-    """An elimination of bodies, and J scaled for it."""
-    return START + BODIES * problem.metric.work
+def body_setup_time(problem: Problem) -> float:
+    """Estimate the time [s] to prepare an elimination of bodies, with the scaled J."""
+    return START_TIME + BODY_ELIMINATION_TIME * problem.metric.work
 
 
-def over_velocities(problem: Problem) -> float:
-    """An elimination of generalised velocities."""
-    return START + VELOCITIES * problem.metric.work
+def velocity_setup_time(problem: Problem) -> float:
+    """Estimate the time [s] to prepare an elimination of generalised velocities."""
+    return START_TIME + VELOCITY_ELIMINATION_TIME * problem.metric.work
 
 
-def sweeping(problem: Problem) -> float:
-    """Sweeps over the form that is given, and the first of them."""
-    return START + SWEPT * problem.metric.work
+def first_sweep_time(problem: Problem) -> float:
+    """Estimate the time [s] to prepare sweeps over the given form, with the first sweep."""
+    return START_TIME + SWEEP_SETUP_TIME * problem.metric.work
 
 
-def ordered(problem: Problem, order: object) -> float:
-    """An order of blocks, other than the one given."""
-    return 0.0 if isinstance(order, str) and order == "given" else START + ORDERED * problem.metric.work
+def order_time(problem: Problem, order: object) -> float:
+    """Estimate the time [s] to compute an order of blocks; 0 for the given order."""
+    return (
+        0.0 if isinstance(order, str) and order == "given" else START_TIME + ORDER_TIME * problem.metric.work
+    )

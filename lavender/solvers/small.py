@@ -1,9 +1,9 @@
-"""Small problems in one compiled call, and the claim that goes with its counts.
+"""Solve small problems in one compiled call, and build the claim from its counts.
 
-It is used for few rows of bodies or of A and for small islands under friction (`lavender_ext/small/call.pyx`), and
-for generalised coordinates if Newton's method is counted to cost no more than others (`lavender_ext/batch/many.pyx`),
-because Python would cost more than such a solve. If the call does not find a solution it returns nothing, and the
-solver runs as on any other problem, from the beginning.
+The call is used for few rows of bodies or of A and for small islands with friction (`lavender_ext/small/call.pyx`), and
+for generalised coordinates if Newton's method is estimated to cost no more than other solvers
+(`lavender_ext/batch/many.pyx`): Python would take longer than such a solve. If the call does not find a solution, it
+returns None, and the solver runs from the beginning as on any other problem.
 """
 
 from __future__ import annotations
@@ -20,83 +20,121 @@ from lavender.base.arrays import FloatArray
 from lavender.judge.residuals import get_reference, judge_impulse
 from lavender.judge.solution import Claim, SolverStage, Status, counted, summed
 from lavender.problem import Problem
-from lavender.solvers.costs import RATES, SOFT, STEPS, SWEEPS, factorisations, sweep_cost
+from lavender.solvers.costs import (
+    EXPECTED_SWEEPS,
+    RATES,
+    RIGID_STEP_RATIO,
+    SOFT_STEP_RATIO,
+    factorisations,
+    sweep_cost,
+)
 from lavender.solvers.islands import islands
 from lavender.solvers.newton_systems import general
-from lavender.solvers.newton_systems.systems import DENSE_ROWS
+from lavender.solvers.newton_systems.systems import MAX_ALWAYS_DENSE_ROWS
 from lavender.solvers.registry import SMALL_ROWS
-from lavender.solvers.setup_times import forming
+from lavender.solvers.setup_times import forming_time
 from lavender_ext.batch.many import Limits, solve_first
 from lavender_ext.small.call import Islands, Rules, Small
 
 # Keys of `Derived.cache`.
-COMPILED_CALL_KEY = (
-    "lavender.solvers.small: compiled call"  # a `Small` or `Islands`; False if the problem has none
-)
-# (solver, tol, start) of a compiled call that did not converge, and its counts: it is not repeated.
+# A `Small` or `Islands`; False if the problem has no compiled call.
+COMPILED_CALL_KEY = "lavender.solvers.small: compiled call"
+# (solver, tol, start) of a compiled call that did not converge, and its counts: the call is not repeated.
 FAILED_CALL_KEY = "lavender.solvers.small: failed call"
 
-#: Why nothing ran, by the status of a start.
-NOTHING = {
+#: Messages if no solver ran, by the status of the start.
+NO_WORK_MESSAGES = {
     Status.CONVERGED: "the start is a solution",
-    Status.ROUNDOFF_LIMIT: "the start is at its floor: what is left is rounding",
+    Status.ROUNDOFF_LIMIT: "the start is at its floor: its residual is rounding",
 }
-NO_TIME = "the time limit left no time for a solver"
-WARM = 1e-3  # relative residual from which an iterate is worth starting from
-# The most rows of an island: up to these, dense factors cost less than sweeps and factors of all islands together.
-ISLAND = 150
-SWEPT = 32  # the most sweeps of a part before its first factorisation
-QUARTER = 0.25  # of the time left, that islands may take
-SPLIT = 200.0  # ns for each row of what tells islands apart
-TREE = 2e5  # ns, Python's share of two lines of the tree, which one compiled call does without
-SHARED = 10.0  # rows for each velocity, from which N is full and small beside what it is made of
-COLUMNS = 12.0  # velocities of two bodies
-MOST = 1e7  # counted cost [ns] of Newton's method over generalised velocities up to which no clock is read in between
-NEWTON_STEPS, AUTO_STEPS = 1500.0, 1e6  # of all islands of velocities: within what each may do by default
+NO_TIME_MESSAGE = "the time limit left no time for a solver"
+WARM_START_MAX_RESIDUAL = 1e-3  # Newton's method starts from an iterate up to this relative residual.
+# Largest number of rows of an island. Up to it, dense factors cost less than sweeps and factors of all islands.
+MAX_ISLAND_ROWS = 150
+MAX_SWEEPS_BEFORE_FACTOR = 32  # Largest number of sweeps of an island before its first factorisation.
+ISLANDS_TIME_FRACTION = 0.25  # Fraction of the remaining time that islands may use.
+ISLANDS_ROW_COST = 200.0  # Cost [ns] per row to separate the islands.
+TREE_OVERHEAD_COST = 2e5  # Cost [ns] of Python in two stages of the tree, which the compiled call avoids.
+# From this many rows per velocity, the matrix N is full, and small compared with the data from which it is formed.
+DENSE_ROWS_PER_VELOCITY = 10.0
+VELOCITIES_OF_TWO_BODIES = 12.0
+# Largest estimated cost [ns] of Newton's method over generalised velocities in one call that does not read the clock.
+MAX_UNCLOCKED_COST = 1e7
+# Largest numbers of steps of all islands of velocities, within the default limits of each solver.
+NEWTON_MAX_STEPS, AUTO_MAX_STEPS = 1500.0, 1e6
 
 
-def limits(sweeps: float, most: float = MOST, steps: float = NEWTON_STEPS) -> Limits:
-    """Of the compiled calls over generalised velocities: they may cost as much as so many sweeps, and `most` [ns], and
-    take so many steps.
+def make_limits(
+    sweeps: float, max_cost: float = MAX_UNCLOCKED_COST, steps: float = NEWTON_MAX_STEPS
+) -> Limits:
+    """Return the limits of compiled calls over generalised velocities.
+
+    Parameters
+    ----------
+    sweeps : float
+        The call may cost as much as this many sweeps,
+    max_cost : float, ns
+        and at most this,
+    steps : float
+        and do at most this many steps.
     """
-    sweep = TREE, RATES["sweep row"], RATES["sweep cone"], sweeps
+    sweep = TREE_OVERHEAD_COST, RATES["sweep row"], RATES["sweep cone"], sweeps
     step = RATES["entry"], RATES["work"]["velocities"], factorisations("lcp")
-    rows = SMALL_ROWS, DENSE_ROWS, SHARED, COLUMNS
-    return Limits(np.array([*step, STEPS, SOFT, *sweep, general.MAX_MATRIX_ENTRIES, most, *rows, steps]))
+    rows = SMALL_ROWS, MAX_ALWAYS_DENSE_ROWS, DENSE_ROWS_PER_VELOCITY, VELOCITIES_OF_TWO_BODIES
+    return Limits(
+        np.array(
+            [
+                *step,
+                RIGID_STEP_RATIO,
+                SOFT_STEP_RATIO,
+                *sweep,
+                general.MAX_MATRIX_ENTRIES,
+                max_cost,
+                *rows,
+                steps,
+            ]
+        )
+    )
 
 
 def call_ends_within(problem: Problem, seconds: float | None) -> bool:
-    """Whether the compiled call is made: of more than a few rows, which may return nothing, if it is counted to end.
+    """Return whether the compiled call is made within a time limit of `seconds`.
 
-    It may take a quarter of the time that is left; over velocities four times what its gate lets in.
+    With more than a few rows, the call may fail. It is only made if its estimated time is at most a quarter of the
+    remaining time; over velocities, the estimate is four times the largest accepted cost.
     """
     if seconds is None or problem.m <= SMALL_ROWS:
         return True
     if problem.generalized is not None:
-        return QUARTER * seconds >= 4e-9 * MOST
+        return ISLANDS_TIME_FRACTION * seconds >= 4e-9 * MAX_UNCLOCKED_COST
     if problem.law in ("linear", "lcp"):
         return False
-    cost = SPLIT * problem.m + 1e9 * forming(problem) + SWEPT * sweep_cost(problem)
-    return 1e-9 * cost <= QUARTER * seconds
+    cost = (
+        ISLANDS_ROW_COST * problem.m
+        + 1e9 * forming_time(problem)
+        + MAX_SWEEPS_BEFORE_FACTOR * sweep_cost(problem)
+    )
+    return 1e-9 * cost <= ISLANDS_TIME_FRACTION * seconds
 
 
-def prepared(problem: Problem) -> Any:
-    """The compiled call of a small problem or of small islands, kept with the problem; None if it has none."""
-    kept = problem.derived.cache.get(COMPILED_CALL_KEY)
-    if kept is None:
-        kept = problem.derived.cache[COMPILED_CALL_KEY] = _make(problem) or False
-    return kept or None
+def prepare_call(problem: Problem) -> Any:
+    """Return the compiled call of a small problem or of small islands, cached with the problem, or None."""
+    call = problem.derived.cache.get(COMPILED_CALL_KEY)
+    if call is None:
+        call = problem.derived.cache[COMPILED_CALL_KEY] = _make_call(problem) or False
+    return call or None
 
 
-def _make(problem: Problem) -> Small | None:
-    cones, count, label, bounded = problem.cones, 1, None, pivots(problem)
+def _make_call(problem: Problem) -> Small | None:
+    """Build the compiled call; None for round cones, rolling or torsional friction, large islands and empty rows."""
+    cones, count, label, bounded = problem.cones, 1, None, uses_pivots(problem)
     if cones.has_round or cones.has_more_parts:
         return None
     if problem.m > SMALL_ROWS:
         if bounded:
             return None
         count, label = islands(problem)
-        if count == 1 or np.bincount(label, np.diff(cones.ptr)).max() > ISLAND:
+        if count == 1 or np.bincount(label, np.diff(cones.ptr)).max() > MAX_ISLAND_ROWS:
             return None
     get_reference(problem)
     data = problem.metric
@@ -104,63 +142,89 @@ def _make(problem: Problem) -> Small | None:
         return None
     if bounded or count == 1:
         return Small(data, problem.csr_data if bounded else data)
-    # Islands are cut out of the bodies where these have fewer unknowns than rows, else out of A.
+    # Islands are taken from the bodies if these have fewer unknowns than rows, else from A.
     bodies = problem.rows is not None and problem.m > 6 * problem.rows.n_bodies
     return Islands(data, data if bodies else problem.csr_data, label, count)
 
 
-def pivots(problem: Problem) -> bool:
-    """Whether the compiled call over A or bodies pivots: its rows are bounded."""
+def uses_pivots(problem: Problem) -> bool:
+    """Return whether the compiled call over A or bodies uses pivots: all rows are bounded or free."""
     return problem.law in ("linear", "lcp")
 
 
-def who(problem: Problem) -> str:
-    """Who solves a problem in the compiled call of `auto`, in words; "" where that is not made."""
+def describe_call(problem: Problem) -> str:
+    """Describe the solver of the compiled call of `auto`; return an empty text if the call is not made."""
     if problem.generalized is not None:
         kernel = general.prepare(problem)
         if kernel is None or AUTO.limits is None:
             return ""
-        cost, most = AUTO.limits.cost(problem.metric, kernel.work, kernel.islands)
-        return f"newton over velocities, counted to take {1e-3 * cost:.3g} us" if cost <= most else ""
-    small = prepared(problem)
+        cost, max_cost = AUTO.limits.cost(problem.metric, kernel.work, kernel.islands)
+        return f"newton over velocities, counted to take {1e-3 * cost:.3g} us" if cost <= max_cost else ""
+    small = prepare_call(problem)
     if small is None:
         return ""
-    if pivots(problem):
-        return "direct (block pivots), then lemke where these do not end"
+    if uses_pivots(problem):
+        return "direct (block pivots), then lemke if these do not end"
     count = islands(problem)[0] if problem.m > SMALL_ROWS else 1
     return "sweeps (anderson), then newton" + (f", on each of {count} islands" if count > 1 else "")
 
 
 @dataclass(frozen=True)
 class SmallCall:
-    """What `SolverSpec.small` holds: small problems as that solver solves them."""
+    """The compiled call of a solver for small problems (`SolverSpec.small`).
+
+    Parameters
+    ----------
+    name : str
+        Name of the solver.
+    limits : Limits or None
+        Limits of the cost over generalised velocities; None if it does not accept them.
+    pivots : bool
+        It accepts bounded rows.
+    hands_over : bool
+        It accepts friction, too; a start that is a solution is returned, and a bad start is replaced by zero.
+    rules : Rules
+        Options of the compiled call.
+    """
 
     name: str
-    limits: Limits | None  # what it may cost over generalised velocities; None: not at all
-    pivots: bool  # bounded rows
-    # And friction; a start that is a solution is the result, a bad one is not started from.
+    limits: Limits | None
+    pivots: bool
     hands_over: bool = False
     rules: Rules = field(init=False)
 
     def __post_init__(self) -> None:
-        rules = Rules(SMALL_ROWS, SWEPT, WARM, self.pivots, self.hands_over)
+        rules = Rules(
+            SMALL_ROWS, MAX_SWEEPS_BEFORE_FACTOR, WARM_START_MAX_RESIDUAL, self.pivots, self.hands_over
+        )
         object.__setattr__(self, "rules", rules)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Copied or pickled it is the call of that name: what the kernels read has no pickle."""
-        return _call_of, (self.name,)
+        """Copy or pickle as the call of that name, because `rules` and `limits` cannot be pickled."""
+        return _named_call, (self.name,)
 
-    def may_cost(self, problem: Problem, kernel: Any) -> float:
-        """What the call over J and M may cost as counted [ns]; 0 where it is not made whatever it costs."""
+    def cost_limit(self, problem: Problem, kernel: Any) -> float:
+        """Return the largest accepted cost [ns] of the call over J and M; 0 if the call is never made."""
         return 0.0 if self.limits is None else float(self.limits.cost(problem.metric, 0.0, kernel.islands)[1])
 
     def attempt(
-        self, problem: Problem, impulse: FloatArray | None, tol: float, most: float = inf
+        self, problem: Problem, impulse: FloatArray | None, tol: float, max_cost: float = inf
     ) -> tuple[Any, Any]:
-        """(what the judge finds, counts) from an impulse (m,) or from doing nothing.
+        """Solve from an impulse (m,) [N s] or from the zero impulse.
 
-        Where it does not converge the judge finds nothing, None, and counts are of what was done in vain: () where no
-        call was made. most: counted cost [ns] at which it ends with what was found by then, above tol.
+        Parameters
+        ----------
+        problem : Problem
+        impulse : (m,) N s, optional
+        tol : float, -
+        max_cost : float, ns
+            Estimated cost at which the call ends with the iterate so far.
+
+        Returns
+        -------
+        tuple
+            (judged result, work counts). The result is None if the call did not converge; the counts are () if no call
+            was made.
         """
         cache = problem.derived.cache
         if not tol > 0.0 or not len(problem.b):
@@ -171,35 +235,34 @@ class SmallCall:
         if problem.generalized is not None:
             if self.limits is None:
                 return None, ()
-            found = solve_first(problem.derived.view, impulse, tol, self.limits, most)
+            result = solve_first(problem.derived.view, impulse, tol, self.limits, max_cost)
         else:
             small = cache.get(COMPILED_CALL_KEY)
             if small is None and (problem.m <= SMALL_ROWS or self.hands_over):
-                small = prepared(problem)
-            if not small or not (self.pivots if pivots(problem) else self.hands_over):
+                small = prepare_call(problem)
+            if not small or not (self.pivots if uses_pivots(problem) else self.hands_over):
                 return None, ()
-            found = small.run(impulse, tol, self.rules, most)
-        if found[0] is None and most == inf:
-            self.in_vain(problem, impulse, tol, found[1])
-        made: tuple[Any, Any] = found
-        return made
+            result = small.run(impulse, tol, self.rules, max_cost)
+        if result[0] is None and max_cost == inf:
+            self.record_failure(problem, impulse, tol, result[1])
+        return result[0], result[1]
 
-    def in_vain(
+    def record_failure(
         self, problem: Problem, impulse: FloatArray | None, tol: float, counts: tuple[int, ...]
     ) -> None:
-        """The call from there left it after these counts: it need not be made again before the full solver."""
+        """Record that the call from this start failed with these counts, so that it is not repeated."""
         problem.derived.cache[FAILED_CALL_KEY] = self._call(problem, impulse, tol), counts
 
     def _call(self, problem: Problem, impulse: FloatArray | None, tol: float) -> tuple[str, float, bytes]:
         return self.name, tol, (problem._start if impulse is None else impulse).tobytes()
 
-    def failed(self, problem: Problem, counts: tuple[int, ...] | None) -> list[tuple[str, Claim]]:
-        """Who did what in a call of these counts, which did not solve the problem."""
-        if counts is None or not any(counts):  # None: of a start that was judged and is the result
+    def failed_claims(self, problem: Problem, counts: tuple[int, ...] | None) -> list[tuple[str, Claim]]:
+        """Return (solver name, claim) for each solver that ran in a failed call, from its counts."""
+        if counts is None or not any(counts):  # None: the start is the result.
             return []
         if problem.generalized is not None:
             return [("newton", replace(general.claim(Status.STALLED, counts), iterations=0))]
-        done = (_by_pivots if pivots(problem) else _in_turns)(counts)
+        done = (_pivot_counts if uses_pivots(problem) else _stage_counts)(counts)
         return [(name, Claim(Status.STALLED, 0, work)) for name, work in done[1]]
 
     def claim(
@@ -210,19 +273,19 @@ class SmallCall:
         after: float,
         status: Status = Status.CONVERGED,
     ) -> Claim:
-        """The claim for a call with these counts, from a start (m,) or from none to a residual `after`."""
-        nothing = NOTHING.get(status, NO_TIME)
+        """Build the claim of a call from its counts, its start (m,) or None, and its relative residual `after`."""
+        no_work = NO_WORK_MESSAGES.get(status, NO_TIME_MESSAGE)
         if counts is None:
-            return Claim(status, 0, {}, nothing)
+            return Claim(status, 0, {}, no_work)
         if problem.generalized is not None:
             claim = general.claim(status, counts)
             if self.name == "newton":
                 return claim
             done, ran = claim.iterations, [("newton", dict(claim.work))]
             if not any(claim.work.values()):
-                return Claim(status, done, {}, nothing)
+                return Claim(status, done, {}, no_work)
         else:
-            done, ran = (_by_pivots if pivots(problem) else _in_turns)(counts)
+            done, ran = (_pivot_counts if uses_pivots(problem) else _stage_counts)(counts)
         if self.name == "direct":
             rank, shifts = ran[0][1].get("rank"), ran[0][1].get("shifts")
             symmetric = problem.is_symmetric
@@ -232,71 +295,77 @@ class SmallCall:
             elif shifts and problem.law != "linear":
                 note = "A is singular on the free rows: shifted and refined"
             return Claim(status, done, ran[0][1], note, form="band" if symmetric else "LU")
-        stages = _stages(problem, ran, start, after)
+        stages = _make_stages(problem, ran, start, after)
         return Claim(
-            status, done, summed(stage.work for stage in stages), told(stages) or nothing, stages=stages
+            status,
+            done,
+            summed(stage.work for stage in stages),
+            describe_stages(stages) or no_work,
+            stages=stages,
         )
 
 
-Ran = list[tuple[str, dict[str, int]]]  # who, and what it did
+SolverWork = list[tuple[str, dict[str, int]]]  # Names of solvers with their work.
 
 
-def _by_pivots(counts: tuple[int, ...]) -> tuple[int, Ran]:
-    """Iterations, and what was done, by the counts of `pivot_few`."""
+def _pivot_counts(counts: tuple[int, ...]) -> tuple[int, SolverWork]:
+    """Return the iterations and the work of each solver from the counts of a call with pivots."""
     done, swept, refined, factored, exchanged, shifts, rank, path = counts
     work = {
         "sweeps": 4 * swept, "rank": rank, "shifts": shifts, "refinements": refined, "factorisations": factored,
         "pivots": exchanged,
     }  # fmt: skip
-    direct = "direct", {what: count for what, count in work.items() if count}
+    direct = "direct", {kind: count for kind, count in work.items() if count}
     return done, [direct, ("lemke", {"pivots": path})] if path else [direct]
 
 
-def _in_turns(counts: tuple[int, ...]) -> tuple[int, Ran]:
-    """The same by those of sweeps in turns."""
+def _stage_counts(counts: tuple[int, ...]) -> tuple[int, SolverWork]:
+    """Return the iterations and the work of each solver from the counts of a call with sweeps and Newton's method."""
     done, sweeps, restarts, factorisations, driven, count, *_ = counts
-    where = f" on {count} islands" if count > 1 else ""
-    ran = [("anderson" + where, {"sweeps": sweeps, "restarts": restarts})]
+    suffix = f" on {count} islands" if count > 1 else ""
+    ran = [("anderson" + suffix, {"sweeps": sweeps, "restarts": restarts})]
     if not sweeps and factorisations:
         ran = []
     if factorisations:
-        where = f" on {driven} islands" if count > 1 else ""
-        ran.append(("newton" + where, {"factorisations": factorisations}))
+        suffix = f" on {driven} islands" if count > 1 else ""
+        ran.append(("newton" + suffix, {"factorisations": factorisations}))
     return done, ran
 
 
-def _stages(problem: Problem, ran: Ran, start: FloatArray | None, after: float) -> tuple[SolverStage, ...]:
-    """Turns of one compiled call; nothing was measured between two."""
+def _make_stages(
+    problem: Problem, ran: SolverWork, start: FloatArray | None, after: float
+) -> tuple[SolverStage, ...]:
+    """Return the stages of one compiled call; the residual between two stages is NaN."""
     if start is None or np.array_equal(start, problem._start):
         before = float(problem.metric.relative_at_zero)
     else:
         before = float(judge_impulse(problem, start.copy()).relative)
-    at = [before, *(len(ran) - 1) * [nan], after]
-    return tuple(SolverStage(*of, *at[i : i + 2]) for i, of in enumerate(ran))
+    residuals = [before, *(len(ran) - 1) * [nan], after]
+    return tuple(SolverStage(name, work, *residuals[i : i + 2]) for i, (name, work) in enumerate(ran))
 
 
-def told(stages: Sequence[SolverStage]) -> str:
-    """What ran, in words: turns of one solver in a row are one."""
+def describe_stages(stages: Sequence[SolverStage]) -> str:
+    """Describe the stages that ran; consecutive stages of one solver are combined."""
     return " -> ".join(
-        said(name, summed(stage.work for stage in of))
-        for name, of in groupby(stages, key=lambda stage: stage.solver)
+        describe_work(name, summed(stage.work for stage in group))
+        for name, group in groupby(stages, key=lambda stage: stage.solver)
     )
 
 
-def said(name: str, work: Mapping[str, int]) -> str:
-    """What a solver did, in words."""
-    between = " "
+def describe_work(name: str, work: Mapping[str, int]) -> str:
+    """Describe the work of a solver."""
+    separator = " "
     for kind, count in work.items():
         if count:
-            name += between + counted(count, kind)
-            between = ", "
+            name += separator + counted(count, kind)
+            separator = ", "
     return name
 
 
-AUTO = SmallCall("auto", limits(SWEEPS, steps=AUTO_STEPS), True, True)
+AUTO = SmallCall("auto", make_limits(EXPECTED_SWEEPS, steps=AUTO_MAX_STEPS), True, True)
 DIRECT = SmallCall("direct", None, True)
-NEWTON = SmallCall("newton", limits(inf), False)
+NEWTON = SmallCall("newton", make_limits(inf), False)
 
 
-def _call_of(name: str) -> SmallCall:
+def _named_call(name: str) -> SmallCall:
     return {call.name: call for call in (AUTO, DIRECT, NEWTON)}[name]

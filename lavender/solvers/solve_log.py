@@ -1,4 +1,4 @@
-"""The log of one solve of `auto`: the best impulse, what ran, and when it has to end."""
+"""Log of one solve of `auto`: the best impulse, the stages that ran, and the deadline."""
 
 from __future__ import annotations
 
@@ -19,33 +19,40 @@ from lavender.judge.residuals import (
 )
 from lavender.judge.solution import Claim, SolverStage, Status, summed
 from lavender.problem import Problem
-from lavender.solvers.small import NO_TIME, NOTHING, told
+from lavender.solvers.small import NO_TIME_MESSAGE, NO_WORK_MESSAGES, describe_stages
 
-__all__ = ["GAIN", "SolveLog"]
+__all__ = ["MIN_GAIN_RATIO", "SolveLog"]
 
-GAIN = 0.99  # of the residual, of which turns in vain leave more
+MIN_GAIN_RATIO = (
+    0.99  # A stage has failed if the residual after it is more than this fraction of the one before.
+)
 
 
 class SolveLog:
-    """What ran on a (sub)problem, what it cost, and the best impulse."""
+    """Stages that ran on a problem, their work, and the best impulse."""
 
     def __init__(self, problem: Problem, tol: float, budget: int, deadline: Deadline = NEVER) -> None:
         self.problem, self.tol, self.budget, self.deadline = problem, tol, budget, deadline
         self.interrupted = False
-        self.failure = ""  # what broke down, in words
-        self.timed_out = False  # it ended a little before the deadline, as the rest of the time was too short
-        self.best, self.impulse = np.inf, problem._start  # lowest relative residual, (m,) N s
-        self.result: FloatArray | None = None  # (m,) N s, while nothing met tol: the best of each island
-        self.given: FloatArray | None = None  # (m,) N s, a start that is worse than doing nothing
+        self.failure = ""  # Message of the last arithmetic error.
+        self.timed_out = (
+            False  # The solve ended before the deadline, because the remaining time was too short.
+        )
+        self.best, self.impulse = (
+            np.inf,
+            problem._start,
+        )  # Smallest relative residual, and its impulse (m,) [N s].
+        self.result: FloatArray | None = None  # (m,) [N s]: best impulse of each island, until one meets tol.
+        self.bad_start: FloatArray | None = None  # (m,) [N s]: a start that is worse than the zero impulse.
         self.stages: list[SolverStage] = []
         self.work: dict[str, int] = {}
         self.iterations = 0
         self.certificate: FloatArray | None = None  # (m,)
-        self.direction: FloatArray | None = None  # (m,) one that is none, but bounds the impulses
-        self.conflict: Any = None  # of `certify`: who fights in the convex relaxation, and what lifts it
+        self.direction: FloatArray | None = None  # (m,): not a certificate, but it bounds the impulses.
+        self.conflict: Any = None  # `certify.Conflict` of the convex relaxation.
 
     def offer(self, impulse: FloatArray) -> None:
-        """Judge an impulse (m,) and keep it in the islands where it is the best, also for the final judgement."""
+        """Judge an impulse (m,) [N s] and store it in the islands in which it is the best."""
         relative = find_known_relative(self.problem, impulse)
         if relative is None:
             last = judge_impulse(self.problem, impulse.copy())
@@ -59,7 +66,7 @@ class SolveLog:
             self.result = best_of_islands(self.problem, (start,), (impulse,), self.tol)
 
     def note(self, name: str, claim: Claim, before: float) -> None:
-        """Record a turn that has ended; the residual was `before`."""
+        """Record a stage that has ended; the relative residual before it was `before`."""
         self.iterations += claim.iterations
         self.work = summed((self.work, claim.work))
         self.stages.append(SolverStage(name, dict(claim.work), before, self.best))
@@ -75,28 +82,29 @@ class SolveLog:
 
     @property
     def left(self) -> int:
-        """Iterations that may still be done."""
+        """Remaining iterations of the budget."""
         return self.budget - self.iterations
 
     @property
     def time_left(self) -> float | None:
-        """s until the time limit, for a solver's `time_limit`."""
+        """Time until the deadline [s], for a solver's `time_limit`; None if there is no limit."""
         return self.deadline.remaining(1e-5)
 
     def ends_late(self, cost: float) -> bool:
-        """Whether a step of this counted cost [ns] would end after the deadline."""
+        """Return whether a step of this estimated cost [ns] would end after the deadline."""
         return self.deadline.passed(1e-9 * cost)
 
     @property
-    def vain(self) -> bool:
-        """The last turn gained next to nothing."""
-        return bool(self.stages) and self.best > GAIN * self.stages[-1].before
+    def last_stage_failed(self) -> bool:
+        """Whether the last stage did not reduce the residual by at least 1 %."""
+        return bool(self.stages) and self.best > MIN_GAIN_RATIO * self.stages[-1].before
 
     def done(self) -> bool:
-        """Solved, proved infeasible, or out of time, iterations or progress."""
+        """Return whether the problem is solved or proved infeasible, or no time or iterations remain."""
         return self.status not in (Status.STALLED, Status.NUMERICAL_ERROR)
 
-    def at_floor(self) -> bool:
+    def is_at_floor(self) -> bool:
+        """Return whether the best impulse is at the round-off floor."""
         if self.best > MAX_EXCUSED_RESIDUAL:
             return False
         last = find_stored(self.problem, self.impulse) or judge_impulse(self.problem, self.impulse)
@@ -104,11 +112,12 @@ class SolveLog:
 
     @property
     def status(self) -> Status:
+        """Status of the solve so far."""
         if self.certificate is not None:
             return Status.INFEASIBLE
         if self.best <= self.tol:
             return Status.CONVERGED
-        if self.at_floor():
+        if self.is_at_floor():
             return Status.ROUNDOFF_LIMIT
         if self.timed_out or self.deadline.passed():
             return Status.TIME_LIMIT
@@ -117,26 +126,25 @@ class SolveLog:
         return Status.NUMERICAL_ERROR if self.failure else Status.STALLED
 
     def claim(self) -> Claim:
-        """The claim of the whole solve."""
+        """Return the claim of the complete solve."""
         status = self.status
-        nothing = NOTHING.get(status, NO_TIME if self.budget > 0 else "no iterations were asked for")
-        message = told(self.stages) or ("" if self.failure else nothing)
+        no_work = NO_TIME_MESSAGE if self.budget > 0 else "no iterations were allowed"
+        no_work = NO_WORK_MESSAGES.get(status, no_work)
+        message = describe_stages(self.stages) or ("" if self.failure else no_work)
         return Claim(
             Status.INTERRUPTED if self.interrupted else status,
             self.iterations,
             self.work,
-            "; ".join(filter(None, (message, self.failure, *self._fights()))),
+            "; ".join(filter(None, (message, self.failure, *self._conflict_messages()))),
             certificate=self.direction if self.certificate is None else self.certificate,
             stages=tuple(self.stages),
         )
 
-    def _fights(self) -> list[str]:
-        """Who fights in the relaxation, where Coulomb's law is not proved to have no solution, and what to do."""
+    def _conflict_messages(self) -> list[str]:
+        """Return messages about the conflict in the relaxation and the recommended compliance, if it is unsolved."""
         if self.conflict is None or self.best <= self.tol:
             return []
-        told = (
-            []
-            if self.certificate is not None
-            else ["of the convex relaxation, " + self.conflict.proof.message]
-        )
-        return [*told, self.conflict.advice]
+        messages = []
+        if self.certificate is None:
+            messages = ["of the convex relaxation, " + self.conflict.proof.message]
+        return [*messages, self.conflict.advice]

@@ -1,4 +1,4 @@
-"""The solvers of `auto` as its tree runs them: so many iterations, then more from where they stopped."""
+"""Run the solvers of `auto` in steps: a number of iterations, later more, continuing where they stopped."""
 
 from __future__ import annotations
 
@@ -13,45 +13,47 @@ from lavender.base.deadline import Deadline
 from lavender.base.errors import BREAKDOWN, format_error
 from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
-from lavender.solvers._accelerated import as_given
-from lavender.solvers.costs import SWEEPS, sweep_cost
-from lavender.solvers.direct import Enough
+from lavender.solvers._accelerated import state_as_given
+from lavender.solvers.costs import EXPECTED_SWEEPS, sweep_cost
+from lavender.solvers.direct import SufficientDirect
 from lavender.solvers.loop import Loop
 from lavender.solvers.registry import get
-from lavender.solvers.setup_times import forming
+from lavender.solvers.setup_times import forming_time
 from lavender.solvers.solve_log import SolveLog
 from lavender_ext.judge.measure import all_finite
 
-__all__ = ["METHODS", "Iterations", "Newton", "Step", "Sweeps", "made", "setup_time"]
+__all__ = ["METHODS", "Iterations", "Newton", "Step", "Sweeps", "make_solver", "setup_time"]
 
-NNCG: dict[str, Any] = {"order": "symmetric", "restart": "against"}
-#: Solver and options of each step.
+NNCG_OPTIONS: dict[str, Any] = {"order": "symmetric", "restart": "against"}
+#: Solver and options of each step, by its name.
 METHODS: dict[str, tuple[str, dict[str, Any]]] = {
     "anderson": ("anderson", {}),
     "newton": ("newton", {}),
     "newton over rows": ("newton", {"form": "impulse"}),
     "direct": ("direct", {}),
-    "nncg": ("nncg", NNCG),
-    # On a loose pile: the convex relaxation has one answer, and where contacts stick it is Coulomb's.
-    "nncg from the cone law": ("nncg", NNCG | {"convex": int(SWEEPS)}),
+    "nncg": ("nncg", NNCG_OPTIONS),
+    # For a loose pile: the convex relaxation is unique, and equals Coulomb's solution if contacts stick.
+    "nncg from the cone law": ("nncg", NNCG_OPTIONS | {"convex": int(EXPECTED_SWEEPS)}),
     "admm": ("admm", {}),
 }
-FIRST = 32  # sweeps before the first prediction of how many are left
-MOST = 2**30  # iterations of one call
-LEAST = 1e-16  # relative residual that can be predicted
-# Relative residual up to which Newton's method begins from another's impulse, and a solution may be near.
-NEAR = 0.02
-PROBE = 0.5  # share of the time left that sweeps have before who factors
-PACE = 4e-9  # s for each ns that an iteration is counted for, at most
-FORMING = 4.0  # times what forming A takes, that has to be left for sweeps over it
+SWEEPS_BEFORE_PREDICTION = 32  # Sweeps before the first prediction of the remaining ones.
+MAX_CALL_ITERATIONS = 2**30  # Largest number of iterations of one call.
+MIN_PREDICTED_RESIDUAL = 1e-16  # Predictions use at least this relative residual as tol.
+# Newton's method starts from the impulse of another solver up to this relative residual, otherwise from zero.
+NEAR_SOLUTION_RESIDUAL = 0.02
+SWEEPS_TIME_FRACTION = 0.5  # Sweeps before a factorising solver may use this fraction of the remaining time.
+# Upper bound of the time [s] of an iteration per estimated cost [ns].
+ITERATION_TIME_PER_COST = 4e-9
+# Sweeps use a formed A only if this multiple of the time to form it remains.
+FORMING_TIME_RATIO = 4.0
 
 
-def made(name: str, problem: Problem) -> Any:
-    """The solver of a step."""
+def make_solver(name: str, problem: Problem) -> Any:
+    """Create the solver of a step."""
     solver, options = METHODS[name]
     if name == "direct" and problem.law == "linear":
-        return Enough()  # no closer than tol
-    # Sweeps solve each block exactly under the cone law, and where a contact's rows may have unlike units.
+        return SufficientDirect()  # It does not refine below tol.
+    # Sweeps solve blocks exactly under the cone law, and if the rows of a contact may have different units.
     exact = problem.law == "cone" or (problem.law == "coulomb" and problem.matrix is not None)
     if exact and "sweep" in get(solver).options:
         options = options | {"sweep": "blocks"}
@@ -59,27 +61,31 @@ def made(name: str, problem: Problem) -> Any:
 
 
 def setup_time(name: str, problem: Problem) -> float:
-    """What a step sets up before its first iteration takes [s]; 0: next to nothing."""
-    return float(made(name, problem).setup_time(problem))
+    """Estimate the set-up time [s] of a step before its first iteration; 0 if it is negligible."""
+    return float(make_solver(name, problem).setup_time(problem))
 
 
 class Step:
-    """A solver on the problem of a log."""
+    """A solver that runs on the problem of a log.
 
-    over = late = False  # it has nothing more to do, or no time for it
-    least = np.inf  # iterations that may be predicted to be left, and it goes on
+    `over` is set if it cannot continue, `late` if it has no time. It stops if it predicts that more than `least`
+    iterations remain.
+    """
+
+    over = late = False
+    least = np.inf
     state: Any = None
-    impulse: FloatArray  # (m,) N s
+    impulse: FloatArray  # (m,) [N s]
 
     def __init__(self, name: str, log: SolveLog) -> None:
         self.name, self.log = name, log
-        self.solver = made(name, log.problem)
+        self.solver = make_solver(name, log.problem)
 
     def run(self, n: float) -> None:
-        """At most n iterations, offered to the log."""
+        """Run at most n iterations and record the stage in the log."""
         log, before = self.log, self.log.best
         try:
-            claim = self.advance(int(min(max(n, 1.0), log.left, MOST)))
+            claim = self.advance(int(min(max(n, 1.0), log.left, MAX_CALL_ITERATIONS)))
         except BREAKDOWN as error:
             log.failure, self.over = format_error(error), True
             claim = Claim(Status.NUMERICAL_ERROR, 0)
@@ -88,7 +94,7 @@ class Step:
         log.note(self.name, claim, before)
 
     def advance(self, n: int) -> Claim:
-        """Run and offer what came of it."""
+        """Run at most n iterations and offer the result to the log."""
         log = self.log
         if self.state is None:
             self.state, self.impulse = self.solver.prepare(log.problem), log.impulse.copy()
@@ -97,48 +103,54 @@ class Step:
         return claim
 
     def offer(self) -> None:
-        """The iterate, to the log."""
+        """Offer the iterate to the log if it is finite."""
         if all_finite(self.impulse):
             self.log.offer(self.impulse)
 
 
 class Newton(Step):
-    """From the state whose factor was counted; from nothing if sweeps left much, and once more if it ends in vain."""
+    """Newton's method with the state that the tree has analysed.
 
-    anew = lost = False
+    It starts from zero if the residual is large. If it stalls from another impulse, it starts once more from zero.
+    """
+
+    started_from_zero = has_stalled = False
 
     def run(self, n: float) -> None:
+        """Run at most n iterations, with a second start from zero if the first one stalls."""
         log, done = self.log, self.log.iterations
         super().run(n)
-        if self.lost and not self.anew and not log.done():
-            self.anew, self.over, self.state.begun = True, False, False
+        if self.has_stalled and not self.started_from_zero and not log.done():
+            self.started_from_zero, self.over, self.state.begun = True, False, False
             super().run(n - (log.iterations - done))
 
     def advance(self, n: int) -> Claim:
+        """Run about n iterations; choose the start at the first call."""
         log = self.log
         if not self.state.begun:
-            far = log.best > NEAR
-            self.impulse = log.problem.start() if self.anew or far else log.impulse.copy()
-            self.anew = not (self.impulse - log.problem.start()).any()
+            is_far = log.best > NEAR_SOLUTION_RESIDUAL
+            self.impulse = log.problem.start() if self.started_from_zero or is_far else log.impulse.copy()
+            self.started_from_zero = not (self.impulse - log.problem.start()).any()
         claim = self.solver.advance(self.state, self.impulse, n, log.tol, log.time_left, log.left)
-        self.lost = claim.status is Status.STALLED
+        self.has_stalled = claim.status is Status.STALLED
         self.offer()
         return claim
 
 
 class Iterations(Step):
-    """A solver that continues to the bit, in chunks for the clock and Ctrl-C."""
+    """A resumable solver, which runs in chunks between checks of the clock and Ctrl-C."""
 
-    share = 1.0  # of the time left, that a turn may take
+    time_fraction = 1.0  # Fraction of the remaining time that a stage may use.
 
     def advance(self, n: int) -> Claim:
+        """Run at most n iterations and offer the last and the best iterate to the log."""
         log, left = self.log, self.log.deadline.remaining()
         if self.state is None:
             self.begin()
         loop = Loop(
             problem=log.problem, solver=self.solver, state=self.state, impulse=self.impulse, tol=log.tol,
-            deadline=log.deadline if left is None or self.share == 1.0 else Deadline(self.share * left),
-            pace=PACE * sweep_cost(log.problem),
+            deadline=log.deadline if left is None or self.time_fraction == 1.0 else Deadline(self.time_fraction * left),
+            pace=ITERATION_TIME_PER_COST * sweep_cost(log.problem),
         )  # fmt: skip
         claim = self.iterate(loop, n)
         self.offer()
@@ -149,40 +161,47 @@ class Iterations(Step):
         return claim
 
     def begin(self) -> None:
-        """From where the log is."""
+        """Prepare the solver and start from the best impulse of the log."""
         self.state, self.impulse = self.solver.prepare(self.log.problem), self.log.impulse.copy()
 
     def iterate(self, loop: Loop, n: int) -> Claim:
-        """At most n iterations."""
-        return loop.chunks(n)
+        """Run at most n iterations."""
+        return loop.run_chunks(n)
 
 
 class Sweeps(Iterations):
-    """Until more than `least` are predicted to be left; under a time limit for half of what is left, or to the end."""
+    """Sweeps that stop if more than `least` remaining sweeps are predicted.
 
-    share = PROBE
+    With a time limit, they use half of the remaining time, or all of it in `finish`.
+    """
+
+    time_fraction = SWEEPS_TIME_FRACTION
 
     def begin(self) -> None:
-        """From where the log is, or from a given start that is worse than doing nothing."""
+        """Prepare the sweeps; start from the best impulse, or from a given start that is worse than zero."""
         p = self.log.problem
-        late = self.log.deadline.is_set and self.log.deadline.passed(FORMING * forming(p))
-        self.state = as_given(self.solver, p) if late else self.solver.prepare(p)
-        self.impulse = self.log.impulse.copy() if self.log.given is None else self.log.given
+        too_late = self.log.deadline.is_set and self.log.deadline.passed(FORMING_TIME_RATIO * forming_time(p))
+        self.state = state_as_given(self.solver, p) if too_late else self.solver.prepare(p)
+        self.impulse = self.log.impulse.copy() if self.log.bad_start is None else self.log.bad_start
 
     def iterate(self, loop: Loop, n: int) -> Claim:
-        """Look after FIRST, and whenever half as many more are done, how fast the residual falls."""
-        done, due, tol = self.state.watch.total, 0, max(self.log.tol, LEAST)
-        if self.share == 1.0:  # checks would cost as much as the first sweeps
+        """Run at most n sweeps; predict how many remain after `SWEEPS_BEFORE_PREDICTION` and after each 50 % more."""
+        done, due, tol = self.state.watch.total, 0, max(self.log.tol, MIN_PREDICTED_RESIDUAL)
+        if self.time_fraction == 1.0:  # Checks would cost as much as the first sweeps.
             loop.tol = 0.0
-            claim = loop.chunks(min(n, FIRST))
+            claim = loop.run_chunks(min(n, SWEEPS_BEFORE_PREDICTION))
             if claim.status is not Status.MAX_ITERATIONS:
                 return claim
             loop.tol = self.log.tol
         while True:
-            step = min(n - due, max((done + due) // 2, FIRST)) if self.least < np.inf else n - due
+            step = (
+                min(n - due, max((done + due) // 2, SWEEPS_BEFORE_PREDICTION))
+                if self.least < np.inf
+                else n - due
+            )
             due += step
-            claim = loop.chunks(due)
-            if claim.status is Status.TIME_LIMIT and self.share < 1.0:
+            claim = loop.run_chunks(due)
+            if claim.status is Status.TIME_LIMIT and self.time_fraction < 1.0:
                 return replace(claim, status=Status.MAX_ITERATIONS)
             if claim.status is not Status.MAX_ITERATIONS or due == n:
                 return claim
@@ -194,7 +213,7 @@ class Sweeps(Iterations):
                 return claim
 
     def finish(self) -> None:
-        """With all of the time that is left."""
-        self.share, self.least = 1.0, np.inf
+        """Sweep for all of the remaining time."""
+        self.time_fraction, self.least = 1.0, np.inf
         self.run(np.inf)
         self.log.timed_out = self.late

@@ -1,7 +1,7 @@
-"""What every sweep solver shares: an order, a count of sweeps, and residual checks.
+"""Base classes of sweep solvers: sweep order, sweep count, residual checks.
 
-The checks are in `lavender_ext/judge/watch.pxd`. They use the judge's arithmetic; each comes half way to the expected
-end, so their places depend only on the numbers.
+The checks are in `lavender_ext/judge/watch.pxd`. They use the judge's arithmetic. Each check is half way to the
+expected end, so the number of sweeps between checks depends only on the numbers of the problem.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
 from lavender.problem.ordering import Order, block_order
 from lavender.solvers.registry import Solver
-from lavender.solvers.setup_times import forming, ordered
+from lavender.solvers.setup_times import forming_time, order_time
 from lavender_ext.judge.watch import AT_FLOOR, CONVERGED, DIVERGED, RUNNING, STALLED, Watch
 from lavender_ext.sweep import serial
 
@@ -26,33 +26,33 @@ STATUS = {
     STALLED: Status.STALLED,
     AT_FLOOR: Status.ROUNDOFF_LIMIT,
 }
-PATIENCE = 64  # sweeps that may always pass without a better check
+SWEEP_PATIENCE = 64  # A run does not stall before this many sweeps without a better check.
 
 
-def watch_over(problem: Problem, data: Any, patience: int) -> Watch:
-    """The watch of a run over `data`; of A that was formed of J and M, the form that was given has the last word."""
+def create_stopping_test(problem: Problem, data: Any, patience: int) -> Watch:
+    """Create the stopping test of a run over `data`. If A was formed from J and M, the test is confirmed on J and M."""
     formed = problem.matrix is None and not (data.factored or data.is_general)
     return Watch(data, patience, problem.metric if formed else None)
 
 
 class SweepState:
-    """State of a run; the watch counts sweeps and keeps the best checked iterate."""
+    """State of a run; the stopping test `watch` counts sweeps and stores the best checked iterate."""
 
     def __init__(
-        self, problem: Problem, data: Any, order: Order, sweeps: Any = None, patience: int = PATIENCE
+        self, problem: Problem, data: Any, order: Order, sweeps: Any = None, patience: int = SWEEP_PATIENCE
     ) -> None:
         self.problem = problem
-        self.data = data  # lavender_ext.core.problem.Data that the kernel sweeps over, and that checks read
-        self.order = self.plan = order  # `plan` is of the problem's own blocks
+        self.data = data  # lavender_ext.core.problem.Data for the sweeps and the checks.
+        self.order = self.plan = order  # `plan` is the order of the problem's own blocks.
         get_reference(problem)
-        data.share_reference(problem.metric)  # residuals in any form are relative to the judge's reference
-        self.watch = watch_over(problem, data, patience)
-        # What the kernel runs over, a `lavender_ext.sweep.serial.Sweeps`; of blocks as they stand, relaxed, by default.
+        data.share_reference(problem.metric)  # Residuals in every form are relative to the judge's reference.
+        self.watch = create_stopping_test(problem, data, patience)
+        # lavender_ext.sweep.serial.Sweeps; by default, relaxed updates of the blocks.
         self.sweeps = serial.Sweeps(data, *plan_of(order)) if sweeps is None else sweeps
 
     @property
     def best(self) -> tuple[float, FloatArray | None]:
-        """(relative residual, impulse) of the best check."""
+        """(relative residual, impulse (m,) [N s]) of the best check."""
         return self.watch.best
 
     @property
@@ -61,35 +61,35 @@ class SweepState:
         return float(self.watch.sweeps_per_decade)
 
 
-def claim(status: int, done: int) -> Claim:
-    """The claim from what a kernel of sweeps returns: how it ended, and after how many sweeps."""
+def make_claim(status: int, done: int) -> Claim:
+    """Return the claim for the status code and the number of sweeps that a kernel returned."""
     return Claim(STATUS[status], done, {"sweeps": done})
 
 
 def plan_of(order: Order) -> tuple[Any, ...]:
-    """(blocks, split, mode, rng) of an order, as kernels take it."""
+    """Return (blocks, split, mode, rng) of an order, as the kernels expect them."""
     return order.blocks, order.split, order.mode, order.rng
 
 
 def reads_whitened(problem: Problem) -> bool:
-    """Whether a sweep over J and M, twice the entries of Y, costs less than one over A, without forming A."""
+    """Return whether a sweep over J and M (twice the entries of Y) costs less than one over A, without forming A."""
     if problem.generalized is None:
         return False
     data = problem.metric
-    return bool(data.work - 4 * problem.m < data.entries_of_a)  # `work` counts Y twice
+    return bool(data.work - 4 * problem.m < data.entries_of_a)  # `work` counts Y twice.
 
 
-def swept(problem: Problem) -> Any:
-    """What sweeps run over: rows or a matrix as given; of J and M, those or A, whichever a sweep costs less on."""
+def swept_data(problem: Problem) -> Any:
+    """Return the data that sweeps use: rows or a matrix as given; for J and M, the cheaper of J and M and A."""
     return problem.metric if reads_whitened(problem) else problem.data
 
 
-def over(data: Any) -> str:
-    """The form that sweeps ran over, in words."""
+def form_name(data: Any) -> str:
+    """Return the name of the operator form that the sweeps used."""
     return "whitened J" if data.is_general else "body velocities" if data.factored else "rows of A"
 
 
-class Swept(Solver):
+class SweepSolver(Solver):
     """A solver whose state is a `SweepState`."""
 
     def run(
@@ -100,41 +100,41 @@ class Swept(Solver):
         tol: float,
         time_limit: float | None = None,
     ) -> Claim:
-        """`max_iter` sweeps in one call of the kernel, or fewer where a check ends them; tol = 0 checks nothing."""
-        status, done, again = state.sweeps.run(state.watch, impulse, max_iter, tol)
-        return self._told(state, claim(status, done), again)
+        """Run `max_iter` sweeps in one call of the kernel, fewer if a check ends them; tol = 0 disables the checks."""
+        status, done, count = state.sweeps.run(state.watch, impulse, max_iter, tol)
+        return self._complete_claim(state, make_claim(status, done), count)
 
-    def _told(self, state: Any, claim: Claim, again: int) -> Claim:
-        """The claim with what else is to tell: `again` counts fallbacks of exact blocks, or restarts."""
+    def _complete_claim(self, state: Any, claim: Claim, count: int) -> Claim:
+        """Add solver-specific work to a claim; `count` is the number of fallbacks of exact blocks, or of restarts."""
         return claim
 
 
 @dataclass(frozen=True)
-class Sweeping(Swept):
-    """Options and life cycle of a sweep solver over A in compressed rows."""
+class Sweeping(SweepSolver):
+    """Base class of sweep solvers over A in compressed rows, with their options."""
 
     order: Any = "given"
     ground: Any = None
     seed: int = 0
 
     def setup_time(self, problem: Problem) -> float:
-        """What `prepare` takes [s], as counted."""
-        return ordered(problem, self.order) + self._forming(problem)
+        """Estimate the time of `prepare` [s]."""
+        return order_time(problem, self.order) + self._forming(problem)
 
     def _forming(self, problem: Problem) -> float:
-        return forming(problem)
+        return forming_time(problem)
 
     def prepare(self, problem: Problem) -> Any:
-        """The state at the first sweep; its order is found anew."""
+        """Build the state before the first sweep, with a new order."""
         order = block_order(problem, self.order, seed=self.seed, ground=self.ground)
         return self._state(problem, order, None)
 
     def update(self, state: Any, problem: Problem) -> Any:
-        """The state for new numbers; levels, colours and places of a fixed order are kept."""
+        """Build the state for new numbers; levels, colours and permutations of a fixed order are reused."""
         if not state.plan.is_fixed:
             return self.prepare(problem)
         return self._state(problem, state.plan, state)
 
     def _state(self, problem: Problem, order: Order, before: Any) -> SweepState:
-        """`before`: the state of a problem of the same structure and order, None the first time."""
+        """Build the state; `before` is the state of a problem of the same structure and order, or None."""
         return SweepState(problem, problem.csr_data, order)

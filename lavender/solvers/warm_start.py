@@ -1,7 +1,7 @@
-"""The first phase of `newton` from a warm start: judge it, a few sweeps; or free joints at once.
+"""First phase of `newton` from a warm start: judge it, then a few sweeps, or a direct solve of free joints.
 
-It solves steps of a simulation at rest, or of a chain. `lavender_ext/newton/warm_start.pxd` has the equations. If the
-result is not within tol, `newton` continues from the original start.
+It solves steps of a simulation at rest, or of a chain. The equations are in `lavender_ext/newton/warm_start.pxd`. If
+the result is not within tol, `newton` continues from the original start.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from lavender_ext.newton.warm_start import (
     from_guess,
 )
 
-NOTHING = UNDECIDED, 0, 0
+UNDECIDED_RESULT = UNDECIDED, 0, 0
 
-#: How the kernel says that it ended; None where nothing was decided.
-ENDED = {
+#: Messages for the codes of the kernel; None if it decided nothing.
+MESSAGES = {
     UNDECIDED: None,
     JUDGED: "as it came",
     SWEPT: "warm sweeps",
@@ -29,26 +29,29 @@ ENDED = {
 }
 
 
-def claim_of(how: int, sweeps: int, factorisations: int) -> Claim | None:
-    """The claim of `newton` for a warm start that ended so in the first phase; None if it decided nothing."""
-    message = ENDED[how]
+def make_warm_start_claim(code: int, sweeps: int, factorisations: int) -> Claim | None:
+    """Return the claim of `newton` for the code and counts of its first phase; None if that decided nothing."""
+    message = MESSAGES[code]
     if message is None:
         return None
     work = {"factorisations": factorisations} | ({"sweeps": sweeps} if sweeps else {})
-    form = "impulse" if how == SOLVED else "velocity"
+    form = "impulse" if code == SOLVED else "velocity"
     return Claim(Status.CONVERGED, factorisations, work, message, form=form)
 
 
 def warm_start(
     problem: Problem, impulse: FloatArray, tol: float, budget: int, time_limit: float | None = None
 ) -> tuple[int, int, int]:
-    """Solve `impulse` (m,) to tol in place if the first phase can; otherwise leave it unchanged.
+    """Solve `impulse` (m,) [N s] to tol in place if the first phase can; otherwise leave it unchanged.
 
-    How it ended, of `ENDED`, its sweeps and factorisations.
+    Returns
+    -------
+    tuple of int
+        Code (a key of `MESSAGES`), sweeps, factorisations.
     """
     if problem.rows is None or problem.friction != "coulomb" or tol <= 0.0 or budget < 1:
-        return NOTHING
+        return UNDECIDED_RESULT
     if time_limit is not None and MOST_SWEEPS * 1e-9 * problem.data.work > time_limit:
-        return NOTHING
-    found: tuple[int, int, int] = from_guess(problem.data, impulse, tol)
-    return found
+        return UNDECIDED_RESULT
+    result: tuple[int, int, int] = from_guess(problem.data, impulse, tol)
+    return result

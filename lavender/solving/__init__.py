@@ -1,1 +1,1 @@
-"""From a call to a judged answer: one problem, many; the loop, the clock, the decision trace of `auto`."""
+"""Solve a problem and judge the result; explain the decisions of `auto`."""

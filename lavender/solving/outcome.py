@@ -1,4 +1,4 @@
-"""The outcome of a solve: compares the solver's claim with the judge's residual and makes the `Solution`."""
+"""Compare the solver's claim with the judge's residual and build the `Solution`."""
 
 from __future__ import annotations
 
@@ -65,7 +65,9 @@ def finish(
     if claim.status is INFEASIBLE and tol > 0.0:
         # An engine that applies the impulse of an infeasible step must not pull at a contact.
         impulse = best_of_islands(problem, (problem._start,), (project(problem.cones, impulse),), tol)
-    judged = residual(problem, impulse, "float64", tol=tol)  # in which solvers work, whatever the data were
+    judged = residual(
+        problem, impulse, "float64", tol=tol
+    )  # Solvers work in float64, whatever the precision of the data.
     status, message = claim.status, claim.message
     relative = judged.relative
     if (
@@ -74,13 +76,13 @@ def finish(
         and divide_by_reference(problem.metric, judged.energy, judged.velocity) <= tol
     ):
         status = DIVERGED
-        message = _joined(message, "beside such impulses float64 loses b")
+        message = _joined(message, "next to such impulses float64 loses b")
     elif tol > 0.0 and relative <= tol and status in (MAX_ITERATIONS, TIME_LIMIT, STALLED):
         status = CONVERGED
     elif tol < relative and (
         (status in (CONVERGED, STALLED, MAX_ITERATIONS, TIME_LIMIT) and judged._float64_relative <= tol)
         or (status is ROUNDOFF_LIMIT and judged._float64_relative < math.inf)
-    ):  # the claim is true of the first pass in float64
+    ):  # The claim is only true for the first pass of the judge, without refinement.
         status = STALLED
         message = _joined(
             message,
@@ -100,7 +102,7 @@ def finish(
         status = ROUNDOFF_LIMIT
     certificate, bound, unproven, status_conflict = claim.certificate, None, "", ""
     if status is INFEASIBLE and relative <= tol:
-        # What meets tol is a solution to tol, whatever can be said of an exact one.
+        # The impulse is a solution to tol, even if no exact solution exists.
         status = CONVERGED
         message = _joined(message, "the impulse meets tol nevertheless")
     elif status is INFEASIBLE and certificate is None:
@@ -130,8 +132,8 @@ def finish(
     if status in (DIVERGED, STALLED) and not message and spec.resumable:
         message = describe_end(problem, status, claim.iterations)
     if status is MAX_ITERATIONS:
-        way = _way_left(problem, relative, tol, claim.iterations, sweeps_per_decade)
-        message = _joined(message, way)
+        prediction = _predict_iterations(problem, relative, tol, claim.iterations, sweeps_per_decade)
+        message = _joined(message, prediction)
     unfinished = status not in (CONVERGED, ROUNDOFF_LIMIT, NUMERICAL_ERROR) and judged.worst_island >= 0
     if tol > 0.0 and unfinished and not relative <= tol:
         message = _joined(message, describe_islands(judged, tol))
@@ -162,32 +164,32 @@ def finish(
 
 
 def describe_end(problem: Problem, status: Status, iterations: int) -> str:
-    """Say why iterations that give no reason of their own found no solution; a row of A in their way comes first."""
-    what = "the residual grew instead of falling" if status is DIVERGED else "the residual falls no further"
-    words = f"{what}, {counted(iterations, 'iterations')}"
+    """Describe why an iteration without a message of its own found no solution; bad diagonal entries come first."""
+    reason = "the residual grew instead of falling" if status is DIVERGED else "the residual falls no further"
+    message = f"{reason}, {counted(iterations, 'iterations')}"
     if problem.matrix is None:
-        return words
+        return message
     diagonal = problem.matrix.diagonal()
     rows = np.flatnonzero(diagonal <= 0.0)
     if len(rows):
         value = diagonal[rows[0]]
         size = "a zero diagonal" if value == 0.0 else f"a negative diagonal, {value:.3g}"
-        return f"{problem.row_name(int(rows[0]))} has {size}: sweeps need A_ii > 0; {words}"
+        return f"{problem.row_name(int(rows[0]))} has {size}: sweeps need A_ii > 0; {message}"
     if status is DIVERGED:
-        words += ": sweeps are sure to converge only if A is symmetric and positive definite"
-    return words
+        message += ": sweeps are sure to converge only if A is symmetric and positive definite"
+    return message
 
 
-def describe_islands(found: Residual, tol: float) -> str:
+def describe_islands(judged: Residual, tol: float) -> str:
     """Return how many islands meet tol, with the worst one's first and last block; empty for one island."""
-    label, relative = found.islands[:2]
+    label, relative = judged.islands[:2]
     if len(relative) < 2:
         return ""
-    problem, blocks = found._problem, np.flatnonzero(label == found.worst_island)
+    problem, blocks = judged._problem, np.flatnonzero(label == judged.worst_island)
     first, last = (problem.block_name(int(i)) for i in blocks[[0, -1]])
-    where = first if len(blocks) == 1 else f"{first} to {last}"
+    names = first if len(blocks) == 1 else f"{first} to {last}"
     solved = int(np.count_nonzero(relative <= tol))
-    return f"{solved} of {len(relative)} islands meet tol, island {found.worst_island} ({where}) does not"
+    return f"{solved} of {len(relative)} islands meet tol, island {judged.worst_island} ({names}) does not"
 
 
 def name_lost_row(problem: Problem, impulse: FloatArray, claim: Claim) -> Claim:
@@ -204,29 +206,31 @@ def _contradicting_impulse(problem: Problem) -> float:
     return CONTRADICTING_IMPULSE_RATIO * float(np.sum(np.abs(problem.b) / problem.d))
 
 
-def _joined(message: str, more: str) -> str:
-    """Both, where the message does not say so already: a record's was told by the solution that it was made of."""
-    return message if more in message else f"{message}; {more}".removeprefix("; ")
+def _joined(message: str, addition: str) -> str:
+    """Append `addition` to the message, unless it contains it already, as the message of a record may."""
+    return message if addition in message else f"{message}; {addition}".removeprefix("; ")
 
 
 def _holds_as_formed(problem: Problem, impulse: FloatArray, tol: float) -> bool:
-    """Within tol or at the floor of A as it was formed: what the given data add is rounding in its forming."""
+    """Return whether the residual with the formed A meets tol or its floor: the given data differ by rounding."""
     try:
         formed = problem.csr_data
-    except InputError:  # too large to be formed: no solver has
+    except InputError:  # A is too large to be formed, so no solver has formed it.
         return False
     get_reference(problem)
     formed.share_reference(problem.metric)
     return bool(Judged(formed, impulse).above_floor <= tol)
 
 
-def _way_left(problem: Problem, relative: float, tol: float, done: int, per_decade: float) -> str:
-    """Message for a used-up budget if reaching tol needs more iterations than were done."""
-    left = per_decade * math.log10(relative / tol) if tol > 0.0 and 0.0 < relative < math.inf else math.nan
-    if not done < left < math.inf:
+def _predict_iterations(problem: Problem, relative: float, tol: float, done: int, per_decade: float) -> str:
+    """Return a message for an exhausted budget if reaching tol needs more iterations than were done, else empty."""
+    remaining = (
+        per_decade * math.log10(relative / tol) if tol > 0.0 and 0.0 < relative < math.inf else math.nan
+    )
+    if not done < remaining < math.inf:
         return ""
     return (
-        f"the residual falls tenfold in {per_decade:.3g} iterations, so tol needs about {left:.2g} more; "
+        f"the residual falls tenfold in {per_decade:.3g} iterations, so tol needs about {remaining:.2g} more; "
         f"solvers of another kind may be faster: {', '.join(in_one_call(problem))}"
     )
 
@@ -234,24 +238,26 @@ def _way_left(problem: Problem, relative: float, tol: float, done: int, per_deca
 def decide_empty_rows(
     problem: Problem, impulse: FloatArray, tol: float
 ) -> tuple[str, FloatArray, list[int]] | None:
-    """Put the impulses of rows of A that are all zero on the bound that b asks for, in place.
+    """Set the impulses of zero rows of A to the bound that minimises -b lambda, in place.
 
     Returns
     -------
     tuple or None
-        If b of such a row asks for what no impulse can give to `tol`: a message, the certificate y (m,), and all rows
-        whose b nothing can meet. None otherwise.
+        If no impulse can meet b of such a row to `tol`: a message, the certificate y (m,), and all rows whose b cannot
+        be met. None otherwise.
     """
     cones, impossible, empty = problem.cones, list[int](), problem.metric.empty
     if not len(empty):
         return None
-    # What is behind a normal is bounded by its impulse.
-    asks = empty[(problem.b[empty] != 0.0) & ~cones.friction_rows[empty]]
-    if problem.law == "cone":  # a normal that separates bears friction of a contact that slides
-        asks = asks[(problem.b[asks] > 0.0) | ~np.append(cones.friction_rows, False)[asks + 1]]
-    if not len(asks):
+    # Friction rows are bounded by the normal impulse.
+    nonzero = empty[(problem.b[empty] != 0.0) & ~cones.friction_rows[empty]]
+    if (
+        problem.law == "cone"
+    ):  # Under the cone law, a separating normal may carry the friction of a sliding contact.
+        nonzero = nonzero[(problem.b[nonzero] > 0.0) | ~np.append(cones.friction_rows, False)[nonzero + 1]]
+    if not len(nonzero):
         return None
-    for i in np.setdiff1d(asks, problem.vanished_rows).tolist():
+    for i in np.setdiff1d(nonzero, problem.vanished_rows).tolist():
         b = problem.b[i]
         bound = cones.upper[i] if b > 0.0 else cones.lower[i]
         if np.isfinite(bound):
@@ -264,6 +270,6 @@ def decide_empty_rows(
     y, b = np.zeros(problem.m), problem.b[worst]
     y[worst] = math.copysign(1.0, b)
     if prove(problem, y, tol).reason:
-        return None  # b is dust
+        return None  # b is negligible.
     message = f"{problem.row_name(worst)}: its row of A is zero, so nothing can meet b = {b:.3g} m/s"
     return message, y, impossible

@@ -1,4 +1,4 @@
-"""The decision trace of `auto` on a problem: its tree of solvers and the counted costs that decide; nothing is run."""
+"""Explain the stages of `auto` for a problem, and the estimated costs that determine them, without running a solver."""
 
 from __future__ import annotations
 
@@ -15,66 +15,85 @@ from lavender.judge.residuals import get_reference
 from lavender.problem import Problem
 from lavender.solvers.auto import Stage, Tree, program_backends
 from lavender.solvers.registry import get
-from lavender.solvers.small import who
+from lavender.solvers.small import describe_call
 
-LINES = 6  # of the tree, that are told: then the work is doubled
+MAX_EXPLAINED_STAGES = 6  # Largest number of stages that are listed before the alternation with doubled work.
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What `auto` would do with a problem: `str()` is one screen, `data()` are plain numbers and words."""
+    """Stages of `auto` for a problem. `str()` formats them as a page, `data()` as numbers and texts.
+
+    Parameters
+    ----------
+    rows : int
+    law : str
+    operator : {"rows", "matrix", "generalized"}
+    tol : float, -
+        Relative residual to reach.
+    small : str
+        Description of the compiled call for small problems; empty if it is not used.
+    newton : float, ns
+        Estimated cost of Newton's method; inf if it does not accept the problem.
+    sweep : float, ns
+        Estimated cost of one sweep.
+    stages : tuple of Stage
+        First stages; each runs only if the stages before it did not solve the problem.
+    in_turn : tuple of str
+        Solvers that alternate afterwards, with doubled work in each round.
+    """
 
     rows: int
     law: str
-    operator: str  # rows, matrix or generalized
-    tol: float  # - relative residual
-    small: str  # who solves it in one compiled call; "" where it is not small
-    newton: float  # ns, Newton's method as counted; inf where it does not take the problem
-    sweep: float  # ns, one sweep
-    stages: tuple[Stage, ...]  # the first lines, each taken where those before it did not solve the problem
-    in_turn: tuple[str, ...]  # who then goes on in turn, with doubled work
+    operator: str
+    tol: float
+    small: str
+    newton: float
+    sweep: float
+    stages: tuple[Stage, ...]
+    in_turn: tuple[str, ...]
 
     def data(self) -> Mapping[str, Any]:
-        """As JSON has it; costs in nanoseconds, None where a number has no bound."""
-        made = asdict(self) | {"stages": [asdict(stage) for stage in self.stages]}
-        return {name: _plain(value) for name, value in made.items()}
+        """Return the fields as JSON-compatible values: costs in nanoseconds, None for an infinite number."""
+        values = asdict(self) | {"stages": [asdict(stage) for stage in self.stages]}
+        return {name: _to_jsonable(value) for name, value in values.items()}
 
     def __str__(self) -> str:
         lines = [f"{self.rows} rows, law {self.law!r}, given as {self.operator}; tol {self.tol:.0e}"]
         if self.small:
             lines.append(f"first one compiled call: {self.small}")
-        if self.in_turn:  # not a program with a singular P, which only backends solve
+        if self.in_turn:  # Only backends solve programs with a singular P.
             lines.append(
                 f"newton is counted to take {seconds(1e-9 * self.newton)}, a sweep {seconds(1e-9 * self.sweep)}"
             )
         for stage in self.stages:
-            most = "to its end"
+            limit = "to its end"
             if stage.iterations < 1e9:
-                most = f"up to {max(1.0, float(round(stage.iterations))):.3g} iterations"
-            lines.append(f"  {stage.solver:<23}{most:<26}{stage.why}")
+                limit = f"up to {max(1.0, float(round(stage.iterations))):.3g} iterations"
+            lines.append(f"  {stage.solver:<23}{limit:<26}{stage.why}")
         if not self.in_turn:
             return "\n".join([*lines, "then a linear program for a certificate that there is no solution"])
-        told = ", ".join(self.in_turn)
-        lines.append(f"then {told} in turn with doubled work, and a certificate that there is no solution")
+        names = ", ".join(self.in_turn)
+        lines.append(f"then {names} in turn with doubled work, and a certificate that there is no solution")
         return "\n".join(lines)
 
 
-def _plain(value: Any) -> Any:
+def _to_jsonable(value: Any) -> Any:
     if isinstance(value, list):
-        return [_plain(entry) for entry in value]
+        return [_to_jsonable(entry) for entry in value]
     if isinstance(value, dict):
-        return {name: _plain(entry) for name, entry in value.items()}
+        return {name: _to_jsonable(entry) for name, entry in value.items()}
     return None if value == float("inf") else value
 
 
 def explain(problem: Problem, tol: float = 1e-6) -> Plan:
-    """Return the decision trace of `auto`: solvers, iteration limits and reasons. Nothing is solved.
+    """Return the stages of `auto` for a problem: solvers, iterations and reasons. Nothing is solved.
 
     Parameters
     ----------
     problem : Problem
     tol : float, default 1e-6
-        The relative residual that a solve would ask for.
+        Relative residual that a solve would have to reach.
 
     Returns
     -------
@@ -85,7 +104,7 @@ def explain(problem: Problem, tol: float = 1e-6) -> Plan:
     InputError
         `problem` is not a Problem or has no rows, or `tol` is not above 0.
     CapabilityError
-        `auto` does not take the problem.
+        `auto` does not accept the problem.
     """
     if not isinstance(problem, Problem):
         raise InputError(f"problem is a {type(problem).__name__}; a lavender.Problem is needed")
@@ -102,12 +121,12 @@ def explain(problem: Problem, tol: float = 1e-6) -> Plan:
             rows=problem.m, law=problem.law, operator=problem.operator, tol=tol, small="", newton=inf, sweep=inf,
             stages=stages, in_turn=(),
         )  # fmt: skip
-    problem = problem.disk  # where it has ellipses
+    problem = problem.disk  # Equal to the problem if it has no ellipses.
     get_reference(problem)
-    tree, small = Tree(problem), who(problem)
-    tree.tried = problem.generalized is not None and bool(small)
-    stages = tuple(islice(tree, LINES))
+    tree, small = Tree(problem), describe_call(problem)
+    tree.compiled_call_failed = problem.generalized is not None and bool(small)
+    stages = tuple(islice(tree, MAX_EXPLAINED_STAGES))
     return Plan(
         rows=problem.m, law=problem.law, operator=problem.operator, tol=tol, small=small, newton=tree.newton,
-        sweep=tree.sweep, stages=stages, in_turn=tuple(stage.solver for stage in tree.in_turn(1.0)),
+        sweep=tree.sweep, stages=stages, in_turn=tuple(stage.solver for stage in tree.alternate(1.0)),
     )  # fmt: skip

@@ -1,4 +1,4 @@
-"""`solve` and `prepare`: check the arguments, set up the solver, run it (`solvers/loop.py`), judge the result."""
+"""`solve` and `prepare`: check the arguments, set up the solver, run it (`solvers/loop.py`), and judge the result."""
 
 from __future__ import annotations
 
@@ -53,23 +53,28 @@ from lavender.judge.solution import (
 from lavender.problem import Problem, check_problem
 from lavender.solvers.certify import check_infeasible
 from lavender.solvers.islands import islands
-from lavender.solvers.loop import LEAST, Callback, Loop, Record, best_of
+from lavender.solvers.loop import MIN_TIME_LIMIT, Callback, Loop, Record, best_of
 from lavender.solvers.registry import SMALL_ROWS, Solver, SolverSpec, get
-from lavender.solvers.setup_times import SCIPY, estimate_disk_time, estimate_refusal_time, loading
+from lavender.solvers.setup_times import (
+    SCIPY_MODULES,
+    estimate_disk_time,
+    estimate_refusal_time,
+    loading_time,
+)
 from lavender.solving.outcome import decide_empty_rows, finish, name_lost_row
 from lavender_ext.judge.measure import all_finite, by_island
 from lavender_ext.judge.watch import Watch
 
-LATER = ("iterations", "work", "solver", "message", "history", "dual", "certificate", "impulse_bound",
+LATE_FIELDS = ("iterations", "work", "solver", "message", "history", "dual", "certificate", "impulse_bound",
          "claim_check", "status_conflict", "sweeps_per_decade", "stages")  # fmt: skip
-COUNTED = 0.9e9  # ns that a small call may be counted for, for each second of its limit
-SET_UP_LATE = "what has to be set up first takes longer than the time limit"
-NO_TURN = "the time limit was over before its turn: the start"
-JUDGE_LATE = "what the judge reads takes longer than the time limit: the start, unjudged"
-WITHOUT_SCIPY = (
+COST_PER_SECOND = 0.9e9  # Largest estimated cost [ns] of a compiled call per second of its time limit.
+SETUP_LATE_MESSAGE = "what has to be set up first takes longer than the time limit"
+NO_STAGE_MESSAGE = "the time limit was over before its turn: the start"
+JUDGE_LATE_MESSAGE = "what the judge reads takes longer than the time limit: the start, unjudged"
+WITHOUT_SCIPY_MESSAGE = (
     "without SciPy, which this process has not loaded: import scipy.linalg.lapack, scipy.sparse before"
 )
-FRONT_DOOR = ("impulse", "tol", "max_iter", "time_limit", "history", "callback")
+SOLVE_ARGUMENTS = ("impulse", "tol", "max_iter", "time_limit", "history", "callback")
 
 
 def solve(
@@ -97,13 +102,14 @@ def solve(
         Relative residual to reach: 0 is a solution, 1 is zero impulses (see `judge.residuals`). `tol=0` runs exactly
         `max_iter` iterations; `auto` and solvers that factor end earlier where nothing is left to gain.
     max_iter : int, optional
-        The most iterations, in the solver's own unit (sweeps, steps, pivots). Default: that of the solver's spec.
+        Largest number of iterations, in the solver's own unit (sweeps, steps, pivots). Default: that of the solver's
+        spec.
     time_limit : float, optional, s
-        Limit of the whole call on the wall clock: set-up, iterations and the judge. What cannot be stopped, such as a
-        set-up or a factorisation, is begun only if its counted time fits in what is left. The result is no worse than
-        the start. Solvers of other packages, and plug-ins, are imported before the clock of the first limit. The
-        former run in a separate process, which is kept for later solves and killed at the limit (at twice the limit if
-        the package has a time limit of its own); `isolate=False` runs them in this process.
+        Wall-clock limit of the whole call: set-up, iterations and the judge. Steps that cannot be interrupted, such as
+        a set-up or a factorisation, start only if their estimated time fits in the remaining time. The result is not
+        worse than the start. Solvers of other packages, and plug-ins, are imported before the clock starts. Solvers of
+        other packages run in a separate process, which is reused by later solves and killed at the limit (at twice the
+        limit if the package has a time limit of its own); `isolate=False` runs them in this process.
     history : bool
         Record iterations, time and residual at fixed numbers of iterations.
     callback : callable (iterations, impulse, residual), optional
@@ -114,7 +120,8 @@ def solve(
     Returns
     -------
     Solution
-        Also if the solver did not converge: then it holds the last iterate. See `Solution.status` and `.success`.
+        It is also returned if the solver did not converge; it then holds the best iterate. See `Solution.status` and
+        `Solution.success`.
 
     Raises
     ------
@@ -128,13 +135,13 @@ def solve(
         `impulse`, `tol`, `max_iter` or `time_limit` is not valid.
     """
     begun = 0.0 if time_limit is None else perf_counter()
-    check_problem(problem)  # first, for those who pass A and b
+    check_problem(problem)  # This comes first, because a frequent error is to pass A and b.
     spec = get(solver)
-    limit = math.inf if time_limit is None else seconds_of(time_limit)
+    limit = math.inf if time_limit is None else check_time_limit(time_limit)
     if max_iter is None and callback is None and history is False and not options:
-        made = solve_small(problem, spec, impulse, tol, limit)
-        if made is not None:
-            return made
+        solution = solve_small(problem, spec, impulse, tol, limit)
+        if solution is not None:
+            return solution
     deadline = _deadline(spec, limit, begun)
     return Prepared(problem, spec, options, False, deadline)._solve(
         None, impulse, tol, max_iter, deadline, history, callback
@@ -142,7 +149,7 @@ def solve(
 
 
 def prepare(problem: Problem, solver: str = "auto", **options: Any) -> Prepared:
-    """Do once the part of a solve that many solves can share: factorisation, colouring, allocation.
+    """Prepare a solver once for many solves: factorisation, colouring, allocation.
 
     Parameters
     ----------
@@ -155,10 +162,10 @@ def prepare(problem: Problem, solver: str = "auto", **options: Any) -> Prepared:
     Returns
     -------
     Prepared
-        `prepared.solve(impulse=..., tol=...)` solves this problem. `prepared.solve(problem2, ...)` solves another,
-        which takes its place: the next `prepared.solve()` solves `problem2`. If that has the same structure (blocks,
+        `prepared.solve(impulse=..., tol=...)` solves this problem. `prepared.solve(problem2, ...)` solves another one,
+        which replaces it: the next `prepared.solve()` solves `problem2`. If that has the same structure (blocks,
         sparsity pattern of A or J), the preparation is reused. Both may be called any number of times. `setup_time`
-        [s] is the time that preparing took.
+        [s] is the time of the preparation.
 
     Examples
     --------
@@ -183,7 +190,7 @@ class Prepared:
     """A solver prepared for a problem; `solve(problem2)` reuses the preparation if the structure is the same.
 
     It runs one solve at a time: calling `solve` during another `solve`, from another thread or from its callback,
-    raises `InUse`. Threads may share a `Problem`, but each needs a `Prepared` of its own.
+    raises `InUse`. Threads may share a `Problem`, but each needs its own `Prepared`.
     """
 
     def __init__(
@@ -194,11 +201,11 @@ class Prepared:
         begin: bool = True,
         deadline: Deadline = NEVER,
     ) -> None:
-        watch = Stopwatch()  # a check may form A, and ellipses become disks: both are set-up
-        late = check_taken(problem, spec, deadline)
+        watch = Stopwatch()  # The checks may form A and convert ellipses to disks, which counts as set-up.
+        late = check_accepted(problem, spec, deadline)
         for name in options:
             if name not in spec.accepts:
-                if name in FRONT_DOOR:
+                if name in SOLVE_ARGUMENTS:
                     raise CapabilityError(
                         f"prepare does not take {name}=: give it to the solve of what it returns"
                     )
@@ -207,39 +214,40 @@ class Prepared:
                         f"solver {spec.name!r} does not take {name}=; it takes: "
                         f"{', '.join(sorted(spec.accepts)) or 'no options'}"
                     )
-                raise UnknownName(f"option of solver {spec.name!r}", name, {*spec.accepts, *FRONT_DOOR})
+                raise UnknownName(f"option of solver {spec.name!r}", name, {*spec.accepts, *SOLVE_ARGUMENTS})
         self.spec = spec
         self.options = options
-        self._given, self.problem = problem, problem if late else problem.disk
+        self._original, self.problem = problem, problem if late else problem.disk
         self._lock = Lock()
-        # `auto` prepares nothing before its compiled call for small problems was made.
+        # `auto` prepares nothing before its compiled call for small problems.
         if begin and (options or not spec.delegates):
-            self._begin(NEVER)
+            self._prepare_solver(NEVER)
         self.setup_time = watch.seconds
 
-    solver: Any = None  # made when it is first needed
-    setup_time = 0.0  # s
-    _fresh = True  # nothing was solved with what was set up
-    _broken = ""  # why there is no state
-    _late = False  # there is none, as it would have taken longer than the time limit
+    solver: Any = None  # Created when it is first needed.
+    setup_time = 0.0  # [s]
+    _is_fresh = True  # No solve has used the state yet.
+    _failure = ""  # Reason why there is no state, or empty.
+    _is_late = False  # There is no state, because building it would have exceeded the time limit.
 
-    def _begin(self, deadline: Deadline) -> None:
+    def _prepare_solver(self, deadline: Deadline) -> None:
+        """Create the solver and its state."""
         watch = Stopwatch()
-        self.problem = self._given.disk
-        self.solver = _make(self.spec, self.options)
+        self.problem = self._original.disk
+        self.solver = _make_solver(self.spec, self.options)
         try:
             self._set_up(self.problem, True, deadline)
         except BaseException:
-            self.solver = None  # the next call begins again
+            self.solver = None  # The next call tries again.
             raise
-        self._fresh = True
+        self._is_fresh = True
         self.setup_time += watch.seconds
 
-    def _take(self, problem: Problem | None, deadline: Deadline = NEVER) -> None:
-        """Another problem, if one is given, in the place of the prepared one; nothing is set up for it yet."""
-        if problem is not None and problem is not self._given:
-            late = check_taken(problem, self.spec, deadline)
-            self._given, self.problem, self.solver = problem, problem if late else problem.disk, None
+    def _replace_problem(self, problem: Problem | None, deadline: Deadline = NEVER) -> None:
+        """Replace the prepared problem by another one, if one is given, without a set-up."""
+        if problem is not None and problem is not self._original:
+            late = check_accepted(problem, self.spec, deadline)
+            self._original, self.problem, self.solver = problem, problem if late else problem.disk, None
 
     def solve(
         self,
@@ -252,14 +260,14 @@ class Prepared:
         history: bool = False,
         callback: Callback | None = None,
     ) -> Solution:
-        """As `lavender.solve`; `problem`, if given, replaces the prepared one unless an error is raised.
+        """Solve as `lavender.solve`; `problem`, if given, replaces the prepared one unless an error is raised.
 
         Raises
         ------
         InUse
             Another call of this object's `solve` has not returned yet.
         """
-        deadline = _deadline(self.spec, seconds_of(time_limit))
+        deadline = _deadline(self.spec, check_time_limit(time_limit))
         return self._solve(problem, impulse, tol, max_iter, deadline, history, callback)
 
     def _solve(
@@ -278,38 +286,41 @@ class Prepared:
                 "make one for each thread (lavender.prepare)"
             )
         try:
-            given = self._given if problem is None else problem
-            plain = max_iter is None and callback is None and history is False
-            if plain and self.spec.delegates and not self.options:
-                made = solve_small(given, self.spec, impulse, tol, deadline.remaining(LEAST) or math.inf)
-                if made is not None:
-                    self._take(problem)
-                    return made
+            original = self._original if problem is None else problem
+            is_default = max_iter is None and callback is None and history is False
+            if is_default and self.spec.delegates and not self.options:
+                limit = deadline.remaining(MIN_TIME_LIMIT) or math.inf
+                solution = solve_small(original, self.spec, impulse, tol, limit)
+                if solution is not None:
+                    self._replace_problem(problem)
+                    return solution
             tol, max_iter = check_budget(self.spec, tol, max_iter)
             _check_records(self.spec, history, callback)
-            check_problem(given)
-            if comes_too_late(given, self.spec, deadline):
-                self._take(problem, deadline)
-                return unjudged(given, self.spec, self.options, impulse, tol, JUDGE_LATE)
-            asked = given.disk
-            start = None if impulse is None else given.on_disk(asked.impulse_array(impulse))
+            check_problem(original)
+            if is_too_late(original, self.spec, deadline):
+                self._replace_problem(problem, deadline)
+                return create_unjudged(original, self.spec, self.options, impulse, tol, JUDGE_LATE_MESSAGE)
+            disk = original.disk
+            start = None if impulse is None else original.on_disk(disk.impulse_array(impulse))
             if deadline.is_set:
-                # Of what was found, and of where it began.
-                passes = 2 if start is not None or asked.guess is not None else 1
-                last = passes * judging_time(asked)
-                if deadline.passed(setup_time(asked) + last) and not self.spec.external:
-                    self._take(problem)
-                    return unjudged(given, self.spec, self.options, impulse, tol, JUDGE_LATE)
-                deadline.reserve(last)
+                # The judge measures the result, and the start if it is not zero.
+                passes = 2 if start is not None or disk.guess is not None else 1
+                judge_time = passes * judging_time(disk)
+                if deadline.passed(setup_time(disk) + judge_time) and not self.spec.external:
+                    self._replace_problem(problem)
+                    return create_unjudged(
+                        original, self.spec, self.options, impulse, tol, JUDGE_LATE_MESSAGE
+                    )
+                deadline.reserve(judge_time)
             if self.solver is None:
-                self._take(problem)
-                self._begin(deadline)
+                self._replace_problem(problem)
+                self._prepare_solver(deadline)
             self._refresh(problem, deadline)
             loop = self._loop(start, tol, deadline, history, callback)
             return self._run(loop, max_iter)
         finally:
-            if self._late:
-                self.solver, self._late = None, False  # the next call begins again
+            if self._is_late:
+                self.solver, self._is_late = None, False  # The next call tries again.
             self._lock.release()
 
     def _loop(
@@ -320,13 +331,14 @@ class Prepared:
         history: bool,
         callback: Callback | None,
     ) -> Loop:
-        problem, given = self.problem, self._given
-        if given is not problem and callback is not None:
-            callback = _in_rows_of(given, given.cones.stretch, callback)
+        """Build the loop of a solve, and start the worker processes of the solver."""
+        problem, original = self.problem, self._original
+        if original is not problem and callback is not None:
+            callback = _unstretched_callback(original, original.cones.stretch, callback)
         if lam is None:
             lam = problem.start() if problem.guess is None else problem.guess.copy()
         left = deadline.remaining()
-        if left is not None and not self._late and not self._broken:
+        if left is not None and not self._is_late and not self._failure:
             watch = Stopwatch()
             self.solver.start_workers(self.state, left)
             deadline.reserve(-watch.seconds)
@@ -338,6 +350,7 @@ class Prepared:
         )  # fmt: skip
 
     def _run(self, loop: Loop, max_iter: int) -> Solution:
+        """Run the solver unless the problem is decided without it, and build the solution."""
         spec, problem = self.spec, self.problem
         setup_time, self.setup_time = self.setup_time, 0.0
         proof = decide_empty_rows(problem, loop.impulse, loop.tol)
@@ -345,27 +358,36 @@ class Prepared:
             message, certificate, impossible = proof
             claim = Claim(INFEASIBLE, 0, {}, message, certificate=certificate)
             claim = self._solve_with_zero_b(loop, claim, impossible, max_iter)
-        elif self._broken:
-            claim = Claim(NUMERICAL_ERROR, 0, {}, self._broken)
-        elif self._late or (loop.deadline.passed() and not spec.external):
-            # A start that does nothing is not weighed beside another, and the judge is for who asks.
-            nothing = find_known_relative(problem, loop.impulse)
-            if nothing is not None and nothing > loop.tol and loop.records is None and loop.deadline.passed():
-                start = loop.impulse if self._given is problem else self._given.cones.stretch * loop.impulse
-                words = f"{SET_UP_LATE}: the start, unjudged"
-                return unjudged(self._given, spec, self.options, start, loop.tol, words, setup_time)
-            claim = Claim(TIME_LIMIT, 0, {}, SET_UP_LATE)
-            loop.not_worse(loop.impulse)
+        elif self._failure:
+            claim = Claim(NUMERICAL_ERROR, 0, {}, self._failure)
+        elif self._is_late or (loop.deadline.passed() and not spec.external):
+            # If the start is the zero impulse, there is no better one to select, and judging is postponed.
+            at_zero = find_known_relative(problem, loop.impulse)
+            if at_zero is not None and at_zero > loop.tol and loop.records is None and loop.deadline.passed():
+                start = loop.impulse
+                if self._original is not problem:
+                    start = self._original.cones.stretch * loop.impulse
+                message = f"{SETUP_LATE_MESSAGE}: the start, unjudged"
+                return create_unjudged(
+                    self._original, spec, self.options, start, loop.tol, message, setup_time
+                )
+            claim = Claim(TIME_LIMIT, 0, {}, SETUP_LATE_MESSAGE)
+            loop.restore_better(loop.impulse)
         else:
             start = loop.impulse.copy()
             claim = loop.run(max_iter) if spec.resumable else loop.run_once(max_iter)
             if loop.tol > 0.0 and claim.status not in (CONVERGED, ROUNDOFF_LIMIT):
                 claim = name_lost_row(problem, loop.impulse, claim)
-                # The checks of sweeps keep the best of each island, from the start on.
+                # The checks of sweeps already store the best of each island, including the start.
                 if claim.status is TIME_LIMIT or not isinstance(getattr(self.state, "watch", None), Watch):
-                    loop.not_worse(start, or_zero=claim.status is TIME_LIMIT)
-            if claim.status is TIME_LIMIT and spec.delegates and problem.m > SMALL_ROWS and loading(*SCIPY):
-                claim = replace(claim, message=f"{claim.message}; {WITHOUT_SCIPY}")
+                    loop.restore_better(start, or_zero=claim.status is TIME_LIMIT)
+            if (
+                claim.status is TIME_LIMIT
+                and spec.delegates
+                and problem.m > SMALL_ROWS
+                and loading_time(*SCIPY_MODULES)
+            ):
+                claim = replace(claim, message=f"{claim.message}; {WITHOUT_SCIPY_MESSAGE}")
         refutation = ""
         if claim.status is INFEASIBLE and (spec.external or not spec.builtin):
             claim, _, refutation = check_infeasible(problem, claim, loop.tol, loop.deadline)
@@ -375,10 +397,10 @@ class Prepared:
             problem, spec, self.options, loop.impulse, claim, loop.tol, setup_time, loop.time, loop.recorded(),
             float(getattr(self.state, "sweeps_per_decade", math.nan)), refutation,
         )  # fmt: skip
-        return solution if self._given is problem else solution.unstretched(self._given)
+        return solution if self._original is problem else solution.unstretched(self._original)
 
     def _without_infeasible_islands(self, loop: Loop, claim: Claim, max_iter: int) -> Claim:
-        """Solve the islands that an INFEASIBLE claim's certificate says nothing about, unless they meet tol."""
+        """Solve the islands that the certificate of an INFEASIBLE claim does not concern, unless they meet tol."""
         assert claim.certificate is not None
         count, label = islands(self.problem)
         if count < 2:
@@ -394,7 +416,7 @@ class Prepared:
         return self._solve_with_zero_b(loop, claim, infeasible[row_label], max_iter)
 
     def _solve_with_zero_b(self, loop: Loop, claim: Claim, rows: Any, max_iter: int) -> Claim:
-        """Solve with b = 0 on rows that nothing can meet, so that other islands keep an impulse; the same claim."""
+        """Solve with b = 0 on rows that cannot be met, so that other islands get an impulse; return the same claim."""
         if loop.tol == 0.0 or loop.deadline.passed():
             return claim
         b, start = self.problem.b.copy(), loop.impulse.copy()
@@ -403,105 +425,107 @@ class Prepared:
             others = Prepared(self.problem.updated(b=b), self.spec, self.options)
         except InputError:  # All other numbers of b are below the smallest that a problem may have.
             return claim
-        found = others.solve(
-            impulse=start, tol=loop.tol, max_iter=max_iter, time_limit=loop.deadline.remaining(LEAST)
+        solution = others.solve(
+            impulse=start, tol=loop.tol, max_iter=max_iter, time_limit=loop.deadline.remaining(MIN_TIME_LIMIT)
         )
-        loop.impulse[:] = best_of_islands(self.problem, (loop.impulse,), (found.impulse,), loop.tol)
-        loop.time += found.setup_time + found.solve_time
-        return replace(
-            claim, iterations=claim.iterations + found.iterations, work=summed((claim.work, found.work))
-        )
+        loop.impulse[:] = best_of_islands(self.problem, (loop.impulse,), (solution.impulse,), loop.tol)
+        loop.time += solution.setup_time + solution.solve_time
+        work = summed((claim.work, solution.work))
+        return replace(claim, iterations=claim.iterations + solution.iterations, work=work)
 
     def _refresh(self, problem: Problem | None, deadline: Deadline) -> None:
-        if problem is None or problem is self._given:
-            if not self._fresh:
+        """Update the state for another problem, or for another solve of the same one."""
+        if problem is None or problem is self._original:
+            if not self._is_fresh:
                 self._set_up(self.problem, False, deadline)
         else:
             watch = Stopwatch()
-            check_taken(problem, self.spec)
-            given, problem = problem, problem.disk
+            check_accepted(problem, self.spec)
+            original, problem = problem, problem.disk
             self._set_up(problem, not same_structure(self.problem, problem), deadline)
             self.setup_time = watch.seconds
-            self._given, self.problem = given, problem  # not before: what cannot be set up is refused again
-        self._fresh = False
+            # Assigned last: a problem whose set-up raises an error does not replace the old one.
+            self._original, self.problem = original, problem
+        self._is_fresh = False
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Copied or pickled it is prepared anew: a state is for one solve at a time."""
-        return partial(prepare, **self.options), (self._given, self.spec.name)
+        """Copy or pickle as a new preparation, because a state can only be used by one solve at a time."""
+        return partial(prepare, **self.options), (self._original, self.spec.name)
 
-    def _set_up(self, problem: Problem, anew: bool, deadline: Deadline) -> None:
-        """Prepare, or update the state of a problem of the same structure, if that is counted to end in time."""
+    def _set_up(self, problem: Problem, is_new: bool, deadline: Deadline) -> None:
+        """Build the state, or update that of a problem of the same structure, if its estimated time fits."""
         if problem.metric.reference_energy < 0.0:
-            get_reference(problem)  # of the judge, before any solver has the problem in its hands
-        anew, self._broken = anew or bool(self._broken), ""
+            get_reference(problem)  # The judge computes its reference before a solver gets the problem.
+        is_new, self._failure = is_new or bool(self._failure), ""
         if deadline.is_set:
-            self._late = deadline.passed(self.solver.setup_time(problem))
-            if self._late and self.solver.needs_scipy and loading(*SCIPY):
-                # As processes are started: else no call within the limit would ever have what it needs.
+            self._is_late = deadline.passed(self.solver.setup_time(problem))
+            if self._is_late and self.solver.needs_scipy and loading_time(*SCIPY_MODULES):
+                # SciPy is imported outside the limit, like the start of processes: otherwise no call with this limit
+                # would ever have it.
                 watch = Stopwatch()
                 import_numerics()
                 deadline.reserve(-watch.seconds)
-                self._late = deadline.passed(self.solver.setup_time(problem))
-            if self._late:
+                self._is_late = deadline.passed(self.solver.setup_time(problem))
+            if self._is_late:
                 self.state = None
                 return
         try:
-            if anew:
+            if is_new:
                 self.state = self.solver.prepare(problem)
             else:
                 self.state = self.solver.update(self.state, problem)
         except InputError:
-            raise  # before the start
+            raise  # The problem is not valid for the solver.
         except BREAKDOWN as error:
-            self.state, self._broken = None, format_error(error)
+            self.state, self._failure = None, format_error(error)
 
 
-def unjudged(
-    given: Problem,
+def create_unjudged(
+    problem: Problem,
     spec: SolverSpec,
     options: dict[str, Any],
     impulse: Any,
     tol: float,
-    words: str,
+    message: str,
     setup_time: float = 0.0,
 ) -> Solution:
-    """The start as it is, if even the judge would be late: it measures the start when a field is first read."""
-    start = given._start if given.guess is None else given.guess
-    start = start.copy() if impulse is None else given.impulse_array(impulse)
-    late = judged_later, (given, spec, options, start, Claim(TIME_LIMIT, 0, {}, words), tol)
+    """Return the start as a solution if even the judge would exceed the limit; its fields are judged when accessed."""
+    start = problem._start if problem.guess is None else problem.guess
+    start = start.copy() if impulse is None else problem.impulse_array(impulse)
+    late = judge_late_fields, (problem, spec, options, start, Claim(TIME_LIMIT, 0, {}, message), tol)
     return Solution.late(read_only(start), TIME_LIMIT, tol, 0.0, late, setup_time)
 
 
-def _in_rows_of(given: Problem, stretch: FloatArray, callback: Callback) -> Callback:
-    """A callback of a problem with ellipses, for what is solved in its place."""
+def _unstretched_callback(problem: Problem, stretch: FloatArray, callback: Callback) -> Callback:
+    """Return a callback for `problem.disk` that calls `callback` with impulse and residual of `problem`."""
 
-    def call(done: int, impulse: FloatArray, found: Residual) -> Any:
-        return callback(done, stretch * impulse, convert_from_disk(given, found))
+    def call(done: int, impulse: FloatArray, judged: Residual) -> Any:
+        return callback(done, stretch * impulse, convert_from_disk(problem, judged))
 
     return call
 
 
-def _make(spec: SolverSpec, options: dict[str, Any]) -> Solver:
+def _make_solver(spec: SolverSpec, options: dict[str, Any]) -> Solver:
+    """Create the solver; wrap solvers of others (`Foreign`) and own solvers of bounded rows (`ThroughRows`)."""
     factory = spec.load()
     try:
-        made = factory(**options)
+        solver = factory(**options)
     except (TypeError, ValueError) as error:
         if isinstance(error, InputError):
             raise
         raise InputError(f"solver {spec.name!r} cannot take the options {options}: {error}") from error
     if not spec.builtin:
-        return Foreign(spec.name, made)
+        return Foreign(spec.name, solver)
     if spec.box_friction_laws <= spec.laws:
-        return made
-    from lavender.solvers.polyhedral import (
-        ThroughRows,  # with the table of solvers, which is imported by then
-    )
+        return solver
+    # Imported here, because it imports the table of solvers.
+    from lavender.solvers.polyhedral import ThroughRows
 
-    return ThroughRows(made)
+    return ThroughRows(solver)
 
 
 def same_structure(p: Problem, q: Problem) -> bool:
-    """Same blocks, same kind of operator, same bodies or same pattern of J and M or of A."""
+    """Return whether two problems have the same blocks, operator, and bodies or pattern of J and M or of A."""
     if not (are_equal(p.cones.ptr, q.cones.ptr) and are_equal(p.cones.kind, q.cones.kind)) or p.law != q.law:
         return False
     if p.rows is not None and q.rows is not None:
@@ -515,23 +539,26 @@ def same_structure(p: Problem, q: Problem) -> bool:
     if p.generalized is not None and q.generalized is not None:
         return all(
             are_equal(x, y)
-            for of in ("jac", "mass")
+            for name in ("jac", "mass")
             for x, y in zip(
-                getattr(p.generalized.operator, of)[:2], getattr(q.generalized.operator, of)[:2], strict=True
+                getattr(p.generalized.operator, name)[:2],
+                getattr(q.generalized.operator, name)[:2],
+                strict=True,
             )
         )
     return are_equal(p.csr.indptr, q.csr.indptr) and are_equal(p.csr.indices, q.csr.indices)
 
 
-def judged_later(
-    given: Problem, spec: SolverSpec, options: dict[str, Any], impulse: FloatArray, claim: Claim, tol: float
+def judge_late_fields(
+    problem: Problem, spec: SolverSpec, options: dict[str, Any], impulse: FloatArray, claim: Claim, tol: float
 ) -> dict[str, Any]:
-    """The fields that `unjudged` leaves for later; impulse (m,) [N s] in the rows of `given`, read-only."""
-    disk = given.disk
-    made = finish(disk, spec, options, given.on_disk(impulse), claim, tol, 0.0, 0.0, None)
-    if given is not disk:
-        made = replace(made.unstretched(given), residual=residual(given, impulse, "float64"))
-    return {name: getattr(made, name) for name in ("residual", *LATER)}
+    """Return the fields that `create_unjudged` postpones; impulse (m,) [N s], read-only."""
+    disk = problem.disk
+    solution = finish(disk, spec, options, problem.on_disk(impulse), claim, tol, 0.0, 0.0, None)
+    if problem is not disk:
+        judged = residual(problem, impulse, "float64")
+        solution = replace(solution.unstretched(problem), residual=judged)
+    return {name: getattr(solution, name) for name in ("residual", *LATE_FIELDS)}
 
 
 def solve_small(
@@ -541,10 +568,10 @@ def solve_small(
     tol: float,
     limit: float = math.inf,
 ) -> Solution | None:
-    """The solution of a small problem by one compiled call, judged there; None if `Prepared` has to solve it.
+    """Solve and judge a small problem by one compiled call; return None if `Prepared` has to solve it.
 
-    If its counted cost is more than the limit [s], the result is the best of what was found by then and of the start.
-    The fields of claim, counts and residual are made when they are first read.
+    If the estimated cost reaches the limit [s], the result is the best of the iterate so far and the start. The fields
+    of claim, counts and residual are computed when they are first accessed.
     """
     small = spec.small
     if small is None or not spec.builtin or type(problem) is not Problem or not isinstance(tol, float):
@@ -554,49 +581,50 @@ def solve_small(
     if problem.cones._blocks.has_ellipse or (
         len(problem.b) > SMALL_ROWS and (problem.generalized is None or limit < math.inf)
     ):
-        return None  # islands may take long: they are solved where Ctrl-C and the clock are heard
+        return None  # Islands may take long: they are solved where Ctrl-C and the clock are checked.
     start = perf_counter()
     if impulse is None:
-        given = problem.guess
+        first = problem.guess
     elif (
         type(impulse) is np.ndarray and impulse.dtype is problem.b.dtype and impulse.shape == problem.b.shape
         and impulse.flags.c_contiguous and all_finite(impulse)
     ):  # fmt: skip
-        given = impulse
+        first = impulse
     else:
-        given = problem.impulse_array(impulse)
-    judged, counts = small.attempt(problem, given, tol, COUNTED * limit)
+        first = problem.impulse_array(impulse)
+    judged, counts = small.attempt(problem, first, tol, COST_PER_SECOND * limit)
     if judged is None:
         return None
     status = CONVERGED
     if judged.relative > tol:
         if limit == math.inf or judged.relative == judged.roundoff_floor:
-            return None  # not the limit: beside such impulses rounding hides b
-        status, judged = TIME_LIMIT, best_of(problem, judged, given, tol)
-    kept = given if given is None or impulse is None else given.copy()  # the caller may write into his own
+            return None  # The limit is not the reason: next to such impulses, rounding hides b.
+        status, judged = TIME_LIMIT, best_of(problem, judged, first, tol)
+    # The caller may change an impulse array of their own later.
+    start_point = first if first is None or impulse is None else first.copy()
     judged.impulse.setflags(write=False)
     return Solution.late(
         judged.impulse,
         status,
         tol,
         perf_counter() - start,
-        (rest_of, (problem, spec, judged, counts, kept, status)),
+        (compute_late_fields, (problem, spec, judged, counts, start_point, status)),
     )
 
 
-def rest_of(
+def compute_late_fields(
     problem: Problem,
     spec: SolverSpec,
     judged: Any,
     counts: Any,
-    given: FloatArray | None,
+    start: FloatArray | None,
     status: Status = CONVERGED,
 ) -> dict[str, Any]:
-    """The fields of a solution of a compiled call that `Solution.late` leaves for later."""
-    if spec.small is None:  # of a world of `solve_many`
-        claim = Claim(status, 0, {}, NO_TURN)
+    """Return the fields of the solution of a compiled call that `Solution.late` postpones."""
+    if spec.small is None:  # A world of `solve_many`.
+        claim = Claim(status, 0, {}, NO_STAGE_MESSAGE)
     else:
-        claim = spec.small.claim(problem, counts, given, judged.relative, status)
+        claim = spec.small.claim(problem, counts, start, judged.relative, status)
     return {
         "residual": make_residual(problem, judged),
         "iterations": claim.iterations,
@@ -614,46 +642,51 @@ def rest_of(
     }
 
 
-def check_taken(problem: Problem, spec: SolverSpec, deadline: Deadline = NEVER) -> bool:
-    """Raise if it is not a problem, or if the solver refuses it; return `comes_too_late`.
+def check_accepted(problem: Problem, spec: SolverSpec, deadline: Deadline = NEVER) -> bool:
+    """Raise an error if the argument is not a problem or the solver refuses it; return `is_too_late`.
 
-    If that is so, only the kind of the problem is checked: whatever is checked beyond it takes longer than is left.
+    If it is too late, only the kind of the problem is checked, because the other checks would exceed the limit.
     """
     check_problem(problem)
-    late = comes_too_late(problem, spec, deadline)
+    late = is_too_late(problem, spec, deadline)
     reason = spec.refuses(problem, late)
     if reason:
         raise CapabilityError(f"solver {spec.name!r} {reason}")
     return late
 
 
-def comes_too_late(problem: Problem, spec: SolverSpec, deadline: Deadline) -> bool:
-    """Whether the forms of a problem that are read before any solver has it would be made after the deadline.
+def is_too_late(problem: Problem, spec: SolverSpec, deadline: Deadline) -> bool:
+    """Return whether forms of a problem that are needed before a solver runs would be built after the deadline.
 
-    These are `problem.disk`, and A where a package of others refuses by its entries. Such a call returns its start.
+    These are `problem.disk`, and A if a solver of another package refuses problems by its entries. Such a call returns
+    its start.
     """
     if not deadline.is_set:
         return False
     if problem.rows is not None and problem.cones.has_ellipse and deadline.passed(setup_time(problem)):
-        return True  # the numbers of bodies alone, from which the entries of A are counted
+        return True  # Even the couplings of bodies, from which the entries of A are counted, would take too long.
     needed = estimate_disk_time(problem) + estimate_refusal_time(problem, spec)
-    if needed > 0.0 and problem.generalized is None and deadline.passed(needed) and loading("scipy.sparse"):
+    if (
+        needed > 0.0
+        and problem.generalized is None
+        and deadline.passed(needed)
+        and loading_time("scipy.sparse")
+    ):
         watch = Stopwatch()
         import_numerics()
-        deadline.reserve(
-            -watch.seconds
-        )  # as processes are started: else no call within the limit would ever have it
+        # SciPy is imported outside the limit: otherwise no call with this limit would ever have it.
+        deadline.reserve(-watch.seconds)
         needed = estimate_disk_time(problem) + estimate_refusal_time(problem, spec)
     return needed > 0.0 and deadline.passed(needed)
 
 
-def seconds_of(time_limit: Any) -> float:
-    """A time limit as a number, inf where it is None.
+def check_time_limit(time_limit: Any) -> float:
+    """Return a time limit [s] as a number; inf if it is None.
 
     Raises
     ------
     InputError
-        No positive number.
+        It is not a positive number.
     """
     if type(time_limit) is float and time_limit > 0.0:
         return time_limit
@@ -663,7 +696,10 @@ def seconds_of(time_limit: Any) -> float:
 
 
 def _deadline(spec: SolverSpec, limit: float, begun: float | None = None) -> Deadline:
-    """Of a call with that limit [s]; code of others, and what it needs of SciPy, is imported before its clock."""
+    """Create the deadline of a call with a time limit [s].
+
+    Solvers of others, and the modules of SciPy that they need, are imported first, so that this time does not count.
+    """
     if limit == math.inf:
         return NEVER
     if spec.external or not spec.builtin:
@@ -674,18 +710,19 @@ def _deadline(spec: SolverSpec, limit: float, begun: float | None = None) -> Dea
 
 
 def check_budget(spec: SolverSpec, tol: float, max_iter: int | None) -> tuple[float, int]:
-    """Both as numbers, `max_iter` the spec's where it is None.
+    """Return `tol` and `max_iter` as numbers; `max_iter` is that of the spec if it is None.
 
     Raises
     ------
     InputError
-        A wrong one.
+        A value is not valid.
     """
     tol = check_float("tol", tol, low=0.0)
     return tol, check_int("max_iter", spec.max_iter if max_iter is None else max_iter)
 
 
 def _check_records(spec: SolverSpec, history: bool, callback: Callback | None) -> None:
+    """Raise an error if `history` or `callback` is not valid or not supported by the solver."""
     if callback is not None and not callable(callback):
         raise InputError(f"callback is {callback!r}; a function of (iterations, impulse, residual) is needed")
     if (callback is not None and not spec.callback) or (check_bool("history", history) and not spec.history):

@@ -25,7 +25,7 @@ import lavender as lv
 from benchmarks.core_problems import fresh, stacks
 from lavender import registry
 from lavender.judge.residuals import get_reference
-from lavender.solvers.auto import Tree, make
+from lavender.solvers.auto import Tree, make_step
 from lavender.solvers.newton_systems import general
 from lavender.solvers.pivoting import PivotState
 from lavender.solvers.solve_log import SolveLog
@@ -202,7 +202,7 @@ def run_step_of_auto(problem, sizes, kind):
     get_reference(problem)
     log = SolveLog(problem, 1e-14, 10**6)
     log.offer(problem.start())
-    step = make(kind, log, Tree(problem))
+    step = make_step(kind, log, Tree(problem))
     for n in sizes:
         step.run(n)
     return log.iterations, step.impulse.tobytes()

@@ -40,7 +40,7 @@ from lavender.lab.motion.reference import reference as reference_of
 from lavender.lab.motion.unique import uniqueness
 from lavender.problem import Problem, check_problem
 from lavender.problem.cones import project
-from lavender.solvers.certify import softened
+from lavender.solvers.certify import soften
 from lavender.solvers.registry import available, get
 from lavender.solving.solve import solve
 
@@ -385,7 +385,7 @@ def solve_with_vanishing_compliance(problem: Problem) -> FloatArray:
     x, s = problem.start(), LARGEST_COMPLIANCE_FRACTION
     while s >= SMALLEST_COMPLIANCE_FRACTION:
         x = np.array(
-            uninterrupted(solve(softened(problem, s * problem.d), "auto", impulse=x, tol=1e-12)).impulse
+            uninterrupted(solve(soften(problem, s * problem.d), "auto", impulse=x, tol=1e-12)).impulse
         )
         s *= COMPLIANCE_STEP
     return np.array(uninterrupted(solve(problem, "auto", impulse=x, tol=1e-13)).impulse)

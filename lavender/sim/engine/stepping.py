@@ -27,7 +27,7 @@ from lavender.sim.scene.scene import Parameters
 from lavender.sim.scene.steppers import get_stepper
 from lavender.solvers.newton import SPEC as NEWTON_SPEC
 from lavender.solvers.registry import get
-from lavender.solvers.warm_start import claim_of
+from lavender.solvers.warm_start import make_warm_start_claim
 from lavender.solving.outcome import finish
 from lavender.solving.solve import solve
 from lavender_ext.engine.arrays import NEED_ROOM, OK
@@ -407,7 +407,7 @@ class Stepping:
     def _build_solution(self, pending: _PendingClaim) -> Solution:
         """Build the solution of the last substep, whose arrays do not change until the next one."""
         problem = self._problem(self.state, steps=self._steps)
-        claim = claim_of(pending.status_code, pending.sweeps, pending.factorisations)
+        claim = make_warm_start_claim(pending.status_code, pending.sweeps, pending.factorisations)
         assert claim is not None
         impulse = self.state.a["impulse"][: problem.m].copy()
         options = dict(self._parameters.solver_options)

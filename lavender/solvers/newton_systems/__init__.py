@@ -1,10 +1,10 @@
-"""Newton's method in parts; `lavender/solvers/newton.py` puts them together.
+"""Linear systems of Newton's method; `lavender/solvers/newton.py` uses them.
 
-systems          what is factored, over the bodies or over the rows of A, and its compiled solve
-sparse           matrices of few entries, for that
-augmented        rows that nearly depend on each other, likewise
-general          over the velocities of generalised coordinates
+systems          systems over the bodies or over the rows of A, and their compiled solve
+sparse           factorisations of sparse systems over the rows of A
+augmented        factorisations for nearly dependent rows of bodies
+general          Newton's method over the velocities of generalised coordinates
 
-The rows that move, in the unknown z = D^1/2 lambda, what is tried when, the exchanges, interior points and proximal
-rounds stand in `lavender_ext/newton/`.
+The scaling z = D^1/2 lambda, the sequence of methods, the exchanges, the interior points and the proximal iterations
+are in `lavender_ext/newton/`.
 """

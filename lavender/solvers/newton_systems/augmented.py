@@ -1,13 +1,13 @@
-"""The augmented system of the bodies, for rows that nearly depend on each other.
+"""Augmented system of the bodies, for nearly dependent rows.
 
     [ I     -K^T              ] [ dy ]   [  0 ]
     [ P K   I - P + P theta   ] [ dz ] = [ -F ]        y = K^T z, P in the derivative of Pi               (1)
 
-Eliminating dy leaves H = K K^T, eliminating dz leaves K^T K: both square the singular values of K, and what is
-below sqrt(2^-53) of the largest is lost (closed loops of hinges, nearly parallel axes: 1e-6 to 1e-8 is usual,
-with impulses of 1e4 and more along them). (1) holds K itself. A shift on the rows that P keeps stands for the
-redundant ones, refinement takes it away again (Bjorck 1996, section 2.4.4). An interior point's systems
-(H + W) dz = r likewise, with W^-1 = R^T Q and dz = R^T x,
+Eliminating dy gives H = K K^T, eliminating dz gives K^T K. Both square the singular values of K, and values below
+sqrt(2^-53) of the largest are lost (for closed loops of hinges and nearly parallel axes, 1e-6 to 1e-8 is usual, with
+impulses of 1e4 and more along them). (1) contains K itself. A shift on the rows that P keeps makes redundant rows
+solvable; refinement removes its effect (Bjorck 1996, section 2.4.4). The systems (H + W) dz = r of an interior point
+are treated in the same way, with W^-1 = R^T Q and dz = R^T x,
 
     [ I     -K^T R^T ] [ dy ]   [  0  ]
     [ Q K    I       ] [ x  ] = [ Q r ]                                                                   (2)
@@ -23,53 +23,59 @@ from lavender.base.arrays import FloatArray
 from lavender.base.deadline import NEVER, Deadline, Stopwatch, TooLate
 from lavender.base.lazy_import import sparse as sp
 from lavender.base.lu import sparse_lu
-from lavender.solvers.setup_times import CALLS, SPARSE, loading, sparse_work
+from lavender.solvers.setup_times import SCIPY_CALLS_TIME, SPARSE_FACTOR_WORK_TIME, loading_time, sparse_work
 from lavender_ext.newton.solve import WHATS, Layout, Solve
 
 
 class Augmented:
-    """Who factors (1) and (2) for `Solve`; K is made when it is first asked for."""
+    """Factorisation of (1) and (2), which `Solve` calls; K is built at the first call."""
 
-    def __init__(self, of: Solve, layout: Layout, bodies: Any) -> None:
-        self.of, self.layout, self.bodies = of, layout, bodies
+    def __init__(self, kernel: Solve, layout: Layout, bodies: Any) -> None:
+        self.kernel, self.layout, self.bodies = kernel, layout, bodies
         self.k: Any = None
         self.lu: Any = None
         self.deadline: Deadline = NEVER
-        self.seconds = 0.0  # of the next factor: the first by structure, then as long as the last took
+        self.seconds = 0.0  # Time [s] of the next factor: estimated for the first, then that of the last one.
 
     def factor(self, _augmented: int, what: int, eps: float) -> bool:
-        """Factor (1) for the P of the last natural map, eps added to theta, or (2); whether there is a factor.
+        """Factor (1) for the P of the last natural map with eps added to theta, or (2); return whether that succeeded.
 
-        TooLate if it would end after the deadline.
+        Raises
+        ------
+        TooLate
+            It would end after the deadline.
         """
         if self.k is None:
-            if self.deadline.passed(CALLS):
+            if self.deadline.passed(SCIPY_CALLS_TIME):
                 raise TooLate
-            self.k = self._make()
-            # K stands in it twice, beside the small matrices.
-            entries = 2.0 * self.k.nnz + len(self.small[0])
+            self.k = self._build_jacobian()
+            # The system contains K twice, and the block matrices.
+            entries = 2.0 * self.k.nnz + len(self.block_entries[0])
             self.seconds = (
-                CALLS + SPARSE * sparse_work(entries, sum(self.k.shape)) + loading("scipy.sparse.linalg")
+                SCIPY_CALLS_TIME
+                + SPARSE_FACTOR_WORK_TIME * sparse_work(entries, sum(self.k.shape))
+                + loading_time("scipy.sparse.linalg")
             )
         if self.deadline.passed(self.seconds):
             raise TooLate
         watch = Stopwatch()
-        found = self._factor_of(what, eps)
+        succeeded = self._factor_kind(what, eps)
         self.seconds = watch.seconds
-        return found
+        return succeeded
 
-    def _factor_of(self, what: int, eps: float) -> bool:
-        s = self.of
+    def _factor_kind(self, what: int, eps: float) -> bool:
+        """Build the blocks of (1) or (2) for the kind `what` and factor them."""
+        s = self.kernel
         if what == WHATS["natural"]:
-            p = self._small(s.p)
+            p = self._block_matrix(s.p)
             own = sp.eye_array(s.m) - p + p @ sp.diags_array(s.theta + eps)
             return self._factor(p, None, own)
-        right = None if s.bt is None else self._small(s.bt)
+        right = None if s.bt is None else self._block_matrix(s.bt)
         left = s.v if s.bt is None else s.bt if what == WHATS["barrier"] else s.pair
-        return self._factor(self._small(left), right, sp.eye_array(s.m))
+        return self._factor(self._block_matrix(left), right, sp.eye_array(s.m))
 
     def solve(self, _augmented: int, r: FloatArray) -> FloatArray:
-        """Dz or x for the right-hand side -F or Q r; not finite where there is no factor."""
+        """Return dz or x for the right-hand side -F or Q r; NaN if there is no factor."""
         if self.lu is None:
             return np.full_like(r, np.nan)
         n = self.k.shape[1]
@@ -78,8 +84,9 @@ class Augmented:
         x += self.lu.solve(right - self.matrix @ x)
         return np.ascontiguousarray(x[n:])
 
-    def _make(self) -> Any:
-        sc, n = self.of, self.layout.n
+    def _build_jacobian(self) -> Any:
+        """Build K (m, 6 n) without empty columns, and the positions of the entries of block matrices."""
+        sc, n = self.kernel, self.layout.n
         panel, _ = sc.jacobian(self.bodies.pair, self.bodies.column)
         size, m = np.diff(sc.ptr), sc.m
         body = np.repeat(self.layout.body, size, axis=0)
@@ -92,13 +99,15 @@ class Augmented:
         square = np.repeat(size, size**2)
         inner = np.arange(int(sc.wptr[-1])) - np.repeat(sc.wptr[:-1], size**2)
         base = np.repeat(sc.ptr[:-1], size**2)
-        self.small = base + inner // square, base + inner % square
+        self.block_entries = base + inner // square, base + inner % square
         return kept
 
-    def _small(self, values: FloatArray) -> Any:
-        return sp.csr_array((values, self.small), shape=(self.of.m,) * 2)
+    def _block_matrix(self, values: FloatArray) -> Any:
+        """Return the block-diagonal matrix (m, m) with these values."""
+        return sp.csr_array((values, self.block_entries), shape=(self.kernel.m,) * 2)
 
     def _factor(self, left: Any, right: Any, own: Any) -> bool:
+        """Factor [[I, -(right K)^T], [left K, own]]; `right` None is the identity."""
         upper = self.k if right is None else right @ self.k
         matrix = sp.block_array([[sp.eye_array(self.k.shape[1]), -upper.T], [left @ self.k, own]])
         self.lu = None

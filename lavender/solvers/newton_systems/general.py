@@ -1,6 +1,6 @@
 """Newton's method over the velocities of generalised coordinates (`lavender_ext/velocity_newton/newton.pxd`).
 
-One compiled call solves every island of trees; here stand the clock and the words of the claim.
+One compiled call solves every island of trees; this module checks the clock and builds the claim.
 """
 
 from __future__ import annotations
@@ -17,16 +17,21 @@ from lavender_ext.core.method import OUTCOMES
 from lavender_ext.driver.driver import Driver
 
 FORM = "generalized velocities"
-# Steps for each island between two looks at the clock and at Ctrl-C, at most as many as are counted for WATCHED [s]: at
-# FLOP, LOOKED_UP times as much where a factor looks for its entries. With a time limit at most as many as a
-# share of what is left is for: counted so, then at the pace so far, and at FLOP at least: the first may be cheap ones.
-CLOCK = 64
-WATCHED = 4.0
-TIME_SHARE = 0.5
-LOOKED_UP = 20.0
-FLOP = 1e-10  # s for each multiply-add of a dense factor
-CLOSEST = 1e-2  # of tol, up to which the kernel is asked again where the judge does not find what it found
-MAX_MATRIX_ENTRIES = 9e6  # values of one island's N: 3,000 velocities dense, 144 MB with its factor
+# Between two checks of the clock and Ctrl-C, an island does at most this many steps, and at most as many as are
+# estimated for CHECK_INTERVAL [s]. The estimate uses FLOP_TIME per multiply-add, or SPARSE_TIME_RATIO times as much for
+# sparse factors. With a time limit, the steps use at most CALL_TIME_FRACTION of the remaining time, at the measured
+# speed or at FLOP_TIME, whichever is slower, because the first steps may be cheap.
+MAX_STEPS_PER_CHECK = 64
+CHECK_INTERVAL = 4.0
+CALL_TIME_FRACTION = 0.5
+SPARSE_TIME_RATIO = 20.0
+FLOP_TIME = 1e-10  # Time [s] per multiply-add of a dense factor.
+# If the judge does not confirm the kernel's result, the kernel runs again with a smaller tolerance, down to this
+# fraction of tol.
+MIN_TOLERANCE_RATIO = 1e-2
+MAX_MATRIX_ENTRIES = (
+    9e6  # Largest number of values of an island's N: 3,000 velocities dense, 144 MB with its factor.
+)
 _STATUS = {
     OUTCOMES["reached"]: Status.CONVERGED,
     OUTCOMES["more"]: Status.MAX_ITERATIONS,
@@ -34,12 +39,18 @@ _STATUS = {
     OUTCOMES["broken"]: Status.NUMERICAL_ERROR,
     OUTCOMES["lost"]: Status.DIVERGED,
 }
-NO_END = 2**31 - 1  # steps: who leads them counts them
-_WORDS = ("factorisations", "Coulomb rounds", "line evaluations")
+UNLIMITED_STEPS = 2**31 - 1  # The kernel has no limit of steps; `run` counts them.
+_WORK_KINDS = ("factorisations", "Coulomb rounds", "line evaluations")
 
 
 def prepare(problem: Problem, work: float = inf) -> Driver | None:
-    """Islands and room for them; None where N of one is too large to be kept, or seen to need more multiply-adds."""
+    """Prepare the islands and their workspace.
+
+    Returns
+    -------
+    Driver or None
+        None if N of an island is too large, or if its factor needs more than `work` multiply-adds.
+    """
     get_reference(problem)
     kernel = Driver(problem.metric, MAX_MATRIX_ENTRIES, work)
     return kernel if kernel.fits else None
@@ -52,39 +63,41 @@ def run(
     max_iter: int,
     tol: float,
     time_limit: float | None,
-    again: bool = False,
+    is_continued: bool = False,
 ) -> Claim:
-    """At most n Newton steps on `impulse`, in place, until the judge's test at tol is met.
+    """Run at most `max_iter` Newton steps on `impulse` (m,) in place, until the judge's test at tol is met.
 
-    `again`: on from where a run before, to the same tol, has used up its steps.
+    With `is_continued`, continue a run to the same tol that used up its steps.
     """
     deadline, watch = Deadline(time_limit), Stopwatch()
     counts = [0, 0, 0, 0]
-    status, closer = Status.MAX_ITERATIONS, 1.0
+    status, tolerance_ratio = Status.MAX_ITERATIONS, 1.0
     now = 0.0
     islands = max(1, kernel.islands)
-    step = counted = FLOP * kernel.work
-    slow = max(LOOKED_UP * step, 1e-9)
-    steps = clock = max(1, int(islands * min(CLOCK, WATCHED / slow)))  # a step is one of an island
+    step = counted = FLOP_TIME * kernel.work
+    slow = max(SPARSE_TIME_RATIO * step, 1e-9)
+    steps = clock = max(
+        1, int(islands * min(MAX_STEPS_PER_CHECK, CHECK_INTERVAL / slow))
+    )  # Each island counts its own steps.
     if time_limit is not None:
-        steps = max(1, int(min(TIME_SHARE * time_limit / slow, clock)))
+        steps = max(1, int(min(CALL_TIME_FRACTION * time_limit / slow, clock)))
     while counts[0] < max_iter:
         if deadline.passed(min(step, 1e6)):
             status = Status.TIME_LIMIT
             break
-        if not again:
-            kernel.start(impulse, closer * tol, NO_END)
+        if not is_continued:
+            kernel.start(impulse, tolerance_ratio * tol, UNLIMITED_STEPS)
         before = kernel.counts
         status = _STATUS[kernel.step(min(steps, max_iter - counts[0]), impulse)]
         done = [now - then for now, then in zip(kernel.counts, before, strict=True)]
-        counts = [count + more for count, more in zip(counts, done, strict=True)]
-        if status is Status.CONVERGED and not confirmed(problem, impulse, tol):
-            # Its sums are rounded in another order, and vanish where squares do.
-            status = Status.MAX_ITERATIONS if closer > CLOSEST else Status.STALLED
-            closer *= 0.25
-            again = False
+        counts = [total + new for total, new in zip(counts, done, strict=True)]
+        if status is Status.CONVERGED and not is_confirmed(problem, impulse, tol):
+            # The kernel rounds sums in another order, and its squares may underflow.
+            status = Status.MAX_ITERATIONS if tolerance_ratio > MIN_TOLERANCE_RATIO else Status.STALLED
+            tolerance_ratio *= 0.25
+            is_continued = False
         elif status is Status.MAX_ITERATIONS:
-            again = True
+            is_continued = True
             if done[0] <= 0:
                 status = Status.STALLED
         if status is not Status.MAX_ITERATIONS:
@@ -96,19 +109,19 @@ def run(
             break
         if left is not None:
             step = max(now / max(1, counts[0]), (now - last) / max(1, done[0]))
-            steps = max(1, int(min(clock, TIME_SHARE * left / max(step, counted, 1e-9))))
+            steps = max(1, int(min(clock, CALL_TIME_FRACTION * left / max(step, counted, 1e-9))))
     return claim(status, counts)
 
 
-def confirmed(problem: Problem, impulse: FloatArray, tol: float) -> bool:
-    """Whether the judge finds what the kernel found; his pass is kept for the one who returns the impulse."""
-    found = judge_impulse(problem, impulse.copy())
-    store_result(problem, found)
-    return bool(found.relative <= tol)
+def is_confirmed(problem: Problem, impulse: FloatArray, tol: float) -> bool:
+    """Return whether the judge confirms the kernel's result; the judge's pass is remembered for the solution."""
+    result = judge_impulse(problem, impulse.copy())
+    store_result(problem, result)
+    return bool(result.relative <= tol)
 
 
 def claim(status: Status, counts: Any) -> Claim:
-    """What (steps, factorisations, rounds, evaluations) come to in words."""
+    """Return the claim for counts of (steps, factorisations, Coulomb rounds, line evaluations)."""
     done, *parts = counts
-    work = {word: c for word, c in zip(_WORDS, parts, strict=True) if c or word == _WORDS[0]}
+    work = {kind: n for kind, n in zip(_WORK_KINDS, parts, strict=True) if n or kind == _WORK_KINDS[0]}
     return Claim(status, done, work, form=FORM)

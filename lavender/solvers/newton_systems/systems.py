@@ -1,7 +1,7 @@
 """H of the scaled problem and its Newton systems, in two forms.
 
-`VelocitySystem` never forms H (K K^T + theta with one small dense block for each body), `MatrixSystem` holds it (dense,
-or sparse panels). The equations, and all that is solved with them, are in `lavender_ext/newton/`.
+`VelocitySystem` does not form H (K K^T + theta with one small dense block for each body); `MatrixSystem` stores it
+(dense, or sparse panels). The equations and the methods that use them are in `lavender_ext/newton/`.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from lavender.base.deadline import Deadline
 from lavender.base.lazy_import import sparse as sp
 from lavender.judge.residuals import get_reference
 from lavender.problem import Problem
-from lavender.solvers.factors import DENSE_LIMIT, WIDE
+from lavender.solvers.factors import MAX_DENSE_ROWS, USE_WIDE_LANES
 from lavender.solvers.newton_systems.augmented import Augmented
 from lavender.solvers.newton_systems.sparse import SparseRows
 from lavender.solvers.setup_times import dense_work
@@ -21,66 +21,77 @@ from lavender_ext.factor import graph
 from lavender_ext.newton.coupled import scaled_entries
 from lavender_ext.newton.solve import Layout, Solve
 
-DENSE_ROWS = 150  # below: a dense factor beats sparse bookkeeping
-# Nonzero share s of A above which a dense factor is there sooner: of one full block of s^1/2 m rows, whose
-# multiply-adds cost a quarter there; and of bounded rows, of which dense factors take the free ones, and under
-# Coulomb's law, whose factors lack symmetry and lose pivots by panels.
-DENSE_FILL, EARLY_FILL = 0.4, 0.25
-# Multiply-adds of a factor over bodies from which dense panels beat block rows; a panel's columns up to which, and
-# share up to which (four times it for so few columns), zeros are held as numbers.
-PANELS, FEW_COLUMNS, ZEROS = 2e6, 6, 0.1
+MAX_ALWAYS_DENSE_ROWS = 150  # Up to this many rows, a dense factor is faster than a sparse one.
+# Fractions of nonzeros of A above which a dense factor is faster. For the cone law: a full block of s^1/2 m rows has
+# the fraction s, and a multiply-add of a dense factor costs a quarter. It is smaller for bounded rows, of which dense
+# factors use only the free ones, and for Coulomb's law, whose asymmetric matrices lose pivots by panels.
+CONE_DENSE_FRACTION, OTHER_DENSE_FRACTION = 0.4, 0.25
+# Dense panels over bodies are used from this many multiply-adds of a factor; below, block rows are faster. A panel
+# stores zeros as numbers up to MAX_STORED_ZERO_FRACTION of its entries, or four times that up to NARROW_PANEL_COLUMNS
+# columns.
+MIN_PANELS_WORK, NARROW_PANEL_COLUMNS, MAX_STORED_ZERO_FRACTION = 2e6, 6, 0.1
 
 
-def is_full(nnz: float, m: int, cones: bool) -> bool:
-    """Whether a dense factor of m rows and nnz entries is there sooner than panels; `cones`: of the cone law."""
-    return nnz > (DENSE_FILL if cones else EARLY_FILL) * m * m
+def is_dense_faster(nnz: float, m: int, cones: bool) -> bool:
+    """Return whether a dense factor of m rows and nnz entries is faster than panels; `cones` for the cone law."""
+    return nnz > (CONE_DENSE_FRACTION if cones else OTHER_DENSE_FRACTION) * m * m
 
 
-def is_dense(nnz: float, m: int, cones: bool) -> bool:
-    """Whether H of m rows and nnz entries is held as a full matrix."""
-    return m <= DENSE_ROWS or (is_full(nnz, m, cones) and m <= DENSE_LIMIT)
+def use_dense_matrix(nnz: float, m: int, cones: bool) -> bool:
+    """Return whether H of m rows and nnz entries is stored as a full matrix."""
+    return m <= MAX_ALWAYS_DENSE_ROWS or (is_dense_faster(nnz, m, cones) and m <= MAX_DENSE_ROWS)
 
 
 class Bodies(NamedTuple):
-    """Between which bodies blocks stand; of J and M, which velocities are those of a body."""
+    """The bodies of a problem.
 
-    pair: IntArray  # (n_blocks, 2), -1 where there is none
+    Parameters
+    ----------
+    pair : (n_blocks, 2) int32
+        Bodies of each block; -1 if there is none.
+    n : int
+        Number of bodies.
+    column : (nv,) int32, optional
+        For J and M: 6 times the body of each velocity, plus its index in the body.
+    """
+
+    pair: IntArray
     n: int
-    column: IntArray | None = None  # (nv,) six times the body of each velocity, and its place there
+    column: IntArray | None = None
 
 
-def bodies_of(problem: Problem) -> Bodies | None:
-    """Bodies of a problem's rows, or those that velocities of J and M stand for, if two at most meet in every block."""
+def find_bodies(problem: Problem) -> Bodies | None:
+    """Return the bodies of a problem, also those of J and M if every block couples at most two of them, else None."""
     if problem.rows is not None:
         return Bodies(problem.rows.block_bodies, problem.rows.n_bodies) if problem.rows.n_bodies else None
     if problem.generalized is None or problem.cones.has_round:
         return None
-    found = graph.bodies_in(problem.metric, problem.generalized.order)
-    return None if found is None else Bodies(*found)
+    parts = graph.bodies_in(problem.metric, problem.generalized.order)
+    return None if parts is None else Bodies(*parts)
 
 
 class System:
-    """H of a scaled problem, and Newton's method on it."""
+    """H of a scaled problem, and the compiled Newton method on it."""
 
     form = ""
-    work = 0.0  # multiply-adds of one factor
-    pace = 1e-9  # s for each of them at most, on any machine of the last ten years
-    dense = False  # A as a full matrix
-    entries = 0.0  # of A
+    work = 0.0  # Multiply-adds of one factor.
+    pace = 1e-9  # Upper bound of the time [s] per multiply-add, on any machine of the last ten years.
+    dense = False  # Whether A is stored as a full matrix.
+    entries = 0.0  # Number of entries of A.
 
     def __init__(self, problem: Problem, solve: Solve) -> None:
         self.problem, self.solve = problem, solve
 
     @property
     def seconds(self) -> float:
-        """What the next factor takes, at that pace."""
+        """Estimated time of the next factor [s]."""
         return self.pace * self.work
 
     def set_deadline(self, deadline: Deadline) -> None:
-        """Let no factor by Python begin that is expected to end after `deadline`."""
+        """Start no factor by Python that is expected to end after `deadline`."""
 
-    def took(self, seconds: float) -> None:
-        """So long did the last factor take, with the steps around it: the next one is refused by that pace."""
+    def record_factor_time(self, seconds: float) -> None:
+        """Record the time of the last factor with the steps around it [s], for the estimate of the next one."""
         if self.work > 0.0:
             self.pace = seconds / self.work
 
@@ -92,15 +103,19 @@ class VelocitySystem(System):
     pace = 0.5e-9
 
     def __init__(self, problem: Problem, bodies: Bodies, like: System | None = None) -> None:
-        """`like`: an earlier system, whose layout serves again between the same bodies."""
+        """Build the system; the layout of an earlier system `like` between the same bodies is reused."""
         super().__init__(problem, Solve(problem.metric))
         solve = self.solve
         panel, columns = solve.jacobian(bodies.pair, bodies.column)
-        of = bodies.pair[solve.block], bodies.n, len(columns)
-        kept = like.layout if isinstance(like, VelocitySystem) and like.layout.serves(*of) else None
-        self.layout: Layout = kept or Layout(*of, PANELS, FEW_COLUMNS, ZEROS)
+        structure = bodies.pair[solve.block], bodies.n, len(columns)
+        reused = like.layout if isinstance(like, VelocitySystem) and like.layout.serves(*structure) else None
+        self.layout: Layout = reused or Layout(
+            *structure, MIN_PANELS_WORK, NARROW_PANEL_COLUMNS, MAX_STORED_ZERO_FRACTION
+        )
         self.work = self.layout.work
-        solve.over_bodies(panel, columns, self.layout, solve.has_friction and problem.law == "coulomb", WIDE)
+        solve.over_bodies(
+            panel, columns, self.layout, solve.has_friction and problem.law == "coulomb", USE_WIDE_LANES
+        )
         self.augmented = Augmented(solve, self.layout, bodies)
         solve.ask(self.augmented)
 
@@ -112,7 +127,7 @@ class MatrixSystem(System):
     """H as a matrix: dense, or sparse panels."""
 
     form = "impulse"
-    sparse: SparseRows  # who factors an H of few entries
+    sparse: SparseRows  # Factorisation of a sparse H.
 
     def __init__(self, problem: Problem) -> None:
         super().__init__(problem, Solve(problem.metric, problem.csr_data))
@@ -121,7 +136,7 @@ class MatrixSystem(System):
         if not solve.whole:
             a = a[solve.keep][:, solve.keep]
         self.symmetric = problem.is_symmetric
-        self.dense = is_dense(a.nnz, m, solve.has_friction and problem.law == "cone")
+        self.dense = use_dense_matrix(a.nnz, m, solve.has_friction and problem.law == "cone")
         self.entries = float(a.nnz)
         self.pace = 0.3e-9 if self.dense else 1e-9
         self.h: Any
@@ -129,7 +144,7 @@ class MatrixSystem(System):
             self.h = a.toarray()
             self.h *= solve.scale[:, None]
             self.h *= solve.scale
-            solve.over_rows(self.h, self.symmetric, WIDE)
+            solve.over_rows(self.h, self.symmetric, USE_WIDE_LANES)
             self.work = dense_work(m)
         else:
             values = scaled_entries(a.indptr, a.indices, a.data, solve.scale)
@@ -143,10 +158,21 @@ class MatrixSystem(System):
 def make_system(
     problem: Problem, form: str, like: System | None = None, bodies: Bodies | None = None
 ) -> System:
-    """The system of a problem; form "velocity", of its `bodies`, or "impulse". `like`: one of the same structure."""
+    """Build the Newton system of a problem.
+
+    Parameters
+    ----------
+    problem : Problem
+    form : {"velocity", "impulse"}
+        Over the bodies, or over the rows of A.
+    like : System, optional
+        System of a problem of the same structure, whose layout may be reused.
+    bodies : Bodies, optional
+        Default: `find_bodies`.
+    """
     get_reference(problem)
     if form == "impulse":
         return MatrixSystem(problem)
-    bodies = bodies or bodies_of(problem)
+    bodies = bodies or find_bodies(problem)
     assert bodies is not None
     return VelocitySystem(problem, bodies, like)

@@ -59,8 +59,8 @@ def test_pairs_within_single_sweeps_are_the_plain_ones(order, name, options, con
 
 def test_large_piles_pack_at_longer_runs_and_written_out(monkeypatch):
     pile = lattice_pile(5_000, shuffle=True)
-    for least in (layout.LARGE, 1):
-        monkeypatch.setattr(layout, "LARGE", least)
+    for least in (layout.MIN_CONTACTS_FOR_COPY, 1):
+        monkeypatch.setattr(layout, "MIN_CONTACTS_FOR_COPY", least)
         for counts, packs in (([8], False), ([16, 3], True)):
             pairs, _ = sweep_packed(pile, counts, order="reverse", start=pile.start())
             assert (pairs > 0) == packs

@@ -21,7 +21,7 @@ from lavender.judge.residuals import judging_time
 from lavender.problem.derived import once
 from lavender.problem.operators import Operators
 from lavender.solvers import factors
-from lavender.solvers.setup_times import estimate_disk_time, forming
+from lavender.solvers.setup_times import estimate_disk_time, forming_time
 from lavender.solvers.small import AUTO, FAILED_CALL_KEY
 
 
@@ -407,6 +407,6 @@ def test_auto_forms_no_dense_a_beyond_its_limit(contacts, velocities, monkeypatc
     problem = lv.Problem.from_jacobian(
         jac, mass, 2.0 * rng.normal(size=velocities), cones=lv.Cones.contacts(0.5, count=contacts)
     )
-    limit = residuals.setup_time(problem) + judging_time(problem) + 0.5 * forming(problem)
+    limit = residuals.setup_time(problem) + judging_time(problem) + 0.5 * forming_time(problem)
     monkeypatch.setattr("lavender.problem.operators.assemble.gram", None)  # which A = Y Y^T is formed by
     assert lv.solve(problem, time_limit=limit).residual.relative <= 1.0

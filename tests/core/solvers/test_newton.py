@@ -19,7 +19,7 @@ from lavender.judge.solution import Status
 from lavender.problem.cones import ROW
 from lavender.solvers.newton import Newton, NewtonState
 from lavender.solvers.newton_systems import sparse, systems
-from lavender.solvers.newton_systems.systems import bodies_of, make_system
+from lavender.solvers.newton_systems.systems import find_bodies, make_system
 from lavender_ext.core.problem import LAWS
 from lavender_ext.newton.solve import PHASES, Layout, Solve
 
@@ -113,7 +113,7 @@ def test_velocities_of_free_bodies_are_told_and_factored_as_theirs(spins, seed):
     """J and M of bodies, as engines give them: H of the system over bodies is D^-1/2 A D^-1/2."""
     p = random_contact_problem(seed, bodies=8, joints=3, contacts=25, tangents=2, spin=spins)
     problem = FORMS["J and M"](p)
-    bodies = bodies_of(problem)
+    bodies = find_bodies(problem)
     assert bodies is not None and bodies.n <= p.rows.n_bodies
     both = np.sort(p.rows.block_bodies, axis=1)
     for i, pair in enumerate(bodies.pair):  # blocks between the same two are between the same two
@@ -133,7 +133,7 @@ def test_no_bodies_are_told_where_three_meet(seed):
     jac[:, [0, 7, 14]] = rng.normal(size=(3, 3))
     jac[0] += rng.normal(size=18)
     problem = lv.Problem.from_jacobian(jac, np.eye(18), rng.normal(size=18), cones=lv.Cones.contacts(0.5))
-    assert bodies_of(problem) is None and bodies_of(as_matrix(problem)) is None
+    assert find_bodies(problem) is None and find_bodies(as_matrix(problem)) is None
 
 
 @pytest.mark.parametrize("compliance", [1e-6, 1e-4, 1e-2])
@@ -193,7 +193,7 @@ def test_dense_factors_solve_what_numpy_solves_with_the_same_bits_at_any_width(n
     problem = lv.Problem.lcp(a, rng.normal(size=n))
     r, x, y = rng.normal(size=n), [], []
     for wide in (True, False):
-        with mock.patch.multiple(systems, WIDE=wide, DENSE_ROWS=1000):
+        with mock.patch.multiple(systems, USE_WIDE_LANES=wide, MAX_ALWAYS_DENSE_ROWS=1000):
             system = make_system(problem, "impulse")
         assert system.dense
         system.solve.v[:] = 1e12  # W = 1e-12
@@ -316,7 +316,7 @@ def test_free_rows_of_few_entries_are_solved_with_all_the_others(even, seed):
     r = rng.normal(size=200)
     system.solve.p[:] = free
     assert system.solve.factor("natural", eps)
-    assert system.sparse.instead is None, "panels serve"
+    assert system.sparse.superlu_solve is None, "panels serve"
     expected = np.linalg.solve(np.where(free[:, None], h, 0.0) + np.diag(np.where(free, eps, 1.0)), r)
     np.testing.assert_allclose(
         system.solve.solve("natural", r), expected, rtol=0, atol=1e-11 * np.abs(expected).max()

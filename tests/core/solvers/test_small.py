@@ -17,7 +17,7 @@ import lavender as lv
 from benchmarks.core_problems import forms, fresh, stacks
 from lavender import registry
 from lavender.solvers.costs import newton_cost
-from lavender.solvers.small import AUTO, SmallCall, call_ends_within, limits, who
+from lavender.solvers.small import AUTO, SmallCall, call_ends_within, describe_call, make_limits
 from lavender_ext.batch.many import solve_first
 
 
@@ -143,17 +143,17 @@ def test_the_compiled_gate_is_the_count_of_newton(seed):
     problem = random_general(seed, friction, n=n, compliance=seed > 8, contacts=contacts)
     state = registry.get("newton").load()().prepare(problem)
     cost = newton_cost(state.count, problem.law)
-    assert limits(0.0).cost(problem.metric, state.count.work, 1)[0] == pytest.approx(cost, rel=1e-12)
+    assert make_limits(0.0).cost(problem.metric, state.count.work, 1)[0] == pytest.approx(cost, rel=1e-12)
 
     def lets_in(of):
         return solve_first(problem.metric, None, np.inf, of)[0] is not None
 
     if (
-        limits(np.inf).cost(problem.metric, 0.0, state.general.islands)[1] == 0.0
+        make_limits(np.inf).cost(problem.metric, 0.0, state.general.islands)[1] == 0.0
     ):  # more rows than it is asked for
-        assert not lets_in(limits(np.inf, np.inf))
+        assert not lets_in(make_limits(np.inf, np.inf))
         return
-    assert lets_in(limits(np.inf, 1.01 * cost)) and not lets_in(limits(np.inf, 0.99 * cost))
+    assert lets_in(make_limits(np.inf, 1.01 * cost)) and not lets_in(make_limits(np.inf, 0.99 * cost))
 
 
 def test_velocities_that_all_meet_are_one_call_as_well():
@@ -161,7 +161,7 @@ def test_velocities_that_all_meet_are_one_call_as_well():
     rng = np.random.default_rng(0)
     jac, velocity = rng.normal(size=(300, 240)), rng.normal(size=240)
     problem = lv.Problem.from_jacobian(jac, np.eye(240), velocity, cones=lv.Cones.free(300), compliance=300.0)
-    found, counts = solve_first(fresh(problem).metric, None, 1e-6, limits(np.inf, np.inf))
+    found, counts = solve_first(fresh(problem).metric, None, 1e-6, make_limits(np.inf, np.inf))
     assert found is not None and found.relative <= 1e-6 and counts[1] == 1
 
 
@@ -249,7 +249,7 @@ def test_ctrl_c_in_the_one_call_of_islands_is_a_result():
     problem = lv.Problem.contact(
         block_diag(list(map(coo_array, parts)), format="csr"), rng.normal(size=9000), np.full(3000, 0.5)
     )
-    assert lv.explain(problem).small == who(problem) != ""
+    assert lv.explain(problem).small == describe_call(problem) != ""
     main = threading.get_ident()
 
     def interrupt():

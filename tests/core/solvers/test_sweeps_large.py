@@ -25,7 +25,7 @@ def test_writing_out_changes_no_bit(order, pile, monkeypatch):
     """Cold start: v = 0 in any numbering, and every block then reads the same values in the same order."""
     monkeypatch.setattr("lavender.problem.ordering.MAX_MEAN_BODY_DISTANCE", 0)
     plain = sweeps(pile, NAME, 7, order=order)
-    monkeypatch.setattr(layout, "LARGE", 1)
+    monkeypatch.setattr(layout, "MIN_CONTACTS_FOR_COPY", 1)
     state = lv.prepare(pile, "sequential_impulses", order=order).state
     assert state.layout is not None
     np.testing.assert_array_equal(sweeps(pile, NAME, 7, order=order), plain)
@@ -37,7 +37,7 @@ def test_writing_out_keeps_joints_spin_and_warm_starts(seed, monkeypatch):
     monkeypatch.setattr("lavender.problem.ordering.MAX_MEAN_BODY_DISTANCE", 0)
     start = sweeps(problem, NAME, 3)
     plain = {o: sweeps(problem, NAME, 20, order=o, impulse=start) for o in ORDERS}
-    monkeypatch.setattr(layout, "LARGE", 1)
+    monkeypatch.setattr(layout, "MIN_CONTACTS_FOR_COPY", 1)
     for order, impulse in plain.items():
         # v = M^-1 J^T lam of the warm start is summed in another order: rounding, carried through 20 sweeps.
         np.testing.assert_allclose(
@@ -49,7 +49,7 @@ def test_writing_out_keeps_joints_spin_and_warm_starts(seed, monkeypatch):
 
 
 def test_a_stalled_run_gives_its_best_iterate_in_the_problems_order(pile, monkeypatch):
-    monkeypatch.setattr(layout, "LARGE", 1)
+    monkeypatch.setattr(layout, "MIN_CONTACTS_FOR_COPY", 1)
     solver = lv.prepare(pile, "sequential_impulses", order="local")
     solver.solve(tol=1e-30, max_iter=40)
     relative, impulse = solver.state.best
@@ -59,14 +59,14 @@ def test_a_stalled_run_gives_its_best_iterate_in_the_problems_order(pile, monkey
 @pytest.mark.parametrize("order", ORDERS)
 def test_an_unfinished_run_gives_its_impulses_in_the_problems_order(order, pile, monkeypatch):
     plain = lv.solve(pile, NAME, order=order, tol=1e-9, max_iter=60)
-    monkeypatch.setattr(layout, "LARGE", 1)
+    monkeypatch.setattr(layout, "MIN_CONTACTS_FOR_COPY", 1)
     copied = lv.solve(pile, NAME, order=order, tol=1e-9, max_iter=60)
     assert copied.status is plain.status is lv.Status.MAX_ITERATIONS
     np.testing.assert_array_equal(copied.impulse, plain.impulse)
 
 
 def test_an_array_that_mixes_joints_and_contacts_is_not_written_out(monkeypatch):
-    monkeypatch.setattr(layout, "LARGE", 1)
+    monkeypatch.setattr(layout, "MIN_CONTACTS_FOR_COPY", 1)
     problem = random_contact_problem(1, bodies=6, joints=3, contacts=9)
     blocks = np.arange(problem.n_blocks)[::-1]
     state = lv.prepare(problem, "sequential_impulses", order=blocks).state
@@ -77,7 +77,7 @@ def test_an_array_that_mixes_joints_and_contacts_is_not_written_out(monkeypatch)
 @pytest.mark.parametrize("large", [1, 10**9])
 def test_orders_within_a_colour_have_the_same_bits(name, large, pile, monkeypatch):
     """Blocks of one colour do not read what others of it write: contacts, joints and rows, packed and copied or not."""
-    monkeypatch.setattr(layout, "LARGE", large)
+    monkeypatch.setattr(layout, "MIN_CONTACTS_FOR_COPY", large)
     rng = np.random.default_rng(5)
     jointed = random_contact_problem(3, bodies=40, joints=20, contacts=200)
     matrix = as_matrix(jointed)
@@ -117,7 +117,7 @@ def test_local_takes_a_matrix_too(pile):
 @pytest.mark.parametrize("order", ("given", *ORDERS, "symmetric", "random"))
 def test_update_keeps_what_comes_from_the_structure(order, pile, monkeypatch):
     monkeypatch.setattr("lavender.problem.ordering.MAX_MEAN_BODY_DISTANCE", 0)
-    monkeypatch.setattr(layout, "LARGE", 1)
+    monkeypatch.setattr(layout, "MIN_CONTACTS_FOR_COPY", 1)
     other = replace(pile, b=pile.b * 1.25)
     prepared = lv.prepare(pile, "sequential_impulses", order=order)
     prepared.solve(tol=0.0, max_iter=3)

@@ -17,7 +17,7 @@ from lavender.solvers.auto import Tree
 from lavender.solvers.costs import sweep_cost
 from lavender.solvers.newton_systems import augmented
 from lavender.solvers.steps import Newton, Step, setup_time
-from lavender.solvers.sweeping import Swept
+from lavender.solvers.sweeping import SweepSolver
 
 OWN = [
     name for name, spec in registry.specs().items() if spec.builtin and not spec.external and name != "auto"
@@ -40,7 +40,7 @@ PROBLEMS = {
 
 def play(monkeypatch, clock, pace, problem):
     """The clock goes by what sweeps, steps that factor and analyses of `auto` are counted for, times `pace`."""
-    sweep, newton = Swept.run, registry.get("newton").load()
+    sweep, newton = SweepSolver.run, registry.get("newton").load()
     prepare, quiet = newton.prepare, []
 
     def swept(*of):
@@ -65,7 +65,7 @@ def play(monkeypatch, clock, pace, problem):
         clock.now += 0.0 if quiet else pace * setup_time("newton", of)
         return prepare(self, of)
 
-    monkeypatch.setattr(Swept, "run", swept)
+    monkeypatch.setattr(SweepSolver, "run", swept)
     monkeypatch.setattr(Newton, "advance", turned(Newton))
     monkeypatch.setattr(Step, "advance", turned(Step))  # of `direct`
     monkeypatch.setattr(newton, "prepare", prepared)
@@ -89,14 +89,14 @@ def test_more_time_is_never_worse(name, pace, clock, monkeypatch):
 def test_sweeps_that_cost_more_than_they_are_counted_for_end_in_time(limit, clock, monkeypatch):
     """Contacts that roll, each solved exactly: half of the time was begun in one call by a count of a quarter."""
     problem = as_matrix(drawn(seed=97112, part="rolling").problem)
-    sweep, each = Swept.run, 4.5e-9 * sweep_cost(problem)
+    sweep, each = SweepSolver.run, 4.5e-9 * sweep_cost(problem)
 
     def swept(*of):
         found = sweep(*of)
         clock.now += each * found.iterations
         return found
 
-    monkeypatch.setattr(Swept, "run", swept)
+    monkeypatch.setattr(SweepSolver, "run", swept)
     solution = lv.solve(fresh(problem), tol=1e-12, time_limit=limit)
     assert 0.0 < clock.now <= limit
     assert solution.residual.relative < 0.1
@@ -106,7 +106,7 @@ def test_sweeps_that_cost_more_than_they_are_counted_for_end_in_time(limit, cloc
 def test_no_factor_of_the_augmented_system_ends_late(limit, clock, monkeypatch):
     """Bodies that roll: one turn went over to it, and the clock was asked again after its last step."""
     problem = drawn(seed=95402, part="rolling").problem
-    monkeypatch.setattr(augmented, "loading", lambda *of: 0.0)
+    monkeypatch.setattr(augmented, "loading_time", lambda *of: 0.0)
     made, factor, each = [], augmented.sparse_lu, 0.01
 
     def played(*of):

@@ -52,7 +52,7 @@ def test_islands_of_generalized_velocities_go_to_newton_where_they_are_small(see
 def test_a_step_that_would_end_after_the_deadline_is_refused(monkeypatch):
     problem = wild(seed=7).problem
     kernel = general.prepare(problem)
-    monkeypatch.setattr(general, "FLOP", 1e-6)  # a machine ten thousand times slower: 40 s a step
+    monkeypatch.setattr(general, "FLOP_TIME", 1e-6)  # a machine ten thousand times slower: 40 s a step
     claim = general.run(problem, kernel, problem.start(), 100, 1e-9, 1.0)
     assert claim.status is lv.Status.TIME_LIMIT
     assert claim.iterations == 0
@@ -74,7 +74,7 @@ def test_cheap_first_steps_promise_nothing_of_those_that_follow(monkeypatch):
             self.counts = (sum(asked), 0, 0, 0)
             return general.OUTCOMES["more"]
 
-    monkeypatch.setattr(general, "FLOP", 1e-8)
+    monkeypatch.setattr(general, "FLOP_TIME", 1e-8)
     monkeypatch.setattr("lavender.base.deadline.perf_counter", lambda: clock[0])
     claim = general.run(problem, Kernel(), problem.start(), 1000, 1e-9, 1.0)
     assert claim.status is lv.Status.TIME_LIMIT

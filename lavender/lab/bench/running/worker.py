@@ -23,7 +23,7 @@ from lavender.lab.bench.record import CRASHED, ERROR, KILLED, Record, parse_fiel
 from lavender.lab.bench.running.timing import Outcome, Task, attempt, judge_outcome, make_solution
 from lavender.problem import Problem
 from lavender.solvers import registry
-from lavender.solving.solve import Prepared, seconds_of, solve
+from lavender.solving.solve import Prepared, check_time_limit, solve
 
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 ORPHAN_CPU_TIME = 60.0  # s. A worker without a parent is killed this CPU time after its task's limit.
@@ -147,7 +147,7 @@ def solve_isolated(
         mode="tol",
         tol=tol,
         max_iter=max_iter or 0,
-        time_limit=seconds_of(time_limit),
+        time_limit=check_time_limit(time_limit),
         start="warm",
         options=options,
     )
