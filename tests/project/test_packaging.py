@@ -165,6 +165,7 @@ def test_every_import_is_declared():
     # If installed:
     known |= {"lavendersim", "mujoco_warp", "newton", "pinocchio", "pydrake", "qoco", "siconos", "warp"}
     known |= {"flint"}  # python-flint, of the extra `proof`
+    known |= {"typing_extensions"}  # for type checkers alone, which bring its stub
     known |= {"ray"}  # a cluster that campaigns can use where it is installed
     known |= set(sys.stdlib_module_names) | {"lavender", "lavender_ext"}
     found = set()
