@@ -146,7 +146,7 @@ def modes(
     rest, work = _read(state, n), state.copy()
 
     def after(z: FloatArray) -> FloatArray:
-        work.take(state)
+        work.copy_from(state)
         _write(work, n, z)
         work.kernel.substeps(substeps)
         return _read(work, n)

@@ -1,7 +1,8 @@
 """Sphinx: python -m sphinx -W --keep-going -b html docs SITE.
 
-Pages below `generated/` are written by `generate.py` before Sphinx reads the sources: one page for each
-solver, the examples' output and figures, scenes, cases, measured curves.
+`generate.py` writes pages below `generated/` before Sphinx reads the sources: one page for each solver, the output
+and figures of the examples, cases, measured curves. The contents are added to the first page here, so that a forge
+does not show their source.
 """
 
 import sys
@@ -20,7 +21,7 @@ copyright = "The lavender developers, BSD 3-Clause licence"
 version = release = lavender.__version__
 
 extensions = ["sphinx.ext.autodoc", "numpydoc", "myst_parser"]
-exclude_patterns = ["_build", "generated/parts"]
+exclude_patterns = ["_build", "paper"]
 default_role = "code"
 
 myst_enable_extensions = ["colon_fence", "deflist", "attrs_inline"]
@@ -43,9 +44,40 @@ html_theme_options = {
 pygments_style = "friendly"
 pygments_dark_style = "github-dark"
 
+# Caption -> pages, in the order of the contents.
+CONTENTS = {
+    "Start": (
+        "install quickstart concepts residual sweep choose deadlines failures cross-check "
+        "diagnose examples generated/examples"
+    ),
+    "Use": (
+        "commands report campaigns formats generalized quadratic-programs mujoco worlds audit "
+        "tune derivatives proof c solvers generated/api"
+    ),
+    "LavenderSim": "engine engine-measurements scenes towers web phenomena",
+    "Background": (
+        "chapter motion newtons-method auto performance peers catalogue generated/cases "
+        "generated/measured method"
+    ),
+    "Project": "architecture plugin trust platforms limitations",
+}
+
+
+def add_contents(app, name, source):
+    """Append the contents to the source of index.md, and the pages of the solvers to that of solvers.md."""
+    toctree = "\n```{{toctree}}\n{}:hidden:\n\n{}\n```\n".format
+    if name == "index":
+        for caption, pages in CONTENTS.items():
+            source[0] += toctree(f":caption: {caption}\n", pages.replace(" ", "\n"))
+    elif name == "solvers":
+        own = (spec for spec in generate.built_in().values() if not spec.external)
+        pages = [*(spec.name for spec in own), "backends"]
+        source[0] += toctree("", "\n".join(f"generated/solvers/{page}" for page in pages))
+
 
 def setup(app):
     """Write the generated pages, and make reStructuredText of docstrings that are plain text."""
     app.connect("builder-inited", lambda app: generate.write(Path(app.srcdir), Path(app.doctreedir)))
+    app.connect("source-read", add_contents)
     app.connect("autodoc-process-docstring", docstrings.process, priority=100)
     app.connect("autodoc-process-docstring", docstrings.add_fields, priority=900)

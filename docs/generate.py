@@ -1,11 +1,15 @@
 """Pages made from what the package says of itself: SPECs, docstrings, examples, scenes, cases, and a small benchmark.
 
-    python docs/generate.py         writes docs/generated/, as the Sphinx build does
+    python docs/generate.py            write docs/generated/, as the Sphinx build does
+    python docs/generate.py --pages    rewrite docs/solvers.md and docs/scenes.md, which are checked in (seconds)
+    python docs/generate.py --tables   measure; rewrite the tables of docs/choose.md and docs/index.md, and the
+                                       figures in docs/static/examples/
 
-Nothing here is checked in. The benchmark keeps its records beside the build and measures again only what is
-missing: another version, machine or plan.
+docs/generated/ is not checked in, and no page links to it: links work in a checkout and on a forge. The benchmark keeps
+its records beside the build and measures again only what is missing: another version, machine or plan.
 """
 
+import argparse
 import contextlib
 import hashlib
 import importlib
@@ -47,6 +51,15 @@ from lavender.problem import LAWS
 from lavender.sim.scene.gallery import SCENES
 
 ROOT = Path(__file__).resolve().parent.parent
+# Examples whose figures pages show.
+FIGURES = (
+    "planned_push",
+    "recorded_slide",
+    "which_contact",
+    "residual_or_motion",
+    "motion_over_a_run",
+    "two_motions",
+)
 TOLERANCES = (1e-3, 1e-6, 1e-9)
 CASES = (
     "random_spd(n=100, condition=1e4)",
@@ -74,9 +87,20 @@ ADVICE = (
     "many cases, if not on all. The second table has the solver that serves the most cases within each time\n"
     "(a case is served if at most half of the start's residual is left); the number is the residual at the 90th\n"
     f"percentile. Solvers after ≈ are as good within noise (a factor of {TIME_NOISE_FACTOR:g} in time, "
-    f"{RESIDUAL_NOISE_FACTOR:g} in residual).\n"
-    "[A report's page](REPORT) shows the same records."
+    f"{RESIDUAL_NOISE_FACTOR:g} in residual)."
 )
+# Paragraphs of docs/solvers.md.
+INTRODUCTION = """\
+This page lists every name that `lavender.solve` accepts, and the options of each solver. [How to choose a
+solver](choose.md) recommends one for a problem; `lv.available(problem)` lists those that accept it. The [built
+documentation](install.md#builds-for-development) has a page for each solver, with its method and its measured times.
+
+*Laws*: the friction models that it accepts ([laws](concepts.md#laws)). *Reads*: the forms of a problem that it reads:
+rows (body velocities), generalized (J and M) or the matrix A, which is formed if it is not given. *Exact*: ends after
+finitely many steps. *Resumable*: n₁ and then n₂ iterations give the bits of n₁ + n₂."""
+ORDERS = """\
+Options are keywords of `lavender.solve`. These solvers also take `order=` and `ground=`, and `seed=` for random
+orders:"""
 LAW_NAMES = {
     "linear": "linear systems",
     "lcp": "bounded rows and contacts without friction",
@@ -198,10 +222,11 @@ def abilities(spec):
         "callback": "`callback=`",
         "history": "`history=True`",
     }
+    boxes = f"; boxes under {' and '.join(sorted(spec.box_friction_laws))}" if spec.box_friction_laws else ""
     rows = [
         (
             "laws",
-            join_laws(spec) + (f"; boxes under {' and '.join(sorted(spec.boxes))}" if spec.boxes else ""),
+            join_laws(spec) + boxes,
         ),
         ("reads", "; ".join(text for name, text in reads.items() if name in spec.operators)),
         (
@@ -311,34 +336,46 @@ def _module_of(spec):
     return function.__module__
 
 
+def solver_overview():
+    """Return the text of docs/solvers.md: a table of all solvers, and their options."""
+    specs = built_in().values()
+    rows = [
+        (
+            f"`{s.name}`",
+            join_laws(s),
+            ", ".join(sorted(s.operators)),
+            "yes" if s.exact else "",
+            "yes" if s.resumable else "",
+            s.summary,
+        )
+        for s in specs
+    ]
+    own = [(f"`{s.name}`", f"`{n}`", text) for s in specs if not s.external for n, text in s.options.items()]
+    others = next(s for s in specs if s.external and s.options).options
+    takes_order = ", ".join(f"`{s.name}`" for s in specs if s.order)
+    return "\n\n".join(
+        (
+            "# Solvers",
+            "<!-- Written by `python docs/generate.py --pages`. -->",
+            INTRODUCTION,
+            table(("name", "laws", "reads", "exact", "resumable", "method"), rows),
+            "## Options",
+            f"{ORDERS}\n{takes_order}.",
+            table(("solver", "option", "meaning"), own),
+            "## Options of backends",
+            "Each backend of another package takes these options:",
+            table(("option", "meaning"), [(f"`{n}`", text) for n, text in others.items()]),
+        )
+    )
+
+
 def solver_pages(site, records, figures):
-    """The table of solvers, a page for each of ours, one page for the backends."""
+    """The page of each of our solvers, and one page for the backends."""
     specs = built_in()
     ours = [s for s in specs.values() if not s.external]
     others = [s for s in specs.values() if s.external]
     for spec in ours:
         solver_page(site, spec, records, figures)
-    rows = [
-        (
-            f"[{s.name}]({s.name}.md)" if not s.external else f"[{s.name}](backends.md#{s.name})",
-            join_laws(s),
-            " ".join(sorted(s.operators)),
-            "yes" if s.exact else "",
-            "yes" if s.resumable else "",
-            s.summary,
-        )
-        for s in specs.values()
-    ]
-    site.write(
-        "solvers/index.md",
-        "# Solvers\n\nEvery name that `lavender.solve` accepts. *Reads*: rows (body velocities), the matrix A "
-        "(formed where it was not given), or both.\n*Exact*: ends after finitely many "
-        "steps. *Resumable*: n₁ and then n₂ iterations give the bits of n₁ + n₂.\n\n"
-        + table(("name", "laws", "reads", "exact", "resumable", ""), rows)
-        + "\n\n```{toctree}\n:hidden:\n\n"
-        + "\n".join([*(s.name for s in ours), "backends"])
-        + "\n```\n",
-    )
     parts = [
         "# Backends of other packages",
         docstrings.markdown(sys.modules["lavender.external.backends"].__doc__),
@@ -371,31 +408,20 @@ def by_structure(records):
     first = 1 + len(report.tolerances)
     to_tolerance = table(found.heads[:first], [row[:first] for row in rows])
     in_time = table(("structure", *found.heads[first:]), [(row[0], *row[first:]) for row in rows])
-    return f"{ADVICE}\n\n:::{{container}} wide\n{to_tolerance}\n\n{in_time}\n:::"
+    return f"{ADVICE}\n\n{wide(to_tolerance, in_time)}"
 
 
 def measured_page(site, records, figures):
     """Advice by structure and law from the records of this build, the curves behind it, and their report."""
     run = next(iter(records.runs.values()))
-    structures = by_structure(records)
+    structures = f"{by_structure(records)}\n\n[A report's page](report.html) shows the same records."
     site.write(
         "report.html",
         render_page(Report(records), build_figures(records), saved=False),
     )
     shown = ", ".join(f"{n} {v}" for n, v in run.versions.items())
-    site.write("parts/advice.md", structures.replace("REPORT", "generated/report.html"))
-    rows, drawn = [], []
-    for law, by_tolerance in geometric_means(records).items():
-        cells = []
-        for tolerance in TOLERANCES:
-            most = max(solved for _, solved, _ in by_tolerance[tolerance].values())
-            names = sorted(
-                (t, name) for name, (t, solved, _) in by_tolerance[tolerance].items() if solved == most
-            )
-            cells.append(
-                "<br>".join(f"**{name}** {seconds(t)}" for t, name in names[:3]) if most else "nobody"
-            )
-        rows.append((LAW_NAMES[law], *cells))
+    drawn = []
+    for law in geometric_means(records):
         if law in figures:
             site.write(f"figures/all-{law}.svg", figures[law])
             shot = image(f"figures/all-{law}.svg", f"error against time on {LAW_NAMES[law]}")
@@ -410,12 +436,56 @@ def measured_page(site, records, figures):
             "Every run, mean and claim, with the cases, is in\n[the report](report.html) of these records."
         ),
         "## By structure",
-        structures.replace("REPORT", "report.html"),
+        structures,
         *drawn,
     ]
     site.write("measured.md", "\n\n".join(parts))
-    by_law = table(("", *(f"to {format_tolerance(x)}" for x in TOLERANCES)), rows)
-    site.write("parts/advice_by_law.md", f":::{{container}} wide\n{by_law}\n:::")
+
+
+def by_law(records):
+    """Return the table of the three fastest solvers for each law, to each tolerance."""
+    rows = []
+    for law, by_tolerance in geometric_means(records).items():
+        cells = []
+        for tolerance in TOLERANCES:
+            most = max(solved for _, solved, _ in by_tolerance[tolerance].values())
+            names = sorted(
+                (t, name) for name, (t, solved, _) in by_tolerance[tolerance].items() if solved == most
+            )
+            cells.append(
+                "<br>".join(f"**{name}** {seconds(t)}" for t, name in names[:3]) if most else "nobody"
+            )
+        rows.append((LAW_NAMES[law], *cells))
+    return wide(table(("", *(f"to {format_tolerance(x)}" for x in TOLERANCES)), rows))
+
+
+def wide(*tables):
+    """Return tables in a block that scrolls in the built pages; on a forge the marks are not shown."""
+    return "\n\n".join(('<div class="wide">', *tables, "</div>"))
+
+
+def measured_tables(records):
+    """Return the tables that are checked in, by the name of their place in a page."""
+    run = next(iter(records.runs.values()))
+    note = (
+        f"Measured with {len(records)} runs on {len(records.cases)} cases ({run.cpu}, {run.threads} thread, Python "
+        f"{run.python}) by\n`python docs/generate.py --tables`."
+    )
+    return {
+        "by_structure": f"{by_structure(records)}\n\n{note}",
+        "by_law": f"{by_law(records)}\n\n{note}",
+    }
+
+
+def replace_tables(page, tables):
+    """Replace the text between `<!-- table: NAME -->` and `<!-- end of table -->` of a page."""
+    text = re.sub(
+        r"(?<=<!-- table: )(\w+) -->.*?(?=<!-- end of table -->)",
+        lambda found: f"{found[1]} -->\n\n{tables[found[1]]}\n\n",
+        page.read_text(encoding="utf-8"),
+        flags=re.DOTALL,
+    )
+    page.write_text(text, encoding="utf-8")
 
 
 # -- examples, scenes, cases, parts -----------------------------------------------------------------
@@ -424,7 +494,7 @@ def measured_page(site, records, figures):
 def example_page(site, cache):
     """Every example: its docstring, what it prints, its figure, its source."""
     parts = [
-        "# Examples",
+        "# Output of the examples",
         "Those that need no simulator are run when these pages are built; a test checks what each shows.",
     ]
     for path in sorted((ROOT / "examples").glob("*.py")):
@@ -476,10 +546,11 @@ def _signature(function, leave=()):
     return ", ".join(shown)
 
 
-def scene_page(site):
-    """The gallery."""
+def scene_page():
+    """Return the text of docs/scenes.md: the gallery."""
     parts = [
         "# Scenes",
+        "<!-- Written by `python docs/generate.py --pages`. -->",
         (
             "`lavender.Scene(name, **parameters)` builds a scene of the gallery; parameters that all scenes share "
             "(`dt`, `friction`,\n`solver_iterations`, `warm_start`, …) are those of `lavender.Scene`. Lengths in m, "
@@ -487,12 +558,14 @@ def scene_page(site):
         ),
     ]
     for name, build in SCENES.items():
+        if build.__module__ != "lavender.sim.scene.gallery":  # a scene of a user or of a doctest
+            continue
         parts += [
             f"## {name}",
             f'```python\nlv.Scene("{name}", {_signature(build, ("scene",))})\n```',
             docstrings.markdown(build.__doc__),
         ]
-    site.write("scenes.md", "\n\n".join(parts).replace("```python\nlv.Scene", "```text\nlv.Scene"))
+    return "\n\n".join(parts).replace("```python\nlv.Scene", "```text\nlv.Scene")
 
 
 def suite_page(site):
@@ -523,9 +596,16 @@ def suite_page(site):
     site.write("cases.md", "\n\n".join(parts))
 
 
-def stability_part(site):
-    """Eigenvalues of a substep, for the page on towers."""
-    stability.figure(site.path("figures/stability.svg"))
+def write_figures(folder):
+    """Write the figures that pages show and that are checked in."""
+    folder.mkdir(parents=True, exist_ok=True)
+    stability.figure(folder / "stability.png")
+    for name in FIGURES:
+        spec = importlib.util.spec_from_file_location(name, ROOT / "examples" / f"{name}.py")
+        module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+        with contextlib.redirect_stdout(io.StringIO()):
+            module.main(str(folder / f"{name}.png"))
 
 
 def api_page(site):
@@ -575,13 +655,36 @@ def write(source, cache):
     solver_pages(site, records, figures)
     measured_page(site, records, figures)
     example_page(site, cache)
-    stability_part(site)
-    scene_page(site)
     suite_page(site)
     api_page(site)
     site.forget_others()
 
 
-if __name__ == "__main__":
+def committed_pages():
+    """Return the texts of the pages that are checked in, by file name."""
+    return {"solvers.md": solver_overview().rstrip() + "\n", "scenes.md": scene_page().rstrip() + "\n"}
+
+
+def main():
+    """Run the command line that the docstring of this module describes."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--pages", action="store_true", help="rewrite docs/solvers.md and docs/scenes.md")
+    parser.add_argument("--tables", action="store_true", help="measure; rewrite tables and figures of pages")
+    chosen = parser.parse_args()
     here = Path(__file__).resolve().parent
-    write(here, here / "_build")
+    if chosen.pages:
+        for name, text in committed_pages().items():
+            (here / name).write_text(text, encoding="utf-8")
+    if chosen.tables:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of backends
+            tables = measured_tables(measure(here / "_build"))
+        for name in ("choose.md", "index.md"):
+            replace_tables(here / name, tables)
+        write_figures(here / "static" / "examples")
+    if not (chosen.pages or chosen.tables):
+        write(here, here / "_build")
+
+
+if __name__ == "__main__":
+    main()

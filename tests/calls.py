@@ -166,7 +166,9 @@ def system_in(problem, form):
     """The system of a problem; "sparse": the impulse form factored by panels whatever it costs."""
     if form != "sparse":
         return make_system(problem, form)
-    with mock.patch.multiple(systems, MAX_ALWAYS_DENSE_ROWS=0, CONE_DENSE_FRACTION=2.0, OTHER_DENSE_FRACTION=2.0):
+    with mock.patch.multiple(
+        systems, MAX_ALWAYS_DENSE_ROWS=0, CONE_DENSE_FRACTION=2.0, OTHER_DENSE_FRACTION=2.0
+    ):
         system = make_system(problem, "impulse")
     assert not system.dense
     return system

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from time import perf_counter
-from typing import Any, overload
+from typing import TYPE_CHECKING, Any, cast, overload
 
 import numpy as np
 
@@ -35,6 +35,19 @@ from lavender.solving.solve import (
 )
 from lavender_ext.batch.many import CODE, NUMBER, PLACE, Hand
 from lavender_ext.judge.measure import all_finite
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
+    from lavender.solvers.loop import Callback
+    from lavender.solvers.registry import SolverOptions
+
+    class ManyOptions(SolverOptions, total=False):
+        """Options of `solve_many`: those of `solve` that it passes on."""
+
+        history: bool
+        callback: Callback | None
+
 
 __all__ = ["Solutions", "solve_many"]
 
@@ -287,7 +300,7 @@ def solve_many(
     max_iter: int | None = None,
     time_limit: float | None = None,
     errors: str = "raise",
-    **options: Any,
+    **options: Unpack[ManyOptions],
 ) -> Solutions:
     """Solve many problems, with results that are bit-identical to `solve` for any number of threads.
 
@@ -331,11 +344,12 @@ def solve_many(
     deadline = NEVER if limit == np.inf else Deadline(limit)
     check_budget(spec, tol, max_iter)
     starts, invalid_starts = _check_starts(worlds, impulse, impulses, errors)
-    solutions = Solutions(worlds, starts, starts is None, tol, spec, options, errors)
+    named = cast("dict[str, Any]", options)
+    solutions = Solutions(worlds, starts, starts is None, tol, spec, named, errors)
     solutions._invalid_starts = invalid_starts
     if deadline.is_set:
         deadline.reserve(solutions._time_to_judge_starts())
-    more = {"tol": tol, "max_iter": max_iter, **options}
+    more: dict[str, Any] = {"tol": tol, "max_iter": max_iter, **named}
     # The compiled loop is used under the conditions under which `solve` makes a single compiled call.
     uses_loop = (
         spec.builtin and not options and max_iter is None and isinstance(tol, float) and 0.0 < tol < np.inf
@@ -369,9 +383,7 @@ def solve_many(
                 deadline.reserve(-LATE_WORLD_TIME)
             if deadline.passed():
                 check_accepted(problem, spec, deadline)
-                unsolved = create_unjudged(
-                    problem, spec, options, start, tol, f"{NO_STAGE_MESSAGE}, unjudged"
-                )
+                unsolved = create_unjudged(problem, spec, named, start, tol, f"{NO_STAGE_MESSAGE}, unjudged")
                 solutions.store_late(i, unsolved)
                 return
         solution = solve(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -66,18 +66,39 @@ class Gradients(_LazySequence):
         super().__init__(len(of), separate)
         self._of, self._numbers, self._is_complete = of, numbers, not separate
 
+    if TYPE_CHECKING:
+        b: FloatArray
+        target: FloatArray
+        v_free: FloatArray
+        lower: FloatArray
+        upper: FloatArray
+        mu: FloatArray
+        coefficients: FloatArray
+        patch_radius: FloatArray
+        rolling: FloatArray
+        compliance: FloatArray
+        jac: FloatArray
+        normal: FloatArray
+        tangent: FloatArray
+        arm_a: FloatArray
+        arm_b: FloatArray
+        inv_mass: FloatArray
+        inv_inertia: FloatArray
+
     def _make(self, i: int) -> Gradient:
         return Gradient(self._of._get(i), self._numbers[self._of._linears.place(i)])
 
-    def __getattr__(self, name: str) -> Any:
-        if name.startswith("_") or name not in INPUTS or name in MATRICES:
-            raise AttributeError(
-                f"gradients have no {name!r} of all problems; [i] is the gradient of problem i"
-            )
-        if self._is_complete and name in ("b", "target", "v_free"):
-            of = self._of
-            return self._numbers[of._velocities if name == "v_free" else of._rows]
-        return np.concatenate([getattr(g, name) for g in self] or [np.zeros(0)])
+    if not TYPE_CHECKING:  # Type checkers report unknown names.
+
+        def __getattr__(self, name: str) -> Any:
+            if name.startswith("_") or name not in INPUTS or name in MATRICES:
+                raise AttributeError(
+                    f"gradients have no {name!r} of all problems; [i] is the gradient of problem i"
+                )
+            if self._is_complete and name in ("b", "target", "v_free"):
+                of = self._of
+                return self._numbers[of._velocities if name == "v_free" else of._rows]
+            return np.concatenate([getattr(g, name) for g in self] or [np.zeros(0)])
 
 
 class Derivatives(_LazySequence):

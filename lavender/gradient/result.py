@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -86,6 +86,28 @@ class Gradient:
     def __init__(self, derivative: Any, adjoint: FloatArray) -> None:
         self._derivative, self._adjoint = derivative, adjoint  # concatenated q, s (m), f (nv), c (m)
 
+    if TYPE_CHECKING:  # `_Input` sets these below; lower, upper and the others are (m,) or (k,) arrays.
+        b: FloatArray
+        target: FloatArray
+        v_free: FloatArray
+        lower: FloatArray
+        upper: FloatArray
+        mu: FloatArray
+        coefficients: FloatArray
+        patch_radius: FloatArray
+        rolling: FloatArray
+        compliance: FloatArray
+        A: Any
+        J: sp.csr_array
+        M: sp.csr_array
+        jac: FloatArray
+        normal: FloatArray
+        tangent: FloatArray
+        arm_a: FloatArray
+        arm_b: FloatArray
+        inv_mass: FloatArray
+        inv_inertia: FloatArray
+
     @property
     def _q(self) -> FloatArray:
         return self._adjoint[: self._derivative.m]
@@ -112,8 +134,10 @@ class Gradient:
     def __repr__(self) -> str:
         return f"<Gradient of {self._derivative.m} rows by {', '.join(self._derivative.inputs)}>"
 
-    def __getattr__(self, name: str) -> Any:
-        raise AttributeError(f"a gradient has no {name!r}; it has {', '.join(INPUTS)}")
+    if not TYPE_CHECKING:  # Type checkers report unknown names.
+
+        def __getattr__(self, name: str) -> Any:
+            raise AttributeError(f"a gradient has no {name!r}; it has {', '.join(INPUTS)}")
 
     def _by_b(self) -> FloatArray:
         m = self._derivative.m

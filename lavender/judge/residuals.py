@@ -48,7 +48,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -197,8 +197,10 @@ class Residual:
     threshold: float = DEFAULT_THRESHOLD
     _float64_relative: float = field(default=math.nan, repr=False)  # before an ill-conditioned M was refined
 
-    def __getattr__(self, name: str) -> Any:
-        raise build_attribute_error("Residual", repr(type(self).__name__), name)
+    if not TYPE_CHECKING:  # Type checkers report unknown names.
+
+        def __getattr__(self, name: str) -> Any:
+            raise build_attribute_error("Residual", repr(type(self).__name__), name)
 
     @property
     def at_floor(self) -> bool:

@@ -272,17 +272,19 @@ class Solution:
         attributes["_rest"] = rest
         return solution
 
-    def __getattr__(self, name: str) -> Any:
-        # Called only for missing names: a field that `late` postponed, or an unknown attribute.
-        attributes = self.__dict__
-        rest = attributes.get("_rest")
-        if rest is not None:
-            function, arguments = rest
-            attributes.update(function(*arguments))  # two threads write equal values
-            attributes.pop("_rest", None)
-        if name in attributes:
-            return attributes[name]
-        raise build_attribute_error("Solution", repr(type(self).__name__), name)
+    if not TYPE_CHECKING:  # Type checkers report unknown names.
+
+        def __getattr__(self, name: str) -> Any:
+            # Called only for missing names: a field that `late` postponed, or an unknown attribute.
+            attributes = self.__dict__
+            rest = attributes.get("_rest")
+            if rest is not None:
+                function, arguments = rest
+                attributes.update(function(*arguments))  # two threads write equal values
+                attributes.pop("_rest", None)
+            if name in attributes:
+                return attributes[name]
+            raise build_attribute_error("Solution", repr(type(self).__name__), name)
 
     def __reduce__(self) -> tuple[Any, ...]:
         # A read-only view of a dict cannot be pickled.

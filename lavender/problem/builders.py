@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypedDict, TypeVar
 
 import numpy as np
 
@@ -29,12 +29,33 @@ from lavender.problem.program import convert_program, unpack_program
 from lavender.problem.rows import Rows
 from lavender_ext.core.problem import rows_velocity
 
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
 ProblemT = TypeVar("ProblemT", bound="Builders")
 
 #: Keywords that every method which builds a problem passes on to `Problem`.
 PROBLEM_KEYWORDS = ("name", "names", "key", "friction", "guess", "compliance", "precision", "copy")
 #: Keywords of `from_rows` for the bounds of rows.
 ROW_BOUND_KEYWORDS = ("lower", "upper", "mu", "tangents", "patch_radius", "rolling", "shape")
+
+
+class NewProblemOptions(TypedDict, total=False):
+    """Keywords that every method that builds a problem passes on to `Problem`, for type checkers."""
+
+    name: str
+    key: Any
+    guess: ArrayLike | None
+    precision: str
+    copy: bool
+
+
+class ProblemOptions(NewProblemOptions, total=False):
+    """`NewProblemOptions` and the keywords that some of these methods have as parameters of their own."""
+
+    names: Sequence[str] | None
+    friction: str
+    compliance: ArrayLike | None
 
 
 def check_keywords(method: str, keywords: Iterable[str], own: Sequence[str] = ()) -> None:
@@ -49,7 +70,7 @@ class Builders(Operators):
     """Class methods that build a problem."""
 
     @classmethod
-    def linear(cls: type[ProblemT], A: Any, b: ArrayLike, **more: Any) -> ProblemT:
+    def linear(cls: type[ProblemT], A: Any, b: ArrayLike, **more: Unpack[ProblemOptions]) -> ProblemT:
         """Build the linear system A lambda = b, in which every row is unbounded.
 
         Parameters
@@ -70,7 +91,7 @@ class Builders(Operators):
         b: ArrayLike,
         lower: ArrayLike = 0.0,
         upper: ArrayLike = np.inf,
-        **more: Any,
+        **more: Unpack[ProblemOptions],
     ) -> ProblemT:
         """Build a boxed LCP: lower <= lambda <= upper complementary to w = A lambda - b.
 
@@ -99,7 +120,7 @@ class Builders(Operators):
         patch_radius: ArrayLike | None = None,
         *,
         rolling: ArrayLike | None = None,
-        **more: Any,
+        **more: Unpack[ProblemOptions],
     ) -> ProblemT:
         """Build a problem of k contacts with m / k rows each: normal, up to two tangents, spin, rolling.
 
@@ -161,7 +182,7 @@ class Builders(Operators):
         lower: ArrayLike,
         upper: ArrayLike,
         findex: ArrayLike,
-        **more: Any,
+        **more: Unpack[ProblemOptions],
     ) -> ProblemT:
         """Build a problem from the arrays of ODE, Bullet and DART, with a separate bound for each tangent.
 
@@ -243,7 +264,7 @@ class Builders(Operators):
         patch_radius: ArrayLike | None = None,
         rolling: ArrayLike | None = None,
         shape: str = "disk",
-        **more: Any,
+        **more: Unpack[ProblemOptions],
     ) -> ProblemT:
         """Build the problem of a step from rows of bodies, with b = target - J v*.
 
@@ -325,7 +346,7 @@ class Builders(Operators):
         friction: str = "coulomb",
         names: Sequence[str] | None = None,
         dof_names: Sequence[str] | None = None,
-        **more: Any,
+        **more: Unpack[NewProblemOptions],
     ) -> ProblemT:
         """Build the problem of a step in generalised coordinates: w = J v+ - target + compliance lambda.
 
@@ -406,7 +427,7 @@ class Builders(Operators):
         b: ArrayLike | None = None,
         lb: ArrayLike | None = None,
         ub: ArrayLike | None = None,
-        **more: Any,
+        **more: Unpack[ProblemOptions],
     ) -> ProblemT:
         """Build a convex quadratic program: min 1/2 x.P x + q.x subject to G x <= h, A x = b, lb <= x <= ub.
 

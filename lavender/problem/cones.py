@@ -155,12 +155,14 @@ class Cones:
         self.__dict__.clear()
         self.__dict__["_blocks"] = blocks
 
-    def __getattr__(self, name: str) -> Any:
-        # The arrays of the fields are created when one of them is first read.
-        if name not in CONES_FIELDS:
-            raise AttributeError(f"Cones have no {name}")
-        self.__dict__.update(zip(CONES_FIELDS, self._blocks.arrays, strict=True))
-        return self.__dict__[name]
+    if not TYPE_CHECKING:  # Type checkers report unknown names.
+
+        def __getattr__(self, name: str) -> Any:
+            # The arrays of the fields are created when one of them is first read.
+            if name not in CONES_FIELDS:
+                raise AttributeError(f"Cones have no {name}")
+            self.__dict__.update(zip(CONES_FIELDS, self._blocks.arrays, strict=True))
+            return self.__dict__[name]
 
     @classmethod
     def _from_blocks(cls, blocks: kernels.Blocks) -> Cones:

@@ -12,7 +12,7 @@ import warnings
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from functools import cache
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol, TypedDict
 
 from lavender.base.arrays import FloatArray, check_bool, check_int
 from lavender.base.deadline import Deadline
@@ -22,13 +22,34 @@ from lavender.judge.solution import Claim, Status
 from lavender.problem import LAWS, OPERATORS, Problem, check_problem
 from lavender.problem.derived import cached_property
 
-__all__ = ["Solver", "SolverSpec", "State", "available", "get", "known", "register"]
+__all__ = ["Solver", "SolverOptions", "SolverSpec", "State", "available", "get", "known", "register"]
 
 
 # Up to this many rows, the overhead of Python dominates a solve: the compiled call `SolverSpec.small` is tried first.
 SMALL_ROWS = 64
 # Modules whose SPECS are registered first. They are named by strings because they import this module.
 TABLES = ("lavender.solvers", "lavender.external")
+
+
+class SolverOptions(TypedDict, total=False):
+    """Options of the built-in solvers, for type checkers; the spec of a solver lists the options that it accepts.
+
+    `**{"name": value}` with a `dict[str, Any]` passes the options of a plug-in.
+    """
+
+    order: Any
+    seed: int
+    ground: Any
+    form: str
+    relaxation: float
+    memory: int
+    convex: int
+    restart: str
+    sweep: Literal["pgs", "blocks"]
+    omega: float
+    settings: Mapping[str, Any]
+    isolate: bool
+    unit_diagonal: bool
 
 
 class SmallCall(Protocol):

@@ -8,7 +8,7 @@ from functools import partial
 from threading import Lock
 from time import perf_counter
 from types import MappingProxyType
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -65,6 +65,11 @@ from lavender.solving.outcome import decide_empty_rows, finish, name_lost_row
 from lavender_ext.judge.measure import all_finite, by_island
 from lavender_ext.judge.watch import Watch
 
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
+    from lavender.solvers.registry import SolverOptions
+
 LATE_FIELDS = ("iterations", "work", "solver", "message", "history", "dual", "certificate", "impulse_bound",
          "claim_check", "status_conflict", "sweeps_per_decade", "stages")  # fmt: skip
 COST_PER_SECOND = 0.9e9  # Largest estimated cost [ns] of a compiled call per second of its time limit.
@@ -87,7 +92,7 @@ def solve(
     time_limit: float | None = None,
     history: bool = False,
     callback: Callback | None = None,
-    **options: Any,
+    **options: Unpack[SolverOptions],
 ) -> Solution:
     """Solve a constraint problem with the named solver; the default `auto` chooses and combines solvers.
 
@@ -143,12 +148,12 @@ def solve(
         if solution is not None:
             return solution
     deadline = _deadline(spec, limit, begun)
-    return Prepared(problem, spec, options, False, deadline)._solve(
+    return Prepared(problem, spec, cast("dict[str, Any]", options), False, deadline)._solve(
         None, impulse, tol, max_iter, deadline, history, callback
     )
 
 
-def prepare(problem: Problem, solver: str = "auto", **options: Any) -> Prepared:
+def prepare(problem: Problem, solver: str = "auto", **options: Unpack[SolverOptions]) -> Prepared:
     """Prepare a solver once for many solves: factorisation, colouring, allocation.
 
     Parameters
@@ -183,7 +188,7 @@ def prepare(problem: Problem, solver: str = "auto", **options: Any) -> Prepared:
     >>> solution.success
     True
     """
-    return Prepared(problem, get(solver), options)
+    return Prepared(problem, get(solver), cast("dict[str, Any]", options))
 
 
 class Prepared:

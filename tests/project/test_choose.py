@@ -42,7 +42,7 @@ def plain(cell):
 
 
 def test_every_cell_is_that_of_the_report(pages):
-    lines = (pages / "parts" / "advice.md").read_text(encoding="utf-8").splitlines()
+    lines = (pages / "measured.md").read_text(encoding="utf-8").splitlines()
     cells = [[plain(c) for c in line.strip("| ").split(" | ")] for line in lines if line.startswith("| ")]
     to_tolerance, in_time = cells[: len(cells) // 2], cells[len(cells) // 2 :]  # two tables there, one here
     shown = [[*a, *b[1:]] for a, b in zip(to_tolerance, in_time, strict=True)]
@@ -58,6 +58,5 @@ def test_every_cell_is_that_of_the_report(pages):
     assert names <= {"auto", "direct", "newton", "sequential_impulses", "nobody"} and names
 
 
-def test_how_to_choose_leads_to_that_page(pages):
-    assert "generated/report.html" in (pages / "parts" / "advice.md").read_text(encoding="utf-8")
-    assert "generated/parts/advice.md" in (DOCS / "choose.md").read_text(encoding="utf-8")
+def test_the_page_of_measurements_leads_to_the_report(pages):
+    assert "(report.html)" in (pages / "measured.md").read_text(encoding="utf-8")

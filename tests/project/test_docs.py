@@ -5,6 +5,7 @@ import importlib
 import pkgutil
 import re
 import shlex
+import sys
 import textwrap
 from pathlib import Path
 
@@ -45,6 +46,16 @@ def modules_with_doctests():
             and ">>> " in Path(spec.origin).read_text(encoding="utf-8")
         ):
             yield name
+
+
+@pytest.fixture(scope="module")
+def generate():
+    """Return the module that writes pages, docs/generate.py."""
+    sys.path.insert(0, str(ROOT / "docs"))
+    try:
+        return importlib.import_module("generate")
+    finally:
+        sys.path.remove(str(ROOT / "docs"))
 
 
 def run_session(text, names, where):
@@ -136,13 +147,6 @@ def test_command_lines_of_a_page_are_understood(page):
                 pytest.fail(f"{where}: {error.format_message()}")
 
 
-def test_pages_link_to_pages_that_exist():
-    for page in PAGES[1:]:
-        for target in re.findall(r"\]\(([\w/.-]+\.md)(?:#[\w-]+)?\)", page.read_text(encoding="utf-8")):
-            if not target.startswith("generated/"):  # those are written, and checked, by the build
-                assert (page.parent / target).is_file(), f"{page.name} links to {target}"
-
-
 def anchors(page):
     """Return the anchors that the headings of a page get from MyST."""
     text = re.sub(r"^```.*?^```$", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
@@ -152,12 +156,80 @@ def anchors(page):
     }
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_links_lead_to_headings_that_exist(page):
-    for target, anchor in re.findall(r"\]\(([\w/.-]*\.md)?#([^)\s]+)\)", page.read_text(encoding="utf-8")):
-        other = page.parent / target if target else page
-        if "generated" not in other.parts and "=" not in anchor:
-            assert anchor in anchors(other), f"{page.name} links to {target}#{anchor}"
+LINKED = [
+    *PAGES,
+    ROOT / "CHANGELOG.md",
+    *sorted((ROOT / ".github").glob("*.md")),
+    *sorted((ROOT / "examples").rglob("*.md")),
+]
+
+
+def links(page):
+    """Return the relative targets of the links and images of a page, outside of code."""
+    text = re.sub(r"^ *```.*?^ *```$", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+    text = re.sub(r"`[^`\n]*`", "code", text)
+    targets = re.findall(r"\]\(([^()\s]+)\)", text) + re.findall(r"(?:src|href)=\"([^\"]+)\"", text)
+    return [target for target in targets if not re.match(r"[a-z]+:", target)]
+
+
+@pytest.mark.parametrize("page", LINKED, ids=lambda page: page.name)
+def test_links_resolve_in_a_checkout(page):
+    """And on a forge: they lead to files that are checked in, below the root, and to headings that exist."""
+    for target in links(page):
+        name, _, anchor = target.partition("#")
+        other = (page.parent / name).resolve() if name else page
+        assert other.exists() and other.is_relative_to(ROOT), f"{page.name} links to {target}"
+        assert not {"generated", "_build"} & set(other.relative_to(ROOT).parts), f"{page.name}: {target}"
+        if anchor and "=" not in anchor:
+            assert anchor in anchors(other), f"{page.name} links to {target}"
+
+
+@pytest.mark.parametrize("page", LINKED, ids=lambda page: page.name)
+def test_a_forge_shows_no_markup_of_sphinx(page):
+    text = page.read_text(encoding="utf-8")
+    assert re.findall(r"^ *(?:`{3,}|:{3,}) *\{.*|^: .*|\{(?:doc|ref|numref)\}`.*", text, re.MULTILINE) == []
+
+
+def test_the_page_on_plug_ins_shows_the_project_file_of_the_example():
+    (shown,) = re.findall(
+        r"^   ```toml\n(.*?)^   ```$", (ROOT / "docs/plugin.md").read_text("utf-8"), re.M | re.S
+    )
+    file = ROOT / "examples" / "plugin" / "pyproject.toml"
+    assert textwrap.dedent(shown) == file.read_text(encoding="utf-8")
+
+
+def test_written_pages_are_current(generate):
+    for name, text in generate.committed_pages().items():
+        current = (ROOT / "docs" / name).read_text(encoding="utf-8") == text
+        assert current, f"docs/{name} is not current: run `python docs/generate.py --pages`"
+
+
+def test_tables_of_pages_come_from_the_generator(generate, tmp_path):
+    for name in ("choose.md", "index.md"):
+        text = (ROOT / "docs" / name).read_text(encoding="utf-8")
+        page = tmp_path / name
+        page.write_text(text, encoding="utf-8")
+        generate.replace_tables(page, {"by_structure": "first", "by_law": "second"})
+        emptied = page.read_text(encoding="utf-8")
+        assert "<!-- table: by_law -->\n\nsecond\n\n<!-- end of table -->" in emptied
+        assert "python docs/generate.py --tables" in text and "--tables" not in emptied
+        solvers = set(re.findall(r"\*\*(\w+)\*\* (?:to )?[\d.]+", text))
+        assert solvers and solvers <= set(lv.registry.specs())
+
+
+def test_the_paper_is_short_and_its_references_and_figures_exist():
+    paper = ROOT / "docs" / "paper" / "paper.md"
+    text = paper.read_text(encoding="utf-8")
+    body = text.split("---\n", 2)[2]
+    assert len(body.split()) < 1000
+    keys = set(re.findall(r"^@\w+\{(\w+),", paper.with_name("paper.bib").read_text("utf-8"), re.MULTILINE))
+    assert set(re.findall(r"@(\w+)", body)) == keys
+    for figure in re.findall(r"\]\(([^)]+)\)", body):
+        assert (paper.parent / figure).is_file()
+    peers = (ROOT / "docs" / "peers.md").read_text(encoding="utf-8")
+    assert "| 1000 rows and more | 1e-06 | 0.18 | 0.24 | 0.19 | 14 |" in peers  # numbers of the paper
+    assert "| smaller | 1e-06 | 0.38 | 0.67 | 0.52 | 15 |" in peers
+    assert "slower in 11 of 88 comparisons" in peers
 
 
 def test_the_chapter_names_functions_that_exist():
