@@ -36,8 +36,7 @@ from lavender.io.efc import from_mujoco_many
 from lavender.io.recording import Control
 from lavender.io.states import VECTOR
 from lavender.io.stored import folder_for_steps, write_arrays
-from lavender.judge.residuals import AT_FLOOR, CLOSE, DEFAULT_THRESHOLD, UNCONVERGED, WRONG
-from lavender.judge.residuals import VERDICTS as JUDGED
+from lavender.judge.residuals import AT_FLOOR, CLOSE, DEFAULT_THRESHOLD, UNCONVERGED, VERDICTS, WRONG
 from lavender.lab.bench.running.runner import Event
 from lavender.lab.bench.running.workers import check_workers, connect_backend, map_unordered
 from lavender.lab.report.figures import Curve, Figure
@@ -56,9 +55,9 @@ from lavender.lab.simulated_worlds import (
 )
 from lavender.problem import PRECISIONS, Problem
 
-VERDICTS = (*JUDGED, "not judged")
-NOT_JUDGED = len(JUDGED)
-NUMBERS = ("velocity", "impulse", "relative", "floor")  # [m/s, N s, -, -] errors of the worst row
+AUDIT_VERDICTS = (*VERDICTS, "not judged")
+NOT_JUDGED = len(VERDICTS)
+WORST_ROW_ERRORS = ("velocity", "impulse", "relative", "floor")  # [m/s, N s, -, -] errors of the worst row
 QUANTILES = (0.5, 0.9, 0.99, 0.999, 1.0)
 MAX_PROBLEMS_IN_MEMORY = 512  # Problems are built and judged in batches of this many.
 STEPS_PER_TASK = 4096  # A worker returns its results after this many steps.
@@ -117,9 +116,9 @@ class Piece(NamedTuple):
     Parameters
     ----------
     world, step : (k,) int
-    numbers : (len(NUMBERS), k)
+    numbers : (len(WORST_ROW_ERRORS), k)
     verdict : (k,) int
-        Indices in VERDICTS.
+        Indices in AUDIT_VERDICTS.
     rows, contacts : (k,) int
     where : list of (int, str)
         Index of a step that stopped before convergence, and the name of its worst row.
@@ -149,7 +148,7 @@ class Audit:
     numbers : (4, worlds, steps)
         Errors of the worst row [m/s, N s], relative residual and its floor; NaN if the step was not judged.
     verdict : (worlds, steps) int
-        Indices in `VERDICTS`; -1 if the audit was stopped before the step.
+        Indices in `AUDIT_VERDICTS`; -1 if the audit was stopped before the step.
     rows, contacts : (worlds, steps) int
         Rows, and contacts that have rows; 0 if the step was not judged.
     can_touch : bool
@@ -183,7 +182,9 @@ class Audit:
     @property
     def unconverged(self) -> Any:
         """(worlds, steps) bool: whether the solve stopped before convergence, or is wrong."""
-        return (self.verdict == VERDICTS.index(UNCONVERGED)) | (self.verdict == VERDICTS.index(WRONG))
+        return (self.verdict == AUDIT_VERDICTS.index(UNCONVERGED)) | (
+            self.verdict == AUDIT_VERDICTS.index(WRONG)
+        )
 
     @property
     def judged(self) -> int:
@@ -208,7 +209,7 @@ class Audit:
     @property
     def largest(self) -> float:
         """Largest velocity error that rounding does not explain, of the steps judged [m/s]."""
-        measured = self.is_judged & (self.verdict > VERDICTS.index(AT_FLOOR))
+        measured = self.is_judged & (self.verdict > AUDIT_VERDICTS.index(AT_FLOOR))
         return float(np.max(self.numbers[0][measured], initial=0.0))
 
     @property
@@ -223,8 +224,8 @@ class Audit:
         """
         selection = divergence.world, slice(0, divergence.step + (not divergence.is_outside))
         verdict = self.verdict[selection]
-        close = (verdict == VERDICTS.index(CLOSE)) & (self.numbers[0][selection] <= DEFAULT_THRESHOLD)
-        return bool(np.all(close | (verdict == VERDICTS.index(AT_FLOOR))))
+        close = (verdict == AUDIT_VERDICTS.index(CLOSE)) & (self.numbers[0][selection] <= DEFAULT_THRESHOLD)
+        return bool(np.all(close | (verdict == AUDIT_VERDICTS.index(AT_FLOOR))))
 
     @property
     def head(self) -> str:
@@ -242,7 +243,7 @@ class Audit:
                 f"the worst error is {format_size(self.largest)} m/s"
             )
         warning = "" if self.sizes.is_enough else (
-            f"Only {self.sizes.sentence}: this says little about the solver. Start from other states with --states."
+            f"Only {self.sizes.sentence}: this is too little to rate the solver. Start from other states with --states."
         )  # fmt: skip
         more = [self._divergence_sentence, warning]
         return " ".join([f"{text}.", *filter(None, more)])
@@ -282,7 +283,7 @@ class Audit:
     def table_of_verdicts(self) -> Table:
         """Number of steps and of worlds with each verdict."""
         rows = []
-        for i, word in enumerate(VERDICTS):
+        for i, word in enumerate(AUDIT_VERDICTS):
             here = self.verdict == i
             if here.any():
                 worlds = str(np.count_nonzero(here.any(axis=1)))
@@ -348,9 +349,9 @@ class Audit:
         names = self.worst[0].state if self.worst else ()
         states = {name: np.array([w.state[name] for w in self.worst]) for name in names}
         indices = {name: np.array([getattr(w, name) for w in self.worst], int) for name in ("world", "step")}
-        records = dict(zip(NUMBERS, self.numbers, strict=True))
+        records = dict(zip(WORST_ROW_ERRORS, self.numbers, strict=True))
         write_arrays(folder / "states.npz", states | indices)
-        records |= {"verdict": self.verdict, "verdicts": np.array(VERDICTS)}
+        records |= {"verdict": self.verdict, "verdicts": np.array(AUDIT_VERDICTS)}
         records |= {"rows": self.rows, "contacts": self.contacts}
         records["diverged"] = np.array([(d.world, d.step) for d in self.divergences], int).reshape(-1, 2)
         write_arrays(folder / "records.npz", records)
@@ -444,7 +445,10 @@ def audit(
     check_workers(workers)
     runs = Runs(os.fspath(model), worlds, steps, control=control, seed=seed, spread=spread).start_from(states)
     judging = precision or "float64", check_float("threshold", threshold, low=0.0)
-    numbers, verdict = np.full((len(NUMBERS), worlds, steps), np.nan), np.full((worlds, steps), -1, np.int8)
+    numbers, verdict = (
+        np.full((len(WORST_ROW_ERRORS), worlds, steps), np.nan),
+        np.full((worlds, steps), -1, np.int8),
+    )
     rows, contacts = np.zeros((2, worlds, steps), int)
     result = Audit(
         runs, engine, numbers, verdict, rows=rows, contacts=contacts, can_touch=can_touch(*runs.load()), where={},
@@ -561,11 +565,13 @@ def _judge_steps(
     verdicts = residuals.verdict
     verdict = np.full(len(verdicts), NOT_JUDGED, np.int8)
     measured = np.isfinite(numbers[0])
-    for i, word in enumerate(JUDGED):
+    for i, word in enumerate(VERDICTS):
         verdict[measured & (verdicts == word)] = i
     numbers[:, verdict == NOT_JUDGED] = np.nan
     rows, contacts = (np.where(verdict == NOT_JUDGED, 0, x) for x in sizes)
-    unconverged = np.flatnonzero((verdict == JUDGED.index(UNCONVERGED)) | (verdict == JUDGED.index(WRONG)))
+    unconverged = np.flatnonzero(
+        (verdict == VERDICTS.index(UNCONVERGED)) | (verdict == VERDICTS.index(WRONG))
+    )
     names = {int(i): residuals[int(i)].worst_name for i in unconverged}
     order = unconverged[np.argsort(-numbers[0, unconverged], kind="stable")]
     _, first = np.unique(world[order], return_index=True)

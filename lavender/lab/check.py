@@ -38,7 +38,7 @@ NEAR_NONE = (
 )
 INEXACT = "no exact solution"  # a certificate holds, and other solvers meet the tolerance
 NOT_SOLVED = "not solved"
-NOTHING = "nothing to do"
+NOTHING_TO_DO = "nothing to do"
 CLAIM_CONTRADICTED = "claim contradicted"
 UNPROVED = "no solution claimed, not proved"
 BREACH = "breach: a residual is computed wrongly"
@@ -152,7 +152,7 @@ class CrossCheck:
         have found different motions (see `lavender.find_solutions`).
         """
         verdicts = {row.verdict for row in self.rows} - {REFUSED}
-        return bool(verdicts) and verdicts <= {AGREES, AGREES_UNCOMPARED, NOTHING}
+        return bool(verdicts) and verdicts <= {AGREES, AGREES_UNCOMPARED, NOTHING_TO_DO}
 
     def __str__(self) -> str:
         head = (
@@ -282,7 +282,7 @@ def _solve_reference(
     if problem.law == "coulomb":
         return None, None, "Coulomb friction is not the optimality condition of a QP"
     if not (problem.has_singular_program or problem.is_symmetric):
-        return None, None, f"A is not symmetric (by {problem.asymmetry:.1e}), so the problem is no QP"
+        return None, None, f"A is not symmetric (by {problem.asymmetry:.1e}), so the problem is not a QP"
     if not (problem.has_singular_program or problem.is_semidefinite):
         return None, None, "A is not positive semidefinite: solutions may be many, of different motions"
     defaults = CONE_REFERENCES if problem.law == "cone" else REFERENCES
@@ -346,7 +346,7 @@ def compare(problem: Problem, name: str, solution: Solution, optimum: Solution |
         verdict = PROVED if solution.impulse_bound == np.inf else NEAR_NONE
     elif r.nothing_to_do and r.verdict != WRONG:
         units = f"{r.velocity:.1e} m/s, {r.energy:.1e} sqrt(J)"
-        verdict, note = NOTHING, f"{units}; {note}".rstrip("; ")
+        verdict, note = NOTHING_TO_DO, f"{units}; {note}".rstrip("; ")
     elif not (solution.success or r.at_floor):
         verdict = NOT_SOLVED
     return CrossCheckRow(name, verdict, note=note, **fields)

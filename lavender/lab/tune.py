@@ -66,7 +66,7 @@ ENUMS = {
 }
 OPTIONS = ("solver", "iterations", "tolerance", "ls_iterations", "ls_tolerance", "jacobian")
 PROBLEM_OPTIONS = ("cone", "impratio", "noslip_iterations")  # Options that change the problem.
-CONVERGED = {
+CONVERGED_OPTIONS = {
     "solver": "Newton",
     "iterations": 300,
     "tolerance": 0.0,
@@ -195,7 +195,7 @@ class Stage:
             controls.append(ctrl)
         configured = cls(mj, model, np.concatenate(starts), np.concatenate(controls))
         try:
-            configured.ends = configured.run(Setting.of(mj, model, **CONVERGED).on(mj, model))[1]
+            configured.ends = configured.run(Setting.of(mj, model, **CONVERGED_OPTIONS).on(mj, model))[1]
         except mj.FatalError as error:
             raise InputError(f"{runs.model}: MuJoCo ends in an error, {error}") from None
         return configured

@@ -11,7 +11,7 @@ from mujoco_scene import mj, whole_mass
 import lavender as lv
 from lavender.io.efc import from_efc
 from lavender.lab import audit as module
-from lavender.lab.audit import VERDICTS, audit
+from lavender.lab.audit import AUDIT_VERDICTS, audit
 from lavender.lab.simulated_worlds import Frame, Runs
 
 
@@ -165,7 +165,7 @@ def test_a_step_whose_state_is_not_finite_is_not_judged(boxes, monkeypatch):
 
     monkeypatch.setattr(module, "simulate_world", spoiled)
     found = audit(boxes(), worlds=1, steps=10, workers=1)
-    assert VERDICTS[found.verdict[0, 5]] == "not judged" and np.isnan(found.numbers[:, 0, 5]).all()
+    assert AUDIT_VERDICTS[found.verdict[0, 5]] == "not judged" and np.isnan(found.numbers[:, 0, 5]).all()
     assert (found.judged, found.unjudged, found.diverged) == (9, 1, 0)
     assert found.head.endswith("1 step was not judged: the answer is not finite.")
 
@@ -180,7 +180,7 @@ def test_a_world_in_which_mujoco_ends_in_an_error_is_not_judged_from_there_on(bo
 
     monkeypatch.setattr(mj, "mj_step", dies)
     found = audit(boxes(), worlds=1, steps=12, workers=1)
-    assert [VERDICTS[i] == "not judged" for i in found.verdict[0]] == [k >= 8 for k in range(12)]
+    assert [AUDIT_VERDICTS[i] == "not judged" for i in found.verdict[0]] == [k >= 8 for k in range(12)]
     assert (found.judged, found.unjudged, found.diverged) == (8, 4, 1)
     assert (
         "none of 8 steps judged in 1 world stopped before convergence. 1 world diverged, in step 8"
@@ -231,7 +231,7 @@ def test_a_world_that_diverges_in_its_last_step_is_counted(tmp_path, monkeypatch
 def test_shares_are_never_rounded_to_nothing(boxes):
     found = audit(boxes(), worlds=1, steps=3, workers=1)
     verdict = np.zeros((10, 320), np.int8)
-    verdict[0, :3] = VERDICTS.index("stopped before convergence")
+    verdict[0, :3] = AUDIT_VERDICTS.index("stopped before convergence")
     many = replace(found, verdict=verdict, numbers=np.zeros((4, 10, 320)), rows=verdict, contacts=verdict + 1)
     assert "3 of 3200 steps judged in 10 worlds stopped before convergence (0.09 %)" in many.head
 
@@ -339,8 +339,8 @@ def test_a_model_whose_start_ends_mujoco_in_an_error_is_refused(boxes, monkeypat
 def test_a_world_that_mujoco_begins_anew_ends_there(boxes, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)  # MuJoCo writes a log there
     found = audit(boxes(), worlds=2, steps=10, workers=1, spread=1e12)
-    assert (found.verdict[1, 1:] == VERDICTS.index("not judged")).all()
-    assert (found.verdict[0] < VERDICTS.index("not judged")).all() and np.isfinite(found.largest)
+    assert (found.verdict[1, 1:] == AUDIT_VERDICTS.index("not judged")).all()
+    assert (found.verdict[0] < AUDIT_VERDICTS.index("not judged")).all() and np.isfinite(found.largest)
     assert [(d.world, d.step, d.is_outside) for d in found.divergences] == [(1, 0, True)]
 
 

@@ -32,7 +32,7 @@ def list_candidates(records: Records, times: Sequence[float] = ()) -> list[Ask]:
     """List the calls to time alternately.
 
     These are calls to the middle tolerance, the same as a batch, and calls with each time limit in `times` [s]. Without
-    `times`, time limits are those of `choose_time_budgets` that are short enough to be reported.
+    `times`, the time limits are the ones from `choose_time_budgets` that are short enough to be reported.
     """
     asks: list[Ask] = []
     for subject in list_subjects(records, times):

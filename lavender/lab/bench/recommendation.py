@@ -160,7 +160,7 @@ def recommend_from_single_runs(records: Records, times: Sequence[float] = ()) ->
 
 @dataclass(frozen=True)
 class _RunGroup:
-    """A solver with all of its runs on single cases, or with those of one call over the steps of sequences."""
+    """A solver with all of its runs on single cases, or with the runs of one call over the steps of sequences."""
 
     solver: str
     how: str = ""  # the call; empty for single cases

@@ -141,7 +141,7 @@ class Difficulty:
         Fraction of blocks at a boundary in the best answer, of the blocks with a bounded error.
     proof : str
     same : tuple of str
-        Solvers that returned the same bits without an iteration: their times are those of one shortcut.
+        Solvers that returned the same bits without an iteration: they share a shortcut, which their times measure.
     """
 
     case: str

@@ -39,7 +39,7 @@ from lavender.lab.bench.record import (
     to_jsonable,
 )
 
-MAX_LINE_BYTES = 2**26  # A longer line is no record; the longest records have a few thousand bytes.
+MAX_LINE_BYTES = 2**26  # A longer line is not a record; the longest records have a few thousand bytes.
 SYNC_INTERVAL = 1.0  # s; a power cut loses the records of at most this time, a killed process none.
 
 
@@ -272,7 +272,7 @@ def read(path: str | Path) -> Records:
     if path.is_dir():
         path = path / "records.jsonl"
     if path.exists() and not path.is_file():
-        raise InputError(f"{path} is no file; a records.jsonl is needed")
+        raise InputError(f"{path} is not a file; a records.jsonl is needed")
     found = Records(source=str(path))
     for number, line in enumerate(_lines(path), 1):
         if not line.strip():

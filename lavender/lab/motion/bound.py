@@ -10,7 +10,7 @@ Let y* be a solution of the problem with targets shifted by D e [m/s], so that b
 
     |y - y*|_A <= |e|_A          and so, for every impulse x,    |x - y*|_A <= |x - y|_A + |e|_A     (2)
 
-Proof. The projection (1) says (p - y + D^-1 w).D (c - p) >= 0 for every c in C, that is
+Proof. The projection (1) implies (p - y + D^-1 w).D (c - p) >= 0 for every c in C, that is
 
     (A y - b').(c - p) >= 0;     take c = y*:   (A y - b').(y* - p) >= 0.
 

@@ -20,7 +20,7 @@ from lavender.problem import Problem
 SAME_MOTION_FRACTION = 1e-6
 
 # Fmt: skip.
-NUMBERS = (
+MOTION_ERROR_FIELDS = (
     "kinetic",
     "energy",
     "speed",
@@ -138,7 +138,7 @@ class MotionError:
 
 def measure(problem: Problem, x: FloatArray, reference: Reference) -> MotionError:
     """Compute the distance of an impulse x (m,) [N s] from one reference; numbers beyond float64 are None."""
-    error = drop_non_finite(_compute_error(problem, x, reference), NUMBERS)
+    error = drop_non_finite(_compute_error(problem, x, reference), MOTION_ERROR_FIELDS)
     if error.relative == math.inf:
         explanation = "relative to next to nothing, as the solution moves no more"
         return replace(error, note="; ".join(n for n in (error.note, explanation) if n))
@@ -163,7 +163,7 @@ def _compute_error(problem: Problem, x: FloatArray, reference: Reference) -> Mot
     energies = reference.accepted and not reference.refusal
     if not reference.accepted:
         notes.append("nothing reached the floor: no estimate")
-    values: dict[str, Any] = dict.fromkeys((*NUMBERS, "relative"))
+    values: dict[str, Any] = dict.fromkeys((*MOTION_ERROR_FIELDS, "relative"))
     values |= {"body": -1, "spin_body": -1, "row": -1}
     velocity = operator.velocity(delta, U * np.abs(delta))
     speed = max_speed = np.zeros(0)

@@ -232,13 +232,13 @@ class SolutionSet:
         for name in available(p) if solvers is None else check_sequence("solvers", solvers, "names"):
             try:
                 budget = max_iter if get(name).resumable else None
-                found = uninterrupted(solve(p, name, tol=tol, max_iter=budget))
+                result = uninterrupted(solve(p, name, tol=tol, max_iter=budget))
             except CapabilityError:
                 continue
             out[name] = None
-            if self.motions and (found.success or found.residual.at_floor):
-                near = self.nearest(found.impulse)
-                off = distance(p, found.impulse, near.impulse)
+            if self.motions and (result.success or result.residual.at_floor):
+                near = self.nearest(result.impulse)
+                off = distance(p, result.impulse, near.impulse)
                 out[name] = Pick(self.motions.index(near), off.speed)
         return out
 
@@ -289,7 +289,7 @@ def find_solutions(
     n, seed, always = check_int("n", n), check_int("seed", seed, high=None), check_bool("always", always)
     proof = uniqueness(problem)
     reference = reference_of(problem)
-    found = [(reference, "auto")] if reference.accepted else []
+    solutions = [(reference, "auto")] if reference.accepted else []
     failed = 0 if reference.accepted else 1
     complete = bool(proof)
     if (always or not proof) and (modes := enumerate_modes(problem)) is not None:
@@ -300,7 +300,7 @@ def find_solutions(
             make_reference(problem, x, "every mode") for x in list(distinct.values())[:MAX_COMPARED_MOTIONS]
         ]
         solved = [end for end in ends if end.accepted]
-        found += [(end, "every mode") for end in solved]
+        solutions += [(end, "every mode") for end in solved]
         # An impulse that passes an inequality only by rounding must be next to a solution; else the list has a gap.
         distances = (
             min((distance(problem, e.impulse, s.impulse).relative_distance for s in solved), default=1.0)
@@ -315,10 +315,10 @@ def find_solutions(
         for label, impulse in search(problem, reference, n, seed):
             candidate = make_reference(problem, impulse, label)
             if candidate.accepted:
-                found.append((candidate, label))
+                solutions.append((candidate, label))
             else:
                 failed += 1
-    merged = _merge_equal_motions(problem, found)
+    merged = _merge_equal_motions(problem, solutions)
     speed, energy = 0.0, 0.0
     for i, first in enumerate(merged):
         for second in merged[:i]:
@@ -330,7 +330,7 @@ def find_solutions(
         spread=speed,
         spread_energy=None if reference.refusal else energy,
         unique=proof.reason if proof else "",
-        runs=len(found),
+        runs=len(solutions),
         failed=failed,
         all=complete,
     )
@@ -362,7 +362,7 @@ def branch(problem: Problem, impulse: Any) -> Reference:
     stored with the problem; `accepted` shows whether it is a solution.
     """
     check_problem(problem)
-    found = None
+    best = None
     x = problem.impulse_array(impulse)
     for name in ("anderson", "newton"):
         if name not in available(problem):
@@ -373,11 +373,11 @@ def branch(problem: Problem, impulse: Any) -> Reference:
             if np.isfinite(end.impulse).all()
             else None
         )
-        if new is not None and (found is None or new.residual.relative < found.residual.relative):
-            found = new
-        if found is not None and found.accepted:
+        if new is not None and (best is None or new.residual.relative < best.residual.relative):
+            best = new
+        if best is not None and best.accepted:
             break
-    return reference_of(problem) if found is None else found
+    return reference_of(problem) if best is None else best
 
 
 def solve_with_vanishing_compliance(problem: Problem) -> FloatArray:
@@ -442,10 +442,10 @@ def _start(
     return "a random start", project(c, x)
 
 
-def _merge_equal_motions(problem: Problem, found: list[tuple[Reference, str]]) -> list[Motion]:
+def _merge_equal_motions(problem: Problem, solutions: list[tuple[Reference, str]]) -> list[Motion]:
     """Merge solutions with equal motions into one `Motion`, the best solved of each; most frequent first."""
     groups: list[list[tuple[Reference, str]]] = []
-    for first in found:
+    for first in solutions:
         for group in groups:
             if (
                 distance(problem, first[0].impulse, group[0][0].impulse).relative_distance

@@ -2,11 +2,11 @@
 
     |x|_A^2 = x.A x = (J^T x).M^-1 (J^T x) + sum theta x^2        A = J M^-1 J^T + diag(theta)       (1)
 
-Half of (1) is an energy [J]: its first part kinetic, its second elastic. Bounds of rounding are those of
-Higham (Accuracy and Stability of Numerical Algorithms, 2002, section 3.1): a sum of n products in any
-order is wrong by at most n u / (1 - n u) times the same sum of absolute values, u = 2^-53. J, M^-1 or M, and theta
-count as exact as they are stored (`Problem.jacobian`, `Rows.inv_mass`, `Rows.inv_inertia`, `Generalized.mass`,
-`Problem.compliance`); a matrix A is replaced by its symmetric part.
+Half of (1) is an energy [J]: its first part kinetic, its second elastic. Bounds of rounding follow Higham
+(Accuracy and Stability of Numerical Algorithms, 2002, section 3.1): a sum of n products in any order is wrong by at
+most n u / (1 - n u) times the same sum of absolute values, u = 2^-53. J, M^-1 or M, and theta count as exact as they
+are stored (`Problem.jacobian`, `Rows.inv_mass`, `Rows.inv_inertia`, `Generalized.mass`, `Problem.compliance`); a
+matrix A is replaced by its symmetric part.
 """
 
 from __future__ import annotations

@@ -98,7 +98,7 @@ def motion_cache(problem: Problem) -> MotionCache:
     check_problem(problem)
     if problem.cones.has_ellipse:
         raise CapabilityError(
-            "the motions of ellipses are those of problem.disk: give that, and impulses as problem.on_disk(impulse)"
+            "ellipses have the same motions as problem.disk: give that, and impulses as problem.on_disk(impulse)"
         )
     with problem.derived.lock:
         cache = problem.derived.cache.get(__name__)

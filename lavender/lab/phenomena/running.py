@@ -53,7 +53,7 @@ class EngineProcess(ProcessBackend):
                 setting=str(answer["setting"]),
             )
         except (ValueError, KeyError, TypeError, AttributeError) as error:
-            return f"its answer is no track: {error}"
+            return f"its answer is not a track: {error}"
         except RemoteError as error:
             return (
                 str(error) if error.kind == CapabilityError.__name__ else f"it failed: {error.kind}: {error}"
@@ -81,7 +81,7 @@ def select_phenomena(names: Sequence[str] = ()) -> list[Phenomenon]:
     Raises
     ------
     UnknownName
-        There is no such phenomenon.
+        The phenomenon is not known.
     """
     names = check_sequence("names", names, "phenomena")
     for name in names:
@@ -97,7 +97,7 @@ def select_variants(
     Raises
     ------
     UnknownName
-        There is no such stepper or engine.
+        The stepper or engine is not known.
     """
     found: list[EngineVariant] = []
     for kind, requested, own in (("stepper", steppers, True), ("engine", engines, False)):
@@ -149,7 +149,7 @@ def run(
     Raises
     ------
     UnknownName
-        There is no such phenomenon, stepper, engine or parameter.
+        A phenomenon, stepper, engine or parameter is not known.
     InputError
         A parameter or limit outside its range, or neither stepper nor engine; nothing has run.
     """

@@ -45,7 +45,7 @@ from lavender.solving.solve import solve
 __all__ = ["Enclosure", "enclose_reference", "prove", "require_python_flint"]
 
 # [bits] A case that is undecided with the first precision is tried again with the second.
-PRECISIONS = (128, 256)
+BALL_PRECISIONS = (128, 256)
 # If impulses are a family, an answer at the family's edge is between two cases; these solvers end inside it.
 INTERIOR_SOLVERS = ("newton", "admm")
 INTERIOR_SOLVERS_MAX_ROWS = 2000  # Larger problems are not solved again with INTERIOR_SOLVERS.
@@ -131,7 +131,7 @@ def _check_certificate(problem: Problem, certificate: FloatArray) -> Enclosure:
 
 def _prove_from(problem: Problem, start: FloatArray, answer: FloatArray) -> Enclosure:
     """Search an enclosure from the impulse `start` (m,) [N s] and measure its distance from `answer` (m,) [N s]."""
-    for bits in PRECISIONS:
+    for bits in BALL_PRECISIONS:
         with ball_precision(bits) as flint:
             search = Search(flint, problem, start, answer)
             enclosure = search.run()
@@ -153,5 +153,5 @@ def enclose_reference(problem: Problem) -> Enclosure:
 
 def require_python_flint() -> None:
     """Raise SolverUnavailable if python-flint is not installed."""
-    with ball_precision(PRECISIONS[0]):
+    with ball_precision(BALL_PRECISIONS[0]):
         pass

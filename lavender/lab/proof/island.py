@@ -93,7 +93,7 @@ class Island:
         return out, speeds
 
     def slope(self, x: list[Any], speeds: Any) -> tuple[dict[Any, Any], dict[Any, Any]]:
-        """Return the entries of `left` that differ from I, and those of `right`, in F' = left A + right over a box."""
+        """Return F' = left A + right over a box: entries of `left` that differ from I, nonzero ones of `right`."""
         number, index = self.number, self.index
         left: dict[Any, Any] = {}
         right: dict[Any, Any] = {}

@@ -17,7 +17,7 @@ GRAVITY = 9.81  # m/s^2, along -z
 STEP_SIZE = 0.01  # s
 FALL_SPEED = GRAVITY * STEP_SIZE  # m/s, speed that gravity adds in one step
 
-FRICTION_LAWS = ("none", "coulomb", "cone")
+CONTACT_FRICTION_LAWS = ("none", "coulomb", "cone")
 
 
 def map_scalar(function: Callable[[float], float], x: Any) -> FloatArray:
@@ -80,8 +80,8 @@ def contact_problem(
     InputError
         `friction` is none of these.
     """
-    if friction not in FRICTION_LAWS:
-        raise InputError(f"friction is {friction!r}; {', '.join(FRICTION_LAWS)} are known")
+    if friction not in CONTACT_FRICTION_LAWS:
+        raise InputError(f"friction is {friction!r}; {', '.join(CONTACT_FRICTION_LAWS)} are known")
     rows = bodies.rows(contacts)
     if friction == "none":
         return Problem.from_rows(rows, target, **more)

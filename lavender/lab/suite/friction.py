@@ -1,4 +1,4 @@
-"""Hard cases of friction, like those of `lavender.lab.suite.hard`: bodies that slide, stick or are held by friction."""
+"""Hard cases of friction, in addition to `lavender.lab.suite.hard`: bodies that slide, stick or hang by friction."""
 
 from __future__ import annotations
 

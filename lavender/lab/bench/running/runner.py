@@ -455,7 +455,7 @@ class Runner:
     def measure_step(
         self, problem: Problem, task: Task, spec: SolverSpec, before: tuple[Problem, FloatArray] | None
     ) -> tuple[Record, tuple[Problem, FloatArray] | None]:
-        """Measure one step; if its task says "carried", start from the previous problem and impulses."""
+        """Measure one step; if its task has start "carried", start from the previous problem and impulses."""
         start = None
         if task.start == "carried":
             begun = perf_counter()
@@ -487,7 +487,7 @@ class Runner:
             return
         name = spec.name
 
-        def one(task: Task) -> Record:
+        def measure_task(task: Task) -> Record:
             record = self.known.get(task.key)
             reused = record is not None
             if record is not None:
@@ -498,7 +498,7 @@ class Runner:
             self.report_progress(info.case, name, record, reused)
             return record
 
-        self.plan.measure(info, problem, spec, one)
+        self.plan.measure(info, problem, spec, measure_task)
 
     def make_record(self, problem: Problem, task: Task, spec: SolverSpec, impulse: Any) -> tuple[Record, Any]:
         """Solve a task, here or in the process for other packages; return its record and impulses (m,) [N s]."""

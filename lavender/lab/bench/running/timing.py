@@ -69,7 +69,7 @@ class Task:
     """One measurement: an `Ask` on a case.
 
     `guarded`: a solve under the time limit comes first. `lead` [s] is the time that the call takes before the solve, to
-    carry impulses. The other fields are those of a `Record`.
+    carry impulses. For the other fields see `Record`.
     """
 
     run: str
@@ -311,7 +311,7 @@ def _ended_by_budget(solution: Solution | None, task: Task) -> bool:
     )
 
 
-_LOOP_NUMBERS = np.arange(2.0**15)  # 256 KiB: more than a first-tolerance cache holds
+_LOOP_NUMBERS = np.arange(2.0**15)  # 256 KiB: more than a first-level cache holds
 
 
 def measure_calibration_time() -> float:

@@ -103,7 +103,7 @@ class Worker:
             return ": ".join(filter(None, (error.kind, str(error))))
         except ValueError as error:
             process.close()
-            text = f"the process of the backend sent what is no answer ({error}); it was killed"
+            text = f"the process of the backend sent an invalid answer ({error}); it was killed"
             raise TaskFailed(f"{CRASHED} (no answer)", text) from None
 
     def close(self) -> None:

@@ -36,7 +36,7 @@ class JsonLines:
         """Return the answer to a message; EOFError if the program ended, ValueError if the answer is not JSON."""
         requests, answers = self._process.stdin, self._process.stdout
         assert requests is not None and answers is not None
-        with contextlib.suppress(OSError):  # The program ended; there is no answer.
+        with contextlib.suppress(OSError):  # The program ended without an answer.
             requests.write(json.dumps(message) + "\n")
             requests.flush()
         line = answers.readline()

@@ -31,7 +31,10 @@ def parents(scene: Scene, engine: str) -> dict[int, Joint]:
 
 
 def collision_shape(body: Body, engine: str, static: bool = True) -> Plane | Sphere | Box:
-    """Return the collision shape; CapabilityError if there is none, or if a static one is no plane and not `static`."""
+    """Return the collision shape of a body.
+
+    Raises CapabilityError if it has none, or if a static body has another shape than a plane, unless `static`.
+    """
     shape = body.shape
     if shape is None or (body.is_static and not static and not isinstance(shape, Plane)):
         raise CapabilityError(f"{body.name} has no shape that {engine} could be given")
