@@ -364,6 +364,7 @@ def _mjx(mj: Any, model: Any, start_arrays: dict[str, Any]) -> Any:
     step_worlds = jax.jit(jax.vmap(step_world))
 
     def step(ctrl: Any) -> Any:
+        """Step all worlds with these controls; return states, constraint rows, mass matrices and contacts."""
         nonlocal data
         before, now, data = step_worlds(data, ctrl)
         e, n = now._impl, len(ctrl)
@@ -404,6 +405,7 @@ def _warp(mj: Any, model: Any, start_arrays: dict[str, Any]) -> Any:
             getattr(data, name).assign(x)
 
     def step(ctrl: Any) -> Any:
+        """Step all worlds with these controls; return states, constraint rows, mass matrices and contacts."""
         data.ctrl.assign(ctrl)
         state = {name: getattr(data, name).numpy().copy() for name in STEP_FIELDS}
         mjw.forward(device_model, data)

@@ -484,7 +484,7 @@ def vary(mj: Any, model: Any, setting: Setting) -> list[Setting]:
     return [Setting.of(mj, model, **options | x) for x in tried]
 
 
-@reject_former_names(horizon="horizon", repeats="repeats")
+@reject_former_names(ahead="horizon", rounds="repeats")
 def tune(
     model: str | os.PathLike[str],
     *,

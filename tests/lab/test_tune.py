@@ -46,7 +46,7 @@ def test_the_converged_run_does_not_move_away_from_itself(boxes):
     runs = Runs(str(boxes()), 1, 20)
     handle, made = runs.load()
     stage = Stage.of(handle, made, runs, [0], 10)
-    same = stage.measure(Setting.of(handle, made, **module.CONVERGED))
+    same = stage.measure(Setting.of(handle, made, **module.CONVERGED_OPTIONS))
     assert same.motion.max() == 0.0 and same.worst < 1e-9
 
 

@@ -109,14 +109,14 @@ def is_path(word: Source) -> bool:
 Source = str | Path | Problem | Case | Item
 
 
-def resolve(words: Source | Iterable[Source], sequences: bool | None = None) -> list[Item]:
+def resolve(sources: Source | Iterable[Source], sequences: bool | None = None) -> list[Item]:
     """Resolve files, folders (and folders in them), names and cases of the suite to items; the default suite if none.
 
-    No problem is solved and usually none is loaded, but every word is checked to exist.
+    No problem is solved and usually none is loaded, but every source is checked to exist.
 
     Parameters
     ----------
-    words : files, folders, names or cases of the suite, problems; or one of them
+    sources : files, folders, names or cases of the suite, problems; or one of them
     sequences : bool, optional
         Folders hold the steps of a simulation. If None, this is assumed for folders with files that differ only in a
         number and name their blocks (`Problem.key`), as recorded steps do.
@@ -124,7 +124,7 @@ def resolve(words: Source | Iterable[Source], sequences: bool | None = None) -> 
     Raises
     ------
     InputError
-        A word is neither a file nor a case of the suite, or a folder holds no problem files.
+        An entry of `sources` is neither a file nor a case of the suite, or a folder holds no problem files.
     UnknownName
         The suite does not have the case.
     """
@@ -132,53 +132,53 @@ def resolve(words: Source | Iterable[Source], sequences: bool | None = None) -> 
         check_bool("sequences", sequences)
     items: list[Item] = []
     visited: set[Path] = set()  # folders: a link in one of them may lead back to another
-    words = (
-        [words]
-        if isinstance(words, Source)
-        else check_sequence("cases", words, "files, folders, names or problems")
+    sources = (
+        [sources]
+        if isinstance(sources, Source)
+        else check_sequence("cases", sources, "files, folders, names or problems")
     )
-    if not words:
+    if not sources:
         items = [_from_case(case, case.name) for case in suite.default()]
-    for word in words:
-        if isinstance(word, Problem):
-            name = word.name or f"problem {len(items)}"
-            items.append(Item(name, name, _constant(word), in_memory=word))
-        elif isinstance(word, Item):
-            items.append(word)
-        elif isinstance(word, Case):
-            items.append(_from_case(word, word.name))
-        elif not (isinstance(word, str) or hasattr(word, "__fspath__")):
-            raise InputError(f"case {word!r:.60} is not a file, a name of the suite or a problem")
-        elif sequences or (sequences is None and _holds_steps(Path(word))):
-            steps = _unique_sequence(steps_in(word), items)
-            name, missing = steps[0].sequence, map(_from_file, _unrecorded_steps(Path(word)))
+    for source in sources:
+        if isinstance(source, Problem):
+            name = source.name or f"problem {len(items)}"
+            items.append(Item(name, name, _constant(source), in_memory=source))
+        elif isinstance(source, Item):
+            items.append(source)
+        elif isinstance(source, Case):
+            items.append(_from_case(source, source.name))
+        elif not (isinstance(source, str) or hasattr(source, "__fspath__")):
+            raise InputError(f"case {source!r:.60} is not a file, a name of the suite or a problem")
+        elif sequences or (sequences is None and _holds_steps(Path(source))):
+            steps = _unique_sequence(steps_in(source), items)
+            name, missing = steps[0].sequence, map(_from_file, _unrecorded_steps(Path(source)))
             items += [
                 *steps,
                 *(replace(item, name=f"{name}, {item.name}", sequence=name) for item in missing),
             ]
-        elif Path(word).is_dir():
-            paths = _problem_files(Path(word))
-            visited.add(Path(word).resolve())
+        elif Path(source).is_dir():
+            paths = _problem_files(Path(source))
+            visited.add(Path(source).resolve())
             inner = [
                 p
-                for p in sorted(Path(word).iterdir())
+                for p in sorted(Path(source).iterdir())
                 if p.is_dir() and p.resolve() not in visited and os.access(p, os.R_OK) and _problem_files(p)
             ]
-            words += inner
+            sources += inner
             if not paths and not inner:
-                records = Path(word) / "records.jsonl"
+                records = Path(source) / "records.jsonl"
                 shown = f": {records} shows its report again" if records.is_file() else ""
-                raise InputError(f"{word} holds no problem file ({', '.join(SUFFIXES)}){shown}")
-            items += [_from_file(path) for path in (*paths, *_unrecorded_steps(Path(word)))]
-        elif Path(word).exists() or Path(word) in _unrecorded_steps(Path(word).parent):
-            items.append(replace(_from_file(Path(word)), named=True))
-        elif is_path(word):
+                raise InputError(f"{source} holds no problem file ({', '.join(SUFFIXES)}){shown}")
+            items += [_from_file(path) for path in (*paths, *_unrecorded_steps(Path(source)))]
+        elif Path(source).exists() or Path(source) in _unrecorded_steps(Path(source).parent):
+            items.append(replace(_from_file(Path(source)), named=True))
+        elif is_path(source):
             raise InputError(
-                f"{word}: no such file; give problem files ({', '.join(SUFFIXES)}), folders or suite names"
+                f"{source}: no such file; give problem files ({', '.join(SUFFIXES)}), folders or suite names"
             )
         else:
-            selected = [_from_name(name) for name in suite.names(str(word))]
-            items += _as_steps(selected) if str(word).removeprefix("@") == "sequences" else selected
+            selected = [_from_name(name) for name in suite.names(str(source))]
+            items += _as_steps(selected) if str(source).removeprefix("@") == "sequences" else selected
     return _unique_names(items)
 
 
@@ -191,7 +191,7 @@ def resolve_again(source: str | Problem, name: str, reason: str) -> Item:
     return replace(item, name=name, reason=reason, sequence="", step=-1)
 
 
-def expand_seeds(words: Iterable[str], n: int, first: int = 0) -> list[str]:
+def expand_seeds(cases: Iterable[str], n: int, first: int = 0) -> list[str]:
     """Return each case with seed=first .. first + n - 1 if its family takes a seed; other names, sets and files once.
 
     Raises
@@ -205,19 +205,19 @@ def expand_seeds(words: Iterable[str], n: int, first: int = 0) -> list[str]:
             f"{n} seeds are requested; at most {MAX_SEEDS} are possible in one run: give A:B, one part at a time"
         )
     out = []
-    for word in check_sequence("cases", words, "names"):
-        if not isinstance(word, str):
-            raise InputError(f"case {word!r:.60} is not a name of the suite")
-        if is_path(word) or word.startswith("@"):
-            out.append(word)
+    for case in check_sequence("cases", cases, "names"):
+        if not isinstance(case, str):
+            raise InputError(f"case {case!r:.60} is not a name of the suite")
+        if is_path(case) or case.startswith("@"):
+            out.append(case)
             continue
-        name, parameters = parse(word)
+        name, parameters = parse(case)
         if name in FAMILIES and "seed" in FAMILIES[name].signature.parameters and "seed" not in parameters:
             for seed in range(first, first + n):
                 inside = ", ".join(f"{k}={v}" for k, v in {**parameters, "seed": seed}.items())
                 out.append(f"{name}({inside})")
         else:
-            out.append(word)
+            out.append(case)
     return out
 
 
@@ -493,21 +493,21 @@ def structure_of(problem: Problem) -> tuple[str, ...]:
     check_problem(problem)
     if problem.m == 0:
         return ("empty",)
-    words = []
+    features = []
     mechanical = problem.asymmetry <= MAX_MECHANICAL_ASYMMETRY
     if mechanical:
-        words.append(_shape(problem))
+        features.append(_shape(problem))
     if _redundant(problem):
-        words.append("redundant")
+        features.append("redundant")
     if problem.law in ("coulomb", "cone"):
-        words.append("friction")
+        features.append("friction")
     if problem.cones.has_ellipse:
-        words.append("ellipses")
+        features.append("ellipses")
     if mechanical and mass_ratio(problem) >= LARGE_MASS_RATIO:
-        words.append("large mass ratio")
+        features.append("large mass ratio")
     if not problem.is_symmetric:
-        words.append("asymmetric")
-    return tuple(words)
+        features.append("asymmetric")
+    return tuple(features)
 
 
 def _shape(problem: Problem) -> str:

@@ -56,13 +56,13 @@ def printable(text: str, lines: bool = False) -> str:
     if text.isprintable():
         return text
 
-    def escape(found: re.Match[str]) -> str:
-        if lines and found[0] in "\n\t":
-            return found[0]
-        code = ord(found[0])
+    def escape(match: re.Match[str]) -> str:
+        if lines and match[0] in "\n\t":
+            return match[0]
+        code = ord(match[0])
         if 0xDC80 <= code <= 0xDCFF:
             code -= 0xDC00
-        return _ESCAPE_SEQUENCES.get(found[0]) or (f"\\x{code:02x}" if code < 0x100 else f"\\u{code:04x}")
+        return _ESCAPE_SEQUENCES.get(match[0]) or (f"\\x{code:02x}" if code < 0x100 else f"\\u{code:04x}")
 
     return _UNPRINTABLE.sub(escape, text)
 

@@ -237,6 +237,7 @@ def rank_calls_in_time(
         return np.asarray(np.maximum(upper, 1e-17))
 
     def choose(i: int, value: float) -> Choice:
+        """Create the choice of call i with the score `value`."""
         line, each = calls[i].line, np.quantile(in_time[i], IN_TIME_SHARE, axis=1, method="lower")
         return Choice.of(
             line.solver,

@@ -59,6 +59,8 @@ def measure_backend_time(
     spent: list[float] = []
 
     def timed(function: Callable[..., Any]) -> Callable[..., Any]:
+        """Wrap a function so that the time of each call is appended to `spent`."""
+
         def call(*args: Any, **kwargs: Any) -> Any:
             begun = clock()
             try:

@@ -252,6 +252,7 @@ def opened(store: Store | str | Path | None) -> Iterator[Store | None]:
 
 
 def _cut_torn_line(path: Path) -> None:
+    """Remove a last line without a line end, which an interrupted run leaves."""
     if not path.exists():
         return
     with path.open("rb+") as f:

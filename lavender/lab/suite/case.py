@@ -135,6 +135,7 @@ def family(**aliases: Mapping[str, Any]) -> Callable[[Callable[P, Draft]], Calla
     """Register a function under its name, and under aliases with some parameters fixed."""
 
     def decorate(function: Callable[P, Draft]) -> Callable[P, Case]:
+        """Wrap the function so that it returns a `Case`, and register it."""
         name = function.__name__
         signature = inspect.signature(function, eval_str=True)
         summary = (function.__doc__ or "").partition("\n")[0]

@@ -488,6 +488,7 @@ class Runner:
         name = spec.name
 
         def measure_task(task: Task) -> Record:
+            """Measure one task, or return its record if an earlier run stored it."""
             record = self.known.get(task.key)
             reused = record is not None
             if record is not None:

@@ -163,6 +163,7 @@ def _connect_dask(address: str) -> contextlib.AbstractContextManager[Any]:
 
 
 def _connect_ray(address: str) -> None:
+    """Register Ray as a joblib backend, and connect to the cluster at `address` if it is given."""
     try:
         import ray
         from ray.util.joblib import register_ray
