@@ -58,7 +58,8 @@ def test_one_sweep_less_is_seen_in_every_part(monkeypatch):
     after = doctor.self_test()
     same = {name for name in before if before[name] == after[name]}
     assert same == {"stack, 60 steps", "gallery, 5 steps"}
-    monkeypatch.setattr(doctor, "steps_of", lambda name, n, steps=doctor.steps_of: steps(name, n - 1))
+    simulate = doctor.simulate_positions
+    monkeypatch.setattr(doctor, "simulate_positions", lambda name, n: simulate(name, n - 1))
     after = doctor.self_test()
     assert all(before[name] != after[name] for name in before)
 

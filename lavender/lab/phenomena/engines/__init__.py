@@ -188,6 +188,8 @@ _THIRD_PARTY_VARIANTS = (
     EngineVariant("lavendersim 64", "lavender_sim", "lavendersim", {"sweeps": 64}, "1/60 s in 4 of 64 sweeps"),
     EngineVariant("rapier", "node", _RAPIER, {"engine": "rapier", "iterations": 4},
         "1/60 s, 4 iterations: its defaults", cannot=NO_TORSION),
+    EngineVariant("rapier 16", "node", _RAPIER, {"engine": "rapier", "iterations": 16}, "1/60 s, 16 iterations",
+        cannot=NO_TORSION),
     EngineVariant("jolt", "node", _JOLT, {"engine": "jolt", "sweeps": 10, "substeps": 1, "gyroscopic": False},
         "1/60 s, 10 sweeps: its defaults", cannot=NO_TORSION),
     EngineVariant("jolt 4", "node", _JOLT, {"engine": "jolt", "sweeps": 10, "substeps": 4, "gyroscopic": True},
