@@ -242,7 +242,7 @@ Ran = list[tuple[str, dict[str, int]]]  # who, and what it did
 
 
 def _by_pivots(counts: tuple[int, ...]) -> tuple[int, Ran]:
-    """Iterations, and what was done, by the counts of `pivot_few`."""
+    """Iterations, and what was done, by the counts of `pivot_small`."""
     done, swept, refined, factored, exchanged, shifts, rank, path = counts
     work = {
         "sweeps": 4 * swept, "rank": rank, "shifts": shifts, "refinements": refined, "factorisations": factored,
