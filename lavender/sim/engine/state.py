@@ -23,9 +23,9 @@ from lavender_ext.engine.arrays import (
     MAX_PAIRS,
     N_SIZES,
     NO_SHAPE,
+    PAIR_COUNT_OVERFLOW,
     PLANE,
     SPHERE,
-    PAIR_COUNT_OVERFLOW,
     lengths,
 )
 from lavender_ext.engine.newton_substep import Substep
