@@ -1,39 +1,38 @@
-# The commands of the people who work on lavender; each is what .ci/run or the README does, run in `.venv`.
-# `make` alone lists them.
+# Development commands, as .ci/run and the README run them, in `.venv`. `make` without a target lists them.
 
 PYTHON ?= .venv/bin/python
 BIN := $(dir $(PYTHON))
 
 .PHONY: help setup kernels test quick lint format types coverage docs wasm fingerprint ci release clean
 
-help:  ## this list
+help:  ## list the commands
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
 
-setup:  ## a virtual environment with everything that development needs
+setup:  ## create a virtual environment with all development dependencies
 	python3 -m venv .venv
 	.venv/bin/pip install -q -e ".[dev,docs]"
 
-kernels:  ## build what changed in lavender_ext/
+kernels:  ## build the changed modules of lavender_ext/
 	$(PYTHON) setup.py -q build_ext --inplace
 
-test: kernels  ## every test
+test: kernels  ## run all tests
 	$(PYTHON) -m pytest -q -n auto --dist worksteal
 
-quick: kernels  ## tests but for the slow ones, first failure stops
+quick: kernels  ## run all tests except slow ones, stop at the first failure
 	$(PYTHON) -m pytest -q -x -m "not slow"
 
-lint:  ## ruff, import-linter, cython-lint
+lint:  ## run ruff, import-linter and cython-lint
 	$(BIN)ruff check .
 	$(BIN)lint-imports
 	PATH="$(abspath $(BIN)):$$PATH" cython-lint $$(git ls-files 'lavender_ext/*.pyx' 'lavender_ext/*.pxd')
 
-format:  ## rewrite Python files in the format that CI expects
+format:  ## format Python files as CI requires
 	$(BIN)ruff format .
 
-types:  ## mypy
+types:  ## run mypy
 	$(BIN)mypy
 
-coverage:  ## which lines of the Python files the tests reach, in build/coverage/index.html
+coverage:  ## measure the tests' line coverage of the Python files, in build/coverage/index.html
 	test -x $(PYTHON) || python3 -m venv .venv
 	$(PYTHON) -m pip install -q -e ".[test]" "coverage>=7.10"
 	$(PYTHON) -m coverage erase
@@ -42,22 +41,22 @@ coverage:  ## which lines of the Python files the tests reach, in build/coverage
 	$(PYTHON) -m coverage html -q -d build/coverage
 	$(PYTHON) -m coverage report | tail -n 1
 
-docs:  ## the documentation, in site/
+docs:  ## build the documentation, in site/
 	$(PYTHON) -m sphinx -W --keep-going -q -b html docs site
 
-wasm:  ## the WebAssembly modules, in lavender/sim/web/
+wasm:  ## build the WebAssembly modules, in lavender/sim/web/
 	$(BIN)lavender web build lavender/sim/web/lavender.wasm
 	$(BIN)lavender web build lavender/sim/web/newton.wasm --part newton
 
-fingerprint:  ## do solvers and engine still give the bits of the stored fingerprint?
+fingerprint:  ## compare the bits of solvers and engine with the stored fingerprint
 	$(PYTHON) .ci/fingerprint --compare .ci/fingerprint.txt
 
-ci:  ## what the continuous integration runs
+ci:  ## run the complete continuous integration
 	bash .ci/run
 
-release:  ## what a release is made of, in dist/; stops where a person must act
+release:  ## build the files of a release, in dist/; stops if a manual step is required
 	PYTHON=$(PYTHON) .ci/release dist
 
-clean:  ## what builds leave behind
+clean:  ## delete the outputs of builds
 	rm -rf build site docs/generated
 	find lavender_ext -name '*.so' -delete

@@ -2,12 +2,12 @@
 
 Environment:
 
-    LAVENDER_DEBUG=1        every index of every memoryview is checked, -Og -g1
-    LAVENDER_DEBUG=asan     the same, with the address and undefined-behaviour sanitizers, which also see raw
+    LAVENDER_DEBUG=1        check every index of every memoryview, -Og -g1
+    LAVENDER_DEBUG=asan     the same with the address and undefined-behaviour sanitizers, which also check raw
                             pointers (gcc; run Python with LD_PRELOAD="$(gcc -print-file-name=libasan.so)")
-    CYTHON_CACHE_DIR=D      translations are kept in D by what they are made of, as ccache does for C
-    LAVENDER_FILES_URL=U    where the files of this version can be fetched: links and pictures of the long description
-                            begin with it, since an index shows the text alone, and so do the project's URLs
+    CYTHON_CACHE_DIR=D      cache translations in D by the hash of their sources, as ccache does for C
+    LAVENDER_FILES_URL=U    base address of the files of this version: prefix of links and pictures in the long
+                            description, since a package index shows only its text, and of the project's URLs
 """
 
 import gc
@@ -34,8 +34,8 @@ from setuptools.command.build_ext import build_ext
 from setuptools.command.sdist import sdist
 from setuptools.errors import CompileError
 
-# The time of every file in an archive [s]: of no meaning, but the same on every machine. Wheels read it, too.
-os.environ.setdefault("SOURCE_DATE_EPOCH", "1580601600")  # 2020-02-02, as hatchling has it
+# Time stamp of every file in an archive [s]: arbitrary, but the same on every machine. Wheels use it, too.
+os.environ.setdefault("SOURCE_DATE_EPOCH", "1580601600")  # 2020-02-02, hatchling's value
 MODE = os.environ.get("LAVENDER_DEBUG", "")
 DEBUG = MODE not in ("", "0")
 OPTIONS = runpy.run_path("lavender_ext/build_options.py")
@@ -43,16 +43,16 @@ WASM = runpy.run_path("lavender/sim/web/compile.py")
 put = WASM["write_atomically"]
 LIBRARY = runpy.run_path("lavender/export/amalgamate.py")
 DIRECTIVES = OPTIONS["directives"](debug=DEBUG)
-#: Holds what Cython would otherwise write into every module (memoryviews): half of all that is compiled.
+#: Module with Cython's utility code (memoryviews), which would otherwise be half of the code of every module.
 SHARED = "lavender_ext._utility"
 
 #: Modules whose loops need the update of a block inlined into them: -O3 and gcc's inlining limits raised (INLINE).
 #: With lower limits they execute 2 to 12 % more instructions; at -O2 a sweep takes up to 1.7 times as long.
 HOT = ("sweep/", "local/", "judge/measure", "driver/", "engine/substep")
-#: -O3 with lower inlining limits: at -O2 a solve by Newton's method takes twice as long.
+#: Modules compiled with -O3 and lower inlining limits: at -O2 a solve by Newton's method takes twice as long.
 FAST = ("newton/solve",)
-#: Modules without a loop that costs time: -O1. All others are compiled at -O2 with gcc's full vectoriser; times of
-#: solves stay within 1 % of -O3, which takes a sixth longer to compile.
+#: Modules without expensive loops: -O1. All others are compiled at -O2 with gcc's full vectoriser; solve times stay
+#: within 1 % of those at -O3, which takes a sixth longer to compile.
 COLD = (
     "_utility",
     "host/",
@@ -67,7 +67,7 @@ LINK_ARGS, INLINE, LIMITS = [], [], []
 if sys.platform == "win32":
     COMPILE_ARGS = ["/Od", "/fp:precise"] if DEBUG else ["/O2", "/fp:precise"]
 else:
-    # -w: .ci/check_kernels.py reads the C for warnings, which cost a twentieth of the time.
+    # -w: .ci/check_kernels.py checks the C code for warnings; here they would take 5 % of the compile time.
     COMPILE_ARGS = ["-Og", "-g1"] if DEBUG else ["-O3", "-g0", "-w"]
     if not DEBUG:
         INLINE = ["-finline-limit=2000", "--param=inline-unit-growth=70"]
@@ -75,7 +75,7 @@ else:
     COMPILE_ARGS += [*OPTIONS["COMPILE_FLAGS"], "-Wno-unused-function"]
     LINK_ARGS += OPTIONS["LINK_FLAGS"]
     if MODE == "asan":
-        # But for what ends by a signal or as a wrong address: a third of the time to compile.
+        # Without the checks that a signal or the address sanitizer replaces: they take a third of the compile time.
         sanitizers = ["-fsanitize=address,undefined", "-fno-sanitize-recover=undefined"]
         sanitizers += ["-fno-sanitize=null,object-size,pointer-overflow"]
         LINK_ARGS += sanitizers
@@ -83,7 +83,7 @@ else:
 
 
 def changed_at(_, path):
-    """When a source was changed; Cython's own never: a version's are the same, whenever pip unpacked them."""
+    """Return the time stamp of a source, 0 for Cython's own files, which depend on its version only."""
     return 0.0 if Path(path).is_relative_to(Path(Cython.__file__).parent) else os.path.getmtime(path)
 
 
@@ -91,16 +91,16 @@ DependencyTree.timestamp = changed_at
 
 
 class BuildKernels(build_ext):
-    """Translates .pyx to C under build/, in parallel, only when an extension is built (not for an sdist)."""
+    """Translate .pyx to C under build/, in parallel, only when an extension is built (not for an sdist)."""
 
     def finalize_options(self):
-        """Built in place, in a checkout: what measures the kernels, too. No wheel has it."""
+        """Add the extensions of the kernel benchmarks to builds in place; wheels do not contain them."""
         if self.inplace or self.editable_mode:
             self.distribution.ext_modules += map(extension, sorted(Path("benchmarks").rglob("*.pyx")))
         super().finalize_options()
 
     def run(self):
-        """Translate, then compile; everything anew when flags or directives are others than last time."""
+        """Translate, then compile; rebuild everything if flags or directives have changed."""
         check_compiler()
         out = Path("build", "cython")
         stamp = out / "how.json"
@@ -109,27 +109,29 @@ class BuildKernels(build_ext):
         )
         current = stamp.exists() and stamp.read_text() == how
         if not current:
-            self.force = True  # file times do not tell
-        # A build that is killed leaves torn files, newer than their sources; and who reads translations while they are
-        # written makes his own (lavender/sim/web/extract_c.py).
+            self.force = True  # file times do not show changed flags
+        # A killed build leaves incomplete files that are newer than their sources. Without the stamp,
+        # lavender/sim/web/extract_c.py makes its own translations instead of reading incomplete ones.
         stamp.unlink(missing_ok=True)
         if self.force:
             for translated in out.rglob("*.c"):
                 translated.unlink()
         out.mkdir(parents=True, exist_ok=True)
         try:
-            self.make(out)
-        except Exception:  # it was told; what could not be made is not there
+            self.translate_and_compile(out)
+        except Exception:  # the error was reported, and no output of the failed step exists
             if current:
                 put(stamp, how.encode())
             raise
         put(stamp, how.encode())
 
-    def make(self, out):
+    def translate_and_compile(self, out):
         """Translate into a folder, then compile."""
         workers = os.cpu_count() or 1
-        forks = multiprocessing.get_start_method() == "fork"  # elsewhere workers would run this file anew
-        gc.disable()  # trees of nodes that live to the end: looking through them is two fifths of the translation
+        forks = (
+            multiprocessing.get_start_method() == "fork"
+        )  # with other methods workers would execute this file again
+        gc.disable()  # syntax trees live until the end: collecting garbage would take two fifths of the translation
         translated = cythonize(
             self.extensions,
             build_dir=str(out),
@@ -142,17 +144,17 @@ class BuildKernels(build_ext):
         for module, c_module in zip(self.extensions, translated, strict=True):
             module.sources = c_module.sources
             module.depends = c_module.depends
-        # The largest first: a long one that starts last holds up everybody.
+        # Compile the largest modules first: a long one that starts last would delay the end of the build.
         self.extensions.sort(key=lambda module: -os.path.getsize(module.sources[0]))
         self.parallel = self.parallel or workers
         super().run()
 
 
 def check_compiler():
-    """A C compiler and Python's headers are there: without them minutes of translation end in words of the system."""
+    """Raise CompileError without a C compiler or Python's headers, before minutes of translation."""
     command = shlex.split(
         os.environ.get("CC") or sysconfig.get_config_var("CC") or ""
-    )  # as setuptools takes it
+    )  # as setuptools selects it
     if command and not shutil.which(command[0]):
         raise CompileError(
             f"the kernels are C, and no compiler {command[0]!r} is found: install one (Debian and Ubuntu: "
@@ -167,21 +169,21 @@ def check_compiler():
 
 
 class BuildWasm(Command):
-    """Compiles the kernels to WebAssembly where a compiler for it is installed (the extra `wasm`)."""
+    """Compile the kernels to WebAssembly if a compiler for it is installed (the extra `wasm`)."""
 
     user_options = [("build-lib=", None, "folder of what is installed")]  # noqa: RUF012 - as the base class asks
 
     def initialize_options(self):
-        """Nothing is known yet."""
+        """Initialise the options."""
         self.build_lib = None
         self.editable_mode = False
 
     def finalize_options(self):
-        """As for the other parts of a build."""
+        """Take the options of `build`."""
         self.set_undefined_options("build", ("build_lib", "build_lib"))
 
     def run(self):
-        """Take the modules that are of these sources, build the others, or say why there will be none."""
+        """Copy the modules that are up to date; build the others, or report why they cannot be built."""
         if self.editable_mode:
             return  # `lavender web` builds it when it is first needed
         for name, part in WASM["PARTS"].items():
@@ -198,38 +200,38 @@ class BuildWasm(Command):
                 WASM["build"](out, Path().resolve(), part.modules, imports_memory=part.imports_memory)
 
     def get_outputs(self):
-        """The modules, where they could be built."""
-        found = (Path(self.build_lib, "lavender", "sim", "web", f"{name}.wasm") for name in WASM["PARTS"])
-        return [str(out) for out in found if out.exists()]
+        """Return the paths of the modules that were built."""
+        modules = (Path(self.build_lib, "lavender", "sim", "web", f"{name}.wasm") for name in WASM["PARTS"])
+        return [str(out) for out in modules if out.exists()]
 
     def get_output_mapping(self):
-        """No file is linked to a source."""
+        """Return {}: outputs have no single source file."""
         return {}
 
     def get_source_files(self):
-        """Nothing beyond what the kernels list."""
+        """Return []: the sources are listed by the extensions."""
         return []
 
 
 class BuildLibrary(Command):
-    """Makes the C library of the kernels (lavender/export/amalgamate.py); into a wheel with all of it."""
+    """Build the C library of the kernels (lavender/export/amalgamate.py) and add its files to the wheel."""
 
     user_options = [("build-lib=", None, "folder of what is installed")]  # noqa: RUF012 - as the base class asks
 
     def initialize_options(self):
-        """Nothing is known yet."""
+        """Initialise the options."""
         self.build_lib = None
         self.editable_mode = False
         self.written = []
 
     def finalize_options(self):
-        """As for the other parts of a build."""
+        """Take the options of `build`."""
         self.set_undefined_options("build", ("build_lib", "build_lib"))
 
     def run(self):
-        """One source from the translations of this build, and everything that lies beside it."""
+        """Write the single C source from the translations of this build, and copy the other files of the library."""
         if self.editable_mode:
-            return  # `lavender export` makes it when it is first needed
+            return  # `lavender export` builds it when it is first needed
         for path in [*sorted(Path("lavender/export").rglob("*.*")), make_library()]:
             if path.is_file() and path.suffix not in (".py", ".pyc", ".part"):
                 out = Path(self.build_lib, path)
@@ -238,20 +240,20 @@ class BuildLibrary(Command):
                 self.written.append(str(out))
 
     def get_outputs(self):
-        """Source, header, and what lies beside them."""
+        """Return the paths of source, header and the other files of the library."""
         return self.written
 
     def get_output_mapping(self):
-        """No file is linked to a source."""
+        """Return {}: outputs have no single source file."""
         return {}
 
     def get_source_files(self):
-        """Nothing beyond what the kernels list."""
+        """Return []: the sources are listed by the extensions."""
         return []
 
 
 def make_library():
-    """lavender/export/c/lavender.c of the kernels as they are, its path."""
+    """Bring lavender/export/c/lavender.c up to date with the kernels and return its path."""
     out = Path("lavender", "export", "c", "lavender.c")
     if not (out.exists() and LIBRARY["source_hash"](Path()) in out.read_text(encoding="utf-8")[:1000]):
         put(out, LIBRARY["amalgamate"](Path().resolve(), Path("build", "cython")).encode())
@@ -259,7 +261,7 @@ def make_library():
 
 
 class ReproducibleArchive(sdist):
-    """A source distribution whose bytes follow from its files alone: no clock, owner, umask or order of a folder."""
+    """Source distribution with bytes that depend on its files only, not on clock, owner, umask or directory order."""
 
     def run(self):
         """Make the C library and the WebAssembly modules first: an unpacked archive needs no compiler for them."""
@@ -275,7 +277,7 @@ class ReproducibleArchive(sdist):
         super().run()
 
     def make_archive(self, base_name, format, root_dir=None, base_dir=None, owner=None, group=None):  # noqa: A002
-        """The archive's path; only `gztar`, the one that frontends ask for, is made here."""
+        """Make a reproducible archive (`gztar`, the format of frontends) and return its path."""
         if format != "gztar":
             return super().make_archive(base_name, format, root_dir, base_dir, owner, group)
         out, epoch = Path(f"{base_name}.tar.gz"), int(os.environ["SOURCE_DATE_EPOCH"])
@@ -299,7 +301,7 @@ build.sub_commands = [*build.sub_commands, ("build_wasm", None), ("build_library
 
 
 def extension(path):
-    """One module, named after its file."""
+    """Return the extension module of a .pyx file, with its compiler options."""
     name = path.as_posix().removeprefix("lavender_ext/")
     options = []
     if LIMITS and name.startswith(COLD):
@@ -321,13 +323,13 @@ FILES_URL = os.environ.get("LAVENDER_FILES_URL", "").rstrip("/")
 
 
 def long_description():
-    """README.md, its links and pictures absolute where it is known what they begin with."""
+    """Return README.md, with absolute links and pictures if LAVENDER_FILES_URL is set."""
     text = Path("README.md").read_text(encoding="utf-8")
     return re.sub(r"\]\((?![a-z]+:|#)([^)\s]+)\)", rf"]({FILES_URL}/\1)", text) if FILES_URL else text
 
 
 def project_urls():
-    """`[project.urls]`: below the address of this version's files, and none where that is not known."""
+    """Return `[project.urls]`, below LAVENDER_FILES_URL; none if it is not set."""
     pages = {"Documentation": "docs/index.md", "Changelog": "CHANGELOG.md", "Citation": "CITATION.cff"}
     return {"Source": FILES_URL} | {k: f"{FILES_URL}/{p}" for k, p in pages.items()} if FILES_URL else {}
 
@@ -338,11 +340,11 @@ setup(
     project_urls=project_urls(),
     ext_modules=[
         *(extension(path) for path in sorted(Path("lavender_ext").rglob("*.pyx"))),
-        # cythonize writes it
+        # written by cythonize
         extension(Path(*SHARED.split(".")).with_suffix(".c")),
     ],
-    # An editable install is a line of a .pth file: the finder of setuptools comes after the folders of sys.path, and a
-    # clone named lavender in one of them, as in its parent, would be imported as an empty package.
+    # Make an editable install a line of a .pth file. Setuptools' finder would come after the folders of sys.path, so
+    # that a clone named lavender in one of them would be imported as an empty package.
     options={"editable_wheel": {"mode": "compat"}},
     cmdclass={
         "build_ext": BuildKernels,

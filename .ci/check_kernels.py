@@ -2,14 +2,15 @@
 
     python .ci/check_kernels.py
 
-What the core functions (`cdef public ... lav_*`) reach must stand alone: the same C then compiles to WebAssembly
-without an interpreter. An ordinary build never shows a breach, because the whole extension module has Python at hand.
-So those of all modules are built as one WebAssembly module by `lavender/sim/web/compile.py`, which refuses Python,
-exceptions, parallel loops, libm, malloc, variables and tables, and names who needs them.
+The core functions (`cdef public ... lav_*`) and everything they call must be self-contained, so that the same C
+compiles to WebAssembly without an interpreter. An ordinary build does not detect violations, because an extension
+module links Python anyway. Therefore the core functions of all modules are built as one WebAssembly module by
+`lavender/sim/web/compile.py`, which rejects Python, exceptions, parallel loops, libm, malloc, variables and tables, and
+names the functions that need them.
 
-The sources are read too: signatures of core functions are fixed-width and `noexcept nogil`, and directives stand in
-lavender_ext/build_options.py alone. And the C is read as strict C11 (`DIALECT`), once as gcc and clang compile it, once
-as a compiler without vector types does: of warnings only `CYTHONS_OWN` may come.
+The sources are checked as well: signatures of core functions must be fixed-width and `noexcept nogil`, and directives
+may be set in lavender_ext/build_options.py only. The C is checked as strict C11 (`DIALECT`), as gcc and clang compile
+it and as a compiler without vector types does: the only permitted warning is `CYTHONS_OWN`.
 """
 
 from __future__ import annotations
@@ -28,15 +29,15 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 OPTIONS = runpy.run_path(str(ROOT / "lavender_ext" / "build_options.py"))
 
-#: Standard C: no extension of a compiler without a guard, no array of variable length (MSVC has none).
-#: The table of a module's Python names is one string of Cython's, of any length.
+#: Standard C: compiler extensions only with a guard, no variable-length arrays (MSVC does not support them).
+#: Overlong strings are permitted: Cython writes a module's Python names as one string.
 DIALECT = ["-std=c11", "-pedantic", "-Wvla", "-Wall", "-Wno-unused-function", "-Wno-overlength-strings"]
-#: The plain branch of every `#if defined(__GNUC__)` of ours.
+#: Selects the branch without vector types of every `#if defined(__GNUC__)` in the kernels.
 PLAIN = ["-DLAVENDER_ONE_LANE"]
-#: What Cython writes into each module: tables of functions for other modules, as pointers to objects.
+#: Warning from code that Cython writes into each module: function tables for other modules, as object pointers.
 CYTHONS_OWN = "ISO C forbids conversion of function pointer to object pointer type"
 
-#: Types that have one size everywhere, as a host outside C must build them; structs end in _t too.
+#: Types with the same size on every platform, so that a host outside C can build them; struct names also end in _t.
 FIXED = re.compile(r"(void|float|double|u?int(8|16|32|64)_t|\w+_t)$")
 NOT_FIXED = {"size_t", "ssize_t", "ptrdiff_t", "intptr_t", "uintptr_t", "Py_ssize_t", "wchar_t"}
 
@@ -49,13 +50,13 @@ HEADER = re.compile(r"#\s*cython\s*:(.*)", re.I)
 
 
 def type_of(declaration: str) -> str:
-    """The type in `const double* x`, without const and pointer stars: `double`."""
+    """Return the type in a declaration without const and pointers: `double` for `const double* x`."""
     words = [word for word in declaration.replace("*", " ").split() if word != "const"]
     return " ".join(words[:-1]) if len(words) > 1 else " ".join(words)
 
 
 def read_source(path: Path) -> list[str]:
-    """What the text of a .pyx file breaks."""
+    """Return the rule violations in the text of a .pyx file."""
     text = path.read_text(encoding="utf-8")
     breaches = []
     for line in text.splitlines():
@@ -85,7 +86,7 @@ def read_source(path: Path) -> list[str]:
 
 
 def run(*command: str | Path, cwd: Path = ROOT, **env: str) -> str:
-    """Standard output of a command; RuntimeError with the end of its messages if it fails."""
+    """Return the standard output of a command; raise RuntimeError with the end of its messages if it fails."""
     done = subprocess.run(
         [str(part) for part in command],
         cwd=cwd, env={**os.environ, **env}, capture_output=True, text=True, check=False,
@@ -98,12 +99,12 @@ def run(*command: str | Path, cwd: Path = ROOT, **env: str) -> str:
 
 
 def read_dialect(c_file: Path) -> list[str]:
-    """What is not standard C, Cython's own tables left aside."""
+    """Return the warnings of the C compiler about nonstandard C, except those of Cython's own tables."""
     compiler = shlex.split(os.environ.get("CC", "cc"))
     include = "-I" + sysconfig.get_paths()["include"]
     found: dict[str, None] = {}
     guarded = PLAIN[0].removeprefix("-D") in c_file.read_text(encoding="utf-8")
-    for more in ([], PLAIN) if guarded else ([],):  # without the word both read the same
+    for more in ([], PLAIN) if guarded else ([],):  # without the guard both compilations are the same
         command = [
             *compiler,
             *OPTIONS["COMPILE_FLAGS"],
@@ -124,7 +125,7 @@ def read_dialect(c_file: Path) -> list[str]:
 
 
 def check(work: Path) -> tuple[list[str], str]:
-    """What breaks the rules, of all kernels, and what was seen, in words; `work` is a folder for what is made."""
+    """Return the violations of all kernels, and a summary of the checks; `work` is a folder for outputs."""
     kernels = ROOT / "lavender_ext"
     sources = sorted(kernels.rglob("*.pyx"))
     modules = [".".join(path.relative_to(kernels).with_suffix("").parts) for path in sources]
@@ -147,7 +148,7 @@ def check(work: Path) -> tuple[list[str], str]:
 
 
 def main() -> int:
-    """Print what breaks the rules; 0 where nothing does."""
+    """Print the violations and return 1 if there are any, else print the summary and return 0."""
     with tempfile.TemporaryDirectory() as work:
         breaches, told = check(Path(work))
     print("\n".join(f"BREACH {text}" for text in breaches) or told)

@@ -1,4 +1,4 @@
-"""Import lavender from where it should come, solve a small problem, compare with the answer made by hand.
+"""Check the origin of the installed lavender, solve a small problem and compare with the solution by hand.
 
 python .ci/smoke.py [FOLDER]        lavender and its kernels must be imported from below FOLDER, else this environment
 """
@@ -13,7 +13,7 @@ import lavender_ext.sweep.serial
 
 
 def main(folder: Path) -> None:
-    """Raise AssertionError where an answer or an origin is wrong."""
+    """Raise AssertionError if a solution or the origin of a module is wrong."""
     for module in (lv, lavender_ext.sweep.serial):
         origin = Path(module.__file__).resolve()
         assert origin.is_relative_to(folder.resolve()), (
@@ -25,7 +25,7 @@ def main(folder: Path) -> None:
     for solver in ("pgs", "direct"):
         solution = lv.solve(problem, solver, tol=1e-12)
         assert solution.success, solution
-        # tol 1e-12 times the condition number 3 of A leaves the answer within 1e-11.
+        # tol 1e-12 times the condition number 3 of A bounds the error by 1e-11.
         np.testing.assert_allclose(solution.impulse, [0.5, 0.0], rtol=0.0, atol=1e-11)
         np.testing.assert_allclose(solution.slack, [0.0, 1.5], rtol=0.0, atol=1e-11)
     print(f"lavender {lv.__version__} from {Path(lv.__file__).parent}: {solution}")

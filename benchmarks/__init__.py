@@ -1,5 +1,5 @@
-"""What measures lavender itself; not part of the package. `python -m benchmarks` lists the commands.
+"""Benchmarks of lavender itself, not part of the package. `python -m benchmarks` lists the commands.
 
-A command is one file: what is measured, a dataclass for each line of the result, the table, the options. Tables are
-markdown and files JSON, made by `benchmarks.output` alone.
+Each command is one file with the measurement, a dataclass for the lines of the result, the table and the options.
+`benchmarks.output` writes all tables (markdown) and files (JSON).
 """

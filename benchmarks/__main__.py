@@ -23,14 +23,14 @@ NAMES = (
 
 
 class Benchmarks(click.Group):
-    """Commands by name, each imported when it is asked for."""
+    """Group of commands; a command's module is imported when it is used."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        """Every name."""
+        """Return the names of the commands."""
         return list(NAMES)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        """The command of `benchmarks.NAME`."""
+        """Import and return the command of `benchmarks.NAME`."""
         if cmd_name not in NAMES:
             return None
         command: click.Command = importlib.import_module(f"benchmarks.{cmd_name}").command
@@ -39,11 +39,11 @@ class Benchmarks(click.Group):
 
 @click.group(cls=Benchmarks)
 def cli() -> None:
-    """What measures lavender itself."""
+    """Benchmarks of lavender itself."""
 
 
 def main() -> None:
-    """The command line; what lavender says is an error line, as in its own commands."""
+    """Run the command line; errors of lavender are printed as one line, as in its own commands."""
     from lavender.base.errors import LavenderError
 
     try:

@@ -1,4 +1,4 @@
-"""The clocks of these benchmarks."""
+"""Timing for these benchmarks."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from typing import Any
 
 
 def least(*calls: Callable[[], Any], seconds: float = 0.2) -> list[float]:
-    """Least CPU time [s] of one call of each, in turns, in batches of about a millisecond.
+    """Return the smallest CPU time [s] of a call of each function, measured alternately in batches of about 1 ms.
 
     Parameters
     ----------
     seconds : float, s
-        Time for all; each is called at least three times.
+        Total time; each function is called at least three times.
     """
     counts = []
     for call in calls:

@@ -1,6 +1,6 @@
-"""Problems that need nothing but the core: benchmarks and the core's tests make them.
+"""Problems for benchmarks and tests that need only the core package.
 
-Piles on a lattice, columns of cubes, and the same problem in another form.
+Piles on a lattice, columns of cubes, and conversions of a problem to another operator form.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from lavender.problem.rows import Rows
 def stacks(
     count: int, height: int, mu: float | None, equal: bool, corners: int = 4, seed: int = 0
 ) -> Problem:
-    """Columns of unit cubes on the ground that touch at so many corners, masses drawn from [0.5, 2]."""
+    """Return columns of unit cubes on the ground with `corners` contacts per face and random masses, 0.5 to 2 kg."""
     rng = np.random.default_rng(seed)
     n = count * height
     mass = rng.uniform(0.5, 2.0, (1 if equal else count, height))
@@ -37,7 +37,7 @@ def stacks(
 
 
 def forms(problem: Problem) -> dict[str, Problem]:
-    """The same given by bodies, by A and by J and M."""
+    """Return the problem given by bodies, by A, and by J and M."""
     rows = problem.rows
     assert rows is not None
     inertia = np.linalg.inv(rows.inv_inertia)
@@ -60,7 +60,7 @@ def forms(problem: Problem) -> dict[str, Problem]:
 
 
 def fresh(problem: Problem) -> Problem:
-    """The same with nothing derived yet."""
+    """Return a copy without derived data."""
     more = {"compliance": problem.compliance, "friction": problem.friction, "copy": False}
     return Problem(
         problem.b, problem.cones, problem.matrix, rows=problem.rows, generalized=problem.generalized, **more
@@ -68,13 +68,13 @@ def fresh(problem: Problem) -> Problem:
 
 
 def lattice_pile(contacts: int, *, shuffle: bool = False, seed: int = 0) -> Problem:
-    """About `contacts` contacts of spheres on a cubic lattice that stands on the ground, normals tilted a little.
+    """Return a cubic lattice of spheres on the ground with about `contacts` contacts and slightly tilted normals.
 
     Parameters
     ----------
     contacts : int
     shuffle : bool, default False
-        Number bodies and contacts at random, as a scene that was not built in space order.
+        Number bodies and contacts at random, as in a scene that was not built in spatial order.
     seed : int
 
     Raises

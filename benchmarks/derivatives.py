@@ -1,13 +1,14 @@
-"""Derivatives of solutions: whether they agree with differences, whether the others are flagged, what they cost.
+"""Derivatives of solutions: agreement with finite differences, flags of those that disagree, and cost.
 
     python -m benchmarks derivatives [--draws 300] [--steps 125] [--models MODEL.xml]...
 
-A direction of v* (of b, where only a matrix is known) is drawn for each problem. The change of the slack along it is
-compared with central differences of solutions whose residual is at most 1e-12 or at its floor. Their step h is the one
-whose error is least: how far neighbours differ, or what the residuals of both ends leave over 2 h; a derivative agrees
-within TIMES that, or within 1e-6 of its size. Steps at whose ends a block is in another state cross a switch, and are
-left out: where none remains a switch is nearer than differences can see, and nothing is compared. A derivative counts
-as flagged where a block is about to switch, what is compared is not unique, or it is refused along this direction.
+A random direction of v* (of b, if only a matrix is known) is drawn for each problem. The change of the slack along it
+is compared with central differences of solutions with a residual of at most 1e-12 or at the round-off floor. The step h
+has the smallest error estimate: the difference between neighbouring steps, or the residuals of both ends over 2 h.
+A derivative agrees if it is within TIMES that error, or within 1e-6 of its size. Steps that change the state of a block
+cross a switch and are not used; if no step remains, a switch is closer than differences can resolve, and the problem is
+not compared. A derivative counts as flagged if a block is close to a switch, if the compared quantity is not unique, or
+if the derivative raises an error along this direction.
 """
 
 from __future__ import annotations
@@ -33,24 +34,24 @@ TIMES = 5.0
 SOLVED = 1e-12
 ROWS = 300
 REFUSED = "refused"
-AGAIN = 8  # further calls, timed together: one is little more than the clock
+AGAIN = 8  # additional calls, timed together: one call is close to the resolution of the clock
 
 
 @dataclass(frozen=True)
 class Compared:
-    """One problem and direction."""
+    """Comparison of one problem along one direction."""
 
     source: str
     law: str
     operator: str
     rows: int
-    flagged: str  # why; empty where it is not
-    off: float  # - of the derivative's size
-    error: float  # - of the differences
+    flagged: str  # reason; empty if not flagged
+    off: float  # difference relative to the derivative's size
+    error: float  # estimated relative error of the differences
 
 
 def robots(models: tuple[str, ...], steps: int) -> Iterator[lv.Problem]:
-    """Steps of MuJoCo models under random controls, under their own law and with cones of two tangents."""
+    """Yield steps of MuJoCo models under random controls, with their own law and with cones of two tangents."""
     import mujoco as mj
 
     from lavender.io import from_mujoco
@@ -72,7 +73,7 @@ def robots(models: tuple[str, ...], steps: int) -> Iterator[lv.Problem]:
 
 
 def sources(draws: int, steps: int, models: tuple[str, ...]) -> Iterator[tuple[str, lv.Problem]]:
-    """(source, problem) of at most ROWS rows."""
+    """Yield (source, problem) with at most ROWS rows."""
     sys.path.append(str(Path(__file__).resolve().parent.parent / "tests"))
     from random_families import wild
 
@@ -90,32 +91,32 @@ def sources(draws: int, steps: int, models: tuple[str, ...]) -> Iterator[tuple[s
 
 
 def solved(problem: lv.Problem, start: Any = None) -> lv.Solution | None:
-    """A solution with a residual of at most 1e-12 or at its floor, or None."""
+    """Return a solution with a residual of at most 1e-12 or at the floor, or None."""
     solution = lv.solve(problem, tol=1e-14, impulse=start, time_limit=2.0)
     return solution if solution.residual.relative <= SOLVED or solution.residual.at_floor else None
 
 
 def along(problem: lv.Problem, h: float, change: np.ndarray) -> lv.Problem:
-    """The problem with h times a change of v*, or of b."""
+    """Return the problem with v*, or b, changed by h times `change`."""
     return replace(problem, b=problem.b + h * change, guess=None)
 
 
 def compared(source: str, problem: lv.Problem, seed: int = 0) -> Compared | None:
-    """Derivative beside differences; None where the problem is not solved."""
+    """Compare the derivative with differences; return None if the problem is not solved."""
     rng, solution = np.random.default_rng(seed), solved(problem)
     if solution is None:
         return None
     d = lv.derivative(problem, solution)
     if problem.matrix is None:
         n = problem.jacobian.shape[1]
-        change = -(problem.jacobian @ rng.standard_normal(n))  # of b, by v*
+        change = -(problem.jacobian @ rng.standard_normal(n))  # change of b due to v*
     else:
         change = rng.standard_normal(problem.m)
     size = float(np.abs(problem.b).max(initial=1e-3)) / max(float(np.abs(change).max(initial=0.0)), 1e-300)
     change = change * size
     try:
         found = d.jvp(b=change).slack
-    except lv.CapabilityError:  # rows that share a load, of which this direction moves one alone
+    except lv.CapabilityError:  # the direction changes one of several rows that share a load
         return Compared(source, problem.law, problem.operator, problem.m, REFUSED, np.nan, np.nan)
     told = []
     if d.switching:
@@ -129,7 +130,7 @@ def compared(source: str, problem: lv.Problem, seed: int = 0) -> Compared | None
     def norm(x: np.ndarray) -> float:
         return float(np.linalg.norm(weight * x))
 
-    # From nothing: a start at its floor would be kept as it is. Of several motions the nearest is wanted.
+    # Start from zero: a start at the floor would be returned unchanged. If there are several motions, use the nearest.
     start = solution.impulse if problem.law == "coulomb" else None
     best, error, before = None, np.inf, None
     for h in STEPS:
@@ -139,7 +140,7 @@ def compared(source: str, problem: lv.Problem, seed: int = 0) -> Compared | None
         if any(not np.array_equal(x.states.case, solution.states.case) for x in (low, high)):
             continue
         now = (high.slack - low.slack) / (2.0 * h)
-        # What the residuals leave in w, or rounding does: sqrt(J), as `norm` has it.
+        # Error of w from the residuals, or from rounding: sqrt(J), as in `norm`.
         left = sum(
             max(x.residual.energy, x.residual.roundoff_floor * x.residual.energy_at_zero) for x in (low, high)
         )
@@ -154,12 +155,12 @@ def compared(source: str, problem: lv.Problem, seed: int = 0) -> Compared | None
 
 
 def agrees(line: Compared) -> bool:
-    """Within 1e-6, or what differences know."""
+    """Return whether the derivative agrees within 1e-6 or the error of the differences."""
     return line.off <= max(AGREES, TIMES * line.error)
 
 
 def agreement(lines: list[Compared]) -> str:
-    """By law and operator."""
+    """Return the table of agreement by law and operator."""
     keys = sorted({(x.law, x.operator) for x in lines})
     rows: list[tuple[Any, ...]] = []
     for key in [*keys, None]:
@@ -191,38 +192,38 @@ def agreement(lines: list[Compared]) -> str:
     return markdown(head, rows)
 
 
-# -- what it costs ------------------------------------------------------------------------------------------------
+# -- cost ---------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class Cost:
-    """Seconds of one problem, or of a batch."""
+    """Times [s] of one problem, or of a batch."""
 
     source: str
     law: str
     operator: str
     rows: int
-    solve: float  # by newton, cold
+    solve: float  # cold solve by newton
     first: float  # the derivative and one vjp
     more: float  # another vjp
 
 
 def fresh(problem: lv.Problem) -> lv.Problem:
-    """The same, with nothing worked out."""
+    """Return a copy without derived data."""
     kind, values = problem.__reduce__()  # type: ignore[misc]
     made: lv.Problem = kind(*values)
     return made
 
 
 def took(work: Callable[[], Any]) -> tuple[float, Any]:
-    """CPU seconds of one call, and what it returns."""
+    """Return the CPU time [s] of one call and its result."""
     start = time.process_time()
     found = work()
     return time.process_time() - start, found
 
 
 def cost(source: str, problem: lv.Problem, repeats: int = 3) -> Cost | None:
-    """Least times of a few runs, each on a problem with nothing worked out; None where `newton` does not solve it."""
+    """Return the smallest times of a few runs without derived data, or None if `newton` does not solve the problem."""
     best = np.full(3, np.inf)
     for _ in range(repeats):
         own = fresh(problem)
@@ -243,7 +244,7 @@ def cost(source: str, problem: lv.Problem, repeats: int = 3) -> Cost | None:
 
         try:
             first, d = took(both)
-        except lv.CapabilityError:  # what it weighs is not unique
+        except lv.CapabilityError:  # the weighted quantity is not unique
             return None
         more, _ = took(lambda d=d, weights=weights: [d.vjp(**weights).b for _ in range(AGAIN)])  # type: ignore[misc]
         best = np.minimum(best, (solve, first, more / AGAIN))
@@ -251,7 +252,7 @@ def cost(source: str, problem: lv.Problem, repeats: int = 3) -> Cost | None:
 
 
 def batch(source: str, problems: list[lv.Problem], repeats: int = 20) -> Cost:
-    """The same of many at once, from `solve_many` to arrays of all problems."""
+    """Return the times of a batch, from `solve_many` to arrays of all problems."""
     best = np.full(3, np.inf)
     for _ in range(repeats):
         own = [fresh(p) for p in problems]
@@ -271,7 +272,7 @@ def batch(source: str, problems: list[lv.Problem], repeats: int = 20) -> Cost:
 
 
 def costs(lines: list[Cost]) -> str:
-    """Medians by source and size."""
+    """Return the table of median times by source and size."""
     rows = []
     for source in dict.fromkeys(x.source for x in lines):
         for low, high in ((0, 10), (10, 30), (30, 100), (100, 10**9)):
@@ -299,7 +300,7 @@ def costs(lines: list[Cost]) -> str:
 
 
 def jacobians(path: str, steps: int = 200) -> tuple[Any, ...]:
-    """Time [us] of d v+ / d controls at one step of a model: vjp, differences of solves, MuJoCo's differences."""
+    """Return times [us] of d v+ / d controls at one step of a model by vjp, differences of solves and MuJoCo."""
     import mujoco as mj
 
     from lavender.io import from_mujoco
@@ -314,7 +315,7 @@ def jacobians(path: str, steps: int = 200) -> tuple[Any, ...]:
     problem = from_mujoco(model, data)
     g = problem.generalized
     assert g is not None
-    # v* = ... + dt M^-1 (moment^T gain u): what controls change of v*, (nv, nu).
+    # v* = ... + dt M^-1 (moment^T gain u): derivative of v* by the controls, (nv, nu).
     free = np.zeros((model.nv, model.nu))
     for i in range(model.nu):
         ends = []
@@ -352,7 +353,7 @@ def jacobians(path: str, steps: int = 200) -> tuple[Any, ...]:
     ways = []
     for way in (implicit, differences, of_mujoco):
         if way is of_mujoco and model.opt.integrator == mj.mjtIntegrator.mjINT_RK4:
-            ways.append((math.nan, None))  # mjd_transitionFD refuses it
+            ways.append((math.nan, None))  # mjd_transitionFD does not support it
             continue
         best = min(took(way)[0] for _ in range(5))
         found = way()
@@ -374,7 +375,7 @@ def jacobians(path: str, steps: int = 200) -> tuple[Any, ...]:
 @click.option("--models", multiple=True, type=click.Path(exists=True, dir_okay=False), help="A MuJoCo model.")
 @click.option("--only", type=click.Choice(("agreement", "costs")), help="One part alone.")
 def command(draws: int, steps: int, models: tuple[str, ...], only: str | None) -> None:
-    """Derivatives beside differences of solves: agreement, what is flagged, times."""
+    """Compare derivatives with differences of solves: agreement, flags, times."""
     lines: list[Any] = []
     given = list(sources(draws, steps, models))
     if only != "costs":

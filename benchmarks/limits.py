@@ -1,13 +1,13 @@
-"""What calls under a time limit take, and what set-ups are counted for against what they take.
+"""Times of calls under a time limit, and estimated against measured times of set-ups.
 
     python -m benchmarks limits [--case 'granularF(n=12)' ...] [--solver auto ...] [--repeats 5]
     python -m benchmarks limits --rates
 
-The first: wall and CPU time of cold calls over their limit, medians, with the sweeps or steps that were done, the
-relative residual, and beside it that of the start; before the limit, least CPU time of one cold sweep without a limit,
-what it sets up and the judge included. The second: counted and least CPU time of every set-up, and the rates that would
-bring the counts closest to it (relative least squares, none negative). The files `lavender/solvers/setup_times.py` and
-`lavender/judge/residuals.py` have half as much again.
+The first prints medians of wall and CPU time of cold calls divided by their limit, the number of sweeps or steps, the
+relative residual, and the residual of the start. Before the limits it prints the smallest CPU time of one cold sweep
+without a limit, set-up and judge included. The second prints the estimated and smallest CPU time of every set-up, and
+the rates that fit the measured times best (relative least squares, nonnegative). The constants in
+`lavender/solvers/setup_times.py` and `lavender/judge/residuals.py` are 1.5 times these rates.
 """
 
 from __future__ import annotations
@@ -37,7 +37,11 @@ CASES = ("stack(n=64)", "chain(n=33)", "pyramidF(k=6)", "stack(n=5000)", "granul
 LIMITS = (1e-3, 1e-2)  # s
 MEASURED = (*CASES[1:-1], "granularF(n=5) as matrix", "granularF(n=5) as J and M", "matrix 1200")
 SOLVERS = ("newton", "direct", "pgs", "jacobi", "anderson", "sequential_impulses", "block_gauss_seidel")
-SWEEPS = ("sequential_impulses", "block_gauss_seidel", "pgs")  # the first that takes a problem as it is given
+SWEEPS = (
+    "sequential_impulses",
+    "block_gauss_seidel",
+    "pgs",
+)  # the first one that accepts the problem's form is used
 RATES = {
     setup_times: (
         "START_TIME",
@@ -63,7 +67,7 @@ RATES = {
 
 
 def problem_of(name: str) -> Callable[[], Problem]:
-    """Makes a problem of which nothing is worked out: a case of the suite, one in another form, or a dense one."""
+    """Return a function that makes a problem without derived data: a case, a case in another form, or a dense one."""
     kind, _, rest = name.partition(" ")
     if kind not in ("dense", "matrix"):
         case, _, form = name.partition(" as ")
@@ -83,7 +87,7 @@ def problem_of(name: str) -> Callable[[], Problem]:
 
 
 def with_ellipses(problem: Problem) -> Problem:
-    """The problem with an ellipse for each contact of two tangents, mu_2 = mu_1 / 2."""
+    """Return the problem with an ellipse for each contact of two tangents, mu_2 = mu_1 / 2."""
     c = problem.cones
     two = (c.kind == lv.CONTACT) & (c.n_tangents == 2)
     kind, ratio = np.where(two, lv.CONTACT_ELLIPSE, c.kind), np.where(two, 0.5, c.patch_radius)
@@ -91,7 +95,7 @@ def with_ellipses(problem: Problem) -> Problem:
 
 
 def calls(make: Callable[[], Problem], solver: str, limit: float, repeats: int) -> tuple[float, float, Any]:
-    """Wall and CPU time over the limit, medians, and the last solution."""
+    """Return medians of wall and CPU time divided by the limit, and the last solution."""
     wall, cpu, found = [], [], None
     for _ in range(repeats):
         problem = make()
@@ -103,7 +107,7 @@ def calls(make: Callable[[], Problem], solver: str, limit: float, repeats: int) 
 
 
 def set_ups(name: str) -> Iterator[tuple[str, Callable[[], float], float]]:
-    """What is set up, its count, and its least CPU time [s], of one problem."""
+    """Yield the name, estimated time and smallest CPU time [s] of every set-up of one problem."""
     make = problem_of(name)
 
     def ready() -> Problem:
@@ -137,7 +141,7 @@ def set_ups(name: str) -> Iterator[tuple[str, Callable[[], float], float]]:
 
 
 def least(make: Callable[[], Problem], call: Callable[[Problem], Any], repeats: int = 3) -> float:
-    """CPU time [s] of a call on a new problem."""
+    """Return the smallest CPU time [s] of a call on new problems."""
     times = []
     for _ in range(repeats):
         problem = make()
@@ -148,7 +152,7 @@ def least(make: Callable[[], Problem], call: Callable[[Problem], Any], repeats: 
 
 
 def with_rates(count: Callable[[], float], changed: dict[tuple[Any, str], float]) -> float:
-    """A count with other rates."""
+    """Return an estimate with other rates."""
     before = {at: getattr(*at) for at in changed}
     try:
         for (module, name), value in changed.items():
@@ -165,7 +169,7 @@ def with_rates(count: Callable[[], float], changed: dict[tuple[Any, str], float]
 @click.option("--repeats", default=5, show_default=True)
 @click.option("--rates", is_flag=True, help="Set-ups: counted, measured, and the rates that fit.")
 def command(names: tuple[str, ...], solvers: tuple[str, ...], repeats: int, rates: bool) -> None:
-    """Calls under time limits, or what set-ups are counted for."""
+    """Measure calls under time limits, or the estimated times of set-ups."""
     lv.solve(problem_of("dense 30 x 20")(), time_limit=1e-2)
     if rates:
         _lazy_import.import_numerics()
@@ -202,7 +206,7 @@ def command(names: tuple[str, ...], solvers: tuple[str, ...], repeats: int, rate
 
 
 def show_rates(names: tuple[str, ...]) -> None:
-    """Two tables."""
+    """Print the tables of set-up times and of fitted rates."""
     at = [(module, rate) for module, of in RATES.items() for rate in of]
     none = dict.fromkeys(at, 0.0)
     rows, weights, left = [], [], []

@@ -1,4 +1,4 @@
-"""Tables as markdown, lines as JSON: for every benchmark."""
+"""Output of the benchmarks: tables as markdown, lines as JSON."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from lavender.lab.bench import machine
 
 
 def markdown(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
-    """A table; columns whose cells are all numbers are ruled like the others, for a diff that stays small."""
+    """Return a markdown table. Columns of numbers are not aligned specially, so that diffs stay small."""
     lines = [
         "| " + " | ".join(str(cell).replace("|", "\\|") for cell in line) + " |" for line in (head, *rows)
     ]
@@ -23,7 +23,7 @@ def markdown(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
 
 
 def out_option(text: str, name: str = "--out") -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """`--out FILE`, which a command gets as a path that it may write, or None."""
+    """Return the option `--out FILE`; the command receives a writable path or None."""
 
     def checked(context: click.Context, option: click.Parameter, path: Path | None) -> Path | None:
         return None if path is None else check_writable(path)
@@ -32,7 +32,7 @@ def out_option(text: str, name: str = "--out") -> Callable[[Callable[..., Any]],
 
 
 def write_json(path: Path, lines: Iterable[Any], **more: Any) -> None:
-    """Lines (dataclasses or dictionaries) with the machine and versions of packages; the file is whole or absent."""
+    """Write lines (dataclasses or dictionaries) with machine and package versions; the file is written atomically."""
     rows = [line if isinstance(line, dict) else asdict(line) for line in lines]
     more = {"cpu": machine.cpu_name(), "versions": machine.versions(), **more, "lines": rows}
     write_text(path, json.dumps(more, indent=1) + "\n")

@@ -1,12 +1,11 @@
-"""Frames a second of the page that runs the kernels, and what one frame costs, in Chromium without a window.
+"""Frame rate of the page that runs the kernels, and processor time of a frame, in headless Chromium.
 
     python -m benchmarks page [ADDRESS ...] [--seconds 8]
 
-ADDRESS is what stands behind # in the page's address; by default the pyramid with sweeps on both sides, the pyramid
-with `newton` beside sweeps, and the pile. Frames are those that the page asked for (requestAnimationFrame);
-milliseconds are the main thread's processor time: of the parts of the script, called one by one, their sum, and of all
-that the thread did for a frame (layout, painting of canvases, hand-over to the compositor; where frames are missed, the
-steps of those, too).
+ADDRESS is the part after # of the page's address; by default the pyramid with sweeps on both sides, the pyramid with
+`newton` on one side, and the pile. Frames are those that the page requested (requestAnimationFrame). Milliseconds are
+processor time of the main thread: for each part of the script, called separately, for their sum, and for all work of a
+frame (layout, painting of canvases, transfer to the compositor, and the steps of missed frames).
 """
 
 import os
@@ -36,8 +35,8 @@ COUNT = """() => {
     inner.call(this, now);
   };
 }"""
-#: What there is to do in a frame at 60 a second: two steps of both sides, the pictures, and one of eight parts of the
-#: page (error of every sweep, which one of sixteen steps is watched for, charts over time, tables, caption).
+#: Work of a frame at 60 frames per second: two steps of both sides, the pictures, and one of eight parts of the page
+#: (error of every sweep, recorded in one of sixteen steps, charts over time, tables, caption).
 PARTS = {
     "steps": "lavender.sides.forEach((side) => { side.step(0, false); side.step(0, false); })",
     "watching": "lavender.sides.forEach((side) => { side.step(0, true); side.step(0, false); })",
@@ -48,12 +47,12 @@ PARTS = {
 
 @contextmanager
 def opened(address, **options):
-    """A page of Chromium, without a window, on what this checkout writes; `options` of `new_page`.
+    """Open the page of this checkout in headless Chromium, and close it at the end; `options` are those of `new_page`.
 
     Raises
     ------
     SolverUnavailable
-        No Chromium, or no playwright.
+        Chromium or playwright is not installed.
     """
     try:
         from playwright.sync_api import sync_playwright
@@ -67,7 +66,7 @@ def opened(address, **options):
         pages.write_page(Path(folder), print)
         server = pages.server(Path(folder))
         threading.Thread(target=server.serve_forever, daemon=True).start()
-        # Containers and root have no user namespaces to build the sandbox from.
+        # In containers and as root there are no user namespaces for the sandbox.
         browser = p.chromium.launch(executable_path=browser_path, args=["--no-sandbox"])
         page = browser.new_page(**options)
         page.goto(f"http://127.0.0.1:{server.server_address[1]}/#{address}")
@@ -79,15 +78,15 @@ def opened(address, **options):
 
 
 def spent(session):
-    """Processor time of the main thread so far [ms]."""
+    """Return the processor time of the main thread so far [ms]."""
     found = {m["name"]: m["value"] for m in session.send("Performance.getMetrics")["metrics"]}
     return 1000 * found["TaskDuration"]
 
 
 def cpu(page, session, code, times):
-    """Processor time of the main thread in `code` [ms], each of `times`."""
+    """Return the processor time of the main thread in one execution of `code` [ms], the mean of `times`."""
     before = spent(session)
-    # uPlot paints in a microtask: each time is given one.
+    # uPlot paints in a microtask: wait for one after each execution.
     page.evaluate(
         f"async () => {{ for (let k = 0; k < {times}; k++) {{ {code}; await null; await null; }} }}"
     )
@@ -95,7 +94,7 @@ def cpu(page, session, code, times):
 
 
 def measured(page, seconds):
-    """Frames and simulated seconds a second, and milliseconds of each part of a frame, as text."""
+    """Return frames and simulated time per second, and milliseconds of each part of a frame, as text."""
     page.wait_for_function("lavender.steps > 10")
     session = page.context.new_cdp_session(page)
     session.send("Performance.enable", {"timeDomain": "threadTicks"})
@@ -123,7 +122,7 @@ def measured(page, seconds):
 @click.argument("addresses", nargs=-1, metavar="[ADDRESS]...")
 @click.option("--seconds", default=8.0, show_default=True)
 def command(addresses, seconds):
-    """Frames a second of the page that runs the kernels, and what one frame costs, in Chromium."""
+    """Measure frame rate and processor time of the page that runs the kernels, in Chromium."""
     rows = []
     for address in addresses or ADDRESSES:
         with opened(address, viewport={"width": 1280, "height": 1000}) as page:

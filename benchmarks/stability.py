@@ -1,24 +1,24 @@
-"""Why a tower falls that should stand: eigenvalues of one substep of the engine about rest.
+"""Stability of towers in the engine: eigenvalues of one substep, linearised at rest.
 
-With few warm-started sweeps a substep takes only the share kappa of what is left of a tower's slow sway. The sway
-then rings like a spring with little damping, |z| = sqrt(1 - kappa). A contact that asks for its whole gap to be closed
-within one substep feeds the gap back with gain 1; all gains above about kappa drive the sway. The engine lets a
-bearing contact be where it is within the slop: gain 0.
+With few warm-started sweeps a substep removes only the fraction kappa of the error of a tower's slow sway. The sway
+then oscillates like a weakly damped spring, |z| = sqrt(1 - kappa). A contact with a target that closes its whole gap
+within one substep feeds the gap back with gain 1; gains above about kappa excite the sway. In the engine a loaded
+contact within the slop has gain 0.
 
-State of a tower of n boxes: places, turns and velocities of the boxes, and the impulses in the cache, 24 n numbers.
-About rest (every face at one gap, the weight spread evenly over the four corners, no friction, all contacts bearing
-and sticking) the substep is a smooth map; its derivative comes from central differences of the compiled substep
-itself.
+The state of a tower of n boxes consists of positions, rotations and velocities of the boxes and the cached
+impulses, 24 n numbers. Near rest (all faces at one gap, the weight distributed evenly over the four corners, no
+friction, all contacts loaded and sticking) the substep is a smooth map; its derivative is computed by central
+differences of the compiled substep itself.
 
-A mode of the tower on which the sweeps of a substep leave the share rho of the error has, with s its approach speed
-[m/s], f what gravity and the impulses in the cache do to s in a substep [m/s], G = gap/h [m/s], and g the share of the
-gap that the target asks to close in a substep,
+Let the sweeps of a substep leave the fraction rho of the error of a mode, and let s be its approach speed [m/s], f the
+change of s by gravity and the cached impulses in a substep [m/s], G = gap/h [m/s], and g the fraction of the gap that
+the target closes in a substep. Then
 
     w = s + f + g G,   s' = rho w - g G,   f' = f - (1 - rho) w,   G' = G + s'                              (1)
     (z - 1)^3 + kappa ((2 + g) (z - 1)^2 + (1 + 2 g) (z - 1) + g) = 0,   kappa = 1 - rho                    (2)
 
-Without feedback (g = 0) it rings with |z| = sqrt(rho) = sqrt(1 - kappa), and z = 1: the gap stays where it is. With
-g > 0 it leaves the unit circle where g is larger than about kappa.
+Without feedback (g = 0) the mode oscillates with |z| = sqrt(rho) = sqrt(1 - kappa), and z = 1: the gap is constant.
+With g > 0 it leaves the unit circle if g is larger than about kappa.
 """
 
 from __future__ import annotations
@@ -41,11 +41,11 @@ from lavender.sim.engine.state import State
 from lavender.sim.scene import Scene
 
 TOWERS = ((2, 4), (4, 4), (6, 4))  # boxes, sweeps
-TALL = ((6, 4), (10, 8), (14, 8))  # of which gravity is quicker than the sweeps
+TALL = ((6, 4), (10, 8), (14, 8))  # taller towers: gravity acts faster than the sweeps
 ORDERS = ("given", "symmetric", "alternating")
-PLAY = 2e-5  # m, gap of a face where feedback acts: more than the differences move it
-STEP = 1e-7  # m, rad, m/s, N s of the differences
-NEUTRAL = 1e-6  # |z| within this of 1 counts as 1: the differences see no more
+PLAY = 2e-5  # m, gap of a face with feedback, larger than its change in the differences
+STEP = 1e-7  # m, rad, m/s, N s, step of the differences
+NEUTRAL = 1e-6  # |z| within this of 1 counts as 1, the accuracy of the differences
 
 
 @dataclass(frozen=True)
@@ -58,19 +58,19 @@ class Modes:
 
     @property
     def growth(self) -> FloatArray:
-        """Rate of growth of each mode [1/s]; negative: it decays."""
+        """Growth rate of each mode [1/s]; negative if it decays."""
         rate: FloatArray = np.log(np.maximum(np.abs(self.z), 1e-300)) / (self.h * self.substeps)
         return rate
 
     @property
     def frequency(self) -> FloatArray:
-        """Of each mode [Hz]."""
+        """Frequency of each mode [Hz]."""
         hertz: FloatArray = np.abs(np.angle(self.z)) / (2.0 * np.pi * self.h * self.substeps)
         return hertz
 
     @property
     def stable(self) -> bool:
-        """No mode grows."""
+        """Whether no mode grows."""
         return bool(np.abs(self.z[0]) <= 1.0 + NEUTRAL)
 
 
@@ -94,7 +94,7 @@ def _write(state: State, n: int, z: FloatArray) -> None:
 
 
 def _at_rest(n: int, sweeps: int, h: float, order: str, friction: float, gap: float, gain: float) -> State:
-    # feedback of any gain is that of a bearing contact with no slop: -beta gap / h
+    # feedback of a given gain: a loaded contact without slop has the target -beta gap / h
     slop = 0.0 if gain > 0.0 else 1e-3
     scene = Scene(
         "stack", n=n, dt=h, substeps=1, order=order, friction=friction, solver_iterations=sweeps, slop=slop,
@@ -102,7 +102,7 @@ def _at_rest(n: int, sweeps: int, h: float, order: str, friction: float, gap: fl
     )  # fmt: skip
     sim = Simulation(scene)
     weight = scene.bodies[1].mass * -scene.parameters.gravity[2] * h
-    for last in (False, True):  # the first substep makes the cache
+    for last in (False, True):  # the first substep fills the cache
         a = sim.state.a
         a["x"][1:] = [(0.0, 0.0, 0.5 + i + gap * (i + 1)) for i in range(n)]
         a["q"][1:], a["v"][:] = (1.0, 0.0, 0.0, 0.0), 0.0
@@ -115,7 +115,7 @@ def _at_rest(n: int, sweeps: int, h: float, order: str, friction: float, gap: fl
             f"a tower of {n} boxes at a gap of {gap:g} m has {found} contacts; 4 on each face are needed"
         )
     bodies = (state.a["cache_key"][:found] >> np.uint64(16)).astype(np.int64)
-    above = n - np.minimum(bodies >> 24, bodies & 0xFFFFFF)  # boxes that a face carries
+    above = n - np.minimum(bodies >> 24, bodies & 0xFFFFFF)  # number of boxes above each face
     state.a["cache_impulse"][:found] = 0.0
     state.a["cache_impulse"][:found, 0] = 0.25 * weight * above
     state.setting[SETTING["beta"]] = gain
@@ -126,7 +126,7 @@ def _at_rest(n: int, sweeps: int, h: float, order: str, friction: float, gap: fl
 def modes(
     n: int, sweeps: int, h: float, *, order: str = "given", gain: float = 0.0, friction: float = 0.5
 ) -> Modes:
-    """Eigenvalues of a tower of n unit boxes about rest, position projection left out.
+    """Compute the eigenvalues of a tower of n unit boxes at rest, without position projection.
 
     Parameters
     ----------
@@ -134,11 +134,11 @@ def modes(
     h : float, s
         Substep.
     order : str
-        Of a scene; two substeps are taken together where it alternates or is drawn anew.
+        Sweep order of the scene; two substeps are combined if it alternates or is random.
     gain : float
-        Share g of a bearing contact's gap that is closed in a substep, within the slop; the engine has 0.
+        Fraction g of a loaded contact's gap that is closed in a substep, within the slop; the engine uses 0.
     friction : float
-        Does not enter while contacts stick.
+        Has no effect while contacts stick.
     """
     gap = PLAY if gain > 0.0 else -5e-4
     state = _at_rest(n, sweeps, h, order, friction, gap, gain)
@@ -162,14 +162,14 @@ def modes(
 
 
 def slowest(found: Modes) -> tuple[float, float]:
-    """kappa and frequency [Hz] of the slowest mode that decays: what a substep's sweeps take of its error."""
+    """Return kappa (fraction of the error that a substep removes) and frequency [Hz] of the slowest decaying mode."""
     inside = np.flatnonzero(np.abs(found.z) < 1.0 - NEUTRAL)
     k = inside[0]
     return float(1.0 - np.abs(found.z[k]) ** (2.0 / found.substeps)), float(found.frequency[k])
 
 
 def critical_gain(n: int, sweeps: int, h: float, *, order: str = "given", digits: int = 2) -> float:
-    """Smallest gain with which a mode grows; 0 where one grows without, inf where none does with 1."""
+    """Return the smallest gain with a growing mode: 0 if one grows without feedback, inf if none grows at gain 1."""
     if not modes(n, sweeps, h, order=order).stable:
         return 0.0
     if modes(n, sweeps, h, order=order, gain=1.0).stable:
@@ -185,18 +185,18 @@ def critical_gain(n: int, sweeps: int, h: float, *, order: str = "given", digits
 
 
 def model(kappa: float, gain: float) -> np.ndarray:
-    """The three eigenvalues of equation (2) (3,) complex."""
+    """Return the three eigenvalues of equation (2) (3,) complex."""
     roots: np.ndarray = 1.0 + np.roots([1.0, kappa * (2.0 + gain), kappa * (1.0 + 2.0 * gain), kappa * gain])
     return roots
 
 
 def figure(path: str | PathLike[str]) -> None:
-    """Growth by gain beside equation (2), eigenvalues with and without feedback, and towers that lean by themselves.
+    """Draw growth over gain with equation (2), eigenvalues with and without feedback, and towers that start to lean.
 
     Raises
     ------
     InputError
-        A path that cannot be written, or a suffix that matplotlib does not know.
+        The path cannot be written, or matplotlib does not support its suffix.
     """
     from matplotlib.figure import Figure
 
@@ -233,7 +233,7 @@ def figure(path: str | PathLike[str]) -> None:
 
 
 def numbers() -> Iterator[tuple[str, ...]]:
-    """Towers in every order: kappa and frequency of the slowest mode, largest |z| of a substep with gain 0 and 1."""
+    """Yield results for towers in every order: kappa and frequency of the slowest mode, largest |z| at gains 0, 1."""
     for n, sweeps in TOWERS:
         for order in ORDERS:
             still = modes(n, sweeps, 1 / 60, order=order)
@@ -255,7 +255,7 @@ def numbers() -> Iterator[tuple[str, ...]]:
 @click.command("stability")
 @click.option("--figure", "picture", type=click.Path(), help="Eigenvalues and growth, drawn.")
 def command(picture: str | None) -> None:
-    """Why towers fall on few sweeps: eigenvalues of one substep about rest."""
+    """Analyse why towers fall with few sweeps: eigenvalues of one substep at rest."""
     head = ("boxes", "sweeps", "order", "kappa", "Hz, 1/60 s", "Hz, 1/240 s", "|z|, g = 0", "|z|, g = 1")
     click.echo(markdown(head, numbers()))
     for n, sweeps in TOWERS[1:]:

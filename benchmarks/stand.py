@@ -1,17 +1,17 @@
-"""How long towers of boxes stand, how far they move, and what a step costs.
+"""Towers of boxes in several engines: time until they fall, drift, and cost of a step.
 
 Every engine stacks the same n unit boxes of 1 kg on a plane, friction 0.5, without sleeping, and steps. With p(t) the
 centres of the boxes,
 
     drift = max over boxes and t >= 2 s of |p(t) - p(2 s)|,                                     (1)
 
-looked at ten times a second. The tower has fallen once a box is half an edge lower than it began
-(`lavender.lab.phenomena.parts.has_fallen`); the run ends then. Lines are sorted by what they spend on a second of
-simulation: sweeps x substeps / dt.
+sampled ten times per second. The tower has fallen when a box is half an edge below its start
+(`lavender.lab.phenomena.parts.has_fallen`); the run then ends. Lines are sorted by the sweeps per simulated second:
+sweeps x substeps / dt.
 
-LavenderSim is stepped as a user steps it, with its observation; the others by their own call for a step. MuJoCo,
+LavenderSim is stepped by its public interface, with observations; the others by their own step functions. MuJoCo,
 PyBullet and lavendersim are Python packages; Rapier (`@dimforge/rapier3d-compat`) and Jolt (`jolt-physics`) run under
-Node. All of them by the adapters of `lavender phenomena`.
+Node. All use the adapters of `lavender phenomena`.
 """
 
 from __future__ import annotations
@@ -49,44 +49,44 @@ LOOK = 0.1  # s
 
 @dataclass(frozen=True)
 class Tower:
-    """What is asked of an engine."""
+    """Settings of one run."""
 
     boxes: int
-    dt: float  # s, of one call for a step
+    dt: float  # s, time of one step call
     sweeps: int | None = None  # None: the engine's own number
     substeps: int | None = None  # None: the engine's own number
-    order: str | None = None  # of LavenderSim
+    order: str | None = None  # sweep order of LavenderSim
     seconds: float = 60.0  # s, simulated
 
 
 @dataclass(frozen=True)
 class Line:
-    """What an engine did of it."""
+    """Result of one run."""
 
     engine: str
     boxes: int
     dt: float  # s
     sweeps: int  # of one substep; 0: solved to a tolerance
     substeps: int  # of one step
-    seconds: float  # s, simulated at most
-    stood: float  # s, until it fell; `seconds` where it did not
+    seconds: float  # s, maximum simulated time
+    stood: float  # s, time until it fell, else `seconds`
     drift: float  # m, equation (1), until it fell
-    cost: float  # s of CPU for one step
+    cost: float  # s, CPU time of one step
 
     @property
     def stands(self) -> bool:
-        """Whether the tower stood to the end."""
+        """Whether the tower was upright until the end."""
         return self.stood >= self.seconds
 
     @property
     def work(self) -> float:
-        """Sweeps for a second of simulation; 0 to a tolerance."""
+        """Sweeps per simulated second; 0 if solved to a tolerance."""
         return self.sweeps * self.substeps / self.dt
 
 
 @dataclass(frozen=True)
 class Standing:
-    """One engine with one tower, and what it is asked for."""
+    """One engine with one tower and its settings."""
 
     engine: Stepping
     name: str
@@ -94,25 +94,25 @@ class Standing:
     substeps: int  # of one step
 
     def centres(self) -> FloatArray:
-        """Centres of the boxes (n, 3) [m]."""
+        """Return the centres of the boxes (n, 3) [m]."""
         x: FloatArray = self.engine.state()[0][1:]
         return x.copy()
 
 
 @dataclass(frozen=True)
 class Contestant:
-    """An engine of `lavender.phenomena` with a setting, what it needs, and what it lets one choose."""
+    """An engine of `lavender.phenomena` with its requirements and options."""
 
     name: str
     module: str = "own"
     needs: str = ""  # Python package, or npm package
-    default: int = 0  # sweeps where nobody says a number; of ours the scene does
-    sweeps: str = "sweeps"  # option of their number; empty: it solves to a tolerance
+    default: int = 0  # default number of sweeps; LavenderSim's is in the scene
+    sweeps: str = "sweeps"  # name of the option for sweeps; empty: solved to a tolerance
     substeps: bool = False
-    options: Mapping[str, Any] = field(default_factory=dict)  # of the engine, of ours of the scene
+    options: Mapping[str, Any] = field(default_factory=dict)  # of the engine; LavenderSim: of the scene
 
     def step(self, build: Callable[..., Scene], tower: Tower) -> Stepping:
-        """The engine with a scene that takes ours' settings; of the tower step, sweeps, substeps and order count."""
+        """Build the engine with a scene for a tower's step, sweeps, substeps and order."""
         if self.module == "own":
             asked = {"solver_iterations": tower.sweeps, "order": tower.order} if self.sweeps else {}
             return create_engine("own", build(dt=tower.dt, substeps=tower.substeps, **asked, **self.options))
@@ -122,7 +122,7 @@ class Contestant:
         return create_engine(self.module, build(), **options)
 
     def make(self, tower: Tower) -> Standing:
-        """The engine with a tower."""
+        """Build the engine with a tower."""
         made: Any = self.step(partial(Scene, "stack", n=tower.boxes, friction=FRICTION), tower)
         if self.module != "own":
             sweeps = (self.default if tower.sweeps is None else tower.sweeps) if self.sweeps else 0
@@ -134,7 +134,7 @@ class Contestant:
 
 
 _ELLIPTIC = {"cone": "elliptic", "tree": False}
-#: Engines by the name that `--engines` takes. Joints of others are constraints between bodies, as ours are.
+#: Engines by their names in `--engines`. Joints of all engines are constraints between bodies.
 ENGINES: dict[str, Contestant] = {
     "lavender": Contestant("lavender", substeps=True),
     "newton": Contestant("lavender newton", sweeps="", options={"solver": "newton"}),
@@ -155,24 +155,24 @@ ENGINES: dict[str, Contestant] = {
 
 
 def missing(name: str) -> str:
-    """What the engine of that name lacks here; empty where it can run."""
+    """Return the missing requirement of an engine, empty if it can run."""
     return installation_hint(ENGINES[name].needs)
 
 
 def installed() -> list[str]:
-    """Names of the engines that can run here."""
+    """Return the names of the engines that can run here."""
     return [name for name in ENGINES if not missing(name)]
 
 
 def check_installed(name: str) -> None:
-    """Refuse an engine that cannot run here.
+    """Raise an error if an engine cannot run here.
 
     Raises
     ------
     UnknownName
-        No such engine.
+        The engine does not exist.
     InputError
-        It is not installed; the message says what is missing.
+        The engine is not installed; the message names the missing package.
     """
     if name not in ENGINES:
         raise UnknownName("engine", name, ENGINES)
@@ -181,7 +181,7 @@ def check_installed(name: str) -> None:
 
 
 def measure(engine: str, tower: Tower) -> Line:
-    """Step one tower in one engine, at most `tower.seconds`; raises as `check_installed`."""
+    """Step one tower in one engine for at most `tower.seconds`; errors as in `check_installed`."""
     check_installed(engine)
     made = ENGINES[engine].make(tower)
     try:
@@ -231,10 +231,10 @@ def lines(
     seconds: float = 60.0,
     orders: Sequence[str | None] = (None,),
 ) -> Iterator[Line]:
-    """The map, tower by tower; `substeps` 0 means the engine's own number.
+    """Yield the result lines, tower by tower; `substeps` = 0: the engine's default.
 
-    Engines that iterate to a tolerance have one line for each tower and step; those of others that sweep also one with
-    their own number of sweeps.
+    Engines that iterate to a tolerance give one line per tower and step. Other sweeping engines also give a line with
+    their default number of sweeps.
     """
     for n, rate, name in product(boxes, rates, engines):
         c = ENGINES[name]
@@ -255,7 +255,7 @@ def lines(
 
 
 def table(found: Sequence[Line]) -> str:
-    """The map as a markdown table, by tower, step and sweeps a second."""
+    """Return the results as a markdown table, by tower, step and sweeps per second."""
     head = (
         *("boxes", "dt [s]", "engine", "sweeps", "substeps", "sweeps a second", "stood [s]", "drift [mm]"),
         "µs a step",
@@ -318,9 +318,9 @@ def command(
     seconds: float,
     out: Path | None,
 ) -> None:
-    """How long towers of boxes stand, how far they move and what a step costs, in every engine that is installed.
+    """Measure how long towers of boxes stay upright, how far they drift and the cost of a step, in installed engines.
 
-    Rapier and Jolt take part where npm has installed them in this folder: npm install @dimforge/rapier3d-compat
+    Rapier and Jolt are included if npm has installed them in this folder: npm install @dimforge/rapier3d-compat
     jolt-physics.
     """
     names = installed() if engines is None else engines

@@ -1,14 +1,14 @@
-"""What `solve_many` and `residual_many` take a world, beside MuJoCo's own Newton's method and alone.
+"""Time per world of `solve_many` and `residual_many`, compared with MuJoCo's Newton's method and by itself.
 
     python -m benchmarks worlds engine [--models FILE ...] [--worlds 1000] [--seed 0]
     python -m benchmarks worlds random [--worlds 100000] [--seed 0]
 
-`engine`: states of models along random controls, every tenth step, cold. MuJoCo has of each state the largest tolerance
-of seven with which its answer is within 1e-6 by our judge, and nothing but `mj_fwdConstraint` is timed, right after the
-stages of a step before it: M's factor not, its data in the cache. Ours has J and M as arrays, factors M, solves to 1e-6
-and judges. Rounds alternate; least time, of the engine's calls one by one on the wall clock, of all worlds of ours on
-that of the thread.
-`random`: problems drawn, with and without the batch made of their arrays, and the judge alone.
+`engine`: states of models along random controls, every tenth step, cold. For each state MuJoCo uses the largest of
+seven tolerances for which its result is within 1e-6 by lavender's judge. Only `mj_fwdConstraint` is timed, directly
+after the preceding stages of a step: the factorisation of M is not included, and its data is in the cache. Lavender
+gets J and M as arrays, factorises M, solves to 1e-6 and judges. Rounds alternate, and the smallest time counts: wall
+time of each MuJoCo call, thread CPU time of all of lavender's worlds.
+`random`: random problems, with and without the construction of the batch from arrays, and the judge alone.
 """
 
 from __future__ import annotations
@@ -31,16 +31,16 @@ from lavender.base.errors import LavenderError
 from lavender.lab.simulated_worlds import Runs, simulate_world
 
 TOL = 1e-6
-TOLERANCES = (1e-2, 1e-4, 1e-6, 1e-8, 1e-10, 1e-12, 1e-15)  # of the engine
+TOLERANCES = (1e-2, 1e-4, 1e-6, 1e-8, 1e-10, 1e-12, 1e-15)  # of MuJoCo
 CLASSES = ((1, 10), (10, 50), (50, 300))  # rows
-FEW = 15  # states of a class that are not told
-LOOK = 10  # steps from one state to the next
+FEW = 15  # classes with fewer states are not reported
+LOOK = 10  # steps between two states
 ROUNDS = 7
 PACKAGES = {"dm_control": "suite", "gymnasium": "envs/mujoco/assets"}
 
 
 def installed() -> Iterator[Path]:
-    """Models of dm_control's suite and of gymnasium, where they are installed."""
+    """Yield the models of dm_control's suite and of gymnasium, if these are installed."""
     for package, folder in PACKAGES.items():
         found = find_spec(package)
         for place in (found.submodule_search_locations or ()) if found else ():
@@ -48,7 +48,7 @@ def installed() -> Iterator[Path]:
 
 
 def states(path: Path, worlds: int, seed: int) -> tuple[Any, Any, np.ndarray]:
-    """MuJoCo, the model with its Newton's method, cold, and so many states of ten runs."""
+    """Return MuJoCo, the model with cold Newton's method, and `worlds` states of ten runs."""
     runs = Runs(str(path), worlds=10, steps=LOOK * -(-worlds // 10), seed=seed)
     mj, model = runs.load()
     found = np.concatenate(
@@ -61,7 +61,7 @@ def states(path: Path, worlds: int, seed: int) -> tuple[Any, Any, np.ndarray]:
 
 
 def beside(path: Path, worlds: int, seed: int) -> Iterator[tuple[int, list[Any], float]]:
-    """Of each class of rows: (its place, cells of the table, ratio)."""
+    """Yield (index of the class, cells of the table, ratio of times) for each class of rows."""
     mj, model, given = states(path, worlds, seed)
     models = []
     for tolerance in TOLERANCES:
@@ -100,7 +100,7 @@ def beside(path: Path, worlds: int, seed: int) -> Iterator[tuple[int, list[Any],
 
 
 def engine_times(mj: Any, models: list[Any], given: np.ndarray) -> np.ndarray:
-    """Time of `mj_fwdConstraint` [s] of each state, and its steps (2, n)."""
+    """Return the time [s] of `mj_fwdConstraint` and its iterations for each state (2, n)."""
     data, kind = mj.MjData(models[0]), mj.mjtState.mjSTATE_INTEGRATION
     out = np.empty((2, len(given)))
     for i, model in enumerate(models):
@@ -115,7 +115,7 @@ def engine_times(mj: Any, models: list[Any], given: np.ndarray) -> np.ndarray:
 
 
 def dense_drawn(cones: lv.Cones) -> Callable[[int, np.random.Generator], Any]:
-    """12 rows, 18 velocities that all rows move."""
+    """Return a generator of problems with 12 rows and 18 velocities, J dense."""
 
     def draw(n: int, rng: np.random.Generator) -> tuple[tuple[Any, ...], dict[str, Any]]:
         half, jac = rng.standard_normal((n, 18, 18)), rng.standard_normal((n, 12, 18))
@@ -126,9 +126,11 @@ def dense_drawn(cones: lv.Cones) -> Callable[[int, np.random.Generator], Any]:
 
 
 def robots_drawn(n: int, rng: np.random.Generator) -> tuple[tuple[Any, ...], dict[str, Any]]:
-    """Four limbs of eight joints on a free body, 24 to 55 bounded rows with compliance: pushes on a limb's end."""
+    """Return random robots: four limbs of eight joints on a free body, 24 to 55 bounded soft rows at limb ends."""
     limb, count = np.repeat(np.arange(4), 8), rng.integers(24, 56, n)
-    above = np.tri(32, dtype=bool) & (limb[:, None] == limb)  # joint j's body moves by it and those before it
+    above = np.tri(32, dtype=bool) & (
+        limb[:, None] == limb
+    )  # a joint moves its own body and the following ones of its limb
     reach = np.hstack([np.ones((32, 6), bool), above])
     mass = np.tile(0.1 * np.eye(38), (n, 1, 1))
     for body in reach:
@@ -140,7 +142,7 @@ def robots_drawn(n: int, rng: np.random.Generator) -> tuple[tuple[Any, ...], dic
 
 
 def drawn(worlds: int, seed: int) -> str:
-    """The table of random problems; they are drawn and solved a part at a time, which memory holds."""
+    """Return the table of random problems, which are drawn and solved in parts to limit memory."""
     lines = []
     draws = {
         "12 bounded rows, 18 velocities": (dense_drawn(lv.Cones.bounded(np.zeros(12), np.inf)), 10_000),
@@ -179,7 +181,7 @@ def drawn(worlds: int, seed: int) -> str:
 
 @click.group("worlds")
 def command() -> None:
-    """What solve_many and residual_many take a world, beside MuJoCo's Newton's method and alone."""
+    """Measure solve_many and residual_many per world, compared with MuJoCo's Newton's method and by themselves."""
 
 
 @command.command("engine")
@@ -189,14 +191,14 @@ def command() -> None:
 @click.option("--worlds", default=1000, show_default=True, help="Of each model.")
 @click.option("--seed", default=0, show_default=True)
 def engine_command(models: tuple[Path, ...], worlds: int, seed: int) -> None:
-    """Beside MuJoCo's Newton's method on the same states."""
+    """Compare with MuJoCo's Newton's method on the same states."""
     lines, ratios = [], [[] for _ in CLASSES]  # type: list[list[Any]], list[list[float]]
     for path in models or installed():
         try:
             for which, cells, ratio in beside(path, worlds, seed):
                 lines.append(cells)
                 ratios[which].append(ratio)
-        except LavenderError as error:  # no model of its own, or one whose problems cannot be read
+        except LavenderError as error:  # not a complete model, or its problems cannot be imported
             click.echo(f"{path.name}: {error}", err=True)
     head = (
         "model",
@@ -224,5 +226,5 @@ def engine_command(models: tuple[Path, ...], worlds: int, seed: int) -> None:
 @click.option("--worlds", default=100_000, show_default=True, help="Of 12 rows; a tenth of the others.")
 @click.option("--seed", default=0, show_default=True)
 def random_command(worlds: int, seed: int) -> None:
-    """Problems drawn."""
+    """Measure random problems."""
     click.echo(drawn(worlds, seed))

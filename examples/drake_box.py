@@ -1,6 +1,6 @@
-"""A box on the ground in Drake: SAP's answer by the rigid law, and lavender's beside it, over a fall and a rest.
+"""A box falls on the ground in Drake and rests: SAP's solution judged by the rigid law, compared with lavender's.
 
-Needs Drake: pip install drake. SAP's contacts are softer than Coulomb's law; the residual of its impulses is how soft.
+Needs Drake: pip install drake. SAP's contacts are softer than Coulomb's law; the residual shows how much.
 
     python examples/drake_box.py
 """
@@ -13,7 +13,7 @@ DT, STEPS, MASS, SIZE = 2e-3, 200, 2.0, 0.2  # s, -, kg, m
 
 
 def plant():
-    """A diagram with a box that stands on four small spheres, and its plant."""
+    """Return a diagram with a box on four small spheres, its plant and the box."""
     from pydrake.geometry import HalfSpace, Sphere
     from pydrake.math import RigidTransform
     from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, CoulombFriction
@@ -22,7 +22,7 @@ def plant():
 
     builder = DiagramBuilder()
     made, _ = AddMultibodyPlantSceneGraph(builder, time_step=DT)
-    made.SetUseSampledOutputPorts(False)  # else its ports hold the step before, whose contacts are others
+    made.SetUseSampledOutputPorts(False)  # sampled ports would return the previous step's contacts
     friction = CoulombFriction(0.5, 0.5)
     made.RegisterCollisionGeometry(made.world_body(), RigidTransform(), HalfSpace(), "ground", friction)
     box = made.AddRigidBody("box", SpatialInertia.SolidBoxWithMass(MASS, SIZE, SIZE, SIZE))
@@ -35,7 +35,7 @@ def plant():
 
 
 def run(steps=STEPS):
-    """Of each step with contacts: residual of SAP's impulses and of ours, largest difference of velocities [m/s]."""
+    """Return for each step with contacts: both residuals, largest velocity difference [m/s]; and the last force [N]."""
     from pydrake.math import RigidTransform
     from pydrake.systems.analysis import Simulator
 

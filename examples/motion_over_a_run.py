@@ -1,10 +1,10 @@
-"""Residual, motion error, drift: which of the first two tells how good a simulation is.
+"""Residual, motion error and drift: compare both error measures with the drift of a simulation.
 
-Six boxes on each other without friction, stepped with 4, 16 and 64 sweeps, in two orders, with warm start and
-without. Of every step stand the relative residual and how wrong the bodies move; at the end, how far they
-are from where the same scene goes with every step solved to the floor. The residual is a promise about the
-impulses; the motion error is about velocities, and what a run adds up are velocities. Within one scene both rank
-runs alike: a fixed factor lies between them. From scene to scene that factor changes (`residual_or_motion.py`).
+Six boxes on each other without friction are stepped with 4, 16 and 64 sweeps, in two orders, with and without a warm
+start. Each step gives the relative residual and the motion error. The drift is the distance of the bodies from a run of
+the same scene in which every step is solved to the round-off floor. The residual measures impulses, the motion error
+velocities, and a run adds up velocities. Within one scene both measures rank runs in the same order, since they
+differ by a nearly constant factor. The factor depends on the scene (`residual_or_motion.py`).
 
     python examples/motion_over_a_run.py [FIGURE.png]
 """
@@ -22,7 +22,7 @@ ORDERS = ("bottom_up", "top_down")
 
 
 def positions(**parameters):
-    """Positions (STEPS, n, 3) [m], and of every step: residual, motion error [-] and speed error [m/s] (STEPS,)."""
+    """Return positions (STEPS, n, 3) [m], and residual, motion error and speed error [m/s] of each step (STEPS,)."""
     sim = lv.Simulation(
         lv.Scene("stack", friction=0.0, **parameters), report_residual=True, report_motion=True
     )
@@ -37,7 +37,7 @@ def positions(**parameters):
 
 
 def numbers():
-    """Of each run: its parameters, residual, motion error, speed error and drift (STEPS,)."""
+    """Return for each run its parameters, residual, motion error, speed error and drift (STEPS,)."""
     exact = positions(solver="direct", solver_options={"tol": 1e-13})[0]
     found = []
     for sweeps in SWEEPS:
@@ -61,7 +61,7 @@ def numbers():
 
 
 def ranks(found):
-    """Rank correlation over the runs of each mean with the drift at the end."""
+    """Return the rank correlation of the mean of each measure with the final drift, over the runs."""
     drift = [run["drift"][-1] for run in found]
     return {
         name: float(spearmanr([run[name][1:].mean() for run in found], drift).statistic)
@@ -70,7 +70,7 @@ def ranks(found):
 
 
 def figure(found, path):
-    """One warm run and one cold run over time, and all runs: residual and motion error against drift."""
+    """Draw one warm and one cold run over time, and residual and motion error of all runs against drift."""
     from matplotlib.figure import Figure
 
     canvas = Figure(figsize=(12, 3.8), layout="constrained")
@@ -101,7 +101,7 @@ def _run(found, sweeps, warm):
 
 
 def main(path="motion_over_a_run.png"):
-    """Print a line a run, the rank correlations, and save the figure."""
+    """Print a line per run and the rank correlations, and save the figure."""
     found = numbers()
     head = ("sweeps", "order", "start", "residual", "motion error", "speed error", "drift at the end")
     print("".join(f"{word:>18}" for word in head))

@@ -1,6 +1,6 @@
-"""A box of Pinocchio falls on the ground, tilted, and comes to rest: its own time stepping on lavender's impulses.
+"""A tilted box in Pinocchio falls on the ground and comes to rest, stepped with lavender's impulses.
 
-Needs Pinocchio 4: pip install pin. Each step is one problem; impulses are carried from step to step.
+Needs Pinocchio 4: pip install pin. Each step is one problem, which starts from the impulses of the previous step.
 
     python examples/pinocchio_box.py
 """
@@ -13,7 +13,7 @@ DT, STEPS, MASS, SIZE = 2e-3, 500, 2.0, 0.2  # s, -, kg, m
 
 
 def model():
-    """The box, and a contact of each lower and upper corner with the ground."""
+    """Return the box, and a contact with the ground for each lower and upper corner."""
     import pinocchio as pin
 
     made = pin.Model()
@@ -24,7 +24,7 @@ def model():
 
 
 def run(steps=STEPS):
-    """Height [m] and speed [m/s] of each step, the normal force [N] of the last, the largest residual."""
+    """Return height [m] and speed [m/s] of each step, normal force [N] of the last step, and the largest residual."""
     import pinocchio as pin
 
     made, box, corners = model()
@@ -38,7 +38,7 @@ def run(steps=STEPS):
         models = []
         for corner in corners:
             place = data.oMi[box].act(corner)
-            place[2] = 0.0  # the point of the ground below; z of a contact points from the ground to the box
+            place[2] = 0.0  # the ground point below; z of a contact points from the ground to the box
             models.append(
                 pin.PointContactConstraintModel(
                     made, 0, pin.SE3(np.eye(3), place), box, pin.SE3(data.oMi[box].rotation.T, corner)
@@ -48,7 +48,9 @@ def run(steps=STEPS):
         problem = lv.io.from_pinocchio(
             made, data, models, [m.createData() for m in models], DT, q=q, v=v, correction=0.1
         )
-        start = None if previous is None else problem.carry(previous)  # the same contacts in the same places
+        start = (
+            None if previous is None else problem.carry(previous)
+        )  # the contacts are the same in every step
         previous = lv.solve(problem, impulse=start, tol=1e-8)
         worst = max(worst, previous.residual.relative)
         v = problem.velocity(previous.impulse)

@@ -1,10 +1,10 @@
-"""A push planned through a stick-slip change: descent that reads how far the next switch is, and one that does not.
+"""Plan a push across a stick-slip switch: gradient descent with and without the distance to the next switch.
 
-A box stands on the floor and is to stop 0.3 m further on after 30 steps. The pushes of the first 15 steps are sought,
-all the same at first and too weak to move it. As long as it sticks, the derivative of where it ends is 0: it exists,
-and leads nowhere. `distance` says how much more impulse a step takes until the box slides. The second descent tries
-the pushes beyond these switches whenever a step along the gradient gains nothing, and goes on from there if that is
-nearer to the goal.
+A box on the floor shall stop 0.3 m further on after 30 steps. The unknowns are the pushes of the first 15 steps, which
+start equal and too weak to move it. While the box sticks, the derivative of its final position is 0: it exists, but
+descent makes no progress. `distance` is the additional impulse of a step at which the box starts to slide. The second
+descent tries pushes beyond these switches whenever a step along the gradient does not reduce the error, and continues
+from there if the result is closer to the goal.
 
     python examples/planned_push.py [FIGURE.png]
 """
@@ -18,13 +18,13 @@ import lavender as lv
 DT, STEPS, PUSHED = 0.02, 30, 15  # s, -, -
 MASS, MU, GRAVITY = 2.0, 0.5, 9.81  # kg, -, m/s2
 GOAL = 0.3  # m
-WEAK = 0.8  # of the push that friction just holds
+WEAK = 0.8  # fraction of the largest push at which the box still sticks
 TURNS = 60
 JAC = np.array([[0.0, 1.0], [1.0, 0.0]])  # normal, tangent of a box that moves along x and z
 
 
 def run(pushes):
-    """Where the box ends [m], its speeds, and the steps' problems and solutions; pushes (PUSHED,) [N s]."""
+    """Return the final position [m], the speeds, and problem and solution of each step; pushes (PUSHED,) [N s]."""
     v, x, speeds, taken = np.zeros(2), 0.0, [], []
     for k in range(STEPS):
         u = pushes[k] if k < PUSHED else 0.0
@@ -39,11 +39,11 @@ def run(pushes):
 
 
 def gradient(taken):
-    """d x / d pushes (PUSHED,) [m/(N s)], and what each step lacks to its next switch [N s]."""
+    """Return d x / d pushes (PUSHED,) [m/(N s)], and the additional impulse [N s] to each step's next switch."""
     back, by_push, lacks, switching = np.zeros(2), np.zeros(PUSHED), np.zeros(PUSHED), 0
     for k in reversed(range(STEPS)):
         d = lv.derivative(*taken[k])
-        back = back + np.array([DT, 0.0])  # this step's speed moves x
+        back = back + np.array([DT, 0.0])  # the speed of this step contributes to x
         back = d.vjp(velocity=back).v_free
         switching += len(d.switching)
         if k < PUSHED:
@@ -53,7 +53,7 @@ def gradient(taken):
 
 
 def descent(heeds):
-    """Pushes and the error [m] of each turn."""
+    """Return the pushes and the error [m] of each iteration."""
     u = np.full(PUSHED, WEAK * MU * MASS * GRAVITY * DT)
     errors, crossed = [], 0
     x, _, taken = run(u)
@@ -74,12 +74,12 @@ def descent(heeds):
 
 
 def numbers():
-    """Both descents."""
+    """Return the results of both descents."""
     return {"as it is": descent(False), "heeding the switches": descent(True)}
 
 
 def figure(found, path):
-    """Errors turn by turn, and the speeds at the end."""
+    """Draw the errors over the iterations, and the final speeds."""
     from matplotlib.figure import Figure
 
     canvas = Figure(figsize=(8, 3.4), layout="constrained")
@@ -94,7 +94,7 @@ def figure(found, path):
 
 
 def main(path="planned_push.png"):
-    """Print both ends, save the figure."""
+    """Print both results and save the figure."""
     found = numbers()
     for name, way in found.items():
         print(

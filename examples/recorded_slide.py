@@ -1,11 +1,12 @@
-"""Friction and mass found from a recorded slide: gradients through every step, by the derivative of its solve.
+"""Identify friction and mass from a recorded slide by gradients through the solve of every step.
 
 A puck on a table is pushed by a known force, slides, and stops. Its speed is recorded with noise. Each step solves
 
     M v+ = M v + dt (push + gravity) + J^T lambda,      |lambda_t| <= mu lambda_n
 
-and the adjoint goes back through the steps: `vjp(velocity=)` of a step gives the cotangent of the speed before it, and
-what mass and mu have changed in it. Descent is in the logarithms of both, with steps of Barzilai and Borwein (1988).
+and the adjoint runs backwards through the steps: `vjp(velocity=)` of a step returns the cotangent of the speed before
+it, and the derivatives by mass and mu. Gradient descent in the logarithms of both uses the step lengths of Barzilai and
+Borwein (1988).
 
     python examples/recorded_slide.py [FIGURE.png]
 """
@@ -24,12 +25,12 @@ TURNS = 40
 
 
 def push(k):
-    """Force along x in step k [N]: for the first half second."""
+    """Return the force along x in step k [N], which acts during the first half second."""
     return 4.0 * np.sin(np.pi * k / 25.0) if k < 25 else 0.0
 
 
 def step(v, k, mass, mu):
-    """(problem, solution) of one step from velocity v (3,)."""
+    """Return (problem, solution) of one step from velocity v (3,)."""
     free = v + DT * np.array([push(k) / mass, 0.0, -GRAVITY])
     jac = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # normal, two tangents
     problem = lv.Problem.from_jacobian(jac, mass * np.eye(3), free, cones=lv.Cones.contacts(mu))
@@ -37,7 +38,7 @@ def step(v, k, mass, mu):
 
 
 def slide(mass, mu):
-    """Speeds along x (STEPS + 1,) and the steps' problems and solutions."""
+    """Return the speeds along x (STEPS + 1,), and problem and solution of each step."""
     v, speeds, taken = np.zeros(3), [0.0], []
     for k in range(STEPS):
         problem, solution = step(v, k, mass, mu)
@@ -48,7 +49,7 @@ def slide(mass, mu):
 
 
 def loss(recorded, mass, mu):
-    """Half the mean square of the speeds' error [m2/s2], its gradient by (mass, mu), and states of the contact."""
+    """Return half the mean square error of the speeds [m2/s2], its gradient by (mass, mu), and the contact's states."""
     speeds, taken = slide(mass, mu)
     error = (speeds - recorded) / STEPS
     back, by_mass, by_mu, states = np.zeros(3), 0.0, 0.0, []
@@ -65,7 +66,7 @@ def loss(recorded, mass, mu):
 
 
 def numbers():
-    """The way of the descent: (mass, mu, loss) of each turn, and the recording."""
+    """Return (mass, mu, loss) of each iteration of the descent, and the recording."""
     exact, _ = slide(**TRUE)
     recorded = exact + NOISE * np.random.default_rng(0).standard_normal(len(exact))
     x, before, way = np.log([START["mass"], START["mu"]]), None, []
@@ -84,7 +85,7 @@ def numbers():
 
 
 def figure(found, path):
-    """The slide, and mass and mu turn by turn."""
+    """Draw the slide, and mass and mu over the iterations."""
     from matplotlib.figure import Figure
 
     canvas = Figure(figsize=(8, 3.4), layout="constrained")
@@ -104,7 +105,7 @@ def figure(found, path):
 
 
 def main(path="recorded_slide.png"):
-    """Print what was found, save the figure."""
+    """Print the identified parameters and save the figure."""
     found = numbers()
     for turn in (0, 5, 10, 20, TURNS - 1):
         mass, mu, value = found["way"][turn]

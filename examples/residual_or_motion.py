@@ -1,11 +1,11 @@
-"""Where residual and motion error disagree: a tall stack, a heavy end, and light things beside heavy ones.
+"""Residual and motion error disagree: a tall stack, a chain with a heavy end, a light body in a heavy scene.
 
-The residual asks how far one more update would move an impulse. A tall stack answers "hardly", while the whole
-stack still has to slow down: its slowest mode has an eigenvalue of (pi / 2n)^2 / 2 in the metric of d, and an
-error in it shows with the square root of that; measured by doing nothing, which is wrong at the ground alone, the
-factor from residual to motion error comes to about 0.9 sqrt(n). A heavy weight on a chain is worse: after a few
-sweeps each joint is nearly content, and the weight falls all the same. The other way round, a light body far from
-rest makes a large residual (V looks at the worst row) in a scene whose energy is elsewhere and right.
+The residual is the change of the impulse by one more update. In a tall stack this change is small while the whole stack
+still has to slow down: its slowest mode has an eigenvalue of (pi / 2n)^2 / 2 in the metric of d, and an error in it
+contributes with the square root of that. Relative to the zero impulse, which is wrong only at the ground, the factor
+from residual to motion error is about 0.9 sqrt(n). A heavy weight on a chain is worse: after a few sweeps every joint
+has a small residual, but the weight still falls. Conversely, a light body with a large error causes a large residual (V
+is the maximum over rows) in a scene with most of its energy in other, correctly solved bodies.
 
     python examples/residual_or_motion.py [FIGURE.png]
 """
@@ -22,7 +22,7 @@ BUDGETS = (1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1024, 2048)
 
 
 def light_beside_heavy():
-    """A stack of three tonnes, solved, beside one gram that falls on the ground and is not."""
+    """Return a solved stack of three tonnes together with an unsolved body of one gram that falls on the ground."""
     mass = np.array([1000.0, 1000.0, 1000.0, 1e-3])
     jac = np.array([[1.0, 0, 0, 0], [-1, 1, 0, 0], [0, -1, 1, 0], [0, 0, 0, 1]])
     b = np.array([0.16, 0.0, 0.0, 0.16])
@@ -31,7 +31,7 @@ def light_beside_heavy():
 
 
 def curve(name):
-    """Sweeps, residual and motion error of `pgs` on one case."""
+    """Return sweeps, residual and motion error of `pgs` on one case."""
     problem = suite.case(name).problem
     found = []
     for budget in BUDGETS:
@@ -41,7 +41,7 @@ def curve(name):
 
 
 def numbers():
-    """Curves by case, and both errors of the gram."""
+    """Return the curves by case, and both errors of the light body's scene."""
     problem, impulse = light_beside_heavy()
     error = lv.motion_error(problem, impulse)
     return {
@@ -53,7 +53,7 @@ def numbers():
 
 
 def figure(found, path):
-    """Motion error over residual along the sweeps of each case."""
+    """Draw motion error over residual along the sweeps of each case."""
     from matplotlib.figure import Figure
 
     canvas = Figure(figsize=(5.6, 4.4), layout="constrained")
@@ -70,7 +70,7 @@ def figure(found, path):
 
 
 def main(path="residual_or_motion.png"):
-    """Print both errors where the residual first passes 1e-1 (or where the sweeps end) and 1e-3, and of the gram."""
+    """Print both errors when the residual first passes 1e-1 (or the sweeps end) and 1e-3, and of the light body."""
     found = numbers()
     print(f"{'case':<28}{'sweeps':>8}{'residual':>12}{'motion error':>14}{'factor':>9}")
     for name, values in found["curves"].items():

@@ -1,9 +1,9 @@
-"""One problem, several right answers: Coulomb's law does not always say how bodies move.
+"""One problem with several solutions: Coulomb's law does not always determine the motion.
 
-A pyramid of boxes slides over the ground. Solvers end at residuals at the floor of float64 and do not agree: they
-find different motions, decimetres per second apart, and each satisfies every condition of the law. No accuracy
-decides between them; a rule with a name does: nearest to the warm start, most energy taken by friction, or what is
-left when softness vanishes. The convex cone law has one motion, and pays for it by lifting what slides.
+A pyramid of boxes slides over the ground. Solvers reach residuals at the round-off floor of float64 and disagree: their
+motions differ by decimetres per second, and each satisfies every condition of the law. A higher accuracy cannot decide
+between them; a named selection rule can: nearest to the warm start, maximum dissipation by friction, or the limit of
+vanishing compliance. The convex cone law has a unique motion, at the price of lifting sliding bodies.
 
     python examples/two_motions.py [FIGURE.png]
 """
@@ -20,7 +20,7 @@ RULES = ("nearest", "dissipation", "compliant")
 
 
 def places(problem):
-    """Centres (n, 3) [m] of the bodies, from the arms of their contacts: x_a + arm_a = x_b + arm_b."""
+    """Return the centres (n, 3) [m] of the bodies from the arms of their contacts: x_a + arm_a = x_b + arm_b."""
     rows = problem.rows
     at = np.full((rows.n_bodies, 3), np.nan)
     at[0] = 0.0
@@ -36,7 +36,7 @@ def places(problem):
 
 
 def numbers():
-    """The motions, who picks which, what the rules choose, and the motion of the cone law."""
+    """Return the motions, the solvers' and the rules' choices, and the motion of the cone law."""
     problem = suite.case(CASE).problem
     found = lv.find_solutions(problem)
     cone = lv.find_solutions(problem.relaxed("cone"))[0]
@@ -51,14 +51,14 @@ def numbers():
 
 
 def furthest(motions):
-    """The two motions that are furthest apart."""
+    """Return the two motions with the largest distance."""
     p = motions.problem
     pairs = [(i, j) for i in range(len(motions)) for j in range(i)]
     return min(pairs, key=lambda ij: -lv.motion.distance(p, *(motions[k].impulse for k in ij)).speed)[::-1]
 
 
 def figure(found, path):
-    """Side view of the two motions that are furthest apart: velocities in this plane, and their difference."""
+    """Draw a side view of the two most distant motions: velocities in this plane, and their difference."""
     from matplotlib.figure import Figure
 
     problem, motions = found["problem"], found["motions"]
@@ -94,7 +94,7 @@ def _box(centre, half):
 
 
 def main(path="two_motions.png"):
-    """Print the motions, the choices and the picks, and save the figure."""
+    """Print the motions and the choices of rules and solvers, and save the figure."""
     found = numbers()
     print(found["motions"])
     for rule, i in found["rules"].items():

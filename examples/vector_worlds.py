@@ -1,13 +1,13 @@
-"""A verdict for every world of a vector environment, at every step of the training loop.
+"""Judge every world of a vector environment at every step of a training loop.
 
-Needs MuJoCo: pip install mujoco. With "gymnasium[mujoco]" its HalfCheetah-v5; without, hoppers in plain MuJoCo behind
-the same two calls, `reset` and `step`. After each step of the environments the states go to `from_mujoco_many` and
-MuJoCo's answers to `residual_many`: worlds that are further off than a trainer would accept are counted, and their
-samples could be left out.
+Needs MuJoCo: pip install mujoco. With "gymnasium[mujoco]" the environment is HalfCheetah-v5; without it, hoppers in
+plain MuJoCo with the same methods `reset` and `step`. After each step of the environments the states are imported by
+`from_mujoco_many`, and MuJoCo's solutions are judged by `residual_many`. Worlds with an error above the limit of a
+trainer are counted; their samples could be discarded.
 
     python examples/vector_worlds.py [WORLDS [STEPS [ITERATIONS]]]
 
-ITERATIONS: of MuJoCo's solver, to see what too few of them do.
+ITERATIONS: iterations of MuJoCo's solver, to show the effect of too few.
 """
 
 import sys
@@ -29,7 +29,7 @@ HOPPER = """<mujoco><option timestep="0.004"/><worldbody><geom name="floor" type
 
 
 class Hoppers:
-    """Worlds of plain MuJoCo with the calls of a vector environment of gymnasium."""
+    """Worlds of plain MuJoCo with the interface of a vector environment of gymnasium."""
 
     def __init__(self, n, substeps=5):
         import mujoco as mj
@@ -39,7 +39,7 @@ class Hoppers:
         self.datas = [mj.MjData(self.model) for _ in range(n)]
 
     def reset(self, seed):
-        """Each from its start, with another velocity."""
+        """Reset every world to its start, with a random velocity."""
         rng = np.random.default_rng(seed)
         for data in self.datas:
             self.engine.mj_resetData(self.model, data)
@@ -47,11 +47,11 @@ class Hoppers:
         return self.observed(), {}
 
     def observed(self):
-        """Places and velocities (n, nq + nv)."""
+        """Return positions and velocities (n, nq + nv)."""
         return np.array([np.concatenate([data.qpos, data.qvel]) for data in self.datas])
 
     def step(self, actions):
-        """Observations, rewards, who has fallen, who is out of time, and nothing more."""
+        """Step all worlds; return observations, rewards, fallen worlds, timed-out worlds and an empty info."""
         for data, action in zip(self.datas, actions, strict=True):
             data.ctrl[:] = action
             self.engine.mj_step(self.model, data, self.substeps)
@@ -61,7 +61,7 @@ class Hoppers:
 
 
 def make(n):
-    """(environments, model, MjData of each, name)."""
+    """Return (environments, model, MjData of each world, name)."""
     try:
         import gymnasium
 
@@ -74,7 +74,7 @@ def make(n):
 
 
 def states_of(model, datas):
-    """(n, size): where each world stands, with its controls and its warm start."""
+    """Return the state of each world (n, size), with its controls and warm start."""
     import mujoco as mj
 
     kind = mj.mjtState.mjSTATE_INTEGRATION
@@ -85,7 +85,7 @@ def states_of(model, datas):
 
 
 def numbers(n=64, steps=50, iterations=None):
-    """Worlds, seconds of the environments and of the verdicts, errors (steps, n) [m/s], worlds not to learn from."""
+    """Return the number of worlds, times [s] of environments and judge, errors (steps, n) [m/s], rejected worlds."""
     envs, model, datas, name = make(n)
     rng, spent, errors = np.random.default_rng(0), np.zeros(2), np.empty((steps, n))
     envs.reset(seed=0)

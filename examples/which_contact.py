@@ -1,9 +1,9 @@
-"""Which contact would change the motion most: the sensitivity of every row of a robot's step, in one solve.
+"""Sensitivity of a robot's motion to every contact, from one solve with the adjoint of a step.
 
 A biped in the plane: a torso (x, z, pitch), and on each side a thigh and a shank with a foot. The left heel lands and
 slides while the right toe still holds. The scalar is the torso's forward speed after the step. One `vjp(velocity=)`
-gives its derivative by the target of every row, by every coefficient of friction and by everything else; solves with
-one number moved show that it tells the truth.
+gives its derivative by the target of every row, every coefficient of friction and all other data; it is verified by
+solves with one number changed.
 
     python examples/which_contact.py [FIGURE.png]
 """
@@ -24,7 +24,7 @@ MU = 0.2
 
 
 def points(q):
-    """Centres of the five bodies and heel and toe of both feet, (9, 2) [m]."""
+    """Return the centres of the five bodies, and heel and toe of both feet, (9, 2) [m]."""
     x, z, pitch = q[:3]
     hip = np.array([x, z])
     bodies, feet = [hip + 0.2 * np.array([np.sin(pitch), np.cos(pitch)])], []
@@ -40,19 +40,19 @@ def points(q):
 
 
 def turned(q):
-    """Angles of the five bodies [rad]."""
+    """Return the angles of the five bodies [rad]."""
     return np.array([q[2], q[2] + q[3], q[2] + q[3] + q[4], q[2] + q[5], q[2] + q[5] + q[6]])
 
 
 def slopes(function, q, h=1e-6):
-    """Central differences of a function of q."""
+    """Return central differences of a function of q."""
     return np.stack(
         [(function(q + h * e) - function(q - h * e)) / (2.0 * h) for e in np.eye(len(q))], axis=-1
     )
 
 
 def robot():
-    """The step's problem; rows: two knees that may not bend forward, then normal and tangent of heels and toes."""
+    """Return the step's problem; rows: two knee limits, then normal and tangent of heels and toes."""
     jac, spin = slopes(points, Q), slopes(turned, Q)
     each = [MASSES["torso"], *[MASSES["thigh"], MASSES["shank"]] * 2]
     inertia = [0.1 * m * LENGTH**2 for m in each]
@@ -79,7 +79,7 @@ def robot():
 
 
 def numbers():
-    """Derivatives of the torso's speed by targets and mu, and two of them by differences."""
+    """Return the derivatives of the torso's speed by targets and mu, and two of them by differences."""
     problem = robot()
     solution = lv.solve(problem, tol=1e-12)
     d = lv.derivative(problem, solution)
@@ -109,7 +109,7 @@ def numbers():
 
 
 def figure(found, path):
-    """A bar for every row and every coefficient."""
+    """Draw a bar for every row and every coefficient."""
     from matplotlib.figure import Figure
 
     p = found["problem"]
@@ -126,7 +126,7 @@ def figure(found, path):
 
 
 def main(path="which_contact.png"):
-    """Print every row, save the figure."""
+    """Print every row and save the figure."""
     found = numbers()
     p, d = found["problem"], found["d"]
     print(f"{'row':<22}{'state':>12}{'by its target':>16}{'by mu [m/s]':>14}")

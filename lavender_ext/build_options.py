@@ -1,24 +1,24 @@
-"""How the kernels are compiled: read by setup.py and by whoever compiles the same sources elsewhere.
+"""Compiler options of the kernels: used by setup.py and by other builds of the same sources.
 
-A kernel gives the same bits on every CPU of an architecture: `-ffp-contract=off`, never `-march`.
-Directives stand here alone, not at the head of a .pyx file, so that the debug build reaches every kernel.
+A kernel computes the same bits on every CPU of an architecture: `-ffp-contract=off`, never `-march`.
+Directives are set only here, not at the top of a .pyx file, so that the debug build applies to every kernel.
 """
 
 from typing import Any
 
 __all__ = ["COMPILE_FLAGS", "LINK_FLAGS", "directives"]
 
-#: Flags for gcc and clang that fix the bits (no fused multiply-add) and the meaning of a cast pointer. The first takes
-#: back a -ffast-math of CFLAGS, and stands first, since clang's resets -ffp-contract too.
+#: Flags for gcc and clang that make the bits reproducible (no fused multiply-add) and allow pointer casts. The first
+#: cancels a -ffast-math in CFLAGS; it precedes the others because it also resets -ffp-contract in clang.
 COMPILE_FLAGS = ["-fno-fast-math", "-ffp-contract=off", "-fno-strict-aliasing"]
 
-#: CFLAGS reach the linker, too. For fast math, also that of -Ofast, which -O3 takes back, gcc's adds code that makes
-#: the whole process, NumPy as well, round subnormal numbers to zero from the import on.
+#: CFLAGS also reach the linker. With fast math (also from -Ofast, which -O3 cancels) gcc links start-up code that
+#: flushes subnormal numbers to zero in the whole process, NumPy included, from the import on.
 LINK_FLAGS = ["-O3", "-fno-fast-math", "-fno-unsafe-math-optimizations"]
 
 
 def directives(*, debug: bool = False) -> dict[str, Any]:
-    """Cython's compiler directives.
+    """Return Cython's compiler directives.
 
     Parameters
     ----------
@@ -28,7 +28,7 @@ def directives(*, debug: bool = False) -> dict[str, Any]:
     Returns
     -------
     dict
-        Directive to value, as `cythonize(compiler_directives=...)` takes it.
+        {directive: value}, for `cythonize(compiler_directives=...)`.
     """
     return {
         "language_level": 3,
@@ -37,6 +37,6 @@ def directives(*, debug: bool = False) -> dict[str, Any]:
         "initializedcheck": debug,
         "cdivision": True,
         "embedsignature": True,
-        "auto_pickle": False,  # what is copied says itself how (lavender.problem, lavender.judge)
+        "auto_pickle": False,  # classes that can be copied define it themselves (lavender.problem, lavender.judge)
         "freethreading_compatible": True,
     }

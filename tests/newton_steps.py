@@ -7,7 +7,7 @@ from lavender.sim.engine.layout import HEAD, SETTING
 from lavender.sim.engine.stepping import TOL
 from lavender_ext.engine.newton_substep import Substep
 
-OK, NEED_ROOM = 0, 1
+OK, NEED_CAPACITY = 0, 1
 
 
 class NewtonSteps:
@@ -27,7 +27,7 @@ class NewtonSteps:
     def step(self):
         """One step; the eight values of the solver after it."""
         for _ in range(self.substeps):
-            while self.state.kernel.prepare() == NEED_ROOM:
+            while self.state.kernel.prepare() == NEED_CAPACITY:
                 self._take(self.state.with_larger_buffers())
             self.state.kernel.solve(False)
             self.told = self.solver.solve(self.tol)

@@ -1,4 +1,4 @@
-"""Kernels and small calls as rows of a table, each timed beside a bare loop where there is one."""
+"""Kernels and small calls as rows of a table, each timed alternately with a bare loop if there is one."""
 
 from __future__ import annotations
 
@@ -28,29 +28,29 @@ class Row:
     """One kernel on one problem."""
 
     case: str
-    size: str  # what it ran on
-    unit: str  # what `work` counts
-    work: float  # units of one call
-    seconds: float  # s, of one call: least CPU time
-    beside: str = ""  # what was timed in turns with it
-    limit: float = float("nan")  # s, of one call of that
-    residual: float = float("nan")  # -, the judge's, of what came out
-    instructions: float = float("nan")  # of a unit
+    size: str  # size of the problem
+    unit: str  # unit of `work`
+    work: float  # units of work of one call
+    seconds: float  # s, smallest CPU time of one call
+    beside: str = ""  # name of the bare loop that was timed alternately
+    limit: float = float("nan")  # s, smallest CPU time of the bare loop
+    residual: float = float("nan")  # -, relative residual of the result
+    instructions: float = float("nan")  # per unit of work
 
     @property
     def per_unit(self) -> float:
-        """Nanoseconds a unit."""
+        """Nanoseconds per unit of work."""
         return 1e9 * self.seconds / self.work
 
     @property
     def share(self) -> float:
-        """Time of what stands beside it over its own: beside a bare loop, 1 is as fast as can be."""
+        """Time of the bare loop divided by the case's time; 1 is the limit."""
         return self.limit / self.seconds
 
 
 @dataclass(frozen=True)
 class Job:
-    """What a case runs; fields as of `Row`."""
+    """Measurement of one case; fields as in `Row`."""
 
     case: str
     size: str
@@ -59,10 +59,10 @@ class Job:
     call: Callable[[], Any]
     beside: str = ""
     limit: Callable[[], Any] | None = None
-    relative: Callable[[], float] | None = None  # residual of what came out
+    relative: Callable[[], float] | None = None  # relative residual of the result
 
     def row(self, seconds: float) -> Row:
-        """Time it for so long [s]."""
+        """Time the case for `seconds` and return its row."""
         both = [self.call] if self.limit is None else [self.call, self.limit]
         time, *other = least(*both, seconds=seconds)
         return Row(
@@ -79,11 +79,11 @@ class Job:
 
 # -- cases -------------------------------------------------------------------------------------------
 
-_ADD = 64  # sweeps beyond which an iterate moves by nothing: timing goes on from there
+_ADD = 64  # sweeps after which the iterate no longer changes; timing starts there
 
 
 def sweeps(problem: Problem, name: str, n: int, **options: Any) -> tuple[Callable[[], Any], FloatArray]:
-    """A call of n more sweeps of a prepared solver, and the impulses (m,) [N s] that it moves."""
+    """Return a call of n more sweeps of a prepared solver, and the impulses (m,) [N s] that it changes."""
     prepared = prepare(problem, name, **options)
     lam = problem.start()
     prepared.solver.run(prepared.state, lam, _ADD, 0.0)
@@ -91,7 +91,7 @@ def sweeps(problem: Problem, name: str, n: int, **options: Any) -> tuple[Callabl
 
 
 def _count(work: float) -> int:
-    return max(4, int(2e5 / work))  # sweeps of one call: a Python call is then nothing
+    return max(4, int(2e5 / work))  # sweeps of one call, so that the Python call is negligible
 
 
 def _impulses(contacts: int, shuffle: bool = False, **options: Any) -> Job:
@@ -133,7 +133,7 @@ def _matrix(problem: Problem) -> Job:
 
 
 def frictionless(contacts: int) -> Problem:
-    """A pile without friction, with A formed."""
+    """Return a pile without friction, with A formed."""
     pile = lattice_pile(contacts)
     assert pile.rows is not None
     smooth = Problem.from_rows(pile.rows)
@@ -183,7 +183,7 @@ _JOBS: dict[str, Callable[[], Job]] = {
 
 
 def _engine(scene: str, seconds: float, **parameters: Any) -> list[Row]:
-    """A step, and its phases as differences of least times from one state."""
+    """Return rows of a step and of its phases, as differences of smallest times from one state."""
     simulation = Simulation(Scene(scene, dt=1 / 240, solver_iterations=16, **parameters))
     for _ in range(240):
         simulation.step()
@@ -228,12 +228,12 @@ _ENGINES: dict[str, dict[str, Any]] = {
     "engine-box": {"scene": "stack", "n": 1},
 }
 
-#: Names of the cases.
+#: Names of all cases.
 CASES = (*_JOBS, *_ENGINES)
 
 
 def job(name: str) -> Job:
-    """What the case of that name runs, made now.
+    """Build the measurement of a case.
 
     Raises
     ------
@@ -246,7 +246,7 @@ def job(name: str) -> Job:
 
 
 def run(names: Sequence[str] = CASES, *, seconds: float = 0.2) -> Iterator[Row]:
-    """Rows of the cases of those names, as they are measured.
+    """Yield the rows of cases as they are measured.
 
     Parameters
     ----------

@@ -18,7 +18,7 @@ def _number(x: float, form: str = "{:.3g}") -> str:
 
 
 def table(rows: Sequence[Row]) -> str:
-    """Every row, markdown."""
+    """Return the rows as a markdown table."""
     head = ("case", "size", "time", "unit", "ns / unit", "instructions / unit", "beside", "share", "residual")
     cells = []
     for r in rows:
@@ -41,13 +41,13 @@ def table(rows: Sequence[Row]) -> str:
     "--instructions", "count", is_flag=True, help="Count instructions by valgrind's callgrind, minutes."
 )
 def command(cases: tuple[str, ...], seconds: float, count: bool) -> None:
-    """Kernels and small calls beside bare loops of the same mathematics, measured in turns.
+    """Measure kernels and small calls alternately with bare loops of the same mathematics.
 
-    CASES are names; without them all of them.
+    CASES are names of cases; default: all.
     """
     click.echo(f"{machine.cpu_name()}\n")
     found: list[Row] = []
-    list(run([name for name in cases if name not in CASES]))  # a wrong name ends it here
+    list(run([name for name in cases if name not in CASES]))  # raises an error for an unknown name
     for name in cases or CASES:
         click.echo(name, err=True)
         rows = list(run([name], seconds=seconds))

@@ -13,7 +13,7 @@ from pathlib import Path
 from benchmarks.kernels.cases import job
 from lavender.base.errors import InputError, SolverUnavailable
 
-ROOT = Path(__file__).parents[2]  # of the checkout
+ROOT = Path(__file__).parents[2]  # root of the checkout
 _COUNT = """
 import sys
 from benchmarks.kernels.cases import job
@@ -26,14 +26,14 @@ COUNTED = ("impulses", "pgs", "pgs-tridiagonal", "block", "solve-8")
 
 
 def instructions(name: str, calls: int = 10) -> float:
-    """Instructions of a unit of a case, by callgrind: the difference of two runs, about a minute.
+    """Return the instructions per unit of work of a case from two runs in callgrind; takes about a minute.
 
     Raises
     ------
     SolverUnavailable
         valgrind is not installed.
     InputError
-        The case is not one of `COUNTED`, or valgrind failed.
+        The case is not in `COUNTED`, or valgrind failed.
     """
     if name not in COUNTED:
         raise InputError(f"instructions of {name!r} are not counted; of {', '.join(COUNTED)} they are")

@@ -1,4 +1,4 @@
-"""Problems that kernels are timed on, and the same as records of the bare loops."""
+"""Problems of the kernel benchmarks, and their data as records for the bare loops."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from lavender.problem import Problem
 
 
 def tridiagonal(m: int) -> Problem:
-    """A stack of m unit masses, frictionless: 2 on the diagonal, -1 beside it."""
+    """Return a frictionless stack of m unit masses: 2 on the diagonal of A, -1 next to it."""
     import scipy.sparse as sp
 
     a = sp.diags_array([np.full(m - 1, -1.0), np.full(m, 2.0), np.full(m - 1, -1.0)], offsets=[-1, 0, 1])
@@ -22,7 +22,7 @@ def tridiagonal(m: int) -> Problem:
 
 
 def bare_contacts(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
-    """Contacts and bodies of `problem` (two tangents each, no joints) as the records of `microbenchmarks.contact`."""
+    """Return contacts (two tangents) and bodies of a problem without joints as `microbenchmarks.contact` records."""
     rows, data = problem.rows, problem.data
     assert rows is not None
     contacts, bodies = (
@@ -49,5 +49,5 @@ def bare_contacts(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
 
 
 def raw_bytes(array: np.ndarray) -> Any:
-    """An array of records as the bytes that a microbenchmark reads."""
+    """Return an array of records as bytes for a microbenchmark."""
     return array.view(np.uint8).reshape(-1)

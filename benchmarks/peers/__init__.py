@@ -1,8 +1,7 @@
-"""Engines of others on the same scenes, solvers of others on the same problems: error beside time.
+"""Other engines on the same scenes, other solvers on the same problems: time and error.
 
-`engines.measure_scene` steps a scene in each engine that is installed, `race.race` gives problems to the contestants
-of `adapters`, both in turns. Times of a machine that others use say nothing by
-themselves: ratios to ours do.
+`engines.measure_scene` steps a scene in each installed engine, `race.race` gives problems to the contestants of
+`adapters`; both alternate between contestants. On a shared machine only ratios of times are meaningful.
 """
 
 from benchmarks.peers.command import command

@@ -1,9 +1,9 @@
-"""Solvers of others on a problem by their own interface, and ours: time to a given error, by one judge.
+"""Other solvers by their own interfaces, and lavender's: time to a given error by one judge.
 
-A contestant runs a problem at tighter and tighter settings of its own; each run gives a time and an impulse, and the
-time to an error is the least time of a run that has it, by the judge, whatever was asked. It gets a problem in its
-better form (impulse or velocity form of `lavender.external.as_qp`, scaled, in the layout it reads): conversion and
-judging are not counted, the call of its own interface is, in CPU time.
+A contestant solves a problem with increasingly tight settings of its own. Each run gives a CPU time and an impulse; the
+time to an error is the smallest time of a run that reaches it by the judge, whatever its setting. A contestant gets a
+problem in its better form (impulse or velocity form of `lavender.external.as_qp`, scaled, in its own data layout).
+Only the call of its interface is timed, not conversion and judging.
 """
 
 from __future__ import annotations
@@ -36,25 +36,25 @@ from lavender.problem import Problem
 from lavender.problem.cones import CONTACT
 from lavender.solving.solve import prepare
 
-TARGETS = (1e-3, 1e-6, 1e-9)  # errors that all are asked for
-SCRATCH = ", from scratch"  # what names of ours end with that pay for forming A too
-SCIPY = "scipy "  # what names of SciPy's factorisations begin with
-#: Settings of other solvers, loose to tight: their own measures, in units where unknowns are near 1.
+TARGETS = (1e-3, 1e-6, 1e-9)  # relative residuals to reach
+SCRATCH = ", from scratch"  # suffix of lavender's solvers that are timed with forming A
+SCIPY = "scipy "  # prefix of SciPy's factorisations
+#: Settings of other solvers from loose to tight, in their own error measures, with unknowns scaled to about 1.
 LADDER = (1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-12, 1e-14)
-START = 60.0  # s, wall: imports of a backend on a loaded machine
+START = 60.0  # s, wall time allowed for imports of a backend on a loaded machine
 QUICK = {
     **dict.fromkeys(("daqp", "quadprog"), (("", True),)),
     **dict.fromkeys(("piqp", "proxqp"), ((" sparse", False), (" dense", True))),
 }
-DENSE_ROWS = 1700  # rows up to which Siconos' solvers of dense matrices are asked
+DENSE_ROWS = 1700  # maximum rows for Siconos' solvers of dense matrices
 
 Call = Callable[[], tuple[float, FloatArray]]  # one run: s of CPU, impulse (m,) [N s]
-Runs = Callable[[Problem, float], Iterator[Call]]  # problem, limit [s] -> a call for each setting
+Runs = Callable[[Problem, float], Iterator[Call]]  # (problem, limit [s]) -> a call for each setting
 
 
 @dataclass(frozen=True)
 class Contestant:
-    """A solver with its form."""
+    """A solver with its problem form."""
 
     name: str
     peer: bool
@@ -64,18 +64,20 @@ class Contestant:
 
 @dataclass
 class Result:
-    """What one contestant reached on one problem."""
+    """Result of one contestant on one problem."""
 
     problem: str
     rows: int
     law: str
     solver: str
     peer: bool
-    runs: list[tuple[float, float]] = field(default_factory=list)  # s, relative residual, of every setting
+    runs: list[tuple[float, float]] = field(
+        default_factory=list
+    )  # (time [s], relative residual) of every setting
     note: str = ""
 
     def time(self, target: float) -> float:
-        """Least time [s] of a run with at most this relative residual; inf without one."""
+        """Return the smallest time [s] of a run with at most this relative residual, or inf."""
         return min((t for t, r in self.runs if r <= target), default=math.inf)
 
 
@@ -83,7 +85,7 @@ class Result:
 
 
 def _limits(eps: float, n: int, limit: float) -> Limits:
-    # A gap falls towards eps^2 where impulse and slack vanish together; below 1e-18 sums lose it.
+    # The gap decreases as eps^2 if impulse and slack vanish together; below 1e-18 rounding hides it.
     return Limits(eps, max(1e-2 * eps, 1e-18), max(1e-4 * eps, 1e-16), n, limit)
 
 
@@ -94,7 +96,7 @@ def _impulse(qp: QP, x: FloatArray | None, zeta: FloatArray | None) -> FloatArra
 
 
 def _backend(backend: Backend, form: str, own: str = "") -> Contestant:
-    """A backend as `lavender.external` calls it; under the name `own` its own set-up and solve count alone."""
+    """Return the runs of a backend called by `lavender.external`; `own`: only its own set-up and solve are timed."""
 
     def runs(problem: Problem, limit: float) -> Iterator[Call]:
         qp = QPSolver(backend, form=form).prepare(problem)
@@ -109,7 +111,7 @@ def _backend(backend: Backend, form: str, own: str = "") -> Contestant:
             seconds = sum(spent) if own else process_time() - begun
             return seconds, _impulse(qp, answer.x, answer.zeta)
 
-        untold = backend.call is None and backend.settings is None  # runs at its own tolerance
+        untold = backend.call is None and backend.settings is None  # has a fixed tolerance
         for eps in LADDER[:1] if untold else LADDER:
             yield functools.partial(once, eps)
 
@@ -127,7 +129,7 @@ def _backend(backend: Backend, form: str, own: str = "") -> Contestant:
 
 
 def _cone(name: str, form: str) -> Contestant:
-    """Solvers of second-order cone programs by their own interface."""
+    """Return the runs of a solver of second-order cone programs by its own interface."""
 
     def runs(problem: Problem, limit: float) -> Iterator[Call]:
         qp = velocity_form(problem) if form == "velocity" else impulse_form(problem)
@@ -188,7 +190,7 @@ def _three_rows_each(problem: Problem) -> bool:
 
 
 def _pinocchio(lanczos: int | None) -> Contestant:
-    """Pinocchio's ADMM on the Delassus matrix, tangents first as it wants them; lanczos None: its default."""
+    """Return the runs of Pinocchio's ADMM on the Delassus matrix, tangents first; lanczos None: its default."""
 
     def runs(problem: Problem, limit: float) -> Iterator[Call]:
         import pinocchio as pin
@@ -224,7 +226,7 @@ def _pinocchio(lanczos: int | None) -> Contestant:
             x[order] = np.asarray(result.retrieveConstraintImpulses()).ravel()
             return seconds, x * (speed / unit)
 
-        # What 50 iterations cost says how many the limit allows.
+        # Estimate the iterations within the limit from the time of 50 iterations.
         most = int(min(10**6, max(50, limit / max(once(1e-16, 50)[0] / 50, 1e-7))))
         for eps in LADDER:
             yield functools.partial(once, eps, most)
@@ -334,12 +336,12 @@ def _found(seconds: float, impulse: FloatArray) -> tuple[float, FloatArray]:
 
 
 def check_siconos(python: str) -> None:
-    """That an interpreter has Siconos.
+    """Raise an error if an interpreter does not have Siconos.
 
     Raises
     ------
     InputError
-        It cannot be run, or cannot import siconos.numerics.
+        The interpreter cannot be run, or cannot import siconos.numerics.
     """
     try:
         done = subprocess.run(
@@ -352,7 +354,7 @@ def check_siconos(python: str) -> None:
         raise InputError(f"{python} has no Siconos ({last}); on Debian: apt install python3-siconos")
 
 
-# -- all of them -----------------------------------------------------------------------------------
+# -- all contestants--------------------------------------------------------------------------------
 
 
 def _installed(module: str) -> bool:
@@ -360,7 +362,7 @@ def _installed(module: str) -> bool:
 
 
 def contestants(siconos: str = "") -> list[Contestant]:
-    """Every installed solver of others, in each of its forms.
+    """Return every other solver that is installed, in each of its forms.
 
     Parameters
     ----------
@@ -370,14 +372,14 @@ def contestants(siconos: str = "") -> list[Contestant]:
     Raises
     ------
     InputError
-        That interpreter has none.
+        The interpreter does not have Siconos.
     """
     made: list[Contestant] = []
     for backend in BACKENDS:
         if registry.specs()[backend.name].missing() is not None:
             continue
         for form in PROGRAM_FORMS[:2]:
-            # Those whose call is quick enough for an adapter to weigh, with dense matrices and with sparse ones.
+            # Backends with calls so short that the adapter's overhead matters, with dense and sparse matrices.
             ways = QUICK.get(backend.name)
             made += [_backend(backend, form, "clarabel cones" if backend.cones else "")] if ways is None else [
                 _backend(replace(backend, dense=dense, warm=False), form, f"{backend.name}{word}, own interface")
@@ -394,17 +396,17 @@ def contestants(siconos: str = "") -> list[Contestant]:
     return made
 
 
-# -- ours -----------------------------------------------------------------------------------------
+# -- lavender -----------------------------------------------------------------------------------------
 
 
 def ours() -> list[Contestant]:
-    """Every solver of ours, on a problem whose A is known and from scratch."""
+    """Return all of lavender's solvers, on problems with known A and from scratch."""
     names = [name for name, spec in registry.specs().items() if not spec.external and spec.missing() is None]
     return [_ours(name, scratch) for name in names for scratch in (False, True)]
 
 
 def _ours(name: str, scratch: bool) -> Contestant:
-    """`prepare` and `solve` of a problem of which A and d are known, or of one of which nothing is yet."""
+    """Return the runs of `prepare` and `solve` with A and d known, or from scratch without derived data."""
 
     def runs(problem: Problem, limit: float) -> Iterator[Call]:
         def once(tol: float) -> tuple[float, FloatArray]:
@@ -412,7 +414,7 @@ def _ours(name: str, scratch: bool) -> Contestant:
             start = process_time()
             prepared = prepare(given, name)
             seconds = process_time() - start
-            get_reference(given)  # the judge's
+            get_reference(given)  # compute the judge's reference before timing
             first = given.start()
             start = process_time()
             impulse = prepared.solve(impulse=first, tol=tol, max_iter=2**31 - 1, time_limit=limit).impulse

@@ -1,7 +1,7 @@
-"""`python -m benchmarks peers`: engines on the same scenes, solvers on the same problems, error beside time.
+"""`python -m benchmarks peers`: engines on the same scenes, solvers on the same problems, time and error.
 
-Everything runs in one go and in turns, and is given as a ratio to ours: times of a machine that others use say
-nothing by themselves. What is not installed is named; where another is faster, it is said.
+All contestants run alternately in one call, and times are given as ratios to lavender's: on a shared machine times
+alone are not meaningful. Missing packages and faster contestants are listed.
 """
 
 from __future__ import annotations
@@ -62,9 +62,9 @@ def command(
     siconos: str,
     out: Path | None,
 ) -> None:
-    """Engines on the same scenes and solvers on the same problems: time as a ratio to ours, error beside it.
+    """Compare engines on the same scenes and solvers on the same problems: ratios of times, and errors.
 
-    FILES are problems for the solvers; without them a fixed list of small and large ones.
+    FILES are problems for the solvers; default: a fixed list of small and large problems.
     """
 
     def note(text: str) -> None:
@@ -99,7 +99,7 @@ def command(
         try:
             for results in rounds_of_all:
                 found += results
-                keep()  # an interruption costs one problem
+                keep()  # an interruption loses the results of one problem only
         except KeyboardInterrupt:
             note("stopped")
         click.echo(solvers_tables(found))

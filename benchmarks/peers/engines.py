@@ -1,9 +1,9 @@
-"""The same scene stepped by LavenderSim, MuJoCo and PyBullet, in turns; time beside what each step leaves.
+"""The same scene stepped alternately by LavenderSim, MuJoCo and PyBullet: time and errors of a step.
 
-All engines of a scene are built from its bodies, settle on their own, and are then timed in alternating batches
-of steps; the time is the CPU time of the least batch, as noise only adds. Speed and penetration left stand
-beside it, and the judge's residual where the engine's problem is known: ours, and MuJoCo's through
-`lavender.io.from_mujoco`. A soft contact model penetrates by design, so its depth is no error of its solver.
+All engines of a scene are built from its bodies, settle separately, and are then timed in alternating batches of
+steps. The time is the CPU time of the fastest batch, since noise only adds time. Remaining speed and penetration are
+reported as well, and the judge's residual if the engine's problem is known: LavenderSim's, and MuJoCo's through
+`lavender.io.from_mujoco`. A soft contact model penetrates by design; its depth is not an error of its solver.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ from lavender.sim.scene import Scene
 DT = 1.0 / 240.0
 NAN = float("nan")
 SETTLE = 480  # steps, 2 s
-SETTLE_LIMIT = 20.0  # s of CPU; an engine that needs more is left out, and said
-BATCH = 5e-3  # s of CPU of one batch: well above the clock's steps
-#: Name -> scene of the gallery, its parameters.
+SETTLE_LIMIT = 20.0  # s of CPU; a slower engine is left out with a note
+BATCH = 5e-3  # s of CPU of one batch, far above the clock's resolution
+#: Scenes of the comparison: {name: (scene of the gallery, parameters)}.
 SCENES: dict[str, tuple[str, dict[str, Any]]] = {
     "box": ("stack", {"n": 1}),
     "stack6": ("stack", {}),
@@ -43,16 +43,18 @@ SCENES: dict[str, tuple[str, dict[str, Any]]] = {
 
 @dataclass(frozen=True)
 class Step:
-    """One engine on one scene, at steady contact."""
+    """Result of one engine on one scene, at steady contact."""
 
     scene: str
     engine: str
-    accurate: bool  # iterates to its own tolerance; else a fixed number of sweeps
-    time: float = NAN  # s of CPU of one step, least batch; nan: left out, `note` says why
+    accurate: bool  # True: iterates to its own tolerance, False: a fixed number of sweeps
+    time: float = (
+        NAN  # s, CPU time of one step in the fastest batch; nan: left out, with the reason in `note`
+    )
     contacts: int = 0
-    depth: float = NAN  # m, deepest penetration; of a chain the largest gap of a joint, nan: not known
-    speed: float = NAN  # m/s, largest of a body
-    relative: float = NAN  # -, the judge's, of the last step; nan where the engine's problem is not known
+    depth: float = NAN  # m, deepest penetration, or largest joint error of a chain; nan: not known
+    speed: float = NAN  # m/s, largest speed of a body
+    relative: float = NAN  # relative residual of the last step; nan if the engine's problem is not known
     note: str = ""
 
 
@@ -63,7 +65,7 @@ def _scene(name: str, **more: Any) -> Scene:
     return Scene(of, **parameters, **more)
 
 
-#: Engines and modes, of those of the towers: friction in elliptic cones where they have a choice.
+#: Engines and modes, from those of the tower benchmark; elliptic friction cones if there is a choice.
 ENGINES: dict[str, Contestant] = {
     name: stand.ENGINES[name] for name in ("lavender", "newton", "mujoco_pgs", "mujoco_newton", "pybullet")
 }
@@ -73,7 +75,7 @@ ENGINES["mujoco_pyramidal"] = replace(
 
 
 def export(scene: str, cone: str = "elliptic", settle: int = 120) -> Problem:
-    """MuJoCo's problem of a scene after some steps; cone "elliptic" (law "cone") or "pyramidal" ("lcp").
+    """Return MuJoCo's problem of a scene after some steps; cone "elliptic" (law "cone") or "pyramidal" ("lcp").
 
     Raises
     ------
@@ -97,19 +99,19 @@ def measure_scene(
     settle: int = SETTLE,
     rounds: int = 30,
 ) -> list[Step]:
-    """Every installed engine on one scene, in turns.
+    """Measure every installed engine on one scene, alternately.
 
     Parameters
     ----------
     scene : str
-        Of `SCENES`.
+        Name in `SCENES`.
     sweeps : int
-        Of every engine that takes a number of them, at tolerance 0.
+        Number of sweeps of every engine with this option, at tolerance 0.
     engines : names of `ENGINES`
     settle : int
-        Steps before the clock starts.
+        Steps before timing starts.
     rounds : int
-        Batches of each engine, one after another in turn.
+        Batches of each engine, alternating between engines.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Problems of the race: cases, files, folders, and steps of scenes as engines export them."""
+"""Problems of the race: cases, files, folders, and steps of scenes exported by engines."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from lavender.problem import Problem
 from lavender.sim.engine import Simulation
 from lavender.sim.scene import Scene
 
-#: Cases of the suite, `mujoco:SCENE:CONE` (what MuJoCo exports), `scene:SCENE` (what LavenderSim exports).
+#: Cases of the suite, `mujoco:SCENE:CONE` (exported by MuJoCo), `scene:SCENE` (exported by LavenderSim).
 PROBLEMS = (
     "stack(n=8)",
     "stack(n=64)",
@@ -52,22 +52,22 @@ PROBLEMS = (
 def problems(
     words: Sequence[str], say: Callable[[str], None] = lambda _: None
 ) -> Iterator[tuple[str, Problem]]:
-    """(name, problem) of cases, files, folders, and of scenes exported by an engine.
+    """Yield (name, problem) of cases, files, folders, and of scenes exported by an engine.
 
     Parameters
     ----------
     words : names
-        As `lavender report` takes them; `mujoco:SCENE:CONE` and `scene:SCENE` with a scene of
+        Names as in `lavender report`; `mujoco:SCENE:CONE` and `scene:SCENE` with a scene of
         `engines.SCENES`.
     say : callable
-        Told what is left out.
+        Called with a message for each problem that is left out.
 
     Raises
     ------
     InputError
-        Neither a file nor a case.
+        A name is neither a file nor a case.
     UnknownName
-        No such scene or case.
+        The scene or case does not exist.
     """
     for word in words:
         engine, _, rest = word.partition(":")

@@ -1,4 +1,4 @@
-"""The race: every contestant in a process of its own, in turns; the quick ones run again in later rounds."""
+"""The race: every contestant runs in its own process, alternately; the fast ones run again in later rounds."""
 
 from __future__ import annotations
 
@@ -15,20 +15,22 @@ from lavender.judge.residuals import residual
 from lavender.lab.bench.running.timing import one_thread
 from lavender.problem import Problem
 
-REPEATS, REPEAT_TIME = 30, 0.1  # of one setting: at most so many, and as long as they take so long [s]
-AGAIN = 4.0  # a contestant runs again in later rounds when it is within so many times the fastest of its side
-PATIENCE = 10.0  # s, wall, beyond four times the limit of a call, before a contestant is ended
+REPEATS, REPEAT_TIME = 30, 0.1  # repeats of one setting: maximum number, and maximum total time [s]
+AGAIN = 4.0  # A contestant runs in later rounds if it is within this factor of the fastest of its side.
+PATIENCE = 10.0  # s, wall time beyond four times the limit of a call after which a contestant is terminated
 
 
 def _child(pipe: Any, contestant: Contestant, problem: Problem, limit: float) -> None:
-    # In a process of its own: (seconds, residual) of each setting, then None or why it stopped.
+    # Runs in its own process: sends (seconds, residual) of each setting, then None or the reason for stopping.
     try:
         with one_thread(contestant.name), capture_output(noisy=True):
             least = max(min(TARGETS), 2.0 * residual(problem, problem.start()).roundoff_floor)
             for call in contestant.runs(problem, limit):
                 began = monotonic()
                 seconds, impulse = call()
-                late = max(seconds, monotonic() - began) > 0.9 * limit  # solvers' own limits are wall time
+                late = (
+                    max(seconds, monotonic() - began) > 0.9 * limit
+                )  # the solvers' own limits are wall time
                 judged = residual(problem, impulse)
                 spent = seconds
                 for _ in range(REPEATS):
@@ -40,7 +42,7 @@ def _child(pipe: Any, contestant: Contestant, problem: Problem, limit: float) ->
                 if judged.relative <= least or judged.at_floor or late:
                     break
         pipe.send(None)
-    except BaseException as error:  # whatever another project's code does
+    except BaseException as error:  # code of other projects may raise anything
         pipe.send(f"{type(error).__name__}: {error}"[:200])
 
 
@@ -54,7 +56,7 @@ def _run(contestant: Contestant, problem: Problem, limit: float) -> tuple[list[t
     note = ""
     try:
         while True:
-            # CPU time of a call is limited by the solver where it can be; wall time here, on a loaded machine.
+            # The solver limits the CPU time of a call if it can; here wall time is limited, on a loaded machine.
             patience = 4.0 * limit + PATIENCE
             if not mine.poll(patience):
                 note = f"ended after {patience:g} s without an answer"
@@ -84,19 +86,19 @@ def race(
     rounds: int = 3,
     watch: Callable[[str], None] = lambda _: None,
 ) -> Iterator[list[Result]]:
-    """Every contestant that takes a problem, on every problem; the results of each problem when it is done.
+    """Run every contestant on every problem that it accepts; yield the results of each problem.
 
     Parameters
     ----------
     problems : (name, Problem) pairs
     all_of : contestants
     limit : s
-        Of CPU for one call; what takes longer ends a contestant's ladder.
+        CPU time limit of a call; tighter settings are not tried after a longer call.
     rounds : int
-        In the second and later ones, in turns, only those near the fastest of their side run, and ours also from
-        scratch.
+        Number of rounds. From the second on only contestants near the fastest of their side run, and lavender's solvers
+        also from scratch.
     watch : callable
-        Told what runs.
+        Called with the name of what runs.
     """
     for name, problem in problems:
         here: dict[str, Result] = {}

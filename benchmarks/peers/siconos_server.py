@@ -1,10 +1,10 @@
-"""Siconos in an interpreter of its own, which need not have lavender: `python siconos_server.py IN.npz FOLDER`.
+"""Run Siconos in a separate interpreter, which does not need lavender: `python siconos_server.py IN.npz FOLDER`.
 
 IN.npz holds A_data, A_indices, A_indptr (compressed rows), b, mu (c,) or empty, solver, tolerances, limit [s].
-With contacts it is FC3D (three rows each, normal first; a solver named "... dense" gets W as a dense matrix), else an
-LCP with lambda >= 0. For each tolerance, from the
-loosest on, FOLDER/<i>.npz appears with impulse (m,), seconds (least CPU time of the driver alone), info. The
-matrix is built outside the clock. A call that takes more than the limit is the last.
+A problem with contacts is solved as FC3D (three rows each, normal first; a solver named "... dense" gets W as a dense
+matrix), others as an LCP with lambda >= 0. For each tolerance, from the loosest on, FOLDER/<i>.npz is written with
+impulse (m,), seconds (smallest CPU time of the driver alone) and info. Building the matrix is not timed. The first call
+that takes more than the limit is the last.
 """
 # mypy: ignore-errors
 # ruff: noqa: UP031 - the interpreter may be of any age
@@ -16,21 +16,21 @@ import time
 import numpy as np
 import scipy.sparse as sp
 
-#: Those that read compressed columns; the others stop the process on them.
+#: Solvers that accept compressed columns; the others abort the process.
 SPARSE = ("PGS", "CONVEXQP_PG")
-#: Most iterations of a method whose iterations are sweeps; one cannot stop it by the clock.
+#: Maximum iterations of methods with sweeps as iterations, which cannot be stopped by a time limit.
 SWEEPS, STEPS, PROBE = 1_000_000, 1000, 50
 
 
 def options(sn, name, tolerance, problem, cap):
-    """Solver options of FC3D or LCP by name."""
+    """Return the solver options of FC3D or LCP by name."""
     prefix = "SICONOS_FRICTION_3D_" if problem == "FC3D" else "SICONOS_LCP_"
     base, _, local = name.partition("+")
     made = sn.SolverOptions(getattr(sn, prefix + base))
     made.dparam[sn.SICONOS_DPARAM_TOL] = tolerance
     made.iparam[sn.SICONOS_IPARAM_MAX_ITER] = cap
     if base == "NSGS":
-        # The full error in every sweep: the default's cheap one never gets small on singular problems.
+        # Evaluate the full error in every sweep: the default's cheap one does not become small on singular problems.
         full = sn.SICONOS_FRICTION_3D_NSGS_ERROR_EVALUATION_FULL
         made.iparam[sn.SICONOS_FRICTION_3D_IPARAM_ERROR_EVALUATION] = full
     if local == "projection":
@@ -40,7 +40,7 @@ def options(sn, name, tolerance, problem, cap):
 
 
 def main():
-    """Read, solve at each tolerance, write."""
+    """Read the problem, solve it at each tolerance, write the results."""
     import siconos.numerics as sn
 
     given = np.load(sys.argv[1], allow_pickle=False)
@@ -74,7 +74,7 @@ def main():
         cap = PROBE
         seconds, x, info, done = once(tolerance, cap)
         if info != 0 and seconds > 0.0:
-            # What an iteration costs says how many the limit allows.
+            # Estimate the iterations within the limit from the time of one iteration.
             each = seconds / max(1, min(done, PROBE))
             cap = int(min(SWEEPS if sweeps else STEPS, max(PROBE, limit / each)))
             seconds, x, info, done = once(tolerance, cap)

@@ -1,4 +1,4 @@
-"""Engines and solvers of others beside ours: ratios of times, means, losses, as markdown."""
+"""Tables of the comparison with other engines and solvers: ratios of times, means, losses, as markdown."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from lavender.base.deadline import seconds
 from lavender.lab.bench.statistics import geometric_mean
 from lavender.lab.report.text import format_residual
 
-LARGE = 1000  # rows from which a problem counts as large
+LARGE = 1000  # minimum rows of a large problem
 
 
 def over_ours(step: Step, steps: Sequence[Step]) -> float:
-    """Time over that of ours on the same scene in the same mode, sweeps or accurate; nan where there is none."""
+    """Return the time divided by LavenderSim's on the same scene in the same mode (sweeps or accurate), or nan."""
     own = [
         s.time
         for s in steps
@@ -27,7 +27,7 @@ def over_ours(step: Step, steps: Sequence[Step]) -> float:
 
 
 def engines_table(steps: Sequence[Step]) -> str:
-    """Each engine beside ours in the same mode, of one that was left out its note; then where ours takes longer."""
+    """Return the table of engines with ratios in the same mode, or their notes; then LavenderSim's losses."""
     head = ("scene", "engine", "time / ours", "contacts", "depth [mm]", "speed left [m/s]", "residual")
     rows, lost = [], []
     for s in steps:
@@ -48,22 +48,22 @@ def engines_table(steps: Sequence[Step]) -> str:
 
 @dataclass(frozen=True)
 class Comparison:
-    """The fastest of ours and of others at one error on one problem."""
+    """Fastest times of lavender and of other solvers at one error on one problem."""
 
     problem: str
     rows: int
     law: str
     target: float
     ours: str
-    our_time: float  # s, inf: nobody reached it
+    our_time: float  # s; inf: not reached
     peer: str
     peer_time: float
-    scratch: float  # s, the fastest of ours from scratch
-    auto: float  # s, "auto"
+    scratch: float  # s, fastest of lavender from scratch
+    auto: float  # s, solver "auto"
 
     @property
     def ratios(self) -> tuple[float, float, float]:
-        """Ours, from scratch, and auto over the fastest peer; nan where no peer got there, inf where ours did not."""
+        """Lavender's times and those of auto over the fastest peer's; nan: no peer converged, inf: ours did not."""
         known = math.isfinite(self.peer_time)
         a, b, c = (
             t / self.peer_time if known else math.nan for t in (self.our_time, self.scratch, self.auto)
@@ -72,12 +72,12 @@ class Comparison:
 
     @property
     def ratio(self) -> float:
-        """Ours over theirs."""
+        """Time of lavender over the fastest peer's."""
         return self.ratios[0]
 
 
 def compare(results: Sequence[Result], scipy: bool = True) -> list[Comparison]:
-    """One line for each problem and error; `scipy` False leaves out SciPy's factorisations of linear systems."""
+    """Return a comparison for each problem and error; `scipy` False excludes SciPy's linear factorisations."""
     results = [r for r in results if scipy or not r.solver.startswith(SCIPY)]
     found = []
     for name in dict.fromkeys(r.problem for r in results):
@@ -113,15 +113,15 @@ def _fastest(side: Sequence[Result], target: float) -> tuple[str, float]:
 
 
 def losses(compared: Sequence[Comparison]) -> list[Comparison]:
-    """Where a peer is faster, or alone, worst first."""
+    """Return the comparisons in which a peer is faster or alone, worst first."""
     return sorted((c for c in compared if c.ratio > 1.0), key=lambda c: -c.ratio)
 
 
 @dataclass(frozen=True)
 class Mean:
-    """Geometric means of times over the fastest peer's, where both sides reached the error."""
+    """Geometric means of times over the fastest peer's, of problems in which both sides reached the error."""
 
-    which: str  # problems
+    which: str  # group of problems
     target: float
     ours: float
     scratch: float
@@ -130,10 +130,10 @@ class Mean:
 
 
 def means(results: Sequence[Result]) -> list[Mean]:
-    """For cases (and files) and for what engines export, large and smaller, at each error.
+    """Return the means for cases (and files) and for exported problems, large and small, at each error.
 
     Peers are QP and cone backends, Pinocchio and Siconos; the last group counts SciPy's factorisations of linear
-    systems among them, which are no solvers of constraint problems.
+    systems, which do not solve constraint problems in general.
     """
     plain = compare(results, scipy=False)
     groups = {
@@ -160,7 +160,7 @@ def means(results: Sequence[Result]) -> list[Mean]:
 
 
 def _ratio(x: float) -> str:
-    """Three digits; "-" where no peer got there, words where only a peer did."""
+    """Format a ratio with three digits; "-" if no peer reached the error, words if only a peer did."""
     return "-" if math.isnan(x) else "only the peer" if math.isinf(x) else f"{x:.3g}"
 
 
@@ -173,7 +173,7 @@ def _list(compared: Sequence[Comparison]) -> str:
 
 
 def solvers_tables(results: Sequence[Result]) -> str:
-    """Every problem and error, geometric means, losses, and what nobody reached."""
+    """Return the tables of all problems and errors, geometric means, losses, and errors that no solver reached."""
     compared = compare(results)
     reached = [c for c in compared if math.isfinite(min(c.our_time, c.peer_time))]
     head = ("problem", "rows", "law", "error", "ours", "fastest peer", "ours / peer", "from scratch", "auto")

@@ -36,9 +36,9 @@ from lavender.judge.residuals import (
 )
 from lavender.problem import PRECISIONS, Problem, check_problem
 from lavender.problem.derived import cached_property
-from lavender_ext.batch.many import CODE, NUMBER, PLACE, Hand, Worlds, data_of
+from lavender_ext.batch.many import CODE, NUMBER, PLACE, Worker, Worlds, data_of
 
-NO_MORE_WORLDS = -1  # return value of the methods of `Hand`
+NO_MORE_WORLDS = -1  # return value of the methods of `Worker`
 
 
 class Many:
@@ -150,7 +150,7 @@ class Many:
 
     def _run(
         self,
-        process_next: Callable[[Hand], int],
+        process_next: Callable[[Worker], int],
         process_single: Callable[[int], None],
         threads: int,
         errors: str,
@@ -175,7 +175,7 @@ class Many:
                 stop[0] |= errors == "raise"
 
         def work(stop: bytearray) -> None:
-            hand = Hand(self._worlds, stop)
+            hand = Worker(self._worlds, stop)
             while (i := process_next(hand)) != NO_MORE_WORLDS:
                 if i >= 0:
                     try_single(i, stop)

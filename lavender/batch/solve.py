@@ -33,7 +33,7 @@ from lavender.solving.solve import (
     create_unjudged,
     solve,
 )
-from lavender_ext.batch.many import CODE, NUMBER, PLACE, Hand
+from lavender_ext.batch.many import CODE, NUMBER, PLACE, Worker
 from lavender_ext.judge.measure import all_finite
 
 if TYPE_CHECKING:
@@ -357,7 +357,7 @@ def solve_many(
     small = spec.small if uses_loop else None
     limits = (small.limits, small.rules) if small is not None else (None, None)
 
-    def process_next(hand: Hand) -> int:
+    def process_next(hand: Worker) -> int:
         if not deadline.is_set:
             return int(hand.solve(tol, *limits))
         if deadline.passed(0.0):

@@ -1,1 +1,1 @@
-"""One call for one problem or for thousands: lay them out, solve and judge them, on threads without the interpreter."""
+"""One call for one problem or for thousands: convert, solve and judge them, on threads without the interpreter lock."""

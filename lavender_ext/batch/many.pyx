@@ -1,7 +1,7 @@
-"""Problems by J and M, by A or by bodies, one or many, for Python: laid out, solved and judged as `job.pxd` has it.
+"""Python interface to batches: problems by J and M, by A or by bodies, converted, solved and judged by `job.pxd`.
 
-`Worlds` are problems and what came of them; each `Hand` is a thread that takes the next one without the interpreter. What a job
-leaves, its caller solves the long way.
+`Worlds` holds problems and their results. Each `Worker` belongs to one thread and processes the next world without the
+interpreter. The caller solves deferred worlds with the general solvers.
 """
 from cpython.exc cimport PyErr_CheckSignals
 from libc.stdint cimport int32_t, int64_t
@@ -17,14 +17,14 @@ from lavender_ext.core.method cimport workspace_t
 from lavender_ext.core.problem cimport Data, made_t
 from lavender_ext.core.problem import LAWS
 from lavender_ext.core.view cimport view_t
-from lavender_ext.small.call cimport COUNTS, Rules, few_rules_t, few_t, judge_few
-from lavender_ext.batch.job cimport (few_rooms_t, begin, found_by, has_numbers, job_t, judge_job, judging_size, prepare_few,
-                                     solve_few, solve_job)
+from lavender_ext.small.call cimport N_COUNTS, Rules, small_rules_t, small_problem_t, judge_small
+from lavender_ext.batch.job cimport (copy_judgement, ensure_derived, judge_task, judge_zero, judging_size, prepare_small,
+                                     solve_small_task, solve_task, task_t, task_workspaces_t)
 from lavender_ext.small.limits cimport allowed, cost_of, limits_t
-from lavender_ext.small.workspace cimport has_workspace_size, leave
+from lavender_ext.small.workspace cimport has_workspace_size, free_workspace
 from lavender_ext.batch.world cimport (BAD, BLOCK, BLOCKS, CONE_ROW, FREE, JAC, LATE, LEFT, MASS, MU, N_ARRAYS, PLACES,
                                        READY, AT_ROW, FIELDS, ROWS, SOFT, STARTED, TARGET, TRIED, VELOCITIES, VELOCITY,
-                                       desk_t, lay_bodies, lay_matrix, lay_world, worlds_t)
+                                       worker_scratch_t, lay_bodies, lay_matrix, lay_world, worlds_t)
 from lavender_ext.judge.measure cimport set_zero_impulse, judged_from, scratch_of
 from lavender_ext.judge.rounding cimport floor_in_float32, squares32
 from lavender_ext.judge.tally cimport norms_of_rhs
@@ -45,15 +45,15 @@ cdef extern from *:
 
 
 cdef enum:
-    AT_A_TIME = 256             # problems between two checks for Ctrl-C
+    INTERRUPT_CHECK_WORLDS = 256    # worlds between two checks for Ctrl-C
 
 
-cdef int take_given(job_t* j, problem) except -1:
-    """The problem of A or of bodies of which nothing was worked out."""
+cdef int set_problem_task(task_t* j, problem) except -1:
+    """Set up a task from a `Problem` of A or of bodies without derived data."""
     cdef Blocks blocks = problem.cones._blocks
     cdef Py_ssize_t m = blocks.at.n_rows, n, c, joints
     rows, matrix = problem.rows, problem.matrix
-    j.p, j.known, j.begin[0], j.factored = blocks.at, False, -1.0, rows is not None
+    j.p, j.has_derived, j.zero_residual[0], j.factored = blocks.at, False, -1.0, rows is not None
     j.p.law, j.p.b = LAWS[problem.friction], doubles(problem.b, m)
     if j.factored:
         n, c, joints = len(rows.inv_mass), len(rows.normal), len(rows.joint_body)
@@ -71,117 +71,119 @@ cdef int take_given(job_t* j, problem) except -1:
     return 0
 
 
-cdef int take(job_t* j, Data p, start, double* lam, double* both) except -1:
-    """The problem of `p` from `start` (m,) [N s], or from doing nothing where it is None."""
+cdef int set_data_task(task_t* j, Data p, start, double* lam, double* slack_error) except -1:
+    """Set up a task from the data `p`, with the start `start` (m,) [N s] or the zero impulse if it is None."""
     j.p, j.g, j.a, j.r, j.general, j.factored = p.blocks, p.general, p.csr, p.rows, p.is_general, p.factored
-    j.known = p.ready
+    j.has_derived = p.ready
     j.made = p.made
     if not p.is_general:
         j.made.n_empty = <int32_t>len(p.empty)
-    j.begin[0], j.begin[1], j.begin[2] = p.reference_energy, p.reference_velocity, p.relative_at_zero
-    return take_start(j, start, lam, both)
+    j.zero_residual[0], j.zero_residual[1], j.zero_residual[2] = p.reference_energy, p.reference_velocity, p.relative_at_zero
+    return set_start(j, start, lam, slack_error)
 
 
-cdef int take_start(job_t* j, start, double* lam, double* both) except -1:
-    cdef const double[::1] given
-    j.lam, j.both = lam, both
-    j.solved, j.spent, j.cold, j.most, j.by_island = False, False, start is None, INFINITY, NULL
+cdef int set_start(task_t* j, start, double* lam, double* slack_error) except -1:
+    """Set the task's start and output arrays, and reset its result."""
+    cdef const double[::1] values
+    j.lam, j.slack_error = lam, slack_error
+    j.solved, j.limit_reached, j.cold, j.cost_limit, j.by_island = False, False, start is None, INFINITY, NULL
     if not j.cold:
-        given = start
-        if given.shape[0] != j.p.n_rows:
-            raise ValueError(f"{given.shape[0]} numbers for {j.p.n_rows} rows")
+        values = start
+        if values.shape[0] != j.p.n_rows:
+            raise ValueError(f"{values.shape[0]} numbers for {j.p.n_rows} rows")
         if j.p.n_rows:
-            memcpy(lam, &given[0], j.p.n_rows * sizeof(double))
+            memcpy(lam, &values[0], j.p.n_rows * sizeof(double))
     return 0
 
 
-cdef result(job_t* j, Data p, impulse, both):
-    """(What the judge found, None where nobody asked him, counts as of `Newton.run`)."""
-    found = None
-    if j.solved or j.spent:
-        found = judged_from(p, impulse, both, &j.score, j.relative, j.floor, j.float64_relative)
-    return found, (j.counts[0], j.counts[1], j.counts[2], j.counts[3])
+cdef make_result(task_t* j, Data p, impulse, both):
+    """Return (judged result or None, counters as of `Newton.run`)."""
+    judged = None
+    if j.solved or j.limit_reached:
+        judged = judged_from(p, impulse, both, &j.score, j.relative, j.floor, j.float64_relative)
+    return judged, (j.counts[0], j.counts[1], j.counts[2], j.counts[3])
 
 
-cdef void remember(job_t* j, Data p):
-    if p.reference_energy < 0.0 and j.begin[0] >= 0.0:
-        p.keep_reference(j.p.islands, j.begin)
+cdef void store_zero_residual(task_t* j, Data p):
+    """Store the residual of the zero impulse in the data, unless it has one."""
+    if p.reference_energy < 0.0 and j.zero_residual[0] >= 0.0:
+        p.keep_reference(j.p.islands, j.zero_residual)
 
 
 cdef class Limits:
-    """Of the numbers of a `limits_t` (16,)."""
+    """Cost limits, from the fields of a `limits_t` as an array (16,)."""
     cdef limits_t at
 
     def __init__(self, const double[::1] numbers):
         self.at = (<const limits_t*>&numbers[0])[0]
 
     def cost(self, Data p, double work, int islands):
-        """What Newton's method is counted to cost [ns], `work` multiply-adds of a factor of each island; and may cost."""
+        """Return the estimated and permitted cost [ns] of Newton's method; `work`: multiply-adds to factorise every island."""
         cdef bint soft = is_soft(&p.blocks, &p.general)
         return (cost_of(&p.blocks, &p.general, &self.at, work, soft),
                 allowed(&p.blocks, &p.general, &self.at, islands, soft))
 
 
-def solve_first(Data p, start, double tol, Limits limits, double most=INFINITY):
-    """A problem of at least one row of which nothing was worked out: what is worked out of its data, solved, judged, at once.
+def solve_first(Data p, start, double tol, Limits limits, double max_cost=INFINITY):
+    """Set up, solve and judge a problem of J and M with at least one row and without derived data, in one call.
 
-    What the judge finds, None where it does not end below tol, an empty row cannot be met or it costs more than the limits
-    (`limits_t`) let in, and the counts, zeros where nothing was done; most: counted cost [ns] where what was found by then
-    is the result. d, Y and the error of doing nothing stay with the data.
+    Returns (judged result, counters). The result is None if it is above tol, if an empty row violates its target, or if the
+    estimated cost exceeds the limits. The counters are zero if nothing was run. At an estimated cost of `max_cost` [ns] the current
+    iterate is returned. d, Y and the residual of the zero impulse are stored in the data.
     """
-    cdef job_t j
+    cdef task_t j
     cdef workspace_t workspace = workspace_t(0, 0, NULL, NULL, 0, 0, 0, 0.0), islands = workspace
     cdef Py_ssize_t m = p.blocks.n_rows
-    cdef bint known = p.ready
+    cdef bint had_derived = p.ready
     impulse, results = new(m), new(2 * m + 1)
-    take(&j, p, start, doubles(impulse, m), doubles(results, 2 * m + 1))
-    j.most = most
+    set_data_task(&j, p, start, doubles(impulse, m), doubles(results, 2 * m + 1))
+    j.cost_limit = max_cost
     with nogil:
-        solve_job(&j, &workspace, &islands, &limits.at, tol)
-        leave(&workspace)
-    if not known and j.known:
+        solve_task(&j, &workspace, &islands, &limits.at, tol)
+        free_workspace(&workspace)
+    if not had_derived and j.has_derived:
         p.adopt(&j.made)
-    elif not known:
+    elif not had_derived:
         free(j.made.marks)
         free(j.made.numbers)
-    remember(&j, p)
-    leave(&islands)
-    return result(&j, p, impulse, results)
+    store_zero_residual(&j, p)
+    free_workspace(&islands)
+    return make_result(&j, p, impulse, results)
 
 
-cdef enum:                      # what is known of a world when it is done, rows of `Worlds.numbers`
+cdef enum:                      # rows of `Worlds.numbers`: results of each world
     RELATIVE = 0
     ENERGY = 1                  # sqrt J
     SPEED = 2                   # m/s
     FLOOR = 3
-    START_ENERGY = 4            # of doing nothing
+    START_ENERGY = 4            # of the zero impulse
     START_SPEED = 5
     START_RELATIVE = 6
-    RHS_ENERGY = 7              # of b, where the judge alone was asked
+    RHS_ENERGY = 7              # of b; set by `judge` only
     PUSH = 8                    # N s, |e| of the worst row
-    ABOVE_FLOOR = 9             # relative residual that rounding does not explain
+    ABOVE_FLOOR = 9             # part of the relative residual above the round-off floor
     N_NUMBERS = 10
 
 
-#: Columns of `at`, by their names.
+#: Columns of `at` by name.
 PLACE = {"rows": ROWS, "velocities": VELOCITIES, "blocks": BLOCKS, "jac": JAC, "mass": MASS, "free": FREE, "target": TARGET,
          "soft": SOFT, "mu": MU, "block": BLOCK, "cone_row": CONE_ROW, "row": AT_ROW, "velocity": VELOCITY}
 
 
-#: Rows of `Worlds.numbers` and codes of worlds by their names.
+#: Rows of `Worlds.numbers`, and status codes of worlds, by name.
 NUMBER = {"relative": RELATIVE, "energy": ENERGY, "speed": SPEED, "roundoff_floor": FLOOR, "reference_energy": START_ENERGY,
           "reference_speed": START_SPEED, "relative_at_zero": START_RELATIVE, "rhs_energy": RHS_ENERGY, "push": PUSH,
           "above_floor": ABOVE_FLOOR}
 CODE = {"left": LEFT, "ready": READY, "bad": BAD, "tried": TRIED, "late": LATE, "started": STARTED}
 
 
-cdef enum:                      # what `Hand` says in the place of a world's number
+cdef enum:                      # results of `Worker.run` other than the index of a deferred world
     DONE_ALL = -1
-    LISTEN = -2                 # to the clock
+    CHECK_CLOCK = -2            # the caller must check the time limit
 
 
 def data_of(list problems, kind):
-    """(Of each problem its Data, True where nothing was worked out, None of one that the loop leaves; rows of each (n,))."""
+    """Return (per problem its Data, True without derived data, or None if the loop does not support it; rows of each (n,))."""
     cdef Py_ssize_t i, n = len(problems)
     cdef list data = [None] * n
     sizes = np.empty(n, np.int64)
@@ -200,49 +202,49 @@ def data_of(list problems, kind):
     return data, sizes
 
 
-cdef struct hand_t:             # rooms of one thread
+cdef struct worker_t:             # memory of one thread
     workspace_t workspace
-    workspace_t both
+    workspace_t slack_error
     made_t made
-    desk_t desk
-    few_rooms_t few
+    worker_scratch_t scratch
+    task_workspaces_t small
     workspace_t by_island
 
 
-cdef inline bint begin_world(job_t* j, hand_t* h) noexcept nogil:
-    """`begin` of a world by J and M."""
+cdef inline bint judge_world_zero(task_t* j, worker_t* h) noexcept nogil:
+    """Judge the zero impulse of a world of J and M; return False without memory."""
     cdef view_t v = view_t(j.p, NULL, NULL, &j.g)
-    return begin(j, &v, &h.few.islands, h.workspace.real)
+    return judge_zero(j, &v, &h.small.islands, h.workspace.real)
 
 
 cdef class Worlds:
-    """Problems, each made of a few arrays when its turn comes, or given; and what came of them.
+    """Problems of a batch and their results. Problems are objects, or are converted from a few arrays when they are solved.
 
-    `numbers` (N_NUMBERS, n) are those of the judge, `worst` (n,) his worst row, `counts` (n, COUNTS) as of `job_t`; `code`
-    (n,) is LEFT, READY or BAD. `impulse` and `velocity` hold the worlds' one after the other, in the places that `at` says.
+    `numbers` (N_NUMBERS, n) are the judge's results, `worst` (n,) its worst rows, `counts` (n, N_COUNTS) as in `task_t`; `code`
+    (n,) is the status, LEFT, READY, BAD, ... `impulse` and `velocity` hold the worlds one after the other, at the offsets in `at`.
 
     Parameters
     ----------
     problems, data : list
-        Of problems that are objects, and `data_of` them. Starts come with it: (m,) [N s] or None.
+        Problems that are objects, and their `data_of`, with starts (m,) [N s] or None.
     at : (n, PLACES) int64
-        Of arrays, as in `world.pxd`; of objects its columns ROWS and AT_ROW alone.
+        Sizes and offsets as in `world.pxd`; for objects only the columns ROWS and AT_ROW.
     arrays : sequence of 6
         J, M, v*, target, compliance, mu (or None), flat float64 or float32; or A, None, None, b, None, mu.
     strides : (int, int)
-        Numbers from one row to the next of J and of M, 0: as many as velocities.
+        Strides of the rows of J and of M; 0: number of velocities.
     pattern : (indptr, indices) int32, or None
-        Of M, where it holds lower triangles in compressed rows of one pattern.
+        Pattern of M, if it holds lower triangles in compressed rows with one shared pattern.
     impulse, velocity : float64
-        Of the results; of arrays the impulse holds the starts, unless `cold`.
+        Results; for arrays the impulse holds the starts on entry, unless `cold`.
     """
 
-    cdef job_t* jobs            # of objects
+    cdef task_t* tasks            # of objects
     cdef worlds_t w
     cdef int64_t taken
     cdef bint cold
     cdef readonly object numbers, worst, counts, code, impulse, velocity
-    cdef list keep
+    cdef list references
     cdef double* lam
     cdef double* v
     cdef double* number
@@ -254,12 +256,12 @@ cdef class Worlds:
         cdef Py_ssize_t n = at.shape[0]
         self.impulse, self.velocity, self.cold = impulse.base, velocity.base, cold
         self.numbers, self.worst = np.zeros((N_NUMBERS, n + 1)), np.full(n + 1, -1, np.int32)
-        self.counts, self.code = np.zeros((n + 1, COUNTS), np.int32), np.zeros(n + 1, np.int8)
+        self.counts, self.code = np.zeros((n + 1, N_COUNTS), np.int32), np.zeros(n + 1, np.int8)
         cdef double[:, ::1] numbers = self.numbers
         cdef int32_t[::1] worst = self.worst
         cdef int32_t[:, ::1] counts = self.counts
         cdef signed char[::1] code = self.code
-        self.keep = [at]
+        self.references = [at]
         self.w.n = n
         if n:
             self.w.at = &at[0, 0]
@@ -268,7 +270,7 @@ cdef class Worlds:
         self.number, self.worst_at, self.count, self.code_at = &numbers[0, 0], &worst[0], &counts[0, 0], &code[0]
 
     def of_arrays(self, arrays, strides, pattern, Blocks blocks, int law, double asymmetry):
-        """Of arrays, which have passed every check but that of their numbers."""
+        """Set the worlds from arrays that are validated except for their values."""
         cdef const double[::1] wide
         cdef const float[::1] narrow
         cdef const int32_t[::1] ptr, col
@@ -280,7 +282,7 @@ cdef class Worlds:
         self.w.blocks, self.w.asymmetry, self.w.general = blocks.at, asymmetry, arrays[1] is not None
         self.w.blocks.law = law
         self.w.jac_row, self.w.mass_row = strides
-        self.keep += [blocks, pattern, *arrays]
+        self.references += [blocks, pattern, *arrays]
         for i in range(N_ARRAYS):
             self.w.array[i] = NULL
             self.w.narrow[i] = arrays[i] is not None and arrays[i].itemsize == sizeof(float)
@@ -294,11 +296,11 @@ cdef class Worlds:
                 self.w.array[i] = &wide[0]
 
     def of_bodies(self, fields, pairs, int bodies, int joints, int contacts, Blocks blocks, int law):
-        """Of bodies: (array, numbers from one world to the next) of each field of `bodies_t`, and of the pairs."""
+        """Set the worlds from bodies: (array, stride from world to world) for each field of `bodies_t` and for the pairs."""
         cdef int32_t i
         self.w.blocks, self.w.general, self.w.factored = blocks.at, False, True
         self.w.blocks.law = law
-        self.keep += [blocks, fields, pairs]
+        self.references += [blocks, fields, pairs]
         for i in range(FIELDS):
             array, self.w.bodies.step[i] = fields[i]
             self.w.bodies.field[i] = doubles(array, array.size)
@@ -308,60 +310,61 @@ cdef class Worlds:
         self.w.bodies.n, self.w.bodies.joints, self.w.bodies.contacts = bodies, joints, contacts
 
     def of_objects(self, list problems, list data, list starts):
-        """Of problems by their `data_of`, None where one is left to the caller."""
+        """Set the worlds from problems and their `data_of`; None defers a problem to the caller."""
         cdef int64_t i
-        cdef job_t* j
-        self.jobs = <job_t*>calloc(self.w.n + 1, sizeof(job_t))
-        if self.jobs == NULL:
+        cdef task_t* j
+        self.tasks = <task_t*>calloc(self.w.n + 1, sizeof(task_t))
+        if self.tasks == NULL:
             raise MemoryError(f"{self.w.n} problems")
-        self.keep += [problems, data]
+        self.references += [problems, data]
         for i in range(self.w.n):
-            p, j = data[i], &self.jobs[i]
+            p, j = data[i], &self.tasks[i]
             if p is True:
-                take_given(j, problems[i])
-                take_start(j, starts[i], self.lam + self.w.at[i * PLACES + AT_ROW], NULL)
+                set_problem_task(j, problems[i])
+                set_start(j, starts[i], self.lam + self.w.at[i * PLACES + AT_ROW], NULL)
             elif p is not None:
-                take(j, p, starts[i], self.lam + self.w.at[i * PLACES + AT_ROW], NULL)
+                set_data_task(j, p, starts[i], self.lam + self.w.at[i * PLACES + AT_ROW], NULL)
 
     def remember(self, data):
-        """Doing nothing stays with the data of what was solved."""
+        """Store the residuals of the zero impulse in the data of solved problems."""
         cdef int64_t i
         for i in range(self.w.n):
             if self.code_at[i] == READY and data[i] is not True:
-                remember(&self.jobs[i], data[i])
+                store_zero_residual(&self.tasks[i], data[i])
 
     cdef bint is_general(self, int64_t i) noexcept nogil:
-        return self.jobs[i].general if self.jobs != NULL else self.w.general
+        return self.tasks[i].general if self.tasks != NULL else self.w.general
 
-    cdef int32_t lay(self, int64_t i, desk_t* desk, workspace_t* both, const made_t* made, job_t* j) noexcept nogil:
-        """World i for a solve or for the judge."""
+    cdef int32_t lay(self, int64_t i, worker_scratch_t* scratch, workspace_t* slack_error, const made_t* made,
+                     task_t* j) noexcept nogil:
+        """Convert world i for a solve or for the judge; return READY, BAD or LEFT."""
         cdef const int64_t* at = self.w.at + i * PLACES
         cdef int32_t code = READY
-        if self.jobs != NULL:
-            j[0] = self.jobs[i]
+        if self.tasks != NULL:
+            j[0] = self.tasks[i]
             if j.p.n_rows == 0:
                 return LEFT
         else:
             j.general, j.factored = self.w.general, self.w.factored
             if j.general:
-                code = lay_world(&self.w, i, desk, &j.p, &j.g)
+                code = lay_world(&self.w, i, scratch, &j.p, &j.g)
             elif j.factored:
-                code = lay_bodies(&self.w, i, desk, &j.p, &j.r)
+                code = lay_bodies(&self.w, i, scratch, &j.p, &j.r)
             else:
-                code = lay_matrix(&self.w, i, desk, &j.p, &j.dense, &j.row)
-            j.begin[0] = -1.0
+                code = lay_matrix(&self.w, i, scratch, &j.p, &j.dense, &j.row)
+            j.zero_residual[0] = -1.0
             j.by_island = NULL
-            j.solved, j.spent, j.cold, j.known, j.lam = False, False, self.cold, False, self.lam + at[AT_ROW]
-        if not j.known and j.general:
+            j.solved, j.limit_reached, j.cold, j.has_derived, j.lam = False, False, self.cold, False, self.lam + at[AT_ROW]
+        if not j.has_derived and j.general:
             j.made = made[0]
-        j.most = INFINITY
-        if not has_workspace_size(both, 0, 2 * at[ROWS] + 1):
+        j.cost_limit = INFINITY
+        if not has_workspace_size(slack_error, 0, 2 * at[ROWS] + 1):
             return LEFT
-        j.both = both.real
+        j.slack_error = slack_error.real
         return code
 
-    cdef void keep_result(self, int64_t i, const job_t* j, const desk_t* desk) noexcept nogil:
-        """The judge's numbers, and v+ of arrays."""
+    cdef void store_result(self, int64_t i, const task_t* j, const worker_scratch_t* scratch) noexcept nogil:
+        """Store the judge's results, and v+ of worlds in arrays."""
         cdef const int64_t* at = self.w.at + i * PLACES
         cdef double* v
         cdef int64_t n = self.w.n + 1
@@ -371,150 +374,154 @@ cdef class Worlds:
         self.number[ENERGY * n + i] = j.score.energy if j.score.finite else INFINITY
         self.number[SPEED * n + i] = j.score.velocity if j.score.finite else INFINITY
         for k in range(3):
-            self.number[(START_ENERGY + k) * n + i] = j.begin[k]
+            self.number[(START_ENERGY + k) * n + i] = j.zero_residual[k]
         self.worst_at[i] = j.score.worst
-        self.number[PUSH * n + i] = fabs(j.both[j.p.n_rows + j.score.worst]) if j.score.worst >= 0 else 0.0
-        if self.jobs == NULL:
+        self.number[PUSH * n + i] = fabs(j.slack_error[j.p.n_rows + j.score.worst]) if j.score.worst >= 0 else 0.0
+        if self.tasks == NULL:
             v = self.v + at[VELOCITY]
             for k in range(at[VELOCITIES]):
-                v[k] = desk.free[k] + j.push[k]
+                v[k] = scratch.free[k] + j.push[k]
 
-    cdef int32_t empty(self, int64_t i, const desk_t* desk) noexcept nogil:
-        """A world without rows, which nothing moves."""
-        memcpy(self.v + self.w.at[i * PLACES + VELOCITY], desk.free,
+    cdef int32_t store_empty_world(self, int64_t i, const worker_scratch_t* scratch) noexcept nogil:
+        """Store v+ = v* of a world without rows."""
+        memcpy(self.v + self.w.at[i * PLACES + VELOCITY], scratch.free,
                self.w.at[i * PLACES + VELOCITIES] * sizeof(double))
         return READY
 
-    cdef int32_t solve(self, int64_t i, hand_t* h, const limits_t* limits, const few_rules_t* rules, double tol,
-                       double most) noexcept nogil:
-        cdef job_t j
-        cdef int32_t code = LEFT
-        cdef bint known
+    cdef int32_t solve(self, int64_t i, worker_t* h, const limits_t* limits, const small_rules_t* rules, double tol,
+                       double max_cost) noexcept nogil:
+        """Solve world i, store its result and return its status."""
+        cdef task_t j
+        cdef int32_t k, code = LEFT
+        cdef bint had_derived
         if limits == NULL if self.is_general(i) else rules == NULL:
             return LEFT
-        code = self.lay(i, &h.desk, &h.both, &h.made, &j)
+        code = self.lay(i, &h.scratch, &h.slack_error, &h.made, &j)
         if code != READY:
             return code
         if j.p.n_rows == 0:
-            return self.empty(i, &h.desk)
-        known, j.most = j.known, most
+            return self.store_empty_world(i, &h.scratch)
+        had_derived, j.cost_limit = j.has_derived, max_cost
         if j.general:
-            solve_job(&j, &h.workspace, &h.few.islands, limits, tol)
-            if not known:
-                h.made = j.made                         # whose workspace the next one has
+            solve_task(&j, &h.workspace, &h.small.islands, limits, tol)
+            if not had_derived:
+                h.made = j.made                         # its memory is reused for the next world
             code = READY if j.solved else TRIED
         else:
-            code = solve_few(&j, &h.few, rules, tol)
+            code = solve_small_task(&j, &h.small, rules, tol)
         if code == READY or code == STARTED:
-            self.keep_result(i, &j, &h.desk)
+            self.store_result(i, &j, &h.scratch)
         if code != LEFT:
-            memcpy(&self.count[COUNTS * i], j.counts, sizeof(j.counts))
-        if self.jobs != NULL and j.p.islands == NULL:   # islands are in memory that the next world uses
-            self.jobs[i].begin[0], self.jobs[i].begin[1], self.jobs[i].begin[2] = j.begin[0], j.begin[1], j.begin[2]
+            memcpy(&self.count[N_COUNTS * i], j.counts, sizeof(j.counts))
+        if self.tasks != NULL and j.p.islands == NULL:   # the next world reuses the memory of islands
+            for k in range(3):
+                self.tasks[i].zero_residual[k] = j.zero_residual[k]
         return code
 
-    cdef int32_t judge(self, int64_t i, hand_t* h, double tol, bint narrow, bint late) noexcept nogil:
-        """The judge alone, refined for `tol`, beside the floor of float32 where `narrow`; empty rows are left to the caller.
+    cdef int32_t judge(self, int64_t i, worker_t* h, double tol, bint narrow, bint late) noexcept nogil:
+        """Judge world i without solving, refined for `tol`, and return its status; worlds with empty rows are deferred.
 
-        late: so are problems of A and of bodies, whose numbers wait until they are read.
+        narrow: with the round-off floor of float32. late: problems of A and of bodies are deferred as well, since they are judged
+        when their result is read.
         """
-        cdef job_t j
-        cdef few_t s
-        cdef int32_t k, code = self.lay(i, &h.desk, &h.both, &h.made, &j), m = j.p.n_rows
-        cdef bint known = j.known
+        cdef task_t j
+        cdef small_problem_t s
+        cdef int32_t k, code = self.lay(i, &h.scratch, &h.slack_error, &h.made, &j), m = j.p.n_rows
+        cdef bint had_derived = j.has_derived
         cdef double size
         cdef double* x
         if code != READY:
             return code
         if m == 0:
-            return self.empty(i, &h.desk)
+            return self.store_empty_world(i, &h.scratch)
         code = LEFT
         if not j.general:
-            if narrow or (late and self.jobs != NULL) or not prepare_few(&j, &s, &h.few):
+            if narrow or (late and self.tasks != NULL) or not prepare_small(&j, &s, &h.small):
                 return LEFT
-            if not has_workspace_size(&h.few.call.work, 0, scratch_of(&s.v)):
+            if not has_workspace_size(&h.small.call.work, 0, scratch_of(&s.v)):
                 return LEFT
             if j.cold:
-                set_zero_impulse(&j.p, j.lam, j.both)
+                set_zero_impulse(&j.p, j.lam, j.slack_error)
             code = READY
-            judge_few(&s, j.lam, j.both, h.few.call.work.real)
-            found_by(&j, &s)
-            j.push = h.few.call.work.real
-        elif (has_numbers(&j) and j.made.n_empty == 0
+            judge_small(&s, j.lam, j.slack_error, h.small.call.work.real)
+            copy_judgement(&j, &s)
+            j.push = h.small.call.work.real
+        elif (ensure_derived(&j) and j.made.n_empty == 0
               and has_workspace_size(&h.workspace, 0, max(judging_size(&j), 4 * <int64_t>m + 5 * j.g.n))
-              and has_workspace_size(&h.by_island, 0, 2 * <int64_t>j.p.n_blocks) and begin_world(&j, h)):
+              and has_workspace_size(&h.by_island, 0, 2 * <int64_t>j.p.n_blocks) and judge_world_zero(&j, h)):
             code, x = READY, h.workspace.real
             if j.cold:
-                set_zero_impulse(&j.p, j.lam, j.both)
+                set_zero_impulse(&j.p, j.lam, j.slack_error)
             j.by_island = h.by_island.real
-            judge_job(&j, tol, x)
+            judge_task(&j, tol, x)
             if narrow:
-                x += j.g.n                              # behind what is pushed
-                squares32(&j.p, &j.g, &h.desk.mass, h.desk.free, j.lam, x, x + m, x + 2 * m, x + 3 * m)
+                x += j.g.n                              # after M^-1 J^T lam
+                squares32(&j.p, &j.g, &h.scratch.mass, h.scratch.free, j.lam, x, x + m, x + 2 * m, x + 3 * m)
                 for k in range(m):
                     x[k] = x[k] + x[m + k] + x[2 * m + k]
-                j.floor = floor_in_float32(&j.p, x, &j.score, j.relative, j.begin[0], j.begin[1], &j.above_floor)
+                j.floor = floor_in_float32(&j.p, x, &j.score, j.relative, j.zero_residual[0], j.zero_residual[1], &j.above_floor)
         if code == READY:
-            self.keep_result(i, &j, &h.desk)
+            self.store_result(i, &j, &h.scratch)
             norms_of_rhs(&j.p, &self.number[RHS_ENERGY * (self.w.n + 1) + i], &size)
-        if j.general and not known:
+        if j.general and not had_derived:
             h.made = j.made
         return code
 
     def __dealloc__(self):
-        free(self.jobs)
+        free(self.tasks)
 
 
-cdef class Hand:
-    """One thread at work on `Worlds`: it takes the next one as long as there is one, by an atomic counter.
+cdef class Worker:
+    """Worker of one thread: processes the next of `Worlds`, selected by an atomic counter, until there are no more.
 
     stop : (1,) bytes
-        What is not begun when it becomes nonzero never is: Ctrl-C comes to another thread than this.
+        No world is started after it becomes nonzero: another thread receives Ctrl-C.
     """
 
     cdef Worlds worlds
-    cdef hand_t h
+    cdef worker_t h
     cdef const unsigned char[::1] stop
 
     def __init__(self, Worlds worlds, const unsigned char[::1] stop):
-        self.worlds, self.stop, self.h.desk.n_tree = worlds, stop, -1
+        self.worlds, self.stop, self.h.scratch.n_tree = worlds, stop, -1
 
     def __dealloc__(self):
-        leave(&self.h.workspace)
-        leave(&self.h.both)
-        leave(&self.h.desk.workspace)
-        leave(&self.h.desk.tree)
-        leave(&self.h.by_island)
-        leave(&self.h.few.islands)
-        leave(&self.h.few.made)
-        leave(&self.h.few.formed)
-        leave(&self.h.few.kept)
-        leave(&self.h.few.call.work)
-        leave(&self.h.few.call.more)
+        free_workspace(&self.h.workspace)
+        free_workspace(&self.h.slack_error)
+        free_workspace(&self.h.scratch.workspace)
+        free_workspace(&self.h.scratch.tree)
+        free_workspace(&self.h.by_island)
+        free_workspace(&self.h.small.islands)
+        free_workspace(&self.h.small.made)
+        free_workspace(&self.h.small.formed)
+        free_workspace(&self.h.small.bound)
+        free_workspace(&self.h.small.call.work)
+        free_workspace(&self.h.small.call.more)
         free(self.h.made.marks)
         free(self.h.made.numbers)
 
-    def solve(self, double tol, Limits limits, Rules rules, double most=INFINITY):
-        """Solve worlds until one is left to the caller, which is returned; DONE_ALL where there are no more.
+    def solve(self, double tol, Limits limits, Rules rules, double max_cost=INFINITY):
+        """Solve worlds until one is deferred and return its index, or DONE_ALL if there are no more.
 
-        Without limits every world of J and M is left, without rules every other. most : counted cost [ns] of a world at which it
-        is; LISTEN is then returned after each.
+        Without limits all worlds of J and M are deferred, without rules all others. max_cost: estimated cost [ns] of a
+        world at which its current iterate is the result; CHECK_CLOCK is then returned after each world.
         """
-        return self.run(tol, limits, rules, most, 0, False)
+        return self.run(tol, limits, rules, max_cost, 0, False)
 
     def judge(self, double tol, bint narrow, bint late=False):
-        """Judge the impulses of worlds until one is left to the caller; narrow: beside the floor of float32.
+        """Judge the impulses of worlds until one is deferred; narrow: with the round-off floor of float32.
 
-        late: as what they keep where there was no time to solve.
+        late: the worlds keep their starts, because there was no time to solve.
         """
         return self.run(tol, None, None, INFINITY, LATE if late else READY, narrow)
 
-    cdef int64_t run(self, double tol, Limits limits, Rules rules, double most, int32_t judges, bint narrow) except? -3:
+    cdef int64_t run(self, double tol, Limits limits, Rules rules, double max_cost, int32_t judges, bint narrow) except? -3:
+        """Process worlds until one is deferred; judges: 0 to solve, or the status of judged worlds."""
         cdef Worlds w = self.worlds
         cdef const limits_t* at = &limits.at if limits is not None else NULL
-        cdef const few_rules_t* few = &rules.at if rules is not None else NULL
+        cdef const small_rules_t* small_rules = &rules.at if rules is not None else NULL
         cdef int64_t i, n = w.w.n
-        cdef int32_t code, done = 0
+        cdef int32_t code, n_done = 0
         with nogil:
             while not self.stop[0]:
                 i = lav_add(&w.taken, 1)
@@ -525,14 +532,14 @@ cdef class Hand:
                     if code == READY:
                         code = judges
                 else:
-                    code = w.solve(i, &self.h, at, few, tol, most)
+                    code = w.solve(i, &self.h, at, small_rules, tol, max_cost)
                 w.code_at[i] = <signed char>code
                 if code == LEFT or code == TRIED:
                     return i
-                if most < INFINITY:
-                    return LISTEN
-                done += 1
-                if done % AT_A_TIME == 0:
+                if max_cost < INFINITY:
+                    return CHECK_CLOCK
+                n_done += 1
+                if n_done % INTERRUPT_CHECK_WORLDS == 0:
                     with gil:
                         PyErr_CheckSignals()
         return DONE_ALL

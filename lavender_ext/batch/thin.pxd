@@ -1,4 +1,4 @@
-"""Numbers other than 0 of a row, with their columns: eight at a time (AVX-512) where the processor can, else one by one."""
+"""Extract the nonzeros of a row with their columns: eight at a time (AVX-512) if the processor supports it, else one by one."""
 from libc.stdint cimport int32_t
 
 
@@ -31,7 +31,7 @@ cdef extern from *:
     static int lavender_thin(int n, const double* x, const int* col, int* idx, double* val) {
         int q = 0;
         if (LAVENDER_THIN_WIDE()) return lavender_thin_wide(n, x, col, idx, val);
-        for (int j = 0; j < n; j++) {                   /* without a branch, which would be guessed */
+        for (int j = 0; j < n; j++) {                   /* branch-free: the pattern is unpredictable */
             idx[q] = col ? col[j] : j;
             val[q] = x[j];
             q += x[j] != 0.0;
@@ -39,5 +39,5 @@ cdef extern from *:
         return q;
     }
     """
-    # How many of x (n) are not 0; with their columns (NULL: 0, 1 ...) into idx and val, which have workspace for n + 8.
+    # Copies the nonzeros of x (n) and their columns (col NULL: 0, 1 ...) to val and idx, both of size n + 8; returns their number.
     int32_t thin "lavender_thin"(int32_t n, const double* x, const int32_t* col, int32_t* idx, double* val) noexcept nogil

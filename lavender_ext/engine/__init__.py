@@ -1,1 +1,1 @@
-"""LavenderSim's substep: arrays, collision detection, rows of contacts and joints, solves, projection, integration."""
+"""LavenderSim's substep: arrays, collision detection, contact and joint rows, solves, projection, integration."""

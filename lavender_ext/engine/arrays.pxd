@@ -88,15 +88,15 @@ cpdef enum:
     S_ROLLING = 24          # m, mu_r of every contact with friction
     N_SETTINGS = 25
 
-# The broad phase stops if more than MOST_PAIRS boxes overlap; it then reports TOO_MANY as the needed capacity.
+# The broad phase stops if more than MAX_PAIRS boxes overlap; it then reports PAIR_COUNT_OVERFLOW as the needed capacity.
 cpdef enum:
-    MOST_PAIRS = 16777216
-    TOO_MANY = 2147483647
+    MAX_PAIRS = 16777216
+    PAIR_COUNT_OVERFLOW = 2147483647
 
 # status of a substep
 cpdef enum:
     OK = 0
-    NEED_ROOM = 1           # H_NEED_PAIRS and H_NEED_CONTACTS hold the needed capacities; the state is unchanged
+    NEED_CAPACITY = 1           # H_NEED_PAIRS and H_NEED_CONTACTS hold the needed capacities; the state is unchanged
     NOT_FINITE = 2          # H_LOST holds the body
 
 # shapes

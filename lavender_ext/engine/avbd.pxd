@@ -1,25 +1,25 @@
 """Block descent over bodies with an augmented Lagrangian (Giles, Diaz, Yuksel, "Augmented Vertex Block Descent", 2025).
 
-Displacements z of a substep, 6 a body [m, rad], y = h v* those of free flight, J z linear in them, C the error of a
-row at the start, lambda its multiplier [N s], kappa its stiffness [N s/m]. With impulses p of the rows
+Let z (6 per body) [m, rad] be the displacements of a substep, y = h v* the displacements of free flight, C the error
+of a row at the start, lambda its multiplier [N s], kappa its stiffness [N s/m]. The impulses p of the rows are
 
-    normal    p = max(0, lambda - kappa (C' + J z))        C' = C where the gap is open, (1 - alpha) C where not
+    normal    p = max(0, lambda - kappa (C' + J z))        C' = C if the gap is open, else (1 - alpha) C
     tangents  p = lambda - kappa J z, in the disk mu p_n                                              (1)
     joint     p = clip(lambda - kappa ((1 - alpha) C + J z), bounds)
 
-body after body takes the Newton step of (1/2h) (z - y).M (z - y) + sum over its rows:
+Each body in turn takes the Newton step of (1/2h) (z - y).M (z - y) + sum over its rows:
 
     (M/h + sum kappa J^T J) dz = -M (z - y)/h + sum J^T p                                             (2)
 
-over the rows that push. Where a contact that did not would push after that step (the next step would open it again, and
-so on, through the ground), the step is taken once more with its row, of lambda - kappa (C' + J z) < 0, too. Then all rows
-take lambda <- p, and those inside their bounds
+over the active rows (p > 0). If an inactive contact would become active after that step, the step is computed once more
+with its row, lambda - kappa (C' + J z) < 0, included. Otherwise the next step would open the contact again, and the body
+would move through the ground. After each pass all rows are updated by lambda <- p, and rows inside their bounds by
 
     kappa <- kappa + beta kappa0 |C' + J z| / slop,   kappa0 = 1/(h A_ii)                             (3)
 
-A soft joint keeps kappa = h k + c and lambda = 0. lambda and kappa of a contact begin at gamma times what the cache has
-of the last substep (kappa in the place of the spin row, which this stepper does not know), never below kappa0. The
-share alpha of an error is left where it is, so that a substep takes away no more than 1 - alpha of it. v = z/h.
+A soft joint has the constants kappa = h k + c and lambda = 0. lambda and kappa of a contact start at gamma times the
+cached values of the last substep, kappa at kappa0 or more. (The cache stores kappa in the entry of the spin row, which
+this stepper does not support.) A substep removes at most the fraction 1 - alpha of an error. v = z/h.
 """
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
@@ -34,49 +34,53 @@ from lavender_ext.engine.projection cimport displacement, rigid_row
 from lavender_ext.engine.vectors cimport scale3
 
 cdef enum:
-    STIFFEST = 100              # times kappa0
+    MAX_STIFFNESS_RATIO = 100   # kappa is limited to this multiple of kappa0
 
 
-cdef inline double fading() noexcept nogil:
-    return 0.99                                         # gamma
+cdef inline double warm_start_fraction() noexcept nogil:
+    """Return gamma, the fraction of the last substep's multipliers and stiffnesses that a substep starts from."""
+    return 0.99
 
 
 cdef inline double normal_error(const engine_t* e, int32_t c) noexcept nogil:
+    """Return C' [m] of a contact's normal, (1)."""
     return e.gap[c] if e.gap[c] > 0.0 else (1.0 - e.setting[S_HERTZ]) * e.gap[c]
 
 
 cdef inline int32_t contact_impulse(const engine_t* e, int32_t c, const double* z, double* p, double* t2, double* turn,
                                     double* error) noexcept nogil:
-    """(1) of a contact: p (1 or 3); 1 where it bears and does not slide.
+    """Compute the impulses p (1 or 3) of a contact by (1); return 1 if it carries load and does not slide.
 
-    And its second tangent, turn (rows, 6) of its axes, and C' + J z of its normal.
+    Also computes its second tangent t2, turn (rows, 6) of its axes (see `displacement`), and error = C' + J z of its normal.
     """
     cdef int32_t block = e.size[N_JOINT] + c, row = e.ptr[block]
     cdef const double* n = e.normal + 3 * c
-    cdef double kappa = e.push[e.size[N_JOINT_ROW] + c], r, s
+    cdef double kappa = e.push[e.size[N_JOINT_ROW] + c], friction_bound, tangential_impulse
+    # normal impulse, clamped at 0
     error[0] = normal_error(e, c) + displacement(e, c, z, n, turn)
     p[0] = e.impulse[row] - kappa * error[0]
     if p[0] < 0.0:
         p[0] = 0.0
     if e.mu[block] == 0.0:
         return p[0] > 0.0
+    # friction, projected radially on the disk
     cross(n, e.tangent + 3 * c, t2)
     p[1] = e.impulse[row + 1] - kappa * displacement(e, c, z, e.tangent + 3 * c, turn + 6)
     p[2] = e.impulse[row + 2] - kappa * displacement(e, c, z, t2, turn + 12)
-    r = e.mu[block] * p[0]
-    s = sqrt(p[1] * p[1] + p[2] * p[2])
-    if s > r:
-        p[1] *= r / s
-        p[2] *= r / s
+    friction_bound = e.mu[block] * p[0]
+    tangential_impulse = sqrt(p[1] * p[1] + p[2] * p[2])
+    if tangential_impulse > friction_bound:
+        p[1] *= friction_bound / tangential_impulse
+        p[2] *= friction_bound / tangential_impulse
         return 0
     return p[0] > 0.0
 
 
 cdef inline double joint_impulse(const engine_t* e, int32_t i, int32_t row, const double* z) noexcept nogil:
-    """(1) of a joint row; a motor's error is a speed, a soft row has its spring and damper."""
+    """Return the impulse of a joint row by (1), of a soft row by its spring and damper; a motor's error is a velocity."""
     cdef double x = joint_velocity(e.jac + 12 * row, z, e.joint_body[2 * i], e.joint_body[2 * i + 1])
     cdef double kappa = e.push[row], h = e.setting[S_H]
-    if e.compliance[row] > 0.0:                         # of engine/joints.pxd: 1/(h (c + h k)), target -C k/(c + h k)
+    if e.compliance[row] > 0.0:                         # engine/joints.pxd (1): 1/(h (c + h k)), target -C k/(c + h k)
         return (e.target[row] - x / h) / e.compliance[row]
     if rigid_row(e, i, row):
         return e.impulse[row] - kappa * ((1.0 - e.setting[S_HERTZ]) * e.joint_error[row] + x)
@@ -84,7 +88,7 @@ cdef inline double joint_impulse(const engine_t* e, int32_t i, int32_t row, cons
 
 
 cdef inline void add_row(const double* j, double p, double kappa, double* m, double* g) noexcept nogil:
-    # lower half of the matrix of (2), and its right-hand side
+    """Add a row j (6) to the lower triangle of the matrix m of (2) and to its right-hand side g."""
     cdef int32_t k, l
     for k in range(6):
         g[k] += p * j[k]
@@ -92,13 +96,15 @@ cdef inline void add_row(const double* j, double p, double kappa, double* m, dou
             m[6 * k + l] += kappa * j[k] * j[l]
 
 
-cdef inline void contact_row(const double* axis, const double* turn, double sign, double* j) noexcept nogil:
+cdef inline void contact_jacobian(const double* axis, const double* turn, double sign, double* j) noexcept nogil:
+    """Compute a contact's Jacobian row j (6) for one of its bodies: sign -1 for a, 1 for b."""
     scale3(sign, axis, j)
     scale3(sign, turn, j + 3)
 
 
 cdef inline void add_contact(const engine_t* e, int32_t c, int32_t side, const double* z, double* m,
                              double* g) noexcept nogil:
+    """Add the active rows of a contact to the system of its body a (side 0) or b (side 1)."""
     cdef double kappa = e.push[e.size[N_JOINT_ROW] + c], sign = 1.0 if side else -1.0, error
     cdef double p[3]
     cdef double j[6]
@@ -107,24 +113,24 @@ cdef inline void add_contact(const engine_t* e, int32_t c, int32_t side, const d
     contact_impulse(e, c, z, p, t2, turn, &error)
     if p[0] == 0.0:
         return
-    contact_row(e.normal + 3 * c, turn + 3 * side, sign, j)
+    contact_jacobian(e.normal + 3 * c, turn + 3 * side, sign, j)
     add_row(j, p[0], kappa, m, g)
     if e.mu[e.size[N_JOINT] + c] == 0.0:
         return
-    contact_row(e.tangent + 3 * c, turn + 6 + 3 * side, sign, j)
+    contact_jacobian(e.tangent + 3 * c, turn + 6 + 3 * side, sign, j)
     add_row(j, p[1], kappa, m, g)
-    contact_row(t2, turn + 12 + 3 * side, sign, j)
+    contact_jacobian(t2, turn + 12 + 3 * side, sign, j)
     add_row(j, p[2], kappa, m, g)
 
 
-cdef inline int32_t add_met(const engine_t* e, int32_t c, int32_t side, const double* z, const double* step, double* m,
-                            double* g) noexcept nogil:
-    """Whether a contact that does not push at z would after the step of its body; its row is then added."""
+cdef inline int32_t add_activated(const engine_t* e, int32_t c, int32_t side, const double* z, const double* step, double* m,
+                                  double* g) noexcept nogil:
+    """Add the normal row of a contact that is inactive at z but active after its body's step; return whether it was added."""
     cdef double kappa = e.push[e.size[N_JOINT_ROW] + c], p
     cdef double j[6]
     cdef double turn[6]
     p = e.impulse[e.ptr[e.size[N_JOINT] + c]] - kappa * (normal_error(e, c) + displacement(e, c, z, e.normal + 3 * c, turn))
-    contact_row(e.normal + 3 * c, turn + 3 * side, 1.0 if side else -1.0, j)
+    contact_jacobian(e.normal + 3 * c, turn + 3 * side, 1.0 if side else -1.0, j)
     if p > 0.0 or p - kappa * (dot3(j, step) + dot3(j + 3, step + 3)) <= 0.0:
         return 0
     add_row(j, p, kappa, m, g)
@@ -133,6 +139,7 @@ cdef inline int32_t add_met(const engine_t* e, int32_t c, int32_t side, const do
 
 cdef inline void add_joint(const engine_t* e, int32_t i, int32_t side, const double* z, double* m,
                            double* g) noexcept nogil:
+    """Add the rows of a joint to the system of its body a (side 0) or b (side 1)."""
     cdef int32_t row
     cdef double kappa
     for row in range(e.ptr[i], e.ptr[i + 1]):
@@ -141,19 +148,21 @@ cdef inline void add_joint(const engine_t* e, int32_t i, int32_t side, const dou
 
 
 cdef inline void solve_6(double* m, double* g) noexcept nogil:
-    """g <- m^-1 g by L L^T in place; m (6, 6) symmetric and definite, its lower half is read."""
+    """Solve m g' = g in place by Cholesky's L L^T; m (6, 6) is symmetric positive definite, its lower triangle is read."""
     cdef int32_t i, j, k
     cdef double s
+    # factorise
     for j in range(6):
         s = m[7 * j]
         for k in range(j):
             s -= m[6 * j + k] * m[6 * j + k]
-        m[7 * j] = sqrt(s) if s > 0.0 else 1.0 / 0.0        # what rounding took away moves nothing
+        m[7 * j] = sqrt(s) if s > 0.0 else 1.0 / 0.0        # a direction without a positive pivot, lost to rounding, does not move
         for i in range(j + 1, 6):
             s = m[6 * i + j]
             for k in range(j):
                 s -= m[6 * i + k] * m[6 * j + k]
             m[6 * i + j] = s / m[7 * j]
+    # substitute forwards, then backwards
     for i in range(6):
         for k in range(i):
             g[i] -= m[6 * i + k] * g[k]
@@ -164,8 +173,8 @@ cdef inline void solve_6(double* m, double* g) noexcept nogil:
         g[i] /= m[7 * i]
 
 
-cdef inline void mass_matrix(const engine_t* e, int32_t i, double* inertia) noexcept nogil:
-    # world inertia (3, 3) of a body; without frames it has no direction
+cdef inline void world_inertia(const engine_t* e, int32_t i, double* inertia) noexcept nogil:
+    """Compute the world inertia (3, 3) [kg m^2] of a dynamic body; without frames inertia is isotropic."""
     cdef int32_t b = e.body_of[i], k
     if e.size[N_FRAME] > 0:
         world_tensor(e.rot + 9 * b, e.inertia + 9 * b, inertia)
@@ -175,7 +184,7 @@ cdef inline void mass_matrix(const engine_t* e, int32_t i, double* inertia) noex
 
 
 cdef inline void descend(engine_t* e, int32_t i, const int32_t* first, const int32_t* rows) noexcept nogil:
-    """(2) of body i; rows[first[i]:first[i + 1]]: its blocks, twice their number, plus the side that it is on."""
+    """Take the Newton step (2) of body i; rows[first[i]:first[i + 1]] holds 2 block + side for each of its blocks."""
     cdef double m[36]
     cdef double g[6]
     cdef double factor[36]
@@ -183,10 +192,11 @@ cdef inline void descend(engine_t* e, int32_t i, const int32_t* first, const int
     cdef double inertia[9]
     cdef double h = e.setting[S_H], mass = 1.0 / e.inv_mass[i], x
     cdef double* z = e.shift
-    cdef int32_t k, l, kj = e.size[N_JOINT], met = 0
+    cdef int32_t k, l, kj = e.size[N_JOINT], activated = 0
     for k in range(36):
         m[k] = 0.0
-    mass_matrix(e, i, inertia)
+    # inertia: M / h and -M (z - y) / h
+    world_inertia(e, i, inertia)
     for k in range(3):
         m[7 * k] = mass / h
         g[k] = -mass * (z[6 * i + k] - h * e.v_free[6 * i + k]) / h
@@ -195,12 +205,14 @@ cdef inline void descend(engine_t* e, int32_t i, const int32_t* first, const int
             m[6 * (3 + k) + 3 + l] = inertia[3 * k + l] / h
             x += inertia[3 * k + l] * (z[6 * i + 3 + l] - h * e.v_free[6 * i + 3 + l])
         g[3 + k] = -x / h
+    # active rows
     for k in range(first[i], first[i + 1]):
         l = rows[k] >> 1
         if l < kj:
             add_joint(e, l, rows[k] & 1, z, m, g)
         else:
             add_contact(e, l - kj, rows[k] & 1, z, m, g)
+    # step; if it activates contacts, compute it once more with them
     for k in range(36):
         factor[k] = m[k]
     for k in range(6):
@@ -208,21 +220,22 @@ cdef inline void descend(engine_t* e, int32_t i, const int32_t* first, const int
     solve_6(factor, step)
     for k in range(first[i], first[i + 1]):
         if rows[k] >> 1 >= kj:
-            met |= add_met(e, (rows[k] >> 1) - kj, rows[k] & 1, z, step, m, g)
-    if met:
+            activated |= add_activated(e, (rows[k] >> 1) - kj, rows[k] & 1, z, step, m, g)
+    if activated:
         solve_6(m, g)
     for k in range(6):
-        z[6 * i + k] += g[k] if met else step[k]
+        z[6 * i + k] += g[k] if activated else step[k]
 
 
-cdef inline void stiffen(double* kappa, double least, double error, double beta, double slop) noexcept nogil:
-    # (3)
-    kappa[0] += beta * least * fabs(error) / slop
-    if kappa[0] > STIFFEST * least:
-        kappa[0] = STIFFEST * least
+cdef inline void stiffen(double* kappa, double kappa0, double error, double beta, double slop) noexcept nogil:
+    """Increase a row's stiffness by (3)."""
+    kappa[0] += beta * kappa0 * fabs(error) / slop
+    if kappa[0] > MAX_STIFFNESS_RATIO * kappa0:
+        kappa[0] = MAX_STIFFNESS_RATIO * kappa0
 
 
-cdef inline void take_multipliers(engine_t* e) noexcept nogil:
+cdef inline void update_multipliers(engine_t* e) noexcept nogil:
+    """Set lambda = p for all rows, and increase the stiffness of rows inside their bounds."""
     cdef int32_t i, c, row, k, sticks
     cdef double h = e.setting[S_H], beta = e.setting[S_RATIO], slop = e.setting[S_SLOP], x
     cdef double p[3]
@@ -249,39 +262,39 @@ cdef inline void take_multipliers(engine_t* e) noexcept nogil:
 
 
 cdef inline void start_stiffness(engine_t* e, double gamma) noexcept nogil:
-    """kappa0, or gamma times what the last substep left; guesses times gamma."""
+    """Start stiffnesses at gamma times their values after the last substep, at least kappa0, and scale lambda by gamma."""
     cdef int32_t i, c, row, k
-    cdef double least, h = e.setting[S_H]
+    cdef double kappa0, h = e.setting[S_H]
     for i in range(e.size[N_JOINT]):
         for row in range(e.ptr[i], e.ptr[i + 1]):
-            least = 1.0 / (h * e.d[row])
-            e.push[row] = gamma * e.push[row] if e.head[H_WARM_START] else least
-            if not least <= e.push[row] <= STIFFEST * least:
-                e.push[row] = least
+            kappa0 = 1.0 / (h * e.d[row])
+            e.push[row] = gamma * e.push[row] if e.head[H_WARM_START] else kappa0
+            if not kappa0 <= e.push[row] <= MAX_STIFFNESS_RATIO * kappa0:
+                e.push[row] = kappa0
             e.impulse[row] = gamma * e.impulse[row]
     for c in range(e.head[H_CONTACTS]):
         row = e.ptr[e.size[N_JOINT] + c]
-        least = 1.0 / (h * e.d[row])
+        kappa0 = 1.0 / (h * e.d[row])
         k = e.size[N_JOINT_ROW] + c
         e.push[k] = gamma * e.push[k]
-        if not least <= e.push[k] <= STIFFEST * least:
-            e.push[k] = least
+        if not kappa0 <= e.push[k] <= MAX_STIFFNESS_RATIO * kappa0:
+            e.push[k] = kappa0
         for k in range(row, e.ptr[e.size[N_JOINT] + c + 1]):
             e.impulse[k] = gamma * e.impulse[k]
 
 
 cdef inline void descend_all(engine_t* e) noexcept nogil:
-    """The whole substep on the prepared rows; dv = z/h - v*."""
+    """Run the solve of a substep on the prepared rows and set dv = z/h - v*."""
     cdef int32_t nd = e.size[N_DYNAMIC], n = e.size[N_JOINT] + e.head[H_CONTACTS], i, _pass
-    cdef int32_t* first = e.order_scratch               # (nd + 1), then two entries a block
+    cdef int32_t* first = e.order_scratch               # (nd + 1), followed by two entries per block
     cdef int32_t* rows = first + nd + 1
     sort_by_level(2 * n, e.joint_body, nd, first, rows)
-    start_stiffness(e, fading())
+    start_stiffness(e, warm_start_fraction())
     for i in range(6 * nd):
         e.shift[i] = e.setting[S_H] * e.v_free[i]
     for _pass in range(e.head[H_ITERATIONS]):
         for i in range(nd):
             descend(e, i, first, rows)
-        take_multipliers(e)
+        update_multipliers(e)
     for i in range(6 * nd):
         e.dv[i] = e.shift[i] / e.setting[S_H] - e.v_free[i]

@@ -16,10 +16,10 @@ from libc.stdint cimport int32_t
 
 from lavender_ext.core.door cimport first_outside
 from lavender_ext.engine.arrays cimport N_BODY, N_DYNAMIC, N_FRAME, S_GRAVITY, S_H, engine_t
-from lavender_ext.engine.vectors cimport copy3, plus3, times3
+from lavender_ext.engine.vectors cimport copy3, add_scaled3, matvec3
 
 
-cdef inline void rotation(const double* q, double* r) noexcept nogil:
+cdef inline void rotation_matrix(const double* q, double* r) noexcept nogil:
     """Compute the rotation matrix r (3, 3), body to world, of a unit quaternion w, x, y, z."""
     cdef double w = q[0], x = q[1], y = q[2], z = q[3]
     r[0] = 1.0 - 2.0 * (y * y + z * z)
@@ -35,7 +35,7 @@ cdef inline void rotation(const double* q, double* r) noexcept nogil:
 
 cdef inline void to_world(const double* r, const double* a, double* out) noexcept nogil:
     """Rotate a vector from the body's frame to the world: out = R a."""
-    times3(r, a, out)
+    matvec3(r, a, out)
 
 
 cdef inline void to_body(const double* r, const double* a, double* out) noexcept nogil:
@@ -45,7 +45,7 @@ cdef inline void to_body(const double* r, const double* a, double* out) noexcept
         out[k] = r[k] * a[0] + r[3 + k] * a[1] + r[6 + k] * a[2]
 
 
-cdef inline void turn(double* q, const double* omega, double h) noexcept nogil:
+cdef inline void rotate_quaternion(double* q, const double* omega, double h) noexcept nogil:
     """Rotate the quaternion q by omega [rad/s] over h [s], (1)."""
     cdef double w = q[0], x = q[1], y = q[2], z = q[3], s, f = 0.5 * h
     cdef double a = f * omega[0], b = f * omega[1], c = f * omega[2]
@@ -80,11 +80,11 @@ cdef inline void world_times(const double* r, const double* body, const double* 
     cdef double s[3]
     cdef double t[3]
     to_body(r, a, s)
-    times3(body, s, t)
+    matvec3(body, s, t)
     to_world(r, t, out)
 
 
-cdef inline void drift_rotation(double* q, double* omega, const double* inertia, const double* inv_inertia,
+cdef inline void advance_rotation(double* q, double* omega, const double* inertia, const double* inv_inertia,
                                 double h) noexcept nogil:
     """Advance q and omega over h at constant angular momentum, (3)."""
     cdef double r[9]
@@ -92,19 +92,19 @@ cdef inline void drift_rotation(double* q, double* omega, const double* inertia,
     cdef double momentum[3]
     cdef double middle[3]
     cdef int32_t k
-    rotation(q, r)
+    rotation_matrix(q, r)
     world_times(r, inertia, omega, momentum)
     for k in range(4):
         half[k] = q[k]
-    turn(half, omega, 0.5 * h)
-    rotation(half, r)
+    rotate_quaternion(half, omega, 0.5 * h)
+    rotation_matrix(half, r)
     world_times(r, inv_inertia, momentum, middle)
-    turn(q, middle, h)
-    rotation(q, r)
+    rotate_quaternion(q, middle, h)
+    rotation_matrix(q, r)
     world_times(r, inv_inertia, momentum, omega)
 
 
-cdef inline int32_t is_lost(const engine_t* e, int32_t body) noexcept nogil:
+cdef inline int32_t is_out_of_range(const engine_t* e, int32_t body) noexcept nogil:
     """Return whether the body's state is outside the range that core/door.pxd (1) allows."""
     return (first_outside(e.v + 6 * body, 6) >= 0 or first_outside(e.x + 3 * body, 3) >= 0
             or first_outside(e.q + 4 * body, 4) >= 0)
@@ -117,16 +117,16 @@ cdef inline void start_bodies(engine_t* e) noexcept nogil:
     cdef const double* g = e.setting + S_GRAVITY
     if e.size[N_FRAME] > 0:
         for i in range(e.size[N_BODY]):
-            rotation(e.q + 4 * i, e.rot + 9 * i)
+            rotation_matrix(e.q + 4 * i, e.rot + 9 * i)
     for i in range(e.size[N_DYNAMIC]):
         b = e.body_of[i]
         if e.uneven[b]:
             world_tensor(e.rot + 9 * b, e.inv_inertia_body + 9 * b, e.inv_inertia + 9 * i)
-        plus3(e.v + 6 * b, h, g, e.v_free + 6 * i)
+        add_scaled3(e.v + 6 * b, h, g, e.v_free + 6 * i)
         copy3(e.v + 6 * b + 3, e.v_free + 6 * i + 3)
 
 
-cdef inline int32_t drift_bodies(engine_t* e, const double* by, int32_t shifted) noexcept nogil:
+cdef inline int32_t advance_bodies(engine_t* e, const double* by, int32_t shifted) noexcept nogil:
     """Set v = v* + dv, advance the poses over h by v* + `by`, and add the shift of the position projection.
 
     by : (nd, 6) or NULL
@@ -153,20 +153,20 @@ cdef inline int32_t drift_bodies(engine_t* e, const double* by, int32_t shifted)
         if by != NULL:
             for k in range(6):
                 moving[k] = e.v_free[6 * i + k] + by[6 * i + k]
-            plus3(x, h, moving, x)
+            add_scaled3(x, h, moving, x)
             if e.uneven[b] and by == e.dv:
-                drift_rotation(q, v + 3, e.inertia + 9 * b, e.inv_inertia_body + 9 * b, h)
+                advance_rotation(q, v + 3, e.inertia + 9 * b, e.inv_inertia_body + 9 * b, h)
             elif e.uneven[b]:
-                rotation(q, r)
+                rotation_matrix(q, r)
                 world_times(r, e.inertia + 9 * b, v + 3, momentum)
-                drift_rotation(q, moving + 3, e.inertia + 9 * b, e.inv_inertia_body + 9 * b, h)
-                rotation(q, r)
+                advance_rotation(q, moving + 3, e.inertia + 9 * b, e.inv_inertia_body + 9 * b, h)
+                rotation_matrix(q, r)
                 world_times(r, e.inv_inertia_body + 9 * b, momentum, v + 3)
             elif moving[3] != 0.0 or moving[4] != 0.0 or moving[5] != 0.0:
-                turn(q, moving + 3, h)
+                rotate_quaternion(q, moving + 3, h)
         if shifted:
-            plus3(x, 1.0, e.shift + 6 * i, x)
-            turn(q, e.shift + 6 * i + 3, 1.0)
-        if lost < 0 and is_lost(e, b):
+            add_scaled3(x, 1.0, e.shift + 6 * i, x)
+            rotate_quaternion(q, e.shift + 6 * i + 3, 1.0)
+        if lost < 0 and is_out_of_range(e, b):
             lost = b
     return lost

@@ -9,17 +9,17 @@ With few bodies, every pair is tested. With many bodies, a hash grid has one lev
 size. A body is stored in the cell of its centre, at the finest level with cells at least as large as its box.
 It searches the neighbouring cells of coarser levels and, on its own level, the cells that follow its own. The
 cost is linear in bodies and pairs for any mix of sizes; counting sorts put the pairs in order. The search stops
-when more than MOST_PAIRS boxes overlap.
+when more than MAX_PAIRS boxes overlap.
 """
 from libc.math cimport fabs, floor
 from libc.stdint cimport int32_t, uint32_t
 
-from lavender_ext.engine.arrays cimport (BOX, CAP_PAIR, H_PAIRS, H_PAIRS_VALID, H_REBUILDS, MOST_PAIRS, N_BODY,
+from lavender_ext.engine.arrays cimport (BOX, CAP_PAIR, H_PAIRS, H_PAIRS_VALID, H_REBUILDS, MAX_PAIRS, N_BODY,
                                          N_BUCKET, N_EXCLUDED, NO_SHAPE, PLANE, SPHERE, S_MARGIN, S_SKIN,
-                                         TOO_MANY, engine_t)
+                                         PAIR_COUNT_OVERFLOW, engine_t)
 
 
-cdef inline void half_box(const engine_t* e, int32_t i, double* half) noexcept nogil:
+cdef inline void compute_half_extents(const engine_t* e, int32_t i, double* half) noexcept nogil:
     """Compute the half extents of the axis-aligned bounding box of body i."""
     cdef const double* s = e.shape + 4 * i
     cdef const double* r
@@ -33,7 +33,7 @@ cdef inline void half_box(const engine_t* e, int32_t i, double* half) noexcept n
             half[k] = s[0]
 
 
-cdef inline int32_t pairs_hold(engine_t* e) noexcept nogil:
+cdef inline int32_t is_pair_list_valid(engine_t* e) noexcept nogil:
     """Return whether every moving shape with its margin is inside the box that the list was built from."""
     cdef int32_t i, k
     cdef double half[3]
@@ -45,7 +45,7 @@ cdef inline int32_t pairs_hold(engine_t* e) noexcept nogil:
         if e.kind_of_shape[i] < SPHERE or e.dyn[i] < 0:
             continue
         fat = e.fat + 6 * i
-        half_box(e, i, half)
+        compute_half_extents(e, i, half)
         for k in range(3):
             x = e.x[3 * i + k]
             if not (x - half[k] - m >= fat[k] and x + half[k] + m <= fat[3 + k]):
@@ -53,14 +53,14 @@ cdef inline int32_t pairs_hold(engine_t* e) noexcept nogil:
     return 1
 
 
-cdef inline int32_t may_meet(const engine_t* e, int32_t i, int32_t j) noexcept nogil:
+cdef inline int32_t can_collide(const engine_t* e, int32_t i, int32_t j) noexcept nogil:
     """Return whether two bodies can collide: both have a shape and at least one is dynamic."""
     if e.kind_of_shape[i] == NO_SHAPE or e.kind_of_shape[j] == NO_SHAPE:
         return 0
     return e.dyn[i] >= 0 or e.dyn[j] >= 0
 
 
-cdef inline int32_t boxes_meet(const engine_t* e, int32_t i, int32_t j) noexcept nogil:
+cdef inline int32_t boxes_overlap(const engine_t* e, int32_t i, int32_t j) noexcept nogil:
     """Return whether two bounding boxes overlap, or the lowest corner of a box is below a plane."""
     cdef const double* a = e.fat + 6 * i
     cdef const double* b = e.fat + 6 * j
@@ -100,7 +100,7 @@ cdef inline int32_t cell_of(double x, double size) noexcept nogil:
     return <int32_t>(-1e9 if not c > -1e9 else (1e9 if c > 1e9 else c))
 
 
-cdef inline double extent_of(const engine_t* e, int32_t i) noexcept nogil:
+cdef inline double longest_side(const engine_t* e, int32_t i) noexcept nogil:
     """Return the longest side [m] of a body's bounding box."""
     cdef const double* f = e.fat + 6 * i
     cdef double extent = 0.0
@@ -125,7 +125,7 @@ cdef inline void grid_pairs(engine_t* e, int32_t* n_pairs) noexcept nogil:
     for i in range(n):
         if e.kind_of_shape[i] < SPHERE:
             continue
-        extent = extent_of(e, i)
+        extent = longest_side(e, i)
         if extent > max_extent:
             max_extent = extent
         if min_extent == 0.0 or extent < min_extent:
@@ -140,7 +140,7 @@ cdef inline void grid_pairs(engine_t* e, int32_t* n_pairs) noexcept nogil:
     while i >= 0:
         if e.kind_of_shape[i] >= SPHERE:
             f = e.fat + 6 * i
-            extent = extent_of(e, i)
+            extent = longest_side(e, i)
             size = base
             level = 0
             while size < extent and level < 31:
@@ -185,9 +185,9 @@ cdef inline void grid_pairs(engine_t* e, int32_t* n_pairs) noexcept nogil:
                                         and e.cell[4 * j + 3] == level
                                         and (j < i or own == NULL or x != own[0] or y != own[1]
                                              or z != own[2])
-                                        and may_meet(e, i, j) and boxes_meet(e, i, j)):
+                                        and can_collide(e, i, j) and boxes_overlap(e, i, j)):
                                     add_pair(e, i, j, n_pairs)
-                                    if n_pairs[0] > MOST_PAIRS:
+                                    if n_pairs[0] > MAX_PAIRS:
                                         return
                                 j = e.chain[j]
             size *= 2.0
@@ -195,9 +195,9 @@ cdef inline void grid_pairs(engine_t* e, int32_t* n_pairs) noexcept nogil:
     for i in range(n):
         if e.kind_of_shape[i] == PLANE:
             for j in range(n):
-                if e.kind_of_shape[j] >= SPHERE and may_meet(e, i, j) and boxes_meet(e, i, j):
+                if e.kind_of_shape[j] >= SPHERE and can_collide(e, i, j) and boxes_overlap(e, i, j):
                     add_pair(e, i, j, n_pairs)
-                    if n_pairs[0] > MOST_PAIRS:
+                    if n_pairs[0] > MAX_PAIRS:
                         return
 
 
@@ -246,27 +246,27 @@ cdef inline int32_t update_pairs(engine_t* e) noexcept nogil:
     cdef int32_t n = e.size[N_BODY], i, j, k, n_pairs = 0
     cdef double half[3]
     cdef double enlargement = e.setting[S_MARGIN] + e.setting[S_SKIN]
-    if pairs_hold(e):
+    if is_pair_list_valid(e):
         return e.head[H_PAIRS]
     e.head[H_PAIRS_VALID] = 0
     for i in range(n):
         if e.kind_of_shape[i] < SPHERE:
             continue
-        half_box(e, i, half)
+        compute_half_extents(e, i, half)
         for k in range(3):
             e.fat[6 * i + k] = e.x[3 * i + k] - half[k] - enlargement
             e.fat[6 * i + 3 + k] = e.x[3 * i + k] + half[k] + enlargement
     if e.size[N_BUCKET] > 0:
         grid_pairs(e, &n_pairs)
-        if n_pairs > MOST_PAIRS:
-            return TOO_MANY
+        if n_pairs > MAX_PAIRS:
+            return PAIR_COUNT_OVERFLOW
         if n_pairs > e.size[CAP_PAIR]:
             return n_pairs
         sort_pairs(e, n_pairs)
     else:
         for i in range(n):
             for j in range(i + 1, n):
-                if may_meet(e, i, j) and boxes_meet(e, i, j):
+                if can_collide(e, i, j) and boxes_overlap(e, i, j):
                     if e.kind_of_shape[i] != PLANE or e.kind_of_shape[j] != PLANE:
                         add_pair(e, i, j, &n_pairs)
         if n_pairs > e.size[CAP_PAIR]:

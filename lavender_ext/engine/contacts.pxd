@@ -38,7 +38,7 @@ from lavender_ext.engine.arrays cimport (ALTERNATING, AVBD, BOX, CAP_CONTACT, H_
                                          S_BETA, S_BOUNCE, S_H, S_MARGIN, S_MATCH, S_ROLLING, S_SLOP, engine_t)
 from lavender_ext.engine.bodies cimport to_body
 from lavender_ext.engine.narrow_phase cimport collide, manifold_t
-from lavender_ext.engine.vectors cimport both3, copy3, minus3
+from lavender_ext.engine.vectors cimport combine3, copy3, subtract3
 
 
 cdef inline uint64_t contact_key(int32_t a, int32_t b, int32_t feature) noexcept nogil:
@@ -46,7 +46,7 @@ cdef inline uint64_t contact_key(int32_t a, int32_t b, int32_t feature) noexcept
     return ((<uint64_t>a) << 40) | ((<uint64_t>b) << 16) | (<uint64_t>feature)
 
 
-cdef inline void tangent_of(const double* n, double* t) noexcept nogil:
+cdef inline void compute_tangent(const double* n, double* t) noexcept nogil:
     """Compute a unit tangent: n x the coordinate axis with the smallest component of n, normalised."""
     cdef double x = fabs(n[0]), y = fabs(n[1]), z = fabs(n[2]), s
     if x <= y and x <= z:
@@ -72,7 +72,7 @@ cdef inline double distance2(const double* a, const double* b) noexcept nogil:
     return x * x + y * y + z * z
 
 
-cdef inline double apart2(const engine_t* e, int32_t c, int32_t entry) noexcept nogil:
+cdef inline double cached_distance2(const engine_t* e, int32_t c, int32_t entry) noexcept nogil:
     """Return the squared distance [m^2] of a contact from a cached one, the smaller of the two body frames' values."""
     cdef double x = distance2(e.cache_local + 6 * entry, e.local + 6 * c)
     cdef double y = distance2(e.cache_local + 6 * entry + 3, e.local + 6 * c + 3)
@@ -96,7 +96,7 @@ cdef inline void match_pair(const engine_t* e, int32_t c, int32_t n, int32_t fir
         entry[j] = -1
         for i in range(first, end):
             if (e.cache_key[i] == e.key[c + j] and not (used >> (i - first)) & 1
-                    and apart2(e, c + j, i) <= max_distance2):
+                    and cached_distance2(e, c + j, i) <= max_distance2):
                 entry[j] = i
                 used |= 1 << (i - first)
                 break
@@ -110,7 +110,7 @@ cdef inline void match_pair(const engine_t* e, int32_t c, int32_t n, int32_t fir
         min_distance2 = max_distance2
         for i in range(first, end):
             if not (used >> (i - first)) & 1:
-                x = apart2(e, c + j, i)
+                x = cached_distance2(e, c + j, i)
                 if x <= min_distance2:
                     min_distance2 = x
                     entry[j] = i
@@ -118,7 +118,7 @@ cdef inline void match_pair(const engine_t* e, int32_t c, int32_t n, int32_t fir
             used |= 1 << (entry[j] - first)
 
 
-cdef inline void guess_contact(engine_t* e, int32_t c, int32_t entry, int32_t nt, int32_t turns,
+cdef inline void warm_start_contact(engine_t* e, int32_t c, int32_t entry, int32_t nt, int32_t n_angular,
                                double* lam) noexcept nogil:
     """Write the cached impulse to lam in this contact's frame; the cache stores friction as a world vector."""
     cdef double t2[3]
@@ -128,11 +128,11 @@ cdef inline void guess_contact(engine_t* e, int32_t c, int32_t entry, int32_t nt
         cross(e.normal + 3 * c, e.tangent + 3 * c, t2)
         lam[1] = dot3(p + 1, e.tangent + 3 * c)
         lam[2] = dot3(p + 1, t2)
-    if turns & 1:
+    if n_angular & 1:
         lam[1 + nt] = p[4]
-    if turns & 2:
-        lam[nt + turns - 1] = dot3(e.cache_roll + 3 * entry, e.tangent + 3 * c)
-        lam[nt + turns] = dot3(e.cache_roll + 3 * entry, t2)
+    if n_angular & 2:
+        lam[nt + n_angular - 1] = dot3(e.cache_roll + 3 * entry, e.tangent + 3 * c)
+        lam[nt + n_angular] = dot3(e.cache_roll + 3 * entry, t2)
     if e.head[H_STEPPER] == AVBD:
         e.push[e.size[N_JOINT_ROW] + c] = p[4]
 
@@ -142,7 +142,7 @@ cdef inline double restitution_of(const engine_t* e, int32_t a, int32_t b) noexc
     return e.restitution[a] if e.restitution[a] > e.restitution[b] else e.restitution[b]
 
 
-cdef inline double normal_velocity(const engine_t* e, int32_t a, int32_t b, int32_t c) noexcept nogil:
+cdef inline double initial_normal_velocity(const engine_t* e, int32_t a, int32_t b, int32_t c) noexcept nogil:
     """Return a contact's relative normal velocity [m/s] before the substep; static bodies are at rest."""
     cdef double u[3]
     cdef double s[3]
@@ -152,20 +152,20 @@ cdef inline double normal_velocity(const engine_t* e, int32_t a, int32_t b, int3
 
 
 cdef inline void local_arm(const engine_t* e, int32_t body, const double* arm, double* out) noexcept nogil:
-    """Store an arm for cache matching: a box's contact rotates with the body, a sphere's does not."""
+    """Copy a contact's arm for the cache: in the body's frame for a box, in the world frame for other shapes."""
     if e.kind_of_shape[body] == BOX:
         to_body(e.rot + 9 * body, arm, out)
     else:
         copy3(arm, out)
 
 
-cdef inline void make_contact(engine_t* e, const rows_t* r, int32_t c, int32_t row, int32_t a, int32_t b,
+cdef inline void build_contact(engine_t* e, const rows_t* r, int32_t c, int32_t row, int32_t a, int32_t b,
                               const manifold_t* m, int32_t at, const double* tangent, int32_t nt,
-                              int32_t turns) noexcept nogil:
-    """Fill rows row .. row + nt + turns of contact c from point `at` of the manifold, except for the target."""
+                              int32_t n_angular) noexcept nogil:
+    """Fill rows row .. row + nt + n_angular of contact c from point `at` of the manifold, except for the target."""
     cdef double off[2]
     cdef double w[6]
-    cdef int32_t k, roll = row + nt + turns - 1, da = e.dyn[a], db = e.dyn[b]
+    cdef int32_t k, roll = row + nt + n_angular - 1, da = e.dyn[a], db = e.dyn[b]
     cdef double* d = e.d + row
     # bodies, key and geometry
     e.contact_pair[2 * c] = a
@@ -176,24 +176,24 @@ cdef inline void make_contact(engine_t* e, const rows_t* r, int32_t c, int32_t r
     e.gap[c] = m.gap[at]
     copy3(m.point + 3 * at, e.point + 3 * c)
     copy3(m.normal, e.normal + 3 * c)
-    minus3(m.point + 3 * at, e.x + 3 * a, e.arm_a + 3 * c)
-    minus3(m.point + 3 * at, e.x + 3 * b, e.arm_b + 3 * c)
+    subtract3(m.point + 3 * at, e.x + 3 * a, e.arm_a + 3 * c)
+    subtract3(m.point + 3 * at, e.x + 3 * b, e.arm_b + 3 * c)
     local_arm(e, a, e.arm_a + 3 * c, e.local + 6 * c)
     local_arm(e, b, e.arm_b + 3 * c, e.local + 6 * c + 3)
     if nt > 0:
         copy3(tangent, e.tangent + 3 * c)
     # diagonal of A and w* = J v*; the common kind has constant sizes, so that the compiler unrolls its loops
-    if nt == 2 and not turns:
+    if nt == 2 and not n_angular:
         contact_diagonal(e.normal + 3 * c, e.tangent + 3 * c, e.arm_a + 3 * c, e.arm_b + 3 * c, 2, 0, da, db,
                          e.inv_mass, e.inv_inertia, d, off, e.coupling + 5 * c,
                          e.swing + 6 * (row - e.size[N_JOINT_ROW]))
         contact_slack(r, c, 2, 0, e.v_free, w)
     else:
-        contact_diagonal(e.normal + 3 * c, e.tangent + 3 * c, e.arm_a + 3 * c, e.arm_b + 3 * c, nt, turns,
+        contact_diagonal(e.normal + 3 * c, e.tangent + 3 * c, e.arm_a + 3 * c, e.arm_b + 3 * c, nt, n_angular,
                          da, db, e.inv_mass, e.inv_inertia, d, off, e.coupling + 5 * c,
                          e.swing + 6 * (row - e.size[N_JOINT_ROW]))
-        contact_slack(r, c, nt, turns, e.v_free, w)
-    for k in range(1 + nt + turns):
+        contact_slack(r, c, nt, n_angular, e.v_free, w)
+    for k in range(1 + nt + n_angular):
         d[k] += e.compliance[row + k]
     # step sizes: separate tangents for box friction, else one step from the tangents' largest eigenvalue
     e.step[row] = reciprocal(d[0])
@@ -206,18 +206,18 @@ cdef inline void make_contact(engine_t* e, const rows_t* r, int32_t c, int32_t r
         e.step[row + 2] = e.step[row + 1]
         d[1] = 0.5 * (d[1] + d[2])
         d[2] = d[1]
-    if turns & 1:
+    if n_angular & 1:
         e.step[row + 1 + nt] = reciprocal(d[1 + nt])
-    if turns & 2:
+    if n_angular & 2:
         e.step[roll] = e.step[roll + 1] = reciprocal(largest_eigenvalue(e.d[roll], off[1], e.d[roll + 1]))
         e.d[roll] = e.d[roll + 1] = 0.5 * (e.d[roll] + e.d[roll + 1])
     # right-hand side with target 0
-    for k in range(1 + nt + turns):
+    for k in range(1 + nt + n_angular):
         e.target[row + k] = 0.0
         e.b[row + k] = 0.0 - w[k]
 
 
-cdef inline void aim_contact(engine_t* e, int32_t c, int32_t row, int32_t a, int32_t b, double bounce) noexcept nogil:
+cdef inline void set_contact_target(engine_t* e, int32_t c, int32_t row, int32_t a, int32_t b, double bounce) noexcept nogil:
     """Set the normal row's target after the warm start; on entry b = -J v*."""
     cdef double h = e.setting[S_H], gap = e.gap[c], target = 0.0, relative_normal_velocity
     if gap > 0.0:
@@ -226,25 +226,25 @@ cdef inline void aim_contact(engine_t* e, int32_t c, int32_t row, int32_t a, int
         if gap > 0.0:
             target = -gap / h                           # (1)
     if bounce > 0.0 and e.gap[c] - h * e.b[row] <= 0.0:  # (3)
-        relative_normal_velocity = normal_velocity(e, a, b, c)
+        relative_normal_velocity = initial_normal_velocity(e, a, b, c)
         if relative_normal_velocity < -e.setting[S_BOUNCE] and -bounce * relative_normal_velocity > target:
             target = -bounce * relative_normal_velocity
     e.target[row] = target
     e.b[row] = target + e.b[row]                        # (4)
 
 
-cdef inline int32_t backwards(const engine_t* e) noexcept nogil:
+cdef inline int32_t is_reversed(const engine_t* e) noexcept nogil:
     """Return whether this substep builds its contacts from the last pair to the first."""
     return e.head[H_ORDER] == ALTERNATING and e.head[H_STEP] & 1
 
 
-cdef inline int32_t make_contacts(engine_t* e, const rows_t* r) noexcept nogil:
+cdef inline int32_t build_contacts(engine_t* e, const rows_t* r) noexcept nogil:
     """Build all contacts of the pair list, warm-started from the cache, and return their number."""
     cdef manifold_t m
     cdef double tangent[3]
     cdef int32_t entry[4]
-    cdef int32_t i, j, k, a, b, nt, turns, box, start, c = 0, row = e.size[N_JOINT_ROW], block
-    cdef int32_t matches = 0, last_first = backwards(e), cached = e.head[H_CACHED]
+    cdef int32_t i, j, k, a, b, nt, n_angular, box, start, c = 0, row = e.size[N_JOINT_ROW], block
+    cdef int32_t matches = 0, last_first = is_reversed(e), cached = e.head[H_CACHED]
     cdef int32_t first = cached if last_first else 0
     cdef double mu, patch, bounce, margin = e.setting[S_MARGIN]
     cdef uint64_t pair
@@ -263,9 +263,9 @@ cdef inline int32_t make_contacts(engine_t* e, const rows_t* r) noexcept nogil:
         bounce = restitution_of(e, a, b)
         patch = e.patch[a] if e.patch[a] < e.patch[b] else e.patch[b]
         nt = 2 if mu > 0.0 else 0
-        turns = 0 if not mu > 0.0 else (1 if patch > 0.0 else 0) + (2 if e.setting[S_ROLLING] > 0.0 else 0)
+        n_angular = 0 if not mu > 0.0 else (1 if patch > 0.0 else 0) + (2 if e.setting[S_ROLLING] > 0.0 else 0)
         if nt > 0:
-            tangent_of(m.normal, tangent)
+            compute_tangent(m.normal, tangent)
         pair = contact_key(a, b, 0)
         # first cache entry of this pair, or its insertion position
         while first < cached and e.cache_key[first] < pair:
@@ -274,18 +274,18 @@ cdef inline int32_t make_contacts(engine_t* e, const rows_t* r) noexcept nogil:
             first -= 1
         start = c
         for j in range(m.n):
-            make_contact(e, r, c, row, a, b, &m, m.n - 1 - j if last_first else j, tangent, nt, turns)
+            build_contact(e, r, c, row, a, b, &m, m.n - 1 - j if last_first else j, tangent, nt, n_angular)
             block = e.size[N_JOINT] + c
             box = nt > 0 and e.head[H_FRICTION_SHAPE]
-            e.kind[block] = contact_kind(box, turns & 1, turns & 2, nt)
+            e.kind[block] = contact_kind(box, n_angular & 1, n_angular & 2, nt)
             e.mu[block] = mu
-            e.patch_radius[block] = 1.0 if box else patch if turns & 1 else 0.0
+            e.patch_radius[block] = 1.0 if box else patch if n_angular & 1 else 0.0
             if e.size[ROWS_PER_CONTACT] > 4:
-                e.rolling[block] = e.setting[S_ROLLING] if turns & 2 else 0.0
-            for k in range(1 + nt + turns):
+                e.rolling[block] = e.setting[S_ROLLING] if n_angular & 2 else 0.0
+            for k in range(1 + nt + n_angular):
                 e.impulse[row + k] = 0.0
             e.push[e.size[N_JOINT_ROW] + c] = 0.0
-            row += 1 + nt + turns
+            row += 1 + nt + n_angular
             c += 1
             e.ptr[block + 1] = row
         if e.head[H_WARM_START] and first < cached:
@@ -293,10 +293,10 @@ cdef inline int32_t make_contacts(engine_t* e, const rows_t* r) noexcept nogil:
             for j in range(m.n):
                 if entry[j] >= 0:
                     k = e.ptr[e.size[N_JOINT] + start + j]
-                    guess_contact(e, start + j, entry[j], nt, turns, e.impulse + k)
+                    warm_start_contact(e, start + j, entry[j], nt, n_angular, e.impulse + k)
                     matches += 1
         for j in range(start, c):
-            aim_contact(e, j, e.ptr[e.size[N_JOINT] + j], a, b, bounce)
+            set_contact_target(e, j, e.ptr[e.size[N_JOINT] + j], a, b, bounce)
     if c <= e.size[CAP_CONTACT]:
         e.head[H_CONTACTS] = c
         e.head[H_CONTACT_ROWS] = row - e.size[N_JOINT_ROW]
@@ -306,7 +306,7 @@ cdef inline int32_t make_contacts(engine_t* e, const rows_t* r) noexcept nogil:
 
 cdef inline void store_contacts(engine_t* e) noexcept nogil:
     """Write the contact cache for the next substep, whether warm starting is on or not."""
-    cdef int32_t c, k, row, nt, at, size, n = e.head[H_CONTACTS], last_first = backwards(e)
+    cdef int32_t c, k, row, nt, at, size, n = e.head[H_CONTACTS], last_first = is_reversed(e)
     cdef double t2[3]
     cdef double* p
     for c in range(n):
@@ -318,13 +318,13 @@ cdef inline void store_contacts(engine_t* e) noexcept nogil:
         p[0] = e.impulse[row]
         if nt > 0:
             cross(e.normal + 3 * c, e.tangent + 3 * c, t2)
-            both3(e.impulse[row + 1], e.tangent + 3 * c, e.impulse[row + 2], t2, p + 1)
+            combine3(e.impulse[row + 1], e.tangent + 3 * c, e.impulse[row + 2], t2, p + 1)
         else:
             p[1] = p[2] = p[3] = 0.0
         size = e.ptr[e.size[N_JOINT] + c + 1] - row
         p[4] = e.impulse[row + 3] if size == 4 or size == 6 else 0.0
         if size > 4:
-            both3(e.impulse[row + size - 2], e.tangent + 3 * c, e.impulse[row + size - 1], t2, e.cache_roll + 3 * at)
+            combine3(e.impulse[row + size - 2], e.tangent + 3 * c, e.impulse[row + size - 1], t2, e.cache_roll + 3 * at)
         elif e.size[ROWS_PER_CONTACT] > 4:
             for k in range(3):
                 e.cache_roll[3 * at + k] = 0.0

@@ -23,10 +23,10 @@ from lavender_ext.engine.arrays cimport (BALL, DISTANCE, HINGE, H_WARM_START, J_
                                          J_AXIS_A, J_AXIS_B, J_DAMPING, J_HERTZ, J_LENGTH, J_SIDE_A, J_SPEED,
                                          J_TORQUE, N_JOINT, N_JOINT_REAL, ROWS_PER_CONTACT, S_H, engine_t)
 from lavender_ext.engine.bodies cimport to_world
-from lavender_ext.engine.vectors cimport copy3, minus3, plus3, scale3
+from lavender_ext.engine.vectors cimport copy3, subtract3, add_scaled3, scale3
 
 
-cdef inline void direction(const engine_t* e, int32_t body, const double* local, double* out) noexcept nogil:
+cdef inline void world_direction(const engine_t* e, int32_t body, const double* local, double* out) noexcept nogil:
     """Rotate a direction from a body's frame to the world; body -1 is the world."""
     if body < 0:
         copy3(local, out)
@@ -34,17 +34,17 @@ cdef inline void direction(const engine_t* e, int32_t body, const double* local,
         to_world(e.rot + 9 * body, local, out)
 
 
-cdef inline void anchor(const engine_t* e, int32_t body, const double* local, double* arm,
+cdef inline void world_anchor(const engine_t* e, int32_t body, const double* local, double* arm,
                         double* point) noexcept nogil:
     """Compute an anchor's arm from the body's centre and its point, both in the world frame."""
-    direction(e, body, local, arm)
+    world_direction(e, body, local, arm)
     if body < 0:
         copy3(arm, point)
     else:
-        plus3(e.x + 3 * body, 1.0, arm, point)
+        add_scaled3(e.x + 3 * body, 1.0, arm, point)
 
 
-cdef inline void point_row(double* jac, const double* axis, const double* arm_a,
+cdef inline void linear_row(double* jac, const double* axis, const double* arm_a,
                            const double* arm_b) noexcept nogil:
     """Fill the Jacobian row (12) of axis.(v_b + omega_b x arm_b - v_a - omega_a x arm_a)."""
     scale3(-1.0, axis, jac)
@@ -54,7 +54,7 @@ cdef inline void point_row(double* jac, const double* axis, const double* arm_a,
     cross(arm_b, axis, jac + 9)
 
 
-cdef inline void turn_row(double* jac, const double* axis) noexcept nogil:
+cdef inline void angular_row(double* jac, const double* axis) noexcept nogil:
     """Fill the Jacobian row (12) of axis.(omega_b - omega_a)."""
     cdef int32_t k
     for k in range(3):
@@ -64,7 +64,7 @@ cdef inline void turn_row(double* jac, const double* axis) noexcept nogil:
         jac[9 + k] = axis[k]
 
 
-cdef inline void joint_geometry(engine_t* e, int32_t i) noexcept nogil:
+cdef inline void compute_joint_geometry(engine_t* e, int32_t i) noexcept nogil:
     """Compute the Jacobian rows and errors of joint i at the current poses."""
     cdef const double* p = e.joint + N_JOINT_REAL * i
     cdef int32_t a = e.joint_bodies[2 * i], b = e.joint_bodies[2 * i + 1], row = e.ptr[i], k
@@ -76,11 +76,11 @@ cdef inline void joint_geometry(engine_t* e, int32_t i) noexcept nogil:
     cdef double other[3]
     cdef double side[3]
     cdef double length
-    anchor(e, a, p + J_ANCHOR_A, arm_a, pa)
-    anchor(e, b, p + J_ANCHOR_B, arm_b, pb)
+    world_anchor(e, a, p + J_ANCHOR_A, arm_a, pa)
+    world_anchor(e, b, p + J_ANCHOR_B, arm_b, pb)
     # distance: one row along the line between the anchors
     if e.joint_kind[i] == DISTANCE:
-        minus3(pb, pa, axis)
+        subtract3(pb, pa, axis)
         length = sqrt(dot3(axis, axis))
         if length > least():
             for k in range(3):
@@ -89,7 +89,7 @@ cdef inline void joint_geometry(engine_t* e, int32_t i) noexcept nogil:
             axis[0] = 0.0
             axis[1] = 0.0
             axis[2] = 1.0
-        point_row(e.jac + 12 * row, axis, arm_a, arm_b)
+        linear_row(e.jac + 12 * row, axis, arm_a, arm_b)
         e.joint_error[row] = length - p[J_LENGTH]
         return
     # ball: the three world axes
@@ -98,27 +98,27 @@ cdef inline void joint_geometry(engine_t* e, int32_t i) noexcept nogil:
         axis[1] = 0.0
         axis[2] = 0.0
         axis[k] = 1.0
-        point_row(e.jac + 12 * (row + k), axis, arm_a, arm_b)
+        linear_row(e.jac + 12 * (row + k), axis, arm_a, arm_b)
         e.joint_error[row + k] = pb[k] - pa[k]
     if e.joint_kind[i] == BALL:
         return
     # hinge: two angular rows normal to the axis
-    direction(e, a, p + J_AXIS_A, axis)
-    direction(e, b, p + J_AXIS_B, other)
-    direction(e, a, p + J_SIDE_A, side)
-    turn_row(e.jac + 12 * (row + 3), side)
+    world_direction(e, a, p + J_AXIS_A, axis)
+    world_direction(e, b, p + J_AXIS_B, other)
+    world_direction(e, a, p + J_SIDE_A, side)
+    angular_row(e.jac + 12 * (row + 3), side)
     cross(axis, side, pa)
-    turn_row(e.jac + 12 * (row + 4), pa)
+    angular_row(e.jac + 12 * (row + 4), pa)
     cross(axis, other, pb)                              # rotation vector from axis_a to axis_b
     e.joint_error[row + 3] = dot3(pb, side)
     e.joint_error[row + 4] = dot3(pb, pa)
     # motor: relative angular velocity about the axis
     if e.joint_motor[i]:
-        turn_row(e.jac + 12 * (row + 5), axis)
+        angular_row(e.jac + 12 * (row + 5), axis)
         e.joint_error[row + 5] = 0.0
 
 
-cdef inline void make_joints(engine_t* e) noexcept nogil:
+cdef inline void build_joints(engine_t* e) noexcept nogil:
     """Build rows, diagonal, compliance, right-hand side and warm start of all joints."""
     cdef int32_t i, row, a, b
     cdef double h = e.setting[S_H], omega, k, c, d, inf = 1.0 / 0.0
@@ -127,7 +127,7 @@ cdef inline void make_joints(engine_t* e) noexcept nogil:
         p = e.joint + N_JOINT_REAL * i
         a = e.joint_body[2 * i]
         b = e.joint_body[2 * i + 1]
-        joint_geometry(e, i)
+        compute_joint_geometry(e, i)
         e.kind[i] = ROW
         e.mu[i] = 0.0
         e.patch_radius[i] = 0.0

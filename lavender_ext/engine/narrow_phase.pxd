@@ -1,19 +1,19 @@
-"""The narrow phase: plane, sphere and box against each other, to a manifold of at most four points.
+"""The narrow phase: contact manifolds of at most four points between planes, spheres and boxes.
 
 The normal points from a to b. A point lies halfway between the two surfaces; its gap is the distance
-between them along the normal [m], negative inside. Points with a gap below the margin are kept
+between them along the normal [m], negative if they overlap. Points with a gap up to the margin are kept
 (speculative contacts). Each has a feature number that stays the same while the same corners and
 faces touch:
 
-    plane-box       the box's corner, bit k set where its axis k counts positive
-    box-box, faces  reference face (4 bits), other face (3 bits), and the two lines whose crossing the
-                    point is (3 bits each): 0-3 edges of the other face, 4-7 sides of the reference face
-    box-box, edges  8192 + the two axes and four signs that name the edges
+    plane-box       the box's corner; bit k is set if its coordinate along axis k is positive
+    box-box, faces  reference face (4 bits), other face (3 bits), and the two lines that intersect in the
+                    point (3 bits each): 0-3 edges of the other face, 4-7 sides of the reference face
+    box-box, edges  8192 + the two axes and four signs that identify the edges
 
 Box-box: the axis of least penetration among 3 + 3 face normals and 9 cross products (Gottschalk, Lin,
-Manocha 1996); faces are preferred to edges, and faces of a to those of b, by a tolerance, so that a
-resting pair keeps its manifold. The face that looks most against the reference face is clipped by its
-four sides (Sutherland, Hodgman 1974).
+Manocha 1996). Within a tolerance, faces are preferred to edges and faces of a to faces of b, so that a
+resting pair keeps its manifold. The incident face, the one most antiparallel to the reference face, is clipped by the
+four sides of the reference face (Sutherland, Hodgman 1974).
 """
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
@@ -22,7 +22,7 @@ from lavender_ext.core.door cimport least
 from lavender_ext.core.rows cimport cross, dot3
 from lavender_ext.engine.arrays cimport BOX, PLANE, SPHERE, engine_t
 from lavender_ext.engine.bodies cimport to_body, to_world
-from lavender_ext.engine.vectors cimport column3, copy3, minus3, plus3, scale3
+from lavender_ext.engine.vectors cimport column3, copy3, subtract3, add_scaled3, scale3
 
 
 cdef struct manifold_t:
@@ -35,10 +35,11 @@ cdef struct manifold_t:
 
 cdef inline void sphere_sphere(const double* xa, double ra, const double* xb, double rb, double margin,
                                manifold_t* m) noexcept nogil:
+    """Collide two spheres."""
     cdef double d[3]
     cdef double s, f
     cdef int32_t k
-    minus3(xb, xa, d)
+    subtract3(xb, xa, d)
     s = dot3(d, d)
     if s > (ra + rb + margin) * (ra + rb + margin):
         return
@@ -46,13 +47,13 @@ cdef inline void sphere_sphere(const double* xa, double ra, const double* xb, do
     if s > least():
         for k in range(3):
             m.normal[k] = d[k] / s
-    else:                                               # one centre: any normal will do, the same every time
+    else:                                               # concentric: use a fixed normal
         s = 0.0
         m.normal[0] = 0.0
         m.normal[1] = 0.0
         m.normal[2] = 1.0
     f = 0.5 * (ra - rb + s)                             # halfway between the surfaces
-    plus3(xa, f, m.normal, m.point)
+    add_scaled3(xa, f, m.normal, m.point)
     m.gap[0] = s - ra - rb
     m.feature[0] = 0
     m.n = 1
@@ -60,11 +61,12 @@ cdef inline void sphere_sphere(const double* xa, double ra, const double* xb, do
 
 cdef inline void plane_sphere(const double* plane, const double* x, double r, double margin,
                               manifold_t* m) noexcept nogil:
+    """Collide a plane and a sphere."""
     cdef double gap = dot3(plane, x) - plane[3] - r
     if gap > margin:
         return
     copy3(plane, m.normal)
-    plus3(x, -(r + 0.5 * gap), plane, m.point)
+    add_scaled3(x, -(r + 0.5 * gap), plane, m.point)
     m.gap[0] = gap
     m.feature[0] = 0
     m.n = 1
@@ -72,12 +74,13 @@ cdef inline void plane_sphere(const double* plane, const double* x, double r, do
 
 cdef inline void plane_box(const double* plane, const double* x, const double* rot, const double* half,
                            double margin, manifold_t* m) noexcept nogil:
-    # Corner gaps are g + sum +-p_k; the four lowest below the margin, ties to the lower corner number.
+    """Collide a plane and a box: the four corners with the smallest gaps g + sum +-p_k, ties to the lower corner number."""
     cdef double p[3]
     cdef double gap[8]
     cdef double low, g = dot3(plane, x) - plane[3]
-    cdef int32_t i, _j, k, best, taken = 0
+    cdef int32_t i, _j, k, best, selected = 0
     to_body(rot, plane, p)
+    # early out: the lowest corner is above the margin
     low = g
     for k in range(3):
         p[k] *= half[k]
@@ -87,17 +90,19 @@ cdef inline void plane_box(const double* plane, const double* x, const double* r
     for i in range(8):
         gap[i] = g + (p[0] if i & 1 else -p[0]) + (p[1] if i & 2 else -p[1]) + (p[2] if i & 4 else -p[2])
     copy3(plane, m.normal)
+    # select the four lowest corners
     for _j in range(4):
         best = -1
         for i in range(8):
-            if not (taken >> i) & 1 and gap[i] <= margin and (best < 0 or gap[i] < gap[best]):
+            if not (selected >> i) & 1 and gap[i] <= margin and (best < 0 or gap[i] < gap[best]):
                 best = i
         if best < 0:
             break
-        taken |= 1 << best
+        selected |= 1 << best
+    # build the points in corner order
     m.n = 0
     for i in range(8):
-        if (taken >> i) & 1:
+        if (selected >> i) & 1:
             for k in range(3):
                 m.point[3 * m.n + k] = (x[k] + (half[0] if i & 1 else -half[0]) * rot[3 * k]
                                         + (half[1] if i & 2 else -half[1]) * rot[3 * k + 1]
@@ -110,13 +115,15 @@ cdef inline void plane_box(const double* plane, const double* x, const double* r
 
 cdef inline void box_sphere(const double* xa, const double* rot, const double* half, const double* xb,
                             double r, double margin, manifold_t* m) noexcept nogil:
+    """Collide a box and a sphere."""
     cdef double d[3]
     cdef double c[3]
     cdef double near[3]
     cdef double s, best
     cdef int32_t k, axis = -1
-    minus3(xb, xa, d)
+    subtract3(xb, xa, d)
     to_body(rot, d, c)
+    # closest point of the box to the sphere's centre, in the box's frame
     s = 0.0
     for k in range(3):
         near[k] = -half[k] if c[k] < -half[k] else (half[k] if c[k] > half[k] else c[k])
@@ -128,7 +135,7 @@ cdef inline void box_sphere(const double* xa, const double* rot, const double* h
         s = sqrt(s)
         for k in range(3):
             d[k] = d[k] / s
-    else:                                               # the centre is inside: out by the nearest face
+    else:                                               # the centre is inside: separate along the nearest face's normal
         best = -1.0 / 0.0
         for k in range(3):
             if fabs(c[k]) - half[k] > best:
@@ -141,9 +148,9 @@ cdef inline void box_sphere(const double* xa, const double* rot, const double* h
         s = best
     m.gap[0] = s - r
     to_world(rot, d, m.normal)
-    plus3(near, 0.5 * m.gap[0], d, c)
+    add_scaled3(near, 0.5 * m.gap[0], d, c)
     to_world(rot, c, m.point)
-    plus3(xa, 1.0, m.point, m.point)
+    add_scaled3(xa, 1.0, m.point, m.point)
     m.feature[0] = 0
     m.n = 1
 
@@ -151,9 +158,12 @@ cdef inline void box_sphere(const double* xa, const double* rot, const double* h
 cdef inline int32_t clip_side(int32_t n, const double* p, const int32_t* code, int32_t axis, double sign,
                               double bound, double tol, int32_t line, double* out,
                               int32_t* out_code) noexcept nogil:
-    # Polygon p (n, 3), edge code[i] from point i to i + 1, against sign * p[axis] <= bound. A corner within
-    # tol of the side counts as inside: a pair that lies edge on edge keeps its corners.
-    cdef int32_t i, j, kept = 0
+    """Clip the polygon p (n, 3) against sign * p[axis] <= bound and return the number of points left.
+
+    code[i] identifies the edge from point i to i + 1, `line` the clipping side. A corner within tol of the side
+    counts as inside, so that a pair with aligned edges keeps its corners.
+    """
+    cdef int32_t i, j, n_out = 0
     cdef double a, b, t
     cdef double edge[3]
     for i in range(n):
@@ -161,23 +171,25 @@ cdef inline int32_t clip_side(int32_t n, const double* p, const int32_t* code, i
         a = sign * p[3 * i + axis] - bound
         b = sign * p[3 * j + axis] - bound
         if a <= tol:
-            copy3(p + 3 * i, out + 3 * kept)
-            out_code[kept] = code[i]
-            kept += 1
+            copy3(p + 3 * i, out + 3 * n_out)
+            out_code[n_out] = code[i]
+            n_out += 1
         if (a <= tol) != (b <= tol):
             t = a / (a - b)
             t = 0.0 if t < 0.0 else (1.0 if t > 1.0 else t)
-            minus3(p + 3 * j, p + 3 * i, edge)
-            plus3(p + 3 * i, t, edge, out + 3 * kept)
-            # the polygon goes on along the side where it leaves, along its own edge where it comes back
-            out_code[kept] = line if a <= tol else code[i]
-            kept += 1
-    return kept
+            subtract3(p + 3 * j, p + 3 * i, edge)
+            add_scaled3(p + 3 * i, t, edge, out + 3 * n_out)
+            # leaving the half-space, the outline continues on the clipping side; entering, on its own edge
+            out_code[n_out] = line if a <= tol else code[i]
+            n_out += 1
+    return n_out
 
 
 cdef inline void pick_four(const double* p, int32_t kept, double margin, int32_t* pick) noexcept nogil:
-    # The outermost along four directions, askew so that no two corners of a square tie; the deepest
-    # takes the place of its neighbour if it is among none of them.
+    """Select the outermost points along four directions, skewed so that the corners of a square do not tie.
+
+    If the deepest point is not among them, it replaces the nearest selected point.
+    """
     cdef double s, best, deep
     cdef int32_t i, j, at, other
     for i in range(4):
@@ -215,7 +227,7 @@ cdef inline void pick_four(const double* p, int32_t kept, double margin, int32_t
 
 cdef inline void to_face(const double* along_x, const double* along_y, const double* along_z, const double* a,
                          double* out) noexcept nogil:
-    # a vector of the world in the frame of a face
+    """Transform a world vector to the frame of a face."""
     out[0] = dot3(a, along_x)
     out[1] = dot3(a, along_y)
     out[2] = dot3(a, along_z)
@@ -224,7 +236,11 @@ cdef inline void to_face(const double* along_x, const double* along_y, const dou
 cdef inline void face_points(const double* xr, const double* rr, const double* hr, int32_t axis, double sign,
                              const double* xo, const double* ro, const double* ho, int32_t on_b,
                              double margin, manifold_t* m) noexcept nogil:
-    # Reference face `axis`, `sign` of one box, the other box clipped; (x, y, z) is the frame of the face.
+    """Build a face manifold: clip the other box's incident face by the reference face.
+
+    The reference face of the box (xr, rr, hr) is given by `axis` and `sign`; x, y, n are the axes of its frame.
+    on_b: the reference face belongs to b.
+    """
     cdef double poly[36]
     cdef double more[36]
     cdef int32_t code[12]
@@ -245,7 +261,7 @@ cdef inline void face_points(const double* xr, const double* rr, const double* h
     column3(rr, ay, y)
     column3(rr, axis, n)
     scale3(sign, n, n)
-    # the other box's face that looks most against n
+    # incident face: the other box's face most antiparallel to n
     to_body(ro, n, u)
     best = -1.0
     for i in range(3):
@@ -255,10 +271,10 @@ cdef inline void face_points(const double* xr, const double* rr, const double* h
     fx = face + 1 if face < 2 else 0
     fy = face - 1 if face > 0 else 2
     s = -ho[face] if u[face] > 0.0 else ho[face]
-    # its centre and half edges in the frame of the reference face
-    minus3(xo, xr, u)
+    # corners of the incident face in the frame of the reference face, from its centre and half edges
+    subtract3(xo, xr, u)
     column3(ro, face, c)
-    plus3(u, s, c, c)
+    add_scaled3(u, s, c, c)
     to_face(x, y, n, c, w)
     w[2] -= hr[axis]
     for i in range(2):
@@ -275,7 +291,7 @@ cdef inline void face_points(const double* xr, const double* rr, const double* h
         code[i] = i
     count = 4
     tol = 1e-3 * (hx if hx < hy else hy)
-    # clip only where a corner is outside
+    # clip by each side of the reference face that a corner is outside of
     for i in range(4):
         k = i >> 1
         s = 1.0 if i & 1 else -1.0
@@ -291,7 +307,7 @@ cdef inline void face_points(const double* xr, const double* rr, const double* h
         for j in range(count):
             code[j] = more_code[j]
             copy3(more + 3 * j, poly + 3 * j)
-    # points above the margin go; a point is the crossing of the lines before and after it
+    # drop points above the margin; a point's feature is the pair of lines before and after it
     kept = 0
     for i in range(count):
         if poly[3 * i + 2] <= margin:
@@ -299,6 +315,7 @@ cdef inline void face_points(const double* xr, const double* rr, const double* h
             more_code[kept] = j * 8 + code[i]
             copy3(poly + 3 * i, more + 3 * kept)
             kept += 1
+    # reduce to four points
     if kept > 4:
         pick_four(more, kept, margin, pick)
     else:
@@ -308,11 +325,12 @@ cdef inline void face_points(const double* xr, const double* rr, const double* h
             pick[i] = pick[0] if kept > 0 else 0
     feature = (((on_b * 8 + axis * 2 + (sign > 0.0)) * 8) + face) * 64
     m.n = 0
-    # from round the face to row by row, as the corners of a box count
+    # reorder from counter-clockwise to row by row, like the corners of a box
     if kept >= 4:
         i = pick[2]
         pick[2] = pick[3]
         pick[3] = i
+    # build the points, skipping duplicates
     for i in range(4 if kept > 4 else kept):
         at = pick[i]
         for j in range(i):
@@ -322,9 +340,9 @@ cdef inline void face_points(const double* xr, const double* rr, const double* h
         if at < 0:
             continue
         s = hr[axis] + 0.5 * more[3 * at + 2]
-        plus3(xr, more[3 * at], x, u)
-        plus3(u, more[3 * at + 1], y, u)
-        plus3(u, s, n, m.point + 3 * m.n)
+        add_scaled3(xr, more[3 * at], x, u)
+        add_scaled3(u, more[3 * at + 1], y, u)
+        add_scaled3(u, s, n, m.point + 3 * m.n)
         m.gap[m.n] = more[3 * at + 2]
         m.feature[m.n] = feature + more_code[at]
         m.n += 1
@@ -333,7 +351,7 @@ cdef inline void face_points(const double* xr, const double* rr, const double* h
 
 cdef inline int32_t edge_centre(const double* x, const double* rot, const double* half, int32_t axis, const double* n,
                                 double sign, double* out) noexcept nogil:
-    # centre of the edge along `axis` that is furthest along sign n; returns two bits that name it
+    """Compute the centre of the edge along `axis` that is farthest along sign n; return two bits that identify it."""
     cdef double side[3]
     cdef double u[3]
     cdef int32_t r, bits = 0
@@ -343,14 +361,14 @@ cdef inline int32_t edge_centre(const double* x, const double* rot, const double
         if r != axis:
             bits = bits * 2 + (u[r] > 0.0)
             column3(rot, r, side)
-            plus3(out, sign * (half[r] if u[r] > 0.0 else -half[r]), side, out)
+            add_scaled3(out, sign * (half[r] if u[r] > 0.0 else -half[r]), side, out)
     return bits
 
 
 cdef inline void edge_point(const double* xa, const double* ra, const double* ha, int32_t i, const double* xb,
                             const double* rb, const double* hb, int32_t j, double* n, double gap,
                             manifold_t* m) noexcept nogil:
-    # nearest points of the two edges along axes i of a and j of b that face each other along n
+    """Build an edge manifold from the closest points of the edges along axis i of a and axis j of b."""
     cdef double p[3]
     cdef double q[3]
     cdef double d[3]
@@ -360,7 +378,7 @@ cdef inline void edge_point(const double* xa, const double* ra, const double* ha
     cdef int32_t bits
     bits = 4 * edge_centre(xa, ra, ha, i, n, 1.0, p)
     bits += edge_centre(xb, rb, hb, j, n, -1.0, q)
-    minus3(q, p, d)
+    subtract3(q, p, d)
     column3(ra, i, along_a)
     column3(rb, j, along_b)
     u = dot3(along_a, along_b)
@@ -370,9 +388,9 @@ cdef inline void edge_point(const double* xa, const double* ra, const double* ha
     t = (u * v - w) / (1.0 - u * u)
     s = -ha[i] if s < -ha[i] else (ha[i] if s > ha[i] else s)
     t = -hb[j] if t < -hb[j] else (hb[j] if t > hb[j] else t)
-    plus3(p, s, along_a, p)
-    plus3(p, 1.0, q, p)
-    plus3(p, t, along_b, p)
+    add_scaled3(p, s, along_a, p)
+    add_scaled3(p, 1.0, q, p)
+    add_scaled3(p, t, along_b, p)
     scale3(0.5, p, m.point)
     copy3(n, m.normal)
     m.gap[0] = gap
@@ -382,6 +400,7 @@ cdef inline void edge_point(const double* xa, const double* ra, const double* ha
 
 cdef inline void box_box(const double* xa, const double* ra, const double* ha, const double* xb,
                          const double* rb, const double* hb, double margin, manifold_t* m) noexcept nogil:
+    """Collide two boxes: separating axis test, then a face or edge manifold on the axis of least penetration."""
     cdef double c[9]            # R_a^T R_b
     cdef double f[9]            # |c|
     cdef double d[3]
@@ -391,7 +410,7 @@ cdef inline void box_box(const double* xa, const double* ra, const double* ha, c
     cdef double l[3]
     cdef double s, t, length, face_a = -1.0 / 0.0, face_b = -1.0 / 0.0, edge = -1.0 / 0.0, tol, best, small
     cdef int32_t i, j, k, i1, i2, j1, j2, axis_a = 0, axis_b = 0, edge_i = -1, edge_j = -1, parallel = 0
-    minus3(xb, xa, d)
+    subtract3(xb, xa, d)
     to_body(ra, d, ta)
     to_body(rb, d, tb)
     for i in range(3):
@@ -399,6 +418,7 @@ cdef inline void box_box(const double* xa, const double* ra, const double* ha, c
             s = ra[i] * rb[j] + ra[3 + i] * rb[3 + j] + ra[6 + i] * rb[6 + j]
             c[3 * i + j] = s
             f[3 * i + j] = fabs(s)
+    # face normals of a
     for i in range(3):
         s = fabs(ta[i]) - ha[i] - (f[3 * i] * hb[0] + f[3 * i + 1] * hb[1] + f[3 * i + 2] * hb[2])
         if s > margin:
@@ -406,6 +426,7 @@ cdef inline void box_box(const double* xa, const double* ra, const double* ha, c
         if s > face_a:
             face_a = s
             axis_a = i
+    # face normals of b
     for j in range(3):
         s = fabs(tb[j]) - hb[j] - (f[j] * ha[0] + f[3 + j] * ha[1] + f[6 + j] * ha[2])
         if s > margin:
@@ -413,14 +434,16 @@ cdef inline void box_box(const double* xa, const double* ra, const double* ha, c
         if s > face_b:
             face_b = s
             axis_b = j
+    # preference for faces: a thousandth of the smallest half extent
     small = ha[0]
     for k in range(3):
         small = ha[k] if ha[k] < small else small
         small = hb[k] if hb[k] < small else small
     tol = 1e-3 * small
     best = face_a if face_a > face_b else face_b
+    # cross products of the edges, unless two axes are parallel within 1 mrad: then they add no separating axis
     for k in range(9):
-        if f[k] > 0.9999995:                            # two axes within 1 mrad: edge axes add nothing
+        if f[k] > 0.9999995:
             parallel = 1
     if not parallel:
         for i in range(3):
@@ -432,7 +455,7 @@ cdef inline void box_box(const double* xa, const double* ra, const double* ha, c
                 length = 1.0 - c[3 * i + j] * c[3 * i + j]
                 if length < 1e-6:
                     continue
-                # the axis a_i x b_j in the frame of a is (0, -c_i2j, c_i1j) in the places i, i1, i2
+                # the axis a_i x b_j has the components (0, -c_i2j, c_i1j) along the axes i, i1, i2 of a
                 t = ta[i2] * c[3 * i1 + j] - ta[i1] * c[3 * i2 + j]
                 s = (fabs(t) - (ha[i1] * f[3 * i2 + j] + ha[i2] * f[3 * i1 + j] + hb[j1] * f[3 * i + j2]
                                 + hb[j2] * f[3 * i + j1])) / sqrt(length)
@@ -442,6 +465,7 @@ cdef inline void box_box(const double* xa, const double* ra, const double* ha, c
                     edge = s
                     edge_i = i
                     edge_j = j
+    # manifold on the axis of least penetration
     if edge_i >= 0 and edge > best + tol + 0.05 * fabs(best):
         column3(ra, edge_i, n)
         column3(rb, edge_j, l)
@@ -458,7 +482,7 @@ cdef inline void box_box(const double* xa, const double* ra, const double* ha, c
 
 cdef inline void collide(const engine_t* e, int32_t a, int32_t b, double margin,
                          manifold_t* m) noexcept nogil:
-    """Manifold of bodies a < b; n = 0 where they are further apart than the margin."""
+    """Compute the manifold of bodies a < b; m.n = 0 if their gap exceeds the margin."""
     cdef int32_t ka = e.kind_of_shape[a], kb = e.kind_of_shape[b], flip = 0
     cdef const double* xa = e.x + 3 * a
     cdef const double* xb = e.x + 3 * b
@@ -471,7 +495,7 @@ cdef inline void collide(const engine_t* e, int32_t a, int32_t b, double margin,
     if ka == BOX and kb == BOX:
         box_box(xa, e.rot + 9 * a, sa, xb, e.rot + 9 * b, sb, margin, m)
         return
-    if ka > kb if kb == PLANE or ka == PLANE else kb == BOX:     # the plane first, then the box
+    if ka > kb if kb == PLANE or ka == PLANE else kb == BOX:     # swap: planes first, then boxes
         flip = 1
         a, b = b, a
         ka, kb = kb, ka

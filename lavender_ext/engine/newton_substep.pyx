@@ -1,13 +1,15 @@
-"""The velocity solve of a substep by Newton's method on the engine's arrays: natively its first phase, in a browser whole.
+"""The velocity solve of a substep by Newton's method on the engine's arrays.
 
-After `prepare` and `solve` without sweeps:
+Native builds run its first phase only, WebAssembly all of it. After `prepare` and `solve` without sweeps:
 
-    index_workspace_size      whole numbers that the next call needs
-    plan            bands, elements, elimination order; doubles that the next call needs
-    solve           the first phase of `newton` (newton/warm_start.pxd), then its steps (newton/solve.pyx); the judge decides
+    index_workspace_size    number of integers that `plan` needs
+    plan                    bands, elements, elimination order; number of doubles that `substep` needs
+    substep                 the first phase of `newton` (newton/warm_start.pxd), then its steps (newton/solve.pyx); the
+                            judge decides when to stop
 
-Natively and in WebAssembly the same lines, the same bits. What asks for another library, the augmented system, is left out;
-where that or `BUDGET` leaves the residual above tol, the best impulse found stays, and is told as such.
+Native builds and WebAssembly run the same code with the same bits. The augmented system, which needs another library, is
+omitted. If the residual stays above tol for that reason or after `MAX_SUBSTEP_FACTORISATIONS`, the best impulse is kept, and
+UNDECIDED is returned.
 """
 from libc.stdint cimport int32_t, int64_t, uint64_t
 
@@ -28,13 +30,13 @@ from lavender_ext.newton.warm_start cimport (FACTORED, JUDGED, MOST_TRACED, UNDE
 
 
 cdef enum:
-    HEAD = 4                    # whole numbers before those of the method: width of the band, how many these are
-    MOST = 2147483647
-    BUDGET = 200                # factorisations: a picture waits for them
+    SCRATCH_HEADER = 4          # integers before the method's in scratch: [0] band width, [1] number of the method's integers
+    INDEX_LIMIT = 2147483647
+    MAX_SUBSTEP_FACTORISATIONS = 200    # of a substep, since a frame waits for them
 
 
 cdef inline workspace_t method_workspace_size(const blocks_t* p, const rows_t* r) noexcept nogil:
-    """Whole numbers of Newton's method, 0 where it does not take the problem."""
+    """Return the workspace of Newton's method, with n_index = 0 if it does not accept the problem."""
     cdef view_t v = view_t(p[0], NULL, r, NULL)
     cdef workspace_t workspace = workspace_t(0, 0, NULL, NULL, 0, 0, 0, 0.0)
     if not bodies_workspace_size(&v, NULL, &workspace):
@@ -43,8 +45,8 @@ cdef inline workspace_t method_workspace_size(const blocks_t* p, const rows_t* r
 
 
 cdef public int32_t lav_newton_index_workspace_size(const int32_t* size, double* real, int32_t* index, uint64_t* keys,
-                                          int32_t turns) noexcept nogil:
-    """Whole numbers of scratch for the prepared substep, -1 for 2^31 and more; turns 0: the first phase alone."""
+                                          int32_t all_stages) noexcept nogil:
+    """Return the number of scratch integers for the prepared substep, -1 if too many; all_stages = 0: first phase only."""
     cdef engine_t e
     cdef int64_t used[3]
     cdef int64_t workspace
@@ -54,15 +56,15 @@ cdef public int32_t lav_newton_index_workspace_size(const int32_t* size, double*
     bind(size, real, index, keys, &e, used)
     view(&e, &p, &r)
     v = view_t(p, NULL, &r, NULL)
-    workspace = HEAD + r.n_bodies + 2 * <int64_t>r.n_joints + 1 + islands_index(&v)
-    if turns:
+    workspace = SCRATCH_HEADER + r.n_bodies + 2 * <int64_t>r.n_joints + 1 + islands_index(&v)
+    if all_stages:
         workspace += method_workspace_size(&p, &r).n_index
-    return <int32_t>workspace if workspace < MOST else -1
+    return <int32_t>workspace if workspace < INDEX_LIMIT else -1
 
 
-cdef public int32_t lav_newton_plan(const int32_t* size, double* real, int32_t* index, uint64_t* keys, int32_t turns,
+cdef public int32_t lav_newton_plan(const int32_t* size, double* real, int32_t* index, uint64_t* keys, int32_t all_stages,
                                     int32_t* scratch) noexcept nogil:
-    """Fills scratch, which begins at a multiple of 8 bytes; doubles that the solve needs, -1 for 2^31 and more."""
+    """Fill scratch (8-byte aligned); return the number of doubles that the solve needs, -1 if too many for int32."""
     cdef engine_t e
     cdef int64_t used[3]
     cdef int64_t workspace
@@ -73,24 +75,24 @@ cdef public int32_t lav_newton_plan(const int32_t* size, double* real, int32_t* 
     bind(size, real, index, keys, &e, used)
     view(&e, &p, &r)
     n = method_workspace_size(&p, &r)
-    scratch[1] = <int32_t>n.n_index if turns else 0
-    scratch[0] = band_width(&p, &r, scratch + HEAD + scratch[1])
+    scratch[1] = <int32_t>n.n_index if all_stages else 0
+    scratch[0] = band_width(&p, &r, scratch + SCRATCH_HEADER + scratch[1])
     workspace = room_of(&p, scratch[0]) + p.n_rows + 2 * <int64_t>p.n_blocks
     if scratch[1] > 0:
         v = view_t(p, NULL, &r, NULL)
-        n.index = scratch + HEAD
-        bodies_start(&v, NULL, &n, NULL)                # finds the pattern, and how much more workspace it needs
+        n.index = scratch + SCRATCH_HEADER
+        bodies_start(&v, NULL, &n, NULL)                # computes the pattern and the remaining workspace size
         workspace += n.n_real
-    return <int32_t>workspace if workspace < MOST else -1
+    return <int32_t>workspace if workspace < INDEX_LIMIT else -1
 
 
-cdef inline int32_t solve_in_turns(const view_t* problem, const options_t* o, workspace_t* workspace, warm_t* s, double* lam,
+cdef inline int32_t run_newton_stages(const view_t* problem, const options_t* o, workspace_t* workspace, warm_t* s, double* lam,
                                    double* v) noexcept nogil:
-    """What `warm_solve` has left undecided, also from lam = 0; UNDECIDED short of tol: lam is then the best that was scored."""
+    """Run Newton's method after `warm_solve`, also from lam = 0; return UNDECIDED with the best lam if it does not reach tol."""
     cdef said_t said
-    cdef int32_t how = bodies_start(problem, o, workspace, lam)
-    while how == MORE or how == CERTIFICATE:
-        how = system_step(problem, o, workspace, 1, lam, &said)
+    cdef int32_t result = bodies_start(problem, o, workspace, lam)
+    while result == MORE or result == CERTIFICATE:
+        result = system_step(problem, o, workspace, 1, lam, &said)
         s.factorisations = said.factorisations
         if s.trace != NULL:
             judged(&problem.p, problem.r, s, said.tried, v, o.e0, o.v0)
@@ -98,18 +100,19 @@ cdef inline int32_t solve_in_turns(const view_t* problem, const options_t* o, wo
     return FACTORED if said.relative <= o.tol else UNDECIDED
 
 
-cdef inline int32_t newton_substep(const blocks_t* p, const rows_t* r, warm_t* s, double tol, int32_t turns,
+cdef inline int32_t newton_substep(const blocks_t* p, const rows_t* r, warm_t* s, double tol, int32_t all_stages,
                                    int32_t* scratch, double* workspace, double* lam, double* v) noexcept nogil:
-    cdef int32_t j, how = warm_solve(p, r, s, tol, lam, v, 1)
+    """Run the first phase, then with `all_stages` the further steps of Newton's method; return the phase's result code."""
+    cdef int32_t j, result = warm_solve(p, r, s, tol, lam, v, 1)
     cdef double e0 = 1.0, v0 = 1.0
     cdef view_t problem
     cdef options_t o
     cdef workspace_t n
-    if how != UNDECIDED or p.n_rows == 0 or not turns:
-        return how
+    if result != UNDECIDED or p.n_rows == 0 or not all_stages:
+        return result
     s.relative = 1.0 / 0.0
     if not start_errors(p, &e0, &v0):
-        if e0 == 0.0 and v0 == 0.0:                     # nothing to do
+        if e0 == 0.0 and v0 == 0.0:                     # lam = 0 is the solution
             for j in range(p.n_rows):
                 lam[j] = 0.0
             judged(p, r, s, lam, v, 1.0, 1.0)
@@ -119,16 +122,17 @@ cdef inline int32_t newton_substep(const blocks_t* p, const rows_t* r, warm_t* s
     if not scratch[1]:
         return UNDECIDED
     problem = view_t(p[0], NULL, r, NULL)
-    o = options_t(0, BUDGET, 0, 0, 0, tol, e0, v0, 1.0 / 0.0, 0.0)
-    n = workspace_t(scratch[1], MOST, scratch + HEAD, workspace, 1, 0, 0, 0.0)    # the pattern stands from `lav_newton_plan`
-    return solve_in_turns(&problem, &o, &n, s, lam, v)
+    o = options_t(0, MAX_SUBSTEP_FACTORISATIONS, 0, 0, 0, tol, e0, v0, 1.0 / 0.0, 0.0)
+    # `lav_newton_plan` computed the pattern
+    n = workspace_t(scratch[1], INDEX_LIMIT, scratch + SCRATCH_HEADER, workspace, 1, 0, 0, 0.0)
+    return run_newton_stages(&problem, &o, &n, s, lam, v)
 
 
 cdef inline void bind_islands(blocks_t* p, const rows_t* r, warm_t* s, int32_t* index, double* reference,
                               islands_t* islands) noexcept nogil:
-    """Islands of the substep with their references, if there are several and all bounds hold 0; arrays of s are scratch.
+    """Find the islands of the substep and their reference errors, if there are several and all bounds contain 0.
 
-    Engine contacts have no bounds to be read.
+    The arrays of s are scratch. Bounds of contact rows are not read.
     """
     cdef view_t v = view_t(p[0], NULL, r, NULL)
     cdef score_t score = new_score()
@@ -148,13 +152,13 @@ cdef inline void bind_islands(blocks_t* p, const rows_t* r, warm_t* s, int32_t* 
 
 
 cdef public int32_t lav_newton_substep(const int32_t* size, double* real, int32_t* index, uint64_t* keys, double tol,
-                                       int32_t turns, int32_t* scratch, double* workspace, double* trace,
+                                       int32_t all_stages, int32_t* scratch, double* workspace, double* trace,
                                        double* said) noexcept nogil:
-    """Impulses, dv and the solver values of the prepared substep; how it ended, UNDECIDED where short of tol.
+    """Compute impulses, dv and statistics of the prepared substep; return the result code, UNDECIDED if above tol.
 
-    Of the first phase alone (turns 0) UNDECIDED leaves all of it as it was. scratch and workspace as `lav_newton_plan` has them;
-    trace (MOST_TRACED, 3) or NULL takes work, E [sqrt J] and max |e_n| [N s] of each score; said (4) takes sweeps,
-    factorisations, relative residual and scores noted.
+    With the first phase only (all_stages = 0), UNDECIDED leaves the arrays unchanged. scratch and workspace are those of
+    `lav_newton_plan`. trace (MOST_TRACED, 3) or NULL receives work, E [sqrt J] and max |e_n| [N s] of each evaluation;
+    said (4) receives sweeps, factorisations, relative residual and the number of traced evaluations.
     """
     cdef engine_t e
     cdef int64_t used[3]
@@ -163,7 +167,7 @@ cdef public int32_t lav_newton_substep(const int32_t* size, double* real, int32_
     cdef warm_t s
     cdef islands_t islands
     cdef int64_t own
-    cdef int32_t how, marks
+    cdef int32_t result, marks
     bind(size, real, index, keys, &e, used)
     view(&e, &p, &r)
     block_weights(&p, p.d, workspace)
@@ -173,22 +177,22 @@ cdef public int32_t lav_newton_substep(const int32_t* size, double* real, int32_
     s.trace = trace
     s.relative = 0.0
     own = room_of(&p, s.width) + p.n_rows
-    marks = HEAD + scratch[1]
+    marks = SCRATCH_HEADER + scratch[1]
     lay_out(&s, workspace + p.n_rows, scratch + marks, &p, &r)
     bind_islands(&p, &r, &s, scratch + marks + r.n_bodies + 2 * r.n_joints + 1, workspace + own, &islands)
     own += 2 * <int64_t>p.n_blocks
-    how = newton_substep(&p, &r, &s, tol, turns, scratch, workspace + own, e.impulse, e.dv)
-    if p.n_rows > 0 and (turns or how != UNDECIDED):
+    result = newton_substep(&p, &r, &s, tol, all_stages, scratch, workspace + own, e.impulse, e.dv)
+    if p.n_rows > 0 and (all_stages or result != UNDECIDED):
         observe(&p, &r, &s, e.setting + S_OUT + 5, e.setting + S_OUT + 7)
     said[0] = s.sweeps
     said[1] = s.factorisations
     said[2] = s.relative
     said[3] = s.traced
-    return how
+    return result
 
 
 cdef class Substep:
-    """The same for Python, beside an engine's three buffers; `stages`: after the first phase, noting each score."""
+    """Newton substep on an engine's buffers, for Python; `all_stages`: continue after the first phase and trace evaluations."""
     cdef const int32_t[::1] size
     cdef double[::1] real
     cdef int32_t[::1] index
@@ -196,15 +200,17 @@ cdef class Substep:
     cdef double[::1] scratch, workspace
     cdef double[:, ::1] noted
     cdef double[4] said
-    cdef int32_t turns
+    cdef int32_t all_stages
 
-    def __init__(self, const int32_t[::1] size, double[::1] real, int32_t[::1] index, uint64_t[::1] keys, bint turns):
-        self.size, self.real, self.index, self.keys, self.turns = size, real, index, keys, turns
+    def __init__(self, const int32_t[::1] size, double[::1] real, int32_t[::1] index, uint64_t[::1] keys, bint all_stages):
+        self.size, self.real, self.index, self.keys, self.all_stages = size, real, index, keys, all_stages
         self.scratch, self.workspace = np.empty(1), np.empty(1)
-        self.noted = np.zeros((MOST_TRACED if turns else 0, 3))
+        self.noted = np.zeros((MOST_TRACED if all_stages else 0, 3))
 
     cdef int _make_scratch(self) except -1:
-        cdef int32_t n = lav_newton_index_workspace_size(&self.size[0], &self.real[0], &self.index[0], &self.keys[0], self.turns)
+        """Allocate the scratch integers."""
+        cdef int32_t n = lav_newton_index_workspace_size(&self.size[0], &self.real[0], &self.index[0], &self.keys[0],
+                                                         self.all_stages)
         if n < 0:
             raise MemoryError("the substep needs more than 2^31 numbers of scratch")
         if 2 * self.scratch.shape[0] < n:
@@ -212,24 +218,24 @@ cdef class Substep:
         return 0
 
     def solve(self, double tol):
-        """After `prepare` and `solve(False)`: (how it ended, sweeps, factorisations, relative residual)."""
-        cdef int32_t how, n
+        """Solve after `prepare` and `solve(False)`; return (result code, sweeps, factorisations, relative residual)."""
+        cdef int32_t result, n
         cdef double* trace = NULL
         self._make_scratch()
-        if self.turns:
+        if self.all_stages:
             trace = &self.noted[0, 0]
-        n = lav_newton_plan(&self.size[0], &self.real[0], &self.index[0], &self.keys[0], self.turns,
+        n = lav_newton_plan(&self.size[0], &self.real[0], &self.index[0], &self.keys[0], self.all_stages,
                             <int32_t*>&self.scratch[0])
         if n < 0:
             raise MemoryError("the substep needs more than 2^31 numbers of scratch")
         if self.workspace.shape[0] < n:
             self.workspace = np.empty(n + n // 4)
         with nogil:
-            how = lav_newton_substep(&self.size[0], &self.real[0], &self.index[0], &self.keys[0], tol, self.turns,
+            result = lav_newton_substep(&self.size[0], &self.real[0], &self.index[0], &self.keys[0], tol, self.all_stages,
                                      <int32_t*>&self.scratch[0], &self.workspace[0], trace, self.said)
-        return how, <int>self.said[0], <int>self.said[1], self.said[2]
+        return result, <int>self.said[0], <int>self.said[1], self.said[2]
 
     @property
     def trace(self):
-        """Of the last solve: sweeps and factorisations so far, E [sqrt J], max |e_n| [N s], a line for each score."""
+        """Trace of the last solve (n, 3): sweeps and factorisations so far, E [sqrt J], max |e_n| [N s], a row per evaluation."""
         return np.asarray(self.noted)[: <int>self.said[3]].copy()

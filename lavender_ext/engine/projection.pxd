@@ -1,13 +1,13 @@
-"""Position projection: a split impulse that moves bodies and leaves their velocities alone.
+"""Position projection: a split impulse that moves bodies and does not change their velocities.
 
 To first order the gap of a contact at the end of the substep is g + h (J v)_n, and the error of a rigid
 joint row C + h J v. Sweeps over multipliers p [N s^2] find a shift s = M^-1 J^T p [m, rad] with
 
-    contact   J s >= -min(beta (g' + slop), push),  p >= 0,  g' = g + h (J v)_n  the gap to come      (1)
+    contact   J s >= -min(beta (g' + slop), push),  p >= 0,  g' = g + h (J v)_n  the predicted gap    (1)
     joint     J s  = -clip(beta C', push)                                                            (2)
 
-Velocities are untouched, so that it adds no kinetic energy; where nothing is deeper than the slop and no
-joint is off, it is skipped.
+Velocities are unchanged, so that the projection adds no kinetic energy. It is skipped if no contact is deeper than
+the slop and no joint has an error.
 """
 from libc.math cimport fabs
 from libc.stdint cimport int32_t
@@ -21,11 +21,12 @@ from lavender_ext.engine.vectors cimport scale3
 
 
 cdef inline int32_t rigid_row(const engine_t* e, int32_t i, int32_t row) noexcept nogil:
-    # soft rows pull by themselves; a motor has no position
+    """Return whether a joint row is projected: soft rows correct their own errors, a motor row has no position."""
     return e.joint[N_JOINT_REAL * i + J_HERTZ] == 0.0 and not (e.joint_motor[i] and row == e.ptr[i + 1] - 1)
 
 
-cdef inline double normal_speed(const engine_t* e, const double* v, int32_t c) noexcept nogil:
+cdef inline double contact_normal_velocity(const engine_t* e, const double* v, int32_t c) noexcept nogil:
+    """Return a contact's relative normal velocity (J v)_n for the body velocities v (nd, 6)."""
     cdef double u[3]
     cdef double s[3]
     relative_velocity(v, e.contact_body[2 * c], e.contact_body[2 * c + 1], e.arm_a + 3 * c, e.arm_b + 3 * c,
@@ -34,7 +35,7 @@ cdef inline double normal_speed(const engine_t* e, const double* v, int32_t c) n
 
 
 cdef inline double displacement(const engine_t* e, int32_t c, const double* z, const double* axis, double* turn) noexcept nogil:
-    """J z of a contact along an axis, a speed where z is velocities; turn (2, 3): arm x axis on a, then on b."""
+    """Return J z of a contact along an axis, a velocity if z (nd, 6) holds velocities; turn (2, 3): arm x axis of a and b."""
     cdef int32_t a = e.contact_body[2 * c], b = e.contact_body[2 * c + 1]
     cdef double s = 0.0
     cross(e.arm_a + 3 * c, axis, turn)
@@ -46,62 +47,65 @@ cdef inline double displacement(const engine_t* e, int32_t c, const double* z, c
     return s
 
 
-cdef inline void push_contact(const engine_t* e, double* v, int32_t c, const double* impulse) noexcept nogil:
-    # velocities v (nd, 6) by an impulse (3) [N s] at a contact
+cdef inline void apply_contact_impulse(const engine_t* e, double* v, int32_t c, const double* impulse) noexcept nogil:
+    """Apply an impulse (3) [N s] at a contact to the velocities v (nd, 6)."""
     push_bodies(v, e.contact_body[2 * c], e.contact_body[2 * c + 1], e.inv_mass, e.inv_inertia, e.arm_a + 3 * c,
                 e.arm_b + 3 * c, impulse, NULL)
 
 
-cdef inline void push_normal(engine_t* e, int32_t c, double impulse) noexcept nogil:
-    # another normal impulse of a contact [N s], 0 where it would pull; dv follows
+cdef inline void set_normal_impulse(engine_t* e, int32_t c, double impulse) noexcept nogil:
+    """Set a contact's normal impulse [N s], clamped at 0, and update dv."""
     cdef int32_t row = e.ptr[e.size[N_JOINT] + c]
     cdef double p[3]
     impulse = impulse if impulse > 0.0 else 0.0
     scale3(impulse - e.impulse[row], e.normal + 3 * c, p)
     e.impulse[row] = impulse
-    push_contact(e, e.dv, c, p)
+    apply_contact_impulse(e, e.dv, c, p)
 
 
 cdef inline int32_t project_positions(engine_t* e) noexcept nogil:
-    """Fill e.shift; returns 1 where there is any. Writes S_DEPTH, S_JOINT_ERROR as the substep began."""
+    """Compute e.shift and return 1 if it is not zero; write S_DEPTH and S_JOINT_ERROR at the start of the substep."""
     cdef int32_t n = e.head[H_CONTACTS], mj = e.size[N_JOINT_ROW], _sweep, i, j, c, a, b, due = 0
     cdef double h = e.setting[S_H], slop = e.setting[S_SLOP], beta = e.setting[S_BETA]
-    cdef double most = e.setting[S_MAX_PUSH]
-    cdef double depth = 0.0, off = 0.0, x, y, p
+    cdef double max_correction = e.setting[S_MAX_PUSH]
+    cdef double depth = 0.0, joint_error = 0.0, x, new_multiplier, change
     cdef double impulse[3]
-    # free after the solve: J s wanted, by contact and joint row
+    # required J s of each joint row and contact; the target array is not needed after the solve
     cdef double* goal = e.target
     e.head[H_PROJECTED] = 0
+    # largest errors
     for c in range(n):
         if -e.gap[c] > depth:
             depth = -e.gap[c]
     for i in range(e.size[N_JOINT]):
         for j in range(e.ptr[i], e.ptr[i + 1]):
-            if rigid_row(e, i, j) and fabs(e.joint_error[j]) > off:
-                off = fabs(e.joint_error[j])
+            if rigid_row(e, i, j) and fabs(e.joint_error[j]) > joint_error:
+                joint_error = fabs(e.joint_error[j])
     e.setting[S_DEPTH] = depth
-    e.setting[S_JOINT_ERROR] = off
-    if e.head[H_POSITION_ITERATIONS] == 0 or not (depth > slop or off > 0.0):
+    e.setting[S_JOINT_ERROR] = joint_error
+    if e.head[H_POSITION_ITERATIONS] == 0 or not (depth > slop or joint_error > 0.0):
         return 0
+    # required corrections from the errors predicted at the end of the substep
     for i in range(6 * e.size[N_DYNAMIC]):
-        e.shift[i] = e.v_free[i] + e.dv[i]              # v+ for the moment
+        e.shift[i] = e.v_free[i] + e.dv[i]              # temporarily v+
     for i in range(e.size[N_JOINT]):
         a = e.joint_body[2 * i]
         b = e.joint_body[2 * i + 1]
         for j in range(e.ptr[i], e.ptr[i + 1]):
             e.push[j] = 0.0
             x = e.joint_error[j] + h * joint_velocity(e.jac + 12 * j, e.shift, a, b)
-            goal[j] = -clip(beta * x, -most, most)
+            goal[j] = -clip(beta * x, -max_correction, max_correction)
             if fabs(x) > 1e-3 * slop and rigid_row(e, i, j):
                 due = 1
     for c in range(n):
         e.push[mj + c] = 0.0
-        x = -beta * (e.gap[c] + h * normal_speed(e, e.shift, c) + slop)
+        x = -beta * (e.gap[c] + h * contact_normal_velocity(e, e.shift, c) + slop)
         if x > 0.0:
             due = 1
-        goal[mj + c] = x if x < most else most
+        goal[mj + c] = x if x < max_correction else max_correction
     if not due:
         return 0
+    # sweeps over joints, then contacts
     for i in range(6 * e.size[N_DYNAMIC]):
         e.shift[i] = 0.0
     for _sweep in range(e.head[H_POSITION_ITERATIONS]):
@@ -110,16 +114,16 @@ cdef inline int32_t project_positions(engine_t* e) noexcept nogil:
             b = e.joint_body[2 * i + 1]
             for j in range(e.ptr[i], e.ptr[i + 1]):
                 if rigid_row(e, i, j):
-                    p = (goal[j] - joint_velocity(e.jac + 12 * j, e.shift, a, b)) * e.step[j]      # (2)
-                    joint_push(e.minv_jac + 12 * j, p, e.shift, a, b)
+                    change = (goal[j] - joint_velocity(e.jac + 12 * j, e.shift, a, b)) * e.step[j]      # (2)
+                    joint_push(e.minv_jac + 12 * j, change, e.shift, a, b)
         for c in range(n):
-            y = relax_normal(e.push[mj + c], normal_speed(e, e.shift, c) - goal[mj + c],
-                             e.step[e.ptr[e.size[N_JOINT] + c]])                                   # (1)
-            p = y - e.push[mj + c]
-            if p == 0.0:
+            new_multiplier = relax_normal(e.push[mj + c], contact_normal_velocity(e, e.shift, c) - goal[mj + c],
+                                          e.step[e.ptr[e.size[N_JOINT] + c]])                           # (1)
+            change = new_multiplier - e.push[mj + c]
+            if change == 0.0:
                 continue
-            e.push[mj + c] = y
-            scale3(p, e.normal + 3 * c, impulse)
-            push_contact(e, e.shift, c, impulse)
+            e.push[mj + c] = new_multiplier
+            scale3(change, e.normal + 3 * c, impulse)
+            apply_contact_impulse(e, e.shift, c, impulse)
     e.head[H_PROJECTED] = e.head[H_POSITION_ITERATIONS]
     return 1

@@ -1,14 +1,14 @@
-"""LavenderSim's substep: broad phase, narrow phase, cache, velocity solve, position projection, drift.
+"""LavenderSim's substep: broad phase, narrow phase, contact cache, velocity solve, position projection, integration.
 
     start       frames, world inverse inertia, v* = v + h g
-    pairs       boxes that meet
-    contacts    manifolds, rows, guesses from the cache; joint rows before them
+    pairs       pairs of overlapping bounding boxes
+    contacts    joint rows; then manifolds, contact rows, warm start from the cache
     solve       dv = M^-1 J^T lam, then `iterations` sweeps: all joints, then all contacts
     finish      shift of the position projection, v = v* + dv, poses, cache
 
-`prepare` is the first three, and changes no state: where the capacities do not suffice it says what is
-needed. Between `prepare` and `finish` any solver may take the place of `solve`: the velocity problem
-lies in the arrays, the impulses go back into them.
+`prepare` performs the first three stages and does not change the state; if a capacity is too small, it reports the
+needed capacity. Between `prepare` and `finish` any solver may replace `solve`: it reads the velocity problem from the
+arrays and writes the impulses back.
 """
 from libc.stdint cimport int32_t, int64_t, uint64_t
 from libc.string cimport memcpy
@@ -28,16 +28,16 @@ from lavender_ext.core.view cimport rows_t
 from lavender_ext.engine.arrays cimport (AT_RANDOM, AVBD, BOTTOM_UP, CAP_CONTACT, CAP_PAIR, COLORED, H_CONTACTS,
                                          H_CONTACT_ROWS, H_ITERATIONS, H_LOST, H_MATCHES, H_RELAXING, H_STEPPER,
                                          H_NEED_CONTACTS, H_NEED_PAIRS, H_ORDER, H_SEED, H_SOLVED, H_STEP,
-                                         H_WARM_START, NEED_ROOM, NOT_FINITE, N_DYNAMIC, N_JOINT,
+                                         H_WARM_START, NEED_CAPACITY, NOT_FINITE, N_DYNAMIC, N_JOINT,
                                          N_JOINT_ROW, OK, REVERSED, ROWS_PER_CONTACT, SOFT_STEP, SYMMETRICALLY, S_OUT,
                                          TOP_DOWN, XPBD, bind, engine_t)
 from lavender_ext.engine.avbd cimport descend_all
-from lavender_ext.engine.bodies cimport drift_bodies, start_bodies
+from lavender_ext.engine.bodies cimport advance_bodies, start_bodies
 from lavender_ext.engine.broad_phase cimport update_pairs
-from lavender_ext.engine.contacts cimport make_contacts, store_contacts
-from lavender_ext.engine.joints cimport make_joints
-from lavender_ext.engine.projection cimport normal_speed, project_positions
-from lavender_ext.engine.soft_step cimport relax, restitute, soften
+from lavender_ext.engine.contacts cimport build_contacts, store_contacts
+from lavender_ext.engine.joints cimport build_joints
+from lavender_ext.engine.projection cimport contact_normal_velocity, project_positions
+from lavender_ext.engine.soft_step cimport remove_bias, apply_restitution, soften_rows
 from lavender_ext.engine.view cimport view
 from lavender_ext.engine.xpbd cimport correct_all
 from lavender_ext.judge.measure cimport score_slack
@@ -47,53 +47,56 @@ from lavender_ext.sweep.packed cimport MOST, allocate_workspace, sweep_packed
 
 
 cdef enum:
-    SWEEPS_PACKED = 4
+    MIN_PACKED_SWEEPS = 4       # Pack the blocks from this many sweeps on: packing costs as much as a few sweeps.
 
 
 cdef int32_t prepare(engine_t* e) noexcept nogil:
+    """Build the velocity problem of the coming substep; return OK or NEED_CAPACITY."""
     cdef blocks_t p
     cdef rows_t r
     cdef int32_t pairs, contacts, i
     e.head[H_SOLVED] = 0
+    # bodies and pairs
     start_bodies(e)
     pairs = update_pairs(e)
     e.head[H_NEED_PAIRS] = pairs
     if pairs > e.size[CAP_PAIR]:
-        return NEED_ROOM
+        return NEED_CAPACITY
+    # joint rows, contact rows
     view(e, &p, &r)
     if e.size[N_JOINT] > 0:
-        make_joints(e)
+        build_joints(e)
     if e.head[H_STEPPER] == SOFT_STEP:
         for i in range(e.size[CAP_CONTACT] * e.size[ROWS_PER_CONTACT]):
-            e.compliance[e.size[N_JOINT_ROW] + i] = 0.0     # where a substep stopped between prepare and solve
-    contacts = make_contacts(e, &r)
+            e.compliance[e.size[N_JOINT_ROW] + i] = 0.0     # a previous substep may have stopped between prepare and solve
+    contacts = build_contacts(e, &r)
     e.head[H_NEED_CONTACTS] = contacts
     if contacts > e.size[CAP_CONTACT]:
-        return NEED_ROOM
+        return NEED_CAPACITY
     if e.head[H_STEPPER] == SOFT_STEP:
-        soften(e)
+        soften_rows(e)
     return OK
 
 
-cdef inline void measure(const engine_t* e, double* residual, double* violation) noexcept nogil:
-    # max |e_n| [N s] and max(0, -w_n) [m/s] over the contacts, w_n = J dv + c lam - b
+cdef inline void measure_contacts(const engine_t* e, double* residual, double* violation) noexcept nogil:
+    """Compute max |e_n| [N s] and max(0, -w_n) [m/s] over the contacts, w_n = J dv + c lam - b."""
     cdef int32_t c, row
-    cdef double w, x, inf = 1.0 / 0.0, big = 0.0, low = 0.0
+    cdef double slack, error, inf = 1.0 / 0.0, max_error = 0.0, max_violation = 0.0
     for c in range(e.head[H_CONTACTS]):
         row = e.ptr[e.size[N_JOINT] + c]
-        w = normal_speed(e, e.dv, c) + (e.compliance[row] * e.impulse[row] - e.b[row])
-        x = row_error(e.impulse[row], w, e.d[row], 0.0, inf)
-        x = -x if x < 0.0 else x
-        if not x <= big:
-            big = x
-        if not -w <= low:
-            low = -w
-    residual[0] = big
-    violation[0] = low
+        slack = contact_normal_velocity(e, e.dv, c) + (e.compliance[row] * e.impulse[row] - e.b[row])
+        error = row_error(e.impulse[row], slack, e.d[row], 0.0, inf)
+        error = -error if error < 0.0 else error
+        if not error <= max_error:
+            max_error = error
+        if not -slack <= max_violation:
+            max_violation = -slack
+    residual[0] = max_error
+    violation[0] = max_violation
 
 
-cdef inline void warm(engine_t* e, const blocks_t* p, const rows_t* r) noexcept nogil:
-    # dv = M^-1 J^T lam, 0 where every substep starts cold
+cdef inline void apply_warm_start(engine_t* e, const blocks_t* p, const rows_t* r) noexcept nogil:
+    """Set dv = M^-1 J^T lam, or 0 without warm starting."""
     cdef int32_t i
     if e.head[H_WARM_START]:
         rows_velocity(p, r, e.impulse, e.dv)
@@ -103,11 +106,11 @@ cdef inline void warm(engine_t* e, const blocks_t* p, const rows_t* r) noexcept 
 
 
 cdef inline void order_blocks(engine_t* e) noexcept nogil:
-    """Sweep order of all blocks into e.order, as lavender.ordering makes it: joints, then contacts."""
+    """Write the sweep order of all blocks to e.order, as computed by lavender.ordering: joints, then contacts."""
     cdef int32_t kj = e.size[N_JOINT], n = kj + e.head[H_CONTACTS], nd = e.size[N_DYNAMIC]
     cdef int32_t mode = e.head[H_ORDER]
     cdef int32_t* level = e.order_scratch
-    cdef int32_t* of_block = level + nd
+    cdef int32_t* block_level = level + nd
     cdef int32_t i, levels
     for i in range(n):
         e.order[i] = i
@@ -116,25 +119,25 @@ cdef inline void order_blocks(engine_t* e) noexcept nogil:
         reverse(e.order, kj, n)
     elif mode == BOTTOM_UP or mode == TOP_DOWN or mode == COLORED:
         if mode == COLORED:
-            levels = color_by_bodies(n, e.joint_body, nd, e.color_scratch, of_block)
+            levels = color_by_bodies(n, e.joint_body, nd, e.color_scratch, block_level)
         else:
             levels = body_levels(n, e.joint_body, nd, level) + 2
-            block_levels(n, e.joint_body, level, of_block)
+            block_levels(n, e.joint_body, level, block_level)
         if mode == TOP_DOWN:
             for i in range(n):
-                of_block[i] = levels - 1 - of_block[i]
-        sort_by_level(kj, of_block, levels, of_block + n, e.order)
-        sort_by_level(n - kj, of_block + kj, levels, of_block + n, e.order + kj)
+                block_level[i] = levels - 1 - block_level[i]
+        sort_by_level(kj, block_level, levels, block_level + n, e.order)
+        sort_by_level(n - kj, block_level + kj, levels, block_level + n, e.order + kj)
         for i in range(kj, n):
             e.order[i] += kj
 
 
-cdef inline void note_sweep(const engine_t* e, const blocks_t* p, const rows_t* r, double* out,
+cdef inline void record_sweep_error(const engine_t* e, const blocks_t* p, const rows_t* r, double* out,
                             double* scratch) noexcept nogil:
-    # max |e_n| [N s] over the contacts, E = sqrt(sum d e^2) [sqrt J] over all rows; scratch (2 m)
+    """Write max |e_n| [N s] over the contacts and E = sqrt(sum d e^2) [sqrt J] over all rows to out (2); scratch (2 m)."""
     cdef double violation
     cdef score_t s = new_score()
-    measure(e, out, &violation)
+    measure_contacts(e, out, &violation)
     rows_slack(p, r, e.impulse, e.dv, scratch)
     score_slack(p, e.impulse, scratch, scratch + p.n_rows, &s)
     out[1] = s.energy
@@ -142,11 +145,11 @@ cdef inline void note_sweep(const engine_t* e, const blocks_t* p, const rows_t* 
 
 cdef void sweep_all(engine_t* e, const blocks_t* p, const rows_t* r, int32_t sweeps, double* curve,
                     double* scratch) noexcept nogil:
-    """Sweeps one after another: joints, then contacts; curve (sweeps + 1, 2) or NULL."""
+    """Run the sweeps, joints, then contacts; curve (sweeps + 1, 2) or NULL receives the error after each."""
     cdef int32_t s, i, kj = r.n_joints, k = p.n_blocks, mode
     cdef uint64_t rng
     mode = SYMMETRIC if e.head[H_ORDER] == SYMMETRICALLY else (RANDOM if e.head[H_ORDER] == AT_RANDOM else 0)
-    # every substep has its own stream, a function of seed and substep alone
+    # every substep has its own random stream, a function of seed and substep alone
     rng = ((<uint64_t>(<int64_t>e.head[H_SEED])) << 32) ^ (<uint64_t>(<int64_t>e.head[H_STEP]))
     for s in range(sweeps):
         advance_order(mode, s == 0, e.order, 0, kj, &rng)
@@ -156,12 +159,12 @@ cdef void sweep_all(engine_t* e, const blocks_t* p, const rows_t* r, int32_t swe
         for i in range(kj, k):
             relax_contact_block(p, r, e.order[i], e.impulse, e.dv)
         if curve != NULL:
-            note_sweep(e, p, r, curve + 2 * (s + 1), scratch)
+            record_sweep_error(e, p, r, curve + 2 * (s + 1), scratch)
 
 
-cdef inline int32_t sweep_fast(engine_t* e, const blocks_t* p, const rows_t* r, int32_t sweeps,
+cdef inline int32_t sweep_packed_blocks(engine_t* e, const blocks_t* p, const rows_t* r, int32_t sweeps,
                                double* workspace) noexcept nogil:
-    # the same bits by packed blocks; 0 where these are few, or the order changes
+    """Sweep over packed blocks with the same bits; return 0 if there are too few blocks or the order changes."""
     if e.head[H_ORDER] == SYMMETRICALLY or e.head[H_ORDER] == AT_RANDOM:
         return 0
     return sweep_packed(p, r, e.order, sweeps, workspace, e.impulse, e.dv)
@@ -169,16 +172,16 @@ cdef inline int32_t sweep_fast(engine_t* e, const blocks_t* p, const rows_t* r, 
 
 cdef inline void sweep(engine_t* e, const blocks_t* p, const rows_t* r, int32_t sweeps, double* workspace, double* curve,
                        double* scratch) noexcept nogil:
+    """Run the sweeps in the order of H_ORDER, over packed blocks if that pays."""
     order_blocks(e)
-    # to pack costs what some sweeps do
-    if workspace == NULL or sweeps < SWEEPS_PACKED or not sweep_fast(e, p, r, sweeps, workspace):
+    if workspace == NULL or sweeps < MIN_PACKED_SWEEPS or not sweep_packed_blocks(e, p, r, sweeps, workspace):
         sweep_all(e, p, r, sweeps, curve, scratch)
 
 
-cdef inline void move(engine_t* e) noexcept nogil:
-    # steppers over positions: residuals of a velocity problem have no meaning there
+cdef inline void solve_positions(engine_t* e) noexcept nogil:
+    """Run a stepper over positions (XPBD, AVBD); its velocity residuals are undefined and set to NaN."""
     cdef int32_t k
-    cdef uint64_t nan = 0x7FF8000000000000              # by its bits: processors choose the sign of 0/0
+    cdef uint64_t nan = 0x7FF8000000000000              # as bits: the sign of 0/0 depends on the processor
     if e.head[H_STEPPER] == XPBD:
         order_blocks(e)
         correct_all(e)
@@ -189,38 +192,41 @@ cdef inline void move(engine_t* e) noexcept nogil:
 
 
 cdef inline void solve(engine_t* e, int32_t sweeps, double* workspace, double* curve, double* scratch) noexcept nogil:
-    """What the stepper does before positions move for good; sweeps = 0: guesses and first measures alone."""
+    """Run the stepper's solve, before the poses are updated; sweeps = 0: warm start and its error only."""
     cdef blocks_t p
     cdef rows_t r
     cdef double* out = e.setting + S_OUT
     view(e, &p, &r)
     if sweeps and (e.head[H_STEPPER] == XPBD or e.head[H_STEPPER] == AVBD):
-        move(e)
+        solve_positions(e)
         return
-    warm(e, &p, &r)
-    measure(e, out + 4, out + 6)
+    # warm start and error before the first sweep
+    apply_warm_start(e, &p, &r)
+    measure_contacts(e, out + 4, out + 6)
     if curve != NULL:
-        note_sweep(e, &p, &r, curve, scratch)
+        record_sweep_error(e, &p, &r, curve, scratch)
     if not sweeps:
         return
+    # sweeps, and for SOFT_STEP the relaxing sweeps and restitution
     sweep(e, &p, &r, e.head[H_ITERATIONS], workspace, curve, scratch)
     if e.head[H_STEPPER] == SOFT_STEP:
-        relax(e)
+        remove_bias(e)
         sweep(e, &p, &r, e.head[H_RELAXING], workspace, NULL, NULL)
-        restitute(e)
-    measure(e, out + 5, out + 7)
+        apply_restitution(e)
+    measure_contacts(e, out + 5, out + 7)
 
 
 cdef inline int32_t moving_body(const engine_t* e, const int32_t* pair) noexcept nogil:
+    """Return the first dynamic body of a pair."""
     return pair[0] if pair[0] >= 0 and e.dyn[pair[0]] >= 0 else pair[1]
 
 
-cdef inline int32_t unsolved_body(const engine_t* e) noexcept nogil:
-    """A moving body of the first block whose impulses are not finite, or the solver's measures; -1 if all are."""
+cdef inline int32_t find_nonfinite_body(const engine_t* e) noexcept nogil:
+    """Return a dynamic body of the first block with a value that is not finite, or -1 if all values are finite."""
     cdef int32_t i, kj = e.size[N_JOINT], c = e.head[H_CONTACTS]
-    cdef int32_t known = 4 if e.head[H_STEPPER] == XPBD or e.head[H_STEPPER] == AVBD else 8
+    cdef int32_t n_statistics = 4 if e.head[H_STEPPER] == XPBD or e.head[H_STEPPER] == AVBD else 8
     if (all_finite(e.impulse, e.size[N_JOINT_ROW] + e.head[H_CONTACT_ROWS]) and all_finite(e.gap, c)
-            and all_finite(e.setting + S_OUT, known)):
+            and all_finite(e.setting + S_OUT, n_statistics)):
         return -1
     for i in range(kj):
         if not all_finite(e.impulse + e.ptr[i], e.ptr[i + 1] - e.ptr[i]):
@@ -233,9 +239,11 @@ cdef inline int32_t unsolved_body(const engine_t* e) noexcept nogil:
 
 
 cdef int32_t finish(engine_t* e) noexcept nogil:
-    cdef int32_t i, shifted, unsolved
+    """Write the statistics, store the contact cache, project and advance the bodies; return OK or NOT_FINITE."""
+    cdef int32_t i, shifted, nonfinite_body
     cdef const double* by = e.dv
     cdef double* out = e.setting + S_OUT
+    # statistics
     out[0] = e.head[H_ITERATIONS]
     out[1] = 1.0 if e.head[H_WARM_START] else 0.0
     out[2] = e.head[H_CONTACTS]
@@ -246,12 +254,13 @@ cdef int32_t finish(engine_t* e) noexcept nogil:
         by = e.shift
     elif e.head[H_STEPPER] == XPBD:
         by = NULL
-    unsolved = unsolved_body(e)
+    # cache, projection, integration
+    nonfinite_body = find_nonfinite_body(e)
     store_contacts(e)
     shifted = project_positions(e)
-    e.head[H_LOST] = drift_bodies(e, by, shifted)
+    e.head[H_LOST] = advance_bodies(e, by, shifted)
     if e.head[H_LOST] < 0:
-        e.head[H_LOST] = unsolved
+        e.head[H_LOST] = nonfinite_body
     e.head[H_SOLVED] = 1
     e.head[H_STEP] = 0 if e.head[H_STEP] == 2147483647 else e.head[H_STEP] + 1
     return OK if e.head[H_LOST] < 0 else NOT_FINITE
@@ -259,7 +268,7 @@ cdef int32_t finish(engine_t* e) noexcept nogil:
 
 cdef public int32_t lav_engine_prepare(const int32_t* size, double* real, int32_t* index,
                                        uint64_t* keys) noexcept nogil:
-    """The coming substep's velocity problem; changes no state. Returns OK or NEED_ROOM."""
+    """Build the coming substep's velocity problem without changing the state; return OK or NEED_CAPACITY."""
     cdef engine_t e
     cdef int64_t n[3]
     bind(size, real, index, keys, &e, n)
@@ -268,7 +277,7 @@ cdef public int32_t lav_engine_prepare(const int32_t* size, double* real, int32_
 
 cdef public void lav_engine_solve(const int32_t* size, double* real, int32_t* index, uint64_t* keys,
                                   int32_t sweeps) noexcept nogil:
-    """Sequential impulses on the prepared problem; sweeps = 0 applies the guesses and measures them only."""
+    """Run the stepper on the prepared problem; sweeps = 0 only applies and measures the warm start."""
     cdef engine_t e
     cdef int64_t n[3]
     bind(size, real, index, keys, &e, n)
@@ -277,8 +286,10 @@ cdef public void lav_engine_solve(const int32_t* size, double* real, int32_t* in
 
 cdef public void lav_engine_solve_watched(const int32_t* size, double* real, int32_t* index, uint64_t* keys,
                                           double* curve, double* scratch) noexcept nogil:
-    """All sweeps, bit for bit, with the error before the first and after every one: curve (iterations + 1, 2)
-    holds max |e_n| [N s] over the contacts and E [sqrt J] over all rows; scratch (2 m)."""
+    """Run all sweeps, with the same bits as `lav_engine_solve`, and record the error before the first and after each.
+
+    curve (iterations + 1, 2) receives max |e_n| [N s] over the contacts and E [sqrt J] over all rows; scratch (2 m).
+    """
     cdef engine_t e
     cdef int64_t n[3]
     bind(size, real, index, keys, &e, n)
@@ -287,7 +298,7 @@ cdef public void lav_engine_solve_watched(const int32_t* size, double* real, int
 
 cdef public int32_t lav_engine_finish(const int32_t* size, double* real, int32_t* index,
                                       uint64_t* keys) noexcept nogil:
-    """Positions, velocities and cache after the solve. Returns OK or NOT_FINITE."""
+    """Update positions, velocities and cache after the solve; return OK or NOT_FINITE."""
     cdef engine_t e
     cdef int64_t n[3]
     bind(size, real, index, keys, &e, n)
@@ -295,7 +306,10 @@ cdef public int32_t lav_engine_finish(const int32_t* size, double* real, int32_t
 
 
 cdef inline int32_t substeps(engine_t* e, int32_t n, double* workspace, int32_t* done) noexcept nogil:
-    # workspace: of packed blocks, `allocate_workspace` the capacities, or NULL: the same bits in more time
+    """Run up to n substeps; `done` receives the number completed.
+
+    workspace: for packed blocks, of the size that `allocate_workspace` returns for the capacities, or NULL: slower, same bits.
+    """
     cdef int32_t status
     done[0] = 0
     while done[0] < n:
@@ -312,7 +326,7 @@ cdef inline int32_t substeps(engine_t* e, int32_t n, double* workspace, int32_t*
 
 cdef public int32_t lav_engine_substeps(const int32_t* size, double* real, int32_t* index, uint64_t* keys,
                                         int32_t n_substeps, int32_t* done) noexcept nogil:
-    """Whole substeps with sequential impulses; done: how many were completed before the status."""
+    """Run complete substeps; `done` receives the number completed before the returned status."""
     cdef engine_t e
     cdef int64_t n[3]
     bind(size, real, index, keys, &e, n)
@@ -320,9 +334,9 @@ cdef public int32_t lav_engine_substeps(const int32_t* size, double* real, int32
 
 
 cdef class Buffers:
-    """Three buffers and their sizes, kept alive for the kernels; `arrays()` names what lies in them.
+    """The engine's three buffers and their sizes, kept alive for the kernels; `arrays()` returns the arrays in them by name.
 
-    The caller passes buffers of at least `lengths(size)` entries.
+    The buffers must have at least `lengths(size)` entries.
     """
     cdef engine_t e
     cdef const int32_t[::1] size
@@ -343,7 +357,7 @@ cdef class Buffers:
                                       size[N_DYNAMIC]) if joints <= MOST else 1)
 
     def pairs(self):
-        """Run the broad phase, whose time the benchmark of kernels tells; returns the number of pairs needed."""
+        """Run the broad phase alone, for the kernel benchmark, and return the number of pairs needed."""
         cdef int32_t n
         with nogil:
             start_bodies(&self.e)
@@ -351,44 +365,47 @@ cdef class Buffers:
         return n
 
     def prepare(self):
+        """Build the velocity problem of the coming substep; return OK or NEED_CAPACITY."""
         cdef int32_t status
         with nogil:
             status = prepare(&self.e)
         return status
 
     def solve(self, bint sweeps=True):
+        """Run the stepper on the prepared problem; without `sweeps` only apply and measure the warm start."""
         with nogil:
             solve(&self.e, sweeps, NULL, NULL, NULL)
 
     def solve_watched(self, double[:, ::1] curve):
-        """All sweeps; curve (iterations + 1, 2) takes max |e_n| [N s] and E [sqrt J] along the way."""
+        """Run all sweeps; curve (iterations + 1, 2) receives max |e_n| [N s] and E [sqrt J] before the first and after each."""
         rows = self.size[N_JOINT_ROW] + self.size[CAP_CONTACT] * self.size[ROWS_PER_CONTACT]
         cdef double[::1] scratch = np.empty(2 * rows + 1)
         with nogil:
             solve(&self.e, 1, NULL, &curve[0, 0], &scratch[0])
 
     def apply(self):
-        """dv and the final measures of impulses that another solver has written."""
+        """Compute dv and the final error of impulses that another solver has written."""
         cdef blocks_t p
         cdef rows_t r
         with nogil:
             view(&self.e, &p, &r)
             rows_velocity(&p, &r, self.e.impulse, self.e.dv)
-            measure(&self.e, self.e.setting + S_OUT + 5, self.e.setting + S_OUT + 7)
+            measure_contacts(&self.e, self.e.setting + S_OUT + 5, self.e.setting + S_OUT + 7)
 
     def finish(self):
+        """Update positions, velocities and cache after the solve; return OK or NOT_FINITE."""
         cdef int32_t status
         with nogil:
             status = finish(&self.e)
         return status
 
     def substeps(self, int32_t n):
-        """Run n substeps; returns (status, how many were completed)."""
+        """Run n substeps; return (status, number of completed substeps)."""
         cdef int32_t status, done = 0
         with nogil:
             status = substeps(&self.e, n, &self.workspace[0], &done)
         return status, done
 
     def arrays(self):
-        """Name -> writable view of one of the buffers, with the shape that engine/arrays.pyx gives."""
+        """Return {array name: writable view into its buffer}, with the shapes of engine/arrays.pyx."""
         return views(self.size, np.asarray(self.real), np.asarray(self.index), np.asarray(self.keys))

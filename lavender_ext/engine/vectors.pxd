@@ -19,21 +19,21 @@ cdef inline void scale3(double s, const double* x, double* out) noexcept nogil:
         out[k] = s * x[k]
 
 
-cdef inline void minus3(const double* x, const double* y, double* out) noexcept nogil:
+cdef inline void subtract3(const double* x, const double* y, double* out) noexcept nogil:
     """Compute out = x - y."""
     cdef int32_t k
     for k in range(3):
         out[k] = x[k] - y[k]
 
 
-cdef inline void plus3(const double* x, double s, const double* y, double* out) noexcept nogil:
+cdef inline void add_scaled3(const double* x, double s, const double* y, double* out) noexcept nogil:
     """Compute out = x + s y."""
     cdef int32_t k
     for k in range(3):
         out[k] = x[k] + s * y[k]
 
 
-cdef inline void both3(double s, const double* x, double t, const double* y, double* out) noexcept nogil:
+cdef inline void combine3(double s, const double* x, double t, const double* y, double* out) noexcept nogil:
     """Compute out = s x + t y."""
     cdef int32_t k
     for k in range(3):
@@ -47,7 +47,7 @@ cdef inline void column3(const double* matrix, int32_t j, double* out) noexcept 
         out[k] = matrix[3 * k + j]
 
 
-cdef inline void times3(const double* matrix, const double* x, double* out) noexcept nogil:
+cdef inline void matvec3(const double* matrix, const double* x, double* out) noexcept nogil:
     """Compute out = matrix (3, 3) x; out must not alias x."""
     cdef int32_t k
     for k in range(3):

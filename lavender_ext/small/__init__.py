@@ -1,1 +1,1 @@
-"""One small problem in one call: check its start, solve and judge it, over kernels of other packages."""
+"""One call for one small problem: check its start, solve and judge it, with kernels of other packages."""

@@ -1,12 +1,12 @@
-"""Problems of few rows by bodies or by A, and islands of few rows: check the start, solve and judge in one call.
+"""Problems with few rows over bodies or A, and islands with few rows: check the start, solve and judge in one call.
 
-    bounded rows   the factor of A, linear or boxed, one shift where it is singular, refinement (pivot/direct.pyx);
-                   where exchanges are stuck Lemke's path, if asked for                      (pivot/lemke.pyx)
-    friction       accelerated sweeps and Newton's method in turns                                 (friction.pxd)
+    bounded rows   factorisation of A, linear or with bounds, a shift if A is singular, refinement   (pivot/direct.pyx);
+                   if exchanges are stuck and another method follows, Lemke's path                   (pivot/lemke.pyx)
+    friction       accelerated sweeps, alternating with Newton's method                              (friction.pxd)
 
-Under friction a part is the whole, or each island in turn, cut out of A or of the bodies and solved to its own relative residual
-(judge/score.pxd). An island with the bytes of the one before has the same answer. If the result does not end below tol on the
-judge's own measure, the call returns none and the caller starts the general solver.
+Under friction a subproblem is the whole problem, or each island in turn. An island's data is copied out of A or the bodies, and
+it is solved to its own relative residual (judge/score.pxd). An island with data identical to the previous one reuses its
+result. If the judge's relative residual is above tol, the call returns no result and the caller starts the general solver.
 """
 from cpython.exc cimport PyErr_CheckSignals
 from libc.math cimport INFINITY
@@ -23,10 +23,11 @@ from lavender_ext.core.problem cimport Data
 from lavender_ext.core.method cimport workspace_t
 from lavender_ext.core.view cimport bodies_of, csr_t, rows_t
 from lavender_ext.factor.tiles cimport has_wide
-from lavender_ext.small.call cimport COUNTS, ENDED, FAILED, KEPT, Rules, few_rules_t, few_t, rooms_t
-from lavender_ext.small.friction cimport ask_t, part_t, solve_part, work_of
+from lavender_ext.small.call cimport (N_COUNTS, RESULT_FAILED, RESULT_IS_START, RESULT_SOLVED, Rules, small_problem_t,
+                                      small_rules_t, solve_workspaces_t)
+from lavender_ext.small.friction cimport friction_run_t, subproblem_t, solve_subproblem, subproblem_work_size
 from lavender_ext.small.limits cimport is_linear
-from lavender_ext.small.workspace cimport has_workspace_size, leave
+from lavender_ext.small.workspace cimport has_workspace_size, free_workspace
 from lavender_ext.judge.measure cimport set_zero_impulse, floor_of, judge_view, judged_from, relative_of, scratch_of
 from lavender_ext.judge.score cimport new_score
 from lavender_ext.local.gauss_seidel cimport prepare_blocks, prepared_sizes
@@ -39,16 +40,16 @@ cdef object new = np.empty
 
 
 cdef enum:
-    SWEEPS = 2                  # that guess the free rows
-    ROUNDS = 32                 # of exchanges
-    PATH = 8                    # pivots of Lemke's for each row
-    ROUND_ROW = 50              # ns of a round for each row, beside its factor
-    FEW = 12                    # rows of an island that has all of its sweeps before its factors
-    LISTEN = 5000000            # multiply-adds between two checks for Ctrl-C, a few milliseconds
+    ACTIVE_SET_SWEEPS = 2       # sweeps that predict which rows are free
+    MAX_PASS_EXCHANGES = 32     # rounds of exchanges of one pass
+    LEMKE_PIVOTS_PER_ROW = 8    # limit of Lemke's paths
+    EXCHANGE_NS_PER_ROW = 50    # estimated cost [ns] of a round of exchanges per row, in addition to its factorisation
+    FULL_SWEEP_ROWS = 12        # Islands with at most this many rows get all sweeps before their factorisations.
+    INTERRUPT_CHECK_WORK = 5000000      # multiply-adds between two checks for Ctrl-C, a few milliseconds
 
 
 cdef bint are_bounded(const blocks_t* p) noexcept nogil:
-    """Does nothing bound a row but its own two numbers?"""
+    """Return whether every row has fixed bounds only: no friction."""
     cdef int32_t i
     for i in range(p.n_blocks):
         if not is_rows(p, i) and p.ptr[i + 1] - p.ptr[i] > 1:
@@ -56,8 +57,11 @@ cdef bint are_bounded(const blocks_t* p) noexcept nogil:
     return True
 
 
-cdef bint lay_few(few_t* s, workspace_t* workspace) noexcept nogil:
-    """What the call needs beside both views and the error of doing nothing; in `workspace`, where it stays."""
+cdef bint lay_few(small_problem_t* s, workspace_t* workspace) noexcept nogil:
+    """Compute a small problem's remaining fields in `workspace`, which it keeps; return False without memory.
+
+    Both views and the residual of the zero impulse are given.
+    """
     cdef const blocks_t* p = &s.v.p
     cdef int32_t band[2]
     cdef int64_t n
@@ -68,7 +72,7 @@ cdef bint lay_few(few_t* s, workspace_t* workspace) noexcept nogil:
     if s.pivots:
         s.symmetric = scan_entries(s.over.a, s.over.p.d, p.n_rows, workspace.index, band) <= 1e-14
         s.band = max(band[0], band[1]) if s.symmetric else p.n_rows - 1
-    elif p.law == CONE or s.v.a != NULL:                # within a contact of a matrix that was given, units may be unlike
+    elif p.law == CONE or s.v.a != NULL:                # the units of a given matrix may differ within a contact
         n = <int64_t>prepared_sizes(p, workspace.index) + 1
         if not has_workspace_size(workspace, 0, n):
             return False
@@ -78,8 +82,8 @@ cdef bint lay_few(few_t* s, workspace_t* workspace) noexcept nogil:
     return True
 
 
-cdef bint has_call(const blocks_t* p) noexcept nogil:
-    """Do these calls solve every block? Neither round cones nor what rolls."""
+cdef bint supports_blocks(const blocks_t* p) noexcept nogil:
+    """Return whether this solver supports every block: no round cones, no rolling friction."""
     cdef int32_t i
     for i in range(p.n_blocks):
         if p.kind[i] == ROUND or p.kind[i] == CONTACT_ROLLING:
@@ -87,51 +91,56 @@ cdef bint has_call(const blocks_t* p) noexcept nogil:
     return True
 
 
-cdef void judge_few(few_t* s, const double* lam, double* both, double* scratch) noexcept nogil:
-    """w and e into both (2 m); scratch as `judge_view`."""
+cdef void judge_small(small_problem_t* s, const double* lam, double* both, double* scratch) noexcept nogil:
+    """Judge lam: write w and e to both (2 m), and score, floor and relative residual to s; scratch as `judge_view`."""
     cdef int32_t m = s.v.p.n_rows
     s.score = new_score()
     judge_view(&s.v, lam, both, both + m, scratch, True, &s.score)
-    s.floor = floor_of(&s.score, s.begin[0], s.begin[1])
-    s.relative = relative_of(&s.score, both, m, s.begin[0], s.begin[1])
+    s.floor = floor_of(&s.score, s.zero_residual[0], s.zero_residual[1])
+    s.relative = relative_of(&s.score, both, m, s.zero_residual[0], s.zero_residual[1])
 
 
-cdef bint begin_few(few_t* s, const few_rules_t* rules, double* own, bint cold, double tol, double* both,
+cdef bint set_small_start(small_problem_t* s, const small_rules_t* rules, double* own, bint cold, double tol, double* both,
                     double* scratch) noexcept nogil:
-    """`own` (m) [N s] where it is started from, from doing nothing if `cold`; is that a solution, and judged?
+    """Set the start `own` (m) [N s], the zero impulse if `cold`; return whether it is a solution, which is then judged.
 
-    Asked where another method comes next. It is no start where its residual is above that of doing nothing, or for pivots above
-    `warm`. scratch: m numbers and as `judge_view`.
+    The residual is checked only if another method follows. A start with a residual above that of the zero impulse, or above
+    `warm` for pivots, is replaced by the zero impulse. scratch: m numbers plus those of `judge_view`.
     """
     cdef int32_t m = s.v.p.n_rows
-    cdef double before = s.begin[2]
+    cdef double residual = s.zero_residual[2]
     set_zero_impulse(&s.v.p, scratch, both)
     if cold:
         memcpy(own, scratch, m * sizeof(double))
     if not rules.follows:
         return False
     cold = memcmp(own, scratch, m * sizeof(double)) == 0
-    if not cold or before <= tol:
-        judge_few(s, own, both, scratch + m)
-        before = before if cold else s.relative
-    if before <= tol:
+    if not cold or residual <= tol:
+        judge_small(s, own, both, scratch + m)
+        residual = residual if cold else s.relative
+    if residual <= tol:
         return True
-    if not before <= (rules.warm if s.pivots else 1.0):
+    if not residual <= (rules.warm if s.pivots else 1.0):
         memcpy(own, scratch, m * sizeof(double))
     return False
 
 
-cdef inline bint met(const direct_t* t, double tol, bint enough) noexcept nogil:
-    # Below tol and to rounding; where bounded rows are exchanged to the end and that is `enough`, below tol alone.
-    return t.relative <= tol and (is_end(t) or (enough and t.solved and not t.linear))
+cdef inline bint is_converged(const direct_t* t, double tol, bint tol_suffices) noexcept nogil:
+    """Return whether the residual is below tol and exchanges have ended, or are at rounding.
+
+    With `tol_suffices`, solved bounded rows need not be refined to rounding.
+    """
+    return t.relative <= tol and (is_end(t) or (tol_suffices and t.solved and not t.linear))
 
 
-cdef inline bint pivot(direct_t* t, const double* start, double tol, bint enough, double most) noexcept nogil:
-    """Into `best`; did it end below tol? Passes end where one does not halve the residual, or is stuck.
+cdef inline bint run_exchanges(direct_t* t, const double* start, double tol, bint tol_suffices, double max_rounds) noexcept nogil:
+    """Solve by exchanges into `best`; return whether the result is converged.
 
-    No more rounds than `most`, which ends it.
+    Passes with a shifted matrix end if one does not halve the residual or is stuck, or after `max_rounds` rounds in total.
     """
     cdef int32_t code
+    cdef double remaining
+    # one factorisation, or exchanges
     direct_begin(t, start)
     if t.linear:
         code = direct_factor(t)
@@ -140,59 +149,64 @@ cdef inline bint pivot(direct_t* t, const double* start, double tol, bint enough
         if code == SOLVED:
             code = direct_linear(t)
     else:
-        code = direct_first(t, SWEEPS, ROUNDS if most > ROUNDS else <int32_t>max(most, 0.0))
+        code = direct_first(t, ACTIVE_SET_SWEEPS,
+                            MAX_PASS_EXCHANGES if max_rounds > MAX_PASS_EXCHANGES else <int32_t>max(max_rounds, 0.0))
+    # singular: passes with a shift
     if t.symmetric and (code == SMALL or (t.linear and not is_end(t))):
         direct_begin_passes(t, 0)
         code = HALVED
-        while code == HALVED and t.s.n_rounds < most:
-            code = direct_pass(t, ROUNDS if most - t.s.n_rounds > ROUNDS else <int32_t>(most - t.s.n_rounds))
+        while code == HALVED and t.s.n_rounds < max_rounds:
+            remaining = max_rounds - t.s.n_rounds
+            code = direct_pass(t, MAX_PASS_EXCHANGES if remaining > MAX_PASS_EXCHANGES else <int32_t>remaining)
             if not t.relative < INFINITY:
                 return False
-    return met(t, tol, enough)
+    return is_converged(t, tol, tol_suffices)
 
 
-cdef inline int32_t followed(direct_t* t, double tol, double* most, workspace_t* workspace) noexcept nogil:
-    """Where exchanges are stuck: Lemke's paths, and exchanges at their end.
+cdef inline int32_t run_lemke_paths(direct_t* t, double tol, double* remaining_cost, workspace_t* workspace) noexcept nogil:
+    """Follow Lemke's paths after stuck exchanges, with exchanges at the end of each.
 
-    Pivots of the paths, -1 where they do not end below tol.
+    Returns the number of pivots, -1 if the residual is above tol. remaining_cost [ns] is reduced by their cost.
     """
     cdef lemke_t l
     cdef double each = 2.0 * <double>t.s.n ** 2
-    cdef int32_t last = PATH * t.s.n if most[0] > PATH * t.s.n * each else <int32_t>(most[0] / each)
+    cdef int32_t limit = LEMKE_PIVOTS_PER_ROW * t.s.n
+    cdef int32_t last = limit if remaining_cost[0] > limit * each else <int32_t>(remaining_cost[0] / each)
     if not has_workspace_size(workspace, lemke_index(t.s.p), lemke_real(t.s.p)):
         return -1
     lemke_lay(&l, t, workspace.real, workspace.index)
     lemke_begin(&l)
     while lemke_run(&l, last - l.pivots) == RAY:
         pass
-    if last < PATH * t.s.n:
-        most[0] -= l.pivots * each
+    if last < limit:
+        remaining_cost[0] -= l.pivots * each
     return l.pivots if t.relative <= tol else -1
 
 
-cdef bint pivot_few(const few_t* s, double* own, double tol, bint follows, double* most, rooms_t* rooms,
-                    int32_t* counts) noexcept nogil:
-    """Linear or boxed; counts are (rounds and pivots of Lemke's path, whether swept, refinements, factorisations, pivots, shifts,
-    rank of a singular linear system or 0, pivots of Lemke's path).
+cdef bint pivot_small(const small_problem_t* s, double* own, double tol, bint follows, double* remaining_cost,
+                      solve_workspaces_t* workspaces, int32_t* counts) noexcept nogil:
+    """Solve free or bounded rows by factorisations and exchanges; return whether there is a result.
 
-    What pivots find is good where it is below tol, not to rounding alone, with Lemke's path where exchanges are stuck, if another
-    method follows.
+    counts receives (rounds plus pivots of Lemke's paths, 1 if swept, refinements, factorisations, exchanged rows, shifts, rank of
+    a singular linear system or 0, pivots of Lemke's paths). If another method follows, a result below tol is accepted even if it
+    is not exact to rounding, and Lemke's paths are followed if exchanges are stuck.
     """
     cdef direct_t t
     cdef int32_t path = 0, m = s.v.p.n_rows
-    cdef double each = ROUND_ROW * m + 0.1 * m * (s.band + 1.0) ** 2
+    cdef double each = EXCHANGE_NS_PER_ROW * m + 0.1 * m * (s.band + 1.0) ** 2
     cdef bint ended
-    if not has_workspace_size(&rooms.work, direct_index(&s.v), direct_real(&s.v, s.band)):
+    if not has_workspace_size(&workspaces.work, direct_index(&s.v), direct_real(&s.v, s.band)):
         return False
-    t.e0, t.v0, t.least = s.begin[0], s.begin[1], 1e-13
+    t.e0, t.v0, t.least = s.zero_residual[0], s.zero_residual[1], 1e-13
     t.linear, t.symmetric = s.linear, s.symmetric
-    direct_lay(&t, &s.v, s.over.a, &s.over.p, s.band, NULL, 1e-13, rooms.work.real, rooms.work.index)
-    ended = pivot(&t, own, tol, follows, most[0] / each)
-    most[0] -= t.s.n_rounds * each
-    if not ended and most[0] > 0.0:
-        path = followed(&t, tol, most, &rooms.more) if follows and not t.linear and not t.solved else -1
+    direct_lay(&t, &s.v, s.over.a, &s.over.p, s.band, NULL, 1e-13, workspaces.work.real, workspaces.work.index)
+    # exchanges, then Lemke's paths
+    ended = run_exchanges(&t, own, tol, follows, remaining_cost[0] / each)
+    remaining_cost[0] -= t.s.n_rounds * each
+    if not ended and remaining_cost[0] > 0.0:
+        path = run_lemke_paths(&t, tol, remaining_cost, &workspaces.more) if follows and not t.linear and not t.solved else -1
     if not ended:
-        ended = (path >= 0 and t.relative <= tol) or (not most[0] > 0.0 and t.relative < INFINITY)
+        ended = (path >= 0 and t.relative <= tol) or (not remaining_cost[0] > 0.0 and t.relative < INFINITY)
     if ended:
         memcpy(own, t.best, t.s.n * sizeof(double))
     path = max(path, 0)
@@ -201,119 +215,120 @@ cdef bint pivot_few(const few_t* s, double* own, double tol, bint follows, doubl
     return ended
 
 
-cdef inline void counted(const ask_t* o, int32_t parts, int32_t* counts) noexcept nogil:
-    """(longest of a part, sweeps, undone, factorisations, parts that asked for these, parts)"""
+cdef inline void store_counts(const friction_run_t* o, int32_t n_subproblems, int32_t* counts) noexcept nogil:
+    """Write the counters: longest subproblem, sweeps, undone sweeps, factorisations, factorised subproblems, subproblems."""
     counts[0], counts[1], counts[2] = o.longest, <int32_t>o.swept, <int32_t>o.undone
-    counts[3], counts[4], counts[5] = <int32_t>o.factorisations, o.driven, parts
+    counts[3], counts[4], counts[5] = <int32_t>o.factorisations, o.factorised, n_subproblems
 
 
-cdef bint sweep_few(const few_t* s, double* own, double tol, int32_t swept, double* most, rooms_t* rooms,
-                    int32_t* counts) noexcept nogil:
-    """Contacts, as one part; counts as `counted`. swept: at most, before its factors."""
+cdef bint sweep_small(const small_problem_t* s, double* own, double tol, int32_t swept, double* remaining_cost,
+                      solve_workspaces_t* workspaces, int32_t* counts) noexcept nogil:
+    """Solve contacts as one subproblem, with at most `swept` sweeps before factorisations; counts as in `store_counts`."""
     cdef int32_t m = s.v.p.n_rows, n = s.over.r.n_bodies if s.over.r != NULL else 0
-    cdef part_t part
-    cdef ask_t o = ask_t(tol, swept, swept, has_wide(), 0, 0, 0, 0.0, most[0], 0, 0)
+    cdef subproblem_t sub
+    cdef friction_run_t o = friction_run_t(tol, swept, swept, has_wide(), 0, 0, 0, 0.0, remaining_cost[0], 0, 0)
     cdef bint good
-    if not has_workspace_size(&rooms.work, s.v.p.n_blocks, work_of(m, n) + m):
+    if not has_workspace_size(&workspaces.work, s.v.p.n_blocks, subproblem_work_size(m, n) + m):
         return False
-    part.v, part.lam, part.answer, part.split = s.over, own, rooms.work.real, s.split
-    part.at, part.prepared, part.nothing = s.at, s.prepared, s.begin[2]
-    part.e0, part.v0 = s.begin[0], s.begin[1]
-    good = solve_part(&part, &o, &rooms.more, rooms.work.real + m, rooms.work.index)
-    memcpy(own, part.answer, m * sizeof(double))
-    most[0] = o.left
-    counted(&o, 1, counts)
-    return good or not o.left > 0.0
+    sub.v, sub.lam, sub.answer, sub.split = s.over, own, workspaces.work.real, s.split
+    sub.at, sub.prepared, sub.relative_at_zero = s.at, s.prepared, s.zero_residual[2]
+    sub.e0, sub.v0 = s.zero_residual[0], s.zero_residual[1]
+    good = solve_subproblem(&sub, &o, &workspaces.more, workspaces.work.real + m, workspaces.work.index)
+    memcpy(own, sub.answer, m * sizeof(double))
+    remaining_cost[0] = o.remaining_cost
+    store_counts(&o, 1, counts)
+    return good or not o.remaining_cost > 0.0
 
 
-cdef int32_t run_few(few_t* s, const few_rules_t* rules, double* own, bint cold, double tol, double most, double* both,
-                     rooms_t* rooms, int32_t* counts) noexcept nogil:
-    """From `own` (m) [N s], from doing nothing if `cold`, into it, judged: how it ended (`FAILED` ...)."""
+cdef int32_t solve_small(small_problem_t* s, const small_rules_t* rules, double* own, bint cold, double tol, double max_cost,
+                         double* both, solve_workspaces_t* workspaces, int32_t* counts) noexcept nogil:
+    """Solve and judge from `own` (m) [N s], or from the zero impulse if `cold`, into `own`; return the result code."""
     cdef int64_t m = s.v.p.n_rows, scratch = m + scratch_of(&s.v)
-    memset(counts, 0, COUNTS * sizeof(int32_t))
-    if not has_workspace_size(&rooms.work, 0, scratch):
-        return FAILED
-    if begin_few(s, rules, own, cold, tol, both, rooms.work.real):
-        return KEPT
-    if not (pivot_few(s, own, tol, rules.follows, &most, rooms, counts) if s.pivots
-            else sweep_few(s, own, tol, rules.swept, &most, rooms, counts)):
-        return FAILED
-    if not has_workspace_size(&rooms.work, 0, scratch):
-        return FAILED
-    judge_few(s, own, both, rooms.work.real)
-    return ENDED if s.pivots or s.relative <= tol or not most > 0.0 else FAILED
+    memset(counts, 0, N_COUNTS * sizeof(int32_t))
+    if not has_workspace_size(&workspaces.work, 0, scratch):
+        return RESULT_FAILED
+    if set_small_start(s, rules, own, cold, tol, both, workspaces.work.real):
+        return RESULT_IS_START
+    if not (pivot_small(s, own, tol, rules.follows, &max_cost, workspaces, counts) if s.pivots
+            else sweep_small(s, own, tol, rules.swept, &max_cost, workspaces, counts)):
+        return RESULT_FAILED
+    if not has_workspace_size(&workspaces.work, 0, scratch):
+        return RESULT_FAILED
+    judge_small(s, own, both, workspaces.work.real)
+    return RESULT_SOLVED if s.pivots or s.relative <= tol or not max_cost > 0.0 else RESULT_FAILED
 
 
 cdef class Rules:
-    """What the calls of few rows are asked for: `few_rules_t`."""
+    """Settings of the calls for small problems: `small_rules_t`."""
 
     def __init__(self, int rows, int swept, double warm, bint pivots, bint follows):
         self.at.rows, self.at.swept, self.at.warm, self.at.pivots, self.at.follows = rows, swept, warm, pivots, follows
 
 
-cdef enum:                      # numbers of an island's
-    OF_ROW = 7                  # rows: lower, upper, b, d, nu, step, where it starts
-    OF_JOINT = 24               # rows of joints: J, M^-1 J^T
-    OF_TURN = 6                 # rows of contacts: swing
-    OF_CONTACT = 17             # contacts: normal, tangent, arm_a, arm_b, coupling
-    OF_BODY = 10                # bodies: 1/m, I^-1
-    SIZES = 5
+cdef enum:                      # doubles of an island's data
+    ROW_DOUBLES = 7             # per row: lower, upper, b, d, nu, step, start
+    JOINT_ROW_DOUBLES = 24      # per joint row: J, M^-1 J^T
+    CONTACT_ROW_DOUBLES = 6     # per contact row: swing
+    CONTACT_DOUBLES = 17        # per contact: normal, tangent, arm_a, arm_b, coupling
+    BODY_DOUBLES = 10           # per body: 1/m, I^-1
+    N_SIZES = 5                 # rows, blocks, entries of A, joint rows, joints
 
 
-cdef struct island_t:           # cut out of A or of the bodies; its numbers and whole numbers are one run of bytes each
-    part_t s
+cdef struct island_t:           # copied from A or the bodies; its doubles and integers are one contiguous array each
+    subproblem_t s
     csr_t a
     rows_t r
     double* numbers
-    int32_t* marks
+    int32_t* integers
     int64_t n_numbers
-    int64_t n_marks
+    int64_t n_integers
 
 
-cdef inline double* after(double** at, int64_t n) noexcept nogil:
-    """The next n of them."""
+cdef inline double* take_next(double** at, int64_t n) noexcept nogil:
+    """Return the next n numbers and advance `at`."""
     cdef double* x = at[0]
     at[0] = x + n
     return x
 
 
-cdef inline void lay(island_t* x, double* numbers, int32_t* marks, const int32_t* size, int32_t n) noexcept nogil:
-    """Places of an island of so many (SIZES) rows, blocks, entries, rows of joints and joints on n bodies, and of its answer.
+cdef inline void lay(island_t* x, double* numbers, int32_t* integers, const int32_t* size, int32_t n) noexcept nogil:
+    """Bind the arrays of an island with the given sizes (N_SIZES) and n bodies, and of its result.
 
     n < 0: over A, without joints.
     """
     cdef blocks_t* p = &x.s.v.p
     cdef rows_t* r = &x.r
     cdef int32_t m = size[0], k = size[1], nnz = size[2], mj = size[3], c = k - size[4]
-    x.numbers, x.marks = numbers, marks
+    x.numbers, x.integers = numbers, integers
     p.n_blocks, p.n_rows, p.islands = k, m, NULL
-    p.lower, p.upper, p.b = after(&numbers, m), after(&numbers, m), after(&numbers, m)
-    p.d, p.nu, p.step, x.s.lam = after(&numbers, m), after(&numbers, m), after(&numbers, m), after(&numbers, m)
-    lay_frictions(p, after(&numbers, FRICTIONS * k), k)
-    p.ptr, p.kind = marks, marks + k + 1
-    marks += 2 * k + 1
+    p.lower, p.upper, p.b = take_next(&numbers, m), take_next(&numbers, m), take_next(&numbers, m)
+    p.d, p.nu, p.step, x.s.lam = take_next(&numbers, m), take_next(&numbers, m), take_next(&numbers, m), take_next(&numbers, m)
+    lay_frictions(p, take_next(&numbers, FRICTIONS * k), k)
+    p.ptr, p.kind = integers, integers + k + 1
+    integers += 2 * k + 1
     x.s.v.a = x.s.v.r = x.s.v.g = NULL
     if n < 0:
-        x.a.data, x.a.indptr, x.a.indices = after(&numbers, nnz), marks, marks + m + 1
-        marks += m + 1 + nnz
+        x.a.data, x.a.indptr, x.a.indices = take_next(&numbers, nnz), integers, integers + m + 1
+        integers += m + 1 + nnz
         x.s.v.a = &x.a
     else:
         r.n_bodies, r.n_joints, r.n_contacts = n, size[4], c
-        r.jac, r.minv_jac = after(&numbers, 12 * mj), after(&numbers, 12 * mj)
-        r.normal, r.tangent = after(&numbers, 3 * c), after(&numbers, 3 * c)
-        r.arm_a, r.arm_b, r.coupling = after(&numbers, 3 * c), after(&numbers, 3 * c), after(&numbers, 5 * c)
-        r.swing, r.compliance = after(&numbers, OF_TURN * (m - mj)), after(&numbers, m)
-        r.inv_mass, r.inv_inertia = after(&numbers, n), after(&numbers, 9 * n)
-        r.joint_body, r.contact_body = marks, marks + 2 * size[4]
-        marks += 2 * k
+        r.jac, r.minv_jac = take_next(&numbers, 12 * mj), take_next(&numbers, 12 * mj)
+        r.normal, r.tangent = take_next(&numbers, 3 * c), take_next(&numbers, 3 * c)
+        r.arm_a, r.arm_b, r.coupling = take_next(&numbers, 3 * c), take_next(&numbers, 3 * c), take_next(&numbers, 5 * c)
+        r.swing, r.compliance = take_next(&numbers, CONTACT_ROW_DOUBLES * (m - mj)), take_next(&numbers, m)
+        r.inv_mass, r.inv_inertia = take_next(&numbers, n), take_next(&numbers, 9 * n)
+        r.joint_body, r.contact_body = integers, integers + 2 * size[4]
+        integers += 2 * k
         x.s.v.r = r
-    x.n_numbers, x.n_marks = numbers - x.numbers, marks - x.marks
+    x.n_numbers, x.n_integers = numbers - x.numbers, integers - x.integers
     x.s.answer = numbers
 
 
-cdef inline void cut(island_t* x, const blocks_t* p, const int32_t* block, const double* lam, int32_t* place) noexcept nogil:
-    """The blocks `block` of the whole; place (rows of the whole) gets the numbers that its rows have here."""
-    cdef const double* of_row[OF_ROW]
+cdef inline void copy_blocks(island_t* x, const blocks_t* p, const int32_t* block, const double* lam,
+                             int32_t* place) noexcept nogil:
+    """Copy the blocks `block` of the complete problem; place (rows of the problem) receives the row indices in the island."""
+    cdef const double* of_row[ROW_DOUBLES]
     cdef const double* of_block[FRICTIONS]
     cdef blocks_t* own = &x.s.v.p
     cdef int32_t i, j, k, q, row, n = 0
@@ -327,9 +342,9 @@ cdef inline void cut(island_t* x, const blocks_t* p, const int32_t* block, const
         i = block[k]
         (<int32_t*>own.kind)[k] = p.kind[i]
         for q in range(FRICTIONS):
-            x.numbers[OF_ROW * own.n_rows + q * own.n_blocks + k] = of_block[q][i]
+            x.numbers[ROW_DOUBLES * own.n_rows + q * own.n_blocks + k] = of_block[q][i]
         j = p.ptr[i]
-        for q in range(OF_ROW):
+        for q in range(ROW_DOUBLES):
             memcpy(x.numbers + q * own.n_rows + n, of_row[q] + j, (p.ptr[i + 1] - j) * sizeof(double))
         for row in range(j, p.ptr[i + 1]):
             place[row] = n
@@ -337,9 +352,9 @@ cdef inline void cut(island_t* x, const blocks_t* p, const int32_t* block, const
         ptr[k + 1] = n
 
 
-cdef inline void cut_matrix(island_t* x, const blocks_t* p, const csr_t* a, const int32_t* block,
+cdef inline void copy_matrix(island_t* x, const blocks_t* p, const csr_t* a, const int32_t* block,
                             const int32_t* place) noexcept nogil:
-    """Their entries of A."""
+    """Copy the island's entries of A."""
     cdef int32_t i, k, q, row, at = 0, n = 0
     cdef int32_t* indptr = <int32_t*>x.a.indptr
     indptr[0] = 0
@@ -355,7 +370,7 @@ cdef inline void cut_matrix(island_t* x, const blocks_t* p, const csr_t* a, cons
 
 
 cdef inline int32_t number_bodies(const rows_t* r, const int32_t* block, int32_t k, int32_t* number, int32_t* body) noexcept nogil:
-    """Those of k blocks, in the order in which they come, into `body`, their places there into `number`; how many."""
+    """Number the bodies of k blocks in order of appearance: `body` lists them, `number` is the inverse. Return their number."""
     cdef const int32_t* two
     cdef int32_t i, side, n = 0
     for i in range(k):
@@ -368,14 +383,14 @@ cdef inline int32_t number_bodies(const rows_t* r, const int32_t* block, int32_t
     return n
 
 
-cdef inline void pick(const double* to, int64_t n, const double* x, int64_t i) noexcept nogil:
-    """n numbers of the i-th."""
+cdef inline void copy_entry(const double* to, int64_t n, const double* x, int64_t i) noexcept nogil:
+    """Copy the n numbers of entry i."""
     memcpy(<void*>to, x + n * i, n * sizeof(double))
 
 
-cdef inline void cut_rows(island_t* x, const blocks_t* p, const rows_t* r, const int32_t* block, const int32_t* number,
+cdef inline void copy_bodies(island_t* x, const blocks_t* p, const rows_t* r, const int32_t* block, const int32_t* number,
                           const int32_t* body) noexcept nogil:
-    """Their joints, contacts and bodies."""
+    """Copy the island's joints, contacts and bodies."""
     cdef const blocks_t* own = &x.s.v.p
     cdef const rows_t* y = &x.r
     cdef const int32_t* two
@@ -391,98 +406,100 @@ cdef inline void cut_rows(island_t* x, const blocks_t* p, const rows_t* r, const
             memcpy(<void*>(y.jac + 12 * m), r.jac + 12 * j, 12 * n * sizeof(double))
             memcpy(<void*>(y.minv_jac + 12 * m), r.minv_jac + 12 * j, 12 * n * sizeof(double))
             continue
-        memcpy(<void*>(y.swing + OF_TURN * (m - first)), r.swing + OF_TURN * (j - p.ptr[r.n_joints]),
-               OF_TURN * n * sizeof(double))
+        memcpy(<void*>(y.swing + CONTACT_ROW_DOUBLES * (m - first)), r.swing + CONTACT_ROW_DOUBLES * (j - p.ptr[r.n_joints]),
+               CONTACT_ROW_DOUBLES * n * sizeof(double))
         c, i = k - y.n_joints, i - r.n_joints
-        pick(y.normal + 3 * c, 3, r.normal, i)
-        pick(y.tangent + 3 * c, 3, r.tangent, i)
-        pick(y.arm_a + 3 * c, 3, r.arm_a, i)
-        pick(y.arm_b + 3 * c, 3, r.arm_b, i)
-        pick(y.coupling + 5 * c, 5, r.coupling, i)
+        copy_entry(y.normal + 3 * c, 3, r.normal, i)
+        copy_entry(y.tangent + 3 * c, 3, r.tangent, i)
+        copy_entry(y.arm_a + 3 * c, 3, r.arm_a, i)
+        copy_entry(y.arm_b + 3 * c, 3, r.arm_b, i)
+        copy_entry(y.coupling + 5 * c, 5, r.coupling, i)
     for k in range(y.n_bodies):
-        pick(y.inv_mass + k, 1, r.inv_mass, body[k])
-        pick(y.inv_inertia + 9 * k, 9, r.inv_inertia, body[k])
+        copy_entry(y.inv_mass + k, 1, r.inv_mass, body[k])
+        copy_entry(y.inv_inertia + 9 * k, 9, r.inv_inertia, body[k])
 
 
-cdef inline bint same(const island_t* x, const island_t* y) noexcept nogil:
-    return (x.n_numbers == y.n_numbers and x.n_marks == y.n_marks
+cdef inline bint are_identical(const island_t* x, const island_t* y) noexcept nogil:
+    """Return whether two islands have bitwise identical data."""
+    return (x.n_numbers == y.n_numbers and x.n_integers == y.n_integers
             and memcmp(x.numbers, y.numbers, x.n_numbers * sizeof(double)) == 0
-            and memcmp(x.marks, y.marks, x.n_marks * sizeof(int32_t)) == 0)
+            and memcmp(x.integers, y.integers, x.n_integers * sizeof(int32_t)) == 0)
 
 
-cdef inline int32_t swept_before(const blocks_t* p, int32_t most) noexcept nogil:
-    """Sweeps of an island before its factors: of many rows these pay sooner, and at once under the cone's law."""
-    if p.n_rows <= FEW:
-        return most
-    return 0 if p.law == CONE else most * FEW // p.n_rows
+cdef inline int32_t first_sweeps(const blocks_t* p, int32_t max_sweeps) noexcept nogil:
+    """Return the sweeps of an island before its factorisations: fewer for many rows, none under the cone law."""
+    if p.n_rows <= FULL_SWEEP_ROWS:
+        return max_sweeps
+    return 0 if p.law == CONE else max_sweeps * FULL_SWEEP_ROWS // p.n_rows
 
 
 cdef class Small:
-    """A problem of few rows, its error of doing nothing known to `data`; `run` only reads it.
+    """A problem with few rows. `data` must hold the residual of the zero impulse; `run` only reads the problem.
 
     Parameters
     ----------
     data : Data
-        What the judge reads.
+        Problem for the judge.
     over : Data
-        What is solved: of bounded rows A in compressed rows.
+        Problem to solve; for bounded rows A in compressed rows.
     """
 
     cdef readonly Data data
-    cdef readonly int count                             # of islands
+    cdef readonly int count                             # number of islands
     cdef Data over
-    cdef few_t at
+    cdef small_problem_t at
     cdef workspace_t workspace
 
     def __init__(self, Data data, Data over):
         self.data, self.over, self.count = data, over, 1
         self.at.v, self.at.over = data.view(), over.view()
-        self.at.begin[0], self.at.begin[1], self.at.begin[2] = data.reference_energy, data.reference_velocity, data.relative_at_zero
+        self.at.zero_residual[0], self.at.zero_residual[1] = data.reference_energy, data.reference_velocity
+        self.at.zero_residual[2] = data.relative_at_zero
         if not lay_few(&self.at, &self.workspace):
             raise MemoryError(f"{data.blocks.n_rows} rows")
 
     def __dealloc__(self):
-        leave(&self.workspace)
+        free_workspace(&self.workspace)
 
-    def run(self, impulse, double tol, Rules rules, double most=INFINITY):
-        """From `impulse` (m,) [N s], or from doing nothing where it is None: (what the judge finds, what was done).
+    def run(self, impulse, double tol, Rules rules, double max_cost=INFINITY):
+        """Solve from `impulse` (m,) [N s], or from the zero impulse if it is None.
 
-        The judge finds None where it does not end below tol. What was done is None where `impulse` is the solution. most: counted
-        cost [ns] where what was found by then is the result.
+        Returns (judged result or None if it is above tol, counters or None if `impulse` is the solution). The result at an
+        estimated cost of `max_cost` [ns] is returned even if it is above tol.
         """
-        cdef few_t s = self.at
-        cdef rooms_t rooms
-        cdef int32_t counts[COUNTS]
+        cdef small_problem_t s = self.at
+        cdef solve_workspaces_t workspaces
+        cdef int32_t counts[N_COUNTS]
         cdef Py_ssize_t m = s.v.p.n_rows
         cdef double[::1] own = new(m), both = new(2 * m + 1)
         cdef int32_t code
-        memset(&rooms, 0, sizeof(rooms))
+        memset(&workspaces, 0, sizeof(workspaces))
         if impulse is not None:
             memcpy(&own[0], doubles(impulse, m), m * sizeof(double))
         try:
-            code = self.end(&s, &rules.at, &own[0], impulse is None, tol, most, &both[0], &rooms, counts)
+            code = self.run_kernel(&s, &rules.at, &own[0], impulse is None, tol, max_cost, &both[0], &workspaces, counts)
         finally:
-            leave(&rooms.work)
-            leave(&rooms.more)
-        found = judged_from(self.data, own.base, both.base, &s.score, s.relative, s.floor) if code != FAILED else None
-        return found, None if code == KEPT else tuple([counts[i] for i in range(COUNTS)])
+            free_workspace(&workspaces.work)
+            free_workspace(&workspaces.more)
+        judged = judged_from(self.data, own.base, both.base, &s.score, s.relative, s.floor) if code != RESULT_FAILED else None
+        return judged, None if code == RESULT_IS_START else tuple([counts[i] for i in range(N_COUNTS)])
 
-    cdef int32_t end(self, few_t* s, const few_rules_t* rules, double* own, bint cold, double tol, double most, double* both,
-                     rooms_t* rooms, int32_t* counts) except -1:
-        """As `run_few`."""
+    cdef int32_t run_kernel(self, small_problem_t* s, const small_rules_t* rules, double* own, bint cold, double tol,
+                            double max_cost, double* both, solve_workspaces_t* workspaces, int32_t* counts) except -1:
+        """Run `solve_small` without the interpreter."""
         with nogil:
-            return run_few(s, rules, own, cold, tol, most, both, rooms, counts)
+            return solve_small(s, rules, own, cold, tol, max_cost, both, workspaces, counts)
 
 
 cdef class Islands(Small):
-    """Islands under friction.
+    """A problem with friction that is solved island by island.
 
     Parameters
     ----------
     label : (k,) int32
-        The island of each block, from 0 to count - 1.
+        Island of each block, from 0 to count - 1.
     count : int
-        More than one.
+        Number of islands, more than one.
     """
 
     cdef object block, size
@@ -492,7 +509,7 @@ cdef class Islands(Small):
         self.count = count
         cdef const int32_t* ptr = over.blocks.ptr
         cdef int32_t i, k = over.blocks.n_blocks, rows, joints = over.rows.n_joints if over.factored else 0
-        self.size, self.block = np.zeros((self.count, SIZES), np.int32), np.empty(k, np.int32)
+        self.size, self.block = np.zeros((self.count, N_SIZES), np.int32), np.empty(k, np.int32)
         cdef int32_t[:, ::1] size = self.size
         cdef int32_t[::1] block = self.block, first = np.empty(self.count + 1, np.int32)
         for i in range(k):
@@ -506,80 +523,83 @@ cdef class Islands(Small):
                 size[label[i], 4] += 1
         sort_by_level(k, &label[0], count, &first[0], &block[0])
 
-    cdef int32_t end(self, few_t* s, const few_rules_t* rules, double* own, bint cold, double tol, double most, double* both,
-                     rooms_t* rooms, int32_t* counts) except -1:
+    cdef int32_t run_kernel(self, small_problem_t* s, const small_rules_t* rules, double* own, bint cold, double tol,
+                            double max_cost, double* both, solve_workspaces_t* workspaces, int32_t* counts) except -1:
         cdef int64_t m = s.v.p.n_rows, scratch = m + scratch_of(&s.v)
-        cdef ask_t o = ask_t(tol, rules.swept, rules.swept, has_wide(), 0, 0, 0, 0.0, most, 0, 0)
+        cdef friction_run_t o = friction_run_t(tol, rules.swept, rules.swept, has_wide(), 0, 0, 0, 0.0, max_cost, 0, 0)
         cdef bint good
-        if not has_workspace_size(&rooms.work, 0, scratch):
+        if not has_workspace_size(&workspaces.work, 0, scratch):
             raise MemoryError(f"{m} rows")
-        if begin_few(s, rules, own, cold, tol, both, rooms.work.real):
-            return KEPT
-        good = self.islands(own, &o, &rooms.more)
-        memset(counts, 0, COUNTS * sizeof(int32_t))
-        counted(&o, self.count, counts)
+        if set_small_start(s, rules, own, cold, tol, both, workspaces.work.real):
+            return RESULT_IS_START
+        good = self.solve_islands(own, &o, &workspaces.more)
+        memset(counts, 0, N_COUNTS * sizeof(int32_t))
+        store_counts(&o, self.count, counts)
         if not good:
-            return FAILED
-        judge_few(s, own, both, rooms.work.real)
-        return ENDED if s.relative <= tol or not o.left > 0.0 else FAILED
+            return RESULT_FAILED
+        judge_small(s, own, both, workspaces.work.real)
+        return RESULT_SOLVED if s.relative <= tol or not o.remaining_cost > 0.0 else RESULT_FAILED
 
-    cdef bint islands(self, double* own, ask_t* o, workspace_t* r) except -1:
-        """Each after the other from `own` (m) [N s], into it."""
+    cdef bint solve_islands(self, double* own, friction_run_t* o, workspace_t* r) except -1:
+        """Solve the islands one after the other from `own` (m) [N s], into `own`; return whether all are solved."""
         cdef const blocks_t* p = &self.over.blocks
         cdef const rows_t* rows = &self.over.rows
         cdef bint over_bodies = self.over.factored
         cdef const int32_t[::1] block = self.block
-        cdef const int32_t[:, ::1] size = self.size     # SIZES of each
+        cdef const int32_t[:, ::1] size = self.size     # N_SIZES of each island
         cdef int32_t n_bodies = rows.n_bodies if over_bodies else 0
-        cdef int32_t[::1] place = np.empty(p.n_rows, np.int32), at, order, marks, number, body
+        cdef int32_t[::1] place = np.empty(p.n_rows, np.int32), at, order, integers, number, body
         cdef double[::1] numbers, work
         cdef int32_t i, j, q, m, k, n = -1, first = 0
-        cdef int64_t swept, read, unheard = 0
+        cdef int64_t swept, read, unchecked = 0
         cdef double factored
         cdef island_t two[2]
         cdef island_t* x
         cdef island_t* last
         cdef bint good = True
         m, k, q, _, _ = self.size.max(axis=0)
-        cdef int64_t each = (OF_ROW + 1) * <int64_t>m + FRICTIONS * k + q, whole = 4 * k + m + 2 + q
+        cdef int64_t each = (ROW_DOUBLES + 1) * <int64_t>m + FRICTIONS * k + q, whole = 4 * k + m + 2 + q
         if over_bodies:
             n = min(2 * k, n_bodies)
-            each += (OF_JOINT + OF_TURN + 1) * <int64_t>m + OF_CONTACT * k + OF_BODY * n
-        numbers, marks, work = np.empty(2 * each), np.empty(2 * whole, np.int32), np.empty(work_of(m, max(n, 0)))
+            each += (JOINT_ROW_DOUBLES + CONTACT_ROW_DOUBLES + 1) * <int64_t>m + CONTACT_DOUBLES * k + BODY_DOUBLES * n
+        numbers, integers, work = np.empty(2 * each), np.empty(2 * whole, np.int32), np.empty(subproblem_work_size(m, max(n, 0)))
         at, order = np.empty(k + 1, np.int32), np.empty(k, np.int32)
         number, body = np.full(n_bodies + 1, -1, np.int32), np.empty(n + 2, np.int32)
         two[1].n_numbers = -1
         with nogil:
             for i in range(self.count):
+                # copy the island's data
                 x, last = &two[i % 2], &two[1 - i % 2]
                 m, k = size[i, 0], size[i, 1]
                 if over_bodies:
                     n = number_bodies(rows, &block[first], k, &number[0], &body[0])
-                lay(x, &numbers[(i % 2) * each], &marks[(i % 2) * whole], &size[i, 0], n)
-                cut(x, p, &block[first], own, &place[0])
+                lay(x, &numbers[(i % 2) * each], &integers[(i % 2) * whole], &size[i, 0], n)
+                copy_blocks(x, p, &block[first], own, &place[0])
                 if over_bodies:
-                    cut_rows(x, p, rows, &block[first], &number[0], &body[0])
+                    copy_bodies(x, p, rows, &block[first], &number[0], &body[0])
                 else:
-                    cut_matrix(x, p, &self.over.csr, &block[first], &place[0])
-                if same(x, last):
+                    copy_matrix(x, p, &self.over.csr, &block[first], &place[0])
+                if are_identical(x, last):
                     memcpy(x.s.answer, last.s.answer, m * sizeof(double))
                 else:
-                    x.s.split, x.s.at, x.s.prepared, x.s.nothing = size[i, 4], NULL, NULL, -1.0
+                    x.s.split, x.s.at, x.s.prepared, x.s.relative_at_zero = size[i, 4], NULL, NULL, -1.0
                     if p.law == CONE:
                         for j in range(k):
                             at[j] = self.at.at[block[first + j]]
                         x.s.at, x.s.prepared = &at[0], self.at.prepared
-                    o.first = swept_before(&x.s.v.p, o.most)
+                    o.first = first_sweeps(&x.s.v.p, o.max_sweeps)
                     swept, factored = o.swept, o.factored
-                    good = solve_part(&x.s, o, r, &work[0], &order[0])
+                    good = solve_subproblem(&x.s, o, r, &work[0], &order[0])
                     if not good:
                         break
-                    read = OF_JOINT * m if over_bodies else size[i, 2]
-                    unheard += <int64_t>(o.factored - factored) + read * (o.swept - swept)
-                    if unheard > LISTEN:
-                        unheard = 0
+                    # check for Ctrl-C
+                    read = JOINT_ROW_DOUBLES * m if over_bodies else size[i, 2]
+                    unchecked += <int64_t>(o.factored - factored) + read * (o.swept - swept)
+                    if unchecked > INTERRUPT_CHECK_WORK:
+                        unchecked = 0
                         with gil:
                             PyErr_CheckSignals()
+                # write the result back
                 for j in range(k):
                     q = block[first + j]
                     memcpy(&own[p.ptr[q]], x.s.answer + x.s.v.p.ptr[j], (p.ptr[q + 1] - p.ptr[q]) * sizeof(double))

@@ -1,6 +1,7 @@
-"""A few contacts, or an island of them: accelerated sweeps, and where these are slow Newton's method, in turns.
+"""A few contacts, or one island of contacts: accelerated sweeps, alternating with Newton's method if they are slow.
 
-One call solves a part over A or over bodies, in workspace that the caller has. Factors go on where they stood; so do sweeps.
+One call solves a subproblem over A or over bodies in the caller's workspace. After a change of method both continue from
+their own last iterates.
 """
 from libc.stdint cimport int32_t, int64_t, uint64_t
 from libc.string cimport memcmp, memcpy, memset
@@ -18,51 +19,51 @@ from lavender_ext.sweep.serial cimport context_t, form_velocity
 
 
 cdef enum:
-    MEMORY = 5                  # sweeps that are combined
-    FIRST = 4                   # before the first check
-    SHORT = 12                  # factorisations before sweeps have AGAIN times as many as before them; of each in the mean,
-    AGAIN = 8
-    STEPS = 120                 # and in all
-    HOPED = 4                   # times the rounds left, that what the last one gained may promise an end in
-    SWEPT_ROW = 15              # ns of a sweep with its mixing for each row, beside one for each entry of A,
-    SWEPT_BODIES = 32           # and as many for each row over bodies
-    FACTOR_ROW = 150            # ns of a factorisation and the steps with it for each row,
-    CUBED = 10                  # and one for so many of all rows cubed
+    MIXING_MEMORY = 5           # sweeps that Anderson mixing combines
+    MIN_CHECK_INTERVAL = 4      # sweeps between two checks of the residual; later half of the sweeps done
+    FIRST_FACTORISATIONS = 12   # Newton's factorisations before sweeps continue
+    RESUMED_SWEEP_RATIO = 8     # Sweeps then continue to this multiple of `max_sweeps` in total.
+    MAX_SUBPROBLEM_FACTORISATIONS = 120    # of one subproblem in total
+    EXTRAPOLATION_FACTOR = 4    # Sweeps go on if the last check's gain, repeated this many times the remaining checks, reaches tol.
+    SWEEP_NS_PER_ROW = 15       # cost of a sweep with its mixing [ns] per row, plus 1 ns per entry of A
+    SWEEP_NS_PER_BODY_ROW = 32  # or this per row over bodies
+    FACTOR_NS_PER_ROW = 150     # cost of a factorisation with its steps [ns] per row,
+    CUBED_ROWS_PER_NS = 10      # plus the cube of the rows divided by this
 
 
-cdef struct part_t:
+cdef struct subproblem_t:
     view_t v                    # over A or bodies
-    double* lam                 # (m) N s, where it starts
-    double* answer              # (m)
-    int32_t split               # blocks before it are swept before the others: joints, contacts
-    const int32_t* at           # of blocks that are solved exactly, as gauss_seidel.prepare has them; else NULL
+    double* lam                 # (m) N s, start
+    double* answer              # (m) N s, result
+    int32_t split               # number of joint blocks, which are swept before the contacts
+    const int32_t* at           # offsets into `prepared` if blocks are solved exactly (gauss_seidel.prepare), else NULL
     const double* prepared
-    double nothing              # relative residual of the zero impulse if the part is the whole, else -1
-    double e0                   # and its reference, sqrt J
-    double v0                   # m/s
+    double relative_at_zero     # relative residual of the zero impulse; -1: not known, as for an island
+    double e0                   # its reference energy, sqrt J
+    double v0                   # its reference velocity, m/s
 
 
-cdef struct ask_t:
+cdef struct friction_run_t:     # settings and counters of a run over one or several subproblems
     double tol
-    int32_t most                # sweeps, an eighth of all,
-    int32_t first               # and before the first factors
+    int32_t max_sweeps          # sweeps before and during the alternation: an eighth of the limit
+    int32_t first               # sweeps before the first factorisation
     int32_t wide
-    int64_t swept               # what was done in all
+    int64_t swept               # counters over all subproblems
     int64_t undone
     int64_t factorisations
-    double factored             # multiply-adds of them
-    double left                 # ns that may still be spent, as counted below; inf without a limit
-    int32_t driven              # parts that asked for factors
-    int32_t longest             # sweeps and factorisations of one part
+    double factored             # multiply-adds of the factorisations
+    double remaining_cost       # ns, estimated cost that may still be spent; inf without a limit
+    int32_t factorised          # number of subproblems that used factorisations
+    int32_t longest             # maximum sweeps plus factorisations of one subproblem
 
 
-cdef struct turns_t:            # of one part
-    part_t* s
-    ask_t* o
-    workspace_t* r                   # of Newton's method
-    double e0                   # the part's reference, sqrt J
+cdef struct alternation_t:      # state of one subproblem
+    subproblem_t* s
+    friction_run_t* o
+    workspace_t* r              # workspace of Newton's method
+    double e0                   # reference of the subproblem, sqrt J
     double v0                   # m/s
-    double* swept               # (m) N s
+    double* swept               # (m) N s, iterate of the sweeps
     double* w                   # (m)
     double* error               # (m)
     double* scratch             # (12 n_bodies)
@@ -72,16 +73,17 @@ cdef struct turns_t:            # of one part
     workspace_t workspace
     said_t said
     int32_t how
-    double sweep                # ns of one sweep and
-    double factor               # of one factorisation with its steps, counted: no clock is read here
+    double sweep                # estimated cost of a sweep, ns; no clock is read
+    double factor               # estimated cost of a factorisation with its steps, ns
 
 
-cdef inline int64_t work_of(int64_t m, int64_t n_bodies) noexcept nogil:
-    return (7 + 2 * MEMORY) * m + 18 * n_bodies + CONTROL + MAX_MEMORY * MAX_MEMORY + 1
+cdef inline int64_t subproblem_work_size(int64_t m, int64_t n_bodies) noexcept nogil:
+    """Return the number of doubles of scratch of `solve_subproblem`."""
+    return (7 + 2 * MIXING_MEMORY) * m + 18 * n_bodies + CONTROL + MAX_MEMORY * MAX_MEMORY + 1
 
 
-cdef inline void lay_turns(turns_t* t, double* work, int32_t* order, uint64_t* rng) noexcept nogil:
-    """Places in work (`work_of`) and order (k)."""
+cdef inline void lay_turns(alternation_t* t, double* work, int32_t* order, uint64_t* rng) noexcept nogil:
+    """Bind the arrays to work (`subproblem_work_size`) and order (k)."""
     cdef const view_t* v = &t.s.v
     cdef int64_t m = v.p.n_rows, n = v.r.n_bodies if v.r != NULL else 0
     cdef int32_t i
@@ -95,54 +97,55 @@ cdef inline void lay_turns(turns_t* t, double* work, int32_t* order, uint64_t* r
     for i in range(v.p.n_blocks):
         order[i] = i
     rng[0] = 0
-    t.c.sweeps, t.c.memory = &t.sweeps, MEMORY
+    t.c.sweeps, t.c.memory = &t.sweeps, MIXING_MEMORY
     t.sweeps.blocks, t.sweeps.csr, t.sweeps.rows, t.sweeps.n_v = &v.p, v.a, v.r, <int32_t>(6 * n)
     t.sweeps.order, t.sweeps.rng, t.sweeps.split = order, rng, t.s.split
     t.sweeps.exact, t.sweeps.start, t.sweeps.g = t.s.at != NULL, t.s.at, t.s.prepared
 
 
-cdef inline double spent(const turns_t* t) noexcept nogil:
-    """ns of this part so far."""
+cdef inline double cost_so_far(const alternation_t* t) noexcept nogil:
+    """Return the estimated cost [ns] of this subproblem so far."""
     return t.c.turn * t.sweep + t.said.factorisations * t.factor
 
 
-cdef inline double found_at(turns_t* t, const double* lam) noexcept nogil:
+cdef inline double relative_residual_of(alternation_t* t, const double* lam) noexcept nogil:
+    """Return the relative residual of lam."""
     cdef const view_t* v = &t.s.v
-    cdef score_t found = new_score()
-    judge_view(v, lam, t.w, t.error, t.scratch, False, &found)
-    return relative_of(&found, t.w, v.p.n_rows, t.e0, t.v0)
+    cdef score_t score = new_score()
+    judge_view(v, lam, t.w, t.error, t.scratch, False, &score)
+    return relative_of(&score, t.w, v.p.n_rows, t.e0, t.v0)
 
 
-cdef inline bint promises(double before, double now, double tol, int32_t rounds) noexcept nogil:
-    """Does what the last round gained bring the residual to tol in so many more?"""
-    cdef double fall = now / before
+cdef inline bint converges_within(double before, double now, double tol, int32_t rounds) noexcept nogil:
+    """Return whether the last check's reduction, repeated `rounds` times, brings the residual to tol."""
+    cdef double reduction = now / before
     cdef int32_t _
     for _ in range(rounds):
-        now *= fall
+        now *= reduction
         if now <= tol:
             return True
     return False
 
 
-cdef inline double sweep_on(turns_t* t, double now, int32_t most, bint hoping) noexcept nogil:
-    """Sweeps of `swept`, whose residual is `now`, up to `most` in all; its relative residual then.
+cdef inline double continue_sweeps(alternation_t* t, double now, int32_t max_sweeps, bint extrapolate) noexcept nogil:
+    """Continue the sweeps of `swept` from the residual `now`, up to `max_sweeps` in total, and return its relative residual.
 
-    `hoping`: as long as they promise an end within that.
+    `extrapolate`: stop early if the extrapolated residual does not reach tol.
     """
     cdef double before, tol = t.o.tol
-    cdef int32_t step = FIRST
-    while now > tol and t.c.turn < most and spent(t) < t.o.left:
+    cdef int32_t step = MIN_CHECK_INTERVAL
+    while now > tol and t.c.turn < max_sweeps and cost_so_far(t) < t.o.remaining_cost:
         before = now
         lav_anderson(&t.c, t.swept, t.c.turn == 0, step)
-        now = found_at(t, t.swept)
-        step = t.c.turn // 2 if t.c.turn // 2 > FIRST else FIRST
-        if hoping and not promises(before, now, tol, HOPED * (most - t.c.turn) // step):
+        now = relative_residual_of(t, t.swept)
+        step = t.c.turn // 2 if t.c.turn // 2 > MIN_CHECK_INTERVAL else MIN_CHECK_INTERVAL
+        if extrapolate and not converges_within(before, now, tol, EXTRAPOLATION_FACTOR * (max_sweeps - t.c.turn) // step):
             break
     return now
 
 
-cdef inline bint begin_newton(turns_t* t) noexcept nogil:
-    """Newton's method from `answer`; is there workspace for it?"""
+cdef inline bint start_newton(alternation_t* t) noexcept nogil:
+    """Start Newton's method from `answer`; return False without memory for it."""
     cdef workspace_t* r = t.r
     t.how = 0
     if not lav_workspace_size(&t.s.v, &t.options, &t.workspace):
@@ -157,70 +160,76 @@ cdef inline bint begin_newton(turns_t* t) noexcept nogil:
             return t.how == MORE
 
 
-cdef inline double step_newton(turns_t* t, int32_t steps) noexcept nogil:
-    """So many factorisations, or its end; the relative residual of `answer`."""
-    cdef double fit = (t.o.left - spent(t)) / t.factor
+cdef inline double step_newton(alternation_t* t, int32_t steps) noexcept nogil:
+    """Run up to `steps` factorisations and return the relative residual of `answer`."""
+    cdef double fit = (t.o.remaining_cost - cost_so_far(t)) / t.factor
     cdef int32_t last = t.said.factorisations + (steps if fit > steps else <int32_t>max(fit, 0.0))
     while t.said.factorisations < last and (t.how == MORE or t.how == CERTIFICATE):
         t.how = lav_step(&t.s.v, &t.options, &t.workspace, last - t.said.factorisations, t.s.answer, &t.said)
-    return found_at(t, t.s.answer)
+    return relative_residual_of(t, t.s.answer)
 
 
-cdef inline double factor_in_turns(turns_t* t) noexcept nogil:
-    """From where sweeps gave way; no more, once there are as many factors as there may be."""
+cdef inline double alternate_methods(alternation_t* t) noexcept nogil:
+    """Alternate after slow sweeps: Newton's method, sweeps again, Newton's method up to `MAX_SUBPROBLEM_FACTORISATIONS`."""
     cdef double now
-    if not begin_newton(t):
+    if not start_newton(t):
         return 1.0 / 0.0
-    now = step_newton(t, SHORT)
-    if now > t.o.tol and spent(t) < t.o.left:
-        now = sweep_on(t, found_at(t, t.swept), AGAIN * t.o.most, t.s.v.p.law == CONE)
+    now = step_newton(t, FIRST_FACTORISATIONS)
+    if now > t.o.tol and cost_so_far(t) < t.o.remaining_cost:
+        now = continue_sweeps(t, relative_residual_of(t, t.swept), RESUMED_SWEEP_RATIO * t.o.max_sweeps, t.s.v.p.law == CONE)
         if now > t.o.tol:
-            return step_newton(t, STEPS)
+            return step_newton(t, MAX_SUBPROBLEM_FACTORISATIONS)
         memcpy(t.s.answer, t.swept, t.s.v.p.n_rows * sizeof(double))
     return now
 
 
-cdef inline bint solve_part(part_t* s, ask_t* o, workspace_t* r, double* work, int32_t* order) noexcept nogil:
-    """From `lam` into `answer`; is its relative residual at most `tol`?"""
-    cdef score_t nothing = new_score()
-    cdef turns_t t
+cdef inline bint solve_subproblem(subproblem_t* s, friction_run_t* o, workspace_t* r, double* work, int32_t* order) noexcept nogil:
+    """Solve a subproblem from `lam` into `answer`; return whether its relative residual is at most `tol`."""
+    cdef score_t score_at_zero = new_score()
+    cdef alternation_t t
     cdef uint64_t rng
     cdef blocks_t* p = &s.v.p
-    cdef double now = s.nothing
-    cdef double begun[3]
+    cdef double now = s.relative_at_zero
+    cdef double zero_residual[3]
     t.s, t.o, t.r = s, o, r
     lay_turns(&t, work, order, &rng)
+    # reference: the residual of the zero impulse
     set_zero_impulse(p, s.answer, t.w)
-    begun[0], begun[1], begun[2] = s.e0, s.v0, now
+    zero_residual[0], zero_residual[1], zero_residual[2] = s.e0, s.v0, now
     if now < 0.0:
-        judge_view(&s.v, s.answer, t.w, t.error, t.scratch, False, &nothing)
-        find_reference(p, s.answer, t.w, t.error, begun)
-        if begun[2] <= o.tol:
+        judge_view(&s.v, s.answer, t.w, t.error, t.scratch, False, &score_at_zero)
+        find_reference(p, s.answer, t.w, t.error, zero_residual)
+        if zero_residual[2] <= o.tol:
             return True                                 # the zero impulse is a solution
-    t.e0, t.v0 = begun[0], begun[1]
+    t.e0, t.v0 = zero_residual[0], zero_residual[1]
+    # residual of the start
     memcpy(t.swept, s.lam, p.n_rows * sizeof(double))
     form_velocity(&t.sweeps, t.swept)
     t.said.factorisations = 0
     if memcmp(t.swept, s.answer, p.n_rows * sizeof(double)) != 0:
-        now = found_at(&t, t.swept)
+        now = relative_residual_of(&t, t.swept)
     else:
-        now = begun[2]
-    t.sweep = SWEPT_ROW * p.n_rows + (s.v.a.indptr[p.n_rows] if s.v.a != NULL else SWEPT_BODIES * p.n_rows)
-    t.factor = FACTOR_ROW * p.n_rows + <double>p.n_rows ** 3 / CUBED
-    now = sweep_on(&t, now, o.first, True)
+        now = zero_residual[2]
+    # estimated costs
+    t.sweep = SWEEP_NS_PER_ROW * p.n_rows + (s.v.a.indptr[p.n_rows] if s.v.a != NULL else SWEEP_NS_PER_BODY_ROW * p.n_rows)
+    t.factor = FACTOR_NS_PER_ROW * p.n_rows + <double>p.n_rows ** 3 / CUBED_ROWS_PER_NS
+    # sweeps, then Newton's method and sweeps alternately
+    now = continue_sweeps(&t, now, o.first, True)
     if now <= o.tol or now < 1.0:
         memcpy(s.answer, t.swept, p.n_rows * sizeof(double))
-    if now > o.tol and spent(&t) < o.left:
-        o.driven += 1
-        t.options = options_t(NEWTON, STEPS, 0, 0, o.wide, o.tol, t.e0, t.v0, 1.0 / 0.0)
-        now = factor_in_turns(&t)
+    if now > o.tol and cost_so_far(&t) < o.remaining_cost:
+        o.factorised += 1
+        t.options = options_t(NEWTON, MAX_SUBPROBLEM_FACTORISATIONS, 0, 0, o.wide, o.tol, t.e0, t.v0, 1.0 / 0.0)
+        now = alternate_methods(&t)
+    # counters
     o.swept += t.c.turn
     o.undone += <int64_t>t.c.control[UNDONE]
     o.factorisations += t.said.factorisations
     o.factored += t.said.factorisations * (<double>p.n_rows * p.n_rows * p.n_rows)
     if t.c.turn + t.said.factorisations > o.longest:
         o.longest = t.c.turn + t.said.factorisations
-    o.left -= spent(&t)
-    if now > o.tol and not o.left > 0.0 and not found_at(&t, s.answer) <= found_at(&t, t.swept):
+    o.remaining_cost -= cost_so_far(&t)
+    # at the cost limit the better of both iterates is the result
+    if now > o.tol and not o.remaining_cost > 0.0 and not relative_residual_of(&t, s.answer) <= relative_residual_of(&t, t.swept):
         memcpy(s.answer, t.swept, p.n_rows * sizeof(double))
     return now <= o.tol

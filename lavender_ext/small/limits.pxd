@@ -1,8 +1,9 @@
-"""What Newton's method is counted to cost over J and M, and may cost [ns]: the gate of one problem and of many.
+"""Estimated and permitted cost [ns] of Newton's method over J and M, for single problems and batches.
 
     count (entry (2 Y + 4 m) + work w)                                                                     (1)
 
-Y entries, m rows, w multiply-adds of a factor of each island; count as in `lavender/solvers/costs.py`.
+Y: entries of J L^-1, m: rows, w: multiply-adds to factorise N of every island, count: number of factorisations, as in
+`lavender/solvers/costs.py`.
 """
 from libc.math cimport INFINITY
 from libc.stdint cimport int32_t
@@ -11,32 +12,32 @@ from lavender_ext.core.parts cimport COULOMB, blocks_t, has_friction, is_rows
 from lavender_ext.core.view cimport generalized_t
 
 
-cdef struct limits_t:           # ns, as in lavender/solvers/costs.py
-    double entry                # each multiply-add of a sweep, and
-    double work                 # of a factor,
-    double count                # factorisations where not all rows are free,
-    double rigid                # times as many, but of bounded rows, with a rigid row,
-    double soft                 # and where none is, but of free ones
-    double start                # what a solve beside this call takes at least,
-    double sweep_row            # each row and multiply-add of one of its sweeps, under the cone law,
-    double sweep_cone
-    double sweeps               # and how many of them
-    double values               # of one island's N
-    double most                 # what all may cost to be asked at all
-    double coulomb_rows         # of an island beyond which it is not under Coulomb's law,
-    double cone_rows            # and where a contact of the cone law is rigid,
-    double dense                # unless so many rows share a velocity,
-    double columns              # or a row reaches more of them: else they may be those of bodies (`graph.bodies_in`)
-    double steps                # of all islands at most
+cdef struct limits_t:           # as in lavender/solvers/costs.py
+    double entry                # ns per multiply-add of a sweep
+    double work                 # ns per multiply-add of a factorisation
+    double count                # factorisations, if some row is not free
+    double rigid                # factor of count with a rigid row, except with bounded rows only
+    double soft                 # factor of count without a rigid row, except if all rows are free
+    double start                # ns, minimum time of a solve outside of this call
+    double sweep_row            # ns per row of a sweep outside of this call
+    double sweep_cone           # ns per multiply-add of such a sweep under the cone law
+    double sweeps               # number of such sweeps
+    double values               # maximum number of entries of one island's N
+    double max_cost             # ns, maximum of the permitted cost
+    double coulomb_rows         # maximum rows of an island under Coulomb's law,
+    double cone_rows            # and under the cone law with a rigid contact; both apply only if
+    double dense                # there are fewer than this many rows per velocity
+    double columns              # and no row has more entries: the velocities may then be of bodies (`graph.bodies_in`)
+    double steps                # maximum steps of all islands together
 
 
 cdef inline double step_cost(const blocks_t* p, const generalized_t* g, const limits_t* l, double work) noexcept nogil:
-    """One factor of each island, of so many multiply-adds in all [ns]."""
+    """Return the cost [ns] of one step with one factorisation of every island, `work` multiply-adds in total."""
     return l.entry * (2.0 * g.pval[g.n_panels] + 4.0 * p.n_rows) + l.work * work
 
 
 cdef inline bint is_linear(const blocks_t* p) noexcept nogil:
-    """Is every row free?"""
+    """Return whether every row is free (unbounded)."""
     cdef int32_t i, k
     for i in range(p.n_blocks):
         for k in range(p.ptr[i], p.ptr[i + 1]):
@@ -46,7 +47,7 @@ cdef inline bint is_linear(const blocks_t* p) noexcept nogil:
 
 
 cdef inline double cost_of(const blocks_t* p, const generalized_t* g, const limits_t* l, double work, bint soft) noexcept nogil:
-    """What Newton's method is counted to cost [ns]: the one gate, for one problem and for many. soft: as `is_soft`."""
+    """Return the estimated cost [ns] of Newton's method, (1); soft: as `is_soft`."""
     cdef bint linear = is_linear(p)
     cdef double count = 1.0 if linear else l.count
     if soft and not linear:
@@ -57,7 +58,7 @@ cdef inline double cost_of(const blocks_t* p, const generalized_t* g, const limi
 
 
 cdef inline bint are_short(const generalized_t* g, double columns) noexcept nogil:
-    """Does no row reach more velocities?"""
+    """Return whether no row couples more than `columns` velocities."""
     cdef int32_t b
     for b in range(g.n_panels):
         if g.pcol[b + 1] - g.pcol[b] > columns:
@@ -67,17 +68,17 @@ cdef inline bint are_short(const generalized_t* g, double columns) noexcept nogi
 
 cdef inline double allowed(const blocks_t* p, const generalized_t* g, const limits_t* l, int32_t islands,
                            bint soft) noexcept nogil:
-    """What it may cost [ns], 0 where it is not asked: with a rigid row as much as sweeps, which may do with less."""
-    cdef bint rubs = has_friction(p)
-    cdef double each = l.sweep_cone if p.law != COULOMB and rubs else l.entry
+    """Return the permitted cost [ns], 0 if Newton's method must not run; with a rigid row at most the estimated cost of sweeps."""
+    cdef bint frictional = has_friction(p)
+    cdef double each = l.sweep_cone if p.law != COULOMB and frictional else l.entry
     cdef double sweep = l.sweep_row * p.n_rows + each * (2.0 * g.pval[g.n_panels] + 4.0 * p.n_rows)
-    cdef double most = l.coulomb_rows if p.law == COULOMB else INFINITY if soft else l.cone_rows
-    if rubs and islands * most < p.n_rows < l.dense * g.n and are_short(g, l.columns):
+    cdef double max_rows = l.coulomb_rows if p.law == COULOMB else INFINITY if soft else l.cone_rows
+    if frictional and islands * max_rows < p.n_rows < l.dense * g.n and are_short(g, l.columns):
         return 0.0
-    return l.most if soft else min(l.most, l.start + l.sweeps * sweep)
+    return l.max_cost if soft else min(l.max_cost, l.start + l.sweeps * sweep)
 
 
 cdef inline double work_within(const blocks_t* p, const generalized_t* g, const limits_t* l, bint soft) noexcept nogil:
-    """Multiply-adds of a factor of each island that it may have at most, into however many islands it falls."""
-    cdef double read = cost_of(p, g, l, 0.0, soft)
-    return (allowed(p, g, l, p.n_rows, soft) - read) / (cost_of(p, g, l, 1.0, soft) - read)
+    """Return the maximum multiply-adds of factorising every island, for any number of islands."""
+    cdef double fixed = cost_of(p, g, l, 0.0, soft)
+    return (allowed(p, g, l, p.n_rows, soft) - fixed) / (cost_of(p, g, l, 1.0, soft) - fixed)

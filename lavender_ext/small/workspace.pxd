@@ -1,4 +1,4 @@
-"""Workspace that grows, for one small problem after the other: fresh pages for each cost more than what is done in them."""
+"""Growing workspace, reused for a sequence of small problems: allocating new pages costs more than solving one of them."""
 from libc.stdint cimport int32_t, int64_t
 from libc.stdlib cimport free, malloc
 
@@ -6,7 +6,7 @@ from lavender_ext.core.method cimport workspace_t
 
 
 cdef inline bint has_workspace_size(workspace_t* r, int64_t n_index, int64_t n_real) noexcept nogil:
-    """Is there workspace for so many, made where there was none? What grows is empty."""
+    """Grow the workspace to at least these sizes; return False if out of memory. Growing discards the content."""
     if n_index > r.n_index:
         free(r.index)
         r.index = <int32_t*>malloc(2 * n_index * sizeof(int32_t))
@@ -18,6 +18,7 @@ cdef inline bint has_workspace_size(workspace_t* r, int64_t n_index, int64_t n_r
     return n_index <= r.n_index and n_real <= r.n_real
 
 
-cdef inline void leave(workspace_t* r) noexcept nogil:
+cdef inline void free_workspace(workspace_t* r) noexcept nogil:
+    """Free both buffers of a workspace."""
     free(r.index)
     free(r.real)

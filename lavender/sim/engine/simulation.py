@@ -27,7 +27,7 @@ from lavender.sim.engine.stepping import (
     invalidate_pairs,
 )
 from lavender.sim.scene import Scene
-from lavender_ext.engine.arrays import NEED_ROOM, lengths
+from lavender_ext.engine.arrays import NEED_CAPACITY, lengths
 
 
 class Simulation(Stepping):
@@ -81,7 +81,7 @@ class Simulation(Stepping):
         state = self.state.copy()
         if self._restored:
             invalidate_pairs(state)
-        while state.kernel.prepare() == NEED_ROOM:
+        while state.kernel.prepare() == NEED_CAPACITY:
             state = state.with_larger_buffers()
         return self._problem(state)
 

@@ -20,12 +20,12 @@ from lavender_ext.engine.arrays import (
     BOX,
     CAP_CONTACT,
     CAP_PAIR,
-    MOST_PAIRS,
+    MAX_PAIRS,
     N_SIZES,
     NO_SHAPE,
+    PAIR_COUNT_OVERFLOW,
     PLANE,
     SPHERE,
-    TOO_MANY,
     lengths,
 )
 from lavender_ext.engine.newton_substep import Substep
@@ -147,9 +147,9 @@ class State:
         InputError
             There are too many pairs of bodies, or the buffers would exceed `MAX_BUFFER_BYTES`.
         """
-        if self.head[HEAD["need_pairs"]] == TOO_MANY:
+        if self.head[HEAD["need_pairs"]] == PAIR_COUNT_OVERFLOW:
             raise InputError(
-                f"more than {MOST_PAIRS} pairs of bodies are close together ({self.size[SIZE['bodies']]} bodies): "
+                f"more than {MAX_PAIRS} pairs of bodies are close together ({self.size[SIZE['bodies']]} bodies): "
                 "move them apart"
             )
         own = (self.size, self.real, self.index, self.keys)

@@ -30,7 +30,7 @@ from lavender.solvers.registry import get
 from lavender.solvers.warm_start import make_warm_start_claim
 from lavender.solving.outcome import finish
 from lavender.solving.solve import solve
-from lavender_ext.engine.arrays import NEED_ROOM, OK
+from lavender_ext.engine.arrays import NEED_CAPACITY, OK
 
 NEWTON = NEWTON_SPEC.factory
 TOL = 1e-6  # Default tolerance of lavender.solve.
@@ -356,14 +356,14 @@ class Stepping:
         while True:
             status, done = self.state.kernel.substeps(min(remaining, SUBSTEPS_PER_CALL))
             remaining -= done
-            if status == NEED_ROOM:
+            if status == NEED_CAPACITY:
                 self.state = self.state.with_larger_buffers()
             elif remaining == 0 or status != OK:
                 return
 
     def prepare_substep(self) -> None:
         """Detect collisions and build the rows of the next substep in `state`."""
-        while self.state.kernel.prepare() == NEED_ROOM:
+        while self.state.kernel.prepare() == NEED_CAPACITY:
             self.state = self.state.with_larger_buffers()
 
     def _solve_substeps(self) -> None:

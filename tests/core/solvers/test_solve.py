@@ -94,7 +94,7 @@ def test_another_problem_replaces_the_prepared_one_unless_an_error_is_raised(nam
 @pytest.mark.parametrize("solver", ["pgs", "auto"])
 def test_ctrl_c_while_many_are_handed_out_to_threads_begins_no_more(solver, monkeypatch):
     """The signal comes with the first problem that a thread takes, one by one or in the compiled loop."""
-    n, begun, solve, hand = 2000, [], many.solve, loop.Hand
+    n, begun, solve, hand = 2000, [], many.solve, loop.Worker
 
     def interrupt():
         begun.append(solver)
@@ -106,7 +106,7 @@ def test_ctrl_c_while_many_are_handed_out_to_threads_begins_no_more(solver, monk
         interrupt()
         return solve(*args, **options)
 
-    class SlowHand:
+    class SlowWorker:
         def __init__(self, worlds, stop):
             self.hand, self.stop = hand(worlds, stop), stop
 
@@ -119,7 +119,7 @@ def test_ctrl_c_while_many_are_handed_out_to_threads_begins_no_more(solver, monk
             return self.hand.solve(*args)
 
     monkeypatch.setattr(many, "solve", slow)
-    monkeypatch.setattr(loop, "Hand", SlowHand)
+    monkeypatch.setattr(loop, "Worker", SlowWorker)
     with pytest.raises(KeyboardInterrupt):
         lv.solve_many([dataclasses.replace(TINY, copy=False) for _ in range(n)], solver, threads=2)
     assert 1 <= len(begun) < n / 2

@@ -7,7 +7,7 @@ const MOST_SWEEPS = 64;
 const MOST_TRACED = 256; // Largest number of checks of one solve by Newton's method, as in lavender_ext/newton/warm_start.pxd.
 export const TOL = 1e-6; // Relative residual at which Newton's method ends, as in Python.
 const OK = 0;
-const NEED_ROOM = 1;
+const NEED_CAPACITY = 1;
 const NOT_FINITE = 2;
 
 export const SOLVER_FIELDS = [
@@ -245,7 +245,7 @@ export class Simulation {
     let status = OK;
     let told = null;
     for (let s = 0; s < this.substeps && status === OK; s++) {
-      while (this.k.functions.lav_engine_prepare(...this.buffers) === NEED_ROOM) {
+      while (this.k.functions.lav_engine_prepare(...this.buffers) === NEED_CAPACITY) {
         this.#grow();
       }
       this.k.functions.lav_engine_solve(...this.buffers, 0);
@@ -267,7 +267,7 @@ export class Simulation {
     for (;;) {
       const status = this.k.functions.lav_engine_substeps(...this.buffers, this.first ? left : 1, this.done);
       left -= this.k.i32(this.done, 1)[0];
-      if (status === NEED_ROOM) {
+      if (status === NEED_CAPACITY) {
         this.#grow();
         continue;
       }
@@ -292,7 +292,7 @@ export class Simulation {
     }
     const n = 1 + sweeps;
     for (let s = 0; s < this.substeps && status === OK; s++) {
-      while (this.k.functions.lav_engine_prepare(...this.buffers) === NEED_ROOM) {
+      while (this.k.functions.lav_engine_prepare(...this.buffers) === NEED_CAPACITY) {
         this.#grow();
       }
       this.k.functions.lav_engine_solve_watched(...this.buffers, this.curve, this.scratch);
