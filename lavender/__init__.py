@@ -4,7 +4,7 @@
     solution = lavender.solve(problem, tol=1e-8)    # by `auto`, or lavender.solve(problem, "pgs", ...)
     solution.impulse, solution.residual.relative    # [N s], [-]
 
-Problems   `Problem`, `Cones` (bounds and friction), `Rows` (bodies), `Generalized` (J and M), `load`
+Problems   `Problem`, `Cones` (bounds and friction), `Rows` and `RowBuilder` (bodies), `Generalized` (J and M), `load`
 Worlds     `Batch` (many problems in arrays), `solve_many`, `residual_many`
 Solving    `solve`, `solve_qp`, `prepare` (for repeated steps), `available`, `known`, `explain` (decision trace
            of `auto`)
@@ -67,6 +67,7 @@ if TYPE_CHECKING:
     from lavender.lab.motion import MotionError, SolutionSet, find_solutions, motion_error
     from lavender.lab.proof import Enclosure, prove
     from lavender.problem import cones as cones
+    from lavender.problem.row_builder import RowBuilder
     from lavender.programs.quadratic import solve_qp
     from lavender.sim import engine, scene
     from lavender.sim.engine import SOLVER_FIELDS, Simulation, Snapshot
@@ -86,6 +87,7 @@ _LAZY_NAMES = {
     "lavender.lab.diagnostics.redundancy": ("Redundancy", "redundancy"),
     "lavender.lab.motion": ("MotionError", "SolutionSet", "find_solutions", "motion_error"),
     "lavender.lab.proof": ("Enclosure", "prove"),
+    "lavender.problem.row_builder": ("RowBuilder",),
     "lavender.sim.engine": ("SOLVER_FIELDS", "Simulation", "Snapshot"),
     "lavender.sim.scene": ("Scene",),
     "lavender.solving.plan": ("Plan", "explain"),
@@ -137,6 +139,7 @@ __all__ = [
     "Redundancy",
     "Residual",
     "Residuals",
+    "RowBuilder",
     "Rows",
     "Scene",
     "Simulation",

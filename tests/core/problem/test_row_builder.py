@@ -1,0 +1,334 @@
+"""`RowBuilder`: closed-form solutions, two dimensions as a plane of three, keys, and agreement of all solvers."""
+
+from functools import partial
+
+import numpy as np
+import pytest
+
+import lavender as lv
+
+DT, G = 1 / 60, 9.81
+TOL = 1e-12
+BODY = (1.5, -1.0)  # m, centre of the body of most tests
+EXACT = {"rtol": 0.0, "atol": 1e-10}
+
+
+def planar(velocity=(0.0, 0.0, 0.0), inv_mass=0.5, inv_inertia=3.0, position=BODY, **more):
+    """Build for one planar body."""
+    return lv.RowBuilder([inv_mass], [inv_inertia], [velocity], DT, [position], **more)
+
+
+def spatial(velocities, positions, inv_mass=0.5, **more):
+    """Build for bodies with the same inverse mass and a full inertia tensor."""
+    n = len(positions)
+    tensor = np.array([[3.0, 0.5, 0.2], [0.5, 2.0, -0.3], [0.2, -0.3, 4.0]])
+    return lv.RowBuilder(np.full(n, inv_mass), [tensor] * n, velocities, DT, positions, **more)
+
+
+def solved(builder, solver="auto", tol=TOL, **more):
+    """Return the problem's solution and the velocities after the step."""
+    problem = builder.problem(**more)
+    solution = lv.solve(problem, solver, tol=tol, max_iter=100_000)
+    assert solution.success, str(solution)
+    return solution, builder.velocity_after(problem, solution.impulse)
+
+
+def test_the_hinge_of_a_pendulum_leaves_its_rotation_about_the_anchor():
+    length, mass, inertia = 1.2, 2.0, 1 / 3.0
+    builder = planar((0.0, -G * DT, 0.0), 1 / mass, 1 / inertia, (length, 0.0))
+    builder.hinge(-1, 0, (0.0, 0.0))
+    _, ((vx, vy, omega),) = solved(builder)
+    exact = -mass * G * DT * length / (inertia + mass * length**2)
+    assert (vx, vy, omega) == pytest.approx((0.0, exact * length, exact), abs=1e-10)
+
+
+@pytest.mark.parametrize("damping", [0.0, 3.0])
+def test_a_spring_step_is_that_of_implicit_euler(damping):
+    k, rest, mass, start, v = 40.0, 1.0, 2.0, 1.3, -0.4
+    builder = planar((v, 0.0, 0.0), 1 / mass, 0.0, (start, 0.0))
+    builder.spring(-1, 0, (0.0, 0.0), (start, 0.0), rest, stiffness=k, damping=damping)
+    _, ((after, *_),) = solved(builder)
+    # m (v+ - v) = h (-k (x + h v+ - rest) - c v+)
+    exact = (mass * v - DT * k * (start - rest)) / (mass + DT * damping + DT**2 * k)
+    assert after == pytest.approx(exact, abs=1e-12)
+
+
+@pytest.mark.parametrize(("torque", "reached"), [(1.0, 1.0 * DT * 3.0), (1000.0, 2.0)])
+def test_a_motor_reaches_its_speed_unless_its_torque_is_too_small(torque, reached):
+    builder = planar()
+    motor = builder.motor(None, 0, speed=2.0, max_torque=torque)
+    solution, ((*_, omega),) = solved(builder)
+    assert omega == pytest.approx(reached, abs=1e-10)
+    assert abs(solution.impulse[builder.rows_of(motor)][0]) <= torque * DT + 1e-12
+
+
+def test_a_linear_motor_is_limited_by_its_force():
+    builder = planar((0.0, 0.0, 0.0))
+    builder.motor(-1, 0, (2.0, 0.0), speed=1.0, max_force=10.0, anchor=BODY)
+    _, ((vx, *_),) = solved(builder)
+    assert vx == pytest.approx(10.0 * DT * 0.5, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("value", "omega", "after"),
+    [
+        (0.5, -3.0, -3.0),  # far from the limit at 0
+        (0.02, -3.0, -0.02 / DT),  # stops at the limit at the end of the step
+        (-0.1, -3.0, 0.2 * 0.1 / DT),  # beyond the lower limit: corrected
+        (0.98, 3.0, 0.02 / DT),
+        (1.1, 0.0, -0.2 * 0.1 / DT),  # beyond the upper limit
+    ],
+)
+def test_a_limit_stops_the_angle_at_the_end_of_the_step(value, omega, after):
+    builder = planar((0.0, 0.0, omega))
+    builder.limit(-1, 0, value=value, lower=0.0, upper=1.0)
+    _, ((*_, reached),) = solved(builder)
+    assert reached == pytest.approx(after, abs=1e-9)
+
+
+def test_a_limit_of_travel_stops_a_slider():
+    builder = planar((5.0, 2.0, 1.0))
+    builder.slider(-1, 0, BODY, (1.0, 0.0))
+    builder.limit(-1, 0, (1.0, 0.0), value=0.97, upper=1.0, anchor=BODY)
+    _, ((vx, vy, omega),) = solved(builder)
+    assert (vx, vy, omega) == pytest.approx((0.03 / DT, 0.0, 0.0), abs=1e-9)
+
+
+def test_gears_turn_in_their_ratio_and_conserve_what_they_exchange():
+    ratio, inertia = 3.0, np.array([2.0, 5.0])
+    builder = lv.RowBuilder([1.0, 1.0], 1 / inertia, [(0, 0, 4.0), (0, 0, 0)], DT, np.array([(0, 0), (4, 0)]))
+    builder.hinge(-1, 0, (0.0, 0.0))
+    builder.hinge(-1, 1, (4.0, 0.0))
+    gear = builder.gear(0, 1, ratio=ratio)
+    solution, after = solved(builder)
+    omega = after[:, 2]
+    assert omega[0] + ratio * omega[1] == pytest.approx(0.0, abs=1e-10)
+    impulse = solution.impulse[builder.rows_of(gear)][0]
+    np.testing.assert_allclose(inertia * (omega - [4.0, 0.0]), impulse * np.array([1.0, ratio]), **EXACT)
+
+
+@pytest.mark.parametrize("dimensions", [2, 3])
+@pytest.mark.parametrize("degrees", [15.0, 35.0])
+def test_a_block_on_an_inclined_plane_slides_only_above_its_friction_angle(dimensions, degrees):
+    mu, angle = 0.5, np.deg2rad(degrees)  # the friction angle is 26.6 degrees
+    down, normal = np.array([np.cos(angle), -np.sin(angle)]), np.array([np.sin(angle), np.cos(angle)])
+    velocity, corner = np.array([0.0, -G * DT]), 0.2
+    flat = dimensions == 2
+    lift = (lambda x: x) if flat else (lambda x: np.array([*x, 0.0]))
+    position = [lift(0.1 * normal)]
+    inertia = [6.0] if flat else [6.0 * np.eye(3)]
+    v = [[*lift(velocity), *np.zeros(1 if flat else 3)]]
+    builder = lv.RowBuilder([1.0], inertia, v, DT, position)
+    for x in (-corner, corner):
+        for z in (None,) if flat else (-corner, corner):
+            at = lift(x * down) if flat else lift(x * down) + np.array([0.0, 0.0, z])
+            builder.contact(-1, 0, at, lift(normal), mu=mu)
+    _, (after,) = solved(builder, tol=1e-10)
+    slides = DT * G * max(0.0, np.sin(angle) - mu * np.cos(angle))
+    np.testing.assert_allclose(after[:2], slides * down, rtol=0.0, atol=1e-8)
+    np.testing.assert_allclose(after[2:], 0.0, rtol=0.0, atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("gap", "speed", "restitution", "after"),
+    [
+        (0.0, -2.0, 0.5, 1.0),
+        (0.0, -0.9, 0.5, 0.0),  # below the threshold of 1 m/s
+        (0.02, -0.6, 0.0, -0.6),  # does not arrive in this step
+        (0.02, -2.0, 0.0, -0.02 / DT),  # touches at the end of the step
+        (0.02, -2.0, 0.5, 1.0),
+        (0.2, -2.0, 0.5, -2.0),
+        (-0.03, 0.0, 0.0, 0.2 * 0.02 / DT),  # penetration beyond the slop
+        (-0.005, -0.1, 0.0, 0.0),  # within the slop
+    ],
+)
+def test_a_contact_closes_its_gap_bounces_and_corrects_penetration(gap, speed, restitution, after):
+    builder = planar((0.0, speed, 0.0), slop=0.01)
+    builder.contact(-1, 0, BODY, (0.0, 1.0), gap=gap, restitution=restitution)
+    _, ((_, vy, _),) = solved(builder)
+    assert vy == pytest.approx(after, abs=1e-9)
+
+
+def test_a_weld_leaves_no_relative_velocity():
+    rng = np.random.default_rng(3)
+    positions = rng.normal(size=(2, 3))
+    builder = spatial(rng.normal(size=(2, 6)), positions)
+    builder.weld(0, 1, (0.3, 0.2, 0.1))
+    _, after = solved(builder)
+    np.testing.assert_allclose(after[0, 3:], after[1, 3:], rtol=0.0, atol=1e-9)
+    carried = after[0, :3] + np.cross(after[0, 3:], positions[1] - positions[0])
+    np.testing.assert_allclose(carried, after[1, :3], rtol=0.0, atol=1e-9)
+
+
+def test_joints_remove_the_fraction_of_their_errors():
+    error = np.array([0.01, -0.02])
+    builder = planar(baumgarte=0.5)
+    builder.weld(-1, 0, BODY, np.array(BODY) + error, angle_error=0.1)
+    _, ((*linear, omega),) = solved(builder)
+    arm = np.array([-error[1], error[0]])  # z x arm of the anchor on the body
+    np.testing.assert_allclose(linear + omega * arm, -0.5 * error / DT, **EXACT)
+    assert omega == pytest.approx(-0.5 * 0.1 / DT, abs=1e-9)
+
+
+def test_a_hinge_in_space_rotates_about_its_axis_alone():
+    axis = np.array([1.0, 2.0, -0.5])
+    builder = spatial(np.random.default_rng(5).normal(size=(2, 6)), np.array([(0.0, 0, 0), (1.0, 0.2, 0)]))
+    builder.hinge(0, 1, (0.5, 0.1, 0.0), axis)
+    builder.motor(0, 1, axis, speed=2.0, max_torque=1e6)
+    _, after = solved(builder)
+    expected = 2.0 * axis / np.linalg.norm(axis)
+    np.testing.assert_allclose(after[1, 3:] - after[0, 3:], expected, rtol=0.0, atol=1e-8)
+
+
+def test_a_tilted_hinge_is_turned_back():
+    tilt, axis = 0.01, np.array([0.0, 0.0, 1.0])
+    builder = spatial(np.zeros((1, 6)), np.zeros((1, 3)), baumgarte=1.0)
+    builder.hinge(-1, 0, np.zeros(3), axis, axis_b=(np.sin(tilt), 0.0, np.cos(tilt)))
+    _, after = solved(builder)
+    assert after[0, 3:5] == pytest.approx((0.0, -np.sin(tilt) / DT), abs=1e-8)
+
+
+def add_everything(builder, lift, axis):
+    """Add a block of each kind; `lift` maps planar vectors, `axis` is the axis of rotation if there is one."""
+    turn = {} if axis is None else {"axis": axis}
+    gear = {} if axis is None else {"axis_a": axis}
+    return [
+        builder.hinge(-1, 0, lift(0.0, 0.0), **turn),
+        builder.motor(-1, 0, speed=2.0, max_torque=5.0, **turn),
+        builder.limit(-1, 0, value=0.1, lower=0.0, **turn),
+        builder.distance(0, 1, lift(1.0, 0.2), lift(2.0, 0.5), 1.0),
+        builder.spring(-1, 1, lift(3.0, 3.0), lift(2.2, 1.0), 1.0, stiffness=50.0, damping=1.0),
+        builder.slider(-1, 2, lift(3.0, 0.0), lift(1.0, 1.0)),
+        builder.weld(2, 3, lift(3.5, 0.0)),
+        builder.gear(0, 1, ratio=2.0, **gear),
+        builder.contact(-1, 1, lift(2.0, -0.5), lift(0.0, 1.0), gap=-0.01, mu=0.4),
+        builder.contact(-1, 3, lift(4.0, -0.5), lift(0.0, 1.0), mu=0.0, restitution=0.5),
+    ]
+
+
+PLACES = np.array([(1.0, 0.0), (2.0, 0.0), (3.0, 0.0), (4.0, 0.0)])
+VELOCITY = np.random.default_rng(0).normal(size=(4, 3)) - (0.0, 2.0, 0.0)
+
+
+def test_two_dimensions_are_a_plane_of_three():
+    flat = lv.RowBuilder([1.0, 0.5, 2.0, 1.0], [3.0, 1.0, 2.0, 0.5], VELOCITY, DT, PLACES)
+    flat_keys = add_everything(flat, lambda x, y: (x, y), None)
+    spread = np.zeros((4, 6))
+    spread[:, [0, 1, 5]] = VELOCITY
+    solid = lv.RowBuilder(
+        [1.0, 0.5, 2.0, 1.0], [x * np.eye(3) for x in (3.0, 1.0, 2.0, 0.5)], spread, DT,
+        np.hstack([PLACES, np.zeros((4, 1))]),
+    )  # fmt: skip
+    solid_keys = add_everything(solid, lambda x, y: (x, y, 0.0), (0.0, 0.0, 1.0))
+    assert flat_keys == solid_keys
+    _, planar_velocity = solved(flat, tol=1e-11)
+    _, velocity = solved(solid, tol=1e-11)
+    np.testing.assert_allclose(velocity[:, [0, 1, 5]], planar_velocity, rtol=0.0, atol=1e-7)
+    np.testing.assert_allclose(velocity[:, 2:5], 0.0, rtol=0.0, atol=1e-7)
+
+
+def test_our_solvers_agree_on_every_kind_of_block():
+    builder = lv.RowBuilder([1.0, 0.5, 2.0, 1.0], [3.0, 1.0, 2.0, 0.5], VELOCITY, DT, PLACES)
+    add_everything(builder, lambda x, y: (x, y), None)
+    problem = builder.problem()
+    expected = builder.velocity_after(problem, lv.solve(problem, tol=1e-11).impulse)
+    names = lv.available(problem, external=False)
+    assert len(names) >= 4
+    for name in names:
+        _, velocity = solved(builder, name, tol=1e-9)
+        np.testing.assert_allclose(velocity, expected, rtol=0.0, atol=1e-5, err_msg=name)
+
+
+def test_keys_carry_impulses_to_blocks_in_another_order():
+    def build(order):
+        builder = planar((0.3, -1.0, 0.0))
+        keys = {i: builder.contact(-1, 0, (1.0 + i, -1.2), (0.0, 1.0), mu=0.5, feature=i) for i in order}
+        return builder, keys
+
+    first, keys = build([0, 1, 2])
+    solution, _ = solved(first)
+    second, other_keys = build([2, 0])
+    other_keys["ball"] = second.ball(-1, 0, (9.0, 9.0))
+    carried = second.problem().carry(solution)
+    assert keys[0] == other_keys[0] and keys[2] == other_keys[2]
+    for i in (0, 2):
+        before, after = solution.impulse[first.rows_of(keys[i])], carried[second.rows_of(keys[i])]
+        np.testing.assert_array_equal(before, after)
+    assert not carried[second.rows_of(other_keys["ball"])].any()
+
+
+def test_blocks_have_names_and_order():
+    builder = planar()
+    contact = builder.contact(None, 0, BODY, (0.0, 1.0), mu=0.2)
+    hinge = builder.hinge(None, 0, BODY)
+    problem = builder.problem(name="two")
+    assert problem.names == ("hinge 0 of world and body 0", "contact 0 of world and body 0")
+    assert (builder.rows_of(hinge), builder.rows_of(contact)) == (slice(0, 2), slice(2, 4))
+    assert problem.row_name(3) == "contact 0 of world and body 0, tangent 1"
+    assert np.diff(problem.cones.ptr).tolist() == [2, 2] and problem.name == "two"
+
+
+def test_a_builder_without_blocks_gives_an_empty_problem():
+    assert planar().problem().m == 0
+    empty = lv.RowBuilder([], [], np.zeros((0, 3)), DT, np.zeros((0, 2)))
+    assert empty.problem().m == 0
+
+
+def test_a_tangent_can_be_chosen():
+    builder = spatial(np.zeros((1, 6)), np.zeros((1, 3)))
+    builder.contact(-1, 0, (0.0, 0.0, -1.0), (0.0, 0.0, 1.0), mu=1.0, tangent=(3.0, 3.0, 1.0))
+    expected = [np.sqrt(0.5), np.sqrt(0.5), 0.0]
+    np.testing.assert_allclose(builder.problem().rows.tangent[0], expected, rtol=0.0, atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda b: b.ball(0, 7, (0, 0)), "b is 7; the number of one of the 1 bodies"),
+        (lambda b: b.ball(None, -1, (0, 0)), "a and b are both the static world"),
+        (lambda b: b.ball(0, 0, (0, 0)), "a and b are both body 0"),
+        (lambda b: b.ball(-1, 0, (0, 0, 0)), r"anchor \[m\] has shape \(3,\); \(2,\) is needed"),
+        (lambda b: b.ball(-1, 0, 1.0), "anchor is 1.0; a vector"),
+        (
+            lambda b: b.hinge(-1, 0, (0, 0), (0, 0, 1)),
+            "axis is .*; in two dimensions all rotation is about z",
+        ),
+        (lambda b: b.slider(-1, 0, (0, 0), (0, 0)), "axis has length 0"),
+        (lambda b: b.contact(-1, 0, (0, 0), (0, 2)), "normal has length 2; a unit vector"),
+        (lambda b: b.contact(-1, 0, (0, 0), (0, 1), tangent=(1, 0)), "tangent is .*; in two dimensions"),
+        (
+            lambda b: b.spring(-1, 0, (0, 0), (1, 0), 1.0, stiffness=0.0),
+            "stiffness is 0 N/m and damping is 0",
+        ),
+        (lambda b: b.motor(-1, 0, speed=1.0), "max_torque and max_force: neither is given"),
+        (lambda b: b.motor(-1, 0, speed=1.0, max_torque=1.0, max_force=1.0), "both are given"),
+        (lambda b: b.motor(-1, 0, (1, 0), speed=1.0, max_force=1.0), "anchor is None"),
+        (lambda b: b.motor(-1, 0, speed=1.0, max_force=1.0, anchor=(0, 0)), "axis is None"),
+        (
+            lambda b: b.motor(-1, 0, speed=1.0, max_torque=1.0, anchor=(0, 0)),
+            "anchor is given with max_torque",
+        ),
+        (lambda b: b.limit(-1, 0, value=0.0), "lower is -inf and upper is inf; at least one must be finite"),
+        (lambda b: b.limit(-1, 0, value=0.0, lower=1.0, upper=0.0), "lower must not exceed upper"),
+        (lambda b: b.gear(-1, 0, ratio=0.0), "ratio is 0"),
+        (lambda b: [b.ball(-1, 0, (0, 0), feature=3) for _ in "ab"], "feature is 3, as of another ball"),
+        (lambda b: b.rows_of(5), "key is 5; a key that a method"),
+        (lambda b: b.velocity_after(None, [0.0]), "problem is None; the result of RowBuilder.problem"),
+        (lambda b: b.ball(-1, 0, (0, 0), name=3), "name is 3; a str is needed"),
+    ],
+)
+def test_errors_name_the_argument(call, message):
+    with pytest.raises(lv.InputError, match=message):
+        call(planar())
+
+
+def test_errors_of_the_builder_and_of_three_dimensions():
+    with pytest.raises(lv.InputError, match=r"position \[m\] has shape \(1, 4\); \(n, 2\) is needed"):
+        planar(position=np.zeros(4))
+    with pytest.raises(lv.InputError, match=r"velocity .* has shape \(1, 2\); \(1, 3\) is needed"):
+        planar(velocity=(1.0, 2.0))
+    builder = partial(spatial, np.zeros((1, 6)), np.zeros((1, 3)))
+    with pytest.raises(lv.InputError, match=r"axis is None; a vector \(3,\)"):
+        builder().hinge(-1, 0, np.zeros(3))
+    with pytest.raises(lv.InputError, match="tangent is parallel to normal"):
+        builder().contact(-1, 0, np.zeros(3), (0.0, 0.0, 1.0), tangent=(0.0, 0.0, 1.0))

@@ -1,0 +1,91 @@
+"""`RowBuilder` gives the rows that LavenderSim records, from poses and joints in world coordinates, to rounding."""
+
+import numpy as np
+
+import lavender as lv
+
+
+def make_scene():
+    """Return a scene with every kind of joint, rigid and soft, a motor, and a box on the ground."""
+    scene = lv.Scene(substeps=1)
+    ground = scene.add_plane()
+    first = scene.add_box(position=(0.0, 0.0, 3.0))
+    second = scene.add_box(position=(1.5, 0.2, 3.0))
+    scene.add_box(position=(6.0, 0.0, 0.499))
+    scene.add_joint("ball", -1, first, anchor=(0.0, 0.1, 4.0))
+    scene.add_joint("hinge", first, second, anchor=(0.7, 0.0, 3.0), axis=(0.2, 1.0, 0.1), motor_speed=1.0,
+                    motor_torque=2.0)  # fmt: skip
+    scene.add_joint("hinge", ground, second, anchor=(1.6, 0.0, 3.0), axis=(0.0, 1.0, 0.0))
+    scene.add_joint("distance", first, second, anchor_a=(0.0, 0.0, 3.4), anchor_b=(1.4, 0.1, 3.3), length=1.3)
+    scene.add_joint("distance", -1, second, anchor_a=(3.0, 0.0, 4.0), anchor_b=(2.0, 0.0, 3.3), hertz=3.0,
+                    damping=0.4)  # fmt: skip
+    return scene
+
+
+def rebuild(sim, state, recorded, h):
+    """Build the same joints and contacts by a builder; no correction of errors, as in LavenderSim's rigid rows."""
+    rows = recorded.rows
+    moving = state["body_of"].tolist()
+    builder = lv.RowBuilder(
+        rows.inv_mass, rows.inv_inertia, rows.v_free, h, state["x"][moving], baumgarte=0.0
+    )
+
+    def world(body, local, offset=True):
+        if body < 0:
+            return np.asarray(local)
+        return state["rot"][body] @ local + offset * state["x"][body]
+
+    for i, joint in enumerate(sim.scene.joints):
+        pair = rows.joint_body[i]
+        points = world(joint.a, joint.anchor_a), world(joint.b, joint.anchor_b)
+        if joint.kind == "ball":
+            builder.ball(*pair, *points)
+        elif joint.kind == "hinge":
+            axes = world(joint.a, joint.axis_a, False), world(joint.b, joint.axis_b, False)
+            builder.hinge(*pair, points[0], axes[0], points[1], axes[1])
+            if joint.motor_torque:
+                builder.motor(*pair, axes[0], speed=joint.motor_speed, max_torque=joint.motor_torque)
+        elif joint.hertz == 0.0:
+            builder.distance(*pair, *points, joint.length)
+        else:
+            row = rows.joint_ptr[i]
+            inverse_mass = recorded.d[row] - recorded.compliance[row]  # J M^-1 J^T
+            omega = 2 * np.pi * joint.hertz
+            builder.spring(*pair, *points, joint.length, stiffness=omega**2 / inverse_mass,
+                           damping=2 * joint.damping * omega / inverse_mass)  # fmt: skip
+    for i, pair in enumerate(rows.contact_body):
+        mu = recorded.cones.mu[rows.n_joints + i]
+        builder.contact(
+            *pair, state["point"][i], rows.normal[i], gap=state["gap"][i], mu=mu, tangent=rows.tangent[i]
+        )
+    return builder.problem()
+
+
+def test_the_builder_gives_the_recorded_rows():
+    scene = make_scene()
+    sim = lv.Simulation(scene)
+    for _ in range(12):
+        sim.step()
+    recorded = sim.constraint_problem()
+    assert recorded.rows.n_contacts >= 4 and recorded.rows.n_joints == 5
+    prepared = sim.state.copy()
+    prepared.kernel.prepare()
+    built = rebuild(sim, prepared.a, recorded, scene.parameters.dt)
+    assert built.m == recorded.m
+    exact = {"rtol": 0.0, "atol": 1e-12}
+    # The two sides of a hinge may be rotated about its axis: rows 3 and 4 of each hinge are compared by their span.
+    rotation, rows = np.eye(built.m), recorded.rows
+    ours, theirs = built.rows.jacobian(built.cones).toarray(), rows.jacobian(recorded.cones).toarray()
+    for i, joint in enumerate(scene.joints):
+        if joint.kind == "hinge":
+            at = slice(rows.joint_ptr[i] + 3, rows.joint_ptr[i] + 5)
+            rotation[at, at] = theirs[at] @ np.linalg.pinv(ours[at])
+            np.testing.assert_allclose(rotation[at, at] @ rotation[at, at].T, np.eye(2), **exact)
+    np.testing.assert_allclose(rotation @ ours, theirs, **exact)
+    np.testing.assert_allclose(rotation @ built.b, recorded.b, **exact)
+    np.testing.assert_allclose(built.compliance, recorded.compliance, **exact)
+    np.testing.assert_allclose(built.cones.lower[:18], recorded.cones.lower[:18], **exact)
+    np.testing.assert_allclose(built.cones.upper[:18], recorded.cones.upper[:18], **exact)
+    ours, theirs = (lv.solve(p, tol=1e-11).impulse for p in (built, recorded))
+    velocity = recorded.velocity(theirs)
+    np.testing.assert_allclose(built.velocity(ours), velocity, rtol=0.0, atol=1e-7)
