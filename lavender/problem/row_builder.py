@@ -644,7 +644,8 @@ class RowBuilder:
         ndarray (n, 3) or (n, 6), m/s and rad/s
             In the layout of `velocity`.
         """
-        if not isinstance(problem, Problem) or problem.rows is None:
+        n = len(self._centres)
+        if not isinstance(problem, Problem) or problem.rows is None or problem.rows.n_bodies != n:
             raise InputError(f"problem is {problem!r:.60}; the result of RowBuilder.problem() is needed")
         after = problem.velocity(impulse)
         return np.ascontiguousarray(after[:, PLANAR_VELOCITIES]) if self._is_planar else after

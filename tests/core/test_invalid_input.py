@@ -36,11 +36,32 @@ EXACT = lv.solve(GENERAL, tol=1e-12)
 DERIVATIVE = lv.derivative(GENERAL, EXACT)
 BODIES = ROW_ARRAYS | {"v_free": np.array([ROWS.v_free] * 2)}
 INDEX = {"i": "index of worlds"}
+PLACES, AT, AXIS = (
+    np.array([(0.0, 0.0, 0.0), (1.0, 0.5, 0.2)]),
+    np.array([0.5, 0.2, 0.1]),
+    np.array([0.0, 0.6, 0.8]),
+)
+PAIR = {"a": 0, "b": 1, "feature": 3}
 LIMITS = {"tol": 1e-6, "max_iter": 100, "time_limit": 1.0}
 
 
 def solve_batch(**arguments):
     return lv.solve_many(lv.Batch(**arguments))
+
+
+def call_builder(method, **arguments):
+    """Call a method of a new builder of two bodies in space; return the problem that it makes."""
+    builder = lv.RowBuilder(ONES, np.tile(np.eye(3), (2, 1, 1)), np.zeros((2, 6)), 0.01, PLACES)
+    getattr(builder, method)(**arguments)
+    return builder.problem()
+
+
+def read_builder(method, **arguments):
+    """Call a method that reads from a builder with one contact."""
+    builder = lv.RowBuilder(ONES, ONES, np.zeros((2, 3)), 0.01, PLACES[:, :2])
+    builder.contact(0, 1, AT[:2], AXIS[:2] / 0.6)
+    arguments = {"problem": builder.problem()} | arguments if method == "velocity_after" else arguments
+    return getattr(builder, method)(**arguments)
 
 
 CALLS = {
@@ -193,6 +214,43 @@ CALLS = {
     "Problem.velocity": Call(GENERAL.velocity, {"impulse": B}),
     "Problem.updated": Call(GENERAL.updated, {"J": A, "M": A, "v_free": B, "target": B, "guess": B}),
     "Problem.updated, b": Call(LCP.updated, {"b": B, "guess": B}),
+    "RowBuilder": Call(
+        lv.RowBuilder,
+        {"inv_mass": ONES, "inv_inertia": np.tile(np.eye(3), (2, 1, 1)), "velocity": np.zeros((2, 6)), "dt": 0.01,
+         "position": PLACES, "baumgarte": 0.2, "slop": 0.001},
+    ),
+    "RowBuilder, planar": Call(
+        lv.RowBuilder,
+        {"inv_mass": ONES, "inv_inertia": ONES, "velocity": np.zeros((2, 3)), "dt": 0.01, "position": PLACES[:, :2]},
+    ),
+    **{f"RowBuilder.{method}": Call(partial(call_builder, method), PAIR | arguments, accepts=accepts)
+       for method, arguments, accepts in (
+           ("ball", {"anchor": AT, "anchor_b": AT + 0.1}, {}),
+           ("hinge", {"anchor": AT, "axis": AXIS, "anchor_b": AT, "axis_b": AXIS}, {}),
+           ("weld", {"anchor": AT, "anchor_b": AT, "angle_error": 0.1 * AXIS}, {}),
+           ("slider", {"anchor": AT, "axis": AXIS, "anchor_b": AT, "angle_error": 0.1 * AXIS}, {}),
+           ("distance", {"anchor_a": AT, "anchor_b": AT + 1.0, "length": 0.5}, {}),
+           ("spring", {"anchor_a": AT, "anchor_b": AT + 1.0, "length": 0.5, "stiffness": 10.0, "damping": 1.0}, {}),
+           ("motor", {"axis": AXIS, "speed": 1.0, "max_torque": 2.0}, {}),
+           ("limit", {"axis": AXIS, "value": 0.5, "lower": 0.0, "upper": 1.0, "anchor": AT},
+            {"lower": ("infinite",)}),
+           ("gear", {"axis_a": AXIS, "axis_b": AXIS, "ratio": 2.0, "angle_error": 0.1}, {}),
+           ("contact", {"point": AT, "normal": AXIS, "gap": 0.1, "mu": 0.5, "restitution": 0.5,
+                        "restitution_threshold": 0.1, "tangent": np.array([1.0, 0.0, 0.0])}, {}),
+       )},
+    "RowBuilder.motor, linear": Call(
+        partial(call_builder, "motor"), PAIR | {"axis": AXIS, "speed": 1.0, "max_force": 2.0, "anchor": AT}
+    ),
+    "RowBuilder.problem": Call(
+        partial(read_builder, "problem"), {"friction": "coulomb", "shape": "disk", "name": "one"},
+        accepts={"name": ("an object", "an ellipsis", "bytes")},
+    ),
+    "RowBuilder.rows_of": Call(partial(read_builder, "rows_of"), {"key": (9 << 60) + (1 << 38) + (2 << 16)}),
+    "RowBuilder.velocity_after": Call(partial(read_builder, "velocity_after"), {"impulse": np.ones(1)}),
+    "RowBuilder.velocity_after, the problem": Call(
+        lambda problem: read_builder("velocity_after", problem=problem, impulse=[]),
+        {"problem": lv.RowBuilder(ONES, ONES, np.zeros((2, 3)), 0.01, PLACES[:, :2]).problem()},
+    ),
     "Rows": Call(lv.Rows, ROW_ARRAYS),
     "Rows.jacobian": Call(CONTACT.rows.jacobian, {"cones": CONTACT.cones}),
     "Solution.state": Call(lv.solve(LCP).state, {"i": 0}, {"i": "block"}),
