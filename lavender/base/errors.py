@@ -56,7 +56,9 @@ class UnknownName(LavenderError, KeyError):
 
         known = sorted(set(known))
         by_lower_case = {word.lower(): word for word in reversed(known)}
-        matches = difflib.get_close_matches(str(name).lower(), by_lower_case, n=3, cutoff=0.5)
+        lower_case = str(name).lower()
+        matches = difflib.get_close_matches(lower_case, by_lower_case, n=3, cutoff=0.5)
+        matches = [lower_case] if lower_case in by_lower_case else matches
         similar = [successor] if successor else [by_lower_case[match] for match in matches]
         hint = (
             f"did you mean {' or '.join(map(repr, similar))}?"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 #: Owner -> {name that does not exist: name to use}.
 INSTEAD = {
     "lavender": {
@@ -14,7 +16,9 @@ INSTEAD = {
     "Solution": {
         "contradicted": "status_conflict",
         "impulses": "impulse",
+        "iters": "iterations",
         "lam": "impulse",
+        "lambda_": "impulse",
         "turns": "stages",
         "x": "impulse",
     },
@@ -25,6 +29,30 @@ INSTEAD = {
     },
     "Status": {"ROUNDOFF_LIMIT": "ROUNDOFF_LIMIT", "INVALID_PROBLEM": "INVALID_PROBLEM"},
 }
+
+#: Keyword argument of other packages -> arguments with that meaning; the first one that a call has is suggested.
+ARGUMENTS = {
+    **dict.fromkeys(("hi", "high", "u", "ub", "upper_bound"), ("upper", "ub")),
+    **dict.fromkeys(("l", "lb", "lo", "low", "lower_bound"), ("lower", "lb")),
+    "lower": ("lb",),
+    "upper": ("ub",),
+    **dict.fromkeys(
+        ("guess", "initial_guess", "initvals", "lam0", "warm_start", "warmstart", "x0"), ("impulse", "guess")
+    ),
+    **dict.fromkeys(
+        ("iterations", "iters", "max_iterations", "maxit", "maxiter", "n_iter", "niter"), ("max_iter",)
+    ),
+    **dict.fromkeys(("accuracy", "eps", "rtol", "tolerance"), ("tol",)),
+    **dict.fromkeys(("time_budget", "timeout"), ("time_limit",)),
+}
+
+#: Solver name that users try -> name to suggest; others get the most similar names.
+SOLVERS = {"lcp": "lemke", "qp": "osqp"}
+
+
+def suggest_argument(name: str, valid: Collection[str]) -> str:
+    """Return the argument of `valid` that has the meaning of the unknown argument `name`, or an empty string."""
+    return next((word for word in ARGUMENTS.get(name.lower(), ()) if word in valid), "")
 
 
 def build_attribute_error(owner: str, subject: str, name: str) -> AttributeError:

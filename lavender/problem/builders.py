@@ -19,6 +19,8 @@ from lavender.base.arrays import (
     shape_of,
 )
 from lavender.base.errors import InputError
+from lavender.base.lazy_import import issparse
+from lavender.base.renamed import suggest_argument
 from lavender.problem.cones import Cones, kinds_of
 from lavender.problem.data import Names, check_matrix
 from lavender.problem.findex import blocks_from_findex, findex_from_blocks, order_rows
@@ -62,8 +64,19 @@ def check_keywords(method: str, keywords: Iterable[str], own: Sequence[str] = ()
     """Raise InputError at a keyword that `Problem.method` does not have; the message lists its keywords."""
     for name in keywords:
         if name not in PROBLEM_KEYWORDS:
-            valid = ", ".join(f"{keyword}=" for keyword in (*own, *PROBLEM_KEYWORDS))
-            raise InputError(f"Problem.{method} has no argument {name}=; it takes {valid}")
+            valid = (*own, *PROBLEM_KEYWORDS)
+            successor = suggest_argument(name, valid)
+            words = (
+                f"use {successor}=" if successor else f"it takes {', '.join(f'{word}=' for word in valid)}"
+            )
+            raise InputError(f"Problem.{method} has no argument {name}=; {words}")
+
+
+def check_rhs_length(A: Any, b: FloatArray) -> None:
+    """Raise InputError that names b if A is square with another number of rows."""
+    shape = A.shape if isinstance(A, np.ndarray) or issparse(A) else shape_of("A", A)
+    if len(shape) == 2 and shape[0] == shape[1] != len(b):
+        raise InputError(f"b [m/s] has shape {b.shape}; ({shape[0]},) is needed, as A has {shape[0]} rows")
 
 
 class Builders(Operators):
@@ -82,6 +95,7 @@ class Builders(Operators):
         """
         check_keywords("linear", more)
         b = as_array("b", b, (None,), unit="m/s")
+        check_rhs_length(A, b)
         return cls(b, Cones.free(len(b)), A, **more)
 
     @classmethod
@@ -105,6 +119,7 @@ class Builders(Operators):
         """
         check_keywords("lcp", more, ("lower", "upper"))
         b = as_array("b", b, (None,), unit="m/s")
+        check_rhs_length(A, b)
         bounds = [
             as_array(n, x, (len(b),), finite=False, unit="N s")
             for n, x in (("lower", lower), ("upper", upper))
@@ -146,6 +161,7 @@ class Builders(Operators):
         """
         check_keywords("contact", more, ("mu", "patch_radius", "rolling"))
         b = as_array("b", b, (None,), unit="m/s")
+        check_rhs_length(A, b)
         check_unmasked("mu", mu)
         if len(shape_of("mu", mu)) > 1:
             return cls(b, Cones.contacts(mu, 2, patch_radius, rolling=rolling), A, **more)

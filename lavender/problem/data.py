@@ -357,7 +357,7 @@ ProblemData.__init__.__qualname__ = "Problem.__init__"  # A TypeError then names
 def check_problem(problem: Any) -> None:
     """Raise InputError unless `problem` is a `Problem`."""
     if not isinstance(problem, ProblemData):
-        advice = "make one by Problem.lcp(A, b), linear, contact, from_rows or from_jacobian"
+        advice = "make one by Problem.lcp(A, b, lower, upper), linear, contact, from_rows or from_jacobian"
         if isinstance(getattr(problem, "problem", None), ProblemData):  # a case, or a file that was read
             advice = "give its .problem"
         raise InputError(f"problem is a {type(problem).__name__}; a lavender.Problem is needed: {advice}")

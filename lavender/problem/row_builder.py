@@ -544,7 +544,19 @@ class RowBuilder:
         arm_a, arm_b = self._arm(pair[0], at), self._arm(pair[1], at)
         key, label = self._take_key("contact", pair, feature, name)
         self._contacts.append(
-            Contact(label, key, pair, along, side, arm_a, arm_b, friction, target, bounce, threshold)
+            Contact(
+                name=label,
+                key=key,
+                bodies=pair,
+                normal=along,
+                tangent=side,
+                arm_a=arm_a,
+                arm_b=arm_b,
+                mu=friction,
+                target=target,
+                restitution=bounce,
+                threshold=threshold,
+            )
         )
         return key
 

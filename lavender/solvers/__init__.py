@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+from types import ModuleType
 from typing import Any
 
 from lavender.base.lazy_import import import_locked
@@ -38,3 +40,16 @@ def __getattr__(name: str) -> Any:
     if name != "SPECS":
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return tuple(map(spec_of, _TABLE))
+
+
+class _SolversModule(ModuleType):
+    """Module whose call, `lavender.solvers()`, raises an error that names the functions that list solvers."""
+
+    def __call__(self, *args: Any, **arguments: Any) -> Any:
+        raise TypeError(
+            "lavender.solvers is a module; lavender.available(problem) lists the solvers that accept a problem, and "
+            "lavender.known() describes all solvers"
+        )
+
+
+sys.modules[__name__].__class__ = _SolversModule

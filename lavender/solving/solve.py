@@ -8,7 +8,7 @@ from functools import partial
 from threading import Lock
 from time import perf_counter
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, NoReturn, cast
 
 import numpy as np
 
@@ -24,6 +24,7 @@ from lavender.base.arrays import (
 from lavender.base.deadline import NEVER, Deadline, Stopwatch
 from lavender.base.errors import BREAKDOWN, CapabilityError, InputError, InUse, UnknownName, format_error
 from lavender.base.lazy_import import import_numerics
+from lavender.base.renamed import suggest_argument
 from lavender.external.foreign import Foreign
 from lavender.judge.certificates import prove
 from lavender.judge.residuals import (
@@ -85,7 +86,7 @@ SOLVE_ARGUMENTS = ("impulse", "tol", "max_iter", "time_limit", "history", "callb
 def solve(
     problem: Problem,
     solver: str = "auto",
-    *,
+    *surplus: NoReturn,
     impulse: ArrayLike | None = None,
     tol: float = 1e-6,
     max_iter: int | None = None,
@@ -141,6 +142,11 @@ def solve(
     """
     begun = 0.0 if time_limit is None else perf_counter()
     check_problem(problem)  # This comes first, because a frequent error is to pass A and b.
+    if surplus:
+        raise InputError(
+            f"solve has {2 + len(surplus)} positional arguments; a problem and the name of a solver are needed, "
+            "all others by name: lavender.solve(problem, solver, tol=..., impulse=...)"
+        )
     spec = get(solver)
     limit = math.inf if time_limit is None else check_time_limit(time_limit)
     if max_iter is None and callback is None and history is False and not options:
@@ -219,7 +225,9 @@ class Prepared:
                         f"solver {spec.name!r} does not take {name}=; it takes: "
                         f"{', '.join(sorted(spec.accepts)) or 'no options'}"
                     )
-                raise UnknownName(f"option of solver {spec.name!r}", name, {*spec.accepts, *SOLVE_ARGUMENTS})
+                valid = {*spec.accepts, *SOLVE_ARGUMENTS}
+                kind = f"option of solver {spec.name!r}"
+                raise UnknownName(kind, name, valid, suggest_argument(name, valid))
         self.spec = spec
         self.options = options
         self._original, self.problem = problem, problem if late else problem.disk

@@ -1,0 +1,78 @@
+"""Names that users of similar packages try are answered by an error that suggests the name of this package."""
+
+import numpy as np
+import pytest
+
+import lavender as lv
+
+A, B = np.array([[2.0, 1.0], [1.0, 2.0]]), np.array([1.0, -1.0])
+LCP = lv.Problem.lcp(A, B)
+
+
+@pytest.mark.parametrize(
+    ("name", "successor"),
+    [("lo", "lower"), ("lb", "lower"), ("hi", "upper"), ("ub", "upper"), ("x0", "guess")],
+)
+def test_bounds_of_other_packages_suggest_ours(name, successor):
+    with pytest.raises(lv.InputError, match=rf"Problem\.lcp has no argument {name}=; use {successor}="):
+        lv.Problem.lcp(A, B, **{name: 0.0})
+
+
+def test_programs_keep_their_own_names_of_bounds():
+    with pytest.raises(lv.InputError, match="has no argument lower=; use lb="):
+        lv.Problem.from_qp(A, B, lower=np.zeros(2))
+
+
+@pytest.mark.parametrize(
+    ("name", "successor"),
+    [("warm_start", "impulse"), ("x0", "impulse"), ("iterations", "max_iter"), ("maxiter", "max_iter")],
+)
+@pytest.mark.parametrize("solver", ["auto", "pgs"])
+def test_options_of_other_packages_suggest_ours(solver, name, successor):
+    for call in (lv.solve, lv.prepare):
+        with pytest.raises(lv.UnknownName, match=f"unknown option '{name}' .*did you mean '{successor}'"):
+            call(LCP, solver, **{name: 3})
+
+
+@pytest.mark.parametrize("name", ["x", "lam", "impulses"])
+def test_results_of_other_packages_suggest_ours(name):
+    with pytest.raises(AttributeError, match=f"no attribute '{name}'; use impulse"):
+        getattr(lv.solve(LCP), name)
+
+
+def test_the_module_of_solvers_names_the_lists_of_solvers():
+    import lavender.solvers
+
+    with pytest.raises(TypeError, match=r"lavender\.available\(problem\) lists .* lavender\.known\(\)"):
+        lavender.solvers()
+
+
+@pytest.mark.parametrize(
+    ("name", "hint"), [("PGS", "'pgs'"), ("Newton", "'newton'"), ("lcp", "'lemke'"), ("LCP", "'lemke'")]
+)
+def test_solver_names_ignore_case_before_similarity(name, hint):
+    with pytest.raises(lv.UnknownName) as raised:
+        lv.solve(LCP, name)
+    assert str(raised.value) == f"unknown solver {name!r}; did you mean {hint}?"
+
+
+@pytest.mark.parametrize("bounds", [(), (0.0, 1.0)])
+def test_a_matrix_in_place_of_a_problem_suggests_to_make_one(bounds):
+    with pytest.raises(lv.InputError, match=r"problem is a ndarray; .* Problem\.lcp\(A, b, lower, upper\)"):
+        lv.solve(A, B, *bounds)
+
+
+def test_arguments_after_the_solver_go_by_name():
+    with pytest.raises(lv.InputError, match="solve has 3 positional arguments; .* all others by name"):
+        lv.solve(LCP, "pgs", B)
+
+
+@pytest.mark.parametrize(
+    "build", [lv.Problem.lcp, lv.Problem.linear, lambda a, b: lv.Problem.contact(a, b, 0.0)]
+)
+@pytest.mark.parametrize("matrix", [A, A.tolist()])
+def test_a_short_b_is_blamed_instead_of_a_square_matrix(build, matrix):
+    with pytest.raises(
+        lv.InputError, match=r"^b \[m/s\] has shape \(1,\); \(2,\) is needed, as A has 2 rows"
+    ):
+        build(matrix, B[:1])
