@@ -48,7 +48,7 @@ from lavender.problem import Problem, QPSolution
 from lavender.solvers.registry import SolverSpec, available, get, known, register
 from lavender.judge.residuals import Residual, residual
 from lavender.problem.rows import Rows
-from lavender.judge.solution import Claim, Solution, Status, SolverStage
+from lavender.judge.solution import Claim, History, Solution, Status, SolverStage
 from lavender.solving.solve import prepare, solve
 
 if TYPE_CHECKING:
@@ -129,6 +129,7 @@ __all__ = [
     "Diagnostic",
     "Enclosure",
     "Generalized",
+    "History",
     "InUse",
     "InputError",
     "LavenderError",

@@ -6,7 +6,8 @@
 (`lavender/problem/generalized.py`) or a matrix, one of them, and derives the rest on first use.
 
 Files, each over the one before: `data.py` (fields and their checks), `operators.py` (A, J and the metric),
-`program.py` (quadratic programs), `builders.py` (ways to make one), `problem.py` (`Problem` and its other forms).
+`program.py` (quadratic programs), `builders.py` (ways to make one), `problem.py` (`Problem` and its other forms),
+`row_builder.py` (`RowBuilder`: joints and contacts in world coordinates).
 """
 
 from lavender.problem.data import FRICTION_LAWS, LAWS, OPERATORS, PRECISIONS, Names, check_problem

@@ -740,5 +740,6 @@ def _check_records(spec: SolverSpec, history: bool, callback: Callback | None) -
         raise InputError(f"callback is {callback!r}; a function of (iterations, impulse, residual) is needed")
     if (callback is not None and not spec.callback) or (check_bool("history", history) and not spec.history):
         raise CapabilityError(
-            f"solver {spec.name!r} runs in one call; it takes no callback and records no history"
+            f"solver {spec.name!r} runs in one call; it takes no callback and records no history: use a solver of "
+            "lavender.available(problem, history=True)"
         )

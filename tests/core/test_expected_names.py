@@ -62,8 +62,14 @@ def test_a_matrix_in_place_of_a_problem_suggests_to_make_one(bounds):
         lv.solve(A, B, *bounds)
 
 
+def test_a_solver_without_history_names_the_list_of_those_with_it():
+    with pytest.raises(lv.CapabilityError, match=r"lavender\.available\(problem, history=True\)"):
+        lv.solve(LCP, "direct", history=True)
+    assert all(lv.solve(LCP, name, history=True).history for name in lv.available(LCP, history=True))
+
+
 def test_arguments_after_the_solver_go_by_name():
-    with pytest.raises(lv.InputError, match="solve has 3 positional arguments; .* all others by name"):
+    with pytest.raises(lv.InputError, match=r"solve has 3 positional arguments; .* all others by name"):
         lv.solve(LCP, "pgs", B)
 
 

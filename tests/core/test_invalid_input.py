@@ -265,6 +265,7 @@ CALLS = {
     "get": Call(lv.get, {"name": "pgs"}, {"name": "solver"}),
     "known": Call(lv.known, {"problem": LCP}),
     "prepare": Call(lv.prepare, {"problem": LCP, "solver": "pgs"}),
+    "History.plot": Call(lv.solve(LCP, "pgs", history=True).history.plot, {"against": "time"}),
     "Prepared.solve": Call(
         lv.prepare(LCP, "pgs").solve, {"problem": LCP, "impulse": B, "history": True} | LIMITS
     ),
@@ -304,7 +305,8 @@ CALLS = {
 #: Public calls that are not in the table, and why.
 NOT_CALLED = {
     **dict.fromkeys(
-        ("Claim", "Derivative", "Plan", "QPSolution", "Residual", "Residuals", "Solution", "Solutions", "SolverStage"),
+        ("Claim", "Derivative", "History", "Plan", "QPSolution", "Residual", "Residuals", "Solution", "Solutions",
+         "SolverStage"),
         "a result: the package makes it",
     ),
     **dict.fromkeys(
