@@ -272,6 +272,7 @@ class Prepared:
         time_limit: float | None = None,
         history: bool = False,
         callback: Callback | None = None,
+        **unknown: NoReturn,
     ) -> Solution:
         """Solve as `lavender.solve`; `problem`, if given, replaces the prepared one unless an error is raised.
 
@@ -279,7 +280,12 @@ class Prepared:
         ------
         InUse
             Another call of this object's `solve` has not returned yet.
+        UnknownName
+            No such argument.
         """
+        for name in unknown:
+            successor = suggest_argument(name, SOLVE_ARGUMENTS)
+            raise UnknownName("argument of Prepared.solve", name, SOLVE_ARGUMENTS, successor)
         deadline = _deadline(self.spec, check_time_limit(time_limit))
         return self._solve(problem, impulse, tol, max_iter, deadline, history, callback)
 

@@ -32,6 +32,8 @@ def test_options_of_other_packages_suggest_ours(solver, name, successor):
     for call in (lv.solve, lv.prepare):
         with pytest.raises(lv.UnknownName, match=f"unknown option '{name}' .*did you mean '{successor}'"):
             call(LCP, solver, **{name: 3})
+    with pytest.raises(lv.UnknownName, match=f"unknown argument '{name}' .*did you mean '{successor}'"):
+        lv.prepare(LCP, solver).solve(**{name: 3})
 
 
 @pytest.mark.parametrize("name", ["x", "lam", "impulses"])
