@@ -31,7 +31,7 @@ INSTEAD = {
 }
 
 #: Keyword argument of other packages -> arguments with that meaning; the first one that a call has is suggested.
-ARGUMENTS = {
+ARGUMENT_HINTS = {
     **dict.fromkeys(("hi", "high", "u", "ub", "upper_bound"), ("upper", "ub")),
     **dict.fromkeys(("l", "lb", "lo", "low", "lower_bound"), ("lower", "lb")),
     "lower": ("lb",),
@@ -47,12 +47,12 @@ ARGUMENTS = {
 }
 
 #: Solver name that users try -> name to suggest; others get the most similar names.
-SOLVERS = {"lcp": "lemke", "qp": "osqp"}
+SOLVER_HINTS = {"lcp": "lemke", "qp": "osqp"}
 
 
 def suggest_argument(name: str, valid: Collection[str]) -> str:
     """Return the argument of `valid` that has the meaning of the unknown argument `name`, or an empty string."""
-    return next((word for word in ARGUMENTS.get(name.lower(), ()) if word in valid), "")
+    return next((word for word in ARGUMENT_HINTS.get(name.lower(), ()) if word in valid), "")
 
 
 def build_attribute_error(owner: str, subject: str, name: str) -> AttributeError:

@@ -11,7 +11,7 @@ is J v+ + compliance lambda = target, within the bounds of its impulse lambda:
 
 (1) is Baumgarte's correction (Baumgarte 1972); beta is the error reduction parameter `ERP` of the ODE manual, section
 3.7. (2) is a spring with a damper integrated by implicit Euler; ODE manual, section 3.8, and Catto, "Soft Constraints"
-(GDC 2011). (3) to (5) are those of Catto, "Understanding Constraints" (GDC 2014): (4) lets a joint or contact close
+(GDC 2011). (3) to (5) follow Catto, "Understanding Constraints" (GDC 2014): (4) lets a joint or contact close
 its remaining distance within the step, but not more.
 """
 
@@ -209,8 +209,8 @@ class RowBuilder:
         anchor_b : array-like, m, optional
             Point of the joint on b. Default: `anchor`. The difference is the error of the joint (eq. 1).
         feature : int, 0 to 65535, optional
-            Number of this block among those of the same method and bodies; part of its key. Default: the order of the
-            calls. Give it if blocks of a pair of bodies appear and disappear.
+            Number of this block among the blocks of the same method and bodies; part of its key. Default: the order of
+            the calls. Give it if blocks of a pair of bodies appear and disappear.
         name : str, optional
             Name of the block in reports. Default: method and bodies.
 
@@ -435,12 +435,12 @@ class RowBuilder:
         lower, upper : float, rad or m
             Limits of `value`; at least one is finite.
         anchor : array-like (2,) or (3,), m, optional
-            For limits of travel: point on b, in world coordinates. Without it the limits are those of an angle.
+            For limits of travel: point on b, in world coordinates. Without it the angle is limited.
 
         Returns
         -------
         int
-            Key of the block. Both rows have impulses of at least 0: first that of the lower, then of the upper limit.
+            Key of the block. Both rows have impulses of at least 0: first the lower limit, then the upper.
         """
         pair, present = self._pair(a, b), check_float("value", value)
         low = -inf if _is_float(lower) and lower == -inf else check_float("lower", lower)
@@ -626,8 +626,8 @@ class RowBuilder:
         Returns
         -------
         slice
-            `solution.impulse[builder.rows_of(key)]` are the impulses of the block [N s]: those of a contact are the
-            normal's, then the tangents'. Contacts follow all joints, so call it after all blocks were added.
+            `solution.impulse[builder.rows_of(key)]` are the impulses of the block [N s]; in a contact the normal
+            impulse is followed by the tangential ones. Call it after all blocks were added: contacts follow joints.
         """
         wanted, start = check_int("key", key, high=2**64 - 1), 0
         for joint in self._joints:
@@ -696,7 +696,7 @@ class RowBuilder:
         return _unit(name, self._vector(name, value))
 
     def _rotation_axis(self, name: str, value: ArrayLike | None) -> Vector:
-        """Return the unit vector of an axis of rotation: z in two dimensions, where none is given."""
+        """Return the unit vector of an axis of rotation: z in two dimensions, which need no axis."""
         if self._is_planar:
             if value is not None:
                 raise InputError(
@@ -839,7 +839,7 @@ class RowBuilder:
         return (-travel if travel > 0.0 else -self._baumgarte * travel) / self._dt
 
     def _normal_target(self, contact: Contact) -> float:
-        """Return the target of a contact's normal row: that of its gap, or of restitution if it is larger (eq. 5)."""
+        """Return the target of a contact's normal row, with restitution if the bodies approach fast enough (eq. 5)."""
         approach = 0.0
         for sign, body, arm in (
             (-1.0, contact.bodies[0], contact.arm_a),
