@@ -2,7 +2,7 @@
 from libc.stdint cimport int32_t, int64_t
 
 from lavender_ext.accelerate.mixing cimport CONTROL, MAX_MEMORY
-from lavender_ext.core.parts cimport CONE, blocks_t
+from lavender_ext.core.block_types cimport CONE, blocks_t
 from lavender_ext.sweep.serial cimport Sweeps, context_t, sweeping_t
 
 

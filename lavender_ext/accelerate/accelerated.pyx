@@ -21,7 +21,7 @@ from lavender_ext.accelerate.accelerated cimport accelerate, accelerated_workspa
 from lavender_ext.accelerate.mixing cimport CONTROL, UNDONE, forget, mix, mixing_t, take
 from lavender_ext.core.block cimport clip, length
 from lavender_ext.core.order cimport SYMMETRIC
-from lavender_ext.core.parts cimport blocks_t, is_rows, parts_of, parts_t
+from lavender_ext.core.block_types cimport blocks_t, is_rows, get_friction_components, friction_components_t
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.view cimport view_t
 from lavender_ext.sweep.serial cimport Sweeps, form_velocity, sweep, velocities_of
@@ -50,16 +50,16 @@ cdef inline void project_block(const blocks_t* p, int32_t i, double* lam) noexce
     """lam of block i into its bounds, normal first."""
     cdef int32_t j = p.ptr[i], g, k
     cdef double bound, size
-    cdef parts_t q
+    cdef friction_components_t q
     if is_rows(p, i):
         for k in range(j, p.ptr[i + 1]):
             lam[k] = clip(lam[k], p.lower[k], p.upper[k])
         return
     if lam[j] < 0.0:
         lam[j] = 0.0
-    parts_of(p, i, &q)
+    get_friction_components(p, i, &q)
     for g in range(q.n):
-        bound = q.reach[g] * lam[j]
+        bound = q.friction_coefficient[g] * lam[j]
         size = length(lam + j + q.first[g], q.size[g])
         if size > bound:
             for k in range(j + q.first[g], j + q.first[g] + q.size[g]):

@@ -27,8 +27,8 @@ from libc.stdint cimport int32_t, int64_t
 import numpy as np
 
 from lavender_ext.accelerate.mixing cimport CONTROL, MAX_MEMORY, UNDONE, forget, mix, mixing_t, take
-from lavender_ext.core.block cimport clip, length, norm2, round_group, round_section, round_share, section
-from lavender_ext.core.parts cimport CONE, blocks_t, is_round, is_rows, parts_of, parts_t
+from lavender_ext.core.block cimport clip, length, norm2, row_group, locate_in_round_cone, round_scale, projected_normal
+from lavender_ext.core.block_types cimport CONE, blocks_t, is_round, is_rows, get_friction_components, friction_components_t
 from lavender_ext.core.problem cimport Data
 from lavender_ext.factor.blocks cimport sparse_t
 from lavender_ext.factor.dense cimport dense_cholesky_solve
@@ -114,22 +114,22 @@ cdef inline void project_round(int32_t n, const double* root, double mu, const d
     t[0] = t[1] = t[2] = 0.0
     a[0] = a[1] = a[2] = 0.0
     for i in range(1, n):
-        g = round_group(i)
+        g = row_group(i)
         t[g] = norm2(t[g], u[i])
         a[g] = mu * root[i] / root[0]
-    zone = round_section(t, a, u[0], &r, &size)
+    zone = locate_in_round_cone(t, a, u[0], &r, &size)
     z[0] = (u[0] if u[0] > 0.0 else 0.0) + r if zone == 0 else (u[0] if zone > 0 else 0.0)
     for i in range(1, n):
-        z[i] = (round_share(a[round_group(i)], r, u[0]) if zone == 0 else (1.0 if zone > 0 else 0.0)) * u[i]
+        z[i] = (round_scale(a[row_group(i)], r, u[0]) if zone == 0 else (1.0 if zone > 0 else 0.0)) * u[i]
 
 
-cdef inline void scaled_parts(const blocks_t* p, const double* root, int32_t i, const double* x, parts_t* q,
+cdef inline void scaled_parts(const blocks_t* p, const double* root, int32_t i, const double* x, friction_components_t* q,
                               double* t) noexcept nogil:
     """Parts of contact i with their reach in the scale of x, and |x_g| in t."""
     cdef int32_t j = p.ptr[i], g
-    parts_of(p, i, q)
+    get_friction_components(p, i, q)
     for g in range(q.n):
-        q.reach[g] = q.reach[g] * root[j + q.first[g]] / root[j]
+        q.friction_coefficient[g] = q.friction_coefficient[g] * root[j + q.first[g]] / root[j]
         t[g] = length(x + j + q.first[g], q.size[g])
 
 
@@ -137,7 +137,7 @@ cdef inline void project_block(const blocks_t* p, const double* root, int32_t i,
                                double* z) noexcept nogil:
     """z = Pi_K(u) of one block, u, z whole scaled vectors; core/block.pxd (7)."""
     cdef int32_t j = p.ptr[i], end = p.ptr[i + 1], k, g
-    cdef parts_t q
+    cdef friction_components_t q
     cdef double t[3]
     cdef double s
     if is_rows(p, i):
@@ -148,21 +148,21 @@ cdef inline void project_block(const blocks_t* p, const double* root, int32_t i,
         project_round(end - j, root + j, p.mu[i], u + j, z + j)
         return
     scaled_parts(p, root, i, u, &q, t)
-    z[j] = s = section(q.n, q.reach, t, u[j])
+    z[j] = s = projected_normal(q.n, q.friction_coefficient, t, u[j])
     for g in range(q.n):
         for k in range(j + q.first[g], j + q.first[g] + q.size[g]):
-            z[k] = q.reach[g] * s / t[g] * u[k] if t[g] > q.reach[g] * s else u[k]
+            z[k] = q.friction_coefficient[g] * s / t[g] * u[k] if t[g] > q.friction_coefficient[g] * s else u[k]
 
 
 cdef inline double shift(const blocks_t* p, const double* root, int32_t i, const double* y) noexcept nogil:
     # s of the normal of contact i
-    cdef parts_t q
+    cdef friction_components_t q
     cdef double t[3]
     cdef double s = 0.0
     cdef int32_t g
     scaled_parts(p, root, i, y, &q, t)
     for g in range(q.n):
-        s += q.reach[g] * t[g]
+        s += q.friction_coefficient[g] * t[g]
     return s
 
 

@@ -17,9 +17,9 @@ from libc.string cimport memcpy, memset
 import numpy as np
 
 from lavender_ext.core.arrays cimport ndarray as Array
-from lavender_ext.core.door cimport all_finite, first_outside
-from lavender_ext.core.generalized cimport jac_push, whitened_dot
-from lavender_ext.core.parts cimport blocks_t, is_rows
+from lavender_ext.core.validate cimport all_finite, first_invalid
+from lavender_ext.core.generalized cimport jac_transpose_times, whitened_dot
+from lavender_ext.core.block_types cimport blocks_t, is_rows
 from lavender_ext.core.problem cimport Data, Workspace, allocate_workspace
 from lavender_ext.core.rows cimport rows_times
 from lavender_ext.core.velocity cimport rows_wrench, wrenches_to_velocity
@@ -40,10 +40,10 @@ cdef double SINGULAR = 1e-12    # least pivot over the largest from which on G c
 CASES = {"open": OPEN, "closed": CLOSED, "sticks": STICKS, "slides": SLIDES, "free": FREE, "low": LOW, "high": HIGH}
 
 
-cdef void push(const view_t* v, const double* lam, double* f) noexcept nogil:
+cdef void times_jac_transpose(const view_t* v, const double* lam, double* f) noexcept nogil:
     # f (n) = J^T lam
     if v.g != NULL:
-        jac_push(v.g, lam, f)
+        jac_transpose_times(v.g, lam, f)
     elif v.r != NULL:
         rows_wrench(&v.p, v.r, lam, f)
 
@@ -91,7 +91,7 @@ cdef public void lav_adjoint(const linear_t* a, const double* y, const double* c
     elif y != NULL or x != NULL:
         memset(f, 0, a.n * sizeof(double))
         if x != NULL:
-            push(v, x, f)
+            times_jac_transpose(v, x, f)
         if y != NULL:
             for i in range(a.n):
                 f[i] += y[i]
@@ -108,7 +108,7 @@ cdef public void lav_adjoint(const linear_t* a, const double* y, const double* c
     block_times(&a.x, &v.p, a.x.p, q, True, s)
     for i in range(m):
         s[i] = s[i] / a.x.root[i] - (x[i] if x != NULL else 0.0)
-    push(v, s, f)
+    times_jac_transpose(v, s, f)
     for i in range(a.n):
         f[i] = (y[i] if y != NULL else 0.0) - f[i]
 
@@ -212,7 +212,7 @@ cdef bint is_prepared(Data p):
         p.prepare()
     except OverflowError:
         return False
-    return first_outside(p.blocks.d, p.blocks.n_rows) < 0
+    return first_invalid(p.blocks.d, p.blocks.n_rows) < 0
 
 
 cdef bint adjoint_into(const linear_t* a, velocity, impulse, slack, double* out):

@@ -21,7 +21,7 @@ from libc.stdint cimport int8_t, int32_t
 from lavender_ext.core.block cimport length
 from lavender_ext.core.contact_map cimport contact_map
 from lavender_ext.core.dot cimport dot
-from lavender_ext.core.parts cimport CONE, blocks_t, is_rows, parts_of, parts_t
+from lavender_ext.core.block_types cimport CONE, blocks_t, is_rows, get_friction_components, friction_components_t
 from lavender_ext.core.view cimport csr_t, generalized_t, view_t
 
 
@@ -93,14 +93,14 @@ cdef inline void natural_contact(const blocks_t* b, int32_t i, const double* lam
     cdef double y[6]
     cdef double to[6]
     cdef double ray[6]
-    cdef parts_t q
+    cdef friction_components_t q
     cdef double t, s, gone, norm = 1.0, over
-    parts_of(b, i, &q)
+    get_friction_components(b, i, &q)
     root[0] = sqrt(b.d[j])
     for g in range(q.n):
         for k in range(q.first[g], q.first[g] + q.size[g]):
             root[k] = sqrt(b.d[j + q.first[g]])
-        q.reach[g] = q.reach[g] * root[q.first[g]] / root[0]
+        q.friction_coefficient[g] = q.friction_coefficient[g] * root[q.first[g]] / root[0]
     for k in range(n):
         y[k] = root[k] * lam[j + k] - w[j + k] / root[k]
         ray[k] = 0.0
@@ -119,19 +119,19 @@ cdef inline void natural_contact(const blocks_t* b, int32_t i, const double* lam
     for g in range(q.n):
         first, size = q.first[g], q.size[g]
         t = length(y + first, size)
-        gone -= q.reach[g] * t
+        gone -= q.friction_coefficient[g] * t
         if not s > 0.0:
             continue
-        over = t - q.reach[g] * s
+        over = t - q.friction_coefficient[g] * s
         for k in range(first, first + size):
-            out.case_[j + k] = STICKS if over <= 0.0 and q.reach[g] > 0.0 else SLIDES
+            out.case_[j + k] = STICKS if over <= 0.0 and q.friction_coefficient[g] > 0.0 else SLIDES
             if over > 0.0:
-                ray[k] = q.reach[g] * y[k] / t
+                ray[k] = q.friction_coefficient[g] * y[k] / t
                 edge[k * n + first] = s * y[k] / t
-        if q.reach[g] > 0.0:
+        if q.friction_coefficient[g] > 0.0:
             margin[first] = fabs(over) / root[first]
         if over > 0.0:
-            norm += q.reach[g] * q.reach[g]
+            norm += q.friction_coefficient[g] * q.friction_coefficient[g]
     if s > 0.0:
         margin[0] = s / root[0]
     else:
@@ -139,9 +139,9 @@ cdef inline void natural_contact(const blocks_t* b, int32_t i, const double* lam
     for g in range(q.n if s > 0.0 else 0):
         first, size = q.first[g], q.size[g]
         t = length(y + first, size)
-        if b.law == CONE and t > q.reach[g] * s:
+        if b.law == CONE and t > q.friction_coefficient[g] * s:
             for k in range(n):
-                edge[k * n + first] += ray[k] * (t - 2.0 * q.reach[g] * s) / norm
+                edge[k * n + first] += ray[k] * (t - 2.0 * q.friction_coefficient[g] * s) / norm
         for k in range(n):                              # of a_g = e_g root_g / root_n
             edge[k * n + first] *= root[first] / root[0]
 

@@ -2,7 +2,7 @@
 from libc.math cimport INFINITY
 from libc.stdint cimport int32_t, int64_t
 
-from lavender_ext.core.method cimport NEEDS_WORKSPACE, Method, method_t, options_t, workspace_t, said_t
+from lavender_ext.core.method cimport NEEDS_WORKSPACE, Method, method_t, options_t, workspace_t, info_t
 from lavender_ext.core.problem cimport Data, Workspace, allocate_workspace
 from lavender_ext.core.view cimport view_t
 from lavender_ext.driver.driver cimport NEWTON
@@ -35,9 +35,9 @@ cdef public int32_t lav_start(const view_t* v, const options_t* o, workspace_t* 
 
 
 cdef public int32_t lav_step(const view_t* v, const options_t* o, const workspace_t* r, int32_t work, double* lam,
-                             said_t* said) noexcept nogil:
+                             info_t* info) noexcept nogil:
     """`work` units or a few more; lam (m) is the best so far."""
-    return row_of(v).step(v, o, r, work, lam, said)
+    return row_of(v).step(v, o, r, work, lam, info)
 
 
 cdef class Driver(Method):

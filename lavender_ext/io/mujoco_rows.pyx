@@ -11,10 +11,10 @@ from libc.string cimport memcmp, memcpy, memset
 
 import numpy as np
 
-from lavender_ext.core.arrays cimport DOUBLE, INT, doubles, frozen, ints, ndarray, spread
-from lavender_ext.core.blocks cimport Blocks, room_of
-from lavender_ext.core.door cimport is_number, is_size, widest
-from lavender_ext.core.parts cimport ROW, blocks_t, contact_kind, spell_bounds
+from lavender_ext.core.arrays cimport DOUBLE, INT, doubles, freeze, ints, ndarray, array_data
+from lavender_ext.core.blocks cimport Blocks, allocate_blocks
+from lavender_ext.core.validate cimport is_number, is_valid_magnitude, max_abs
+from lavender_ext.core.block_types cimport ROW, blocks_t, contact_kind, spell_bounds
 from lavender_ext.core.problem cimport Workspace, allocate_workspace
 
 
@@ -127,10 +127,10 @@ def blocks(type_, id_, codes, tuple most, dim, friction, geom, loss, double dt):
     cdef const int32_t* of = ints(type_, m)
     cdef const int32_t* which = ints(id_, m)
     cdef const double* losses = doubles(loss, m)
-    cdef const char* dims = spread(dim, c, 1, INT, &step[0])
-    cdef const char* pair = spread(geom, c, 2, INT, &step[1])
-    cdef const char* rub = spread(friction, c, 5, DOUBLE, &step[2])
-    cdef Blocks made = room_of(m, m, 2 * m + 3 * c, m + 5 * c)
+    cdef const char* dims = array_data(dim, c, 1, INT, &step[0])
+    cdef const char* pair = array_data(geom, c, 2, INT, &step[1])
+    cdef const char* rub = array_data(friction, c, 5, DOUBLE, &step[2])
+    cdef Blocks made = allocate_blocks(m, m, 2 * m + 3 * c, m + 5 * c)
     cdef blocks_t* p = &made.at
     cdef int32_t* held = <int32_t*>p.kind + m
     cdef double* scale = <double*>p.rolling + m
@@ -153,7 +153,7 @@ def blocks(type_, id_, codes, tuple most, dim, friction, geom, loss, double dt):
     p.n_blocks = k
     fits = made.check()
     spell_bounds(&made.at)
-    return made if fits else None, made.numbers[5 * m:6 * m], frozen(keys if k == m else keys[:k])
+    return made if fits else None, made.numbers[5 * m:6 * m], freeze(keys if k == m else keys[:k])
 
 
 def rows_of_dense(values, int32_t m, int32_t n, scale):
@@ -269,20 +269,20 @@ def lower(first_, count_, columns, values, x, y, double bound, tuple like):
         if whole[n] != nnz:
             return None
         for made_ in like:
-            frozen(made_)
+            freeze(made_)
     at, column = ints(like[0], n + 1), ints(like[1], nnz)
     copy, scratch = new(nnz), allocate_workspace(n * sizeof(double))
     out, made = doubles(copy, nnz), <double*>scratch.at
     memcpy(out, doubles(values, nnz), nnz * sizeof(double))
     multiply(n, at, column, out, v, False, made)
     for i in range(n):
-        gap = widest(gap, made[i] - right[i])
-        big = widest(big, right[i])
+        gap = max_abs(gap, made[i] - right[i])
+        big = max_abs(big, right[i])
     if not gap <= bound * big:
         big = 0.0
         multiply(n, at, column, out, v, True, made)
         for i in range(n):
-            big = widest(big, made[i] + fabs(right[i]))
+            big = max_abs(big, made[i] + fabs(right[i]))
     return (like[0], like[1], copy), gap / big if big > 0.0 else gap
 
 
@@ -472,9 +472,9 @@ def numbers(jptr_, jidx_, jval_, scale_, double dt, v_, smooth_, aref_, r_, inve
         pushed[j] = pushed[n + j] = 0.0
         free[j] = v[j] + change[j]
         sound &= is_number(free[j])
-        top_v = widest(top_v, v[j])
-        top_free = widest(top_free, change[j])
-        said_3 = widest(said_3, push[j])
+        top_v = max_abs(top_v, v[j])
+        top_free = max_abs(top_free, change[j])
+        said_3 = max_abs(said_3, push[j])
         finite += 0.0 * a[j]
     for i in range(m):
         size = s_v = s_free = 0.0
@@ -490,21 +490,21 @@ def numbers(jptr_, jidx_, jval_, scale_, double dt, v_, smooth_, aref_, r_, inve
             pushed[n + j] += fabs(c)
         rhs[i] = dt * scale[i] * aref[i] - s_free
         compliance[i] = r[i] * scale[i] * scale[i]
-        top_b = widest(top_b, rhs[i])
-        sound &= is_size(compliance[i]) and compliance[i] <= usual
-        gap_0 = widest(gap_0, r[i] * inverse[i] - 1.0)
+        top_b = max_abs(top_b, rhs[i])
+        sound &= is_valid_magnitude(compliance[i]) and compliance[i] <= usual
+        gap_0 = max_abs(gap_0, r[i] * inverse[i] - 1.0)
         c = scale[i] * vel[i]
-        gap_1 = widest(gap_1, s_v - c)
-        big_1 = widest(big_1, size * top_v + fabs(c))
-        said_1 = widest(said_1, vel[i])
+        gap_1 = max_abs(gap_1, s_v - c)
+        big_1 = max_abs(big_1, size * top_v + fabs(c))
+        said_1 = max_abs(said_1, vel[i])
         c = scale[i] * dt * b[i]
-        gap_2 = widest(gap_2, rhs[i] + c)
-        big_2 = widest(big_2, size * top_free + fabs(rhs[i]) + fabs(c))
-        said_2 = widest(said_2, b[i])
+        gap_2 = max_abs(gap_2, rhs[i] + c)
+        big_2 = max_abs(big_2, size * top_free + fabs(rhs[i]) + fabs(c))
+        said_2 = max_abs(said_2, b[i])
     for j in range(n):
-        gap_3 = widest(gap_3, pushed[j] - push[j])
-        big_3 = widest(big_3, pushed[n + j] + fabs(push[j]))
-    return frozen(rhs_), frozen(compliance_), frozen(free_), sound and is_size(top_b), gap_0, (
+        gap_3 = max_abs(gap_3, pushed[j] - push[j])
+        big_3 = max_abs(big_3, pushed[n + j] + fabs(push[j]))
+    return freeze(rhs_), freeze(compliance_), freeze(free_), sound and is_valid_magnitude(top_b), gap_0, (
         gap_1 / big_1 if said_1 != 0.0 and big_1 != 0.0 else 0.0,
         gap_2 / big_2 if said_2 != 0.0 and big_2 != 0.0 else 0.0,
         gap_3 / big_3 if said_3 != 0.0 and big_3 != 0.0 else 0.0, finite)

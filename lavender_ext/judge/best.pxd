@@ -12,7 +12,7 @@ from libc.math cimport INFINITY
 from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memcpy
 
-from lavender_ext.core.parts cimport blocks_t
+from lavender_ext.core.block_types cimport blocks_t
 from lavender_ext.judge.score cimport score_t
 
 

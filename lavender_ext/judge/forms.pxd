@@ -13,8 +13,8 @@ from libc.stdint cimport int32_t
 
 from lavender_ext.core.block cimport block_error
 from lavender_ext.core.csr cimport csr_dot, csr_dot_long
-from lavender_ext.core.generalized cimport panel_push_size, panel_size
-from lavender_ext.core.parts cimport blocks_t, is_rows, n_directions, n_turns
+from lavender_ext.core.generalized cimport panel_transpose_add_abs, panel_times_abs
+from lavender_ext.core.block_types cimport blocks_t, is_rows, n_tangents, n_angular_rows
 from lavender_ext.core.rows cimport cross
 from lavender_ext.core.velocity cimport add6, rows_velocity
 from lavender_ext.core.view cimport csr_t, generalized_t, rows_t
@@ -143,7 +143,7 @@ cdef inline double abs_cross(const double* x, const double* y, int32_t k) noexce
 
 
 cdef inline void side_wrench_size(const double* n, const double* t1, const double* t2, const double* arm, int32_t nt,
-                                  int32_t turns, double x, double y, double z, const double* turn, double* out) noexcept nogil:
+                                  int32_t n_angular, double x, double y, double z, const double* turn, double* out) noexcept nogil:
     # x, y, z: |lam| of normal and tangents; turn (turns): of spin and of what rolls.
     cdef int32_t k
     cdef double s, l
@@ -156,15 +156,15 @@ cdef inline void side_wrench_size(const double* n, const double* t1, const doubl
         if nt > 1:
             s += fabs(t2[k]) * z
             l += abs_cross(arm, t2, k) * z
-        if turns & 1:
+        if n_angular & 1:
             l += fabs(n[k]) * fabs(turn[0])
-        if turns & 2:
-            l += fabs(t1[k]) * fabs(turn[turns & 1]) + fabs(t2[k]) * fabs(turn[1 + (turns & 1)])
+        if n_angular & 2:
+            l += fabs(t1[k]) * fabs(turn[n_angular & 1]) + fabs(t2[k]) * fabs(turn[1 + (n_angular & 1)])
         out[k] += s
         out[3 + k] += l
 
 
-cdef inline void contact_wrench_size(const rows_t* r, int32_t c, int32_t nt, int32_t turns, const double* lam,
+cdef inline void contact_wrench_size(const rows_t* r, int32_t c, int32_t nt, int32_t n_angular, const double* lam,
                                      double* size) noexcept nogil:
     # |J|^T |lam| of one contact.
     cdef double t2[3]
@@ -178,14 +178,14 @@ cdef inline void contact_wrench_size(const rows_t* r, int32_t c, int32_t nt, int
         z = fabs(lam[2])
         cross(n, t1, t2)
     if a >= 0:
-        side_wrench_size(n, t1, t2, r.arm_a + 3 * c, nt, turns, fabs(lam[0]), y, z, lam + 1 + nt, size + 6 * a)
+        side_wrench_size(n, t1, t2, r.arm_a + 3 * c, nt, n_angular, fabs(lam[0]), y, z, lam + 1 + nt, size + 6 * a)
     if b >= 0:
-        side_wrench_size(n, t1, t2, r.arm_b + 3 * c, nt, turns, fabs(lam[0]), y, z, lam + 1 + nt, size + 6 * b)
+        side_wrench_size(n, t1, t2, r.arm_b + 3 * c, nt, n_angular, fabs(lam[0]), y, z, lam + 1 + nt, size + 6 * b)
 
 
 cdef inline void velocity_size(const blocks_t* p, const rows_t* r, const double* lam, double* size) noexcept nogil:
     """|M^-1| |J|^T |lam|, (n, 6)."""
-    cdef int32_t i, j, c, k, nt, turns
+    cdef int32_t i, j, c, k, nt, n_angular
     cdef double* x
     cdef const double* inv
     cdef double t[3]
@@ -196,10 +196,10 @@ cdef inline void velocity_size(const blocks_t* p, const rows_t* r, const double*
     for c in range(r.n_contacts):
         i = r.n_joints + c
         j = p.ptr[i]
-        nt = n_directions(p, i)
-        turns = n_turns(p, i)
-        if turns or nt == 1:                            # the two common kinds with their sizes as constants
-            contact_wrench_size(r, c, nt, turns, lam + j, size)
+        nt = n_tangents(p, i)
+        n_angular = n_angular_rows(p, i)
+        if n_angular or nt == 1:                            # the two common kinds with their sizes as constants
+            contact_wrench_size(r, c, nt, n_angular, lam + j, size)
         elif nt == 2:
             contact_wrench_size(r, c, 2, 0, lam + j, size)
         else:
@@ -242,7 +242,7 @@ cdef inline double side_size(const double* axis, const double* arm, const double
     return s + t
 
 
-cdef inline void contact_sizes(const rows_t* r, int32_t c, int32_t nt, int32_t turns, const double* size,
+cdef inline void contact_sizes(const rows_t* r, int32_t c, int32_t nt, int32_t n_angular, const double* size,
                                double* out) noexcept nogil:
     # |J| size of the rows of one contact
     cdef double t2[3]
@@ -250,10 +250,10 @@ cdef inline void contact_sizes(const rows_t* r, int32_t c, int32_t nt, int32_t t
     cdef const double* t1 = r.tangent + 3 * c
     cdef const double* arm
     cdef const double* x
-    cdef int32_t k, side, body, roll = 1 + nt + (turns & 1)
+    cdef int32_t k, side, body, roll = 1 + nt + (n_angular & 1)
     if nt > 1:
         cross(n, t1, t2)
-    for k in range(1 + nt + turns):
+    for k in range(1 + nt + n_angular):
         out[k] = 0.0
     for side in range(2):
         body = r.contact_body[2 * c + side]
@@ -266,10 +266,10 @@ cdef inline void contact_sizes(const rows_t* r, int32_t c, int32_t nt, int32_t t
             out[1] += side_size(t1, arm, x)
         if nt > 1:
             out[2] += side_size(t2, arm, x)
-        if turns & 1:
+        if n_angular & 1:
             for k in range(3):
                 out[1 + nt] += fabs(n[k]) * x[3 + k]
-        if turns & 2:
+        if n_angular & 2:
             for k in range(3):
                 out[roll] += fabs(t1[k]) * x[3 + k]
                 out[roll + 1] += fabs(t2[k]) * x[3 + k]
@@ -286,10 +286,10 @@ cdef inline void joint_floor(const blocks_t* p, const rows_t* r, int32_t i, cons
 cdef inline void contact_floor(const blocks_t* p, const rows_t* r, int32_t c, const double* lam, const double* w,
                                const double* e, const double* sizes, floor_t* f) noexcept nogil:
     # the same of contact c
-    cdef int32_t k, i = r.n_joints + c, j = p.ptr[i], n = p.ptr[i + 1] - j, nt = n_directions(p, i), turns = n_turns(p, i)
+    cdef int32_t k, i = r.n_joints + c, j = p.ptr[i], n = p.ptr[i + 1] - j, nt = n_tangents(p, i), n_angular = n_angular_rows(p, i)
     cdef double size[6]
-    if turns or nt == 1:                                # the two common kinds with their sizes as constants
-        contact_sizes(r, c, nt, turns, sizes, size)
+    if n_angular or nt == 1:                                # the two common kinds with their sizes as constants
+        contact_sizes(r, c, nt, n_angular, sizes, size)
     elif nt == 2:
         contact_sizes(r, c, 2, 0, sizes, size)
     else:
@@ -322,9 +322,9 @@ cdef inline const double* general_sizes(const blocks_t* p, const generalized_t* 
     for i in range(g.n):
         x[i] = 0.0
     for i in range(g.n_panels):
-        panel_push_size(g, i, lam, x)
+        panel_transpose_add_abs(g, i, lam, x)
     for i in range(g.n_panels):
-        panel_size(g, i, x, size)
+        panel_times_abs(g, i, x, size)
     for i in range(p.n_rows):
         size[i] += g.compliance[i] * fabs(lam[i])
     if more != NULL:

@@ -1,7 +1,7 @@
 """The judge for other modules: its pass is compiled once, in `measure.pyx`, and called by pointer."""
 from libc.stdint cimport int32_t, int64_t
 
-from lavender_ext.core.parts cimport blocks_t, islands_t
+from lavender_ext.core.block_types cimport blocks_t, islands_t
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.view cimport generalized_t, view_t
 from lavender_ext.judge.score cimport above_floor, are_numbers, hides, relative, score_t

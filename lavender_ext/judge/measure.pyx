@@ -5,11 +5,11 @@ from libc.string cimport memcmp, memcpy
 
 import numpy as np
 
-from lavender_ext.core cimport door
+from lavender_ext.core cimport validate
 from lavender_ext.core.arrays cimport doubles, ints
-from lavender_ext.core.generalized cimport whitened_gather
+from lavender_ext.core.generalized cimport whitened_transpose_times
 from lavender_ext.core.islands cimport find_islands, is_immovable, islands_index, list_one_island
-from lavender_ext.core.parts cimport blocks_t, islands_t
+from lavender_ext.core.block_types cimport blocks_t, islands_t
 from lavender_ext.core.problem cimport Data, Workspace, allocate_workspace
 from lavender_ext.core.velocity cimport rows_velocity
 from lavender_ext.core.view cimport generalized_t, view_t
@@ -248,7 +248,7 @@ def compare(double energy, double velocity, double reference_energy, double refe
 
 def all_finite(const double[::1] x):
     """Does x hold neither NaN nor infinity?"""
-    return door.all_finite(&x[0], x.shape[0]) if x.shape[0] else True
+    return validate.all_finite(&x[0], x.shape[0]) if x.shape[0] else True
 
 
 def rhs_norms(Data p):
@@ -358,7 +358,7 @@ def best_of_islands(Data p, list starts, list impulses, double tol):
 def velocity_change(Data p, const double[::1] lam, double[:, ::1] v):
     """M^-1 J^T lam (n, 6) of a factored problem, Y^T lam (nv) of J and M, into v."""
     if p.is_general and p.blocks.n_rows > 0:
-        whitened_gather(&p.general, &lam[0], &v[0, 0])
+        whitened_transpose_times(&p.general, &lam[0], &v[0, 0])
         return
     if not p.factored or p.rows.n_bodies == 0:
         return

@@ -15,7 +15,7 @@ from libc.stdint cimport int32_t
 from libc.string cimport memcpy
 
 from lavender_ext.core.block cimport norm2
-from lavender_ext.core.parts cimport blocks_t, is_rows, parts_of, parts_t
+from lavender_ext.core.block_types cimport blocks_t, is_rows, get_friction_components, friction_components_t
 
 
 cdef enum:
@@ -118,7 +118,7 @@ cdef inline bint meets_bound(const progress_t* s, const blocks_t* p, const doubl
     """(2): whether a row does within `most` sweeps."""
     cdef int32_t i, j, k, g
     cdef double v, rate
-    cdef parts_t q
+    cdef friction_components_t q
     if not now > s.last_at > s.before_at >= 0:
         return False
     for i in range(p.n_blocks):
@@ -134,10 +134,10 @@ cdef inline bint meets_bound(const progress_t* s, const blocks_t* p, const doubl
         rate = speed(s, lam, now, j)
         if meets(lam[j], -rate, most):
             return True
-        parts_of(p, i, &q)
+        get_friction_components(p, i, &q)
         for g in range(q.n):
             k = j + q.first[g]
-            if meets_disk(s, lam, now, k, k + q.size[g], q.reach[g], lam[j], rate, most):
+            if meets_disk(s, lam, now, k, k + q.size[g], q.friction_coefficient[g], lam[j], rate, most):
                 return True
     return False
 

@@ -24,7 +24,8 @@ from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
 
 from lavender_ext.core.block cimport length
-from lavender_ext.core.parts cimport CONE, blocks_t, groups_of, is_rows, islands_t, parts_of, parts_t
+from lavender_ext.core.block_types cimport (CONE, blocks_t, get_row_groups, is_rows, islands_t, get_friction_components,
+                                            friction_components_t)
 from lavender_ext.judge.score cimport relative
 from lavender_ext.judge.tally cimport block_at, nothing, relative_by_rows, tally_block, tally_t
 
@@ -46,12 +47,12 @@ cdef inline bint is_inactive_contact(const blocks_t* p, int32_t i, const double*
     """Whether contact i is strictly inactive at zero impulse, slack w (m)."""
     cdef int32_t g, j = p.ptr[i]
     cdef double gap = w[j], size = fabs(p.b[j])
-    cdef parts_t q
+    cdef friction_components_t q
     if p.law == CONE:
-        parts_of(p, i, &q)
+        get_friction_components(p, i, &q)
         for g in range(q.n):
-            gap -= q.reach[g] * length(w + j + q.first[g], q.size[g])
-            size += q.reach[g] * length(p.b + j + q.first[g], q.size[g])
+            gap -= q.friction_coefficient[g] * length(w + j + q.first[g], q.size[g])
+            size += q.friction_coefficient[g] * length(p.b + j + q.first[g], q.size[g])
     return gap > reference_rounding() * size
 
 
@@ -80,7 +81,7 @@ cdef inline void add_block_terms(const blocks_t* p, int32_t i, const double* x, 
                                  double* fast) noexcept nogil:
     """Add the rows of block i that act to the sums of (2)."""
     cdef int32_t k, g, j = p.ptr[i]
-    cdef parts_t q
+    cdef friction_components_t q
     if is_rows(p, i):
         for k in range(j, p.ptr[i + 1]):
             if not is_inactive_row(p, k, x[k], w[k]):
@@ -89,7 +90,7 @@ cdef inline void add_block_terms(const blocks_t* p, int32_t i, const double* x, 
     if is_inactive_contact(p, i, w):
         return
     add_terms(p, j, 1, energy, fast)
-    groups_of(p, i, &q)
+    get_row_groups(p, i, &q)
     for g in range(q.n):
         add_terms(p, j + q.first[g], q.size[g], energy, fast)
 

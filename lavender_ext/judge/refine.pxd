@@ -25,7 +25,7 @@ from libc.string cimport memcpy
 
 from lavender_ext.core.dot cimport dot
 from lavender_ext.core.generalized cimport bound_condition, get_condition, tree_solve
-from lavender_ext.core.parts cimport blocks_t
+from lavender_ext.core.block_types cimport blocks_t
 from lavender_ext.core.view cimport generalized_t
 from lavender_ext.judge.forms cimport general_errors
 from lavender_ext.judge.score cimport relative, score_t, smallest_reference, unit_roundoff

@@ -10,8 +10,8 @@ squared entry by entry, and u = 2^-24 (the formulas of lavender/judge/residuals.
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.generalized cimport jac_push, jac_row, tree_solve, whitened_push
-from lavender_ext.core.parts cimport blocks_t
+from lavender_ext.core.generalized cimport jac_transpose_times, jac_row, tree_solve, add_scaled_whitened_row
+from lavender_ext.core.block_types cimport blocks_t
 from lavender_ext.core.view cimport generalized_t
 from lavender_ext.judge.score cimport relative, score_t
 from lavender_ext.judge.tally cimport block_at
@@ -38,7 +38,7 @@ cdef inline void unwhitened(const generalized_t* g, int32_t panel, int32_t row, 
     cdef double x
     for k in range(g.n):
         z[k] = 0.0
-    whitened_push(g, panel, row, 1.0, z)
+    add_scaled_whitened_row(g, panel, row, 1.0, z)
     for k in range(g.n):
         x = z[k] * g.root[k]
         for q in range(g.lptr[k], g.lptr[k + 1]):
@@ -58,7 +58,7 @@ cdef inline void squares32(const blocks_t* p, const generalized_t* g, const mass
     cdef double* off = z + n
     cdef double unit = 5.9604644775390625e-08 * 5.9604644775390625e-08, s, seen, soft, target
     cdef bint rigid = False
-    jac_push(g, lam, x)
+    jac_transpose_times(g, lam, x)
     tree_solve(g, x)
     for k in range(n):
         xx[k] = x[k] * x[k]

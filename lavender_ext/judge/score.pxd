@@ -9,7 +9,7 @@ The judge, the stopping test of sweeps and warm starts use these functions, and 
 """
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.parts cimport blocks_t
+from lavender_ext.core.block_types cimport blocks_t
 
 
 cdef struct score_t:

@@ -1,8 +1,8 @@
 """The slack w = A lam - b over bodies, and over J and M."""
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.generalized cimport jac_push, jac_row, tree_solve
-from lavender_ext.core.parts cimport blocks_t
+from lavender_ext.core.generalized cimport jac_transpose_times, jac_row, tree_solve
+from lavender_ext.core.block_types cimport blocks_t
 from lavender_ext.core.rows cimport rows_times
 from lavender_ext.core.view cimport generalized_t, rows_t
 
@@ -20,7 +20,7 @@ cdef inline void general_slack(const blocks_t* p, const generalized_t* g, const 
                                double* w) noexcept nogil:
     """w = J x + c lam - b, x = M^-1 J^T lam by M's factor; x (n)."""
     cdef int32_t i
-    jac_push(g, lam, x)
+    jac_transpose_times(g, lam, x)
     tree_solve(g, x)
     for i in range(p.n_rows):
         w[i] = jac_row(g, i, x) + (g.compliance[i] * lam[i] - p.b[i])

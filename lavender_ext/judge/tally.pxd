@@ -3,7 +3,8 @@ from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
 
 from lavender_ext.core.block cimport block_error, length
-from lavender_ext.core.parts cimport CONE, blocks_t, disk_of, groups_of, is_disk, is_rows, parts_of, parts_t
+from lavender_ext.core.block_types cimport (CONE, blocks_t, disk_of, get_row_groups, is_disk, is_rows,
+                                            get_friction_components, friction_components_t)
 from lavender_ext.judge.score cimport above_floor, hides, is_at_floor, ratio, relative, score_t, unit_roundoff
 
 
@@ -78,7 +79,7 @@ cdef inline void tally_pair(const blocks_t* p, int32_t k, const double* e, tally
 
 cdef inline void tally_block(const blocks_t* p, int32_t i, const double* e, tally_t* s) noexcept nogil:
     cdef int32_t k, g, j = p.ptr[i]
-    cdef parts_t q
+    cdef friction_components_t q
     if is_rows(p, i):
         for k in range(j, p.ptr[i + 1]):
             tally_row(p, k, e[k], s)
@@ -87,7 +88,7 @@ cdef inline void tally_block(const blocks_t* p, int32_t i, const double* e, tall
     if is_disk(p, i):                                   # compiled apart
         tally_pair(p, j + 1, e, s)
         return
-    groups_of(p, i, &q)
+    get_row_groups(p, i, &q)
     for g in range(q.n):
         if q.size[g] == 2:
             tally_pair(p, j + q.first[g], e, s)
@@ -121,7 +122,7 @@ cdef inline void norms_of_rhs(const blocks_t* p, double* energy, double* velocit
     """sqrt(sum b^2 / d) and max |b| sqrt(nu / d), of two rows of a part by their norm."""
     cdef int32_t i, j, k, g
     cdef double t, pair, sum_ = 0.0, fast = 0.0
-    cdef parts_t q
+    cdef friction_components_t q
     for i in range(p.n_blocks):
         j = p.ptr[i]
         for k in range(j, p.ptr[i + 1]):
@@ -130,7 +131,7 @@ cdef inline void norms_of_rhs(const blocks_t* p, double* energy, double* velocit
             t = t * p.nu[k]
             if t > fast:
                 fast = t
-        groups_of(p, i, &q)
+        get_row_groups(p, i, &q)
         for g in range(q.n):
             if q.size[g] == 2:
                 k = j + q.first[g]
@@ -176,17 +177,17 @@ cdef inline bint holds_at_zero(const blocks_t* p, int32_t i, const double* lam, 
     """Whether contact i has no impulse, and its slack keeps it there by more than rounding: its error is then 0."""
     cdef int32_t k, g, j = p.ptr[i], n = p.ptr[i + 1] - j
     cdef double gap = w[j], rounding
-    cdef parts_t q
+    cdef friction_components_t q
     for k in range(n):
         if lam[j + k] != 0.0:
             return False
     rounding = row_rounding(p, j, size[0])
     if p.law == CONE:
-        parts_of(p, i, &q)
+        get_friction_components(p, i, &q)
         for g in range(q.n):
-            gap -= q.reach[g] * length(w + j + q.first[g], q.size[g])
+            gap -= q.friction_coefficient[g] * length(w + j + q.first[g], q.size[g])
             for k in range(q.first[g], q.first[g] + q.size[g]):
-                rounding += q.reach[g] * row_rounding(p, j + k, size[k])
+                rounding += q.friction_coefficient[g] * row_rounding(p, j + k, size[k])
     return gap > rounding
 
 
@@ -198,7 +199,7 @@ cdef inline void add_block_floor(const blocks_t* p, int32_t i, const double* lam
     velocity; d_k, of both rows, may be far above A_kk.
     """
     cdef int32_t k, g, j = p.ptr[i], n = p.ptr[i + 1] - j
-    cdef parts_t q
+    cdef friction_components_t q
     cdef double x, own
     cdef bint held
     if is_rows(p, i):
@@ -216,7 +217,7 @@ cdef inline void add_block_floor(const blocks_t* p, int32_t i, const double* lam
     if is_disk(p, i):                                   # compiled apart
         disk_of(p, i, &q)
     else:
-        groups_of(p, i, &q)
+        get_row_groups(p, i, &q)
     for g in range(q.n):
         for k in range(q.first[g], q.first[g] + q.size[g]):
             x = size[k]

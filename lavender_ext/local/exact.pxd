@@ -5,7 +5,7 @@ local/coulomb.pxd or local/cone.pxd.
 
 A second part of one row s, its reach a: either w_s = 0, and lam_s is eliminated; or lam_s = +-a lam_n, and its column
 (cone: and row) is added to the normal's. Three problems of one part; the one whose answer keeps the bound is the answer.
-Any other parts: local/parts.pxd.
+Any other parts: local/friction_components.pxd.
 
 Several rows: boxed complementarity by principal pivoting.
 """
@@ -13,10 +13,10 @@ from libc.math cimport fabs
 from libc.stdint cimport int32_t
 
 from lavender_ext.core.block cimport clip, cone_error, relax_normal, relax_row, relax_tangents, round_error
-from lavender_ext.core.parts cimport CONE, parts_t
+from lavender_ext.core.block_types cimport CONE, friction_components_t
 from lavender_ext.local.cone cimport cone2, cone3
 from lavender_ext.local.coulomb cimport PREPARED, coulomb2, coulomb3, prepare3
-from lavender_ext.local.parts cimport contact_of_parts
+from lavender_ext.local.friction_components cimport solve_contact_newton
 from lavender_ext.local.small cimport FAILED, MAX_ROWS, OPEN, STICK, eliminate
 
 
@@ -95,17 +95,17 @@ cdef inline void local_slack(int32_t m, const double* W, const double* q, const 
 
 
 cdef inline int32_t exact_contact(int32_t law, int32_t m, const double* W, const double* q, const double* d,
-                                  const parts_t* part, double* lam) noexcept nogil:
+                                  const friction_components_t* part, double* lam) noexcept nogil:
     """lam (m) of a contact with parts, the present one before; FAILED where no exact answer is found."""
     if part.n == 1 and part.size[0] <= 2:
-        return contact_of_one(law, part.size[0], W, q, part.reach[0], lam)
+        return contact_of_one(law, part.size[0], W, q, part.friction_coefficient[0], lam)
     if part.n == 2 and part.size[1] == 1:
-        return contact_of_two(law, part.size[0], W, q, part.reach[0], part.reach[1], lam)
-    return contact_of_parts(law, m, W, q, d, part, lam)
+        return contact_of_two(law, part.size[0], W, q, part.friction_coefficient[0], part.friction_coefficient[1], lam)
+    return solve_contact_newton(law, m, W, q, d, part, lam)
 
 
 cdef inline void project_locally(int32_t law, bint round_, int32_t m, const double* W, const double* q, const double* d,
-                                 const double* step, const parts_t* part, double* lam) noexcept nogil:
+                                 const double* step, const friction_components_t* part, double* lam) noexcept nogil:
     """Where no exact answer is found: the update of core/block.pxd (cone: projected gradient) on the block alone."""
     cdef int32_t _sweep, i, g
     cdef double w[MAX_ROWS]
@@ -121,7 +121,7 @@ cdef inline void project_locally(int32_t law, bint round_, int32_t m, const doub
                 high[i] = m * d[i]
             local_slack(m, W, q, lam, w)
             if round_:
-                round_error(lam, w, high, part.reach[0], m - 1, e)
+                round_error(lam, w, high, part.friction_coefficient[0], m - 1, e)
             else:
                 cone_error(lam, w, high, part, e)
             for i in range(m):
@@ -133,7 +133,7 @@ cdef inline void project_locally(int32_t law, bint round_, int32_t m, const doub
             for g in range(part.n):
                 i = part.first[g]
                 local_slack(m, W, q, lam, w)
-                relax_tangents(lam + i, w + i, step[i], part.reach[g] * lam[0], part.size[g])
+                relax_tangents(lam + i, w + i, step[i], part.friction_coefficient[g] * lam[0], part.size[g])
             for i in range(m):
                 change += fabs(lam[i] - e[i])
         if not change > 1e-12 * fabs(lam[0]):

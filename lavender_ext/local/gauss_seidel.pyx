@@ -20,11 +20,11 @@ from libc.stdint cimport int32_t
 from lavender_ext.core.block cimport relax_normal, relax_row
 from lavender_ext.core.csr cimport csr_dot
 from lavender_ext.core.dot cimport dot
-from lavender_ext.core.generalized cimport whitened_dot, whitened_push
-from lavender_ext.core.parts cimport (CONE, blocks_t, is_box, is_disk, is_round, is_rows, n_directions, n_turns,
-                                      parts_of, parts_t)
-from lavender_ext.core.rows cimport (contact_jacobian, contact_slack, cross, dot12, dot3, joint_push, joint_velocity,
-                                     minv_times, push_bodies, relative_velocity, relax_joint, swing_body)
+from lavender_ext.core.generalized cimport whitened_dot, add_scaled_whitened_row
+from lavender_ext.core.block_types cimport (CONE, blocks_t, is_box, is_disk, is_round, is_rows, n_tangents, n_angular_rows,
+                                      get_friction_components, friction_components_t)
+from lavender_ext.core.rows cimport (contact_jacobian, contact_velocity, cross, dot12, dot3, apply_joint_impulse, joint_velocity,
+                                     minv_times, apply_impulse_to_bodies, relative_velocity, relax_joint, apply_contact_impulse)
 from lavender_ext.core.view cimport csr_t, generalized_t, rows_t, view_t
 from lavender_ext.local.box cimport box3_from
 from lavender_ext.local.cone cimport cone3
@@ -40,11 +40,11 @@ cdef inline bint is_plain3(const blocks_t* p, int32_t i) noexcept nogil:
 
 
 cdef inline int32_t coulomb_block3(const blocks_t* p, int32_t i, const double* g, const double* w, double* lam) noexcept nogil:
-    cdef parts_t q
+    cdef friction_components_t q
     if is_disk(p, i):
         return coulomb3_from(g, w, p.mu[i], lam)
-    parts_of(p, i, &q)
-    return box3_from(g, w, q.reach[0], q.reach[1], lam)
+    get_friction_components(p, i, &q)
+    return box3_from(g, w, q.friction_coefficient[0], q.friction_coefficient[1], lam)
 
 
 cdef inline int32_t prepared_size(const blocks_t* p, int32_t i) noexcept nogil:
@@ -108,7 +108,7 @@ cdef inline int32_t solve_block(const blocks_t* p, int32_t i, const double* g, c
                                 double* lam) noexcept nogil:
     """The exact update of block i from its slack w; lam at its first row. 1 where it fell back."""
     cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, k, t, found = FAILED
-    cdef parts_t part
+    cdef friction_components_t part
     cdef double q[MAX_ROWS]
     cdef double x[MAX_ROWS]
     cdef double s
@@ -138,7 +138,7 @@ cdef inline int32_t solve_block(const blocks_t* p, int32_t i, const double* g, c
         for t in range(n):
             s -= g[n * k + t] * lam[t]
         q[k] = s
-    parts_of(p, i, &part)
+    get_friction_components(p, i, &part)
     if is_round(p, i):
         found = round_contact(n, g, q, p.d + j, p.mu[i], lam)
     elif not is_disk(p, i):
@@ -210,7 +210,7 @@ cdef inline int32_t solve_general_block(const blocks_t* p, const generalized_t* 
         for k in range(j, j + n):
             now = relax_row(lam[k], whitened_dot(o, b, k, u) + (o.compliance[k] * lam[k] - p.b[k]), p.step[k],
                             p.lower[k], p.upper[k])
-            whitened_push(o, b, k, now - lam[k], u)
+            add_scaled_whitened_row(o, b, k, now - lam[k], u)
             lam[k] = now
         return 1
     for k in range(n):
@@ -218,7 +218,7 @@ cdef inline int32_t solve_general_block(const blocks_t* p, const generalized_t* 
         old[k] = lam[j + k]
     found = solve_block(p, i, g, w, lam + j)
     for k in range(n):
-        whitened_push(o, b, j + k, lam[j + k] - old[k], u)
+        add_scaled_whitened_row(o, b, j + k, lam[j + k] - old[k], u)
     return found
 
 
@@ -234,7 +234,7 @@ cdef inline int32_t solve_sliding_contact(const blocks_t* p, const rows_t* r, in
     cdef double n = lam[0], x = lam[1], y = lam[2]
     cdef const double* normal = r.normal + 3 * c
     cdef const double* t1 = r.tangent + 3 * c
-    cdef const double* swing = r.swing + 6 * (j - p.ptr[r.n_joints])
+    cdef const double* inv_inertia_arm = r.inv_inertia_arm + 6 * (j - p.ptr[r.n_joints])
     relative_velocity(v, a, b, r.arm_a + 3 * c, r.arm_b + 3 * c, u, omega)
     cross(normal, t1, t2)
     w[0] = dot3(normal, u) + (r.compliance[j] * n - p.b[j])
@@ -250,15 +250,15 @@ cdef inline int32_t solve_sliding_contact(const blocks_t* p, const rows_t* r, in
     impulse[1] = n * normal[1] + x * t1[1] + y * t2[1]
     impulse[2] = n * normal[2] + x * t1[2] + y * t2[2]
     if a >= 0:
-        swing_body(v + 6 * a, r.inv_mass[a], swing, impulse, n, x, y, 0.0, 2, 0, -1.0)
+        apply_contact_impulse(v + 6 * a, r.inv_mass[a], inv_inertia_arm, impulse, n, x, y, 0.0, 2, 0, -1.0)
     if b >= 0:
-        swing_body(v + 6 * b, r.inv_mass[b], swing + 3, impulse, n, x, y, 0.0, 2, 0, 1.0)
+        apply_contact_impulse(v + 6 * b, r.inv_mass[b], inv_inertia_arm + 3, impulse, n, x, y, 0.0, 2, 0, 1.0)
     return k
 
 
 cdef inline int32_t solve_rows_block(const blocks_t* p, const rows_t* r, int32_t i, const double* g, double* lam,
                                      double* v) noexcept nogil:
-    cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, c = i - r.n_joints, k, a, b, nt, turns, roll, found
+    cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, c = i - r.n_joints, k, a, b, nt, n_angular, roll, found
     cdef double w[MAX_ROWS]
     cdef double old[MAX_ROWS]
     cdef double t2[3]
@@ -280,16 +280,16 @@ cdef inline int32_t solve_rows_block(const blocks_t* p, const rows_t* r, int32_t
             old[k] = lam[j + k]
         found = solve_block(p, i, g, w, lam + j)
         for k in range(n):
-            joint_push(r.minv_jac + 12 * (j + k), lam[j + k] - old[k], v, a, b)
+            apply_joint_impulse(r.minv_jac + 12 * (j + k), lam[j + k] - old[k], v, a, b)
         return found
     a = r.contact_body[2 * c]
     b = r.contact_body[2 * c + 1]
-    turns = n_turns(p, i)
-    nt = n_directions(p, i)
-    roll = 1 + nt + (turns & 1)
+    n_angular = n_angular_rows(p, i)
+    nt = n_tangents(p, i)
+    roll = 1 + nt + (n_angular & 1)
     normal = r.normal + 3 * c
     t1 = r.tangent + 3 * c
-    contact_slack(r, c, nt, turns, v, w)
+    contact_velocity(r, c, nt, n_angular, v, w)
     for k in range(n):
         w[k] += r.compliance[j + k] * lam[j + k] - p.b[j + k]
         old[k] = lam[j + k]
@@ -306,13 +306,13 @@ cdef inline int32_t solve_rows_block(const blocks_t* p, const rows_t* r, int32_t
         cross(normal, t1, t2)
         for k in range(3):
             impulse[k] += w[2] * t2[k]
-    if turns & 1:
+    if n_angular & 1:
         for k in range(3):
             twist[k] = w[1 + nt] * normal[k]
-    if turns & 2:
+    if n_angular & 2:
         for k in range(3):
             twist[k] += w[roll] * t1[k] + w[roll + 1] * t2[k]
-    push_bodies(v, a, b, r.inv_mass, r.inv_inertia, r.arm_a + 3 * c, r.arm_b + 3 * c, impulse, twist)
+    apply_impulse_to_bodies(v, a, b, r.inv_mass, r.inv_inertia, r.arm_a + 3 * c, r.arm_b + 3 * c, impulse, twist)
     return found
 
 
@@ -347,17 +347,17 @@ cdef inline void part_of_rows(const blocks_t* p, const rows_t* r, int32_t i, dou
     """The same from J and M^-1: the slack that each row's unit impulse makes on the block."""
     cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, k, q, c = i - r.n_joints
     cdef double jac[72]
-    cdef double push[12]
+    cdef double minv_jac_row[12]
     cdef const double* row = r.jac + 12 * j
     cdef const double* change
     if c >= 0:
-        contact_jacobian(r, c, n_directions(p, i), n_turns(p, i), jac)
+        contact_jacobian(r, c, n_tangents(p, i), n_angular_rows(p, i), jac)
         row = jac
     for k in range(n):
         change = r.minv_jac + 12 * (j + k)
         if c >= 0:
-            minv_times(row + 12 * k, r.inv_mass, r.inv_inertia, r.contact_body[2 * c], r.contact_body[2 * c + 1], push)
-            change = push
+            minv_times(row + 12 * k, r.inv_mass, r.inv_inertia, r.contact_body[2 * c], r.contact_body[2 * c + 1], minv_jac_row)
+            change = minv_jac_row
         for q in range(n):
             W[n * q + k] = dot12(row + 12 * q, change)
     for k in range(n):

@@ -22,7 +22,7 @@ CONVERGED by r, the best impulse of each island is put back. A check costs about
 """
 from libc.stdint cimport int32_t, int64_t
 
-from lavender_ext.core.parts cimport blocks_t
+from lavender_ext.core.block_types cimport blocks_t
 from lavender_ext.core.view cimport view_t
 from lavender_ext.judge.best cimport best_workspace_size, best_t, bind_best
 from lavender_ext.judge.progress cimport open_progress, progress_t
@@ -40,7 +40,7 @@ cdef enum:
     EARLY = 8                   # sweeps, whose residuals rise where doing nothing is nearly right
 
 
-cdef struct watch_t:
+cdef struct stopping_test_t:
     int32_t total               # sweeps done
     int32_t check_at            # sweeps at the next check
     int32_t last_at             # sweeps at the last check
@@ -64,14 +64,14 @@ cdef struct watch_t:
 ctypedef void (*sweep_t)(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil
 
 
-cdef inline int64_t watch_workspace_size(int64_t m, int64_t n) noexcept nogil:
-    """Number of doubles that `begin_watch` needs for m rows in n islands."""
+cdef inline int64_t stopping_test_workspace_size(int64_t m, int64_t n) noexcept nogil:
+    """Number of doubles that `begin_stopping_test` needs for m rows in n islands."""
     return best_workspace_size(m, n) + n + 2 * m
 
 
-cdef inline void begin_watch(watch_t* s, const blocks_t* p, double reference_energy, double reference_velocity, int32_t patience,
-                             double* workspace) noexcept nogil:
-    """Before the first sweep; workspace (`watch_workspace_size`)."""
+cdef inline void begin_stopping_test(stopping_test_t* s, const blocks_t* p, double reference_energy,
+                                     double reference_velocity, int32_t patience, double* workspace) noexcept nogil:
+    """Before the first sweep; workspace (`stopping_test_workspace_size`)."""
     s.total = s.check_at = s.last_at = 0
     s.start = 0.0
     s.last = s.best_relative = s.lowest = 1.0 / 0.0
@@ -85,7 +85,7 @@ cdef inline void begin_watch(watch_t* s, const blocks_t* p, double reference_ene
     open_progress(&s.progress, s.marked + s.best.n, p.n_rows)
 
 
-cdef inline bint begins_again(watch_t* s, int32_t patience) noexcept nogil:
+cdef inline bint begins_again(stopping_test_t* s, int32_t patience) noexcept nogil:
     """Whether a run that STALLED, its best put back, may go on from there with nothing remembered: once for each best.
 
     For maps with a memory, which may have lost the way; `patience` sweeps are theirs to find a better one.
@@ -97,13 +97,13 @@ cdef inline bint begins_again(watch_t* s, int32_t patience) noexcept nogil:
     return True
 
 
-cdef int32_t watched(watch_t* s, const view_t* v, const view_t* confirm, sweep_t sweep, void* context, double* lam,
+cdef int32_t run_until_stop(stopping_test_t* s, const view_t* v, const view_t* confirm, sweep_t sweep, void* context, double* lam,
                      int32_t n, double tol, int32_t* done) noexcept nogil
 
 
-cdef class Watch:
+cdef class StoppingTest:
     cdef object keep
     cdef view_t view
     cdef view_t other
     cdef const view_t* confirm  # the other, or NULL
-    cdef watch_t state
+    cdef stopping_test_t state

@@ -1,4 +1,4 @@
-"""The checks of judge/watch.pxd, compiled once, and the same for Python: where a run of sweeps stands."""
+"""The checks of judge/stopping_test.pxd, compiled once, and the same for Python: where a run of sweeps stands."""
 from libc.math cimport NAN, log10
 from libc.stdint cimport int32_t
 from libc.string cimport memcpy
@@ -6,36 +6,36 @@ from libc.string cimport memcpy
 import numpy as np
 
 from lavender_ext.core.problem cimport Data
-from lavender_ext.core.parts cimport blocks_t
+from lavender_ext.core.block_types cimport blocks_t
 from lavender_ext.core.view cimport view_t
 from lavender_ext.judge.best cimport count_islands, note_score, relative_of_best, see_impulse
 from lavender_ext.judge.measure cimport above_floor_of, floor_of, judge_view, refine_view, relative_of, scratch_of
 from lavender_ext.judge.progress cimport envelope, keep, rests, see
 from lavender_ext.judge.score cimport new_score, relative, score_t, smallest_reference
-from lavender_ext.judge.watch cimport (AT_FLOOR, CONVERGED, DIVERGED, EARLY, RUNNING, STALLED, begin_watch, sweep_t,
-                                       watch_workspace_size,
-                                       watch_t)
+from lavender_ext.judge.stopping_test cimport (AT_FLOOR, CONVERGED, DIVERGED, EARLY, RUNNING, STALLED, begin_stopping_test, sweep_t,
+                                       stopping_test_workspace_size,
+                                       stopping_test_t)
 
 
-cdef inline double relative_to_start(const watch_t* s, const score_t* x) noexcept nogil:
+cdef inline double relative_to_start(const stopping_test_t* s, const score_t* x) noexcept nogil:
     """Relative residual of a pass without floor; inf if an error is not finite."""
     if x.relative >= 0.0:
         return x.relative
     return relative(x.energy, x.velocity, s.reference_energy, s.reference_velocity) if x.finite else 1.0 / 0.0
 
 
-cdef inline bint is_rounding(const watch_t* s, const score_t* x, double now, double tol) noexcept nogil:
+cdef inline bint is_rounding(const stopping_test_t* s, const score_t* x, double now, double tol) noexcept nogil:
     """Whether rounding explains what a pass with its floor found above tol, in each island."""
     return above_floor_of(x, now, floor_of(x, s.reference_energy, s.reference_velocity)) <= tol
 
 
-cdef inline double judge_with_floor(const watch_t* s, const view_t* v, const double* lam, score_t* x) noexcept nogil:
+cdef inline double judge_with_floor(const stopping_test_t* s, const view_t* v, const double* lam, score_t* x) noexcept nogil:
     """The judge's relative residual with its floor."""
     judge_view(v, lam, s.w, s.e, s.v, True, x)
     return relative_of(x, s.w, v.p.n_rows, s.reference_energy, s.reference_velocity)
 
 
-cdef inline double judge_closely(const watch_t* s, const view_t* v, const double* lam, double tol, score_t* x,
+cdef inline double judge_closely(const stopping_test_t* s, const view_t* v, const double* lam, double tol, score_t* x,
                                  bint* refined) noexcept nogil:
     """The judge's relative residual with its floor, refined if an ill-conditioned M needs it."""
     cdef double now = judge_with_floor(s, v, lam, x)
@@ -45,7 +45,7 @@ cdef inline double judge_closely(const watch_t* s, const view_t* v, const double
     return now
 
 
-cdef inline bint rounds_much(const watch_t* s, const blocks_t* p, const double* lam) noexcept nogil:
+cdef inline bint rounds_much(const stopping_test_t* s, const blocks_t* p, const double* lam) noexcept nogil:
     """Whether rounding of so large an impulse may hide the residual: 2^-53 sqrt(sum d lam^2) > 1e-7 E0 of some island."""
     cdef double size = 0.0, energy = s.reference_energy, velocity = s.reference_velocity
     cdef int32_t k
@@ -55,7 +55,7 @@ cdef inline bint rounds_much(const watch_t* s, const blocks_t* p, const double* 
     return size > 8e17 * energy * energy and energy > 0.0
 
 
-cdef inline int32_t end_refined(const watch_t* s, const score_t* x, double now, double tol) noexcept nogil:
+cdef inline int32_t end_refined(const stopping_test_t* s, const score_t* x, double now, double tol) noexcept nogil:
     """The claim of an impulse whose first pass is within tol, by its refined residual: more sweeps reduce that to its floor."""
     if now <= tol:
         return CONVERGED
@@ -64,7 +64,7 @@ cdef inline int32_t end_refined(const watch_t* s, const score_t* x, double now, 
     return STALLED if not floor_of(x, s.reference_energy, s.reference_velocity) <= tol else RUNNING
 
 
-cdef inline int32_t until_next(const watch_t* s, double now, double tol) noexcept nogil:
+cdef inline int32_t until_next(const stopping_test_t* s, double now, double tol) noexcept nogil:
     """Sweeps until the next check."""
     cdef double least = s.total >> 3, most = s.total, n = 0.0, gap = s.total - s.last_at, fall, r = now
     if least < 1.0:
@@ -81,7 +81,7 @@ cdef inline int32_t until_next(const watch_t* s, double now, double tol) noexcep
     return <int32_t>(n if n < most else most)
 
 
-cdef inline bint is_progress(watch_t* s, double now, double tol) noexcept nogil:
+cdef inline bint is_progress(stopping_test_t* s, double now, double tol) noexcept nogil:
     """Whether a check is better, after `see_impulse`."""
     cdef bint better = now < s.lowest
     cdef int32_t i
@@ -94,7 +94,7 @@ cdef inline bint is_progress(watch_t* s, double now, double tol) noexcept nogil:
     return better
 
 
-cdef inline int32_t check(watch_t* s, const view_t* v, double* lam, double tol) noexcept nogil:
+cdef inline int32_t check(stopping_test_t* s, const view_t* v, double* lam, double tol) noexcept nogil:
     """One check; sets the sweeps of the next."""
     cdef score_t x = new_score()
     cdef const blocks_t* p = &v.p
@@ -153,7 +153,8 @@ cdef inline int32_t check(watch_t* s, const view_t* v, double* lam, double tol) 
     return RUNNING
 
 
-cdef inline int32_t confirmed(const watch_t* s, const view_t* v, const double* lam, double tol, int32_t status) noexcept nogil:
+cdef inline int32_t confirmed(const stopping_test_t* s, const view_t* v, const double* lam, double tol,
+                              int32_t status) noexcept nogil:
     """The claim `status`, judged in another form: what does not hold there goes on, or has stalled."""
     cdef score_t x = new_score()
     cdef double now
@@ -172,7 +173,8 @@ cdef inline int32_t confirmed(const watch_t* s, const view_t* v, const double* l
     return AT_FLOOR if is_rounding(s, &x, now, tol) else STALLED
 
 
-cdef inline int32_t due(watch_t* s, const view_t* v, const view_t* confirm, double* lam, double tol, int32_t* step) noexcept nogil:
+cdef inline int32_t due(stopping_test_t* s, const view_t* v, const view_t* confirm, double* lam, double tol,
+                        int32_t* step) noexcept nogil:
     """A check, where one is due; the sweeps until the next into step, where these are fewer. tol = 0 checks nothing.
 
     confirm: the same problem in another form, which a claim must hold in too, or NULL.
@@ -189,7 +191,7 @@ cdef inline int32_t due(watch_t* s, const view_t* v, const view_t* confirm, doub
     return status
 
 
-cdef int32_t watched(watch_t* s, const view_t* v, const view_t* confirm, sweep_t sweep, void* context, double* lam,
+cdef int32_t run_until_stop(stopping_test_t* s, const view_t* v, const view_t* confirm, sweep_t sweep, void* context, double* lam,
                      int32_t n, double tol, int32_t* done) noexcept nogil:
     """n sweeps, fewer where a check ends them; counts them in `done`."""
     cdef int32_t step, status
@@ -205,7 +207,7 @@ cdef int32_t watched(watch_t* s, const view_t* v, const view_t* confirm, sweep_t
     return RUNNING
 
 
-cdef class Watch:
+cdef class StoppingTest:
     """Where a run of sweeps stands; `data` is what the judge reads, its start error known.
 
     `confirm`: the same problem in another form, which a claim must hold in too.
@@ -218,10 +220,10 @@ cdef class Watch:
         if confirm is not None:
             self.other = confirm.view()
             self.confirm = &self.other
-        workspace = watch_workspace_size(m, count_islands(&self.view.p))
+        workspace = stopping_test_workspace_size(m, count_islands(&self.view.p))
         scratch = np.empty(workspace + 2 * m + scratch_of(&self.other) + 4)
         self.keep = data, confirm, scratch
-        begin_watch(&self.state, &self.view.p, data.reference_energy, data.reference_velocity, patience, &scratch[0])
+        begin_stopping_test(&self.state, &self.view.p, data.reference_energy, data.reference_velocity, patience, &scratch[0])
         self.state.w = &scratch[workspace]
         self.state.e = &scratch[workspace + m]
         self.state.v = &scratch[workspace + 2 * m]
@@ -240,7 +242,7 @@ cdef class Watch:
 
     def keep_best(self, double[::1] lam, double tol):
         """Replace lam (m,), unless it meets tol, by the best of each island of it and of all checks."""
-        cdef watch_t* s = &self.state
+        cdef stopping_test_t* s = &self.state
         cdef score_t x = new_score()
         cdef double now
         if s.best.seen == 0 or lam.shape[0] == 0:

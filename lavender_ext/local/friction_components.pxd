@@ -8,7 +8,7 @@ from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
 
 from lavender_ext.core.contact_map cimport contact_map
-from lavender_ext.core.parts cimport parts_t
+from lavender_ext.core.block_types cimport friction_components_t
 from lavender_ext.local.small cimport FAILED, MAX_ROWS, OPEN, STICK, eliminate
 
 
@@ -18,8 +18,8 @@ cdef enum:
     SLOW = 4                    # steps that leave more than 0.9: where none leads on, all 40 cost a hundred updates
 
 
-cdef inline double residue(int32_t law, int32_t n, const double* H, const double* g, const parts_t* part, const double* z,
-                           double* out, double* p, double* size) noexcept nogil:
+cdef inline double residue(int32_t law, int32_t n, const double* H, const double* g, const friction_components_t* part,
+                           const double* z, double* out, double* p, double* size) noexcept nogil:
     # |z - Pi(y)|, Pi(y) in out; size: of what is added up
     cdef double y[MAX_ROWS]
     cdef double total = 0.0, s, x
@@ -39,8 +39,8 @@ cdef inline double residue(int32_t law, int32_t n, const double* H, const double
     return sqrt(total)
 
 
-cdef inline int32_t contact_of_parts(int32_t law, int32_t n, const double* W, const double* q, const double* d,
-                                     const parts_t* part, double* lam) noexcept nogil:
+cdef inline int32_t solve_contact_newton(int32_t law, int32_t n, const double* W, const double* q, const double* d,
+                                     const friction_components_t* part, double* lam) noexcept nogil:
     """lam (n) from the present one; FAILED, lam left alone, where Newton's method does not end."""
     cdef double H[MAX_ROWS * MAX_ROWS]
     cdef double P[MAX_ROWS * MAX_ROWS]
@@ -51,7 +51,7 @@ cdef inline int32_t contact_of_parts(int32_t law, int32_t n, const double* W, co
     cdef double to[MAX_ROWS]
     cdef double out[MAX_ROWS]
     cdef double root[MAX_ROWS]
-    cdef parts_t a = part[0]                            # with their reach in the metric of d
+    cdef friction_components_t a = part[0]                            # with their reach in the metric of d
     cdef double now, next_, size, x
     cdef int32_t i, j, k, _step, _halving, start, slow
     if not W[0] > 0.0:
@@ -63,7 +63,7 @@ cdef inline int32_t contact_of_parts(int32_t law, int32_t n, const double* W, co
         for j in range(n):
             H[n * i + j] = W[n * i + j] / (root[i] * root[j])
     for i in range(a.n):
-        a.reach[i] = a.reach[i] * root[a.first[i]] / root[0]
+        a.friction_coefficient[i] = a.friction_coefficient[i] * root[a.first[i]] / root[0]
     for start in range(2):                              # from where it is, then from where everything sticks
         for i in range(n):
             z[i] = root[i] * lam[i] if start == 0 else g[i]
