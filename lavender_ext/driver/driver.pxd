@@ -1,4 +1,4 @@
-"""The table of methods, each as workspace, start and step (`core/method.pxd`), and the three calls that lead any of them.
+"""Table of methods with the interface of `core/method.pxd`, and the three functions that dispatch to them.
 
 | method | over A | over bodies | over J and M |
 |---|---|---|---|

@@ -1,4 +1,4 @@
-"""The slack w = A lam - b over bodies, and over J and M."""
+"""Slack w = A lam - b over bodies, and over J and M."""
 from libc.stdint cimport int32_t
 
 from lavender_ext.core.generalized cimport jac_transpose_times, jac_row, tree_solve
@@ -9,7 +9,7 @@ from lavender_ext.core.view cimport generalized_t, rows_t
 
 cdef inline void rows_slack(const blocks_t* p, const rows_t* r, const double* lam, const double* v,
                                 double* w) noexcept nogil:
-    """w = J v + c lam - b, v = M^-1 J^T lam."""
+    """Compute w = J v + c lam - b, with v = M^-1 J^T lam."""
     cdef int32_t j
     rows_times(p, r, v, w)
     for j in range(p.n_rows):
@@ -18,7 +18,7 @@ cdef inline void rows_slack(const blocks_t* p, const rows_t* r, const double* la
 
 cdef inline void general_slack(const blocks_t* p, const generalized_t* g, const double* lam, double* x,
                                double* w) noexcept nogil:
-    """w = J x + c lam - b, x = M^-1 J^T lam by M's factor; x (n)."""
+    """Compute w = J x + c lam - b with x (n) = M^-1 J^T lam, solved with the factor of M."""
     cdef int32_t i
     jac_transpose_times(g, lam, x)
     tree_solve(g, x)

@@ -1,4 +1,4 @@
-"""Sweeps of block Gauss-Seidel, compiled once, in `gauss_seidel.pyx`."""
+"""Sweeps of block Gauss-Seidel, which are compiled once, in `gauss_seidel.pyx`."""
 from libc.stdint cimport int32_t
 
 from lavender_ext.core.block_types cimport blocks_t

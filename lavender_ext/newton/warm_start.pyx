@@ -15,7 +15,7 @@ from lavender_ext.factor.band cimport ldl_factor, ldl_solve, pivots_t
 from lavender_ext.judge.measure cimport score_slack
 from lavender_ext.judge.score cimport new_score, relative, score_t
 from lavender_ext.judge.slack cimport rows_slack
-from lavender_ext.judge.tally cimport nothing, tally_row, tally_t
+from lavender_ext.judge.tally cimport empty_tally, tally_row, tally_t
 from lavender_ext.newton.warm_start cimport (FIRST_SWEEPS, JUDGED, MOST_ROWS, MOST_BAND, MOST_SWEEPS, MOST_TRACED, PATIENT_SWEEPS,
                                              SOLVED, SWEPT, UNDECIDED, bind_warm_workspace, room_of, warm_t)
 
@@ -24,7 +24,7 @@ cdef int32_t start_errors(const blocks_t* p, double* energy, double* velocity) n
     """E0, V0 of lam = 0, w = -b; 0 where they are not plainly the judge's."""
     cdef int32_t i, j
     cdef double e, rhs = 0.0, least = 1.0 / 0.0, inf = 1.0 / 0.0
-    cdef tally_t s = nothing()
+    cdef tally_t s = empty_tally()
     for i in range(p.n_blocks):
         for j in range(p.ptr[i], p.ptr[i + 1]):
             if not 0.0 < p.d[j] < inf:

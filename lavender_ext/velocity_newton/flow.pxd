@@ -20,7 +20,7 @@ from lavender_ext.core.generalized cimport panel_transpose_add, panel_times
 from lavender_ext.core.block_types cimport blocks_t, is_rows, get_friction_components, friction_components_t
 from lavender_ext.core.view cimport generalized_t
 from lavender_ext.factor.tiles cimport combine
-from lavender_ext.judge.tally cimport nothing, tally_block, tally_row, tally_t
+from lavender_ext.judge.tally cimport empty_tally, tally_block, tally_row, tally_t
 
 
 cdef struct descent_t:          # Newton steps under one law
@@ -350,7 +350,7 @@ cdef inline double measure(const flow_t* f, int32_t island, const double* lam, b
     cdef const double* phi = f.phi
     cdef const double* compliance = f.g.compliance
     cdef double* w = f.w
-    cdef tally_t t = nothing()
+    cdef tally_t t = empty_tally()
     if not moves:
         blank(f, island, w)
     elif f.formed:
