@@ -17,7 +17,7 @@ from lavender.base.errors import InputError
 from lavender.base.lazy_import import issparse
 from lavender.base.lazy_import import sparse as sp
 from lavender_ext.core import checks
-from lavender_ext.core.checks import MIN_MAGNITUDE, MAX_MAGNITUDE
+from lavender_ext.core.checks import MAX_MAGNITUDE, MIN_MAGNITUDE
 from lavender_ext.judge.measure import all_finite
 
 FloatArray = npt.NDArray[np.float64]

@@ -51,7 +51,7 @@ from lavender.problem.friction import (
     convert_ellipse_coefficients,
 )
 from lavender_ext.core import blocks as kernels
-from lavender_ext.core.checks import MIN_MAGNITUDE, MAX_MAGNITUDE
+from lavender_ext.core.checks import MAX_MAGNITUDE, MIN_MAGNITUDE
 
 __all__ = [
     "CONTACT",

@@ -239,7 +239,7 @@ cdef inline bint derive_matrix(task_t* j, workspace_t* workspace) noexcept nogil
 
 
 cdef inline bint derive_bodies(task_t* j, workspace_t* workspace) noexcept nogil:
-    """Compute d, nu, step, joints' M^-1 J^T, contacts' coupling and swing; return whether d is in the valid range."""
+    """Compute d, nu, step, joints' M^-1 J^T, coupling and inv_inertia_arm of contacts; return whether d is in the valid range."""
     cdef int64_t m = j.p.n_rows, joints = j.p.ptr[j.r.n_joints], c = j.r.n_contacts
     cdef int64_t n = 3 * (m + 1) + 12 * joints + 5 * c + 6 * (m - joints)
     cdef double* x

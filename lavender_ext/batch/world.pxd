@@ -8,7 +8,8 @@ from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memcmp, memcpy, memset
 
-from lavender_ext.core.validate cimport are_pairs, first_invalid_magnitude, has_invalid, is_definite, is_frame, is_valid_magnitude, norm_inf, min_magnitude
+from lavender_ext.core.validate cimport (are_pairs, first_invalid_magnitude, has_invalid, is_definite, is_frame,
+                                         is_valid_magnitude, norm_inf, min_magnitude)
 from lavender_ext.core.generalized cimport jac_row
 from lavender_ext.core.tree cimport tree_factor, tree_pattern
 from lavender_ext.core.method cimport workspace_t

@@ -18,7 +18,8 @@ import numpy as np
 from lavender_ext.core.arrays cimport doubles
 from lavender_ext.core.csr cimport scan_entries
 from lavender_ext.core.order cimport sort_by_level
-from lavender_ext.core.block_types cimport CONE, CONTACT_ROLLING, N_FRICTION_ARRAYS, ROUND, blocks_t, get_friction_arrays, is_rows, bind_friction_arrays
+from lavender_ext.core.block_types cimport (CONE, CONTACT_ROLLING, N_FRICTION_ARRAYS, ROUND, blocks_t, get_friction_arrays,
+                                            is_rows, bind_friction_arrays)
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.method cimport workspace_t
 from lavender_ext.core.view cimport bodies_of, csr_t, rows_t
@@ -268,7 +269,7 @@ cdef class Rules:
 cdef enum:                      # doubles of an island's data
     ROW_DOUBLES = 7             # per row: lower, upper, b, d, nu, step, start
     JOINT_ROW_DOUBLES = 24      # per joint row: J, M^-1 J^T
-    CONTACT_ROW_DOUBLES = 6     # per contact row: swing
+    CONTACT_ROW_DOUBLES = 6     # per contact row: inv_inertia_arm
     CONTACT_DOUBLES = 17        # per contact: normal, tangent, arm_a, arm_b, coupling
     BODY_DOUBLES = 10           # per body: 1/m, I^-1
     N_SIZES = 5                 # rows, blocks, entries of A, joint rows, joints
@@ -406,7 +407,8 @@ cdef inline void copy_bodies(island_t* x, const blocks_t* p, const rows_t* r, co
             memcpy(<void*>(y.jac + 12 * m), r.jac + 12 * j, 12 * n * sizeof(double))
             memcpy(<void*>(y.minv_jac + 12 * m), r.minv_jac + 12 * j, 12 * n * sizeof(double))
             continue
-        memcpy(<void*>(y.inv_inertia_arm + CONTACT_ROW_DOUBLES * (m - first)), r.inv_inertia_arm + CONTACT_ROW_DOUBLES * (j - p.ptr[r.n_joints]),
+        memcpy(<void*>(y.inv_inertia_arm + CONTACT_ROW_DOUBLES * (m - first)),
+               r.inv_inertia_arm + CONTACT_ROW_DOUBLES * (j - p.ptr[r.n_joints]),
                CONTACT_ROW_DOUBLES * n * sizeof(double))
         c, i = k - y.n_joints, i - r.n_joints
         copy_entry(y.normal + 3 * c, 3, r.normal, i)

@@ -10,7 +10,7 @@ import numpy as np
 from lavender.base.arrays import FloatArray, as_array, check_float, shape_of
 from lavender.base.errors import InputError
 from lavender.sim.scene.arithmetic import norm, rotate_back, sine_cosine
-from lavender_ext.core.checks import MIN_MAGNITUDE, MAX_MAGNITUDE
+from lavender_ext.core.checks import MAX_MAGNITUDE, MIN_MAGNITUDE
 
 # Relative excess of the largest moment over the sum of the others that is accepted as rounding, as for a flat plate.
 PLATE_MOMENT_TOLERANCE = 1e-6
