@@ -1,8 +1,8 @@
 """Validation of arguments: dtype, shape and range of arrays; numbers, flags and names. Kernels check nothing.
 
-The ranges are defined in `lavender_ext/core/validate.pxd`: numbers are at most 1e60 in absolute value, and masses, lengths
-and other nonnegative quantities are 0 or at least 1e-60. The same problem in other units has the same answer, so the
-message suggests a unit to change.
+The ranges are defined in `lavender_ext/core/validate.pxd`: numbers are at most 1e60 in absolute value, and masses,
+lengths and other nonnegative quantities are 0 or at least 1e-60. The same problem in other units has the same answer,
+so the message suggests a unit to change.
 """
 
 from __future__ import annotations

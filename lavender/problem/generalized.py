@@ -230,8 +230,8 @@ class Generalized:
             velocity = row if self.order is None else int(self.order[row])
             raise InputError(
                 f"M is not positive definite: the pivot of {self.velocity_name(velocity)} is no more than rounding of "
-                f"its diagonal entry, or less than {MIN_MAGNITUDE:g} (another unit of mass or length brings it nearer to 1); a "
-                "body without mass or inertia needs some (MuJoCo: armature), or the velocity must be left out"
+                f"its diagonal entry, or less than {MIN_MAGNITUDE:g} (another unit of mass or length brings it nearer "
+                "to 1); a body without mass or inertia needs some (MuJoCo: armature), or the velocity must be left out"
             )
 
     def __setattr__(self, name: str, value: Any) -> None:

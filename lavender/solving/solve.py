@@ -384,7 +384,9 @@ class Prepared:
             if loop.tol > 0.0 and claim.status not in (CONVERGED, ROUNDOFF_LIMIT):
                 claim = name_lost_row(problem, loop.impulse, claim)
                 # The checks of sweeps already store the best of each island, including the start.
-                if claim.status is TIME_LIMIT or not isinstance(getattr(self.state, "watch", None), StoppingTest):
+                if claim.status is TIME_LIMIT or not isinstance(
+                    getattr(self.state, "watch", None), StoppingTest
+                ):
                     loop.restore_better(start, or_zero=claim.status is TIME_LIMIT)
             if (
                 claim.status is TIME_LIMIT

@@ -239,8 +239,8 @@ def inertia_of(label: str, inertia: Any, shape: Any, mass: float) -> FloatArray:
     moments = np.linalg.eigvalsh(x) if np.isfinite(x).all() else x
     if not mass >= MIN_MAGNITUDE or not np.all((moments >= MIN_MAGNITUDE) & (moments <= MAX_MAGNITUDE)):
         raise InputError(
-            f"{quantity} is {np.diag(x).tolist()} kg m^2; it and the mass must be from {MIN_MAGNITUDE:g} to {MAX_MAGNITUDE:g}: use "
-            "other units of mass or length"
+            f"{quantity} is {np.diag(x).tolist()} kg m^2; it and the mass must be from {MIN_MAGNITUDE:g} "
+            f"to {MAX_MAGNITUDE:g}: use other units of mass or length"
         )
     return x
 
