@@ -1,8 +1,8 @@
 """Validation of arguments: dtype, shape and range of arrays; numbers, flags and names. Kernels check nothing.
 
-The ranges are defined in `lavender_ext/core/door.pxd`: numbers are at most 1e60 in absolute value, and masses, lengths
-and other nonnegative quantities are 0 or at least 1e-60. The same problem in other units has the same answer, so the
-message suggests a unit to change.
+The ranges are defined in `lavender_ext/core/validate.pxd`: numbers are at most 1e60 in absolute value, and masses,
+lengths and other nonnegative quantities are 0 or at least 1e-60. The same problem in other units has the same answer,
+so the message suggests a unit to change.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from lavender.base.errors import InputError
 from lavender.base.lazy_import import issparse
 from lavender.base.lazy_import import sparse as sp
 from lavender_ext.core import checks
-from lavender_ext.core.checks import LEAST, MOST
+from lavender_ext.core.checks import MAX_MAGNITUDE, MIN_MAGNITUDE
 from lavender_ext.judge.measure import all_finite
 
 FloatArray = npt.NDArray[np.float64]
@@ -69,7 +69,7 @@ def as_array(
         Required shape; None allows any length.
     dtype : {numpy.float64, numpy.int32}
     finite : bool, default True
-        Reject numbers that are not finite, or above MOST in absolute value.
+        Reject numbers that are not finite, or above MAX_MAGNITUDE in absolute value.
     copy : bool, default True
         If False, an array that already has the required dtype and layout is returned itself, marked read-only.
     unit : str, optional
@@ -87,10 +87,10 @@ def as_array(
     """
     # Fast path for values that need no conversion and no message.
     if dtype is np.float64:
-        array = checks.plain(value, shape, finite, copy)
+        array = checks.as_plain_array(value, shape, finite, copy)
         if array is not None:
             return array
-        is_valid = type(value) is float and (abs(value) <= MOST or not finite)
+        is_valid = type(value) is float and (abs(value) <= MAX_MAGNITUDE or not finite)
         if is_valid and len(shape) == 1 and shape[0] is not None:
             array = np.empty(shape[0])
             array.fill(value)
@@ -229,8 +229,8 @@ def check_float(
         x = np.inf if value > 0 else -np.inf
     if not np.isfinite(x):
         raise InputError(f"{name} is {x}; a finite number is needed")
-    if abs(x) > MOST:
-        raise InputError(f"{name} is {x:g}; at most {MOST:g} is needed: change a unit")
+    if abs(x) > MAX_MAGNITUDE:
+        raise InputError(f"{name} is {x:g}; at most {MAX_MAGNITUDE:g} is needed: change a unit")
     if above is not None and not x > above:
         raise InputError(f"{name} is {x:g}; more than {above:g} is needed")
     if x < low or x > high:
@@ -342,28 +342,28 @@ def _format_index(index: np.ndarray, csr: Any) -> str:
 
 
 def check_inside(name: str, array: np.ndarray, unit: str = "", csr: Any = None) -> None:
-    """Raise InputError at the first number that is not finite or is above MOST in absolute value."""
-    if checks.inside(array.reshape(-1)):
+    """Raise InputError at the first number that is not finite or is above MAX_MAGNITUDE in absolute value."""
+    if checks.all_valid(array.reshape(-1)):
         return
     check_finite(name, array, csr)
-    bad = np.argwhere(np.abs(array) > MOST)
+    bad = np.argwhere(np.abs(array) > MAX_MAGNITUDE)
     raise InputError(
-        f"{name} must be at most {MOST:g} in size; entry [{_format_index(bad[0], csr)}] is "
+        f"{name} must be at most {MAX_MAGNITUDE:g} in size; entry [{_format_index(bad[0], csr)}] is "
         f"{array[tuple(bad[0])]:g}, {len(bad)} in all: {_suggest_unit(unit)}"
     )
 
 
 def check_sizes(name: str, array: np.ndarray, unit: str = "") -> None:
-    """Raise InputError at the first number that is negative, or neither 0 nor in [LEAST, MOST]."""
+    """Raise InputError at the first number that is negative, or neither 0 nor in [MIN_MAGNITUDE, MAX_MAGNITUDE]."""
     flat = array.reshape(-1)
-    position = checks.unsized(flat)
+    position = checks.first_invalid_magnitude_of(flat)
     if position < 0:
         return
     check_inside(name, array, unit)
     check_not_negative(name, flat)
     index = ", ".join(map(str, np.unravel_index(position, array.shape)))
     raise InputError(
-        f"{name} must be 0 or at least {LEAST:g}; entry [{index}] is {flat[position]:g}: {_suggest_unit(unit)}"
+        f"{name} must be 0 or at least {MIN_MAGNITUDE:g}; entry [{index}] is {flat[position]:g}: {_suggest_unit(unit)}"
     )
 
 

@@ -21,7 +21,7 @@ MODULES = (
     "core.order",
     "core.problem",
     "judge.measure",
-    "judge.watch",
+    "judge.stopping_test",
     "sweep.pgs",
     "sweep.serial",
     "local.gauss_seidel",

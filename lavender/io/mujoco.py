@@ -446,7 +446,9 @@ def _blocks(seen: _ModelCache, data: Any, contacts: int, dt: float) -> tuple[Con
     return Cones._from_blocks(blocks), scale, key
 
 
-def _block_names(mj: Any, model: Any, ints: IntArray, m: int, joined: int = mujoco_rows.JOINED) -> list[str]:
+def _block_names(
+    mj: Any, model: Any, ints: IntArray, m: int, joined: int = mujoco_rows.MAX_EQUALITY_ROWS
+) -> list[str]:
     """Return the names of the blocks of m rows.
 
     `ints` holds efc_type (m,), efc_id (m,), and dim (c,) and geom (c, 2) of the contacts. An equality of more than

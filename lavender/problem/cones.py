@@ -51,7 +51,7 @@ from lavender.problem.friction import (
     convert_ellipse_coefficients,
 )
 from lavender_ext.core import blocks as kernels
-from lavender_ext.core.checks import LEAST, MOST
+from lavender_ext.core.checks import MAX_MAGNITUDE, MIN_MAGNITUDE
 
 __all__ = [
     "CONTACT",
@@ -144,7 +144,7 @@ class Cones:
         rolling: Any = self.rolling
         if isinstance(rolling, tuple) and not rolling:
             self.__dict__["rolling"] = np.zeros(np.size(self.kind))
-        blocks = kernels.private(
+        blocks = kernels.copy_to_blocks(
             self.ptr, self.kind, self.lower, self.upper, self.mu, self.patch_radius, self.rolling
         )
         if blocks is None:
@@ -173,7 +173,7 @@ class Cones:
     @classmethod
     def _concatenate(cls, cones: Iterable[Cones]) -> Cones:
         """Concatenate the blocks of several cones."""
-        blocks = kernels.joined([each._blocks for each in cones])
+        blocks = kernels.concatenate_blocks([each._blocks for each in cones])
         if blocks is None:
             raise InputError("together these have more rows than 32-bit numbers count")
         return cls._from_blocks(blocks)
@@ -323,7 +323,7 @@ class Cones:
             pair_kind = 0 if ratio is None else CONTACT_ELLIPSE
         size_of_mu = 1 if type(mu) is float or np.ndim(mu) == 0 else shape_of("mu", mu)[0]
         k = size_of_mu if count is None else check_int("count", count)
-        if type(mu) is not float or not (mu == 0.0 or LEAST <= mu <= MOST):
+        if type(mu) is not float or not (mu == 0.0 or MIN_MAGNITUDE <= mu <= MAX_MAGNITUDE):
             mu = check_coefficients("mu", mu, k)
         if patch_radius is not None:
             patch_radius = check_coefficients("patch_radius", patch_radius, k, "m")

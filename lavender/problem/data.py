@@ -31,7 +31,7 @@ from lavender.problem.derived import Derived, cached_property
 from lavender.problem.generalized import Generalized
 from lavender.problem.rows import Rows
 from lavender_ext.core.blocks import are_joints_then_contacts
-from lavender_ext.core.checks import LEAST, largest
+from lavender_ext.core.checks import MIN_MAGNITUDE, norm_inf
 from lavender_ext.core.problem import LAWS as FRICTION_NUMBER
 from lavender_ext.core.problem import general_data
 from lavender_ext.judge import measure
@@ -342,12 +342,12 @@ class ProblemData:
 
 
 def _check_rhs(b: FloatArray) -> None:
-    """Raise InputError if the largest |b_i| [m/s] is not 0 but below LEAST."""
-    max_abs = largest(b)
-    if 0.0 < max_abs < LEAST:
+    """Raise InputError if the largest |b_i| [m/s] is not 0 but below MIN_MAGNITUDE."""
+    max_abs = norm_inf(b)
+    if 0.0 < max_abs < MIN_MAGNITUDE:
         raise InputError(
             f"b [m/s] is {max_abs:g} at most, at [{int(np.argmax(np.abs(b)))}]; its largest must be 0 or at least "
-            f"{LEAST:g}: another unit of length or time brings it nearer to 1"
+            f"{MIN_MAGNITUDE:g}: another unit of length or time brings it nearer to 1"
         )
 
 

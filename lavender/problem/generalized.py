@@ -32,7 +32,7 @@ from lavender.base.lazy_import import sparse as sp
 from lavender.problem.derived import cached_property
 from lavender_ext.core import generalized as kernels
 from lavender_ext.core.assemble import dense_to_csr, mirrored, stacked
-from lavender_ext.core.checks import LEAST, plain
+from lavender_ext.core.checks import MIN_MAGNITUDE, as_plain_array
 from lavender_ext.factor.graph import least_degree
 
 # |M_ij - M_ji| above this fraction of sqrt(M_ii M_jj) is an error: rounding of sums over bodies in float64 causes less.
@@ -121,9 +121,9 @@ class Generalized:
         new = object.__new__(cls)
         n = len(mass[0]) - 1
         for name, x in (("J", jac[2]), ("M", mass[2])):
-            if plain(x, ANY_LENGTH, True, False) is None:
+            if as_plain_array(x, ANY_LENGTH, True, False) is None:
                 as_array(name, x, ANY_LENGTH, copy=False)  # raises with a message
-        free = plain(v_free, (n,), True, False)
+        free = as_plain_array(v_free, (n,), True, False)
         if free is None:
             free = as_array("v_free", v_free, (n,), unit="m/s, rad/s", copy=False)
         new._initialize(jac, mass, free, names, like)
@@ -230,8 +230,8 @@ class Generalized:
             velocity = row if self.order is None else int(self.order[row])
             raise InputError(
                 f"M is not positive definite: the pivot of {self.velocity_name(velocity)} is no more than rounding of "
-                f"its diagonal entry, or less than {LEAST:g} (another unit of mass or length brings it nearer to 1); a "
-                "body without mass or inertia needs some (MuJoCo: armature), or the velocity must be left out"
+                f"its diagonal entry, or less than {MIN_MAGNITUDE:g} (another unit of mass or length brings it nearer "
+                "to 1); a body without mass or inertia needs some (MuJoCo: armature), or the velocity must be left out"
             )
 
     def __setattr__(self, name: str, value: Any) -> None:

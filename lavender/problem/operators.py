@@ -14,7 +14,7 @@ from lavender.problem.data import ProblemData
 from lavender.problem.derived import Derived, cached_property, once
 from lavender_ext.core import assemble
 from lavender_ext.core.assemble import dense_to_csr
-from lavender_ext.core.checks import MOST, largest
+from lavender_ext.core.checks import MAX_MAGNITUDE, norm_inf
 from lavender_ext.core.problem import LAWS as FRICTION_NUMBER
 from lavender_ext.core.problem import Data, general_data, zero_impulse
 from lavender_ext.factor import sparse
@@ -24,7 +24,7 @@ from lavender_ext.judge import measure
 # the entries causes negative eigenvalues of about -m 2^-53 in the metric of D.
 SEMIDEFINITE_SHIFT = 1e-12
 MAX_SAFE_ENTRY = (
-    1e15  # If entries of J and M^-1 are at most this, A_ii cannot exceed MOST and is not checked.
+    1e15  # If entries of J and M^-1 are at most this, A_ii cannot exceed MAX_MAGNITUDE and is not checked.
 )
 MAX_INDEXABLE_ENTRIES = 2**31  # A with this many entries or more is not formed: its indices have 32 bits.
 
@@ -53,14 +53,14 @@ class Operators(ProblemData):
         return problem
 
     def _has_large_entries(self) -> bool:
-        """Return whether entries of J and M^-1 are so large that A_ii may exceed MOST."""
-        if self.compliance is not None and largest(self.compliance) > MAX_SAFE_ENTRY:
+        """Return whether entries of J and M^-1 are so large that A_ii may exceed MAX_MAGNITUDE."""
+        if self.compliance is not None and norm_inf(self.compliance) > MAX_SAFE_ENTRY:
             return True
         if self.generalized is not None:
             return bool(self.generalized.operator.is_beyond(MAX_SAFE_ENTRY))
         r = self.rows
         return r is not None and any(
-            largest(x.reshape(-1)) > MAX_SAFE_ENTRY
+            norm_inf(x.reshape(-1)) > MAX_SAFE_ENTRY
             for x in (r.jac, r.arm_a, r.arm_b, r.inv_mass, r.inv_inertia)
         )
 
@@ -128,7 +128,7 @@ class Operators(ProblemData):
         """Arrays for sweep kernels over A in compressed rows; A is formed if J and M are given."""
         data = self._make_data(csr=self._compressed)
         if self.rows is not None:
-            data.weigh_as(self.metric)
+            data.copy_velocity_weight(self.metric)
         if self.generalized is not None and self.metric.reference_energy >= 0.0:
             data.share_reference(self.metric)
         return data
@@ -147,12 +147,12 @@ class Operators(ProblemData):
         return view
 
     def _check_diagonal(self, data: Data) -> None:
-        """Raise InputError if an entry of A's diagonal exceeds MOST."""
+        """Raise InputError if an entry of A's diagonal exceeds MAX_MAGNITUDE."""
         i = data.outside
         if i >= 0:
             raise InputError(
                 f"A_ii = J_i M^-1 J_i^T + compliance of {self.row_name(i)} (row {i}) is {data.d[i]:g} 1/kg; at most "
-                f"{MOST:g} is needed: another unit of mass, or of the row's velocity, brings it nearer to 1"
+                f"{MAX_MAGNITUDE:g} is needed: another unit of mass, or of the row's velocity, brings it nearer to 1"
             )
 
     def _make_data(self, **operator: Any) -> Data:

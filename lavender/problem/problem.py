@@ -15,7 +15,7 @@ from lavender.base.lazy_import import sparse as sp
 from lavender.problem.builders import Builders
 from lavender.problem.cones import Cones
 from lavender.problem.derived import once
-from lavender_ext.core.checks import LEAST
+from lavender_ext.core.checks import MIN_MAGNITUDE
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,11 +215,11 @@ class Problem(Builders):
         else:
             assert self.compliance is not None
             compliance = s * s * self.compliance
-            compliance[compliance < LEAST] = 0.0  # A compliance must be 0 or at least LEAST.
+            compliance[compliance < MIN_MAGNITUDE] = 0.0  # A compliance must be 0 or at least MIN_MAGNITUDE.
             scaled = self.generalized.with_scaled_rows(s)
             disk = Problem(s * self.b, cones, generalized=scaled, compliance=compliance, copy=False, **more)
         if self.rows is not None:
-            disk.metric.weigh_as(self.metric, True)
+            disk.metric.copy_velocity_weight(self.metric, True)
         return disk
 
     def boxed(self, normal_impulse: ArrayLike) -> Problem:

@@ -50,7 +50,7 @@ from lavender.problem.cones import Cones
 from lavender.problem.derived import cached_property
 from lavender.problem.generalized import Compressed, Generalized, compressed, lower_of
 from lavender_ext.core.assemble import dense_to_csr, mirrored, stacked
-from lavender_ext.core.checks import largest
+from lavender_ext.core.checks import norm_inf
 from lavender_ext.judge.measure import all_finite, program_residuals
 
 IntpArray = npt.NDArray[np.intp]
@@ -126,7 +126,7 @@ class QPSolution:
     def _residuals(self) -> tuple[float, ...]:
         """r_p, r_d, gap, the same three relative to their terms, and the largest relative one."""
         qp, multipliers, min_force = self.qp, self.qp.of_rows(self.impulse), 0.0
-        if largest(qp.q) == 0.0:
+        if norm_inf(qp.q) == 0.0:
             min_force = CURVATURE_SHARE * float((abs(qp.hessian) @ np.abs(self.x)).max(initial=0.0))
         jac, order = qp.compressed_rows
         result: tuple[float, ...] = program_residuals(

@@ -38,7 +38,7 @@ from lavender.solvers.newton_systems import general
 from lavender.solvers.registry import get
 from lavender.solvers.setup_times import loading_time
 from lavender.solvers.solve_log import SolveLog
-from lavender_ext.core.checks import LEAST as MIN_NUMBER
+from lavender_ext.core.checks import MIN_MAGNITUDE as MIN_NUMBER
 from lavender_ext.core.checks import MOST as MAX_NUMBER
 from lavender_ext.judge.measure import by_island
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray, IntArray
 from lavender.problem import Problem
-from lavender_ext.core.checks import LEAST as MIN_NUMBER
+from lavender_ext.core.checks import MIN_MAGNITUDE as MIN_NUMBER
 from lavender_ext.core.checks import largest as max_abs
 from lavender_ext.factor import graph
 

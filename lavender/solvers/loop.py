@@ -38,7 +38,7 @@ from lavender.problem import Problem
 from lavender.problem.cones import project
 from lavender.solvers.registry import Solver, State
 from lavender_ext.judge.measure import same_bits
-from lavender_ext.judge.watch import Watch
+from lavender_ext.judge.stopping_test import StoppingTest
 
 MIN_TIME_LIMIT = 1e-6  # Smallest time limit [s] that is passed to a solver.
 # A chunk uses at most this fraction of the remaining time, at the speed of the chunk before.
@@ -198,7 +198,7 @@ class Loop:
             return
         state: State = self.state
         watch = getattr(state, "watch", None)
-        if isinstance(watch, Watch):
+        if isinstance(watch, StoppingTest):
             # The state may have its rows in another order than the problem.
             getattr(state, "keep_best", watch.keep_best)(self.impulse, self.tol)
             return

@@ -365,7 +365,7 @@ def _run_stages(
     if not is_continued:
         solve.start(impulse, tol, SPEC.max_iter if max_total else max_iter)
     if max_total:
-        solve.allow(max_total)
+        solve.limit_work(max_total)
     try:
         while True:
             before = solve.done

@@ -1,6 +1,6 @@
 """Base classes of sweep solvers: sweep order, sweep count, residual checks.
 
-The checks are in `lavender_ext/judge/watch.pxd`. They use the judge's arithmetic. Each check is half way to the
+The checks are in `lavender_ext/judge/stopping_test.pxd`. They use the judge's arithmetic. Each check is half way to the
 expected end, so the number of sweeps between checks depends only on the numbers of the problem.
 """
 
@@ -16,7 +16,7 @@ from lavender.problem import Problem
 from lavender.problem.ordering import Order, block_order
 from lavender.solvers.registry import Solver
 from lavender.solvers.setup_times import forming_time, order_time
-from lavender_ext.judge.watch import AT_FLOOR, CONVERGED, DIVERGED, RUNNING, STALLED, Watch
+from lavender_ext.judge.stopping_test import AT_FLOOR, CONVERGED, DIVERGED, RUNNING, STALLED, StoppingTest
 from lavender_ext.sweep import serial
 
 STATUS = {
@@ -29,10 +29,10 @@ STATUS = {
 SWEEP_PATIENCE = 64  # A run does not stall before this many sweeps without a better check.
 
 
-def create_stopping_test(problem: Problem, data: Any, patience: int) -> Watch:
+def create_stopping_test(problem: Problem, data: Any, patience: int) -> StoppingTest:
     """Create the stopping test of a run over `data`. If A was formed from J and M, the test is confirmed on J and M."""
     formed = problem.matrix is None and not (data.factored or data.is_general)
-    return Watch(data, patience, problem.metric if formed else None)
+    return StoppingTest(data, patience, problem.metric if formed else None)
 
 
 class SweepState:

@@ -64,7 +64,7 @@ from lavender.solvers.setup_times import (
 )
 from lavender.solving.outcome import decide_empty_rows, finish, name_lost_row
 from lavender_ext.judge.measure import all_finite, by_island
-from lavender_ext.judge.watch import Watch
+from lavender_ext.judge.stopping_test import StoppingTest
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -398,7 +398,9 @@ class Prepared:
             if loop.tol > 0.0 and claim.status not in (CONVERGED, ROUNDOFF_LIMIT):
                 claim = name_lost_row(problem, loop.impulse, claim)
                 # The checks of sweeps already store the best of each island, including the start.
-                if claim.status is TIME_LIMIT or not isinstance(getattr(self.state, "watch", None), Watch):
+                if claim.status is TIME_LIMIT or not isinstance(
+                    getattr(self.state, "watch", None), StoppingTest
+                ):
                     loop.restore_better(start, or_zero=claim.status is TIME_LIMIT)
             if (
                 claim.status is TIME_LIMIT

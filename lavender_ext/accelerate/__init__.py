@@ -1,1 +1,1 @@
-"""Fixed-point iterations that remember: Anderson mixing, accelerated sweeps, proximal splitting."""
+"""Accelerated fixed-point iterations: Anderson mixing, accelerated sweeps, proximal splitting."""

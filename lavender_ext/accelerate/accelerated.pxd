@@ -1,18 +1,18 @@
-"""What an accelerated sweep runs over, and its step for a loop under a watch."""
+"""Data of accelerated sweeps, and their step for a loop with a stopping test."""
 from libc.stdint cimport int32_t, int64_t
 
 from lavender_ext.accelerate.mixing cimport CONTROL, MAX_MEMORY
-from lavender_ext.core.parts cimport CONE, blocks_t
+from lavender_ext.core.block_types cimport CONE, blocks_t
 from lavender_ext.sweep.serial cimport Sweeps, context_t, sweeping_t
 
 
 cdef struct sweep_data_t:
-    context_t* sweeps           # prepared blocks are read where these are exact, or under the cone law
+    context_t* sweeps           # prepared blocks are read if sweeps are exact or under the cone law
     blocks_t cone               # the blocks under the cone law
-    int32_t convex              # iterations under the cone law first
-    int32_t turn                # iterations done
+    int32_t convex              # number of first iterations under the cone law
+    int32_t turn                # number of iterations done
     int32_t memory
-    int32_t keeps               # nncg: beta > 1 drops p only where it points against the sweep
+    int32_t keeps               # nncg: beta > 1 drops p only if p points against the sweep
     double* control             # (CONTROL) of accelerate/mixing.pxd
     double* gram                # (MAX_MEMORY, MAX_MEMORY)
     double* work                # nncg 3 (m + n_v); anderson (4 + 2 memory) m
@@ -25,15 +25,15 @@ cdef double undone_of(const sweep_data_t* c) noexcept nogil
 
 
 cdef inline int64_t accelerated_workspace_size(int64_t m, int64_t n_v, int64_t memory) noexcept nogil:
-    """Numbers of a run."""
+    """Return the number of doubles of a run."""
     return 3 * (m + n_v) + (1 + 2 * memory) * m + CONTROL + MAX_MEMORY * MAX_MEMORY
 
 
 cdef inline void accelerate(sweeping_t* x, sweep_data_t* c, int32_t memory, int32_t convex, int32_t keeps,
                             double* workspace) noexcept nogil:
-    """A run of sweeps, started, before its first iteration, in workspace (`accelerated_workspace_size`, zeroed).
+    """Turn a started run of sweeps x into an accelerated one, before its first iteration.
 
-    memory 0 is nncg.
+    memory = 0 is nncg. workspace (`accelerated_workspace_size`) must be zero-initialised.
     """
     cdef context_t* sweeps = &x.c
     x.step, x.of, x.forget = lav_nncg if memory == 0 else lav_anderson, c, forget_all

@@ -1,41 +1,42 @@
-"""Sweeps of Gauss-Seidel type, accelerated: one sweep y = S(x) is the map, g = x - y its step.
+"""Accelerated sweeps of Gauss-Seidel type: the fixed-point map is one sweep y = S(x), with step g = x - y.
 
     nncg      x_k = y_{k-1} + beta_{k-1} p_{k-2},  y_k = S(x_k),  g_k = x_k - y_k,                    (1)
-              beta_k = g_k.D g_k / g_{k-1}.D g_{k-1},  p_k = beta_k p_{k-1} - g_k  (p_k = -g_k where beta_k > 1)
-              or, where it keeps p, beta_k = 1 there while p_{k-1}.D g_k <= 0                         (3)
+              beta_k = g_k.D g_k / g_{k-1}.D g_{k-1},  p_k = beta_k p_{k-1} - g_k  (p_k = -g_k if beta_k > 1,
+              or with `keeps` beta_k = 1 instead while p_{k-1}.D g_k <= 0)                            (3)
     anderson  x_k = Pi(y - sum_i gamma_i (y_i+1 - y_i)),  gamma least squares of f = sum_i gamma_i (f_i+1 - f_i),
               f = D^1/2 (y - x), over the last `memory` sweeps                                        (2)
 
-D = diag d, so that both work in energy. S is a sweep of pgs or of exact blocks (local/gauss_seidel.pyx), over A in
-compressed rows, over the factored form with v = M^-1 J^T lam, or over J and M with v = Y^T lam; with the symmetric
-order a sweep and the same sweep backwards. An iterate that is shown is always a swept one, y. All sums run in a fixed
+D = diag d, so that both methods use the energy norm. S is a sweep of pgs or of exact blocks (local/gauss_seidel.pyx), over A
+in compressed rows, over the factored form with v = M^-1 J^T lam, or over J and M with v = Y^T lam. With the symmetric order S
+is a sweep followed by the same sweep backwards. The returned iterate is always the result y of a sweep. All sums have a fixed
 order.
 
-(2) and its safeguards are those of accelerate/mixing.pxd. The first `convex` iterations may sweep under the cone law:
-where contacts stick, its answer is Coulomb's.
+(2) and its safeguards are implemented in accelerate/mixing.pxd. The first `convex` iterations may sweep under the cone law,
+which has the same solution as Coulomb's law if all contacts stick.
 """
 from libc.math cimport sqrt
 from libc.stdint cimport int32_t, int64_t, uint64_t
 
 from lavender_ext.accelerate.accelerated cimport accelerate, accelerated_workspace_size, sweep_data_t
-from lavender_ext.accelerate.mixing cimport CONTROL, UNDONE, forget, mix, mixing_t, take
+from lavender_ext.accelerate.mixing cimport CONTROL, UNDONE, forget, mix, mixing_t, store_evaluation
 from lavender_ext.core.block cimport clip, length
 from lavender_ext.core.order cimport SYMMETRIC
-from lavender_ext.core.parts cimport blocks_t, is_rows, parts_of, parts_t
+from lavender_ext.core.block_types cimport blocks_t, is_rows, get_friction_components, friction_components_t
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.view cimport view_t
 from lavender_ext.sweep.serial cimport Sweeps, form_velocity, sweep, velocities_of
 
 cdef enum:
-    REFRESH = 64                # iterations of nncg after which v is formed anew: rounding adds up in it
+    # Number of nncg iterations after which v is recomputed, because rounding errors accumulate in it.
+    VELOCITY_REFRESH_INTERVAL = 64
 
-cdef enum:                      # places in control of nncg
+cdef enum:                      # indices in `control` of nncg
     NORM = 0                    # g.Dg of the last sweep
-    RESTARTS = 1                # p dropped
+    RESTARTS = 1                # number of dropped directions p
 
 
 cdef inline void iterate(sweep_data_t* c, double* lam, int32_t first) noexcept nogil:
-    """One sweep, or with the symmetric order one and the same backwards."""
+    """Sweep once, or with the symmetric order forwards and backwards."""
     cdef const blocks_t* p = c.sweeps.blocks
     cdef bint exact = c.sweeps.exact
     cdef int32_t k
@@ -47,19 +48,19 @@ cdef inline void iterate(sweep_data_t* c, double* lam, int32_t first) noexcept n
 
 
 cdef inline void project_block(const blocks_t* p, int32_t i, double* lam) noexcept nogil:
-    """lam of block i into its bounds, normal first."""
+    """Project lam of block i to its bounds, normal first."""
     cdef int32_t j = p.ptr[i], g, k
     cdef double bound, size
-    cdef parts_t q
+    cdef friction_components_t q
     if is_rows(p, i):
         for k in range(j, p.ptr[i + 1]):
             lam[k] = clip(lam[k], p.lower[k], p.upper[k])
         return
     if lam[j] < 0.0:
         lam[j] = 0.0
-    parts_of(p, i, &q)
+    get_friction_components(p, i, &q)
     for g in range(q.n):
-        bound = q.reach[g] * lam[j]
+        bound = q.friction_coefficient[g] * lam[j]
         size = length(lam + j + q.first[g], q.size[g])
         if size > bound:
             for k in range(j + q.first[g], j + q.first[g] + q.size[g]):
@@ -67,7 +68,7 @@ cdef inline void project_block(const blocks_t* p, int32_t i, double* lam) noexce
 
 
 cdef inline double energy(const double* d, const double* x, const double* y, int32_t m) noexcept nogil:
-    """x.D y."""
+    """Return x.D y."""
     cdef double s0 = 0.0, s1 = 0.0, s2 = 0.0, s3 = 0.0
     cdef int32_t i = 0
     while i + 4 <= m:
@@ -83,7 +84,7 @@ cdef inline double energy(const double* d, const double* x, const double* y, int
 
 
 cdef inline double step_energy(const double* d, double* x, const double* y, int32_t m) noexcept nogil:
-    """x <- x - y; x.D x of that, summed as `energy`."""
+    """Subtract y from x and return x.D x, summed as in `energy`."""
     cdef double s0 = 0.0, s1 = 0.0, s2 = 0.0, s3 = 0.0
     cdef int32_t i = 0
     while i + 4 <= m:
@@ -103,8 +104,8 @@ cdef inline double step_energy(const double* d, double* x, const double* y, int3
     return (s0 + s1) + (s2 + s3)
 
 
-cdef inline void follow(double* y, double* x, double* p, double beta, int32_t n) noexcept nogil:
-    """p <- beta p - x, then y <- y + beta p of before and x <- y, in one pass."""
+cdef inline void extrapolate(double* y, double* x, double* p, double beta, int32_t n) noexcept nogil:
+    """Set y and x to y + beta p, and p to beta p - x with the old x, in one pass."""
     cdef int32_t i
     cdef double q
     for i in range(n):
@@ -116,22 +117,22 @@ cdef inline void follow(double* y, double* x, double* p, double beta, int32_t n)
 
 
 cdef public void lav_nncg(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:
-    """n iterations of (1)."""
+    """Run n iterations of (1)."""
     cdef sweep_data_t* c = <sweep_data_t*>context
     cdef int32_t m = c.sweeps.blocks.n_rows, n_v = c.sweeps.n_v, i, s
-    cdef double* x = c.work                             # x, then g; behind lam's part that of v
-    cdef double* q = c.work + m + n_v                   # beta p, to be added
+    cdef double* x = c.work                             # x, then g: the part of lam is followed by that of v
+    cdef double* q = c.work + m + n_v                   # beta p, added before the next sweep
     cdef double* p = q + m + n_v
     cdef double* v = c.sweeps.v
     cdef double* control = c.control
     cdef const double* d = c.sweeps.blocks.d
     cdef double norm, beta = 0.0
     for s in range(n):
-        if c.turn > 0 and c.turn % REFRESH == 0:
+        if c.turn > 0 and c.turn % VELOCITY_REFRESH_INTERVAL == 0:
             form_velocity(c.sweeps, lam)
         if s > 0:
-            follow(lam, x, p, beta, m)
-            follow(v, x + m, p + m, beta, n_v)
+            extrapolate(lam, x, p, beta, m)
+            extrapolate(v, x + m, p + m, beta, n_v)
         else:
             for i in range(m):
                 lam[i] += q[i]
@@ -153,7 +154,7 @@ cdef public void lav_nncg(void* context, double* lam, int32_t first_sweep, int32
         control[NORM] = norm
         c.turn += 1
         if c.turn == c.convex:
-            control[NORM] = 0.0                         # another map: start anew
+            control[NORM] = 0.0                         # the law changes: restart
     if n > 0:
         for i in range(m + n_v):
             q[i] = beta * p[i]
@@ -161,7 +162,7 @@ cdef public void lav_nncg(void* context, double* lam, int32_t first_sweep, int32
 
 
 cdef public void lav_anderson(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:
-    """n iterations of (2)."""
+    """Run n iterations of (2)."""
     cdef sweep_data_t* c = <sweep_data_t*>context
     cdef const blocks_t* p = c.sweeps.blocks
     cdef int32_t m = p.n_rows, i, s, mixed
@@ -181,7 +182,7 @@ cdef public void lav_anderson(void* context, double* lam, int32_t first_sweep, i
         for i in range(m):
             root[i] = sqrt(p.d[i])
     for s in range(n):
-        mixed = mix(&mixing, lam, 1.0 / 0.0)  # recorded rockfalls to 1e-10 need large ones
+        mixed = mix(&mixing, lam, 1.0 / 0.0)  # No limit on sum |gamma|: recorded rockfalls need large ones for 1e-10.
         if mixed:
             for i in range(p.n_blocks):
                 project_block(p, i, lam)
@@ -191,15 +192,15 @@ cdef public void lav_anderson(void* context, double* lam, int32_t first_sweep, i
         iterate(c, lam, first_sweep and s == 0)
         for i in range(m):
             x[i] = root[i] * (lam[i] - x[i])
-        if not take(&mixing, mixed, lam, x):
+        if not store_evaluation(&mixing, mixed, lam, x):
             form_velocity(c.sweeps, lam)
         c.turn += 1
         if c.turn == c.convex:
-            forget(&mixing)                             # another map
+            forget(&mixing)                             # the law changes
 
 
 cdef void forget_all(void* context, const double* lam) noexcept nogil:
-    """As before the first iteration, from lam (m), but for the counts."""
+    """Restart from lam (m) without memory; the counts are kept."""
     cdef sweep_data_t* c = <sweep_data_t*>context
     cdef int32_t i, n = c.sweeps.blocks.n_rows + c.sweeps.n_v
     if c.memory == 0:
@@ -214,21 +215,21 @@ cdef void forget_all(void* context, const double* lam) noexcept nogil:
 
 
 cdef double undone_of(const sweep_data_t* c) noexcept nogil:
-    """Directions or mixtures so far that were dropped."""
+    """Return the number of dropped directions or undone mixed steps."""
     return c.control[RESTARTS if c.memory == 0 else UNDONE]
 
 
 cdef class AcceleratedSweeps(Sweeps):
-    """Accelerated sweeps, `undone`: restarts.
+    """Accelerated sweeps; `undone` counts restarts.
 
     p, order, split, mode, rng, exact
         As in `Sweeps`.
     memory : int
-        Sweeps that are combined, up to 16; 0 is nncg.
+        Number of sweeps that are combined, up to 16; 0 is nncg.
     convex : int
-        Iterations under the cone law first, whose blocks are solved exactly.
+        Number of first iterations under the cone law, whose blocks are solved exactly.
     keeps : bool
-        nncg drops a direction only where it points against the sweep.
+        nncg drops a direction only if it points against the sweep.
     """
 
     def __init__(self, Data p, int32_t[::1] order, int split, int mode, uint64_t[::1] rng, bint exact=False, int memory=0,
@@ -240,4 +241,5 @@ cdef class AcceleratedSweeps(Sweeps):
                    self.lay(p, order, split, mode, rng, exact, exact or convex > 0, n))
 
     cdef double undone(self) noexcept:
+        """Return the number of restarts."""
         return undone_of(&self.fast)

@@ -7,28 +7,28 @@ With x = D^1/2 lam, B = D^-1/2 A D^-1/2, c = D^-1/2 b, cones K in the same scale
     (B + rho) x = c - s + rho z - y                                                               (1)
     u <- u + alpha (x - z)                          then accelerate/mixing.pxd
 
-At rest x = z: B z - c + s + y = 0. The shift comes in once both imbalances below are at most 1e-3 (or
-after 200 iterations), that is from the convex answer: where contacts stick that is the answer, elsewhere a
-start. (1) is solved with a factorisation made by the caller: Cholesky of a dense matrix, L L^T or L U by panels
+At a fixed point x = z and B z - c + s + y = 0. The shift is added when both imbalances (3) are at most 1e-3 (or after 200
+iterations), that is, from the convex solution. If contacts stick, that is the solution, otherwise a start. (1) is solved with
+a factorisation that the caller computes: Cholesky of a dense matrix, L L^T or L U by panels
 (`factor/sparse.pyx`), or those of I + K^T diag(1 / (theta + rho)) K over bodies where B = K K^T + diag(theta):
 
     x = E (r - K t),  (I + K^T E K) t = K^T E r,  E = diag(1 / (theta + rho))                     (2)
 
-At 20 iterations, then after every quarter more of them (20 at least), rho is weighed by its imbalances,
+At 20 iterations, then whenever their number has grown by a quarter (at least 20), rho is updated from its imbalances,
 
     primal = |x - z| / |max(|x|, |z|)|,   dual = rho |z - z before| / |max(|y|, |c|)|                  (3)
 
-Where sqrt(primal / dual) is outside 1/3 .. 3 the kernel stops and asks for a factorisation with rho times
-that; u then becomes z + y / rho.
+If sqrt(primal / dual) is outside 1/3 .. 3, the kernel stops and returns rho times that ratio, for which the caller computes a
+new factorisation; u then becomes z + y / rho.
 """
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t, int64_t
 
 import numpy as np
 
-from lavender_ext.accelerate.mixing cimport CONTROL, MAX_MEMORY, UNDONE, forget, mix, mixing_t, take
-from lavender_ext.core.block cimport clip, length, norm2, round_group, round_section, round_share, section
-from lavender_ext.core.parts cimport CONE, blocks_t, is_round, is_rows, parts_of, parts_t
+from lavender_ext.accelerate.mixing cimport CONTROL, MAX_MEMORY, UNDONE, forget, mix, mixing_t, store_evaluation
+from lavender_ext.core.block cimport clip, length, norm2, row_group, locate_in_round_cone, round_scale, projected_normal
+from lavender_ext.core.block_types cimport CONE, blocks_t, is_round, is_rows, get_friction_components, friction_components_t
 from lavender_ext.core.problem cimport Data
 from lavender_ext.factor.blocks cimport sparse_t
 from lavender_ext.factor.dense cimport dense_cholesky_solve
@@ -43,17 +43,17 @@ cdef enum:
     BODIES = 2
 
 cdef enum:
-    RHO_EVERY = 20              # iterations between weighings of rho at first, later a quarter of those done
-    CONVEX_AT_MOST = 200        # iterations without the shift
+    RHO_UPDATE_INTERVAL = 20    # iterations between updates of rho; later a quarter of the iterations done
+    MAX_CONVEX_ITERATIONS = 200     # iterations without the shift
     # Largest c of a block that its bounds hold at zero impulse, over the largest c of the others. Below, a block that the others
     # can make act would keep a wrong c; above 1e6, rho and the mixing lose the digits of the others (|b| up to 1e60 tried).
     MAX_INACTIVE_RATIO = 10000
 
 
-cdef struct factor_t:           # of B + rho, or of the body form
-    int32_t kind
-    int32_t n                   # its order
-    const double* dense         # of factor/dense.pxd, for a host without panels
+cdef struct factor_t:           # factor of B + rho, or of the body form
+    int32_t kind                # DENSE | PANELS | BODIES
+    int32_t n                   # order of the factor
+    const double* dense         # factor of factor/dense.pxd, for a host without panels
     const sparse_t* panels
     const int32_t* k_ptr        # K by rows (BODIES)
     const int32_t* k_col
@@ -72,17 +72,17 @@ cdef struct admm_t:
     double* y                   # (m)
     double* x                   # (m)
     double* g                   # (m)
-    double* before              # (m) z of the iteration before
-    double* work                # (n) of BODIES
-    double done                 # iterations
-    double next                 # of them at the next weighing
-    int32_t mixed               # u was
-    int32_t shifted             # the shift is on
+    double* before              # (m) z of the previous iteration
+    double* work                # (n) scratch of BODIES
+    double done                 # number of iterations
+    double next                 # number of iterations at the next update of rho
+    int32_t mixed               # 1 if u was mixed
+    int32_t shifted             # 1 if the shift is on
     mixing_t mixing
 
 
 cdef inline void solve_shifted(const factor_t* f, int32_t m, double* x, double* t) noexcept nogil:
-    # (1): x (m) <- (B + rho)^-1 x; t (n) is scratch of BODIES
+    """Overwrite x (m) with (B + rho)^-1 x (1); t (n) is scratch of BODIES."""
     cdef int32_t i, k
     cdef double s
     if f.kind == DENSE:
@@ -106,7 +106,7 @@ cdef inline void solve_shifted(const factor_t* f, int32_t m, double* x, double* 
 
 
 cdef inline void project_round(int32_t n, const double* root, double mu, const double* u, double* z) noexcept nogil:
-    """Pi_K(u) of a round cone of n rows; core/block.pxd (8)."""
+    """Compute z = Pi_K(u) of a round cone of n rows by core/block.pxd (8)."""
     cdef double t[3]
     cdef double a[3]
     cdef double r = 0.0, size = 0.0
@@ -114,30 +114,30 @@ cdef inline void project_round(int32_t n, const double* root, double mu, const d
     t[0] = t[1] = t[2] = 0.0
     a[0] = a[1] = a[2] = 0.0
     for i in range(1, n):
-        g = round_group(i)
+        g = row_group(i)
         t[g] = norm2(t[g], u[i])
         a[g] = mu * root[i] / root[0]
-    zone = round_section(t, a, u[0], &r, &size)
+    zone = locate_in_round_cone(t, a, u[0], &r, &size)
     z[0] = (u[0] if u[0] > 0.0 else 0.0) + r if zone == 0 else (u[0] if zone > 0 else 0.0)
     for i in range(1, n):
-        z[i] = (round_share(a[round_group(i)], r, u[0]) if zone == 0 else (1.0 if zone > 0 else 0.0)) * u[i]
+        z[i] = (round_scale(a[row_group(i)], r, u[0]) if zone == 0 else (1.0 if zone > 0 else 0.0)) * u[i]
 
 
-cdef inline void scaled_parts(const blocks_t* p, const double* root, int32_t i, const double* x, parts_t* q,
+cdef inline void scaled_components(const blocks_t* p, const double* root, int32_t i, const double* x, friction_components_t* q,
                               double* t) noexcept nogil:
-    """Parts of contact i with their reach in the scale of x, and |x_g| in t."""
+    """Write the friction components of contact i with coefficients in the scale of x, and |x_g| in t."""
     cdef int32_t j = p.ptr[i], g
-    parts_of(p, i, q)
+    get_friction_components(p, i, q)
     for g in range(q.n):
-        q.reach[g] = q.reach[g] * root[j + q.first[g]] / root[j]
+        q.friction_coefficient[g] = q.friction_coefficient[g] * root[j + q.first[g]] / root[j]
         t[g] = length(x + j + q.first[g], q.size[g])
 
 
 cdef inline void project_block(const blocks_t* p, const double* root, int32_t i, const double* u,
                                double* z) noexcept nogil:
-    """z = Pi_K(u) of one block, u, z whole scaled vectors; core/block.pxd (7)."""
+    """Compute z = Pi_K(u) of block i by core/block.pxd (7); u and z are scaled vectors of all rows."""
     cdef int32_t j = p.ptr[i], end = p.ptr[i + 1], k, g
-    cdef parts_t q
+    cdef friction_components_t q
     cdef double t[3]
     cdef double s
     if is_rows(p, i):
@@ -147,27 +147,27 @@ cdef inline void project_block(const blocks_t* p, const double* root, int32_t i,
     if is_round(p, i):
         project_round(end - j, root + j, p.mu[i], u + j, z + j)
         return
-    scaled_parts(p, root, i, u, &q, t)
-    z[j] = s = section(q.n, q.reach, t, u[j])
+    scaled_components(p, root, i, u, &q, t)
+    z[j] = s = projected_normal(q.n, q.friction_coefficient, t, u[j])
     for g in range(q.n):
         for k in range(j + q.first[g], j + q.first[g] + q.size[g]):
-            z[k] = q.reach[g] * s / t[g] * u[k] if t[g] > q.reach[g] * s else u[k]
+            z[k] = q.friction_coefficient[g] * s / t[g] * u[k] if t[g] > q.friction_coefficient[g] * s else u[k]
 
 
 cdef inline double shift(const blocks_t* p, const double* root, int32_t i, const double* y) noexcept nogil:
-    # s of the normal of contact i
-    cdef parts_t q
+    """Return the shift s of the normal of contact i."""
+    cdef friction_components_t q
     cdef double t[3]
     cdef double s = 0.0
     cdef int32_t g
-    scaled_parts(p, root, i, y, &q, t)
+    scaled_components(p, root, i, y, &q, t)
     for g in range(q.n):
-        s += q.reach[g] * t[g]
+        s += q.friction_coefficient[g] * t[g]
     return s
 
 
 cdef inline double imbalance(const admm_t* c, double* primal, double* dual) noexcept nogil:
-    # |x - z| and rho |z - z before|, each over the size of its vectors; the larger of both.
+    """Compute the imbalances (3) and return the larger one."""
     cdef int32_t i, m = c.blocks.n_rows
     cdef double x = 0.0, y = 0.0, s, t
     primal[0] = dual[0] = 0.0
@@ -187,8 +187,8 @@ cdef inline double imbalance(const admm_t* c, double* primal, double* dual) noex
     return primal[0] if primal[0] > dual[0] else dual[0]
 
 
-cdef inline double weighed(const admm_t* c) noexcept nogil:
-    # The rho that the last iteration asks for, or the present one.
+cdef inline double next_rho(const admm_t* c) noexcept nogil:
+    """Return the rho that balances the last iteration, or the present one if the imbalance is small."""
     cdef double primal, dual, s
     imbalance(c, &primal, &dual)
     if not primal > 0.0:
@@ -199,13 +199,13 @@ cdef inline double weighed(const admm_t* c) noexcept nogil:
 
 
 cdef public double lav_admm_workspace_size(int32_t m, int32_t memory) noexcept nogil:
-    """Numbers of a run, a whole number (no 64-bit integer by value)."""
+    """Return the number of doubles of a run, as a double because some hosts pass no 64-bit integers by value."""
     return (10.0 + 2.0 * memory) * m + CONTROL + MAX_MEMORY * MAX_MEMORY
 
 
 cdef public void lav_admm_lay(admm_t* c, const blocks_t* p, int32_t memory, double rho, double alpha,
                               double* workspace) noexcept nogil:
-    """A run over p before its first iteration, in workspace (`lav_admm_workspace_size`, zeroed)."""
+    """Initialise a run over p before its first iteration; workspace (`lav_admm_workspace_size`) must be zero-initialised."""
     cdef int64_t m = p.n_rows
     cdef int32_t i
     c.blocks = p
@@ -228,7 +228,7 @@ cdef public void lav_admm_lay(admm_t* c, const blocks_t* p, int32_t memory, doub
 
 
 cdef inline bint is_inactive(const blocks_t* p, int32_t i, const double* w) noexcept nogil:
-    """Whether the bounds hold all rows of block i at zero impulse, slack w (m), by more than rounding."""
+    """Return whether all rows of block i are strictly inactive at zero impulse with slack w (m)."""
     cdef int32_t k
     if not is_rows(p, i):
         return is_inactive_contact(p, i, w)
@@ -241,7 +241,7 @@ cdef inline bint is_inactive(const blocks_t* p, int32_t i, const double* w) noex
 cdef inline void limit_inactive(const blocks_t* p, const double* w, double* c) noexcept nogil:
     """Reduce c of blocks inactive at zero impulse, slack w, to MAX_INACTIVE_RATIO times the largest c of the others.
 
-    A far limit or a placeholder bound would otherwise take the digits of the rows that act, and rho with them.
+    A distant limit or a placeholder bound would otherwise dominate the rounding errors of the active rows, and rho.
     """
     cdef double size = 0.0, own
     cdef int32_t i, k
@@ -261,7 +261,7 @@ cdef inline void limit_inactive(const blocks_t* p, const double* w, double* c) n
 
 
 cdef public double lav_admm(admm_t* c, const factor_t* f, double* lam, int32_t* n) noexcept nogil:
-    """At most n iterations; n is what is left on return. Returns 0, or the rho that should be factored next."""
+    """Run at most n iterations; return 0, or the rho of the next factorisation. n receives the remaining iterations."""
     cdef const blocks_t* p = c.blocks
     cdef int32_t m = p.n_rows, i, mixed
     cdef double rho = c.rho, primal, dual
@@ -282,16 +282,16 @@ cdef public double lav_admm(admm_t* c, const factor_t* f, double* lam, int32_t* 
         for i in range(m):
             c.g[i] = c.alpha * (c.x[i] - c.z[i])
             c.u[i] += c.g[i]
-        if not take(&c.mixing, mixed, c.u, c.g):
+        if not store_evaluation(&c.mixing, mixed, c.u, c.g):
             c.mixed = 0
             continue
-        if not c.shifted and (c.done >= CONVEX_AT_MOST or imbalance(c, &primal, &dual) <= 1e-3):
+        if not c.shifted and (c.done >= MAX_CONVEX_ITERATIONS or imbalance(c, &primal, &dual) <= 1e-3):
             c.shifted = 1
             forget(&c.mixing)
         if c.done >= c.next:
             if c.next > 0.0:
-                rho = weighed(c)
-            c.next = c.done + (0.25 * c.done if c.done > 4.0 * RHO_EVERY else RHO_EVERY)
+                rho = next_rho(c)
+            c.next = c.done + (0.25 * c.done if c.done > 4.0 * RHO_UPDATE_INTERVAL else RHO_UPDATE_INTERVAL)
         for i in range(m):
             c.before[i] = c.z[i]
             lam[i] = c.z[i] / c.root[i]
@@ -301,17 +301,17 @@ cdef public double lav_admm(admm_t* c, const factor_t* f, double* lam, int32_t* 
             forget(&c.mixing)
             c.mixed = 0
             return rho
-        c.mixed = mix(&c.mixing, c.u, 1e4)    # (1e3 and 1e5 do as well) without: impulses of 1e15 on rows of low rank
+        c.mixed = mix(&c.mixing, c.u, 1e4)    # Without a limit, impulses on rows of low rank reach 1e15; 1e3 and 1e5 also work.
     return 0.0
 
 
 cdef public void lav_admm_start(admm_t* c, const double* lam, const double* w) noexcept nogil:
-    """u of a start lam and its slack w (m): z + y / rho with y = -(w + s) in the scale of u."""
+    """Compute u = z + y / rho from a start lam and its slack w (m), with y = -(w + s) in the scale of u."""
     cdef const blocks_t* p = c.blocks
     cdef int32_t i
     for i in range(p.n_rows):
         c.y[i] = -w[i] / c.root[i]
-        if c.c[i] != p.b[i] / c.root[i]:                # of `limit_inactive`
+        if c.c[i] != p.b[i] / c.root[i]:                # c was reduced by `limit_inactive`
             c.y[i] = c.c[i] - (w[i] + p.b[i]) / c.root[i]
     for i in range(p.n_rows):
         c.u[i] = c.y[i]
@@ -324,13 +324,13 @@ cdef public void lav_admm_start(admm_t* c, const double* lam, const double* w) n
 
 
 cdef class Splitting:
-    """A run over a problem, whose factorisations the caller makes.
+    """A run over a problem, with factorisations that the caller computes.
 
     Parameters
     ----------
     p : Data
     memory : int
-        Iterations that are mixed, 0 to MAX_MEMORY.
+        Number of iterations that are mixed, 0 to MAX_MEMORY.
     rho, alpha : float
         The first penalty; the relaxation.
     """
@@ -347,27 +347,28 @@ cdef class Splitting:
 
     @property
     def rho(self):
-        """The penalty that the factor must have."""
+        """Penalty that the factor must have."""
         return self.c.rho
 
     @property
     def undone(self):
-        """Mixed steps that were undone."""
+        """Number of mixed steps that were undone."""
         return int(self.c.mixing.control[UNDONE])
 
     def start(self, const double[::1] lam, const double[::1] w):
-        """From an impulse and its slack (m,)."""
+        """Start from an impulse and its slack (m,)."""
         if lam.shape[0]:
             lav_admm_start(&self.c, &lam[0], &w[0])
 
     def run(self, double[::1] lam, int n, factor):
-        """At most `n` iterations in place, GIL released: how many. `rho` may be another then, and asks for a factor.
+        """Run at most `n` iterations in place, without the GIL; return their number.
 
-        factor: (PANELS or BODIES, order, arrays) with the arrays that `factor_t` names, in its order.
+        If `rho` has changed on return, a new factor is needed. factor is (PANELS or BODIES, order, arrays) with the arrays of
+        `factor_t` in its order.
         """
         cdef factor_t f
-        cdef int32_t left = n
-        cdef double wanted
+        cdef int32_t remaining = n
+        cdef double new_rho
         cdef double[::1] work
         cdef const double[::1] k_val, e
         cdef const int32_t[::1] k_ptr, k_col
@@ -382,7 +383,7 @@ cdef class Splitting:
         work = np.empty(f.n + 1)
         self.c.work = &work[0]
         with nogil:
-            wanted = lav_admm(&self.c, &f, &lam[0], &left)
-        if wanted > 0.0:
-            self.c.rho = wanted
-        return n - left
+            new_rho = lav_admm(&self.c, &f, &lam[0], &remaining)
+        if new_rho > 0.0:
+            self.c.rho = new_rho
+        return n - remaining

@@ -2,11 +2,10 @@
 
     u <- v - sum_i gamma_i (v_i+1 - v_i),    gamma = argmin |g - sum_i gamma_i (g_i+1 - g_i)|         (1)
 
-Safeguards: where a mixed u multiplied |g| by more than 2 it is undone and the memory cleared. Where sum |gamma_i| is
-above a limit of the caller's nothing is mixed and the memory cleared (bounded coefficients: Toth, Kelley, Convergence
-analysis for Anderson acceleration, 2015). Where WINDOW evaluations have not brought the
-least |g| below 0.9 of what it was, as many plain ones follow.
-All sums run in a fixed order.
+Safeguards: if a mixed u increases |g| by more than a factor of 2, it is undone and the memory is cleared. If sum |gamma_i| is
+above a limit of the caller, nothing is mixed and the memory is cleared (bounded coefficients: Toth, Kelley, Convergence
+analysis for Anderson acceleration, 2015). If WINDOW evaluations do not reduce the lowest |g| below 0.9 of its previous value,
+the same number of evaluations without mixing follows. All sums have a fixed order.
 """
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
@@ -18,35 +17,35 @@ cdef enum:
     MAX_MEMORY = 16
     WINDOW = 200
 
-cdef enum:                      # places in control
-    LAST = 0                    # |g| of the last evaluation
-    KEPT = 1                    # differences in memory
-    HEAD = 2                    # slot of the next one
-    FRESH = 3                   # v and g of the evaluation before are there
-    REST = 4                    # plain evaluations to come
-    LEAST = 5                   # least |g| so far, 0 before any
-    AGO = 6                     # the same when the window began
-    STEPS = 7                   # evaluations since then
-    UNDONE = 8                  # mixed u that were undone
-    CONTROL = 9
+cdef enum:                      # indices in `control`
+    LAST_NORM = 0               # |g| of the last evaluation
+    N_DIFFERENCES = 1           # number of differences in memory
+    NEXT_SLOT = 2               # slot of the next difference
+    HAS_PREVIOUS = 3            # 1 if v and g of the previous evaluation are stored
+    N_UNMIXED = 4               # number of following evaluations without mixing
+    LOWEST_NORM = 5             # lowest |g| so far, 0 before any
+    WINDOW_NORM = 6             # lowest |g| at the beginning of the window
+    WINDOW_STEPS = 7            # evaluations since the beginning of the window
+    UNDONE = 8                  # number of mixed u that were undone
+    CONTROL = 9                 # length of `control`
 
 
 cdef struct mixing_t:
     int32_t m
     int32_t memory
     double* control             # (CONTROL), zero at the start
-    double* gram                # (MAX_MEMORY, MAX_MEMORY) of the dg
-    double* v                   # (m) of the evaluation before
-    double* g                   # (m)
-    double* dv                  # (memory, m) differences, a ring
-    double* dg                  # (memory, m)
+    double* gram                # (MAX_MEMORY, MAX_MEMORY) products of the dg
+    double* v                   # (m) v of the previous evaluation
+    double* g                   # (m) g of the previous evaluation
+    double* dv                  # (memory, m) differences of v, a ring buffer
+    double* dg                  # (memory, m) differences of g
 
 
 cdef inline int32_t least_squares(int32_t n, int32_t head, int32_t memory, const double* gram, const double* rhs,
                                   double* gamma) noexcept nogil:
-    """gamma (memory), by slot, of the normal equations over the n newest differences; how many took part.
+    """Solve the normal equations over the n newest differences for gamma (memory), by slot; return the number of columns used.
 
-    Cholesky, newest first: a column whose pivot is below 1e-12 of its square says nothing new and is left out.
+    Cholesky factorisation, newest first. A column whose pivot is at most 1e-12 of its square is linearly dependent and omitted.
     """
     cdef double l[MAX_MEMORY * MAX_MEMORY]
     cdef double y[MAX_MEMORY]
@@ -87,23 +86,23 @@ cdef inline int32_t least_squares(int32_t n, int32_t head, int32_t memory, const
     return used
 
 
-cdef inline int32_t mix(const mixing_t* c, double* u, double most) noexcept nogil:
-    """u holds the last v on entry, (1) on return; 1 where something was mixed. `most`: sum of |gamma| up to which it is."""
-    cdef int32_t kept = <int32_t>c.control[KEPT], head = <int32_t>c.control[HEAD], i, j, k
+cdef inline int32_t mix(const mixing_t* c, double* u, double max_weight) noexcept nogil:
+    """Replace u, which holds the last v, by (1) and return 1; return 0 if nothing is mixed, as if sum |gamma| > max_weight."""
+    cdef int32_t n_differences = <int32_t>c.control[N_DIFFERENCES], head = <int32_t>c.control[NEXT_SLOT], i, j, k
     cdef double rhs[MAX_MEMORY]
     cdef double gamma[MAX_MEMORY]
     cdef double a, weight = 0.0
     cdef const double* x
-    if kept == 0 or c.control[REST] > 0.0:
+    if n_differences == 0 or c.control[N_UNMIXED] > 0.0:
         return 0
-    for k in range(kept):
+    for k in range(n_differences):
         j = (head - 1 - k + 2 * c.memory) % c.memory
         rhs[j] = dot(c.dg + j * c.m, c.g, c.m)
-    if least_squares(kept, head, c.memory, c.gram, rhs, gamma) == 0:
+    if least_squares(n_differences, head, c.memory, c.gram, rhs, gamma) == 0:
         return 0
     for j in range(c.memory):
         weight += fabs(gamma[j])
-    if weight > most:
+    if weight > max_weight:
         forget(c)
         return 0
     for j in range(c.memory):
@@ -116,53 +115,54 @@ cdef inline int32_t mix(const mixing_t* c, double* u, double most) noexcept nogi
 
 
 cdef inline void forget(const mixing_t* c) noexcept nogil:
-    c.control[KEPT] = 0.0
-    c.control[FRESH] = 0.0
+    """Clear the memory."""
+    c.control[N_DIFFERENCES] = 0.0
+    c.control[HAS_PREVIOUS] = 0.0
 
 
-cdef inline int32_t take(const mixing_t* c, int32_t mixed, double* v, const double* g) noexcept nogil:
-    """Remember the evaluation (v, g) of a u; 0 where that u is undone, v then being the one before."""
-    cdef int32_t kept = <int32_t>c.control[KEPT], head = <int32_t>c.control[HEAD], i, j, k
+cdef inline int32_t store_evaluation(const mixing_t* c, int32_t mixed, double* v, const double* g) noexcept nogil:
+    """Store the evaluation (v, g) of u and return 1; return 0 if u is undone, with v replaced by the previous one."""
+    cdef int32_t n_differences = <int32_t>c.control[N_DIFFERENCES], head = <int32_t>c.control[NEXT_SLOT], i, j, k
     cdef double size = sqrt(dot(g, g, c.m)), x
     cdef double* dv
     cdef double* dg
-    if mixed and not size <= 2.0 * c.control[LAST]:
+    if mixed and not size <= 2.0 * c.control[LAST_NORM]:
         for i in range(c.m):
             v[i] = c.v[i]
         forget(c)
         c.control[UNDONE] += 1.0
         return 0
-    c.control[LAST] = size
-    if c.control[LEAST] == 0.0 or size < c.control[LEAST]:
-        c.control[LEAST] = size
-    if c.control[REST] > 0.0:
-        c.control[REST] -= 1.0
+    c.control[LAST_NORM] = size
+    if c.control[LOWEST_NORM] == 0.0 or size < c.control[LOWEST_NORM]:
+        c.control[LOWEST_NORM] = size
+    if c.control[N_UNMIXED] > 0.0:
+        c.control[N_UNMIXED] -= 1.0
     else:
-        c.control[STEPS] += 1.0
-        if c.control[STEPS] >= WINDOW:
-            if c.control[AGO] > 0.0 and c.control[LEAST] > 0.9 * c.control[AGO]:
-                c.control[REST] = WINDOW
+        c.control[WINDOW_STEPS] += 1.0
+        if c.control[WINDOW_STEPS] >= WINDOW:
+            if c.control[WINDOW_NORM] > 0.0 and c.control[LOWEST_NORM] > 0.9 * c.control[WINDOW_NORM]:
+                c.control[N_UNMIXED] = WINDOW
                 forget(c)
-                kept = 0
-            c.control[AGO] = c.control[LEAST]
-            c.control[STEPS] = 0.0
-    if c.control[FRESH] > 0.0 and c.control[REST] <= 1.0 and c.memory > 0:
+                n_differences = 0
+            c.control[WINDOW_NORM] = c.control[LOWEST_NORM]
+            c.control[WINDOW_STEPS] = 0.0
+    if c.control[HAS_PREVIOUS] > 0.0 and c.control[N_UNMIXED] <= 1.0 and c.memory > 0:
         dv = c.dv + head * c.m
         dg = c.dg + head * c.m
         for i in range(c.m):
             dv[i] = v[i] - c.v[i]
             dg[i] = g[i] - c.g[i]
-        if kept < c.memory:
-            kept += 1
-        for k in range(kept):
+        if n_differences < c.memory:
+            n_differences += 1
+        for k in range(n_differences):
             j = (head - k + 2 * c.memory) % c.memory
             x = dot(c.dg + j * c.m, dg, c.m)
             c.gram[MAX_MEMORY * head + j] = x
             c.gram[MAX_MEMORY * j + head] = x
-        c.control[KEPT] = kept
-        c.control[HEAD] = (head + 1) % c.memory
+        c.control[N_DIFFERENCES] = n_differences
+        c.control[NEXT_SLOT] = (head + 1) % c.memory
     for i in range(c.m):
         c.v[i] = v[i]
         c.g[i] = g[i]
-    c.control[FRESH] = 1.0
+    c.control[HAS_PREVIOUS] = 1.0
     return 1

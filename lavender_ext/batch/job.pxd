@@ -9,11 +9,11 @@ from libc.math cimport INFINITY, NAN, fabs, sqrt
 from libc.string cimport memset
 
 from lavender_ext.core.assemble cimport lav_assemble, lav_body_blocks, lav_expand_rows
-from lavender_ext.core.door cimport first_outside
-from lavender_ext.core.method cimport MORE, REACHED, NEEDS_WORKSPACE, options_t, workspace_t, said_t
+from lavender_ext.core.validate cimport first_invalid
+from lavender_ext.core.method cimport MORE, REACHED, NEEDS_WORKSPACE, options_t, workspace_t, info_t
 from lavender_ext.core.islands cimport islands_index
-from lavender_ext.core.parts cimport CONE, blocks_t, is_rows, islands_t
-from lavender_ext.core.problem cimport MADE, lav_rows_diagonal, made_t, make_numbers, matrix_numbers
+from lavender_ext.core.block_types cimport CONE, blocks_t, is_rows, islands_t
+from lavender_ext.core.problem cimport DERIVED, lav_rows_diagonal, derived_t, compute_derived, matrix_numbers
 from lavender_ext.core.view cimport csr_t, generalized_t, rows_t, view_t
 from lavender_ext.driver.driver cimport NEWTON, lav_workspace_size, lav_start, lav_step
 from lavender_ext.factor.tiles cimport has_wide
@@ -47,7 +47,7 @@ cdef struct task_t:
     rows_t r
     const double* dense         # A (m, m), to be converted to `a`
     int64_t row                 # stride of its rows
-    made_t made                 # derived numbers, of the data object or of this call
+    derived_t made                 # derived numbers, of the data object or of this call
     bint has_derived            # `made` is valid for this problem
     double zero_residual[3]     # E0, V0, relative residual of the zero impulse; E0 < 0: not known
     islands_t islands           # target of p.islands, if this call computed the islands
@@ -100,13 +100,13 @@ cdef inline int32_t step_within_cost(task_t* j, const view_t* v, const options_t
     Each call runs as many steps as the remaining cost permits if every step factorises. Steps without a factorisation cost
     less, so that the calls are repeated.
     """
-    cdef said_t said = said_t(0, 0, 0, 0, 0.0, NULL, NULL)
+    cdef info_t info = info_t(0, 0, 0, 0, 0.0, NULL, NULL)
     cdef int32_t code = MORE
     cdef double each = estimate_cost(j, l, r.work, 1, STEP_EVALUATIONS) - estimate_cost(j, l, r.work, 0, 0.0), fit = 1.0
     while code == MORE and fit >= 1.0:
-        fit = (j.cost_limit - estimate_cost(j, l, r.work, said.factorisations, said.evaluations)) / each
-        code = lav_step(v, o, r, <int32_t>max(fit, 0.0) if fit < o.budget else o.budget, j.lam, &said)
-    j.counts[0], j.counts[1], j.counts[2], j.counts[3] = said.work, said.factorisations, said.rounds, said.evaluations
+        fit = (j.cost_limit - estimate_cost(j, l, r.work, info.factorisations, info.evaluations)) / each
+        code = lav_step(v, o, r, <int32_t>max(fit, 0.0) if fit < o.budget else o.budget, j.lam, &info)
+    j.counts[0], j.counts[1], j.counts[2], j.counts[3] = info.work, info.factorisations, info.rounds, info.evaluations
     j.limit_reached = code == MORE
     return code
 
@@ -167,8 +167,8 @@ cdef inline void judge_task(task_t* j, double tol, double* x) noexcept nogil:
 cdef inline bint ensure_derived(task_t* j) noexcept nogil:
     """Compute the derived numbers d, Y unless they are known; return whether they are in the valid range."""
     if not j.has_derived:
-        j.has_derived = make_numbers(&j.p, &j.g, &j.made) == MADE
-    return j.has_derived and first_outside(j.p.d, j.p.n_rows) < 0
+        j.has_derived = compute_derived(&j.p, &j.g, &j.made) == DERIVED
+    return j.has_derived and first_invalid(j.p.d, j.p.n_rows) < 0
 
 
 cdef inline void solve_task(task_t* j, workspace_t* workspace, workspace_t* islands, const limits_t* limits,
@@ -194,7 +194,7 @@ cdef inline void solve_task(task_t* j, workspace_t* workspace, workspace_t* isla
     if not o.work > 0.0:
         return
     lav_workspace_size(&v, &o, &r)
-    while code == NEEDS_WORKSPACE and not r.laid:
+    while code == NEEDS_WORKSPACE and not r.is_bound:
         if not has_workspace_size(workspace, r.n_index, 0):
             return
         r.index = workspace.index
@@ -239,7 +239,7 @@ cdef inline bint derive_matrix(task_t* j, workspace_t* workspace) noexcept nogil
 
 
 cdef inline bint derive_bodies(task_t* j, workspace_t* workspace) noexcept nogil:
-    """Compute d, nu, step, joints' M^-1 J^T, contacts' coupling and swing; return whether d is in the valid range."""
+    """Compute d, nu, step, joints' M^-1 J^T, coupling and inv_inertia_arm of contacts; return whether d is in the valid range."""
     cdef int64_t m = j.p.n_rows, joints = j.p.ptr[j.r.n_joints], c = j.r.n_contacts
     cdef int64_t n = 3 * (m + 1) + 12 * joints + 5 * c + 6 * (m - joints)
     cdef double* x
@@ -249,11 +249,11 @@ cdef inline bint derive_bodies(task_t* j, workspace_t* workspace) noexcept nogil
     x, of_joints = workspace.real, workspace.real + 3 * (m + 1)
     memset(x, 0, n * sizeof(double))
     j.p.d, j.p.nu, j.p.step = x, x + m + 1, x + 2 * (m + 1)
-    j.r.minv_jac, j.r.coupling, j.r.swing = of_joints, of_joints + 12 * joints, of_joints + 12 * joints + 5 * c
+    j.r.minv_jac, j.r.coupling, j.r.inv_inertia_arm = of_joints, of_joints + 12 * joints, of_joints + 12 * joints + 5 * c
     j.made.n_empty = lav_rows_diagonal(&j.p, &j.r, x, x + m + 1, x + 2 * (m + 1), workspace.index, of_joints,
                                        of_joints + 12 * joints,
                                        of_joints + 12 * joints + 5 * c)
-    return first_outside(j.p.d, m) < 0
+    return first_invalid(j.p.d, m) < 0
 
 
 cdef inline bint form_matrix(task_t* j, small_problem_t* s, workspace_t* workspace) noexcept nogil:

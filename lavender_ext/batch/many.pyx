@@ -14,7 +14,7 @@ import numpy as np
 from lavender_ext.core.arrays cimport doubles, ints, ndarray
 from lavender_ext.core.blocks cimport Blocks
 from lavender_ext.core.method cimport workspace_t
-from lavender_ext.core.problem cimport Data, made_t
+from lavender_ext.core.problem cimport Data, derived_t
 from lavender_ext.core.problem import LAWS
 from lavender_ext.core.view cimport view_t
 from lavender_ext.small.call cimport N_COUNTS, Rules, small_rules_t, small_problem_t, judge_small
@@ -75,7 +75,7 @@ cdef int set_data_task(task_t* j, Data p, start, double* lam, double* slack_erro
     """Set up a task from the data `p`, with the start `start` (m,) [N s] or the zero impulse if it is None."""
     j.p, j.g, j.a, j.r, j.general, j.factored = p.blocks, p.general, p.csr, p.rows, p.is_general, p.factored
     j.has_derived = p.ready
-    j.made = p.made
+    j.made = p.derived
     if not p.is_general:
         j.made.n_empty = <int32_t>len(p.empty)
     j.zero_residual[0], j.zero_residual[1], j.zero_residual[2] = p.reference_energy, p.reference_velocity, p.relative_at_zero
@@ -205,7 +205,7 @@ def data_of(list problems, kind):
 cdef struct worker_t:             # memory of one thread
     workspace_t workspace
     workspace_t slack_error
-    made_t made
+    derived_t made
     worker_scratch_t scratch
     task_workspaces_t small
     workspace_t by_island
@@ -335,7 +335,7 @@ cdef class Worlds:
     cdef bint is_general(self, int64_t i) noexcept nogil:
         return self.tasks[i].general if self.tasks != NULL else self.w.general
 
-    cdef int32_t lay(self, int64_t i, worker_scratch_t* scratch, workspace_t* slack_error, const made_t* made,
+    cdef int32_t lay(self, int64_t i, worker_scratch_t* scratch, workspace_t* slack_error, const derived_t* made,
                      task_t* j) noexcept nogil:
         """Convert world i for a solve or for the judge; return READY, BAD or LEFT."""
         cdef const int64_t* at = self.w.at + i * PLACES

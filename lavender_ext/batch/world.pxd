@@ -8,11 +8,12 @@ from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memcmp, memcpy, memset
 
-from lavender_ext.core.door cimport are_pairs, first_unsized, has_outside, is_definite, is_frame, is_size, largest, least
+from lavender_ext.core.validate cimport (are_pairs, first_invalid_magnitude, has_invalid, is_definite, is_frame,
+                                         is_valid_magnitude, norm_inf, min_magnitude)
 from lavender_ext.core.generalized cimport jac_row
 from lavender_ext.core.tree cimport tree_factor, tree_pattern
 from lavender_ext.core.method cimport workspace_t
-from lavender_ext.core.parts cimport blocks_t, from_block, is_rows
+from lavender_ext.core.block_types cimport blocks_t, from_block, is_rows
 from lavender_ext.core.rows cimport rows_times
 from lavender_ext.judge.rounding cimport mass_t
 from lavender_ext.small.workspace cimport has_workspace_size
@@ -316,7 +317,7 @@ cdef inline int32_t lay_world(const worlds_t* w, int64_t i, worker_scratch_t* d,
     g.n, g.m, g.jptr, g.jidx, g.jval = n, m, ptr, idx, x
     a = read_matrix(w, 0, at[JAC], m, n, &row, x + numbers)
     entries = compress_rows(a, row, m, n, ptr, idx, x)
-    if has_outside(x, entries):
+    if has_invalid(x, entries):
         return BAD
     # lower triangle of M in compressed rows
     ptr, x = idx + all, x + all
@@ -324,7 +325,7 @@ cdef inline int32_t lay_world(const worlds_t* w, int64_t i, worker_scratch_t* d,
     if w.mass_ptr != NULL:
         row = entries = w.mass_ptr[n]
         a = read_matrix(w, 1, at[MASS], 1, entries, &row, d.workspace.real + numbers)
-        if has_outside(a, entries):
+        if has_invalid(a, entries):
             return BAD
         d.mass.ptr, d.mass.idx, d.mass.val = w.mass_ptr, w.mass_col, a
         entries = reuse_shared_pattern(w, d, n, a, g)
@@ -336,7 +337,7 @@ cdef inline int32_t lay_world(const worlds_t* w, int64_t i, worker_scratch_t* d,
         row = w.mass_row
         a = read_matrix(w, 1, at[MASS], n, n, &row, d.workspace.real + numbers)
         entries = compress_lower_triangle(a, row, w.asymmetry, n, ptr, idx, x)
-        if entries < 0 or has_outside(x, entries):
+        if entries < 0 or has_invalid(x, entries):
             return BAD
         d.mass.ptr, d.mass.idx, d.mass.val = ptr, idx, x
         shared = False
@@ -360,9 +361,9 @@ cdef inline int32_t lay_world(const worlds_t* w, int64_t i, worker_scratch_t* d,
     read_numbers(w, 4, at[SOFT], m, <double*>g.compliance)
     for j in range(m):
         b[j] -= jac_row(g, j, d.free)
-    if first_unsized(g.compliance, m) >= 0 or has_outside(d.free, n) or has_outside(b, m):
+    if first_invalid_magnitude(g.compliance, m) >= 0 or has_invalid(d.free, n) or has_invalid(b, m):
         return BAD
-    if 0.0 < largest(b, m) < least():
+    if 0.0 < norm_inf(b, m) < min_magnitude():
         return BAD
     return lay_blocks(w, at, p, b, idx + half, x + n + 2 * m)
 
@@ -378,10 +379,10 @@ cdef inline int32_t lay_matrix(const worlds_t* w, int64_t i, worker_scratch_t* d
     b, row[0] = d.workspace.real, w.jac_row
     a[0] = read_matrix(w, 0, at[JAC], m, m, row, b + m + k)
     for j in range(m):
-        if has_outside(a[0] + j * row[0], m):
+        if has_invalid(a[0] + j * row[0], m):
             return BAD
     read_numbers(w, 3, at[TARGET], m, b)
-    if has_outside(b, m) or 0.0 < largest(b, m) < least():
+    if has_invalid(b, m) or 0.0 < norm_inf(b, m) < min_magnitude():
         return BAD
     return lay_blocks(w, at, p, b, d.workspace.index, b + m)
 
@@ -400,7 +401,7 @@ cdef inline int32_t lay_bodies(const worlds_t* w, int64_t i, worker_scratch_t* d
         return LEFT
     for k in range(FIELDS):
         x[k] = o.field[k] + i * o.step[k]
-        if has_outside(x[k], size[k]):
+        if has_invalid(x[k], size[k]):
             return LEFT
     r.n_bodies, r.n_joints, r.n_contacts = o.n, kj, c
     r.joint_body, r.contact_body = o.pair[0] + i * o.pair_step[0], o.pair[1] + i * o.pair_step[1]
@@ -408,10 +409,10 @@ cdef inline int32_t lay_bodies(const worlds_t* w, int64_t i, worker_scratch_t* d
     r.normal, r.tangent, r.arm_a, r.arm_b = x[NORMAL], x[TANGENT], x[ARM_A], x[ARM_B]
     if not are_pairs(r.joint_body, kj, o.n, False) or not are_pairs(r.contact_body, c, o.n, True):
         return LEFT
-    if first_unsized(r.inv_mass, o.n) >= 0 or first_unsized(r.compliance, m) >= 0:
+    if first_invalid_magnitude(r.inv_mass, o.n) >= 0 or first_invalid_magnitude(r.compliance, m) >= 0:
         return LEFT
     for k in range(o.n):
-        if not is_size(largest(r.inv_inertia + 9 * k, 9)) or not is_definite(r.inv_inertia + 9 * k, 5e-10, 0.0, 1e-6):
+        if not is_valid_magnitude(norm_inf(r.inv_inertia + 9 * k, 9)) or not is_definite(r.inv_inertia + 9 * k, 5e-10, 0.0, 1e-6):
             return LEFT
     for k in range(c):
         if not is_frame(r.normal + 3 * k, r.tangent + 3 * k, 5e-10):
@@ -425,7 +426,7 @@ cdef inline int32_t lay_bodies(const worlds_t* w, int64_t i, worker_scratch_t* d
     rows_times(p, r, d.free, b)
     for k in range(m):
         b[k] = x[BODY_TARGET][k] - b[k]
-    return LEFT if has_outside(b, m) or 0.0 < largest(b, m) < least() else READY
+    return LEFT if has_invalid(b, m) or 0.0 < norm_inf(b, m) < min_magnitude() else READY
 
 
 cdef inline int32_t lay_blocks(const worlds_t* w, const int64_t* at, blocks_t* p, const double* b, int32_t* ptr,
@@ -445,6 +446,6 @@ cdef inline int32_t lay_blocks(const worlds_t* w, const int64_t* at, blocks_t* p
         read_numbers(w, 5, at[MU], p.n_blocks, mu)
         p.mu = mu
     for k in range(p.n_blocks):
-        if not is_size(p.mu[k]) or (not is_rows(p, k) and not is_size(p.mu[k] * p.patch_radius[k])):
+        if not is_valid_magnitude(p.mu[k]) or (not is_rows(p, k) and not is_valid_magnitude(p.mu[k] * p.patch_radius[k])):
             return BAD
     return READY

@@ -1,1 +1,1 @@
-"""Blocks and their update, rows and bodies, matrices in compressed rows, a problem's derived numbers, sweep orders."""
+"""Blocks and their update, bodies and rows, sparse matrices, derived numbers of a problem, sweep orders."""

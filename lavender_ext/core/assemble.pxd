@@ -1,7 +1,7 @@
-"""A of bodies, for other compiled loops."""
+"""Assembly of A from bodies, for other compiled loops."""
 from libc.stdint cimport int32_t, int64_t
 
-from lavender_ext.core.parts cimport blocks_t
+from lavender_ext.core.block_types cimport blocks_t
 from lavender_ext.core.view cimport rows_t
 
 
@@ -9,5 +9,5 @@ cdef public void lav_expand_rows(const blocks_t* p, const rows_t* r, double* jac
 cdef public void lav_body_blocks(const blocks_t* p, const rows_t* r, int32_t* start, int32_t* blocks,
                                  int64_t* bound) noexcept nogil
 cdef public void lav_assemble(const blocks_t* p, const rows_t* r, const double* jac, const double* minv_jac,
-                              const int32_t* start, const int32_t* blocks, int32_t* near, int32_t* sides,
+                              const int32_t* start, const int32_t* blocks, int32_t* neighbors, int32_t* sides,
                               int32_t* next_, int32_t* indptr, int32_t* indices, double* data) noexcept nogil

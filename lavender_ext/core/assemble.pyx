@@ -2,16 +2,16 @@
 
     A_rc = sum over the bodies that rows r and c share of J_r . (M^-1 J^T)_c
 
-Blocks that meet at a body are found from the blocks of each body; entries that are exactly zero are left out.
-A_rc is formed once, from r <= c, so that A is symmetric to the bit.
+Blocks that share a body are found from the list of blocks of each body. Entries that are exactly zero are not stored.
+A_rc is computed once, for r <= c, so that A is symmetric to the bit.
 """
 from libc.stdint cimport INT32_MAX, int32_t, int64_t
 
 import numpy as np
 
-from lavender_ext.core.csr cimport by_columns
-from lavender_ext.core.door cimport is_number
-from lavender_ext.core.parts cimport blocks_t, n_directions, n_turns
+from lavender_ext.core.csr cimport transpose_csr
+from lavender_ext.core.validate cimport is_number
+from lavender_ext.core.block_types cimport blocks_t, n_tangents, n_angular_rows
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.rows cimport contact_jacobian, dot6, minv_times
 from lavender_ext.core.view cimport bodies_of, rows_t
@@ -20,7 +20,7 @@ cdef object F8 = np.dtype(np.float64), I4 = np.dtype(np.int32)
 
 
 cdef public void lav_expand_rows(const blocks_t* p, const rows_t* r, double* jac, double* minv_jac) noexcept nogil:
-    """J and M^-1 J^T of every row as (m, 12), in the layout of joint rows."""
+    """Write J and M^-1 J^T of every row as (m, 12), in the layout of joint rows."""
     cdef int32_t i, j, k, c, a, b, end
     for i in range(p.n_blocks):
         j = p.ptr[i]
@@ -32,19 +32,19 @@ cdef public void lav_expand_rows(const blocks_t* p, const rows_t* r, double* jac
                 jac[k] = r.jac[k]
         else:
             c = i - r.n_joints
-            contact_jacobian(r, c, n_directions(p, i), n_turns(p, i), jac + 12 * j)
+            contact_jacobian(r, c, n_tangents(p, i), n_angular_rows(p, i), jac + 12 * j)
         for k in range(j, end):
             minv_times(jac + 12 * k, r.inv_mass, r.inv_inertia, a, b, minv_jac + 12 * k)
 
 
 cdef public void lav_body_blocks(const blocks_t* p, const rows_t* r, int32_t* start, int32_t* blocks,
                                  int64_t* bound) noexcept nogil:
-    """Blocks of each body: blocks[start[i]:start[i + 1]], increasing; start (n + 1), blocks (2 k).
+    """List the blocks of body i in increasing order in blocks[start[i]:start[i + 1]]; start (n + 1), blocks (2 k).
 
-    bound[0] becomes a bound on the entries of A.
+    bound[0] receives an upper bound on the number of stored entries of A.
     """
     cdef int32_t i, s, x, t, sum_ = 0
-    cdef int64_t here
+    cdef int64_t n_rows
     for i in range(r.n_bodies + 1):
         start[i] = 0
     for i in range(p.n_blocks):
@@ -69,18 +69,20 @@ cdef public void lav_body_blocks(const blocks_t* p, const rows_t* r, int32_t* st
     start[0] = 0
     bound[0] = 0
     for i in range(p.n_blocks):
-        here = p.ptr[i + 1] - p.ptr[i]
+        n_rows = p.ptr[i + 1] - p.ptr[i]
         t = (bodies_of(r, i)[0] >= 0) + (bodies_of(r, i)[1] >= 0)
-        bound[0] += here if t == 0 else (1 - t) * here * here    # a block meets itself once, not at both bodies
+        # The loop over bodies counts a block with itself once for each of its moving bodies; count it once in all.
+        bound[0] += n_rows if t == 0 else (1 - t) * n_rows * n_rows
     for i in range(r.n_bodies):
-        here = 0
+        n_rows = 0
         for x in range(start[i], start[i + 1]):
-            here += p.ptr[blocks[x] + 1] - p.ptr[blocks[x]]
-        bound[0] += here * here
+            n_rows += p.ptr[blocks[x] + 1] - p.ptr[blocks[x]]
+        bound[0] += n_rows * n_rows
 
 
-cdef inline int32_t meet(const rows_t* r, int32_t i, const int32_t* start, const int32_t* blocks, int32_t* out) noexcept nogil:
-    # Blocks that share a body with block i, increasing: the merge of two sorted lists; i itself always.
+cdef inline int32_t find_neighbors(const rows_t* r, int32_t i, const int32_t* start, const int32_t* blocks,
+                                   int32_t* out) noexcept nogil:
+    """List block i and the blocks that share a body with it in `out`, increasing; return their number."""
     cdef int32_t a = bodies_of(r, i)[0], b = bodies_of(r, i)[1], x = 0, y = 0, xe = 0, ye = 0, n = 0, u, v
     if a >= 0:
         x = start[a]
@@ -102,7 +104,7 @@ cdef inline int32_t meet(const rows_t* r, int32_t i, const int32_t* start, const
 
 
 cdef inline int32_t shared_sides(const rows_t* r, int32_t i, int32_t j) noexcept nogil:
-    # Bit 2 s + t: side s of block i and side t of block j are the same moving body.
+    """Return a bit set: bit 2 s + t means that side s of block i and side t of block j are the same moving body."""
     cdef int32_t s, t, x, bits = 0
     for s in range(2):
         x = bodies_of(r, i)[s]
@@ -112,8 +114,8 @@ cdef inline int32_t shared_sides(const rows_t* r, int32_t i, int32_t j) noexcept
     return bits
 
 
-cdef inline double meeting(const double* jac, const double* minv_jac, int32_t bits) noexcept nogil:
-    # sum over the shared bodies; bit 2 s + t: side s of jac, side t of minv_jac.
+cdef inline double coupling_entry(const double* jac, const double* minv_jac, int32_t bits) noexcept nogil:
+    """Return the entry of A of two rows: the sum over shared bodies; bit 2 s + t is side s of jac and side t of minv_jac."""
     cdef double value = 0.0
     if bits & 1:
         value += dot6(jac, minv_jac)
@@ -126,8 +128,8 @@ cdef inline double meeting(const double* jac, const double* minv_jac, int32_t bi
     return value
 
 
-cdef inline int32_t single(int32_t bits) noexcept nogil:
-    # Which of the four bits, where it is one alone; else -1.
+cdef inline int32_t single_bit(int32_t bits) noexcept nogil:
+    """Return the index (0 to 3) of the only set bit, -1 if not exactly one bit is set."""
     if bits == 1:
         return 0
     if bits == 2:
@@ -138,11 +140,11 @@ cdef inline int32_t single(int32_t bits) noexcept nogil:
 
 
 cdef public void lav_assemble(const blocks_t* p, const rows_t* r, const double* jac, const double* minv_jac,
-                              const int32_t* start, const int32_t* blocks, int32_t* near, int32_t* sides,
+                              const int32_t* start, const int32_t* blocks, int32_t* neighbors, int32_t* sides,
                               int32_t* next_, int32_t* indptr, int32_t* indices, double* data) noexcept nogil:
-    """Rows of A into indptr (m + 1), indices, data; near, sides (2 k + 1), next_ (m) are scratch.
+    """Write the rows of A into indptr (m + 1), indices, data; neighbors, sides (2 k + 1) and next_ (m) are scratch.
 
-    next_[c] is the entry of row c that the row of its column, which comes later, copies.
+    next_[c] is the entry of row c above the diagonal that will be copied next, into the row of that entry's column.
     """
     cdef int32_t i, n, q, j, row, col, end, at, bit, nnz = 0
     cdef double value
@@ -150,14 +152,15 @@ cdef public void lav_assemble(const blocks_t* p, const rows_t* r, const double* 
     cdef const double* y
     indptr[0] = 0
     for i in range(p.n_blocks):
-        n = meet(r, i, start, blocks, near)
+        n = find_neighbors(r, i, start, blocks, neighbors)
         for q in range(n):
-            sides[q] = shared_sides(r, i, near[q]) if i <= near[q] else 0
+            sides[q] = shared_sides(r, i, neighbors[q]) if i <= neighbors[q] else 0
         for row in range(p.ptr[i], p.ptr[i + 1]):
             for q in range(n):
-                j = near[q]
+                j = neighbors[q]
                 col = p.ptr[j]
                 end = p.ptr[j + 1]
+                # below the diagonal: copy from the row of the column
                 while col < end and col < row:
                     at = next_[col]
                     if at < indptr[col + 1] and indices[at] == row:
@@ -168,16 +171,16 @@ cdef public void lav_assemble(const blocks_t* p, const rows_t* r, const double* 
                     col += 1
                 if col == end:
                     continue
-                # The lower block gives J, the higher M^-1 J^T.
+                # diagonal and above: J of this row times M^-1 J^T of the column
                 if col == row:
-                    value = (meeting(jac + 12 * row, minv_jac + 12 * row, sides[q]) + r.compliance[row])
+                    value = (coupling_entry(jac + 12 * row, minv_jac + 12 * row, sides[q]) + r.compliance[row])
                     if value != 0.0:
                         indices[nnz] = row
                         data[nnz] = value
                         nnz += 1
                     next_[row] = nnz
                     col += 1
-                bit = single(sides[q])
+                bit = single_bit(sides[q])
                 if bit >= 0:
                     x = jac + 12 * row + 6 * (bit >> 1)
                     y = minv_jac + 6 * (bit & 1)
@@ -189,7 +192,7 @@ cdef public void lav_assemble(const blocks_t* p, const rows_t* r, const double* 
                         col += 1
                 else:
                     while col < end:
-                        value = meeting(jac + 12 * row, minv_jac + 12 * col, sides[q])
+                        value = coupling_entry(jac + 12 * row, minv_jac + 12 * col, sides[q])
                         indices[nnz] = col
                         data[nnz] = value
                         nnz += value != 0.0
@@ -198,45 +201,48 @@ cdef public void lav_assemble(const blocks_t* p, const rows_t* r, const double* 
 
 
 def bound(Data p):
-    """(most entries A can have, start, blocks): how large A gets before it is formed."""
-    start_ = np.empty(p.rows.n_bodies + 1, np.int32)    # a view made an array again costs more than the view
+    """Return an upper bound on the entries of A, and the lists (start, blocks) of `lav_body_blocks`."""
+    start_ = np.empty(p.rows.n_bodies + 1, np.int32)    # Converting a view back to an array costs more than creating the view.
     blocks_ = np.empty(2 * p.blocks.n_blocks + 1, np.int32)
     cdef int32_t[::1] start = start_, blocks = blocks_
-    cdef int64_t most
-    lav_body_blocks(&p.blocks, &p.rows, &start[0], &blocks[0], &most)
-    return most, start_, blocks_
+    cdef int64_t max_entries
+    lav_body_blocks(&p.blocks, &p.rows, &start[0], &blocks[0], &max_entries)
+    return max_entries, start_, blocks_
 
 
-def delassus(Data p, Py_ssize_t most, int32_t[::1] start, int32_t[::1] blocks):
-    """A as (indptr, indices, data) of compressed rows with sorted columns; arguments are `bound(p)`, most < 2^31."""
+def delassus(Data p, Py_ssize_t max_entries, int32_t[::1] start, int32_t[::1] blocks):
+    """Return A as (indptr, indices, data) of compressed rows with sorted columns.
+
+    The arguments after p are the results of `bound(p)`; max_entries must be below 2^31.
+    """
     cdef Py_ssize_t m = p.blocks.n_rows
     cdef int32_t nnz
-    data_, indices_, indptr_ = np.empty(most + 1), np.empty(most + 1, np.int32), np.zeros(m + 1, np.int32)
+    data_, indices_, indptr_ = np.empty(max_entries + 1), np.empty(max_entries + 1, np.int32), np.zeros(m + 1, np.int32)
     cdef double[::1] jac = np.empty(24 * m + 1), data = data_
     cdef double* minv_jac = &jac[12 * m]
     cdef int32_t[::1] indices = indices_, indptr = indptr_
-    cdef int32_t[::1] near = np.empty(4 * p.blocks.n_blocks + 2 + m, np.int32)
+    cdef int32_t[::1] scratch = np.empty(4 * p.blocks.n_blocks + 2 + m, np.int32)
     with nogil:
         lav_expand_rows(&p.blocks, &p.rows, &jac[0], minv_jac)
-        lav_assemble(&p.blocks, &p.rows, &jac[0], minv_jac, &start[0], &blocks[0], &near[0],
-                     &near[2 * p.blocks.n_blocks + 1], &near[0] + 4 * p.blocks.n_blocks + 2, &indptr[0], &indices[0],
+        lav_assemble(&p.blocks, &p.rows, &jac[0], minv_jac, &start[0], &blocks[0], &scratch[0],
+                     &scratch[2 * p.blocks.n_blocks + 1], &scratch[0] + 4 * p.blocks.n_blocks + 2, &indptr[0], &indices[0],
                      &data[0])
     nnz = indptr[m]
-    found = indices_[:nnz], data_[:nnz]
-    if nnz < 0.75 * most:                               # a copy costs more than a quarter of unused workspace
-        found = found[0].copy(), found[1].copy()
-    return (indptr_, *found)
+    entries = indices_[:nnz], data_[:nnz]
+    if nnz < 0.75 * max_entries:                        # Copy only if more than a quarter of the memory is unused.
+        entries = entries[0].copy(), entries[1].copy()
+    return (indptr_, *entries)
 
 
 def dense_to_csr(const double[:, ::1] a, double sign=1.0):
-    """Nonzeros of a dense matrix times a sign as (indptr, indices, data), int32; nnz must be below 2^31."""
+    """Return the nonzeros of a dense matrix times `sign` as (indptr, indices, data), int32; nnz must be below 2^31."""
     cdef Py_ssize_t i, j, n = a.shape[0], m = a.shape[1], nnz = 0, q = 0
     for i in range(n):
         for j in range(m):
             nnz += a[i, j] != 0.0
-    whole, numbers = np.empty(n + 1 + nnz, np.int32), np.empty(nnz)
-    cdef int32_t[::1] indptr = whole
-    cdef double[::1] data = numbers
+    all_indices, values = np.empty(n + 1 + nnz, np.int32), np.empty(nnz)
+    cdef int32_t[::1] indptr = all_indices
+    cdef double[::1] data = values
     cdef int32_t* indices = &indptr[0] + n + 1
     indptr[0] = 0
     for i in range(n):
@@ -246,29 +252,29 @@ def dense_to_csr(const double[:, ::1] a, double sign=1.0):
                 data[q] = sign * a[i, j]
                 q += 1
         indptr[i + 1] = <int32_t>q
-    whole.setflags(False)
-    numbers.setflags(False)
-    return whole[:n + 1], whole[n + 1:], numbers
+    all_indices.setflags(False)
+    values.setflags(False)
+    return all_indices[:n + 1], all_indices[n + 1:], values
 
 
 def transposed(const int32_t[::1] indptr, const int32_t[::1] indices, const double[::1] data, int n):
-    """(indptr, indices, data) of the transpose of a matrix (m, n) in compressed rows."""
+    """Return (indptr, indices, data) of the transpose of a matrix (m, n) in compressed rows."""
     cdef Py_ssize_t nnz = indices.shape[0]
     ptr_array, row_array, value_array = np.empty(n + 2, np.int32), np.empty(max(nnz, 1), np.int32), np.empty(max(nnz, 1))
     cdef int32_t[::1] ptr = ptr_array, row = row_array
     cdef double[::1] value = value_array
-    by_columns(<int32_t>indptr.shape[0] - 1, n, &indptr[0], &indices[0] if nnz else NULL, &data[0] if nnz else NULL,
+    transpose_csr(<int32_t>indptr.shape[0] - 1, n, &indptr[0], &indices[0] if nnz else NULL, &data[0] if nnz else NULL,
                &ptr[0], &row[0], &value[0])
     return ptr_array[:n + 1], row_array[:nnz], value_array[:nnz]
 
 
 def mirrored(const int32_t[::1] indptr, const int32_t[::1] indices, const double[::1] data):
-    """(indptr, indices, data) of both triangles of a symmetric matrix from the rows of its lower one, diagonal last."""
+    """Return (indptr, indices, data) of a symmetric matrix from its lower triangle, whose rows end with the diagonal."""
     cdef Py_ssize_t n = indptr.shape[0] - 1, nnz = indices.shape[0]
     cdef Py_ssize_t i, q, k = 0
     upper = transposed(indptr, indices, data, n)
     cdef const int32_t[::1] above = upper[0], column = upper[1]
-    cdef const double[::1] number = upper[2]
+    cdef const double[::1] upper_value = upper[2]
     ptr_array, index_array, value_array = np.zeros(n + 1, np.int32), np.empty(2 * nnz - n, np.int32), np.empty(2 * nnz - n)
     cdef int32_t[::1] ptr = ptr_array, index = index_array
     cdef double[::1] value = value_array
@@ -277,24 +283,27 @@ def mirrored(const int32_t[::1] indptr, const int32_t[::1] indices, const double
             index[k] = indices[q]
             value[k] = data[q]
             k += 1
-        for q in range(above[i] + 1, above[i + 1]):     # the diagonal is there already
+        for q in range(above[i] + 1, above[i + 1]):     # The diagonal is already stored.
             index[k] = column[q]
-            value[k] = number[q]
+            value[k] = upper_value[q]
             k += 1
         ptr[i + 1] = <int32_t>k
     return ptr_array, index_array, value_array
 
 
-cdef int32_t count_rows(Py_ssize_t lines, Py_ssize_t across, const int32_t* ptr, const int32_t* idx, const double* val,
+cdef int32_t count_row_entries(Py_ssize_t lines, Py_ssize_t n_across, const int32_t* ptr, const int32_t* idx, const double* val,
                         bint columns, int32_t* count) noexcept nogil:
-    # count[row] += its nonzeros; False where the matrix has no ascending indices in range, or numbers that the door excludes.
+    """Add the nonzeros of each row to `count`; return False if the matrix is not canonical or has an invalid entry.
+
+    Canonical: indices ascend within each line and lie in [0, n_across). Valid: (1) of core/validate.pxd.
+    """
     cdef Py_ssize_t i
     cdef int32_t p
     for i in range(lines):
         if ptr[i + 1] < ptr[i]:
             return False
         for p in range(ptr[i], ptr[i + 1]):
-            if not 0 <= idx[p] < across or p > ptr[i] and idx[p] <= idx[p - 1]:
+            if not 0 <= idx[p] < n_across or p > ptr[i] and idx[p] <= idx[p - 1]:
                 return False
             if not is_number(val[p]):
                 return False
@@ -302,31 +311,32 @@ cdef int32_t count_rows(Py_ssize_t lines, Py_ssize_t across, const int32_t* ptr,
     return True
 
 
-def stacked(int32_t n, parts):
-    """Rows of n columns of several matrices, one under another, as (indptr, indices, data) without entries that are zero.
+def stacked(int32_t n, matrices):
+    """Stack several matrices of n columns vertically; return (indptr, indices, data) without zero entries, or None.
 
-    A part is (indptr, indices, data, whether these are of columns, a sign that it is multiplied with, its rows). None where a
-    part is not int32 and float64 in canonical form, and inside the door: who checks at length finds the words.
+    A matrix is (indptr, indices, data, whether it is stored by columns, a sign that it is multiplied with, its number of
+    rows). The result is None if a matrix does not have int32 indices and float64 data in canonical form, or has an entry
+    that core/validate.pxd (1) rejects. The caller then validates in detail and raises.
     """
     cdef const int32_t[::1] ptr, idx
     cdef const double[::1] val
     cdef double sign
     cdef bint columns
     cdef int32_t m = 0, rows, first, i, p, nnz
-    for part in parts:
-        m += part[5]
-        if part[0].dtype is not I4 or part[1].dtype is not I4 or part[2].dtype is not F8:
+    for matrix in matrices:
+        m += matrix[5]
+        if matrix[0].dtype is not I4 or matrix[1].dtype is not I4 or matrix[2].dtype is not F8:
             return None
-    indptr = np.zeros(m + 2, np.int32)                  # one before, so that filling moves each pointer to its row's end
+    indptr = np.zeros(m + 2, np.int32)                  # One extra entry: filling moves each pointer to the end of its row.
     cdef int32_t[::1] start = indptr
     first = 0
-    for ptr_, idx_, val_, columns, _, rows in parts:
+    for ptr_, idx_, val_, columns, _, rows in matrices:
         ptr, idx, val = ptr_, idx_, val_
         if ptr.shape[0] != (n if columns else rows) + 1 or ptr[0] != 0 or ptr[ptr.shape[0] - 1] > idx.shape[0] \
                 or idx.shape[0] != val.shape[0]:
             return None
-        if idx.shape[0] and not count_rows(ptr.shape[0] - 1, rows if columns else n, &ptr[0], &idx[0], &val[0], columns,
-                                           &start[2] + first if rows else NULL):
+        if idx.shape[0] and not count_row_entries(ptr.shape[0] - 1, rows if columns else n, &ptr[0], &idx[0], &val[0],
+                                                  columns, &start[2] + first if rows else NULL):
             return None
         first += rows
     for i in range(m):
@@ -336,7 +346,7 @@ def stacked(int32_t n, parts):
     cdef int32_t[::1] column = indices
     cdef double[::1] value = data
     first = 1
-    for ptr_, idx_, val_, columns, sign, rows in parts:
+    for ptr_, idx_, val_, columns, sign, rows in matrices:
         ptr, idx, val = ptr_, idx_, val_
         for i in range(<int32_t>ptr.shape[0] - 1):
             for p in range(ptr[i], ptr[i + 1]):
@@ -353,7 +363,7 @@ def stacked(int32_t n, parts):
 
 cdef public void lav_gram_pattern(int32_t m, const int32_t* indptr, const int32_t* indices, const int32_t* ptr,
                                   const int32_t* row, int32_t* mark, int32_t* count) noexcept nogil:
-    """count (m + 1): where each row of Y Y^T + D begins, its diagonal always there; mark (m) is scratch."""
+    """Write the row pointers of the pattern of Y Y^T + D, diagonal included, into count (m + 1); mark (m) is scratch."""
     cdef int32_t i, q, p, k
     for i in range(m):
         mark[i] = -1
@@ -372,21 +382,21 @@ cdef public void lav_gram_pattern(int32_t m, const int32_t* indptr, const int32_
 cdef public int32_t lav_gram(int32_t m, const int32_t* indptr, const int32_t* indices, const double* data,
                              const int32_t* ptr, const int32_t* row, const double* value, const double* diagonal,
                              int32_t* next, double* sum_, int32_t* count, int32_t* out, double* entry) noexcept nogil:
-    """Y Y^T + D by columns, which are its rows; entries in all, those that are zero left out.
+    """Compute Y Y^T + D in compressed rows without zero entries; return the number of entries.
 
-    Each is a sum over the columns of Y in their order, the same for (i, j) and (j, i). count is from
-    `lav_gram_pattern`; next (2 m) is scratch, sum_ (m).
+    Each entry is a sum over the columns of Y in their order, the same for (i, j) and (j, i). count is from
+    `lav_gram_pattern`; next (2 m) and sum_ (m) are scratch.
     """
     cdef int32_t i, j, q, p, k, to = 0, begin
     cdef int32_t* list_ = next + m
     cdef double y
-    # Row i adds itself to every column it meets: rows of each column ascend.
+    # Row i appends its entries to their columns, so that the rows of each column ascend.
     for i in range(m):
         next[i] = count[i]
         sum_[i] = 0.0
         list_[i] = -1
     for i in range(m):
-        # Entries of row i, linked through `list_` from the last to the first: no order is needed.
+        # The entries of row i are linked through `list_` from the last to the first; their order does not matter.
         k = i
         list_[i] = i
         for q in range(indptr[i], indptr[i + 1]):
@@ -421,11 +431,11 @@ cdef public int32_t lav_gram(int32_t m, const int32_t* indptr, const int32_t* in
 
 
 cdef enum:
-    TILE = 4                    # rows and columns of A whose sums are in registers
+    TILE = 4                    # rows and columns of A that are summed in registers
 
 
 cdef bint is_full(int32_t m, const int32_t* indptr, const int32_t* indices) noexcept nogil:
-    """Has every row entries in the same columns, in ascending order?"""
+    """Return whether every row has entries in the same columns, in ascending order."""
     cdef int32_t i, q, n = indptr[1]
     for i in range(m):
         if indptr[i + 1] != (i + 1) * n:
@@ -436,8 +446,8 @@ cdef bint is_full(int32_t m, const int32_t* indptr, const int32_t* indices) noex
     return True
 
 
-cdef void full_gram(int32_t m, int64_t n, const double* y, const double* across, double* a) noexcept nogil:
-    """a (m, m) = Y Y^T of Y (m, n), in `across` by columns; each entry a sum in their order, as of `lav_gram`."""
+cdef void full_gram(int32_t m, int64_t n, const double* y, const double* y_transposed, double* a) noexcept nogil:
+    """Compute a (m, m) = Y Y^T of a dense Y (m, n); each entry is summed in the order of the columns, as in `lav_gram`."""
     cdef int32_t tiles = (m + TILE - 1) // TILE, down, right, i, j, r, c, high, wide
     cdef int64_t k
     cdef double x
@@ -453,19 +463,19 @@ cdef void full_gram(int32_t m, int64_t n, const double* y, const double* across,
                     for r in range(TILE):
                         x = y[(i + r) * n + k]
                         for c in range(TILE):
-                            s[TILE * r + c] += x * across[k * m + j + c]
+                            s[TILE * r + c] += x * y_transposed[k * m + j + c]
             else:
                 for k in range(n):
                     for r in range(high):
                         for c in range(wide):
-                            s[TILE * r + c] += y[(i + r) * n + k] * across[k * m + j + c]
+                            s[TILE * r + c] += y[(i + r) * n + k] * y_transposed[k * m + j + c]
             for r in range(high):
                 for c in range(wide):
                     a[<int64_t>(i + r) * m + j + c] = a[<int64_t>(j + c) * m + i + r] = s[TILE * r + c]
 
 
 cdef int32_t full_rows(int32_t m, const double* diagonal, int32_t* count, int32_t* out, double* entry) noexcept nogil:
-    """D is added to A (m, m), and entries that are zero are left out."""
+    """Add D to the dense A (m, m) and compress it to rows without zero entries; return the number of entries."""
     cdef int32_t i, j, to = 0
     cdef double x
     for i in range(m):
@@ -482,7 +492,7 @@ cdef int32_t full_rows(int32_t m, const double* diagonal, int32_t* count, int32_
 
 
 def gram(const double[::1] data, const int32_t[::1] indices, const int32_t[::1] indptr, int n, const double[::1] diagonal):
-    """(indptr, indices, data) of Y Y^T + D, columns sorted, of Y (m, n) in compressed rows; D = diag(diagonal)."""
+    """Return (indptr, indices, data) of Y Y^T + D, columns sorted, for Y (m, n) in compressed rows and D = diag(diagonal)."""
     cdef int32_t m = <int32_t>indptr.shape[0] - 1, nnz = <int32_t>indices.shape[0], total
     cdef int32_t[::1] whole = np.empty(n + 2 + nnz + 2 * m + 1, np.int32), count, out
     cdef double[::1] value = np.empty(nnz + m + 1), entry
@@ -497,7 +507,7 @@ def gram(const double[::1] data, const int32_t[::1] indices, const int32_t[::1] 
         return count_array, np.empty(0, np.int32), np.empty(0)
     count = count_array
     with nogil:
-        by_columns(m, n, &indptr[0], columns, numbers, ptr, row, &value[0])
+        transpose_csr(m, n, &indptr[0], columns, numbers, ptr, row, &value[0])
         full = nnz > 0 and <int64_t>m * m < INT32_MAX and is_full(m, &indptr[0], columns)
         if full:
             count[m] = m * m

@@ -1,4 +1,4 @@
-"""Sets of at most 64 numbers as bits."""
+"""Sets of the integers 0 to 63 as bits of a word."""
 from libc.stdint cimport int32_t, uint64_t
 
 
@@ -17,4 +17,4 @@ cdef extern from *:
     #endif
     #endif
     """
-    int32_t lowest "lavender_lowest"(uint64_t x) noexcept nogil     # x is not empty
+    int32_t lowest "lavender_lowest"(uint64_t x) noexcept nogil     # index of the lowest set bit of x; x must not be 0

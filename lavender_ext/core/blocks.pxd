@@ -1,17 +1,17 @@
-"""Blocks of a problem: plain pointers into arrays that stay alive with the object."""
+"""Blocks of a problem: pointers into arrays that the object keeps alive."""
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.parts cimport blocks_t
+from lavender_ext.core.block_types cimport blocks_t
 
 
 cdef class Blocks:
     cdef blocks_t at                                    # without law, b, d, nu and step
-    cdef readonly object ints, numbers                  # what `at` points into, and what its maker laid behind
+    cdef readonly object ints, numbers                  # arrays that `at` points into, with optional extra memory at the end
     cdef tuple _arrays
     cdef readonly bint is_free                          # every row is unbounded
     cdef readonly bint is_bounded_rows                  # every row has constant bounds
     cdef readonly bint has_round                        # some contact has more than two tangents
-    cdef readonly bint has_rolling                      # some contact has rows that roll, bounded by themselves
+    cdef readonly bint has_rolling                      # some contact has rolling rows with a bound of their own
     cdef readonly bint has_ellipse                      # some contact bounds its two tangents by an ellipse
     cdef readonly bint single_rows                      # every block is one bounded row
 
@@ -21,4 +21,4 @@ cdef class Blocks:
     cdef bint check(self) noexcept
 
 
-cdef Blocks room_of(Py_ssize_t k, Py_ssize_t m, Py_ssize_t ints=*, Py_ssize_t numbers=*)
+cdef Blocks allocate_blocks(Py_ssize_t k, Py_ssize_t m, Py_ssize_t ints=*, Py_ssize_t numbers=*)

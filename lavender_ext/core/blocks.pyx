@@ -1,29 +1,30 @@
-"""Blocks of a problem, made, joined and checked: one pass over few numbers, in a few arrays.
+"""Creation, concatenation and checks of blocks, in one pass over a few small arrays.
 
-What Python would do in ten calls of NumPy takes longer than a solve of eight rows. Nothing is said here of what is wrong:
-`lavender.problem.cones` finds the words where these functions return None.
+The same work in ten NumPy calls takes longer than a solve of eight rows. These functions report no reasons: if they return
+None, `lavender.problem.cones` validates in detail and raises.
 """
 from libc.stdint cimport int32_t
 
 import numpy as np
 
-from lavender_ext.core.arrays cimport frozen, ndarray
-from lavender_ext.core.door cimport is_number, is_size
-from lavender_ext.core.parts cimport (CONTACT, CONTACT_BOX, CONTACT_ROLLING, CONTACT_SPIN, ROUND, ROW, contact_kind, fits,
-                                      lay_frictions, spell_bounds)
+from lavender_ext.core.arrays cimport freeze, ndarray
+from lavender_ext.core.validate cimport is_number, is_valid_magnitude
+from lavender_ext.core.block_types cimport (CONTACT, CONTACT_BOX, CONTACT_ROLLING, CONTACT_SPIN, ROUND, ROW, contact_kind, fits,
+                                      bind_friction_arrays, spell_bounds)
 
 cdef enum:
-    CONTACT_ELLIPSE = 7                                 # no kernel meets it: `Problem.disk` is solved and judged
+    CONTACT_ELLIPSE = 7                                 # Kernels never get this kind: `Problem.disk` is solved and judged.
 
-#: Kinds of blocks by the kernels' numbers.
+#: Kernel numbers of the kinds of blocks.
 KINDS = (ROW, CONTACT, CONTACT_SPIN, ROUND, CONTACT_BOX, CONTACT_ROLLING, CONTACT_ELLIPSE)
 
-cdef double INF = 1.0 / 0.0, WIDEST = 2.0 ** 60          # of mu_2 / mu_1 of an ellipse, and of mu_1 / mu_2
+cdef double INF = 1.0 / 0.0
+cdef double MAX_ELLIPSE_RATIO = 2.0 ** 60               # upper bound of mu_2 / mu_1 and mu_1 / mu_2 of an ellipse
 cdef object new = np.empty, F8 = np.dtype(np.float64), I4 = np.dtype(np.int32)
 
 
 cdef class Blocks:
-    """Pointers to the arrays of a problem's blocks, which are kept; ValueError where they are no blocks."""
+    """Pointers to the arrays of a problem's blocks, which are kept alive. Raises ValueError if the arrays are invalid."""
 
     def __init__(self, ptr, kind, lower, upper, mu, patch_radius, rolling):
         if not self.point(ptr, kind, lower, upper, mu, patch_radius, rolling) or not self.check():
@@ -32,7 +33,7 @@ cdef class Blocks:
 
     @property
     def arrays(self):
-        """ptr, kind, lower, upper, mu, patch_radius, rolling: views, made at first use."""
+        """Arrays (ptr, kind, lower, upper, mu, patch_radius, rolling): views, created at first use."""
         cdef Py_ssize_t k = self.at.n_blocks, m = self.at.n_rows, at = self.at.mu - self.at.lower
         cdef Py_ssize_t kind = self.at.kind - self.at.ptr, stride = self.at.patch_radius - self.at.mu
         if self._arrays is None:
@@ -69,7 +70,7 @@ cdef class Blocks:
         return m > 0 or k == 0
 
     cdef bint check(self) noexcept:
-        # What the blocks are; False where one is none.
+        """Set the flags of the blocks; return False if a block is invalid."""
         cdef blocks_t* p = &self.at
         cdef int32_t i, j, size, kind
         self.is_free = self.is_bounded_rows = self.single_rows = True
@@ -77,15 +78,15 @@ cdef class Blocks:
         for i in range(p.n_blocks):
             size = p.ptr[i + 1] - p.ptr[i]
             kind = p.kind[i]
-            if not is_size(p.mu[i]) or not is_size(p.patch_radius[i]) or not is_size(p.rolling[i]):
+            if not is_valid_magnitude(p.mu[i]) or not is_valid_magnitude(p.patch_radius[i]) or not is_valid_magnitude(p.rolling[i]):
                 return False
-            if kind != ROW and not is_size(p.mu[i] * p.patch_radius[i]):
+            if kind != ROW and not is_valid_magnitude(p.mu[i] * p.patch_radius[i]):
                 return False
             self.has_round |= kind == ROUND
             self.has_rolling |= kind == CONTACT_ROLLING
             if kind == CONTACT_ELLIPSE:
                 self.has_ellipse, kind = True, CONTACT_BOX
-                if not 1.0 / WIDEST <= p.patch_radius[i] <= WIDEST:
+                if not 1.0 / MAX_ELLIPSE_RATIO <= p.patch_radius[i] <= MAX_ELLIPSE_RATIO:
                     return False
             if not fits(kind, size):
                 return False
@@ -108,22 +109,25 @@ cdef class Blocks:
         return True
 
 
-cdef Blocks room_of(Py_ssize_t k, Py_ssize_t m, Py_ssize_t ints=0, Py_ssize_t numbers=0):
-    """Blocks over new arrays, read-only for everybody else, whose numbers are still to be written; behind them more workspace."""
-    cdef Blocks made = Blocks.__new__(Blocks)
-    made.ints, made.numbers = frozen(new(2 * k + 1 + ints, I4)), frozen(new(2 * m + 3 * k + numbers))
-    made.at.n_blocks = <int32_t>k
-    made.at.n_rows = <int32_t>m
-    made.at.ptr = <int32_t*>(<ndarray>made.ints).data
-    made.at.kind = made.at.ptr + k + 1
-    made.at.lower = <double*>(<ndarray>made.numbers).data
-    made.at.upper = made.at.lower + m
-    lay_frictions(&made.at, made.at.upper + m, k)
-    return made
+cdef Blocks allocate_blocks(Py_ssize_t k, Py_ssize_t m, Py_ssize_t ints=0, Py_ssize_t numbers=0):
+    """Create k blocks of m rows over new, uninitialised arrays, which are read-only for Python.
+
+    `ints` int32 and `numbers` float64 of extra memory follow at the end of the arrays.
+    """
+    cdef Blocks blocks = Blocks.__new__(Blocks)
+    blocks.ints, blocks.numbers = freeze(new(2 * k + 1 + ints, I4)), freeze(new(2 * m + 3 * k + numbers))
+    blocks.at.n_blocks = <int32_t>k
+    blocks.at.n_rows = <int32_t>m
+    blocks.at.ptr = <int32_t*>(<ndarray>blocks.ints).data
+    blocks.at.kind = blocks.at.ptr + k + 1
+    blocks.at.lower = <double*>(<ndarray>blocks.numbers).data
+    blocks.at.upper = blocks.at.lower + m
+    bind_friction_arrays(&blocks.at, blocks.at.upper + m, k)
+    return blocks
 
 
-cdef void put(Blocks to, Py_ssize_t block, Py_ssize_t row, const blocks_t* p) noexcept:
-    # The blocks of p, from block and row on.
+cdef void copy_blocks(Blocks to, Py_ssize_t block, Py_ssize_t row, const blocks_t* p) noexcept:
+    """Copy the blocks of p into `to`, beginning at this block and row."""
     cdef Py_ssize_t i
     for i in range(p.n_blocks):
         (<int32_t*>to.at.ptr)[block + i] = p.ptr[i] + <int32_t>row
@@ -137,8 +141,8 @@ cdef void put(Blocks to, Py_ssize_t block, Py_ssize_t row, const blocks_t* p) no
     (<int32_t*>to.at.ptr)[block + p.n_blocks] = <int32_t>row + p.n_rows
 
 
-def joined(list each):
-    """The blocks of each, one after the other; None where they have more rows than 32-bit numbers count."""
+def concatenate_blocks(list each):
+    """Return the blocks of all items of `each` in sequence, or None if the rows exceed 32-bit indices."""
     cdef Py_ssize_t k = 0, m = 0
     cdef Blocks one
     for one in each:
@@ -146,25 +150,25 @@ def joined(list each):
         m += one.at.n_rows
     if k >= 2147483647 or m >= 2147483647:
         return None
-    cdef Blocks made = room_of(k, m)
-    (<int32_t*>made.at.ptr)[0] = 0
-    made.is_free = made.is_bounded_rows = made.single_rows = True
+    cdef Blocks blocks = allocate_blocks(k, m)
+    (<int32_t*>blocks.at.ptr)[0] = 0
+    blocks.is_free = blocks.is_bounded_rows = blocks.single_rows = True
     k = m = 0
     for one in each:
-        put(made, k, m, &one.at)
+        copy_blocks(blocks, k, m, &one.at)
         k += one.at.n_blocks
         m += one.at.n_rows
-        made.is_free &= one.is_free
-        made.is_bounded_rows &= one.is_bounded_rows
-        made.single_rows &= one.single_rows
-        made.has_round |= one.has_round
-        made.has_rolling |= one.has_rolling
-        made.has_ellipse |= one.has_ellipse
-    return made
+        blocks.is_free &= one.is_free
+        blocks.is_bounded_rows &= one.is_bounded_rows
+        blocks.single_rows &= one.single_rows
+        blocks.has_round |= one.has_round
+        blocks.has_rolling |= one.has_rolling
+        blocks.has_ellipse |= one.has_ellipse
+    return blocks
 
 
 def are_joints_then_contacts(Blocks blocks, const int32_t[::1] joint_ptr):
-    """Whether blocks begin with ROW blocks of these rows, and all others are contacts of up to two tangents, spin and rolling."""
+    """Return whether the blocks are ROW blocks with these pointers, followed only by contacts without round cones."""
     cdef int32_t i, kj = <int32_t>joint_ptr.shape[0] - 1
     if kj > blocks.at.n_blocks or blocks.has_round:
         return False
@@ -177,35 +181,35 @@ def are_joints_then_contacts(Blocks blocks, const int32_t[::1] joint_ptr):
     return True
 
 
-def private(ptr, kind, lower, upper, mu, patch_radius, rolling):
-    """Blocks over a copy of these arrays; None where anything is amiss."""
-    cdef Blocks given = Blocks.__new__(Blocks), made
+def copy_to_blocks(ptr, kind, lower, upper, mu, patch_radius, rolling):
+    """Return blocks over a copy of these arrays, or None if they need conversion or detailed validation."""
+    cdef Blocks source = Blocks.__new__(Blocks), blocks
     for x, dtype in ((ptr, I4), (kind, I4), (lower, F8), (upper, F8), (mu, F8), (patch_radius, F8),
                      (rolling, F8)):
         if type(x) is not ndarray or x.dtype is not dtype or x.ndim != 1 or not x.flags.c_contiguous:
             return None
     try:
-        if not given.point(ptr, kind, lower, upper, mu, patch_radius, rolling):
+        if not source.point(ptr, kind, lower, upper, mu, patch_radius, rolling):
             return None
-    except ValueError:                                  # not aligned
+    except ValueError:                                  # An array is not aligned.
         return None
-    made = room_of(given.at.n_blocks, given.at.n_rows)
-    put(made, 0, 0, &given.at)
-    if not made.check():
+    blocks = allocate_blocks(source.at.n_blocks, source.at.n_rows)
+    copy_blocks(blocks, 0, 0, &source.at)
+    if not blocks.check():
         return None
-    spell_bounds(&made.at)
-    return made
+    spell_bounds(&blocks.at)
+    return blocks
 
 
 def free_rows(Py_ssize_t m):
-    """m unbounded rows, each its own block; None below 0 and beyond 32 bits."""
+    """Return m unbounded rows, each a block; None if m is negative or exceeds 32-bit indices."""
     if not 0 <= m < 2147483647:
         return None
     return rows_between(m, NULL, NULL)
 
 
 def bounded_rows(lower, upper):
-    """One row for each pair of bounds, `upper` perhaps inf for all; None where anything is amiss."""
+    """Return one row per pair of bounds; `upper` may be inf for all rows. Return None if the arrays need detailed validation."""
     cdef const double[::1] low, high
     cdef Py_ssize_t m
     cdef bint open_ = type(upper) is float and upper == INF
@@ -220,33 +224,32 @@ def bounded_rows(lower, upper):
 
 
 cdef Blocks rows_between(Py_ssize_t m, const double* lower, const double* upper):
-    cdef Blocks made = room_of(m, m)
+    """Return m single-row blocks with these bounds, or None if a bound is invalid; NULL means unbounded."""
+    cdef Blocks blocks = allocate_blocks(m, m)
     cdef Py_ssize_t i
-    (<int32_t*>made.at.ptr)[0] = 0
+    (<int32_t*>blocks.at.ptr)[0] = 0
     for i in range(m):
-        (<int32_t*>made.at.ptr)[i + 1] = <int32_t>i + 1
-        (<int32_t*>made.at.kind)[i] = ROW
-        (<double*>made.at.mu)[i] = (<double*>made.at.patch_radius)[i] = (<double*>made.at.rolling)[i] = 0.0
-        (<double*>made.at.lower)[i] = -INF if lower == NULL else lower[i]
-        (<double*>made.at.upper)[i] = INF if upper == NULL else upper[i]
-    return made if made.check() else None
+        (<int32_t*>blocks.at.ptr)[i + 1] = <int32_t>i + 1
+        (<int32_t*>blocks.at.kind)[i] = ROW
+        (<double*>blocks.at.mu)[i] = (<double*>blocks.at.patch_radius)[i] = (<double*>blocks.at.rolling)[i] = 0.0
+        (<double*>blocks.at.lower)[i] = -INF if lower == NULL else lower[i]
+        (<double*>blocks.at.upper)[i] = INF if upper == NULL else upper[i]
+    return blocks if blocks.check() else None
 
 
 def contacts(Py_ssize_t k, int32_t tangents, mu, radius, rolling, int32_t sides=0):
-    """k contacts of so many tangents, with a spin row where there is a radius (k,), two that roll where there is mu_r (k,).
+    """Return k contacts, or None if the arguments need detailed validation.
 
-    mu is a float or (k,) array.
-
-    sides: CONTACT_BOX or CONTACT_ELLIPSE, which have two tangents, and as radius mu_2 / mu_1; else 0.
-
-    None where anything is amiss.
+    Each contact has `tangents` tangent rows, a spin row if `radius` (k,) is given, and two rolling rows if `rolling` (k,)
+    [m], mu_r, is given. mu is a float or an array (k,). `sides` is CONTACT_BOX or CONTACT_ELLIPSE (two tangents; `radius` is
+    then mu_2 / mu_1), otherwise 0.
     """
-    cdef bint spin = radius is not None and not sides, rolls = rolling is not None
-    cdef int32_t size = 1 + tangents + spin + 2 * rolls, kind
+    cdef bint spin = radius is not None and not sides, has_rolling = rolling is not None
+    cdef int32_t size = 1 + tangents + spin + 2 * has_rolling, kind
     cdef const double[::1] each = None, patch = None, moment = None
     cdef double one = 0.0
     cdef Py_ssize_t i
-    kind = sides if sides else contact_kind(False, spin, rolls, tangents)
+    kind = sides if sides else contact_kind(False, spin, has_rolling, tangents)
     if not 0 <= k < 2147483647 // size:
         return None
     if type(mu) is float:
@@ -259,17 +262,17 @@ def contacts(Py_ssize_t k, int32_t tangents, mu, radius, rolling, int32_t sides=
         patch = radius
         if patch.shape[0] != k:
             return None
-    if rolls:
+    if has_rolling:
         moment = rolling
         if moment.shape[0] != k:
             return None
-    cdef Blocks made = room_of(k, k * size)
-    (<int32_t*>made.at.ptr)[0] = 0
+    cdef Blocks blocks = allocate_blocks(k, k * size)
+    (<int32_t*>blocks.at.ptr)[0] = 0
     for i in range(k):
-        (<int32_t*>made.at.ptr)[i + 1] = <int32_t>(i + 1) * size
-        (<int32_t*>made.at.kind)[i] = kind
-        (<double*>made.at.mu)[i] = one if each is None else each[i]
-        (<double*>made.at.patch_radius)[i] = 0.0 if patch is None else patch[i]
-        (<double*>made.at.rolling)[i] = moment[i] if rolls else 0.0
-    spell_bounds(&made.at)
-    return made if made.check() else None
+        (<int32_t*>blocks.at.ptr)[i + 1] = <int32_t>(i + 1) * size
+        (<int32_t*>blocks.at.kind)[i] = kind
+        (<double*>blocks.at.mu)[i] = one if each is None else each[i]
+        (<double*>blocks.at.patch_radius)[i] = 0.0 if patch is None else patch[i]
+        (<double*>blocks.at.rolling)[i] = moment[i] if has_rolling else 0.0
+    spell_bounds(&blocks.at)
+    return blocks if blocks.check() else None

@@ -1,4 +1,4 @@
-"""Rows of a compressed sparse row matrix: the products that sweeps and the judge share."""
+"""Products with rows of a compressed sparse row matrix, shared by sweeps and the judge."""
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
 
@@ -6,11 +6,12 @@ from lavender_ext.core.view cimport csr_t
 
 
 cdef enum:
-    LONG_ROW = 128              # Entries that one running sum rounds to about the floor of the judge; longer rows are split.
+    # Number of entries above which a row is summed in pieces: rounding of a longer sum would exceed the judge's round-off floor.
+    LONG_ROW = 128
 
 
 cdef inline double csr_dot(const csr_t* a, int32_t i, const double* x) noexcept nogil:
-    # sum_j A_ij x_j in four running sums: a fixed order of additions, four times the throughput.
+    """Return sum_j A_ij x_j, in four running sums: a fixed order of additions with four times the throughput of one sum."""
     cdef int32_t p = a.indptr[i], end = a.indptr[i + 1]
     cdef const int32_t* idx = a.indices
     cdef const double* val = a.data
@@ -31,7 +32,7 @@ cdef inline double csr_dot(const csr_t* a, int32_t i, const double* x) noexcept 
 
 
 cdef inline double range_dot_size(const csr_t* a, int32_t p, int32_t end, const double* x, double* size) noexcept nogil:
-    # The sum over entries [p, end) in the order of csr_dot; that of absolute values into size.
+    """Return the sum over entries [p, end) in the order of csr_dot; write the sum of absolute values to `size`."""
     cdef const int32_t* idx = a.indices
     cdef const double* val = a.data
     cdef double s0 = 0.0, s1 = 0.0, s2 = 0.0, s3 = 0.0, f0 = 0.0, f1 = 0.0, f2 = 0.0, f3 = 0.0, t
@@ -66,28 +67,31 @@ cdef inline double range_dot_size(const csr_t* a, int32_t p, int32_t end, const 
 
 
 cdef inline double csr_dot_long(const csr_t* a, int32_t i, const double* x, double* size) noexcept nogil:
-    # csr_dot, to the bit, and sum_j |A_ij x_j| into size. A row of more than LONG_ROW entries is summed in parts, and the
-    # sum of the parts is compensated.
+    """Return sum_j A_ij x_j and write sum_j |A_ij x_j| to `size`.
+
+    A row of at most LONG_ROW entries gets the bits of csr_dot. A longer row is summed in pieces of LONG_ROW entries, and the
+    sum of the pieces is compensated.
+    """
     cdef int32_t p = a.indptr[i], last = a.indptr[i + 1], end
-    cdef double high = 0.0, low = 0.0, term, part, total, back
+    cdef double high = 0.0, low = 0.0, term, piece_size, total, added
     if last - p <= LONG_ROW:
         return range_dot_size(a, p, last, x, size)
     size[0] = 0.0
     while p < last:
         end = p + LONG_ROW if last - p > LONG_ROW else last
-        term = range_dot_size(a, p, end, x, &part)
-        size[0] += part
+        term = range_dot_size(a, p, end, x, &piece_size)
+        size[0] += piece_size
         total = high + term
-        back = total - high
-        low += (high - (total - back)) + (term - back)
+        added = total - high
+        low += (high - (total - added)) + (term - added)
         high = total
         p = end
-    return high + low if low == low else high          # what overflows is infinite
+    return high + low if low == low else high          # low is NaN if the sum overflows
 
 
-cdef inline void by_columns(int32_t m, int32_t n, const int32_t* indptr, const int32_t* indices, const double* data,
+cdef inline void transpose_csr(int32_t m, int32_t n, const int32_t* indptr, const int32_t* indices, const double* data,
                             int32_t* ptr, int32_t* row, double* value) noexcept nogil:
-    """A matrix (m, n) in compressed rows by its columns, rows ascending; ptr (n + 2)."""
+    """Transpose a matrix (m, n) in compressed rows: pointers in ptr (n + 2), ascending rows, values."""
     cdef int32_t i, j, q
     for j in range(n + 2):
         ptr[j] = 0
@@ -103,21 +107,22 @@ cdef inline void by_columns(int32_t m, int32_t n, const int32_t* indptr, const i
             ptr[j] += 1
 
 
-cdef inline double own_share(double gap, double d_i, double d_j) noexcept nogil:
-    """|A_ij - A_ji| / sqrt(d_i d_j): of rows of heavy bodies, too, whose entries are small."""
+cdef inline double scaled_gap(double gap, double d_i, double d_j) noexcept nogil:
+    """Return gap / sqrt(d_i d_j) for gap = |A_ij - A_ji|: also meaningful for rows of heavy bodies, whose entries are small."""
     return gap / sqrt(d_i) / sqrt(d_j) if gap > 0.0 else 0.0
 
 
 cdef inline double scan_entries(const csr_t* a, const double* d, int32_t n, int32_t* cursor,
                                 int32_t* band) noexcept nogil:
-    """Asymmetry of A; its lower and upper bandwidth into band[2]; columns are sorted.
+    """Return the asymmetry of A and write its lower and upper bandwidth to band[2]; columns must be sorted.
 
-        max |A - A^T| / max |A|;    where that is rounding, up to 1e-14:  max |A_ij - A_ji| / sqrt(d_i d_j) above 1e-10
+    The asymmetry is max |A - A^T| / max |A|. If that is rounding (at most 1e-14) and max |A_ij - A_ji| / sqrt(d_i d_j) is
+    above 1e-10, it is the latter.
 
-    cursor (n) is scratch: the first entry of row j that no earlier row has looked up as its mirror image.
+    cursor (n) is scratch: the first entry of row j that has not yet been matched with its mirror image in an earlier row.
     """
     cdef int32_t i, j, q
-    cdef double x, gap = 0.0, big = 0.0, own = 0.0
+    cdef double x, gap = 0.0, big = 0.0, scaled = 0.0
     band[0] = 0
     band[1] = 0
     for i in range(n):
@@ -138,18 +143,18 @@ cdef inline double scan_entries(const csr_t* a, const double* d, int32_t n, int3
             if j < i:
                 if q >= cursor[i]:                      # no mirror image above the diagonal
                     gap = max(gap, x)
-                    own = max(own, own_share(x, d[i], d[j]))
+                    scaled = max(scaled, scaled_gap(x, d[i], d[j]))
                 continue
             if j == i:
                 continue
             while cursor[j] < a.indptr[j + 1] and a.indices[cursor[j]] < i:
                 gap = max(gap, fabs(a.data[cursor[j]]))
-                own = max(own, own_share(fabs(a.data[cursor[j]]), d[j], d[a.indices[cursor[j]]]))
+                scaled = max(scaled, scaled_gap(fabs(a.data[cursor[j]]), d[j], d[a.indices[cursor[j]]]))
                 cursor[j] += 1
             if cursor[j] < a.indptr[j + 1] and a.indices[cursor[j]] == i:
                 x = fabs(a.data[q] - a.data[cursor[j]])
                 cursor[j] += 1
             gap = max(gap, x)
-            own = max(own, own_share(x, d[i], d[j]))
+            scaled = max(scaled, scaled_gap(x, d[i], d[j]))
     gap = gap / big if big > 0.0 else 0.0
-    return own if gap <= 1e-14 and own > 1e-10 else gap
+    return scaled if gap <= 1e-14 and scaled > 1e-10 else gap

@@ -3,7 +3,7 @@ from libc.stdint cimport int32_t
 
 
 cdef inline double dot(const double* x, const double* y, int32_t n) noexcept nogil:
-    # Four running sums: a fixed order of additions.
+    """Return x^T y of n numbers, in four running sums: a fixed order of additions."""
     cdef double s0 = 0.0, s1 = 0.0, s2 = 0.0, s3 = 0.0
     cdef int32_t i = 0
     while i + 4 <= n:

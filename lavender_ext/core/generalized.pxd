@@ -1,36 +1,38 @@
-"""Generalised coordinates: J (m, nv) and M (nv, nv), known by the factor of M and by the whitened Jacobian.
+"""Generalised coordinates: J (m, nv) and M (nv, nv), represented by the factor of M and the whitened Jacobian Y.
 
     M = L^T D L, the factor of `core/tree.pxd`                                                              (1)
     Y = J L^-1 D^-1/2,   J M^-1 J^T = Y Y^T                                                                 (2)
     w = J x + compliance lambda - b,   M x = J^T lambda                                                     (3)
 
-A row of Y has entries in the columns of its row of J and in their ancestors, the rows that (1) reaches from them.
-Rows that stand together and reach the same columns share a panel: one list of columns, values row by row.
+A row of Y has entries in the columns of its row of J and in their ancestors in the elimination tree of (1). Consecutive rows
+with the same columns form a panel: one list of columns, values stored row by row.
 """
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t, uint64_t
 
 from lavender_ext.core.bits cimport lowest
 from lavender_ext.core.dot cimport dot
-from lavender_ext.core.tree cimport ldl_solve, take_from, take_two
+from lavender_ext.core.tree cimport ldl_solve, axpy_subtract, axpy_subtract_2
 from lavender_ext.core.view cimport generalized_t
 
 
 cdef enum:
-    PANEL_ROWS = 16             # most rows of a panel, unless one block has more
-    NEAR = 64                   # columns of a panel that are copied together where several rows need them
+    PANEL_ROWS = 16             # A panel has at most this many rows, unless a single block has more.
+    # The entries of x on the columns of a panel are copied to a contiguous array if the panel has at most this many columns
+    # and more than two rows.
+    MAX_GATHERED_COLUMNS = 64
 
 
 cdef inline void tree_solve(const generalized_t* g, double* x) noexcept nogil:
-    """x <- M^-1 x."""
+    """Overwrite x (n) with M^-1 x."""
     ldl_solve(g.n, g.lptr, g.lidx, g.lval, g.inv_pivot, x)
 
 
 # -- J ---------------------------------------------------------------------------------------------------
 
 
-cdef inline void jac_push(const generalized_t* g, const double* lam, double* x) noexcept nogil:
-    """x = J^T lam (n)."""
+cdef inline void jac_transpose_times(const generalized_t* g, const double* lam, double* x) noexcept nogil:
+    """Compute x (n) = J^T lam."""
     cdef int32_t i, q, first, end, m = g.m
     cdef const int32_t* jptr = g.jptr
     cdef const int32_t* jidx = g.jidx
@@ -48,6 +50,7 @@ cdef inline void jac_push(const generalized_t* g, const double* lam, double* x) 
 
 
 cdef inline double jac_row(const generalized_t* g, int32_t i, const double* x) noexcept nogil:
+    """Return row i of J times x."""
     cdef int32_t q, first = g.jptr[i], end = g.jptr[i + 1]
     cdef const int32_t* jidx = g.jidx
     cdef const double* jval = g.jval
@@ -60,24 +63,27 @@ cdef inline double jac_row(const generalized_t* g, int32_t i, const double* x) n
 # -- Y ---------------------------------------------------------------------------------------------------
 
 
-cdef inline int32_t reached(const generalized_t* g, int32_t first, int32_t last, int32_t stamp, int32_t before,
-                            int32_t* mark, int32_t* out, int32_t* same) noexcept nogil:
-    """Columns that rows [first, last) reach, unsorted, into out (n); how many. `same`: of those, marked `before`."""
-    cdef int32_t q, k, count = 0, hits = 0
+cdef inline int32_t collect_columns(const generalized_t* g, int32_t first, int32_t last, int32_t stamp, int32_t previous,
+                                    int32_t* mark, int32_t* out, int32_t* same) noexcept nogil:
+    """List the columns of Y in rows [first, last), unsorted, in out (n); return their number.
+
+    The columns are marked with `stamp`. `same` receives the number of them that were marked `previous`.
+    """
+    cdef int32_t q, k, count = 0, n_same = 0
     for q in range(g.jptr[last] - 1, g.jptr[first] - 1, -1):
         k = g.jidx[q]
         while k >= 0 and mark[k] != stamp:
-            hits += mark[k] == before
+            n_same += mark[k] == previous
             mark[k] = stamp
             out[count] = k
             count += 1
             k = g.parent[k]
-    same[0] = hits
+    same[0] = n_same
     return count
 
 
-cdef inline void sort_falling(int32_t* x, int32_t n) noexcept nogil:
-    """Ascending order of what comes in a few falling runs."""
+cdef inline void sort_descending_runs(int32_t* x, int32_t n) noexcept nogil:
+    """Sort x (n) ascending; x should consist of a few descending runs."""
     cdef int32_t i, j, t
     for i in range(n // 2):
         t = x[i]
@@ -92,49 +98,51 @@ cdef inline void sort_falling(int32_t* x, int32_t n) noexcept nogil:
         x[j + 1] = t
 
 
-cdef inline int32_t few_panels(const generalized_t* g, int32_t n_blocks, const int32_t* ptr, uint64_t* above,
+cdef inline int32_t panel_pattern_bits(const generalized_t* g, int32_t n_blocks, const int32_t* ptr, uint64_t* ancestors,
                                int32_t* prow, int32_t* pcol, int32_t* pval, int32_t* cols, int32_t workspace,
                                int32_t* n_cols, double* n_values) noexcept nogil:
-    """`panel_pattern` of at most 64 velocities, sets of columns as bits; above (n) is scratch."""
-    cdef int32_t i, q, k, first, last, count = 0, before = -1, at = 0, n = 0, nv = g.n, end, entries, odd
+    """Compute `panel_pattern` for at most 64 velocities, with column sets as bits; ancestors (n) is scratch."""
+    cdef int32_t i, q, k, first, last, count = 0, previous_entries = -1, at = 0, n = 0, nv = g.n, end, entries, differs
     cdef const int32_t* jptr = g.jptr
     cdef const int32_t* jidx = g.jidx
     cdef const int32_t* parent = g.parent
-    cdef uint64_t on = 0, held = 0, left
+    cdef uint64_t columns = 0, panel_columns = 0, remaining
     cdef double values = 0.0
     prow[0] = 0
     pcol[0] = 0
     pval[0] = 0
-    for k in range(nv):                                 # a column and those that it reaches, which come before it
-        above[k] = <uint64_t>1 << k
+    # each column and its ancestors, which come before it
+    for k in range(nv):
+        ancestors[k] = <uint64_t>1 << k
         if parent[k] >= 0:
-            above[k] |= above[parent[k]]
+            ancestors[k] |= ancestors[parent[k]]
     for i in range(n_blocks):
         first = ptr[i]
         last = ptr[i + 1]
         end = jptr[last]
         entries = end - jptr[first]
-        odd = entries - before                          # 0 where it has the entries of the block before
-        for q in range(jptr[first], end if odd == 0 else 0):
-            odd |= jidx[q] ^ jidx[q - entries]
-        if odd:
-            on = 0
+        # zero if the block has the same columns as the previous block
+        differs = entries - previous_entries
+        for q in range(jptr[first], end if differs == 0 else 0):
+            differs |= jidx[q] ^ jidx[q - entries]
+        if differs:
+            columns = 0
             for q in range(jptr[first], end):
-                on |= above[jidx[q]]
-        before = entries
-        if n > 0 and on == held and last - prow[n - 1] <= PANEL_ROWS:
-            prow[n] = last                              # the panel grows
+                columns |= ancestors[jidx[q]]
+        previous_entries = entries
+        if n > 0 and columns == panel_columns and last - prow[n - 1] <= PANEL_ROWS:
+            prow[n] = last                              # append to the panel
         else:
             if at + nv > workspace:
                 return -1
             count = 0
-            left = on
-            while left:
-                cols[at + count] = lowest(left)
+            remaining = columns
+            while remaining:
+                cols[at + count] = lowest(remaining)
                 count += 1
-                left &= left - 1
+                remaining &= remaining - 1
             at += count
-            held = on
+            panel_columns = columns
             n += 1
             prow[n] = last
             pcol[n] = at
@@ -150,14 +158,15 @@ cdef inline int32_t few_panels(const generalized_t* g, int32_t n_blocks, const i
 cdef inline int32_t panel_pattern(const generalized_t* g, int32_t n_blocks, const int32_t* ptr, int32_t* mark,
                                   int32_t* prow, int32_t* pcol, int32_t* pval, int32_t* cols, int32_t workspace,
                                   int32_t* n_cols, double* n_values) noexcept nogil:
-    """Panels of consecutive blocks that reach the same columns; how many, or -1 where `workspace` columns do not suffice.
+    """Group consecutive blocks with the same columns of Y into panels; return the number of panels.
 
-    mark (2 n) is scratch, aligned to 8 bytes; of n_cols and n_values the caller makes arrays.
+    The result is -1 if `workspace` columns do not suffice. mark (2 n) is scratch, aligned to 8 bytes. n_cols and n_values
+    receive the number of columns of all panels and the number of values of Y.
     """
-    cdef int32_t i, first, last, count, same, before = -1, held = 0, at = 0, n = 0, stamp = 0
+    cdef int32_t i, first, last, count, same, previous = -1, panel_columns = 0, at = 0, n = 0, stamp = 0
     cdef int32_t* out = mark + g.n
     if g.n <= 64:
-        return few_panels(g, n_blocks, ptr, <uint64_t*>mark, prow, pcol, pval, cols, workspace, n_cols, n_values)
+        return panel_pattern_bits(g, n_blocks, ptr, <uint64_t*>mark, prow, pcol, pval, cols, workspace, n_cols, n_values)
     n_values[0] = 0.0
     prow[0] = 0
     pcol[0] = 0
@@ -167,32 +176,32 @@ cdef inline int32_t panel_pattern(const generalized_t* g, int32_t n_blocks, cons
     for i in range(n_blocks):
         first = ptr[i]
         last = ptr[i + 1]
-        count = reached(g, first, last, stamp, before, mark, out, &same)
+        count = collect_columns(g, first, last, stamp, previous, mark, out, &same)
         n_values[0] += <double>count * (last - first)
-        if n > 0 and count == held and same == count and last - prow[n - 1] <= PANEL_ROWS:
-            prow[n] = last                                  # the panel grows
+        if n > 0 and count == panel_columns and same == count and last - prow[n - 1] <= PANEL_ROWS:
+            prow[n] = last                                  # append to the panel
         else:
             if at + count > workspace:
                 return -1
-            sort_falling(out, count)
+            sort_descending_runs(out, count)
             for same in range(count):
                 cols[at + same] = out[same]
             at += count
-            held = count
+            panel_columns = count
             n += 1
             prow[n] = last
             pcol[n] = at
         pval[n] = pval[n - 1] + count * (last - prow[n - 1])
         if n_values[0] >= 2147483647.0:
             break
-        before = stamp
+        previous = stamp
         stamp += 1
     n_cols[0] = at
     return n
 
 
 cdef inline void panel_whiten(const generalized_t* g, int32_t panel, int32_t* place, double* y) noexcept nogil:
-    """Rows of Y of one panel: L^T y = J^T on its columns, then D^-1/2. place (n) is scratch."""
+    """Compute the rows of Y of one panel: solve L^T y = J^T on its columns, then scale by D^-1/2. place (n) is scratch."""
     cdef int32_t first = g.prow[panel], rows = g.prow[panel + 1] - first, c0 = g.pcol[panel]
     cdef int32_t nc = g.pcol[panel + 1] - c0, a, k, q, i, _i, p, count, end, before
     cdef const int32_t* cols = g.cols + c0
@@ -224,18 +233,19 @@ cdef inline void panel_whiten(const generalized_t* g, int32_t panel, int32_t* pl
         z = root[k]
         x = y
         if count == a > 0 and lptr[cols[a - 1] + 1] - lptr[cols[a - 1]] == a - 1:
-            a -= 1                                          # two with every column before them: the bits of one by one
+            # two dense columns at once, with the same bits as one after the other
+            a -= 1
             u = g.lval + lptr[cols[a]]
             for _i in range(rows):
                 top = x[a + 1]
                 low = x[a] - l[a] * top
-                take_two(x, l, top, u, low, a)
+                axpy_subtract_2(x, l, top, u, low, a)
                 x[a + 1] = top * z
                 x[a] = low * root[cols[a]]
                 x += nc
         elif count == a:
             for _i in range(rows):
-                take_from(x, l, x[a], a)
+                axpy_subtract(x, l, x[a], a)
                 x[a] *= z
                 x += nc
         else:
@@ -250,7 +260,7 @@ cdef inline void panel_whiten(const generalized_t* g, int32_t panel, int32_t* pl
 
 
 cdef inline double indexed_dot(const double* y, const int32_t* cols, const double* x, int32_t n) noexcept nogil:
-    # Two running sums, as in `near_dot`: whoever reads a row of Y gets the same bits.
+    """Return sum_a y_a x[cols_a] in two running sums, with the bits of `contiguous_dot`."""
     cdef int32_t a = 0
     cdef double s0 = 0.0, s1 = 0.0
     while a + 2 <= n:
@@ -262,8 +272,8 @@ cdef inline double indexed_dot(const double* y, const int32_t* cols, const doubl
     return s0 + s1
 
 
-cdef inline double near_dot(const double* y, const double* x, int32_t n) noexcept nogil:
-    # `indexed_dot` of what stands together.
+cdef inline double contiguous_dot(const double* y, const double* x, int32_t n) noexcept nogil:
+    """Return y^T x of contiguous vectors, with the bits of `indexed_dot`."""
     cdef int32_t a = 0
     cdef double s0 = 0.0, s1 = 0.0
     while a + 2 <= n:
@@ -276,16 +286,16 @@ cdef inline double near_dot(const double* y, const double* x, int32_t n) noexcep
 
 
 cdef inline void panel_times(const generalized_t* g, int32_t panel, const double* x, double* out) noexcept nogil:
-    """out (m) = Y x on the rows of a panel."""
+    """Compute out (m) = Y x on the rows of a panel."""
     cdef int32_t i, first = g.prow[panel], end = g.prow[panel + 1], nc = g.pcol[panel + 1] - g.pcol[panel]
     cdef const int32_t* cols = g.cols + g.pcol[panel]
     cdef const double* y = g.y + g.pval[panel]
-    cdef double near[NEAR]
-    if end - first > 2 and nc <= NEAR:
+    cdef double gathered[MAX_GATHERED_COLUMNS]
+    if end - first > 2 and nc <= MAX_GATHERED_COLUMNS:
         for i in range(nc):
-            near[i] = x[cols[i]]
+            gathered[i] = x[cols[i]]
         for i in range(first, end):
-            out[i] = near_dot(y, near, nc)
+            out[i] = contiguous_dot(y, gathered, nc)
             y += nc
         return
     for i in range(first, end):
@@ -294,13 +304,14 @@ cdef inline void panel_times(const generalized_t* g, int32_t panel, const double
 
 
 cdef inline double whitened_dot(const generalized_t* g, int32_t panel, int32_t row, const double* x) noexcept nogil:
-    """Y_row x, with the bits of `panel_times`."""
+    """Return Y_row x, with the bits of `panel_times`."""
     cdef int32_t nc = g.pcol[panel + 1] - g.pcol[panel]
     return indexed_dot(g.y + g.pval[panel] + <ssize_t>(row - g.prow[panel]) * nc, g.cols + g.pcol[panel], x, nc)
 
 
-cdef inline void whitened_push(const generalized_t* g, int32_t panel, int32_t row, double change, double* x) noexcept nogil:
-    """x (n) += Y_row^T change."""
+cdef inline void add_scaled_whitened_row(const generalized_t* g, int32_t panel, int32_t row, double change,
+                                         double* x) noexcept nogil:
+    """Add Y_row^T change to x (n)."""
     cdef int32_t a, nc = g.pcol[panel + 1] - g.pcol[panel]
     cdef const int32_t* cols = g.cols + g.pcol[panel]
     cdef const double* y = g.y + g.pval[panel] + <ssize_t>(row - g.prow[panel]) * nc
@@ -309,35 +320,35 @@ cdef inline void whitened_push(const generalized_t* g, int32_t panel, int32_t ro
             x[cols[a]] += y[a] * change
 
 
-cdef inline void whitened_gather(const generalized_t* g, const double* lam, double* x) noexcept nogil:
-    """x (n) = Y^T lam."""
+cdef inline void whitened_transpose_times(const generalized_t* g, const double* lam, double* x) noexcept nogil:
+    """Compute x (n) = Y^T lam."""
     cdef int32_t a
     for a in range(g.n):
         x[a] = 0.0
     for a in range(g.n_panels):
-        panel_push(g, a, lam, x)
+        panel_transpose_add(g, a, lam, x)
 
 
-cdef inline void panel_push(const generalized_t* g, int32_t panel, const double* lam, double* x) noexcept nogil:
-    """x (n) += Y^T lam of the rows of a panel."""
+cdef inline void panel_transpose_add(const generalized_t* g, int32_t panel, const double* lam, double* x) noexcept nogil:
+    """Add Y^T lam of the rows of a panel to x (n)."""
     cdef int32_t i, a, first = g.prow[panel], end = g.prow[panel + 1], nc = g.pcol[panel + 1] - g.pcol[panel]
     cdef const int32_t* cols = g.cols + g.pcol[panel]
     cdef const double* y = g.y + g.pval[panel]
-    cdef double near[NEAR]
-    if end - first > 2 and nc <= NEAR:
+    cdef double gathered[MAX_GATHERED_COLUMNS]
+    if end - first > 2 and nc <= MAX_GATHERED_COLUMNS:
         while first < end and lam[first] == 0.0:
             first += 1
             y += nc
         if first == end:
             return
         for a in range(nc):
-            near[a] = x[cols[a]]
+            gathered[a] = x[cols[a]]
         for i in range(first, end):
             if lam[i] != 0.0:
-                give_to(near, y, lam[i], nc)
+                axpy_add(gathered, y, lam[i], nc)
             y += nc
         for a in range(nc):
-            x[cols[a]] = near[a]
+            x[cols[a]] = gathered[a]
         return
     for i in range(first, end):
         if lam[i] != 0.0:
@@ -346,14 +357,15 @@ cdef inline void panel_push(const generalized_t* g, int32_t panel, const double*
         y += nc
 
 
-cdef inline void give_to(double* x, const double* y, double z, int32_t n) noexcept nogil:
+cdef inline void axpy_add(double* x, const double* y, double z, int32_t n) noexcept nogil:
+    """Add z y to x (n)."""
     cdef int32_t i
     for i in range(n):
         x[i] += y[i] * z
 
 
-cdef inline void panel_push_size(const generalized_t* g, int32_t panel, const double* lam, double* x) noexcept nogil:
-    """x (n) += |Y|^T |lam| of the rows of a panel."""
+cdef inline void panel_transpose_add_abs(const generalized_t* g, int32_t panel, const double* lam, double* x) noexcept nogil:
+    """Add |Y|^T |lam| of the rows of a panel to x (n)."""
     cdef int32_t i, a, first = g.prow[panel], end = g.prow[panel + 1], nc = g.pcol[panel + 1] - g.pcol[panel]
     cdef const int32_t* cols = g.cols + g.pcol[panel]
     cdef const double* y = g.y + g.pval[panel]
@@ -364,8 +376,8 @@ cdef inline void panel_push_size(const generalized_t* g, int32_t panel, const do
         y += nc
 
 
-cdef inline void panel_size(const generalized_t* g, int32_t panel, const double* x, double* out) noexcept nogil:
-    """out (m) = |Y| x on the rows of a panel, x >= 0."""
+cdef inline void panel_times_abs(const generalized_t* g, int32_t panel, const double* x, double* out) noexcept nogil:
+    """Compute out (m) = |Y| x on the rows of a panel, for x >= 0."""
     cdef int32_t i, a, first = g.prow[panel], end = g.prow[panel + 1], nc = g.pcol[panel + 1] - g.pcol[panel]
     cdef const int32_t* cols = g.cols + g.pcol[panel]
     cdef const double* y = g.y + g.pval[panel]
@@ -382,10 +394,11 @@ cdef inline void panel_size(const generalized_t* g, int32_t panel, const double*
 
 
 cdef inline double estimate_condition(const generalized_t* g, double* x) noexcept nogil:
-    """|H^-1|, H = M scaled to a diagonal of ones, from two solves by M's factor: a lower bound, in general within a factor of 3.
+    """Estimate |H^-1| of H = M scaled to a unit diagonal, from two solves with the factor of M.
 
-    The first has the right-hand side of +-1 that makes L^-T times it large (Cline, Moler, Stewart and Wilkinson 1979); the
-    second shows by how much H^-1 stretches its result. At least 1; x (2 n) is scratch.
+    The result is a lower bound of |H^-1|, in general within a factor of 3, and at least 1. The first solve has a right-hand
+    side of +-1 chosen to make L^-T times it large (Cline, Moler, Stewart and Wilkinson 1979). The second measures by how much
+    H^-1 stretches the result of the first. x (2 n) is scratch.
     """
     cdef int32_t i, q, n = g.n
     cdef double* s = x + n                              # S^-1
@@ -419,12 +432,12 @@ cdef inline double estimate_condition(const generalized_t* g, double* x) noexcep
 
 
 cdef inline double get_condition(const generalized_t* g, double* x) noexcept nogil:
-    """The estimate that is stored with the factor, or a new one; x (2 n) is scratch."""
+    """Return the estimate stored with the factor, or a new one; x (2 n) is scratch."""
     return g.condition if g.condition > 0.0 else estimate_condition(g, x)
 
 
 cdef inline double bound_condition(const generalized_t* g) noexcept nogil:
-    """At least |H^-1|, far above it if n is large: e / det H, as the other eigenvalues have a sum below n."""
+    """Return the upper bound e / det H of |H^-1|, which follows from trace H = n and is very loose for large n."""
     cdef int32_t i
     cdef double det = 1.0
     for i in range(g.n):

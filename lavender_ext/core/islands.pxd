@@ -7,7 +7,7 @@ path halving; islands are numbered in the order of their first block.
 from libc.stdint cimport int32_t, int64_t
 
 from lavender_ext.core.order cimport sort_by_level
-from lavender_ext.core.parts cimport blocks_t, islands_t
+from lavender_ext.core.block_types cimport blocks_t, islands_t
 from lavender_ext.core.roots cimport root_of
 from lavender_ext.core.view cimport bodies_of, csr_t, generalized_t, rows_t, view_t
 
@@ -94,7 +94,7 @@ cdef inline int32_t connect_trees(const blocks_t* p, const generalized_t* g, int
 
 
 cdef inline int64_t islands_index(const view_t* v) noexcept nogil:
-    """Number of int32 that `find_islands` needs."""
+    """Return the number of int32 that `find_islands` needs."""
     cdef int64_t k = v.p.n_blocks
     cdef int64_t scratch = 2 * <int64_t>v.g.n if v.g != NULL else v.r.n_bodies if v.r != NULL else v.p.n_rows
     return 4 * k + 1 + scratch
@@ -126,7 +126,7 @@ cdef inline int32_t find_islands(const view_t* v, int32_t* index, islands_t* out
 
 
 cdef inline bint is_immovable(const view_t* v, int32_t i) noexcept nogil:
-    """Whether no impulse changes a slack of block i: it lies between static bodies, or its rows of J or A have no entries."""
+    """Return whether no impulse changes a slack of block i: its bodies are static, or its rows of J or A are empty."""
     cdef const int32_t* pair
     if v.g != NULL:
         return v.g.jptr[v.p.ptr[i + 1]] == v.g.jptr[v.p.ptr[i]]
@@ -137,7 +137,7 @@ cdef inline bint is_immovable(const view_t* v, int32_t i) noexcept nogil:
 
 
 cdef inline void list_one_island(int32_t k, int32_t* index, islands_t* out) noexcept nogil:
-    """All k blocks as one island, in index (3 k + 2)."""
+    """Write all k blocks as one island into `out`, with arrays in index (3 k + 2)."""
     cdef int32_t i
     for i in range(k):
         index[i] = 0
@@ -147,5 +147,5 @@ cdef inline void list_one_island(int32_t k, int32_t* index, islands_t* out) noex
 
 
 cdef inline int32_t first_row_of(const blocks_t* p, int32_t island) noexcept nogil:
-    """The first row of an island, in its first block."""
+    """Return the first row of an island."""
     return p.ptr[p.islands.order[p.islands.ptr[island]]]

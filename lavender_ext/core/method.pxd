@@ -1,15 +1,16 @@
-"""A method as three functions on plain structs: workspace, start, step. Nothing here needs Python, allocates, or looks at a clock.
+"""Interface of an iterative method: three functions on plain structs, without Python, allocation or clocks.
 
-    view_t v          a problem: its blocks with d and nu, and one of A, bodies, J and M
-    options_t o       which method, to what tolerance, with how much work
-    workspace_t r          the caller's arrays
-    workspace(&v, &o, &r)            -> r.n_index, r.n_real as a first guess; 0: the method does not take this problem
-    start(&v, &o, &r, lambda)   -> MORE | NEEDS_WORKSPACE (r.n_index, r.n_real say how much; give it, start again) | an end
-    step(&v, &o, &r, work, lambda, &s) -> MORE | another outcome, lambda the best so far
+    view_t v                      the problem: blocks with d and nu, and one of A, bodies, J and M
+    options_t o                   method, tolerance, budget
+    workspace_t r                 arrays that the caller allocates
+    workspace(&v, &o, &r)         estimates r.n_index and r.n_real; returns 0 if the method does not accept the problem
+    start(&v, &o, &r, lambda)     returns MORE, NEEDS_WORKSPACE (allocate r.n_index and r.n_real, then start again) or another
+                                  outcome
+    step(&v, &o, &r, work, lambda, &s)      returns MORE or another outcome; lambda is the best impulse so far
 
-A start stores its findings in r.index before it knows the size of its workspace, once: r describes the problem (`laid`) from
-the first NEEDS_WORKSPACE on that asks for no more integers. A method keeps its state in r, which must not move between the start
-and the last step, nor may the arrays of v.
+`start` analyses the structure of the problem once and stores the result in r.index, before it can compute the size of the
+remaining workspace: r.is_bound is set from the first NEEDS_WORKSPACE that does not request more integers. A method keeps its
+state in r. Neither r nor the arrays of v may move between `start` and the last `step`.
 """
 from libc.stdint cimport int32_t, int64_t
 
@@ -19,28 +20,28 @@ from lavender_ext.core.view cimport view_t
 
 cdef enum:                      # outcomes
     MORE = 0
-    REACHED = 1                 # tol
-    ROUNDOFF_LIMIT = 2                   # within twice what rounding leaves
-    STUCK = 3
-    CERTIFICATE = 4             # `direction` may prove that there is no solution: the caller looks, and calls again
-    SPENT = 5                   # the budget, or `stop`
+    REACHED = 1                 # the residual is at most tol
+    ROUNDOFF_LIMIT = 2          # the residual is within twice the round-off floor
+    STUCK = 3                   # the method makes no progress
+    CERTIFICATE = 4             # `direction` may prove that no solution exists: the caller checks it, and may step again
+    SPENT = 5                   # the budget is used up, or `stop` is set
     NEEDS_WORKSPACE = 6
-    UNFIT = 7                   # the method does not take this problem
-    BROKEN = 8                  # a factor has no sound pivots
-    LOST = 9                    # numbers are not finite
+    UNFIT = 7                   # the method does not accept this problem
+    BROKEN = 8                  # a factorisation has no acceptable pivots
+    LOST = 9                    # a number is not finite
 
 
 cdef struct options_t:
     int32_t method
-    int32_t budget              # units of work
-    int32_t proven              # the direction of a CERTIFICATE is a proof
-    int32_t stop                # end with what is there
-    int32_t wide                # four lanes are one instruction: the same bits, sooner
+    int32_t budget              # maximum units of work
+    int32_t proven              # the caller confirmed that the direction of a CERTIFICATE is a proof
+    int32_t stop                # the next step ends with the present result
+    int32_t wide                # the processor has four-lane instructions: same bits, faster
     double tol                  # relative residual
-    double e0                   # error of doing nothing, as the judge has it: sqrt J
-    double v0                   # m/s
-    double most                 # doubles of one factor, above which the method does not take the problem
-    double work                 # multiply-adds of one, above which it need not be laid out; 0: however many
+    double e0                   # judge's energy error of the zero impulse, sqrt J
+    double v0                   # judge's velocity error of the zero impulse, m/s
+    double most                 # maximum doubles of one factor; the method does not accept a problem that needs more
+    double work                 # multiply-adds of one factor above which no workspace is bound; 0: no limit
 
 
 cdef struct workspace_t:
@@ -48,34 +49,34 @@ cdef struct workspace_t:
     int64_t n_real
     int32_t* index              # a multiple of 8 bytes
     double* real
-    int32_t laid                # what follows is known, and stands in index
-    int32_t tries               # layouts that were too small
+    int32_t is_bound            # the structure is analysed, and the following fields are known
+    int32_t tries               # number of layouts that were too small
     int32_t islands
     double work                 # multiply-adds of one factor
 
 
-cdef struct said_t:             # since the start
-    int32_t work                # in the method's unit
+cdef struct info_t:             # statistics since the start
+    int32_t work                # units of work of the method
     int32_t factorisations
-    int32_t rounds              # over J and M: of Coulomb friction,
-    int32_t evaluations         # and of lambda along a line
-    double relative             # residual of lambda, -1: not known
-    const double* direction     # (m) N s of a CERTIFICATE, or NULL
+    int32_t rounds              # over J and M: friction updates of Coulomb's law
+    int32_t evaluations         # over J and M: line search evaluations
+    double relative             # relative residual of lambda, -1 if unknown
+    const double* direction     # (m) N s, direction of a CERTIFICATE, or NULL
     const double* tried         # (m) N s, the impulse that was judged last, or NULL
 
 
 cdef struct method_t:
     int32_t (*workspace)(const view_t*, const options_t*, workspace_t*) noexcept nogil
     int32_t (*start)(const view_t*, const options_t*, workspace_t*, const double*) noexcept nogil
-    int32_t (*step)(const view_t*, const options_t*, const workspace_t*, int32_t, double*, said_t*) noexcept nogil
+    int32_t (*step)(const view_t*, const options_t*, const workspace_t*, int32_t, double*, info_t*) noexcept nogil
 
 
-cdef inline bint grant(workspace_t* r, int64_t n_index, int64_t n_real) noexcept nogil:
-    """Is there as much? Else that is what is needed."""
-    cdef bint enough = r.n_index >= n_index and r.n_real >= n_real and (r.real != NULL or n_real == 0)
-    if not enough:
+cdef inline bint require_workspace(workspace_t* r, int64_t n_index, int64_t n_real) noexcept nogil:
+    """Return whether r has this much workspace; if not, store the required sizes in r."""
+    cdef bint is_enough = r.n_index >= n_index and r.n_real >= n_real and (r.real != NULL or n_real == 0)
+    if not is_enough:
         r.n_index, r.n_real = n_index, n_real
-    return enough
+    return is_enough
 
 
 cdef class Method:
@@ -83,7 +84,7 @@ cdef class Method:
     cdef view_t view
     cdef options_t options
     cdef workspace_t space
-    cdef said_t said
+    cdef info_t info
     cdef method_t own
-    cdef readonly int how       # it stands: one of `OUTCOMES`
+    cdef readonly int how       # the last outcome: one of `OUTCOMES`
     cdef void aim(self, double tol, int budget) noexcept

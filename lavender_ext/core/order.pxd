@@ -1,8 +1,8 @@
 """Sweep orders of blocks: the next sweep's order, levels from the ground, greedy colours.
 
-An order is a permutation of block numbers (int32). GIVEN keeps it; SYMMETRIC turns it round before
-every sweep but the first; RANDOM shuffles it before every sweep with an own generator (SplitMix64,
-Steele, Lea, Flood 2014), so that a seed means the same sweep everywhere.
+An order is a permutation of block numbers (int32). GIVEN keeps it, SYMMETRIC reverses it before every sweep except the
+first, and RANDOM shuffles it before every sweep with SplitMix64 (Steele, Lea, Flood 2014), so that a seed gives the same
+sweeps on every machine.
 """
 from libc.stdint cimport int32_t, uint64_t
 
@@ -14,6 +14,7 @@ cpdef enum:
 
 
 cdef inline uint64_t next_random(uint64_t* state) noexcept nogil:
+    """Return the next 64 random bits of SplitMix64."""
     cdef uint64_t z
     state[0] = state[0] + <uint64_t>0x9E3779B97F4A7C15ULL
     z = state[0]
@@ -23,7 +24,7 @@ cdef inline uint64_t next_random(uint64_t* state) noexcept nogil:
 
 
 cdef inline void shuffle(int32_t* order, int32_t first, int32_t end, uint64_t* rng) noexcept nogil:
-    # Fisher-Yates on order[first:end]; the draw is (random 32 bits) * n / 2^32.
+    """Shuffle order[first:end] (Fisher-Yates); an index below n is (32 random bits) * n / 2^32."""
     cdef int32_t i = end - 1, j, t
     while i > first:
         j = first + <int32_t>(((next_random(rng) >> 32) * <uint64_t>(i - first + 1)) >> 32)
@@ -34,6 +35,7 @@ cdef inline void shuffle(int32_t* order, int32_t first, int32_t end, uint64_t* r
 
 
 cdef inline void reverse(int32_t* order, int32_t first, int32_t end) noexcept nogil:
+    """Reverse order[first:end]."""
     cdef int32_t i = first, j = end - 1, t
     while i < j:
         t = order[i]
@@ -45,7 +47,7 @@ cdef inline void reverse(int32_t* order, int32_t first, int32_t end) noexcept no
 
 cdef inline void advance_order(int32_t mode, int32_t first_sweep, int32_t* order, int32_t first, int32_t end,
                                uint64_t* rng) noexcept nogil:
-    """Order of the coming sweep, in place, of the blocks order[first:end]."""
+    """Update order[first:end] in place for the next sweep."""
     if mode == RANDOM:
         shuffle(order, first, end, rng)
     elif mode == SYMMETRIC and not first_sweep:
@@ -53,15 +55,15 @@ cdef inline void advance_order(int32_t mode, int32_t first_sweep, int32_t* order
 
 
 cdef inline int32_t body_levels(int32_t n_blocks, const int32_t* body, int32_t n_bodies, int32_t* level) noexcept nogil:
-    """Breadth-first level of each body from the static ones (body -1); unreached bodies get the last level + 1.
+    """Compute the breadth-first level of each body from the static ones (body -1); return the number of levels.
 
-    `body` is (n_blocks, 2). Relaxed edge by edge until nothing changes, forwards then backwards: as many
-    passes as the longest run against both directions, linear for scenes built bottom-up.
+    Bodies without a path to a static body get the last level + 1. `body` is (n_blocks, 2). Edges are relaxed forwards and
+    backwards until no level changes. This is linear for scenes whose bodies are numbered from the ground up.
     """
     cdef int32_t i, a, b, la, lb, changed, top = 0, far = 2147483647, _pass
     for i in range(n_bodies):
         level[i] = far
-    for _pass in range(n_bodies + 1):                   # the last of them changes nothing
+    for _pass in range(n_bodies + 1):                   # The last pass changes nothing.
         changed = 0
         for i in range(2 * n_blocks):
             a = body[2 * i] if i < n_blocks else body[2 * (2 * n_blocks - 1 - i)]
@@ -86,7 +88,7 @@ cdef inline int32_t body_levels(int32_t n_blocks, const int32_t* body, int32_t n
 
 
 cdef inline void block_levels(int32_t n_blocks, const int32_t* body, const int32_t* level, int32_t* out) noexcept nogil:
-    # A block sits as low as the lower of its two bodies: a block on the ground has level 0.
+    """Compute the level of each block: the lower level of its two bodies plus 1, 0 for a block on the ground."""
     cdef int32_t i, la, lb
     for i in range(n_blocks):
         la = 0 if body[2 * i] < 0 else level[body[2 * i]] + 1
@@ -96,7 +98,10 @@ cdef inline void block_levels(int32_t n_blocks, const int32_t* body, const int32
 
 cdef inline void sort_by_level(int32_t n_blocks, const int32_t* level, int32_t n_levels, int32_t* start,
                                int32_t* order) noexcept nogil:
-    # Stable counting sort, without what has level -1; start has n_levels + 1 entries and ends as the first place of each level.
+    """Sort blocks by level (stable counting sort); blocks of level -1 are omitted.
+
+    start (n_levels + 1) receives the first index of each level in `order`.
+    """
     cdef int32_t i, s, t
     for i in range(n_levels + 1):
         start[i] = 0
@@ -121,16 +126,16 @@ cdef inline void sort_by_level(int32_t n_blocks, const int32_t* level, int32_t n
 
 cdef inline int32_t color_by_bodies(int32_t n_blocks, const int32_t* body, int32_t n_bodies, uint64_t* used,
                                     int32_t* color) noexcept nogil:
-    """Greedy colours: no two blocks of one colour share a moving body. Returns the number of colours.
+    """Colour blocks greedily so that no two blocks of one colour share a moving body; return the number of colours.
 
-    `used` (n_bodies) holds one bit per colour of the current group of 63; blocks that find no free bit
-    wait for the next group.
+    `used` (n_bodies) holds one bit per colour of the current group of 63 colours. Blocks without a free bit are coloured in
+    the next group.
     """
-    cdef int32_t i, a, b, c, base = 0, left = n_blocks, top = 0
-    cdef uint64_t free
+    cdef int32_t i, a, b, c, base = 0, uncoloured = n_blocks, top = 0
+    cdef uint64_t occupied
     for i in range(n_blocks):
         color[i] = -1
-    while left > 0:
+    while uncoloured > 0:
         for i in range(n_bodies):
             used[i] = 0
         for i in range(n_blocks):
@@ -138,13 +143,13 @@ cdef inline int32_t color_by_bodies(int32_t n_blocks, const int32_t* body, int32
                 continue
             a = body[2 * i]
             b = body[2 * i + 1]
-            free = 0
+            occupied = 0
             if a >= 0:
-                free |= used[a]
+                occupied |= used[a]
             if b >= 0:
-                free |= used[b]
+                occupied |= used[b]
             c = 0
-            while c < 63 and (free >> c) & 1:
+            while c < 63 and (occupied >> c) & 1:
                 c += 1
             if c == 63:
                 continue
@@ -155,6 +160,6 @@ cdef inline int32_t color_by_bodies(int32_t n_blocks, const int32_t* body, int32
             color[i] = base + c
             if base + c + 1 > top:
                 top = base + c + 1
-            left -= 1
+            uncoloured -= 1
         base += 63
     return top

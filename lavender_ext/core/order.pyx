@@ -1,4 +1,4 @@
-"""Orders and colours of blocks for Python: thin entries of core/order.pxd, and colours of a matrix's blocks."""
+"""Orders and colours of blocks for Python: wrappers of core/order.pxd, and colours of the blocks of a matrix."""
 from libc.stdint cimport int32_t, uint64_t
 
 import numpy as np
@@ -9,9 +9,9 @@ from lavender_ext.core.order cimport block_levels, body_levels, color_by_bodies
 cdef public int32_t lav_graph_colors(int32_t n_blocks, const int32_t* block_ptr, const int32_t* block_of,
                                      const int32_t* indptr, const int32_t* indices, int32_t* mark,
                                      int32_t* color) noexcept nogil:
-    """Greedy colours of blocks that meet in A (pattern of rows and columns given symmetrically).
+    """Colour blocks greedily so that no two blocks of one colour are coupled in A; return the number of colours.
 
-    mark (n_blocks + 1) is scratch. Returns the number of colours.
+    The pattern of A must be symmetric. mark (n_blocks + 1) is scratch.
     """
     cdef int32_t i, j, q, c, top = 0
     for i in range(n_blocks):
@@ -34,7 +34,7 @@ cdef public int32_t lav_graph_colors(int32_t n_blocks, const int32_t* block_ptr,
 
 
 def body_order_levels(const int32_t[:, ::1] body, int n_bodies):
-    """Level (k,) of each block from the static bodies; `body` (k, 2)."""
+    """Return the level (k,) of each block, counted from the static bodies; `body` is (k, 2)."""
     cdef int32_t k = <int32_t>body.shape[0]
     cdef int32_t[::1] level = np.empty(n_bodies + 1, np.int32), out = np.empty(k + 1, np.int32)
     if k:
@@ -44,7 +44,7 @@ def body_order_levels(const int32_t[:, ::1] body, int n_bodies):
 
 
 def body_colors(const int32_t[:, ::1] body, int n_bodies):
-    """Colour (k,) of each block: within one colour no two share a moving body."""
+    """Return the colour (k,) of each block; no two blocks of one colour share a moving body."""
     cdef int32_t k = <int32_t>body.shape[0]
     cdef uint64_t[::1] used = np.zeros(n_bodies + 1, np.uint64)
     cdef int32_t[::1] color = np.empty(k + 1, np.int32)
@@ -55,7 +55,7 @@ def body_colors(const int32_t[:, ::1] body, int n_bodies):
 
 def graph_colors(const int32_t[::1] block_ptr, const int32_t[::1] block_of, const int32_t[::1] indptr,
                  const int32_t[::1] indices):
-    """Colour (k,) of each block: within one colour no two meet in the symmetric pattern given."""
+    """Return the colour (k,) of each block; no two blocks of one colour are coupled in the symmetric pattern."""
     cdef int32_t k = <int32_t>block_ptr.shape[0] - 1
     cdef int32_t[::1] mark = np.empty(k + 1, np.int32), color = np.empty(k + 1, np.int32)
     if k and indices.shape[0]:

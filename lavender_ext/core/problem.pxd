@@ -1,60 +1,60 @@
-"""What the kernels know of a problem: plain pointers into arrays that a `Data` keeps alive."""
+"""A problem for kernels: pointers into arrays that a `Data` keeps alive, and derived numbers."""
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.parts cimport blocks_t, islands_t
+from lavender_ext.core.block_types cimport blocks_t, islands_t
 from lavender_ext.core.view cimport csr_t, generalized_t, rows_t, view_t
 
 
 cdef class Workspace:
-    cdef void* at               # freed with the object
+    cdef void* at               # memory, freed with the object
 
 
 cdef Workspace allocate_workspace(Py_ssize_t bytes)
 
 
-cdef enum:                      # how `make_numbers` ended
-    MADE = 0
+cdef enum:                      # results of `compute_derived`
+    DERIVED = 0
     NO_MEMORY = 1
     TOO_MANY = 2
 
 
-cdef struct made_t:             # of a problem in generalised coordinates; `free` both, of which the next may be made
+cdef struct derived_t:          # derived numbers in generalised coordinates; the owner frees or reuses both arrays
     int32_t* marks              # scratch (2 n), prow, pcol, pval (k + 1 each), empty (m + 1), home (k), cols
     double* numbers             # d, nu, step (m + 1 each), Y
-    ssize_t n_marks             # as many as there is workspace for,
-    ssize_t n_numbers           # 0 at first
-    int32_t* empty              # inside marks
+    ssize_t n_marks             # allocated length of marks, 0 at first
+    ssize_t n_numbers           # allocated length of numbers, 0 at first
+    int32_t* empty              # points into marks
     int32_t n_empty
     int32_t n_panels
-    double values               # of Y
+    double values               # number of values of Y
 
 
 cdef double entries_of(const generalized_t* g, double* on) noexcept nogil
-cdef int32_t make_numbers(blocks_t* p, generalized_t* g, made_t* out) noexcept nogil
+cdef int32_t compute_derived(blocks_t* p, generalized_t* g, derived_t* out) noexcept nogil
 
 
 cdef public int32_t lav_rows_diagonal(const blocks_t* p, const rows_t* r, double* d, double* nu, double* step, int32_t* empty,
-                                      double* minv_jac, double* coupling, double* swing) noexcept nogil
+                                      double* minv_jac, double* coupling, double* inv_inertia_arm) noexcept nogil
 cdef int32_t matrix_numbers(const blocks_t* p, const csr_t* a, double* d, double* nu, double* step, int32_t* empty) noexcept nogil
 
 
 cdef class Data:
     cdef blocks_t blocks
-    cdef csr_t csr              # where A is given, or formed
-    cdef rows_t rows            # where factored
-    cdef generalized_t general  # where is_general
+    cdef csr_t csr              # valid if A is given or formed
+    cdef rows_t rows            # valid if factored
+    cdef generalized_t general  # valid if is_general
     cdef readonly bint factored, is_general
     cdef readonly bint ready            # d, nu, step and Y are known
     cdef readonly bint single_rows      # every block is one bounded row
     cdef readonly object empty
     cdef object _numbers, _d, _nu, _step
-    cdef made_t made            # where is_general and ready
-    cdef readonly double reference_energy, reference_velocity, relative_at_zero   # negative where not known
-    cdef islands_t islands_at           # what blocks.islands points to, if it is not NULL
+    cdef derived_t derived      # valid if is_general and ready
+    cdef readonly double reference_energy, reference_velocity, relative_at_zero   # negative if unknown
+    cdef islands_t islands_at           # target of blocks.islands, if that is not NULL
     cdef object _weight
     cdef list keep
 
     cdef view_t view(self) noexcept nogil
-    cdef void adopt(self, made_t* made)
+    cdef void adopt(self, derived_t* derived)
     cdef void keep_reference(self, const islands_t* islands, const double* start)
     cdef object part(self, int which)

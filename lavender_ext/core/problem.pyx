@@ -1,10 +1,10 @@
-"""A problem's derived numbers: diagonal d, velocity weight nu, sweep step, coupling of a contact's rows.
+"""Derived numbers of a problem: diagonal d, velocity weight nu, sweep step, coupling of the rows of a contact.
 
-    d_i     = A_ii; where A_ii <= 1e-10 max_j |A_ij| that maximum; an empty row, its largest below 1e-60: the mean of the
-              others' d, or 1 (factored: only empty rows fall back); on two tangents the mean of both, and on
-              the two that roll                                                                   (1)
-    nu_i    = d_i; on a row that spins or rolls d of its normal; on an angular joint row 1/m_a + 1/m_b           (2)
-    step_i  by `core/steps.pxd`                                                                   (3)
+    d_i     = A_ii; max_j |A_ij| if A_ii <= 1e-10 of it (only for a matrix A). An empty row (largest entry below 1e-60) gets the
+              mean d of the other rows, or 1 if all are empty. The two tangents of a disk get their mean, and so do the two
+              rolling rows.                                                                                        (1)
+    nu_i    = d_i; on a spin or rolling row d of its normal; on an angular joint row 1/m_a + 1/m_b                 (2)
+    step_i    see core/steps.pxd                                                                                   (3)
 """
 from libc.math cimport fabs
 from libc.stdint cimport int32_t
@@ -17,25 +17,26 @@ import numpy as np
 
 from lavender_ext.core.arrays cimport doubles
 from lavender_ext.core.blocks cimport Blocks
-from lavender_ext.core.door cimport first_outside, least
+from lavender_ext.core.validate cimport first_invalid, min_magnitude
 from lavender_ext.core.dot cimport dot
 from lavender_ext.core.generalized cimport Operator, panel_pattern, panel_whiten
 from lavender_ext.core.islands cimport find_islands, islands_index
-from lavender_ext.core.parts cimport CONE, COULOMB, blocks_t, is_box, islands_t, n_directions, n_turns, parts_of, parts_t
+from lavender_ext.core.block_types cimport (CONE, COULOMB, MAX_FRICTION_COMPONENTS, blocks_t, is_box, islands_t, n_tangents,
+                                            n_angular_rows, get_friction_components, friction_components_t)
 from lavender_ext.core.rows cimport contact_diagonal, dot12, largest_eigenvalue, minv_times, rows_times
-from lavender_ext.core.steps cimport block_steps, csr_largest, pair_means
+from lavender_ext.core.steps cimport block_steps, csr_pair_eigenvalue, pair_means
 from lavender_ext.core.view cimport csr_t, generalized_t, rows_t, view_t
 from lavender_ext.core.weights cimport block_weights, joint_weights
 
 
 cdef object new = np.empty, I4 = np.dtype(np.int32)
 
-#: Friction laws by the kernels' numbers.
+#: Kernel numbers of the friction laws.
 LAWS = {"coulomb": COULOMB, "cone": CONE}
 
 
 cdef inline void fill_empty(int32_t m, double* d) noexcept nogil:
-    """The mean of the others, or 1, where d (m) is not above 0; NaN stays."""
+    """Replace entries of d (m) that are not above 0 by the mean of the others, or by 1; NaN is kept."""
     cdef int32_t i, count = 0
     cdef double total = 0.0, mean
     for i in range(m):
@@ -50,11 +51,11 @@ cdef inline void fill_empty(int32_t m, double* d) noexcept nogil:
 
 cdef public int32_t lav_csr_diagonal(const blocks_t* p, const csr_t* a, double* d, double* step,
                                      int32_t* empty) noexcept nogil:
-    """d and step of (1), (3) from the rows of A; marks empty rows, returns how many."""
+    """Compute d (1) and step (3) from the rows of A; mark empty rows and return their number."""
     cdef int32_t i, j, q, g, n_empty = 0
     cdef double diag, big, x
-    cdef double most[3]
-    cdef parts_t part
+    cdef double eigenvalue[MAX_FRICTION_COMPONENTS]
+    cdef friction_components_t part
     for i in range(p.n_rows):
         diag = 0.0
         big = 0.0
@@ -65,31 +66,31 @@ cdef public int32_t lav_csr_diagonal(const blocks_t* p, const csr_t* a, double* 
             if a.indices[q] == i:
                 diag += a.data[q]
         d[i] = diag if diag > 1e-10 * big else big
-        empty[i] = big < least()
+        empty[i] = big < min_magnitude()
         if empty[i]:
             d[i] = 0.0
         n_empty += empty[i]
-        step[i] = big                                   # held for (3) below
+        step[i] = big                                   # row maximum, used by (3) below
     fill_empty(p.n_rows, d)
     for i in range(p.n_blocks):
         j = p.ptr[i]
         pair_means(p, i, d)
-        parts_of(p, i, &part)
+        get_friction_components(p, i, &part)
         for g in range(part.n):
             if part.size[g] == 2:
-                most[g] = csr_largest(a, j + part.first[g], d, step)
-        block_steps(p, i, &part, most, d, step)
+                eigenvalue[g] = csr_pair_eigenvalue(a, j + part.first[g], d, step)
+        block_steps(p, i, &part, eigenvalue, d, step)
     return n_empty
 
 
 cdef public void lav_matrix_nu(const blocks_t* p, double* nu) noexcept nogil:
-    """(2) where only a matrix is known."""
+    """Compute nu (2) if only a matrix is known."""
     block_weights(p, p.d, nu)
 
 
 cdef int32_t matrix_numbers(const blocks_t* p, const csr_t* a, double* d, double* nu, double* step,
                             int32_t* empty) noexcept nogil:
-    """d, which is that of p, nu and step of a matrix; empty rows."""
+    """Compute d (= p.d), nu and step from a matrix; return the number of empty rows."""
     cdef int32_t n_empty = lav_csr_diagonal(p, a, d, step, empty)
     lav_matrix_nu(p, nu)
     return n_empty
@@ -97,12 +98,16 @@ cdef int32_t matrix_numbers(const blocks_t* p, const csr_t* a, double* d, double
 
 cdef public int32_t lav_rows_diagonal(const blocks_t* p, const rows_t* r, double* d, double* nu, double* step,
                                       int32_t* empty, double* minv_jac, double* coupling,
-                                      double* swing) noexcept nogil:
-    """d, nu, step, M^-1 J^T of joints, coupling and swing of contacts, from the factored form."""
+                                      double* inv_inertia_arm) noexcept nogil:
+    """Compute d, nu, step, M^-1 J^T of joints, coupling and inv_inertia_arm of contacts from the factored form.
+
+    Returns the number of empty rows.
+    """
     cdef int32_t i, j, q, g, c, nt, n_empty = 0, a, b
     cdef double off[2]
-    cdef double most[3]
-    cdef parts_t part
+    cdef double eigenvalue[MAX_FRICTION_COMPONENTS]
+    cdef friction_components_t part
+    # joints: M^-1 J^T and diagonal
     for i in range(r.n_joints):
         a = r.joint_body[2 * i]
         b = r.joint_body[2 * i + 1]
@@ -110,36 +115,39 @@ cdef public int32_t lav_rows_diagonal(const blocks_t* p, const rows_t* r, double
             minv_times(r.jac + 12 * j, r.inv_mass, r.inv_inertia, a, b, minv_jac + 12 * j)
             d[j] = dot12(r.jac + 12 * j, minv_jac + 12 * j) + r.compliance[j]
             step[j] = 0.0
+    # contacts: block of A
     for c in range(r.n_contacts):
         i = r.n_joints + c
         j = p.ptr[i]
-        nt = n_directions(p, i)
+        nt = n_tangents(p, i)
         contact_diagonal(r.normal + 3 * c, r.tangent + 3 * c, r.arm_a + 3 * c, r.arm_b + 3 * c, nt,
-                         n_turns(p, i), r.contact_body[2 * c], r.contact_body[2 * c + 1], r.inv_mass,
+                         n_angular_rows(p, i), r.contact_body[2 * c], r.contact_body[2 * c + 1], r.inv_mass,
                          r.inv_inertia, d + j, off,
-                         coupling + 5 * c, swing + 6 * (j - p.ptr[r.n_joints]))
+                         coupling + 5 * c, inv_inertia_arm + 6 * (j - p.ptr[r.n_joints]))
         for q in range(j, p.ptr[i + 1]):
             d[q] += r.compliance[q]
             step[q] = 0.0
-        if is_box(p, i):                                # each tangent has a step of its own, and feels the one before
+        if is_box(p, i):                                # The second tangent of a box uses the impulse change of the first.
             coupling[5 * c + 2] = off[0]
-        parts_of(p, i, &part)
+        get_friction_components(p, i, &part)
         for g in range(part.n):
             if part.size[g] == 2:
                 q = j + part.first[g]
                 step[q] = largest_eigenvalue(d[q], off[part.first[g] > nt], d[q + 1])
+    # empty rows
     for j in range(p.n_rows):
-        empty[j] = fabs(d[j]) < least()
+        empty[j] = fabs(d[j]) < min_magnitude()
         if empty[j]:
             d[j] = 0.0
         n_empty += empty[j]
     fill_empty(p.n_rows, d)
+    # steps
     for i in range(p.n_blocks):
         pair_means(p, i, d)
-        parts_of(p, i, &part)
+        get_friction_components(p, i, &part)
         for g in range(part.n):
-            most[g] = step[p.ptr[i] + part.first[g]]
-        block_steps(p, i, &part, most, d, step)
+            eigenvalue[g] = step[p.ptr[i] + part.first[g]]
+        block_steps(p, i, &part, eigenvalue, d, step)
     block_weights(p, d, nu)
     joint_weights(p, r, nu)
     return n_empty
@@ -147,10 +155,10 @@ cdef public int32_t lav_rows_diagonal(const blocks_t* p, const rows_t* r, double
 
 cdef public int32_t lav_general_diagonal(const blocks_t* p, const generalized_t* g, double* d, double* nu, double* step,
                                          int32_t* empty, int32_t* place, double* y) noexcept nogil:
-    """Y, d, nu and step of a problem in generalised coordinates; place (n) is scratch. Returns how many rows are empty."""
+    """Compute Y, d, nu and step in generalised coordinates; return the number of empty rows. place (n) is scratch."""
     cdef int32_t i, j, b, nc, part_, n_empty = 0
-    cdef double most[3]
-    cdef parts_t part
+    cdef double eigenvalue[MAX_FRICTION_COMPONENTS]
+    cdef friction_components_t part
     cdef const double* row
     for b in range(g.n_panels):
         panel_whiten(g, b, place, y + g.pval[b])
@@ -158,7 +166,7 @@ cdef public int32_t lav_general_diagonal(const blocks_t* p, const generalized_t*
         row = y + g.pval[b]
         for i in range(g.prow[b], g.prow[b + 1]):
             d[i] = dot(row, row, nc) + g.compliance[i]
-            empty[i] = d[i] < least()
+            empty[i] = d[i] < min_magnitude()
             if empty[i]:
                 d[i] = 0.0
                 n_empty += 1
@@ -171,36 +179,37 @@ cdef public int32_t lav_general_diagonal(const blocks_t* p, const generalized_t*
         while g.prow[b + 1] <= j:
             b += 1
         nc = g.pcol[b + 1] - g.pcol[b]
-        parts_of(p, i, &part)
+        get_friction_components(p, i, &part)
         for part_ in range(part.n):
             if part.size[part_] == 2:
                 j = p.ptr[i] + part.first[part_]
                 row = y + g.pval[b] + (j - g.prow[b]) * nc
-                most[part_] = largest_eigenvalue(d[j], dot(row, row + nc, nc), d[j + 1])
+                eigenvalue[part_] = largest_eigenvalue(d[j], dot(row, row + nc, nc), d[j + 1])
         pair_means(p, i, d)
-        block_steps(p, i, &part, most, d, step)
+        block_steps(p, i, &part, eigenvalue, d, step)
     block_weights(p, d, nu)
     return n_empty
 
 
-cdef void point_at(blocks_t* p, generalized_t* g, const made_t* made) noexcept nogil:
+cdef void point_at(blocks_t* p, generalized_t* g, const derived_t* derived) noexcept nogil:
+    """Point p and g at the derived numbers."""
     cdef ssize_t k = p.n_blocks, m = p.n_rows
-    p.d = made.numbers
-    p.nu = made.numbers + m + 1
-    p.step = made.numbers + 2 * (m + 1)
-    g.y = made.numbers + 3 * (m + 1)
-    g.n_panels = made.n_panels
-    g.prow = made.marks + 2 * <ssize_t>g.n
+    p.d = derived.numbers
+    p.nu = derived.numbers + m + 1
+    p.step = derived.numbers + 2 * (m + 1)
+    g.y = derived.numbers + 3 * (m + 1)
+    g.n_panels = derived.n_panels
+    g.prow = derived.marks + 2 * <ssize_t>g.n
     g.pcol = g.prow + k + 1
     g.pval = g.pcol + k + 1
-    g.home = made.empty + m + 1
+    g.home = derived.empty + m + 1
     g.cols = g.home + k
 
 
 cdef double entries_of(const generalized_t* g, double* on) noexcept nogil:
-    """`Data.entries_of_a`; on (n) is scratch: rows of each tree, at its first velocity."""
+    """Return `Data.entries_of_a`; on (n) is scratch: the number of rows of each tree, stored at its root."""
     cdef int32_t b, q, rows
-    cdef double out = 0.0, most = <double>g.m * g.m
+    cdef double out = 0.0, dense = <double>g.m * g.m
     for b in range(g.n):
         on[b] = 0.0
     for b in range(g.n_panels):
@@ -210,19 +219,22 @@ cdef double entries_of(const generalized_t* g, double* on) noexcept nogil:
                 on[g.cols[q]] += rows
     for b in range(g.n):
         out += on[b] * on[b]
-    return out if out < most else most
+    return out if out < dense else dense
 
 
-cdef int32_t make_numbers(blocks_t* p, generalized_t* g, made_t* out) noexcept nogil:
-    """Panels, Y, d, nu and step of a problem in generalised coordinates, which then points at them; how it ended.
+cdef int32_t compute_derived(blocks_t* p, generalized_t* g, derived_t* out) noexcept nogil:
+    """Compute panels, Y, d, nu and step in generalised coordinates, and point p and g at them.
 
-    out: zeros, or what an earlier problem leaves.
+    `out` is zero-initialised, or holds the memory of an earlier problem, which is reused. Returns DERIVED, NO_MEMORY or
+    TOO_MANY (indices exceed 32 bits).
     """
     cdef int32_t n = g.n, k = p.n_blocks, m = p.n_rows, n_cols, i, b = 0
     cdef int32_t* home
-    cdef ssize_t head = 2 * <ssize_t>n + 3 * (<ssize_t>k + 1) + m + 1 + k, workspace = 2 * <ssize_t>g.jptr[m] + 64, most, size
+    cdef ssize_t head = 2 * <ssize_t>n + 3 * (<ssize_t>k + 1) + m + 1 + k, workspace = 2 * <ssize_t>g.jptr[m] + 64, max_workspace
+    cdef ssize_t size
     cdef int32_t* w
-    most = 2147483647 - head
+    max_workspace = 2147483647 - head
+    # panels, with more memory until it suffices
     while True:
         if out.n_marks < head + workspace:
             free(out.marks)
@@ -235,9 +247,9 @@ cdef int32_t make_numbers(blocks_t* p, generalized_t* g, made_t* out) noexcept n
                                      <int32_t>workspace, &n_cols, &out.values)
         if out.n_panels >= 0:
             break
-        if workspace >= most:
+        if workspace >= max_workspace:
             return TOO_MANY
-        workspace = 2 * workspace if 2 * workspace < most else most
+        workspace = 2 * workspace if 2 * workspace < max_workspace else max_workspace
     if out.values >= 2147483647.0:
         return TOO_MANY
     size = 3 * (<ssize_t>m + 1) + <ssize_t>out.values + 1
@@ -247,6 +259,7 @@ cdef int32_t make_numbers(blocks_t* p, generalized_t* g, made_t* out) noexcept n
         out.n_numbers = size if out.numbers != NULL else 0
     if out.numbers == NULL:
         return NO_MEMORY
+    # panel of each block
     out.empty = w + head - (m + 1) - k
     home = w + head - k
     for i in range(k):
@@ -255,34 +268,35 @@ cdef int32_t make_numbers(blocks_t* p, generalized_t* g, made_t* out) noexcept n
         home[i] = b
     point_at(p, g, out)
     out.n_empty = lav_general_diagonal(p, g, <double*>p.d, <double*>p.nu, <double*>p.step, out.empty, w, <double*>g.y)
-    return MADE
+    return DERIVED
 
 
 cdef class Workspace:
-    """Memory that lives as long as this: a quarter of what an array of NumPy and a view of it cost to make."""
+    """Memory owned by a Python object, created in a quarter of the time of a NumPy array with a view."""
 
     def __dealloc__(self):
         free(self.at)
 
 
 cdef Workspace allocate_workspace(Py_ssize_t bytes):
-    cdef Workspace made = Workspace.__new__(Workspace)
-    made.at = malloc(bytes if bytes > 0 else 1)
-    if made.at == NULL:
+    """Allocate uninitialised memory; raise MemoryError if that fails."""
+    cdef Workspace workspace = Workspace.__new__(Workspace)
+    workspace.at = malloc(bytes if bytes > 0 else 1)
+    if workspace.at == NULL:
         raise MemoryError(f"{bytes} bytes")
-    return made
+    return workspace
 
 
 cdef class Data:
-    """Pointers to a problem's arrays, and the numbers derived from them once.
+    """Pointers to the arrays of a problem, and the numbers derived from them once.
 
-    The caller passes checked, C-contiguous float64 / int32 arrays; they are kept alive here. Either
-    `csr` = (indptr, indices, data) or `rows` = (joint_jac, joint_body, normal, tangent, arm_a, arm_b,
-    contact_body, inv_mass, inv_inertia, compliance). In generalised coordinates: `general_data`.
+    The arrays must be validated, C-contiguous float64 or int32 arrays; they are kept alive. Either `csr` = (indptr, indices,
+    data) or `rows` = (joint_jac, joint_body, normal, tangent, arm_a, arm_b, contact_body, inv_mass, inv_inertia, compliance)
+    is given. `general_data` creates data in generalised coordinates.
     """
 
     def __init__(self, Blocks blocks, b_, int law, csr=None, rows=None):
-        # Kept as they came: a view made an object again costs more than the view.
+        # The arrays are kept as passed, because converting a view back to an object costs more than creating the view.
         cdef const double[::1] b = b_
         cdef int32_t m = blocks.at.n_rows, n_empty, i
         numbers_ = new(3 * m + 3)
@@ -310,7 +324,7 @@ cdef class Data:
             self._set_rows(rows)
             n_empty = lav_rows_diagonal(&self.blocks, &self.rows, d, nu, step, empty,
                                         <double*>self.rows.minv_jac, <double*>self.rows.coupling,
-                                        <double*>self.rows.swing)
+                                        <double*>self.rows.inv_inertia_arm)
         else:
             indptr, indices, data = csr
             self.csr.indptr = &indptr[0]
@@ -324,11 +338,11 @@ cdef class Data:
             self.empty = _read_only(np.array([i for i in range(m) if empty[i]], np.intp))
 
     def __dealloc__(self):
-        free(self.made.marks)
-        free(self.made.numbers)
+        free(self.derived.marks)
+        free(self.derived.numbers)
 
     cdef view_t view(self) noexcept nogil:
-        # Pointers into this object, which must outlive them.
+        """Return pointers into this object, which must outlive them."""
         cdef view_t v = view_t(self.blocks, NULL, NULL, NULL)
         if self.is_general:
             v.g = &self.general
@@ -339,56 +353,57 @@ cdef class Data:
         return v
 
     def prepare(self):
-        """d, nu, step and Y of a problem in generalised coordinates, where they are not known yet."""
-        cdef made_t made = made_t(NULL, NULL, 0, 0, NULL, 0, 0, 0.0)
+        """Compute d, nu, step and Y in generalised coordinates, unless they are known."""
+        cdef derived_t derived = derived_t(NULL, NULL, 0, 0, NULL, 0, 0, 0.0)
         cdef blocks_t blocks = self.blocks
         cdef generalized_t general = self.general
         cdef int32_t end
         if self.ready:
             return
-        end = make_numbers(&blocks, &general, &made)
-        if end == MADE:
-            self.adopt(&made)
+        end = compute_derived(&blocks, &general, &derived)
+        if end == DERIVED:
+            self.adopt(&derived)
             return
-        free(made.marks)
-        free(made.numbers)
+        free(derived.marks)
+        free(derived.numbers)
         if end == TOO_MANY:
-            raise OverflowError(f"M^-1 J^T has {made.values:.3g} entries, more than 32-bit indices reach")
-        raise MemoryError(f"{made.values:.3g} entries of M^-1 J^T")
+            raise OverflowError(f"M^-1 J^T has {derived.values:.3g} entries, more than 32-bit indices reach")
+        raise MemoryError(f"{derived.values:.3g} entries of M^-1 J^T")
 
-    cdef void adopt(self, made_t* made):
-        # What `make_numbers` made becomes this one's; freed where another thread was first with the same.
+    cdef void adopt(self, derived_t* derived):
+        """Take ownership of the result of `compute_derived`; free it if another thread stored the same result first."""
         cdef int32_t m = self.blocks.n_rows, i
         empty = _NONE
-        if made.n_empty:
-            empty = _read_only(np.array([i for i in range(m) if made.empty[i]], np.intp))
+        if derived.n_empty:
+            empty = _read_only(np.array([i for i in range(m) if derived.empty[i]], np.intp))
         with cython.critical_section(self):
             if self.ready:
-                free(made.marks)
-                free(made.numbers)
+                free(derived.marks)
+                free(derived.numbers)
                 return
             self.empty = empty
-            self.made = made[0]
-            point_at(&self.blocks, &self.general, made)
+            self.derived = derived[0]
+            point_at(&self.blocks, &self.general, derived)
             self.ready = True
 
     def _set_rows(self, rows):
+        """Point self.rows at the arrays of the factored form and allocate its derived arrays."""
         cdef const double[:, ::1] jac, normal, tangent, arm_a, arm_b
         cdef const int32_t[:, ::1] joint_body, contact_body
         cdef const double[::1] inv_mass, compliance
         cdef const double[:, :, ::1] inv_inertia
-        cdef double[:, ::1] minv_jac, coupling, swing
+        cdef double[:, ::1] minv_jac, coupling, inv_inertia_arm
         jac, joint_body, normal, tangent, arm_a, arm_b, contact_body, inv_mass, inv_inertia, compliance = rows
         minv_jac = np.zeros((jac.shape[0] + 1, 12))
         coupling = np.zeros((normal.shape[0] + 1, 5))
-        swing = np.zeros((self.blocks.n_rows - jac.shape[0] + 1, 6))
-        self.keep += [minv_jac, coupling, swing]
+        inv_inertia_arm = np.zeros((self.blocks.n_rows - jac.shape[0] + 1, 6))
+        self.keep += [minv_jac, coupling, inv_inertia_arm]
         self.rows.n_bodies = <int32_t>inv_mass.shape[0]
         self.rows.n_joints = <int32_t>joint_body.shape[0]
         self.rows.n_contacts = <int32_t>contact_body.shape[0]
         self.rows.minv_jac = &minv_jac[0, 0]
         self.rows.coupling = &coupling[0, 0]
-        self.rows.swing = &swing[0, 0]
+        self.rows.inv_inertia_arm = &inv_inertia_arm[0, 0]
         if jac.shape[0]:
             self.rows.jac = &jac[0, 0]
         if self.rows.n_joints:
@@ -406,6 +421,7 @@ cdef class Data:
             self.rows.compliance = &compliance[0]
 
     cdef object part(self, int which):
+        """Return d (0), nu (1) or step (2) as an array (m,)."""
         cdef Py_ssize_t m = self.blocks.n_rows, at = which * (m + 1)
         cdef double[::1] x
         if not self.is_general:
@@ -413,20 +429,20 @@ cdef class Data:
         out = np.empty(m)
         if m:
             x = out
-            memcpy(&x[0], self.made.numbers + at, m * sizeof(double))
+            memcpy(&x[0], self.derived.numbers + at, m * sizeof(double))
         return out
 
     @property
     def d(self):
-        """(m,) 1/kg: diagonal of A with fallbacks."""
+        """Diagonal of A with fallbacks (m,) [1/kg]."""
         if self._d is None:
             self._d = _read_only(self.part(0))
         return self._d
 
-    def weigh_as(self, Data other, bint joints=False):
-        """Take nu of the same problem given by rows: in A alone nothing tells an angular row from a linear one.
+    def copy_velocity_weight(self, Data other, bint joints=False):
+        """Copy nu from the same problem given by bodies, because A does not distinguish angular from linear rows.
 
-        joints: only of the bounded rows before the first contact, of a problem whose contacts are others.
+        If `joints` is true, only nu of the rows before the first contact is copied; the contacts may then differ.
         """
         cdef int32_t rows = self.blocks.ptr[other.rows.n_joints] if joints else self.blocks.n_rows
         memcpy(<double*>self.blocks.nu, other.blocks.nu, rows * sizeof(double))
@@ -434,26 +450,26 @@ cdef class Data:
 
     @property
     def nu(self):
-        """(m,) 1/kg: velocity error = sqrt(nu d) |e|."""
+        """Velocity weight nu (m,) [1/kg]: velocity error = sqrt(nu d) |e|."""
         if self._nu is None:
             self._nu = _read_only(self.part(1))
         return self._nu
 
     @property
     def step(self):
-        """(m,) kg: steps of a sweep."""
+        """Steps of a sweep (m,) [kg]."""
         if self._step is None:
             self._step = _read_only(self.part(2))
         return self._step
 
     @property
     def outside(self):
-        """The first row whose d is beyond what core/door.pxd allows, or -1."""
-        return first_outside(self.blocks.d, self.blocks.n_rows)
+        """First row whose d exceeds the range of core/validate.pxd, or -1."""
+        return first_invalid(self.blocks.d, self.blocks.n_rows)
 
     @property
     def work(self):
-        """Rough number of multiply-adds of one sweep; the front door sizes its chunks by it."""
+        """Approximate number of multiply-adds of one sweep, by which the caller sizes chunks of sweeps."""
         if self.is_general:
             return 2 * self.general.pval[self.general.n_panels] + 4 * self.blocks.n_rows
         if self.factored:
@@ -463,20 +479,20 @@ cdef class Data:
 
     @property
     def weight(self):
-        """sqrt(nu d) (m,) 1/kg: velocity error of a row per N s of e."""
+        """Weight sqrt(nu d) (m,) [1/kg]: velocity error of a row per N s of e."""
         if self._weight is None:
             self._weight = _read_only(np.sqrt(self.nu) * np.sqrt(self.d))
         return self._weight
 
     @property
     def entries_of_a(self):
-        """Entries that A has at most, of J and M: rows that share a tree meet; those that share two count twice."""
+        """Upper bound on the entries of A, from J and M: rows on the same tree are coupled; rows on two trees count twice."""
         cdef double[::1] on = np.empty(self.general.n + 1)
         return entries_of(&self.general, &on[0])
 
     @property
     def products_of_a(self):
-        """Multiply-adds of A = Y Y^T, of J and M: of each column of Y the square of its entries."""
+        """Multiply-adds of A = Y Y^T, from J and M: the sum over columns of Y of the squared number of entries."""
         cdef const generalized_t* g = &self.general
         cdef double[::1] on = np.zeros(g.n + 1)
         cdef int32_t b, q
@@ -489,7 +505,7 @@ cdef class Data:
         return out
 
     def whitened(self):
-        """(data, indices, indptr) of Y (m, n) in generalised coordinates; entries that are zero are left out."""
+        """Return (data, indices, indptr) of Y (m, n) in generalised coordinates, without zero entries."""
         cdef const generalized_t* g = &self.general
         cdef int32_t b, i, a, nc, at = 0
         cdef const double* y
@@ -512,7 +528,7 @@ cdef class Data:
         return data_[:at], indices_[:at], indptr_
 
     cdef void keep_reference(self, const islands_t* islands, const double* start):
-        """Keep a copy of the islands with their references, or NULL, and (3) of `reference_of`, unless they are known."""
+        """Store a copy of the islands with their references (or NULL) and the start of `reference_of`, unless known."""
         cdef Py_ssize_t k = self.blocks.n_blocks
         cdef Workspace numbers, marks
         cdef int32_t* at
@@ -534,46 +550,46 @@ cdef class Data:
             self.reference_energy = start[0]
 
     def share_reference(self, Data other):
-        """Take islands and references of the same problem in another form, which must know them."""
+        """Copy islands and references from the same problem in another form, which must know them."""
         cdef double start[3]
         if other is not self:
             start[0], start[1], start[2] = other.reference_energy, other.reference_velocity, other.relative_at_zero
             self.keep_reference(other.blocks.islands, start)
 
     def islands(self):
-        """(number of islands, island of each block (k,)), as `find_islands` of core/islands.pxd."""
+        """Return (number of islands, island of each block (k,)), computed by `find_islands` of core/islands.pxd."""
         cdef view_t v = self.view()
-        cdef islands_t found
+        cdef islands_t islands
         cdef Py_ssize_t i, k = self.blocks.n_blocks
         cdef Workspace marks = allocate_workspace(islands_index(&v) * sizeof(int32_t))
-        cdef int32_t count = find_islands(&v, <int32_t*>marks.at, &found)
+        cdef int32_t count = find_islands(&v, <int32_t*>marks.at, &islands)
         label_ = np.zeros(k, np.int32)
         cdef int32_t[::1] label = label_
         if count > 1:
             for i in range(k):
-                label[i] = found.label[i]
+                label[i] = islands.label[i]
         return count if k else 0, label_
 
 
 def general_data(Blocks blocks, b, Operator operator, compliance, int law):
-    """Data of a problem in generalised coordinates, whose own numbers wait until `prepare`; law: COULOMB or CONE."""
-    cdef Data made = Data.__new__(Data)
-    made.keep = [blocks, b, operator, compliance]
-    made.blocks = blocks.at
-    made.blocks.law = law
-    made.general = operator.g
-    made.is_general = True
-    made.single_rows = blocks.single_rows
-    made.reference_energy = made.reference_velocity = made.relative_at_zero = -1.0
-    made.empty = _NONE
+    """Create the data of a problem in generalised coordinates; `prepare` derives its numbers. law: COULOMB or CONE."""
+    cdef Data data = Data.__new__(Data)
+    data.keep = [blocks, b, operator, compliance]
+    data.blocks = blocks.at
+    data.blocks.law = law
+    data.general = operator.g
+    data.is_general = True
+    data.single_rows = blocks.single_rows
+    data.reference_energy = data.reference_velocity = data.relative_at_zero = -1.0
+    data.empty = _NONE
     if blocks.at.n_rows:
-        made.blocks.b = doubles(b, blocks.at.n_rows)
-        made.general.compliance = doubles(compliance, blocks.at.n_rows)
-    return made
+        data.blocks.b = doubles(b, blocks.at.n_rows)
+        data.general.compliance = doubles(compliance, blocks.at.n_rows)
+    return data
 
 
 def zero_impulse(const double[::1] lower, const double[::1] upper):
-    """Pi(0) (m,) [N s]: zero clipped to the bounds, read-only."""
+    """Return Pi(0) (m,) [N s], zero clipped to the bounds, read-only."""
     cdef Py_ssize_t i, m = lower.shape[0]
     out = np.zeros(m)
     cdef double[::1] x = out
@@ -595,7 +611,7 @@ def _read_only(x):
 
 
 def rows_velocity(Data p, const double[:, ::1] v, double[::1] out):
-    """J v (m,) of a factored problem, v (n, 6) [m/s, rad/s]."""
+    """Write J v (m,) of a factored problem to `out`, for v (n, 6) [m/s, rad/s]."""
     if p.blocks.n_rows and p.rows.n_bodies:
         rows_times(&p.blocks, &p.rows, &v[0, 0], &out[0])
     else:

@@ -1,9 +1,9 @@
-"""Union-find forests."""
+"""Union-find with path halving."""
 from libc.stdint cimport int32_t
 
 
 cdef inline int32_t root_of(int32_t* parent, int32_t i) noexcept nogil:
-    """Return the root of i; paths are halved on the way."""
+    """Return the root of i, and halve its path."""
     while parent[i] != i:
         parent[i] = parent[parent[i]]
         i = parent[i]

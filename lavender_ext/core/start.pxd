@@ -1,16 +1,16 @@
-"""Where a solve begins."""
+"""The zero impulse, from which a solve starts by default."""
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.parts cimport blocks_t
+from lavender_ext.core.block_types cimport blocks_t
 
 
 cdef inline double zero_impulse(const blocks_t* p, int32_t k) noexcept nogil:
-    """Pi(0) of row k: zero clipped to its bounds."""
+    """Return Pi(0) of row k: zero clipped to its bounds."""
     return p.lower[k] if p.lower[k] > 0.0 else p.upper[k] if p.upper[k] < 0.0 else 0.0
 
 
-cdef inline bint is_nothing(const blocks_t* p, const double* lam) noexcept nogil:
-    """Is lam (m) 0, or what doing nothing is: Pi(0)?"""
+cdef inline bint is_zero_impulse(const blocks_t* p, const double* lam) noexcept nogil:
+    """Return whether lam (m) is 0 or Pi(0)."""
     cdef int32_t j
     cdef bint zero = True, same = True
     for j in range(p.n_rows):

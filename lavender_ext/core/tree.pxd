@@ -1,30 +1,33 @@
-"""The factor of M (nv, nv), whose pattern is a tree or nearly one.
+"""Factorisation of M (nv, nv), whose elimination graph is a tree or nearly one.
 
-    M = L^T D L, L unit lower triangular: row k is eliminated into rows before it, k = nv - 1 ... 0, so that a leaf
-    of a kinematic tree comes before its ancestors and nothing fills in (Featherstone 2008, section 6.5)     (1)
+    M = L^T D L, L unit lower triangular. Row k is eliminated into the rows before it, k = nv - 1 ... 0: each leaf of a
+    kinematic tree is eliminated before its ancestors, and there is no fill-in (Featherstone 2008, section 6.5)     (1)
 """
 from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memcpy
 
-from lavender_ext.core.door cimport least
+from lavender_ext.core.validate cimport min_magnitude
 
 
 cdef enum:
-    WIDE = 8                    # rows of a chain that are eliminated together
-    LONG = 16                   # columns from which on four of them are at once
+    MAX_CHAIN_ROWS = 8          # maximum number of rows of a chain that are eliminated together
+    MIN_COLUMNS_FOR_FOUR = 16   # Four rows are subtracted at once if they have at least this many columns, otherwise two.
 
 
-cdef inline void put_in_order(int32_t k, const int32_t* mark, int32_t count, int32_t* cols) noexcept nogil:
-    """The columns of row k, all those below k whose mark is k, ascending: by insertion, or by their marks where that reads less."""
+cdef inline void sort_columns(int32_t k, const int32_t* mark, int32_t count, int32_t* cols) noexcept nogil:
+    """Sort the columns of row k, the columns below k whose mark is k, in ascending order.
+
+    They are sorted by insertion, or collected by scanning the marks if that is cheaper.
+    """
     cdef int32_t i = 1, j, x, first
-    while i < count and cols[i - 1] < cols[i]:              # those of a tree come so
+    while i < count and cols[i - 1] < cols[i]:              # rows of a tree are already sorted
         i += 1
     if i >= count:
         return
     first = cols[0]
     for j in range(i, count):
         first = min(first, cols[j])
-    if <int64_t>count * count > 4 * <int64_t>(k - first):   # what insertion moves of a row in no order
+    if <int64_t>count * count > 4 * <int64_t>(k - first):   # estimated cost of insertion
         i = 0
         for j in range(first, k):
             if mark[j] == k:
@@ -44,10 +47,10 @@ cdef inline void put_in_order(int32_t k, const int32_t* mark, int32_t count, int
 cdef inline int32_t tree_pattern(int32_t n, const int32_t* mptr, const int32_t* midx, int32_t workspace, int32_t* lptr,
                                  int32_t* lidx, int32_t* parent, int32_t* mark, int32_t* next_child,
                                  int32_t* first_child) noexcept nogil:
-    """Pattern of L from the lower triangle of M; entries of L, or -1 where `workspace` does not hold them.
+    """Compute the pattern of L from the lower triangle of M; return the number of entries, -1 if `workspace` is too small.
 
-    Rows are found from the last: row k has the entries of M and those that rows below it, whose last column is k,
-    leave there. They are written from the end of `lidx` backwards; `lptr` counts from the front afterwards.
+    The last row comes first. Row k has the entries of M and the fill-in of the rows whose last column is k. Rows are written
+    from the end of `lidx` backwards; at the end they are moved to the front, and `lptr` is adjusted.
     """
     cdef int32_t k, q, c, j, at = workspace, start, end
     for k in range(n):
@@ -56,7 +59,7 @@ cdef inline int32_t tree_pattern(int32_t n, const int32_t* mptr, const int32_t* 
     for k in range(n - 1, -1, -1):
         end = at
         mark[k] = k
-        for q in range(mptr[k + 1] - 1, mptr[k] - 1, -1):   # backwards, so that the row stands ascending
+        for q in range(mptr[k + 1] - 1, mptr[k] - 1, -1):   # backwards, so that the row becomes ascending
             j = midx[q]
             if j < k and mark[j] != k:
                 mark[j] = k
@@ -66,7 +69,7 @@ cdef inline int32_t tree_pattern(int32_t n, const int32_t* mptr, const int32_t* 
                 lidx[at] = j
         c = first_child[k]
         while c >= 0:
-            for q in range(lptr[c] + parent[c] - 1, lptr[c] - 1, -1):   # parent holds the length until the end
+            for q in range(lptr[c] + parent[c] - 1, lptr[c] - 1, -1):   # parent holds the row length until the end
                 j = lidx[q]
                 if mark[j] != k:
                     mark[j] = k
@@ -76,7 +79,7 @@ cdef inline int32_t tree_pattern(int32_t n, const int32_t* mptr, const int32_t* 
                     lidx[at] = j
             c = next_child[c]
         start = at
-        put_in_order(k, mark, end - start, lidx + start)
+        sort_columns(k, mark, end - start, lidx + start)
         lptr[k] = start
         parent[k] = end - start
         if end > start:
@@ -96,18 +99,20 @@ cdef inline int32_t tree_pattern(int32_t n, const int32_t* mptr, const int32_t* 
 cdef inline int32_t tree_factor(int32_t n, const int32_t* mptr, const int32_t* midx, const double* mval,
                                 const int32_t* lptr, const int32_t* lidx, double* lval, double* pivot,
                                 double* inv_pivot) noexcept nogil:
-    """L and 1 / D of (1); -1, or the row whose pivot is no more than rounding of M_kk, or below the door's least.
+    """Compute L and 1 / D of (1); return -1, or the row whose pivot is too small.
 
-    Rows of a chain, whose columns are the same but for their own places, are eliminated together: with the bits of one
-    after the other, and a part of what is read and written.
+    A pivot is too small if it is at most the rounding error of M_kk, or below `min_magnitude`. Consecutive rows of a chain,
+    which have the same columns except themselves, are eliminated together. This gives the same bits as one after the other
+    with less memory traffic.
     """
     cdef int32_t k, q, a, j, first, count, at, s, t
-    cdef double* row[WIDE]
+    cdef double* row[MAX_CHAIN_ROWS]
+    # copy M into the pattern of L
     for k in range(n):
         at = lptr[k]
         first = mptr[k]
         count = mptr[k + 1] - first - 1
-        if lptr[k + 1] - at == count >= 0 and midx[first + count] == k:     # no fill
+        if lptr[k + 1] - at == count >= 0 and midx[first + count] == k:     # no fill-in
             memcpy(lval + at, mval + first, count * sizeof(double))
             pivot[k] = inv_pivot[k] = mval[first + count]   # M_kk, until its row is eliminated
             continue
@@ -122,80 +127,90 @@ cdef inline int32_t tree_factor(int32_t n, const int32_t* mptr, const int32_t* m
                 while lidx[at] != j:
                     at += 1
                 lval[at] = mval[q]
+    # eliminate chains of rows from the last
     k = n - 1
     while k >= 0:
         first, count, s = lptr[k], lptr[k + 1] - lptr[k], 1
-        while s < WIDE and s <= count and lidx[first + count - s] == k - s and lptr[k - s + 1] - lptr[k - s] == count - s:
+        while s < MAX_CHAIN_ROWS and s <= count and lidx[first + count - s] == k - s and lptr[k - s + 1] - lptr[k - s] == count - s:
             s += 1
         for t in range(s):
             row[t] = lval + lptr[k - t]
+        # rows of the chain among each other
         for t in range(s):
-            take_rows(lptr, lidx, lval, pivot, inv_pivot, k, k - t, count - t, row, t)
+            subtract_chain_rows(lptr, lidx, lval, pivot, inv_pivot, k, k - t, count - t, row, t)
             if not has_reciprocal(pivot, inv_pivot, k - t):
                 return k - t
+        # the other rows
         for a in range(count - s, -1, -1):
-            take_rows(lptr, lidx, lval, pivot, inv_pivot, k, lidx[first + a], a, row, s)
+            subtract_chain_rows(lptr, lidx, lval, pivot, inv_pivot, k, lidx[first + a], a, row, s)
         k -= s
     return -1
 
 
 cdef inline bint has_reciprocal(const double* pivot, double* inv_pivot, int32_t k) noexcept nogil:
-    # inv_pivot holds M_kk before, 1 / D_k afterwards.
-    if not (pivot[k] > 8.8817841970012523e-16 * inv_pivot[k] and pivot[k] >= least()):
+    """Replace inv_pivot[k], which holds M_kk, by 1 / D_k; return False if the pivot is too small."""
+    if not (pivot[k] > 8.8817841970012523e-16 * inv_pivot[k] and pivot[k] >= min_magnitude()):
         return False
     inv_pivot[k] = 1.0 / pivot[k]
     return True
 
 
-cdef inline void take_rows(const int32_t* lptr, const int32_t* lidx, double* lval, double* pivot, const double* inv_pivot,
-                           int32_t k, int32_t j, int32_t count, double** row, int32_t s) noexcept nogil:
-    """Rows k, k - 1 ... (s) of a chain leave row j, their column at `count`; the `count` before it are runs of row j."""
+cdef inline void subtract_chain_rows(const int32_t* lptr, const int32_t* lidx, double* lval, double* pivot,
+                                     const double* inv_pivot, int32_t k, int32_t j, int32_t count, double** row,
+                                     int32_t s) noexcept nogil:
+    """Eliminate the s rows k, k - 1 ... of a chain from row j, which is their column number `count`.
+
+    Their `count` columns before that one are subtracted from row j in runs of consecutive columns.
+    """
     cdef int32_t b = 0, n, t, at = lptr[j], first = lptr[k]
-    cdef double z[WIDE]
+    cdef double z[MAX_CHAIN_ROWS]
     for t in range(s):
         z[t] = row[t][count] * inv_pivot[k - t]
         pivot[j] -= z[t] * row[t][count]
     while b < count:
         while lidx[at] != lidx[first + b]:
             at += 1
-        n = count - b if lptr[j + 1] - at == count - b else 1       # the same columns to the end
+        n = count - b if lptr[j + 1] - at == count - b else 1       # the remaining columns are the same
         while b + n < count and lidx[at + n] == lidx[first + b + n]:
             n += 1
-        take_run(lval + at, row, z, s, b, n)
+        subtract_run(lval + at, row, z, s, b, n)
         at += n
         b += n
     for t in range(s):
         row[t][count] = z[t]
 
 
-cdef inline void take_run(double* x, double** row, const double* z, int32_t s, int32_t b, int32_t n) noexcept nogil:
-    """x <- x - z_0 row_0 - z_1 row_1 ... on n columns from place b."""
+cdef inline void subtract_run(double* x, double** row, const double* z, int32_t s, int32_t b, int32_t n) noexcept nogil:
+    """Subtract z_0 row_0 + z_1 row_1 + ... (s rows) from x on n columns, beginning at column b of the rows."""
     cdef int32_t t = 0
-    while t + 4 <= s and n >= LONG:
-        take_four(x, row[t] + b, z[t], row[t + 1] + b, z[t + 1], row[t + 2] + b, z[t + 2], row[t + 3] + b, z[t + 3], n)
+    while t + 4 <= s and n >= MIN_COLUMNS_FOR_FOUR:
+        axpy_subtract_4(x, row[t] + b, z[t], row[t + 1] + b, z[t + 1], row[t + 2] + b, z[t + 2], row[t + 3] + b, z[t + 3], n)
         t += 4
     while t + 2 <= s:
-        take_two(x, row[t] + b, z[t], row[t + 1] + b, z[t + 1], n)
+        axpy_subtract_2(x, row[t] + b, z[t], row[t + 1] + b, z[t + 1], n)
         t += 2
     if t < s:
-        take_from(x, row[t] + b, z[t], n)
+        axpy_subtract(x, row[t] + b, z[t], n)
 
 
-cdef inline void take_from(double* x, const double* l, double f, int32_t n) noexcept nogil:
+cdef inline void axpy_subtract(double* x, const double* l, double f, int32_t n) noexcept nogil:
+    """Subtract f l from x (n)."""
     cdef int32_t i
     if f != 0.0:
         for i in range(n):
             x[i] -= f * l[i]
 
 
-cdef inline void take_two(double* x, const double* l, double f, const double* u, double g, int32_t n) noexcept nogil:
+cdef inline void axpy_subtract_2(double* x, const double* l, double f, const double* u, double g, int32_t n) noexcept nogil:
+    """Subtract f l, then g u from x (n)."""
     cdef int32_t i
     for i in range(n):
         x[i] = (x[i] - f * l[i]) - g * u[i]
 
 
-cdef inline void take_four(double* x, const double* l, double f, const double* u, double g, const double* v, double h,
-                           const double* w, double k, int32_t n) noexcept nogil:
+cdef inline void axpy_subtract_4(double* x, const double* l, double f, const double* u, double g, const double* v, double h,
+                                 const double* w, double k, int32_t n) noexcept nogil:
+    """Subtract f l, g u, h v, then k w from x (n)."""
     cdef int32_t i
     for i in range(n):
         x[i] = (((x[i] - f * l[i]) - g * u[i]) - h * v[i]) - k * w[i]
@@ -203,7 +218,7 @@ cdef inline void take_four(double* x, const double* l, double f, const double* u
 
 cdef inline void ldl_solve(int32_t n, const int32_t* lptr, const int32_t* lidx, const double* lval,
                            const double* inv_pivot, double* x) noexcept nogil:
-    """x <- (L^T D L)^-1 x (n); lval is counted as lidx is, from wherever lptr begins."""
+    """Overwrite x (n) with (L^T D L)^-1 x; lptr indexes both lidx and lval."""
     cdef int32_t k, q, first, end
     cdef double z
     for k in range(n - 1, -1, -1):                          # L^T z = x

@@ -1,24 +1,25 @@
-"""The change of velocity that impulses make: summed as wrenches on each body, then M^-1 once a body.
+"""Velocity change M^-1 J^T lam of all impulses: wrenches are summed on each body, then multiplied by M^-1 once per body.
 
     f_i = sum of J^T lam over the blocks of body i      (linear [N s], angular [N m s])
     v_i = (f_i / m_i, I_i^-1 l_i)                                                              (1)
 """
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.parts cimport blocks_t, n_directions, n_turns
+from lavender_ext.core.block_types cimport blocks_t, n_tangents, n_angular_rows
 from lavender_ext.core.rows cimport cross, dot3
 from lavender_ext.core.view cimport rows_t
 
 
-cdef inline void add6(double* to, const double* x) noexcept nogil:
+cdef inline void add6(double* total, const double* x) noexcept nogil:
+    """Add x (6) to `total`."""
     cdef int32_t k
     for k in range(6):
-        to[k] += x[k]
+        total[k] += x[k]
 
 
 cdef inline void joint_wrench(const blocks_t* p, const rows_t* r, int32_t i, const double* lam,
                               double* f) noexcept nogil:
-    """f (n, 6) += J^T lam of joint i."""
+    """Add J^T lam of joint i to f (n, 6)."""
     cdef double x[12]
     cdef const double* row
     cdef int32_t j, k, a = r.joint_body[2 * i], b = r.joint_body[2 * i + 1]
@@ -34,15 +35,15 @@ cdef inline void joint_wrench(const blocks_t* p, const rows_t* r, int32_t i, con
         add6(f + 6 * b, x + 6)
 
 
-cdef inline void contact_wrench(const rows_t* r, int32_t c, int32_t nt, int32_t turns, const double* lam,
+cdef inline void contact_wrench(const rows_t* r, int32_t c, int32_t nt, int32_t n_angular, const double* lam,
                                 double* f) noexcept nogil:
-    """The same of contact c; lam at its normal."""
+    """Add J^T lam of contact c to f (n, 6); lam points at its normal."""
     cdef double t2[3]
     cdef double x[3]
     cdef double l[3]
     cdef double twist[3]
     cdef const double* n = r.normal + 3 * c
-    cdef const double* roll = lam + 1 + nt + (turns & 1)
+    cdef const double* rolling = lam + 1 + nt + (n_angular & 1)
     cdef int32_t k, a = r.contact_body[2 * c], b = r.contact_body[2 * c + 1]
     if nt > 1:
         cross(n, r.tangent + 3 * c, t2)
@@ -52,23 +53,23 @@ cdef inline void contact_wrench(const rows_t* r, int32_t c, int32_t nt, int32_t 
             x[k] += lam[1] * r.tangent[3 * c + k]
         if nt > 1:
             x[k] += lam[2] * t2[k]
-        twist[k] = lam[1 + nt] * n[k] if turns & 1 else 0.0
-        if turns & 2:
-            twist[k] += roll[0] * r.tangent[3 * c + k] + roll[1] * t2[k]
+        twist[k] = lam[1 + nt] * n[k] if n_angular & 1 else 0.0
+        if n_angular & 2:
+            twist[k] += rolling[0] * r.tangent[3 * c + k] + rolling[1] * t2[k]
     if a >= 0:
         cross(r.arm_a + 3 * c, x, l)
         for k in range(3):
             f[6 * a + k] -= x[k]
-            f[6 * a + 3 + k] -= l[k] + twist[k] if turns else l[k]
+            f[6 * a + 3 + k] -= l[k] + twist[k] if n_angular else l[k]
     if b >= 0:
         cross(r.arm_b + 3 * c, x, l)
         for k in range(3):
             f[6 * b + k] += x[k]
-            f[6 * b + 3 + k] += l[k] + twist[k] if turns else l[k]
+            f[6 * b + 3 + k] += l[k] + twist[k] if n_angular else l[k]
 
 
 cdef inline void wrenches_to_velocity(const rows_t* r, double* v) noexcept nogil:
-    """M^-1 of (1) in place; v (n, 6)."""
+    """Multiply wrenches v (n, 6) by M^-1 in place (1)."""
     cdef int32_t i, k
     cdef double l[3]
     cdef double* x = v
@@ -84,8 +85,8 @@ cdef inline void wrenches_to_velocity(const rows_t* r, double* v) noexcept nogil
 
 
 cdef inline void rows_wrench(const blocks_t* p, const rows_t* r, const double* lam, double* f) noexcept nogil:
-    """f = J^T lam (n, 6) of all blocks."""
-    cdef int32_t i, j, c, nt, turns
+    """Compute f (n, 6) = J^T lam of all blocks."""
+    cdef int32_t i, j, c, nt, n_angular
     for i in range(6 * r.n_bodies):
         f[i] = 0.0
     for i in range(r.n_joints):
@@ -93,10 +94,10 @@ cdef inline void rows_wrench(const blocks_t* p, const rows_t* r, const double* l
     for c in range(r.n_contacts):
         i = r.n_joints + c
         j = p.ptr[i]
-        nt = n_directions(p, i)
-        turns = n_turns(p, i)
-        if turns or nt == 1:                            # the two common kinds with their sizes as constants
-            contact_wrench(r, c, nt, turns, lam + j, f)
+        nt = n_tangents(p, i)
+        n_angular = n_angular_rows(p, i)
+        if n_angular or nt == 1:                            # the two common kinds below have constant sizes
+            contact_wrench(r, c, nt, n_angular, lam + j, f)
         elif nt == 2:
             contact_wrench(r, c, 2, 0, lam + j, f)
         else:
@@ -104,6 +105,6 @@ cdef inline void rows_wrench(const blocks_t* p, const rows_t* r, const double* l
 
 
 cdef inline void rows_velocity(const blocks_t* p, const rows_t* r, const double* lam, double* v) noexcept nogil:
-    """v = M^-1 J^T lam (n, 6) of all blocks, by (1)."""
+    """Compute v (n, 6) = M^-1 J^T lam of all blocks by (1)."""
     rows_wrench(p, r, lam, v)
     wrenches_to_velocity(r, v)

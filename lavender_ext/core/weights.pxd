@@ -1,4 +1,4 @@
-"""nu, what a velocity error weighs: d, but for rows that turn and have a linear row beside them.
+"""Velocity weight nu: d, except on angular rows of blocks that also have linear rows.
 
     spin, rolling rows  nu = d of their normal                                                 (1)
     angular joint row   nu = 1/m_a + 1/m_b                                                     (2)
@@ -6,23 +6,23 @@
 from libc.math cimport fabs
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.parts cimport blocks_t, n_turns
+from lavender_ext.core.block_types cimport blocks_t, n_angular_rows
 from lavender_ext.core.view cimport rows_t
 
 
 cdef inline void block_weights(const blocks_t* p, const double* d, double* nu) noexcept nogil:
-    """nu (m) where only a matrix is known: d (m), and (1)."""
+    """Compute nu (m) if only a matrix is known: d (m), with (1) on angular rows."""
     cdef int32_t i, j, end
     for j in range(p.n_rows):
         nu[j] = d[j]
     for i in range(p.n_blocks):
         end = p.ptr[i + 1]
-        for j in range(end - n_turns(p, i), end):
+        for j in range(end - n_angular_rows(p, i), end):
             nu[j] = d[p.ptr[i]]
 
 
 cdef inline void joint_weights(const blocks_t* p, const rows_t* r, double* nu) noexcept nogil:
-    """(2), after `block_weights`."""
+    """Apply (2) to the angular joint rows, after `block_weights`."""
     cdef int32_t i, q, t, a, b
     cdef double linear, inv
     for i in range(r.n_joints):

@@ -1,1 +1,1 @@
-"""The judge's map at an answer, differentiated, with a factor: for derivatives and states of blocks."""
+"""Derivative of the judge's natural map at a solution, with a factor, for gradients and states of blocks."""

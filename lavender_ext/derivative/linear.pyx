@@ -1,10 +1,10 @@
-"""An answer, judged and linearised (`natural.pxd`), with a factor of its equations where these are few; for Python.
+"""Judged and linearised solutions (`natural.pxd`) for Python, with a factor of the linear equations if there are few.
 
-With cotangents c of lambda, x of w and y of v (equation (4) of lavender/gradient/__init__.py), of J and M or bodies
+With cotangents c of lambda, x of w and y of v (equation (4) of lavender/gradient/__init__.py), for J and M or bodies
 
     G^T q = D^-1/2 (c + C x + J M^-1 (y + J^T x)),   s = D^-1/2 P^T q - x,   f = y - J^T s                  (1)
 
-with C the compliance, and of a matrix
+with C the compliance, and for a matrix
 
     G^T q = D^-1/2 (c + A^T x),   s = D^-1/2 P^T q - x                                                      (2)
 """
@@ -17,9 +17,9 @@ from libc.string cimport memcpy, memset
 import numpy as np
 
 from lavender_ext.core.arrays cimport ndarray as Array
-from lavender_ext.core.door cimport all_finite, first_outside
-from lavender_ext.core.generalized cimport jac_push, whitened_dot
-from lavender_ext.core.parts cimport blocks_t, is_rows
+from lavender_ext.core.validate cimport all_finite, first_invalid
+from lavender_ext.core.generalized cimport jac_transpose_times, whitened_dot
+from lavender_ext.core.block_types cimport blocks_t, is_rows
 from lavender_ext.core.problem cimport Data, Workspace, allocate_workspace
 from lavender_ext.core.rows cimport rows_times
 from lavender_ext.core.velocity cimport rows_wrench, wrenches_to_velocity
@@ -34,22 +34,26 @@ from lavender_ext.judge.score cimport new_score, score_t
 cdef object empty = np.empty, ndarray = np.ndarray
 cdef object F8 = np.dtype(np.float64), I4 = np.dtype(np.int32), I1 = np.dtype(np.int8)
 
-cdef double SINGULAR = 1e-12    # least pivot over the largest from which on G counts as singular
+# G counts as singular if the ratio of its smallest to its largest pivot is at most this.
+cdef double MIN_PIVOT_RATIO = 1e-12
 
-#: Cases of rows by the kernels' numbers.
+#: Kernel numbers of the cases of rows.
 CASES = {"open": OPEN, "closed": CLOSED, "sticks": STICKS, "slides": SLIDES, "free": FREE, "low": LOW, "high": HIGH}
 
 
-cdef void push(const view_t* v, const double* lam, double* f) noexcept nogil:
-    # f (n) = J^T lam
+cdef void times_jac_transpose(const view_t* v, const double* lam, double* f) noexcept nogil:
+    """Compute f (n) = J^T lam over J and M or bodies."""
     if v.g != NULL:
-        jac_push(v.g, lam, f)
+        jac_transpose_times(v.g, lam, f)
     elif v.r != NULL:
         rows_wrench(&v.p, v.r, lam, f)
 
 
-cdef void pull(const linear_t* a, double* f, double* out) noexcept nogil:
-    # out = J M^-1 f on rows of G, of bodies on all; f (n) becomes scratch. With M = L^T D L it is Y D^-1/2 L^-T f
+cdef void times_jac_minv(const linear_t* a, double* f, double* out) noexcept nogil:
+    """Compute out = J M^-1 f on the rows of G (with bodies: on all rows); f (n) is overwritten.
+
+    With M = L^T D L the result is Y D^-1/2 L^-T f.
+    """
     cdef const generalized_t* g = a.v.g
     cdef int32_t k, q, i, b
     cdef double z
@@ -69,8 +73,8 @@ cdef void pull(const linear_t* a, double* f, double* out) noexcept nogil:
                 out[i] = whitened_dot(g, b, i, f)
 
 
-cdef void turned(const view_t* v, const double* x, double* out) noexcept nogil:
-    # out (m) = A^T x of a matrix
+cdef void add_matrix_transpose_times(const view_t* v, const double* x, double* out) noexcept nogil:
+    """Add A^T x of a matrix to out (m)."""
     cdef int32_t i, k
     for i in range(v.p.n_rows):
         for k in range(v.a.indptr[i], v.a.indptr[i + 1]):
@@ -79,7 +83,7 @@ cdef void turned(const view_t* v, const double* x, double* out) noexcept nogil:
 
 cdef public void lav_adjoint(const linear_t* a, const double* y, const double* c, const double* x, double* q, double* s,
                              double* f) noexcept nogil:
-    """(1) or (2) but for q on rows outside the factor; y (n), c (m) and x (m) may be NULL, for 0."""
+    """Compute q, s and f of (1) or (2), with q = 0 on rows outside G; y (n), c (m) and x (m) may be NULL, for 0."""
     cdef const view_t* v = &a.v
     cdef int32_t i, m = v.p.n_rows
     cdef const double* soft = NULL
@@ -87,15 +91,15 @@ cdef public void lav_adjoint(const linear_t* a, const double* y, const double* c
         soft = v.g.compliance if v.g != NULL else v.r.compliance
     memset(q, 0, m * sizeof(double))
     if v.a != NULL and x != NULL:
-        turned(v, x, q)
+        add_matrix_transpose_times(v, x, q)
     elif y != NULL or x != NULL:
         memset(f, 0, a.n * sizeof(double))
         if x != NULL:
-            push(v, x, f)
+            times_jac_transpose(v, x, f)
         if y != NULL:
             for i in range(a.n):
                 f[i] += y[i]
-        pull(a, f, q)
+        times_jac_minv(a, f, q)
         if x != NULL:
             for i in range(m):
                 q[i] += soft[i] * x[i]
@@ -108,21 +112,21 @@ cdef public void lav_adjoint(const linear_t* a, const double* y, const double* c
     block_times(&a.x, &v.p, a.x.p, q, True, s)
     for i in range(m):
         s[i] = s[i] / a.x.root[i] - (x[i] if x != NULL else 0.0)
-    push(v, s, f)
+    times_jac_transpose(v, s, f)
     for i in range(a.n):
         f[i] = (y[i] if y != NULL else 0.0) - f[i]
 
 
-cdef bint is_plain(given, Py_ssize_t n, Py_buffer* view, const double** to):
-    """Whether it is None, `to` NULL then, or an array (n,) of numbers that lie together, held by `view`."""
+cdef bint get_array_data(array, Py_ssize_t n, Py_buffer* view, const double** to):
+    """Write the address of a contiguous float64 array (n,), acquired in `view`, or NULL for None; return whether it is valid."""
     to[0] = NULL
-    if given is None:
+    if array is None:
         return True
-    if type(given) is not ndarray:
+    if type(array) is not ndarray:
         return False
     try:
-        PyObject_GetBuffer(given, view, PyBUF_FORMAT | PyBUF_C_CONTIGUOUS)
-    except ValueError:                                  # dates have no buffer
+        PyObject_GetBuffer(array, view, PyBUF_FORMAT | PyBUF_C_CONTIGUOUS)
+    except ValueError:                                  # datetime arrays have no buffer
         return False
     if view.format[0] != 100 or view.format[1] != 0 or view.ndim != 1 or view.shape[0] != n:    # "d"
         return False
@@ -132,7 +136,7 @@ cdef bint is_plain(given, Py_ssize_t n, Py_buffer* view, const double** to):
 
 
 cdef void form(const linear_t* a, const view_t* v, double shift, double* g, double* h) noexcept nogil:
-    # G of H + shift, A of J and M or in rows; h (rows, rows + n) is scratch
+    """Compute G of H + shift, for A of J and M or in compressed rows; h (rows, rows + n) is scratch."""
     cdef int32_t i, n = a.rows
     if v.g != NULL:
         scaled_general(v.g, n, a.place, a.x.root, h + <ssize_t>n * n, h)
@@ -144,7 +148,7 @@ cdef void form(const linear_t* a, const view_t* v, double shift, double* g, doub
 
 
 cdef ssize_t values_of(const blocks_t* b) noexcept nogil:
-    # of P
+    """Return the number of values of P."""
     cdef int32_t i, n
     cdef ssize_t size = 0
     for i in range(b.n_blocks):
@@ -153,13 +157,16 @@ cdef ssize_t values_of(const blocks_t* b) noexcept nogil:
     return size
 
 
-cdef ssize_t room_of(const blocks_t* b, ssize_t values) noexcept nogil:
-    # numbers that `linearise` keeps
+cdef ssize_t linear_workspace_size(const blocks_t* b, ssize_t values) noexcept nogil:
+    """Return the number of doubles that `linearise` stores."""
     return 5 * <ssize_t>b.n_rows + 2 * values + (5 * <ssize_t>b.n_rows + 4 * <ssize_t>b.n_blocks + 11) // 8
 
 
 cdef void linearise(linear_t* a, const double* lam, double energy, double velocity, double* at, double* scratch) noexcept nogil:
-    """An impulse by the data of `a.v`; at (`room_of`), scratch (m + `scratch_of`); energy and velocity of doing nothing."""
+    """Judge and linearise the impulse lam (m) of a.v; energy and velocity are the references of the zero impulse.
+
+    at (`linear_workspace_size`) is stored, scratch (m + `scratch_of`) is not.
+    """
     cdef const blocks_t* b = &a.v.p
     cdef int32_t m = b.n_rows
     cdef ssize_t values = values_of(b)
@@ -178,20 +185,24 @@ cdef void linearise(linear_t* a, const double* lam, double energy, double veloci
     a.above_floor = above_floor_of(&s, a.relative, floor_of(&s, energy, velocity))
 
 
-cdef ssize_t room_of_factor(int32_t n) noexcept nogil:
-    # numbers that `factorise` keeps
+cdef ssize_t factor_workspace_size(int32_t n) noexcept nogil:
+    """Return the number of doubles that `factorise` stores."""
     return <ssize_t>n * n + (n + 1) // 2
 
 
 cdef ssize_t scratch_of_factor(int32_t n, const view_t* v) noexcept nogil:
-    cdef ssize_t most = n + (v.g.n if v.g != NULL else 0)
-    return n * (most if most > PANEL else PANEL)
+    """Return the number of scratch doubles of `factorise`."""
+    cdef ssize_t width = n + (v.g.n if v.g != NULL else 0)
+    return n * (width if width > PANEL else PANEL)
 
 
 cdef bint factorise(linear_t* a, const view_t* v, double shift, double* at, double* scratch) noexcept nogil:
-    """G of H + shift, A of v; at (`room_of_factor`) and scratch (`scratch_of_factor`). Whether it is regular."""
+    """Factor G of H + shift, with A of v; return whether it is regular.
+
+    at (`factor_workspace_size`) is stored, scratch (`scratch_of_factor`) is not.
+    """
     cdef int32_t i, n = a.rows
-    cdef double least = 1.0 / 0.0, most = 0.0, x
+    cdef double smallest = 1.0 / 0.0, norm_inf = 0.0, x
     a.tried = a.regular = True
     if n == 0:
         return True
@@ -200,23 +211,23 @@ cdef bint factorise(linear_t* a, const view_t* v, double shift, double* at, doub
     if dense_lu(has_wide(), n, a.lu, a.swap, scratch):
         for i in range(n):
             x = fabs(a.lu[<ssize_t>i * n + i])
-            least = x if x < least else least
-            most = x if x > most else most
-    a.regular = least > SINGULAR * most and most > 0.0
+            smallest = x if x < smallest else smallest
+            norm_inf = x if x > norm_inf else norm_inf
+    a.regular = smallest > MIN_PIVOT_RATIO * norm_inf and norm_inf > 0.0
     return a.regular
 
 
 cdef bint is_prepared(Data p):
-    # or has too many entries, or A_ii out of reach
+    """Prepare p; return False if it has too many entries or d outside the valid range."""
     try:
         p.prepare()
     except OverflowError:
         return False
-    return first_outside(p.blocks.d, p.blocks.n_rows) < 0
+    return first_invalid(p.blocks.d, p.blocks.n_rows) < 0
 
 
 cdef bint adjoint_into(const linear_t* a, velocity, impulse, slack, double* out):
-    """`Linear.adjoint` into out (3 m + n); or not."""
+    """Write `Linear.adjoint` to out (3 m + n); return False if an argument is invalid or all are None."""
     cdef int32_t m = a.v.p.n_rows, i
     cdef const double* y
     cdef const double* c
@@ -224,10 +235,10 @@ cdef bint adjoint_into(const linear_t* a, velocity, impulse, slack, double* out)
     cdef Py_buffer views[3]
     if velocity is None and impulse is None and slack is None:
         return False
-    memset(&views[0], 0, 3 * sizeof(Py_buffer))         # what holds nothing is released in vain
+    memset(&views[0], 0, 3 * sizeof(Py_buffer))         # Releasing an empty buffer does nothing.
     try:
-        if not (is_plain(velocity, a.n, &views[0], &y) and is_plain(impulse, m, &views[1], &c)
-                and is_plain(slack, m, &views[2], &x)):
+        if not (get_array_data(velocity, a.n, &views[0], &y) and get_array_data(impulse, m, &views[1], &c)
+                and get_array_data(slack, m, &views[2], &x)):
             return False
         if not (all_finite(y, 0 if y == NULL else a.n) and all_finite(c, 0 if c == NULL else m)
                 and all_finite(x, 0 if x == NULL else m)):
@@ -244,70 +255,71 @@ cdef bint adjoint_into(const linear_t* a, velocity, impulse, slack, double* out)
             PyBuffer_Release(&views[i])
 
 
-cdef object copied(const void* x, Py_ssize_t n, dtype):
-    """(n,) numbers that stand there."""
-    made = empty(n, dtype)
+cdef object copy_to_array(const void* x, Py_ssize_t n, dtype):
+    """Return a new array (n,) with the numbers at x."""
+    array = empty(n, dtype)
     if n:
-        memcpy((<Array>made).data, x, n * (<Array>made).strides[0])
-    return made
+        memcpy((<Array>array).data, x, n * (<Array>array).strides[0])
+    return array
 
 
 cdef class Linear:
-    """One of `Linears`. `solve` and `adjoint` are of the factor that was found last."""
+    """One item of `Linears`. `solve` and `adjoint` use the last factor."""
     cdef linear_t at
-    cdef Data judge, data                               # data: with the A of G
+    cdef Data judge, data                               # data: the problem whose A is in G
     cdef Workspace workspace, factor
 
     @property
     def rows(self):
-        """Of G: those with a place."""
+        """Number of rows of G."""
         return self.at.rows
 
     @property
     def tried(self):
-        """Whether a factor was tried for."""
+        """Whether a factorisation was attempted."""
         return self.at.tried
 
     @property
     def regular(self):
-        """Whether one was found, or nothing is to be factored."""
+        """Whether G is regular or empty."""
         return self.at.regular
 
     @property
     def relative(self):
-        """The judge's relative residual."""
+        """Relative residual of the judge."""
         return self.at.relative
 
     @property
     def above_floor(self):
-        """What of it rounding does not explain."""
+        """Relative residual that rounding does not explain."""
         return self.at.above_floor
 
     def prepare(self, Data data, double shift=0.0):
-        """Factor G of H + shift, A of the data in rows or J and M; whether it is regular."""
+        """Factor G of H + shift, with A of `data` (compressed rows, or J and M); return whether it is regular."""
         cdef view_t v = data.view()
         cdef Workspace spare = allocate_workspace(scratch_of_factor(self.at.rows, &v) * sizeof(double))
-        self.data, self.factor = data, allocate_workspace(room_of_factor(self.at.rows) * sizeof(double))
+        self.data, self.factor = data, allocate_workspace(factor_workspace_size(self.at.rows) * sizeof(double))
         with nogil:
             factorise(&self.at, &v, shift, <double*>self.factor.at, <double*>spare.at)
         return self.at.regular
 
     def adjoint(self, velocity, impulse, slack):
-        """(q, s (m), f (n), c (m)) of (1), end to end, of y (n,), c and x, None for 0; of (2) n is 0. With a factor.
+        """Return (q (m), s (m), f (n), c (m)) of (1), concatenated, from y (n,), c (m,) and x (m,), None meaning 0.
 
-        None where y, c or x is no such array or not finite: the long way finds the words.
+        A factor is required; n is 0 for (2). The result is None if y, c or x is not such an array or not finite; the caller
+        then validates in detail.
         """
         cdef Py_buffer view
-        cdef bint made
+        cdef bint is_valid
         out = empty(3 * self.at.v.p.n_rows + self.at.n)
         PyObject_GetBuffer(out, &view, PyBUF_WRITABLE)
-        made = adjoint_into(&self.at, velocity, impulse, slack, <double*>view.buf)
+        is_valid = adjoint_into(&self.at, velocity, impulse, slack, <double*>view.buf)
         PyBuffer_Release(&view)
-        return out if made else None
+        return out if is_valid else None
 
     @property
     def slides(self):
-        """Whether some row of G is not that of H: some contact slides, or is without friction."""
+        """Whether any contact slides or has no friction, so that its rows of G are not those of H."""
         cdef int32_t i, j
         for i in range(self.at.v.p.n_blocks):
             for j in range(self.at.v.p.ptr[i], self.at.v.p.ptr[i + 1]):
@@ -316,7 +328,7 @@ cdef class Linear:
         return False
 
     def matrix(self):
-        """G (n, n) on the rows with a place."""
+        """Return G (n, n)."""
         out_ = np.empty((self.at.rows, self.at.rows))
         cdef double[:, ::1] out = out_
         cdef view_t v = self.data.view()
@@ -326,84 +338,84 @@ cdef class Linear:
             form(&self.at, &v, 0.0, &out[0, 0], <double*>work.at)
         return out_
 
-    def solve(self, r, bint back=False):
-        """x (n,) with G x = r, of the transpose with `back`."""
+    def solve(self, r, bint transpose=False):
+        """Return x (n,) with G x = r, or G^T x = r."""
         out_ = r.copy()
         cdef double[::1] out = out_
-        if self.at.rows and back:
+        if self.at.rows and transpose:
             dense_lu_solve_back(self.at.rows, self.at.lu, self.at.swap, &out[0])
         elif self.at.rows:
             dense_lu_solve(self.at.rows, self.at.lu, self.at.swap, &out[0])
         return out_
 
-    def times(self, v_, bint back=False, bint edge=False):
-        """P v (m,), or with `edge` dPi/de v; `back`: of the transpose."""
+    def times(self, v_, bint transpose=False, bint edge=False):
+        """Return P v (m,), or dPi/de v with `edge`; with `transpose` the product with the transpose."""
         cdef const double[::1] v = v_
         out_ = np.empty(self.at.v.p.n_rows)
         cdef double[::1] out = out_
         if self.at.v.p.n_rows:
-            block_times(&self.at.x, &self.at.v.p, self.at.x.edge if edge else self.at.x.p, &v[0], back, &out[0])
+            block_times(&self.at.x, &self.at.v.p, self.at.x.edge if edge else self.at.x.p, &v[0], transpose, &out[0])
         return out_
 
     @property
     def impulse(self):
-        """lambda (m,) [N s]."""
-        return copied(self.at.lam, self.at.v.p.n_rows, F8)
+        """Impulse lambda (m,) [N s]."""
+        return copy_to_array(self.at.lam, self.at.v.p.n_rows, F8)
 
     @property
     def slack(self):
-        """w (m,) [m/s]."""
-        return copied(self.at.w, self.at.v.p.n_rows, F8)
+        """Slack w (m,) [m/s]."""
+        return copy_to_array(self.at.w, self.at.v.p.n_rows, F8)
 
     @property
     def root(self):
-        """D^1/2 (m,)."""
-        return copied(self.at.x.root, self.at.v.p.n_rows, F8)
+        """Scale D^1/2 (m,)."""
+        return copy_to_array(self.at.x.root, self.at.v.p.n_rows, F8)
 
     @property
     def residual(self):
-        """F (m,) of (1) of natural.pxd."""
-        return copied(self.at.x.f, self.at.v.p.n_rows, F8)
+        """Residual F (m,) of natural.pxd (1)."""
+        return copy_to_array(self.at.x.f, self.at.v.p.n_rows, F8)
 
     @property
     def margin(self):
-        """(m,) N s: of each row to the next case."""
-        return copied(self.at.x.margin, self.at.v.p.n_rows, F8)
+        """Distance of each row to the next case (m,) [N s]."""
+        return copy_to_array(self.at.x.margin, self.at.v.p.n_rows, F8)
 
     @property
     def p(self):
-        """Values of P, block by block: the diagonal of rows, else row by row."""
-        return copied(self.at.x.p, self.at.x.at[self.at.v.p.n_blocks] if self.at.v.p.n_rows else 0, F8)
+        """Values of P, block by block: the diagonal for bounded rows, otherwise row by row."""
+        return copy_to_array(self.at.x.p, self.at.x.at[self.at.v.p.n_blocks] if self.at.v.p.n_rows else 0, F8)
 
     @property
     def case(self):
-        """(m,) int8, by the numbers of CASES."""
-        return copied(self.at.x.case_, self.at.v.p.n_rows, I1)
+        """Case of each row (m,), int8, by the numbers of CASES."""
+        return copy_to_array(self.at.x.case_, self.at.v.p.n_rows, I1)
 
     @property
     def place(self):
-        """(m,) row of G that each row is, -1 without one."""
-        return copied(self.at.place, self.at.v.p.n_rows, I4)
+        """Row of G of each row (m,), -1 if it has none."""
+        return copy_to_array(self.at.place, self.at.v.p.n_rows, I4)
 
 
 cdef class Linears:
-    """Many impulses (m,) [N s], judged by the data that the judge reads, their reference known, and linearised, at once.
+    """Judge and linearise several impulses (m,) [N s] at once.
 
-    impulses: a list, or (all of them, where each begins, how many rows each has) of arrays. With a factor where A is of J
-    and M and G has at most `most` rows. Left to the caller are data that are None, an impulse that is no array of its rows,
-    A_ii out of reach: `one` is None.
+    The data must know the references of the zero impulse. impulses is a list, or the arrays (all impulses, first index of
+    each, number of rows of each). G is factored if A is given by J and M and G has at most `most` rows. An item is skipped,
+    and its `one` is None, if its data are None, its impulse is not an array of its rows, or d is outside the valid range.
     """
     cdef Workspace table, workspace, factors
     cdef list data
     cdef linear_t* at
-    cdef readonly Py_ssize_t n, size                    # how many impulses; numbers of `adjoint`
+    cdef readonly Py_ssize_t n, size                    # number of impulses; length of the result of `adjoint`
 
     def __init__(self, list data, impulses, int32_t most=0):
         cdef Py_ssize_t i, n = len(data), size = 0, scratch = 1, more = 0
         cdef Data p
         cdef linear_t* a
         cdef const double* lam
-        cdef Py_buffer held
+        cdef Py_buffer view
         cdef double* to
         cdef double* work
         cdef Workspace spare
@@ -423,7 +435,7 @@ cdef class Linears:
                 continue
             a.known, a.v = True, p.view()
             a.n = a.v.g.n if a.v.g != NULL else 6 * a.v.r.n_bodies if a.v.r != NULL else 0
-            size += room_of(&a.v.p, values_of(&a.v.p))
+            size += linear_workspace_size(&a.v.p, values_of(&a.v.p))
             scratch = max(scratch, a.v.p.n_rows + scratch_of(&a.v))
         self.workspace, spare = allocate_workspace(size * sizeof(double)), allocate_workspace(scratch * sizeof(double))
         to = <double*>self.workspace.at
@@ -432,22 +444,22 @@ cdef class Linears:
             if not a.known:
                 continue
             p = data[i]
-            memset(&held, 0, sizeof(Py_buffer))
+            memset(&view, 0, sizeof(Py_buffer))
             try:
                 if each is None:
                     a.known = sizes[i] == a.v.p.n_rows
                     lam = &flat[0] + first[i] if a.v.p.n_rows else NULL
                 else:
-                    a.known = each[i] is not None and is_plain(each[i], a.v.p.n_rows, &held, &lam)
+                    a.known = each[i] is not None and get_array_data(each[i], a.v.p.n_rows, &view, &lam)
                 if not a.known:
                     continue
                 with nogil:
                     linearise(a, lam, p.reference_energy, p.reference_velocity, to, <double*>spare.at)
             finally:
-                PyBuffer_Release(&held)
-            to += room_of(&a.v.p, values_of(&a.v.p))
+                PyBuffer_Release(&view)
+            to += linear_workspace_size(&a.v.p, values_of(&a.v.p))
             if a.v.g != NULL and a.rows <= most:
-                more += room_of_factor(a.rows)
+                more += factor_workspace_size(a.rows)
                 scratch = max(scratch, scratch_of_factor(a.rows, &a.v))
         self.factors, spare = allocate_workspace(more * sizeof(double)), allocate_workspace(scratch * sizeof(double))
         to, work = <double*>self.factors.at, <double*>spare.at
@@ -456,23 +468,23 @@ cdef class Linears:
                 a = self.at + i
                 if a.known and a.v.g != NULL and a.rows <= most:
                     factorise(a, &a.v, 0.0, to, work)
-                    to += room_of_factor(a.rows)
+                    to += factor_workspace_size(a.rows)
 
     def one(self, Py_ssize_t i):
-        """The `Linear` of one of them, or None."""
-        cdef Linear made
+        """Return item i as a `Linear`, or None if it was skipped."""
+        cdef Linear item
         if not self.at[i].known:
             return None
-        made = Linear.__new__(Linear)
-        made.at, made.judge, made.data = self.at[i], self.data[i], self.data[i]
-        made.workspace, made.factor = self.workspace, self.factors
-        return made
+        item = Linear.__new__(Linear)
+        item.at, item.judge, item.data = self.at[i], self.data[i], self.data[i]
+        item.workspace, item.factor = self.workspace, self.factors
+        return item
 
     def leave(self, double accepted):
-        """Leave also those without a regular factor, and with a residual above `accepted`: a list of all that are left."""
+        """Skip items without a regular factor or with a residual above `accepted`; return the indices of all skipped items."""
         cdef Py_ssize_t i
         cdef linear_t* a
-        cdef list left = []
+        cdef list skipped = []
         self.size = 0
         for i in range(self.n):
             a = self.at + i
@@ -481,30 +493,30 @@ cdef class Linears:
             if a.known:
                 self.size += 3 * a.v.p.n_rows + a.n
             else:
-                left.append(i)
-        return left
+                skipped.append(i)
+        return skipped
 
     def adjoint(self, list velocities, list impulses, list slacks):
-        """`Linear.adjoint` of all that are not left, end to end; and a list of those that it had to leave."""
+        """Return the concatenated `Linear.adjoint` of all items that are not skipped, and the indices of items that failed."""
         cdef Py_ssize_t i
         cdef Py_buffer view
-        cdef list left = []
+        cdef list failed = []
         numbers = empty(self.size)
         PyObject_GetBuffer(numbers, &view, PyBUF_WRITABLE)
         for i in range(self.n):
             if self.at[i].known and not adjoint_into(self.at + i, velocities[i], impulses[i], slacks[i],
                                                      <double*>view.buf + self.at[i].first):
-                left.append(i)
+                failed.append(i)
         PyBuffer_Release(&view)
-        return numbers, left
+        return numbers, failed
 
     def place(self, Py_ssize_t i):
-        """The slice of one of them in what `adjoint` finds."""
+        """Return the slice of item i in the result of `adjoint`."""
         cdef linear_t* a = self.at + i
         return slice(a.first, a.first + 3 * a.v.p.n_rows + a.n)
 
     def places(self, bint velocities):
-        """The places there of every s (sum m,), or of every f (sum n,)."""
+        """Return the indices of every s (sum m,), or of every f (sum n,), in the result of `adjoint`."""
         cdef Py_ssize_t i, j, k = 0
         cdef int32_t m, n
         out_ = np.empty(self.size, np.intp)
@@ -519,7 +531,7 @@ cdef class Linears:
 
 
 def wrench(Data p, const double[::1] lam, double[:, ::1] f):
-    """f (n, 6) = J^T lam of bodies."""
+    """Write J^T lam (n, 6) of bodies to f."""
     if p.blocks.n_rows and p.rows.n_bodies:
         rows_wrench(&p.blocks, &p.rows, &lam[0], &f[0, 0])
     else:

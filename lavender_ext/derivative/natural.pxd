@@ -1,19 +1,19 @@
-"""The natural map of a problem's blocks at an answer, differentiated: which case each row is in, and how far the next is.
+"""Derivative of the natural map of the blocks at a solution, the case of each row, and its distance to the next case.
 
 With z = D^1/2 lambda, s = D^-1/2 w, y = z - s, Pi and P = dPi/dy of contact_map.pxd, H = D^-1/2 A D^-1/2,
 
     F = z - Pi(y) = 0                                                                                       (1)
     (I - P) dz + P ds = (dPi/da) da + dl,   ds = H dz + ...                                                 (2)
-    G = I - P + P H,   which is the identity on rows where P is 0: open contacts, rows at a bound           (3)
+    G = I - P + P H,   the identity on rows with P = 0: open contacts, rows at a bound                      (3)
 
-Any metric D does at a solution, so a round cone has one d for all its tangents. Of a part g that slides, with
-u = y_g / |y_g|, ray as in contact_map.pxd and s_n the normal of Pi,
+Any metric D is valid at a solution, so a round cone has one d for all its tangents. For a friction component g that slides,
+with u = y_g / |y_g|, ray as in contact_map.pxd and s_n the normal of Pi,
 
-    dPi/da_g = s_n u on its own rows;   cone: besides ray (|y_g| - 2 a_g s_n) / |ray|^2                     (4)
+    dPi/da_g = s_n u on its own rows;   cone law: plus ray (|y_g| - 2 a_g s_n) / |ray|^2                    (4)
 
-since there s_n = (y_n + sum a |y|) / (1 + sum a^2). A row's margin is how far y is from the next case, in N s:
-y from its bound; of an open contact y_n below 0, under the cone law y_n + sum a |y| below 0; of a closed one s_n, and
-||y_g| - a_g s_n| of each part.
+because s_n = (y_n + sum a |y|) / (1 + sum a^2). The margin of a row is the distance of y to the next case, in N s: the distance
+of y to the bound of a row; -y_n of an open contact, -(y_n + sum a |y|) under the cone law; s_n of a closed contact, and
+||y_g| - a_g s_n| of each of its friction components.
 """
 from libc.math cimport INFINITY, fabs, sqrt
 from libc.stdint cimport int8_t, int32_t
@@ -21,49 +21,50 @@ from libc.stdint cimport int8_t, int32_t
 from lavender_ext.core.block cimport length
 from lavender_ext.core.contact_map cimport contact_map
 from lavender_ext.core.dot cimport dot
-from lavender_ext.core.parts cimport CONE, blocks_t, is_rows, parts_of, parts_t
+from lavender_ext.core.block_types cimport CONE, blocks_t, is_rows, get_friction_components, friction_components_t
 from lavender_ext.core.view cimport csr_t, generalized_t, view_t
 
 
-cdef enum:                      # the case of a row
-    OPEN = 0                    # of a contact without an impulse
-    CLOSED = 1                  # a normal that presses
+cdef enum:                      # case of a row
+    OPEN = 0                    # row of a contact without an impulse
+    CLOSED = 1                  # normal with a positive impulse
     STICKS = 2
     SLIDES = 3
     FREE = 4                    # between its bounds
-    LOW = 5                     # at the lower bound, at the upper one
-    HIGH = 6
+    LOW = 5                     # at the lower bound
+    HIGH = 6                    # at the upper bound
 
 
-cdef struct natural_t:          # of all blocks
+cdef struct natural_t:          # natural map of all blocks
     double* root                # (m) D^1/2
     double* f                   # (m) F
     double* margin              # (m) N s
     int8_t* case_               # (m)
-    const int32_t* at           # (k + 1) first value of each block in p and edge: its diagonal for bounded rows, else square
+    const int32_t* at           # (k + 1) first value of each block in p and edge: a diagonal for bounded rows, otherwise a square
     double* p                   # P
-    double* edge                # dPi/de, e_g the reach of part g in its first column
+    double* edge                # dPi/de, e_g the friction coefficient of component g, in the first column of g
 
 
-cdef struct linear_t:           # an answer, judged and linearised
-    view_t v                    # what the judge reads
+cdef struct linear_t:           # a judged and linearised solution
+    view_t v                    # problem for the judge
     natural_t x
-    int32_t n                   # velocities, 0 of a matrix
-    int32_t rows                # of G
-    bint known                  # all of this, and
-    bint tried                  # for a factor, which is
-    bint regular                # that of a regular G
+    int32_t n                   # number of velocities, 0 for a matrix
+    int32_t rows                # order of G
+    bint known                  # the problem is supported and linearised
+    bint tried                  # a factorisation was attempted
+    bint regular                # G was factored and is regular
     double* lam                 # (m) N s
     double* w                   # (m) m/s
     int32_t* place              # (m) row of G that each row is, -1 without one
     double* lu                  # (rows, rows) P G^T = L U
     int32_t* swap               # (rows)
-    double relative, above_floor        # of the judge
-    ssize_t first               # number of its own, among those of many
+    double relative, above_floor        # results of the judge
+    ssize_t first               # first index of its numbers in the results of several
 
 
 cdef inline void natural_row(double lam, double w, double low, double high, double root, double* f, double* margin,
                              int8_t* case_, double* p) noexcept nogil:
+    """Compute (1), P, case and margin of one bounded row."""
     cdef double y = lam - w / (root * root), below = y - low, above = high - y
     p[0] = 0.0
     if below > 0.0 and above > 0.0:
@@ -85,6 +86,7 @@ cdef inline void natural_row(double lam, double w, double low, double high, doub
 
 cdef inline void natural_contact(const blocks_t* b, int32_t i, const double* lam, const double* w,
                                  const natural_t* out) noexcept nogil:
+    """Compute (1), P, (4), cases and margins of contact i."""
     cdef int32_t j = b.ptr[i], n = b.ptr[i + 1] - j, k, g, first, size
     cdef double* root = out.root + j
     cdef double* margin = out.margin + j
@@ -93,14 +95,14 @@ cdef inline void natural_contact(const blocks_t* b, int32_t i, const double* lam
     cdef double y[6]
     cdef double to[6]
     cdef double ray[6]
-    cdef parts_t q
+    cdef friction_components_t q
     cdef double t, s, gone, norm = 1.0, over
-    parts_of(b, i, &q)
+    get_friction_components(b, i, &q)
     root[0] = sqrt(b.d[j])
     for g in range(q.n):
         for k in range(q.first[g], q.first[g] + q.size[g]):
             root[k] = sqrt(b.d[j + q.first[g]])
-        q.reach[g] = q.reach[g] * root[q.first[g]] / root[0]
+        q.friction_coefficient[g] = q.friction_coefficient[g] * root[q.first[g]] / root[0]
     for k in range(n):
         y[k] = root[k] * lam[j + k] - w[j + k] / root[k]
         ray[k] = 0.0
@@ -119,19 +121,19 @@ cdef inline void natural_contact(const blocks_t* b, int32_t i, const double* lam
     for g in range(q.n):
         first, size = q.first[g], q.size[g]
         t = length(y + first, size)
-        gone -= q.reach[g] * t
+        gone -= q.friction_coefficient[g] * t
         if not s > 0.0:
             continue
-        over = t - q.reach[g] * s
+        over = t - q.friction_coefficient[g] * s
         for k in range(first, first + size):
-            out.case_[j + k] = STICKS if over <= 0.0 and q.reach[g] > 0.0 else SLIDES
+            out.case_[j + k] = STICKS if over <= 0.0 and q.friction_coefficient[g] > 0.0 else SLIDES
             if over > 0.0:
-                ray[k] = q.reach[g] * y[k] / t
+                ray[k] = q.friction_coefficient[g] * y[k] / t
                 edge[k * n + first] = s * y[k] / t
-        if q.reach[g] > 0.0:
+        if q.friction_coefficient[g] > 0.0:
             margin[first] = fabs(over) / root[first]
         if over > 0.0:
-            norm += q.reach[g] * q.reach[g]
+            norm += q.friction_coefficient[g] * q.friction_coefficient[g]
     if s > 0.0:
         margin[0] = s / root[0]
     else:
@@ -139,16 +141,16 @@ cdef inline void natural_contact(const blocks_t* b, int32_t i, const double* lam
     for g in range(q.n if s > 0.0 else 0):
         first, size = q.first[g], q.size[g]
         t = length(y + first, size)
-        if b.law == CONE and t > q.reach[g] * s:
+        if b.law == CONE and t > q.friction_coefficient[g] * s:
             for k in range(n):
-                edge[k * n + first] += ray[k] * (t - 2.0 * q.reach[g] * s) / norm
-        for k in range(n):                              # of a_g = e_g root_g / root_n
+                edge[k * n + first] += ray[k] * (t - 2.0 * q.friction_coefficient[g] * s) / norm
+        for k in range(n):                              # chain rule: a_g = e_g root_g / root_n
             edge[k * n + first] *= root[first] / root[0]
 
 
 cdef inline void natural_all(const blocks_t* b, const double* lam, const double* w, int32_t* at,
                              const natural_t* out) noexcept nogil:
-    """(1) and (2) of every block; `at` (k + 1) are the places of `out`."""
+    """Compute (1) and (2) of all blocks; `at` (k + 1) is the array of `out`."""
     cdef int32_t i, j, k, n
     at[0] = 0
     for i in range(b.n_blocks):
@@ -166,7 +168,7 @@ cdef inline void natural_all(const blocks_t* b, const double* lam, const double*
 
 
 cdef inline int32_t place_rows(const blocks_t* b, const natural_t* x, int32_t* place) noexcept nogil:
-    """Rows of G that (3) leaves: those of closed contacts, and rows between their bounds; how many."""
+    """Number the rows of G that are not trivial in (3), of closed contacts and rows between bounds; return their number."""
     cdef int32_t i, j, n = 0
     for i in range(b.n_blocks):
         for j in range(b.ptr[i], b.ptr[i + 1]):
@@ -177,9 +179,9 @@ cdef inline int32_t place_rows(const blocks_t* b, const natural_t* x, int32_t* p
     return n
 
 
-cdef inline void block_times(const natural_t* x, const blocks_t* b, const double* values, const double* v, bint back,
+cdef inline void block_times(const natural_t* x, const blocks_t* b, const double* values, const double* v, bint transpose,
                              double* out) noexcept nogil:
-    """out (m) = values v of all blocks, or with `back` of their transposes."""
+    """Compute out (m), the products of the blocks in `values`, or of their transposes, with v."""
     cdef int32_t i, j, k, l, n
     cdef const double* a
     cdef double s
@@ -196,13 +198,13 @@ cdef inline void block_times(const natural_t* x, const blocks_t* b, const double
                 out[j + k] = s
                 continue
             for l in range(n):
-                s += a[l * n + k if back else k * n + l] * v[j + l]
+                s += a[l * n + k if transpose else k * n + l] * v[j + l]
             out[j + k] = s
 
 
 cdef inline void scaled_csr(const csr_t* a, int32_t m, int32_t count, const int32_t* place, const double* root,
                             double* h) noexcept nogil:
-    """H (count, count) on the rows that have a place."""
+    """Compute H (count, count) of a matrix on the rows of G."""
     cdef int32_t i, q, c
     cdef double* row
     for i in range(m):
@@ -219,7 +221,7 @@ cdef inline void scaled_csr(const csr_t* a, int32_t m, int32_t count, const int3
 
 cdef inline void scaled_general(const generalized_t* g, int32_t count, const int32_t* place, const double* root,
                                 double* y, double* h) noexcept nogil:
-    """H (count, count) of J and M on the rows that have a place; y (count, nv) is scratch."""
+    """Compute H (count, count) of J and M on the rows of G; y (count, nv) is scratch."""
     cdef int32_t i, k, c, b, nc, n = g.n
     cdef const double* from_
     cdef double* row
@@ -248,7 +250,7 @@ cdef inline void scaled_general(const generalized_t* g, int32_t count, const int
 
 cdef inline void system_rows(const natural_t* x, const blocks_t* b, int32_t count, const int32_t* place,
                              const double* h, double* g) noexcept nogil:
-    """G (count, count) of (3) on the rows that have a place, -1 for the others; h is H there."""
+    """Compute G (count, count) of (3) from H; place is the row of G of each row, or -1."""
     cdef int32_t i, j, k, l, n, c
     cdef const double* p
     cdef double* row

@@ -1,1 +1,1 @@
-"""Methods as workspace, start and step on plain structs, for any host: `driver.pxd` says which, over what."""
+"""Dispatch of solver methods (workspace size, start, step) on plain structs, for any host."""

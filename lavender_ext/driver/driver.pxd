@@ -1,4 +1,4 @@
-"""The table of methods, each as workspace, start and step (`core/method.pxd`), and the three calls that lead any of them.
+"""Table of methods with the interface of `core/method.pxd`, and the three functions that dispatch to them.
 
 | method | over A | over bodies | over J and M |
 |---|---|---|---|
@@ -6,7 +6,7 @@
 """
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.method cimport options_t, workspace_t, said_t
+from lavender_ext.core.method cimport options_t, workspace_t, info_t
 from lavender_ext.core.view cimport view_t
 
 
@@ -17,4 +17,4 @@ cdef enum:                      # methods
 cdef public int32_t lav_workspace_size(const view_t* v, const options_t* o, workspace_t* r) noexcept nogil
 cdef public int32_t lav_start(const view_t* v, const options_t* o, workspace_t* r, const double* lam) noexcept nogil
 cdef public int32_t lav_step(const view_t* v, const options_t* o, const workspace_t* r, int32_t work, double* lam,
-                             said_t* said) noexcept nogil
+                             info_t* info) noexcept nogil

@@ -1,8 +1,8 @@
-"""Workspace, start and step of the methods, for any host; the same from Python."""
+"""Dispatch of workspace size, start and step to the methods, for any host, and a Python class."""
 from libc.math cimport INFINITY
 from libc.stdint cimport int32_t, int64_t
 
-from lavender_ext.core.method cimport NEEDS_WORKSPACE, Method, method_t, options_t, workspace_t, said_t
+from lavender_ext.core.method cimport NEEDS_WORKSPACE, Method, method_t, options_t, workspace_t, info_t
 from lavender_ext.core.problem cimport Data, Workspace, allocate_workspace
 from lavender_ext.core.view cimport view_t
 from lavender_ext.driver.driver cimport NEWTON
@@ -13,7 +13,7 @@ from lavender_ext.velocity_newton.soft cimport is_soft
 
 
 cdef inline method_t row_of(const view_t* v) noexcept nogil:
-    """The table: a method over the form that the problem has."""
+    """Return the functions of the method for the form of the problem."""
     if v.g != NULL:
         return method_t(general_workspace_size, general_start, general_step)
     if v.r != NULL:
@@ -22,7 +22,7 @@ cdef inline method_t row_of(const view_t* v) noexcept nogil:
 
 
 cdef public int32_t lav_workspace_size(const view_t* v, const options_t* o, workspace_t* r) noexcept nogil:
-    """r.n_index and r.n_real as far as they are known beforehand; 0 where the method does not take the problem."""
+    """Write first estimates of r.n_index and r.n_real; return 0 if the method does not accept the problem."""
     r[0] = workspace_t(0, 0, NULL, NULL, 0, 0, 0, 0.0)
     if o.method != NEWTON or v.p.n_rows == 0:
         return 0
@@ -30,22 +30,31 @@ cdef public int32_t lav_workspace_size(const view_t* v, const options_t* o, work
 
 
 cdef public int32_t lav_start(const view_t* v, const options_t* o, workspace_t* r, const double* lam) noexcept nogil:
-    """From lam (m): MORE, or NEEDS_WORKSPACE with how much is needed."""
+    """Start from lam (m); return MORE, NEEDS_WORKSPACE with the required sizes in r, or another outcome."""
     return row_of(v).start(v, o, r, lam)
 
 
 cdef public int32_t lav_step(const view_t* v, const options_t* o, const workspace_t* r, int32_t work, double* lam,
-                             said_t* said) noexcept nogil:
-    """`work` units or a few more; lam (m) is the best so far."""
-    return row_of(v).step(v, o, r, work, lam, said)
+                             info_t* info) noexcept nogil:
+    """Do at least `work` units of work; lam (m) receives the best impulse so far."""
+    return row_of(v).step(v, o, r, work, lam, info)
 
 
 cdef class Driver(Method):
-    """A method of the table on a problem, in arrays that are made when they are known; `start` as often as wanted.
+    """A method on a problem, with workspace that is allocated when its size is known; `start` may be called repeatedly.
 
-    `fits`: it takes the problem. Of J and M `work` are multiply-adds of N and a factor of each of the `islands`, `soft`
-    says that no row needs a proximal term. An island whose N has more than `most` values does not fit, and need not where
-    its factor takes more than `work`.
+    Parameters
+    ----------
+    data : Data
+        The problem.
+    most : float
+        Maximum number of values of the matrix N of an island over J and M. A larger island is not accepted.
+    work : float
+        Multiply-adds of a factorisation above which an island may be rejected without analysis.
+
+    Notes
+    -----
+    `fits` is whether the method accepts the problem.
     """
     cdef Workspace index, real
     cdef readonly bint fits
@@ -55,22 +64,22 @@ cdef class Driver(Method):
         self.options.method, self.options.wide, self.options.most = NEWTON, has_wide(), most
         self.options.work = work
         self.own = row_of(&self.view)
-        self.fits = lav_workspace_size(&self.view, &self.options, &self.space) and self.lay() == NEEDS_WORKSPACE
+        self.fits = lav_workspace_size(&self.view, &self.options, &self.space) and self.analyse() == NEEDS_WORKSPACE
 
-    cdef int32_t lay(self) except -1:
-        """A start, as far as whole numbers lead."""
+    cdef int32_t analyse(self) except -1:
+        """Start with integer workspace only: analyse the structure and compute the size of the real workspace."""
         cdef int32_t how = NEEDS_WORKSPACE
-        cdef int64_t had = -1
-        while how == NEEDS_WORKSPACE and self.space.n_index > had:
-            had = self.space.n_index
-            self.index = allocate_workspace(had * sizeof(int32_t))
+        cdef int64_t n_allocated = -1
+        while how == NEEDS_WORKSPACE and self.space.n_index > n_allocated:
+            n_allocated = self.space.n_index
+            self.index = allocate_workspace(n_allocated * sizeof(int32_t))
             self.space.index = <int32_t*>self.index.at
             with nogil:
                 how = lav_start(&self.view, &self.options, &self.space, NULL)
         return how
 
     def start(self, const double[::1] impulse, double tol, int budget):
-        """From impulse (m,), to a relative residual of tol, by so many units of work."""
+        """Start from impulse (m,) [N s], to a relative residual of `tol`, with `budget` units of work."""
         self.aim(tol, budget)
         if self.real is None:
             self.real = allocate_workspace(self.space.n_real * sizeof(double))
@@ -80,15 +89,15 @@ cdef class Driver(Method):
 
     @property
     def work(self):
-        """Multiply-adds."""
+        """Multiply-adds of one factorisation; over J and M of N and a factor of each island."""
         return self.space.work
 
     @property
     def islands(self):
-        """Problems that share no velocity."""
+        """Number of islands: independent problems without common velocities."""
         return self.space.islands
 
     @property
     def soft(self):
-        """No row of J and M needs a proximal term."""
+        """Whether no row needs a proximal term; False unless the problem is given by J and M."""
         return self.view.g != NULL and is_soft(&self.view.p, self.view.g)

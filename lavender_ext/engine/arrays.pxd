@@ -170,7 +170,7 @@ cdef struct engine_t:
     double* arm_a           # (c, 3) m
     double* arm_b           # (c, 3) m
     double* coupling        # (c, 5) 1/kg, absent without friction
-    double* swing           # (contact rows, 6) 1/(kg m)
+    double* inv_inertia_arm           # (contact rows, 6) 1/(kg m)
     double* local           # (c, 6) m, arms in the frames of a and b
     double* cache_impulse   # (c, N_CACHE_IMPULSE) N s, N m s
     double* cache_local     # (c, 6) m
@@ -270,7 +270,7 @@ cdef inline void bind(const int32_t* size, double* real, int32_t* index, uint64_
     e.arm_a = reals(real, &i, 3 * c)
     e.arm_b = reals(real, &i, 3 * c)
     e.coupling = reals(real, &i, 5 * nt)
-    e.swing = reals(real, &i, 6 * (m - mj))
+    e.inv_inertia_arm = reals(real, &i, 6 * (m - mj))
     e.local = reals(real, &i, 6 * c)
     e.cache_impulse = reals(real, &i, N_CACHE_IMPULSE * c)
     e.cache_local = reals(real, &i, 6 * c)

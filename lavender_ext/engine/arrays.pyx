@@ -44,7 +44,7 @@ SHAPES = {
         "shape": (4,), "friction": (), "restitution": (), "patch": (), "rot": (3, 3), "fat": (6,), "joint": (N_JOINT_REAL,),
         "joint_error": (), "jac": (12,), "minv_jac": (12,), "joint_impulse": (), "inv_mass": (), "inv_inertia": (3, 3),
         "v_free": (6,), "dv": (6,), "shift": (6,), "point": (3,), "gap": (), "normal": (3,), "tangent": (3,), "arm_a": (3,),
-        "arm_b": (3,), "coupling": (5,), "swing": (6,), "local": (6,), "cache_impulse": (N_CACHE_IMPULSE,),
+        "arm_b": (3,), "coupling": (5,), "inv_inertia_arm": (6,), "local": (6,), "cache_impulse": (N_CACHE_IMPULSE,),
         "cache_local": (6,), "push": (), "target": (), "lower": (), "upper": (), "b": (), "d": (), "step": (),
         "compliance": (), "impulse": (), "mu": (), "patch_radius": (), "rolling": (), "cache_roll": (3,),
     },

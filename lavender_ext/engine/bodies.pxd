@@ -14,7 +14,7 @@ so the gyroscopic term conserves angular momentum to rounding and energy to O(h^
 from libc.math cimport sqrt
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.door cimport first_outside
+from lavender_ext.core.validate cimport first_invalid
 from lavender_ext.engine.arrays cimport N_BODY, N_DYNAMIC, N_FRAME, S_GRAVITY, S_H, engine_t
 from lavender_ext.engine.vectors cimport copy3, add_scaled3, matvec3
 
@@ -105,9 +105,9 @@ cdef inline void advance_rotation(double* q, double* omega, const double* inerti
 
 
 cdef inline int32_t is_out_of_range(const engine_t* e, int32_t body) noexcept nogil:
-    """Return whether the body's state is outside the range that core/door.pxd (1) allows."""
-    return (first_outside(e.v + 6 * body, 6) >= 0 or first_outside(e.x + 3 * body, 3) >= 0
-            or first_outside(e.q + 4 * body, 4) >= 0)
+    """Return whether the body's state is outside the range that core/validate.pxd (1) allows."""
+    return (first_invalid(e.v + 6 * body, 6) >= 0 or first_invalid(e.x + 3 * body, 3) >= 0
+            or first_invalid(e.q + 4 * body, 4) >= 0)
 
 
 cdef inline void start_bodies(engine_t* e) noexcept nogil:

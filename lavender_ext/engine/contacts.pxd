@@ -28,8 +28,8 @@ no key has matched. A stale entry is not used; the sweeps correct a wrong match.
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t, uint64_t
 
-from lavender_ext.core.parts cimport contact_kind
-from lavender_ext.core.rows cimport (contact_diagonal, contact_slack, cross, dot3, largest_eigenvalue, reciprocal,
+from lavender_ext.core.block_types cimport contact_kind
+from lavender_ext.core.rows cimport (contact_diagonal, contact_velocity, cross, dot3, largest_eigenvalue, reciprocal,
                                      relative_velocity)
 from lavender_ext.core.view cimport rows_t
 from lavender_ext.engine.arrays cimport (ALTERNATING, AVBD, BOX, CAP_CONTACT, H_CACHED, H_CONTACTS, H_CONTACT_ROWS,
@@ -186,13 +186,13 @@ cdef inline void build_contact(engine_t* e, const rows_t* r, int32_t c, int32_t 
     if nt == 2 and not n_angular:
         contact_diagonal(e.normal + 3 * c, e.tangent + 3 * c, e.arm_a + 3 * c, e.arm_b + 3 * c, 2, 0, da, db,
                          e.inv_mass, e.inv_inertia, d, off, e.coupling + 5 * c,
-                         e.swing + 6 * (row - e.size[N_JOINT_ROW]))
-        contact_slack(r, c, 2, 0, e.v_free, w)
+                         e.inv_inertia_arm + 6 * (row - e.size[N_JOINT_ROW]))
+        contact_velocity(r, c, 2, 0, e.v_free, w)
     else:
         contact_diagonal(e.normal + 3 * c, e.tangent + 3 * c, e.arm_a + 3 * c, e.arm_b + 3 * c, nt, n_angular,
                          da, db, e.inv_mass, e.inv_inertia, d, off, e.coupling + 5 * c,
-                         e.swing + 6 * (row - e.size[N_JOINT_ROW]))
-        contact_slack(r, c, nt, n_angular, e.v_free, w)
+                         e.inv_inertia_arm + 6 * (row - e.size[N_JOINT_ROW]))
+        contact_velocity(r, c, nt, n_angular, e.v_free, w)
     for k in range(1 + nt + n_angular):
         d[k] += e.compliance[row + k]
     # step sizes: separate tangents for box friction, else one step from the tangents' largest eigenvalue

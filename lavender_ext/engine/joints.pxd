@@ -16,8 +16,8 @@ A rigid row has target 0; the position projection removes its error.
 from libc.math cimport sqrt
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.door cimport least
-from lavender_ext.core.parts cimport ROW
+from lavender_ext.core.validate cimport min_magnitude
+from lavender_ext.core.block_types cimport ROW
 from lavender_ext.core.rows cimport cross, dot3, dot12, joint_velocity, minv_times, reciprocal
 from lavender_ext.engine.arrays cimport (BALL, DISTANCE, HINGE, H_WARM_START, J_ANCHOR_A, J_ANCHOR_B,
                                          J_AXIS_A, J_AXIS_B, J_DAMPING, J_HERTZ, J_LENGTH, J_SIDE_A, J_SPEED,
@@ -82,7 +82,7 @@ cdef inline void compute_joint_geometry(engine_t* e, int32_t i) noexcept nogil:
     if e.joint_kind[i] == DISTANCE:
         subtract3(pb, pa, axis)
         length = sqrt(dot3(axis, axis))
-        if length > least():
+        if length > min_magnitude():
             for k in range(3):
                 axis[k] = axis[k] / length
         else:

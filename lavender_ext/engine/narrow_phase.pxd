@@ -18,7 +18,7 @@ four sides of the reference face (Sutherland, Hodgman 1974).
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.door cimport least
+from lavender_ext.core.validate cimport min_magnitude
 from lavender_ext.core.rows cimport cross, dot3
 from lavender_ext.engine.arrays cimport BOX, PLANE, SPHERE, engine_t
 from lavender_ext.engine.bodies cimport to_body, to_world
@@ -44,7 +44,7 @@ cdef inline void sphere_sphere(const double* xa, double ra, const double* xb, do
     if s > (ra + rb + margin) * (ra + rb + margin):
         return
     s = sqrt(s)
-    if s > least():
+    if s > min_magnitude():
         for k in range(3):
             m.normal[k] = d[k] / s
     else:                                               # concentric: use a fixed normal
@@ -131,7 +131,7 @@ cdef inline void box_sphere(const double* xa, const double* rot, const double* h
         s += d[k] * d[k]
     if s > (r + margin) * (r + margin):
         return
-    if s > least() * least():
+    if s > min_magnitude() * min_magnitude():
         s = sqrt(s)
         for k in range(3):
             d[k] = d[k] / s

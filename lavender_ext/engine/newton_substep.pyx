@@ -15,9 +15,9 @@ from libc.stdint cimport int32_t, int64_t, uint64_t
 
 import numpy as np
 
-from lavender_ext.core.method cimport CERTIFICATE, MORE, options_t, workspace_t, said_t
+from lavender_ext.core.method cimport CERTIFICATE, MORE, options_t, workspace_t, info_t
 from lavender_ext.core.islands cimport find_islands, islands_index
-from lavender_ext.core.parts cimport blocks_t, is_rows, islands_t
+from lavender_ext.core.block_types cimport blocks_t, is_rows, islands_t
 from lavender_ext.core.view cimport rows_t, view_t
 from lavender_ext.core.weights cimport block_weights, joint_weights
 from lavender_ext.engine.arrays cimport S_OUT, bind, engine_t
@@ -25,7 +25,7 @@ from lavender_ext.engine.view cimport view
 from lavender_ext.judge.measure cimport find_reference, score_slack
 from lavender_ext.judge.score cimport new_score, score_t
 from lavender_ext.newton.solve cimport bodies_workspace_size, bodies_start, system_step
-from lavender_ext.newton.warm_start cimport (FACTORED, JUDGED, MOST_TRACED, UNDECIDED, band_width, judged, lay_out,
+from lavender_ext.newton.warm_start cimport (FACTORED, JUDGED, MOST_TRACED, UNDECIDED, band_width, judged, bind_warm_workspace,
                                       observe, room_of, start_errors, warm_solve, warm_t)
 
 
@@ -89,7 +89,7 @@ cdef public int32_t lav_newton_plan(const int32_t* size, double* real, int32_t* 
 cdef inline int32_t run_newton_stages(const view_t* problem, const options_t* o, workspace_t* workspace, warm_t* s, double* lam,
                                    double* v) noexcept nogil:
     """Run Newton's method after `warm_solve`, also from lam = 0; return UNDECIDED with the best lam if it does not reach tol."""
-    cdef said_t said
+    cdef info_t said
     cdef int32_t result = bodies_start(problem, o, workspace, lam)
     while result == MORE or result == CERTIFICATE:
         result = system_step(problem, o, workspace, 1, lam, &said)
@@ -178,7 +178,7 @@ cdef public int32_t lav_newton_substep(const int32_t* size, double* real, int32_
     s.relative = 0.0
     own = room_of(&p, s.width) + p.n_rows
     marks = SCRATCH_HEADER + scratch[1]
-    lay_out(&s, workspace + p.n_rows, scratch + marks, &p, &r)
+    bind_warm_workspace(&s, workspace + p.n_rows, scratch + marks, &p, &r)
     bind_islands(&p, &r, &s, scratch + marks + r.n_bodies + 2 * r.n_joints + 1, workspace + own, &islands)
     own += 2 * <int64_t>p.n_blocks
     result = newton_substep(&p, &r, &s, tol, all_stages, scratch, workspace + own, e.impulse, e.dv)

@@ -13,7 +13,7 @@ from libc.math cimport fabs
 from libc.stdint cimport int32_t
 
 from lavender_ext.core.block cimport clip, relax_normal
-from lavender_ext.core.rows cimport cross, dot3, joint_push, joint_velocity, push_bodies, relative_velocity
+from lavender_ext.core.rows cimport cross, dot3, apply_joint_impulse, joint_velocity, apply_impulse_to_bodies, relative_velocity
 from lavender_ext.engine.arrays cimport (H_CONTACTS, H_POSITION_ITERATIONS, H_PROJECTED, J_HERTZ, N_DYNAMIC,
                                          N_JOINT, N_JOINT_REAL, N_JOINT_ROW, S_BETA, S_DEPTH, S_H,
                                          S_JOINT_ERROR, S_MAX_PUSH, S_SLOP, engine_t)
@@ -49,7 +49,7 @@ cdef inline double displacement(const engine_t* e, int32_t c, const double* z, c
 
 cdef inline void apply_contact_impulse(const engine_t* e, double* v, int32_t c, const double* impulse) noexcept nogil:
     """Apply an impulse (3) [N s] at a contact to the velocities v (nd, 6)."""
-    push_bodies(v, e.contact_body[2 * c], e.contact_body[2 * c + 1], e.inv_mass, e.inv_inertia, e.arm_a + 3 * c,
+    apply_impulse_to_bodies(v, e.contact_body[2 * c], e.contact_body[2 * c + 1], e.inv_mass, e.inv_inertia, e.arm_a + 3 * c,
                 e.arm_b + 3 * c, impulse, NULL)
 
 
@@ -115,7 +115,7 @@ cdef inline int32_t project_positions(engine_t* e) noexcept nogil:
             for j in range(e.ptr[i], e.ptr[i + 1]):
                 if rigid_row(e, i, j):
                     change = (goal[j] - joint_velocity(e.jac + 12 * j, e.shift, a, b)) * e.step[j]      # (2)
-                    joint_push(e.minv_jac + 12 * j, change, e.shift, a, b)
+                    apply_joint_impulse(e.minv_jac + 12 * j, change, e.shift, a, b)
         for c in range(n):
             new_multiplier = relax_normal(e.push[mj + c], contact_normal_velocity(e, e.shift, c) - goal[mj + c],
                                           e.step[e.ptr[e.size[N_JOINT] + c]])                           # (1)

@@ -18,10 +18,10 @@ import numpy as np
 from lavender_ext.engine.arrays import views
 
 from lavender_ext.core.block cimport row_error
-from lavender_ext.core.door cimport all_finite
+from lavender_ext.core.validate cimport all_finite
 from lavender_ext.core.order cimport (RANDOM, SYMMETRIC, advance_order, block_levels, body_levels,
                                       color_by_bodies, reverse, sort_by_level)
-from lavender_ext.core.parts cimport blocks_t
+from lavender_ext.core.block_types cimport blocks_t
 from lavender_ext.core.rows cimport relax_contact_block, relax_joint
 from lavender_ext.core.velocity cimport rows_velocity
 from lavender_ext.core.view cimport rows_t

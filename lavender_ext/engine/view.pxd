@@ -1,5 +1,5 @@
 """The engine's velocity problem as the structs of the shared kernels."""
-from lavender_ext.core.parts cimport COULOMB, blocks_t
+from lavender_ext.core.block_types cimport COULOMB, blocks_t
 from lavender_ext.core.view cimport rows_t
 from lavender_ext.engine.arrays cimport H_CONTACTS, H_CONTACT_ROWS, N_DYNAMIC, N_JOINT, N_JOINT_ROW, engine_t
 
@@ -36,7 +36,7 @@ cdef inline void view(const engine_t* e, blocks_t* p, rows_t* r) noexcept nogil:
     r.arm_b = e.arm_b
     r.contact_body = e.contact_body
     r.coupling = e.coupling
-    r.swing = e.swing
+    r.inv_inertia_arm = e.inv_inertia_arm
     r.inv_mass = e.inv_mass
     r.inv_inertia = e.inv_inertia
     r.compliance = e.compliance

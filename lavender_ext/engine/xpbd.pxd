@@ -23,7 +23,7 @@ from libc.math cimport sqrt
 from libc.stdint cimport int32_t
 
 from lavender_ext.core.block cimport clip
-from lavender_ext.core.rows cimport cross, dot3, joint_push, joint_velocity
+from lavender_ext.core.rows cimport cross, dot3, apply_joint_impulse, joint_velocity
 from lavender_ext.engine.arrays cimport (BOX, DISTANCE, HINGE, H_CONTACTS, H_ITERATIONS, J_ANCHOR_A, J_ANCHOR_B,
                                          J_AXIS_A, J_AXIS_B, J_DAMPING, J_HERTZ, J_LENGTH, N_DYNAMIC, N_JOINT,
                                          N_JOINT_REAL, S_BOUNCE, S_H, engine_t)
@@ -347,7 +347,7 @@ cdef inline void correct_all(engine_t* e) noexcept nogil:
             row = e.ptr[i + 1] - 1
             x = e.b[row] - joint_velocity(e.jac + 12 * row, e.dv, e.joint_body[2 * i], e.joint_body[2 * i + 1])
             e.impulse[row] = clip(x / e.d[row], e.lower[row], e.upper[row])
-            joint_push(e.minv_jac + 12 * row, e.impulse[row], e.dv, e.joint_body[2 * i], e.joint_body[2 * i + 1])
+            apply_joint_impulse(e.minv_jac + 12 * row, e.impulse[row], e.dv, e.joint_body[2 * i], e.joint_body[2 * i + 1])
     # stage 4: restitution, then friction
     for i in range(kj, n):
         apply_contact_restitution(e, e.order[i] - kj)

@@ -17,7 +17,7 @@ import numpy as np
 
 from lavender_ext.factor.symbolic import analysed
 
-from lavender_ext.core.csr cimport by_columns, scan_entries
+from lavender_ext.core.csr cimport transpose_csr, scan_entries
 from lavender_ext.core.view cimport csr_t
 from lavender_ext.factor.blocks cimport sparse_t
 from lavender_ext.factor.dense cimport cholesky_workspace_size, dense_cholesky, dense_cholesky_solve
@@ -332,7 +332,7 @@ cdef class SparsePanels:
             tind, tdata = np.empty(data.shape[0], np.int32), np.empty(data.shape[0])
         with nogil:
             if self.f.lu:
-                by_columns(self.f.n, self.f.n, &ptr[0], &ind[0], &data[0], &tptr[0], &tind[0], &tdata[0])
+                transpose_csr(self.f.n, self.f.n, &ptr[0], &ind[0], &data[0], &tptr[0], &tind[0], &tdata[0])
             lost = lav_sparse_factor(&self.f, &ptr[0], &ind[0], &data[0], &tptr[0], &tind[0], &tdata[0], &d[0], shift, tiny)
         return lost
 

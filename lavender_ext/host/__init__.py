@@ -1,1 +1,1 @@
-"""What a host without Python needs beside the kernels: where numbers lie, values, workspace."""
+"""Functions for engine hosts without Python: solver values and growth of buffers."""

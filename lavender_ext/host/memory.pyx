@@ -1,7 +1,7 @@
-"""What a host without Python needs beside the engine's kernels: its values, and more workspace.
+"""Functions for engine hosts without Python: solver values, and growth of the buffers.
 
-Such a host (WebAssembly, C) allocates every buffer itself. Where arrays lie tells engine/arrays.pyx, in the order of
-`bind`: the length of an array is the distance to the next one of the same buffer.
+Such a host (WebAssembly, C) allocates every buffer itself. engine/arrays.pyx returns the offsets of the arrays in the order of
+`bind`: the length of an array is the distance to the next array of the same buffer.
 """
 from libc.stdint cimport int32_t, int64_t, uint64_t
 from libc.string cimport memcpy
@@ -15,7 +15,7 @@ from lavender_ext.engine.arrays cimport (CAP_CONTACT, CAP_PAIR, H_NEED_CONTACTS,
 
 cdef public void lav_engine_values(const int32_t* size, double* real, int32_t* index, uint64_t* keys,
                                    double* out) noexcept nogil:
-    """The eight solver values of the last substep (8)."""
+    """Write the eight solver values of the last substep to out (8)."""
     cdef engine_t e
     cdef int64_t n[3]
     cdef int32_t k
@@ -25,13 +25,14 @@ cdef public void lav_engine_values(const int32_t* size, double* real, int32_t* i
 
 
 cdef inline int32_t quarter_more(int32_t need) noexcept nogil:
+    """Return need * 1.25 + 16, at most 2^31 - 1."""
     cdef double workspace = need * 1.25
     return 2147483647 if workspace > 2147483000.0 else <int32_t>workspace + 16
 
 
 cdef public void lav_engine_grow_workspace(const int32_t* size, double* real, int32_t* index, uint64_t* keys,
                                       int32_t* out) noexcept nogil:
-    """Sizes (N_SIZES) with workspace for what the last substep found missing, and a quarter more."""
+    """Write sizes (N_SIZES) with capacity for the pairs and contacts that did not fit, and a quarter more."""
     cdef engine_t e
     cdef int64_t n[3]
     cdef int32_t k
@@ -47,13 +48,13 @@ cdef public void lav_engine_grow_workspace(const int32_t* size, double* real, in
 cdef public void lav_engine_move(const int32_t* size, double* real, int32_t* index, uint64_t* keys,
                                  const int32_t* to_size, double* to_real, int32_t* to_index,
                                  uint64_t* to_keys) noexcept nogil:
-    """Into zeroed buffers with more workspace: what is carried from one substep to the next; scratch stays behind."""
+    """Copy the state that is carried between substeps, without scratch, to larger, zero-initialised buffers."""
     cdef engine_t a, b
     cdef int64_t used[3]
     cdef int64_t kj = size[N_JOINT], c = size[CAP_CONTACT]
     bind(size, real, index, keys, &a, used)
     bind(to_size, to_real, to_index, to_keys, &b, used)
-    # What lies side by side and does not depend on the workspace at once.
+    # Consecutive arrays whose sizes do not depend on the capacities are copied together.
     memcpy(b.setting, a.setting, (a.rot - a.setting) * sizeof(double))
     memcpy(b.fat, a.fat, (a.joint_error - a.fat) * sizeof(double))
     memcpy(b.joint_impulse, a.joint_impulse, (a.v_free - a.joint_impulse) * sizeof(double))
@@ -63,13 +64,13 @@ cdef public void lav_engine_move(const int32_t* size, double* real, int32_t* ind
     memcpy(b.head, a.head, (a.pair - a.head) * sizeof(int32_t))
     memcpy(b.joint_body, a.joint_body, 2 * kj * sizeof(int32_t))
     memcpy(b.ptr, a.ptr, (kj + c + 1) * sizeof(int32_t))
-    memcpy(b.push, a.push, size[N_JOINT_ROW] * sizeof(double))  # stiffness of joints: of contacts the cache has it
+    memcpy(b.push, a.push, size[N_JOINT_ROW] * sizeof(double))  # joint stiffness; that of contacts is in the cache
     memcpy(b.cache_key, a.cache_key, c * sizeof(uint64_t))
     b.head[H_PAIRS_VALID] = 0
 
 
 def grow_workspace(const int32_t[::1] size, double[::1] real, int32_t[::1] index, uint64_t[::1] keys):
-    """Sizes (10,) with workspace for what the last substep found missing."""
+    """Return sizes (10,) with capacity for the pairs and contacts that did not fit in the last substep."""
     cdef int32_t[::1] out = np.empty(N_SIZES, np.int32)
     lav_engine_grow_workspace(&size[0], &real[0], &index[0], &keys[0], &out[0])
     return np.asarray(out)
@@ -77,5 +78,5 @@ def grow_workspace(const int32_t[::1] size, double[::1] real, int32_t[::1] index
 
 def move(const int32_t[::1] size, double[::1] real, int32_t[::1] index, uint64_t[::1] keys,
          const int32_t[::1] to_size, double[::1] to_real, int32_t[::1] to_index, uint64_t[::1] to_keys):
-    """What lasts, into zeroed buffers of sizes at least as large."""
+    """Copy the state that is carried between substeps to zero-initialised buffers of at least the same sizes."""
     lav_engine_move(&size[0], &real[0], &index[0], &keys[0], &to_size[0], &to_real[0], &to_index[0], &to_keys[0])

@@ -1,1 +1,1 @@
-"""Rows of other engines in the layout of a problem: MuJoCo's constraint rows."""
+"""Conversion of constraint rows of other engines to a problem: MuJoCo."""

@@ -1,7 +1,7 @@
-"""MuJoCo's constraint rows in the layout of a problem: blocks, bounds, keys, J and its checks, in one pass each.
+"""Conversion of MuJoCo's constraint rows to a problem: blocks, bounds, keys, J and consistency checks, in one pass each.
 
-Arrays come as the engine holds them: efc_type, efc_id (m), contact dim (c), friction (c, 5), geom (c, 2). A contact
-whose coefficients f differ has the rows of its tangents scaled by f_j / f_0, so that one mu = f_0 bounds all:
+Arrays have MuJoCo's layout: efc_type, efc_id (m), contact dim (c), friction (c, 5), geom (c, 2). The
+tangent rows of a contact with different coefficients f are scaled by f_j / f_0, so that mu = f_0 bounds them all:
 
     |(lambda_1 / f_0, ..., lambda_n / f_n)| <= lambda_n   <=>   |lambda'| <= f_0 lambda_n,   lambda'_j = lambda_j f_0 / f_j   (1)
 """
@@ -11,30 +11,31 @@ from libc.string cimport memcmp, memcpy, memset
 
 import numpy as np
 
-from lavender_ext.core.arrays cimport DOUBLE, INT, doubles, frozen, ints, ndarray, spread
-from lavender_ext.core.blocks cimport Blocks, room_of
-from lavender_ext.core.door cimport is_number, is_size, widest
-from lavender_ext.core.parts cimport ROW, blocks_t, contact_kind, spell_bounds
+from lavender_ext.core.arrays cimport DOUBLE, INT, doubles, freeze, ints, ndarray, array_data
+from lavender_ext.core.blocks cimport Blocks, allocate_blocks
+from lavender_ext.core.validate cimport is_number, is_valid_magnitude, max_abs
+from lavender_ext.core.block_types cimport ROW, blocks_t, contact_kind, spell_bounds
 from lavender_ext.core.problem cimport Workspace, allocate_workspace
 
 
 cpdef enum:
-    JOINED = 6                  # rows of an equality that are one block; a flex has one for each edge
-    CODES = 8                   # kinds of constraints
+    # Equalities of at most this many rows form one block. Larger ones, as a flex with one row per edge, form single rows.
+    MAX_EQUALITY_ROWS = 6
+    CODES = 8                   # number of kinds of constraints
 
 cdef object new = np.empty, I4 = np.dtype(np.int32), U8 = np.dtype(np.uint64)
 
 
 cdef public int32_t lav_export_blocks(int32_t m, const int32_t* type_, const int32_t* id_, const int32_t* codes,
-                                      const int32_t* most, const int32_t* dim, const double* friction,
+                                      const int32_t* n_objects, const int32_t* dim, const double* friction,
                                       const int32_t* geom, const double* loss, double dt, int32_t* ptr, int32_t* kind,
                                       double* lower,
                                       double* upper, double* mu, double* scale, uint64_t* key) noexcept nogil:
-    """Blocks of m rows, how many; -1 - i where row i is of a type that `codes` does not hold, or names what is not there.
+    """Write the blocks of m rows and return their number; -1 - i if row i has an unknown type or an invalid id.
 
-    codes (8): equality, friction of a joint, of a tendon, limit of a joint, of a tendon, contact without friction,
-    pyramidal, elliptic; most (8): how many there are of what rows of each code name. A contact's dim is from 1 to 6, and
-    its rows end with the m. Of ptr workspace for m + 1.
+    codes (8) are MuJoCo's types of equality, joint friction, tendon friction, joint limit, tendon limit, frictionless
+    contact, pyramidal contact and elliptic contact. n_objects (8) is the number of objects that rows of each code may refer
+    to. The dim of a contact is 1 to 6, and its rows must lie within the m rows. ptr has m + 1 entries.
     """
     cdef int32_t i = 0, j, _j, k = 0, t, of, size, count, nth, code
     cdef double inf = 1.0 / 0.0
@@ -47,7 +48,7 @@ cdef public int32_t lav_export_blocks(int32_t m, const int32_t* type_, const int
         code = 0
         while code < CODES and t != codes[code]:
             code += 1
-        if code == CODES or not 0 <= of < most[code]:
+        if code == CODES or not 0 <= of < n_objects[code]:
             return -1 - i
         mu[k] = 0.0
         kind[k] = ROW
@@ -61,7 +62,7 @@ cdef public int32_t lav_export_blocks(int32_t m, const int32_t* type_, const int
                 upper[i + size] = inf
                 scale[i + size] = 1.0
                 size += 1
-            if size > JOINED:                           # rows of their own: together they would reach every vertex
+            if size > MAX_EQUALITY_ROWS:                # single rows, because one block would couple every vertex
                 count = size
                 size = 1
                 for j in range(1, count):
@@ -74,7 +75,7 @@ cdef public int32_t lav_export_blocks(int32_t m, const int32_t* type_, const int
         elif code <= 4:
             lower[i] = 0.0
             if k > 0 and (key[k - 1] | 0xFFFF) == (key[k] | 0xFFFF):
-                key[k] = key[k - 1] + 1                 # the other limit of the same joint
+                key[k] = key[k - 1] + 1                 # second limit of the same joint
         else:
             nth = 0
             j = of - 1
@@ -86,10 +87,10 @@ cdef public int32_t lav_export_blocks(int32_t m, const int32_t* type_, const int
             lower[i] = 0.0
             if code == 5:
                 kind[k] = contact_kind(False, False, False, 0)
-            elif not 1 < dim[of] <= JOINED:
+            elif not 1 < dim[of] <= MAX_EQUALITY_ROWS:
                 return -1 - i
             elif code == 6:
-                count = 2 * (dim[of] - 1)               # an edge each
+                count = 2 * (dim[of] - 1)               # one row per edge of the pyramid
                 if i + count > m:
                     return -1 - i
                 for j in range(1, count):
@@ -116,10 +117,10 @@ cdef public int32_t lav_export_blocks(int32_t m, const int32_t* type_, const int
     return k
 
 
-def blocks(type_, id_, codes, tuple most, dim, friction, geom, loss, double dt):
-    """(blocks, scale, key), or the number of a row that is unknown, or names what is not there.
+def blocks(type_, id_, codes, tuple n_objects, dim, friction, geom, loss, double dt):
+    """Return (blocks, scale, key), or the number of a row with an unknown type or an invalid id.
 
-    The blocks are None where some bound is no number; behind them, in `ints` from 2 m + 1 on, stand type, id, dim and geom.
+    blocks is None if a bound is not a valid number. Its `ints` hold type, id, dim and geom from index 2 m + 1.
     """
     cdef int32_t m = <int32_t>len(type_), c = <int32_t>len(dim), k, i
     cdef int32_t limits[CODES]
@@ -127,16 +128,16 @@ def blocks(type_, id_, codes, tuple most, dim, friction, geom, loss, double dt):
     cdef const int32_t* of = ints(type_, m)
     cdef const int32_t* which = ints(id_, m)
     cdef const double* losses = doubles(loss, m)
-    cdef const char* dims = spread(dim, c, 1, INT, &step[0])
-    cdef const char* pair = spread(geom, c, 2, INT, &step[1])
-    cdef const char* rub = spread(friction, c, 5, DOUBLE, &step[2])
-    cdef Blocks made = room_of(m, m, 2 * m + 3 * c, m + 5 * c)
+    cdef const char* dims = array_data(dim, c, 1, INT, &step[0])
+    cdef const char* pair = array_data(geom, c, 2, INT, &step[1])
+    cdef const char* rub = array_data(friction, c, 5, DOUBLE, &step[2])
+    cdef Blocks made = allocate_blocks(m, m, 2 * m + 3 * c, m + 5 * c)
     cdef blocks_t* p = &made.at
     cdef int32_t* held = <int32_t*>p.kind + m
     cdef double* scale = <double*>p.rolling + m
     cdef double* x = scale + m
     for k in range(CODES):
-        limits[k] = most[k]
+        limits[k] = n_objects[k]
     keys = new(m, U8)
     memcpy(held, of, m * sizeof(int32_t))
     memcpy(held + m, which, m * sizeof(int32_t))
@@ -153,11 +154,11 @@ def blocks(type_, id_, codes, tuple most, dim, friction, geom, loss, double dt):
     p.n_blocks = k
     fits = made.check()
     spell_bounds(&made.at)
-    return made if fits else None, made.numbers[5 * m:6 * m], frozen(keys if k == m else keys[:k])
+    return made if fits else None, made.numbers[5 * m:6 * m], freeze(keys if k == m else keys[:k])
 
 
 def rows_of_dense(values, int32_t m, int32_t n, scale):
-    """(indptr, indices, data) of J scaled by row, from its numbers row by row; there are m n of them, or more."""
+    """Return (indptr, indices, data) of J with scaled rows, from at least m n values, row by row."""
     cdef int32_t i, j, at = 0
     cdef double x
     cdef const double* value = doubles(values, values.size)
@@ -183,11 +184,11 @@ def rows_of_dense(values, int32_t m, int32_t n, scale):
 
 
 def rows_of_sparse(values, count_, first_, columns, scale, int32_t n):
-    """The same of compressed rows of n columns that may have workspace between them; None where columns do not ascend.
+    """Return (indptr, indices, data) of J with scaled rows, from compressed rows of n columns that may have gaps between them.
 
-    Of rows that cannot be followed, the first one's number.
+    The result is None if columns do not ascend, and the number of the first row with invalid indices if there is one.
     """
-    cdef int32_t i, m = <int32_t>len(scale), stray
+    cdef int32_t i, m = <int32_t>len(scale), is_invalid
     cdef Py_ssize_t q, begin, end, at = 0, total = 0, workspace = min(values.size, columns.size)
     cdef double x, factor
     cdef bint ascend = True
@@ -209,14 +210,14 @@ def rows_of_sparse(values, count_, first_, columns, scale, int32_t n):
         factor = scales[i]
         begin = first[i]
         end = begin + count[i]
-        stray = 0
+        is_invalid = 0
         for q in range(begin, end):
-            stray |= not 0 <= column[q] < n
-        if stray:
+            is_invalid |= not 0 <= column[q] < n
+        if is_invalid:
             return i
         for q in range(begin + 1, end):
-            stray |= column[q] <= column[q - 1]
-        ascend &= not stray
+            is_invalid |= column[q] <= column[q - 1]
+        ascend &= not is_invalid
         for q in range(begin, end):
             x = value[q] * factor
             if x != 0.0:
@@ -230,16 +231,17 @@ def rows_of_sparse(values, count_, first_, columns, scale, int32_t n):
 
 
 def lower(first_, count_, columns, values, x, y, double bound, tuple like):
-    """M's rows by first place and length as (indptr, indices, data), and max |M x - y| over max (|M| |x| + |y|).
+    """Return the lower triangle of M as (indptr, indices, data), and max |M x - y| over max (|M| |x| + |y|).
 
-    The latter over max |y| where that is within `bound` already. Columns ascend to the diagonal entry. None where these
-    are no lower triangle, row behind row. `like` is (indptr, indices) of such a triangle, shared where they are these.
+    The denominator is max |y| if the ratio is then at most `bound`. Rows are given by first index and length and must be
+    consecutive; columns must ascend to the diagonal entry; otherwise the result is None. `like` is (indptr, indices) of a
+    lower triangle that is shared if it has the same pattern.
     """
     cdef int32_t i, q, last, n = <int32_t>len(first_), nnz = <int32_t>len(columns)
     cdef double gap = 0.0, big = 0.0
     cdef Workspace scratch
     cdef const int32_t* first = ints(first_, n)
-    cdef const int32_t* given = ints(columns, nnz)
+    cdef const int32_t* source = ints(columns, nnz)
     cdef const int32_t* count
     cdef const int32_t* at
     cdef const int32_t* column
@@ -251,7 +253,7 @@ def lower(first_, count_, columns, values, x, y, double bound, tuple like):
     if not n == len(count_) == len(x) == len(y) or nnz != len(values) or n == 0:
         return None if n or nnz else ((np.zeros(1, I4), new(0, I4), new(0)), 0.0)
     count, v, right = ints(count_, n), doubles(x, n), doubles(y, n)
-    if not is_seen(like, n, nnz, first, count, given):
+    if not has_pattern(like, n, nnz, first, count, source):
         like = new(n + 1, I4), np.array(columns, I4)
         whole = ints(like[0], n + 1)
         whole[0] = 0
@@ -261,34 +263,34 @@ def lower(first_, count_, columns, values, x, y, double bound, tuple like):
             whole[i + 1] = whole[i] + count[i]
             last = -1
             for q in range(whole[i], whole[i + 1]):
-                if not last < given[q] <= i:
+                if not last < source[q] <= i:
                     return None
-                last = given[q]
+                last = source[q]
             if last != i:
                 return None
         if whole[n] != nnz:
             return None
         for made_ in like:
-            frozen(made_)
+            freeze(made_)
     at, column = ints(like[0], n + 1), ints(like[1], nnz)
     copy, scratch = new(nnz), allocate_workspace(n * sizeof(double))
     out, made = doubles(copy, nnz), <double*>scratch.at
     memcpy(out, doubles(values, nnz), nnz * sizeof(double))
     multiply(n, at, column, out, v, False, made)
     for i in range(n):
-        gap = widest(gap, made[i] - right[i])
-        big = widest(big, right[i])
+        gap = max_abs(gap, made[i] - right[i])
+        big = max_abs(big, right[i])
     if not gap <= bound * big:
         big = 0.0
         multiply(n, at, column, out, v, True, made)
         for i in range(n):
-            big = widest(big, made[i] + fabs(right[i]))
+            big = max_abs(big, made[i] + fabs(right[i]))
     return (like[0], like[1], copy), gap / big if big > 0.0 else gap
 
 
 cdef inline void multiply(int32_t n, const int32_t* at, const int32_t* column, const double* data, const double* x,
                           bint sizes, double* y) noexcept nogil:
-    """y = M x of M's lower triangle, or the sizes |M| |x|."""
+    """Compute y = M x from the lower triangle of M, or |M| |x| with `sizes`."""
     cdef int32_t i, q, j, end
     cdef double own, z, term
     for i in range(n):
@@ -303,7 +305,8 @@ cdef inline void multiply(int32_t n, const int32_t* at, const int32_t* column, c
         y[i] = own + (fabs(data[end]) if sizes else data[end]) * z
 
 
-cdef bint is_seen(tuple like, int32_t n, int32_t nnz, const int32_t* first, const int32_t* count, const int32_t* columns):
+cdef bint has_pattern(tuple like, int32_t n, int32_t nnz, const int32_t* first, const int32_t* count, const int32_t* columns):
+    """Return whether (indptr, indices) is the pattern given by first index, length and columns of each row."""
     cdef const int32_t* at
     cdef int32_t i
     if len(like[0]) != n + 1 or len(like[1]) != nnz:
@@ -318,15 +321,15 @@ cdef bint is_seen(tuple like, int32_t n, int32_t nnz, const int32_t* first, cons
 
 
 def motion_gap(parent, body, axis, spatial, v_):
-    """How far the spatial velocities c (n, 6) of bodies are from those that v (nv) makes, and the largest term.
+    """Return the largest difference of the spatial velocities c (n, 6) of bodies from those of v (nv), and the largest term.
 
         c_i = c_parent(i) + sum over the velocities j of body i of s_j v_j,   s = axis (nv, 6)
 
-    0 where s is all zeros: a copy did not fill it. -1 where these are not the arrays of one tree.
+    The difference is 0 if s is all zeros, as in a copy that does not fill it, and -1 if the arrays do not describe one tree.
     """
     cdef Py_ssize_t i, j, k, n = len(v_), bodies = len(spatial)
     cdef double term, z
-    cdef double[6] big, gap, lost                       # of each component; lost: 0, or NaN
+    cdef double[6] big, gap, lost                       # per component; lost is 0, or NaN
     if not len(body) == len(axis) == n or len(parent) != bodies or bodies == 0:
         return -1.0, 0.0
     cdef Workspace scratch = allocate_workspace(6 * bodies * sizeof(double))
@@ -375,16 +378,17 @@ def motion_gap(parent, body, axis, spatial, v_):
 
 def motion_before(const int32_t[::1] parent, const int32_t[::1] body, const double[:, ::1] axis,
                   const double[:, ::1] spatial, double alike):
-    """v (nv) of which spatial velocities c were made, from arrays that `motion_gap` takes; None where s does not tell it.
+    """Recover v (nv) from the spatial velocities c, with the arrays of `motion_gap`; None if s does not determine it.
 
-    Least squares body by body, as modified Gram-Schmidt has them; `alike`: share of an axis s_j that others of its body leave.
+    Least squares are solved body by body with modified Gram-Schmidt. `alike` is the minimum fraction of an axis s_j that must
+    be independent of the other axes of its body.
     """
     cdef Py_ssize_t i, j = 0, k, r, count, n = body.shape[0]
     cdef double[36] q, upper
-    cdef double[6] left, x
+    cdef double[6] residual, x
     cdef double size, dot
-    found = new(n)
-    cdef double[::1] v = found
+    velocities = new(n)
+    cdef double[::1] v = velocities
     while j < n:
         count = 1
         while j + count < n and body[j + count] == body[j]:
@@ -392,7 +396,7 @@ def motion_before(const int32_t[::1] parent, const int32_t[::1] body, const doub
         if count > 6:
             return None
         for k in range(6):
-            left[k] = spatial[body[j], k] - spatial[parent[body[j]], k]
+            residual[k] = spatial[body[j], k] - spatial[parent[body[j]], k]
         for i in range(count):
             size = 0.0
             for k in range(6):
@@ -416,29 +420,30 @@ def motion_before(const int32_t[::1] parent, const int32_t[::1] body, const doub
             x[i] = 0.0
             for k in range(6):
                 q[6 * i + k] /= dot
-                x[i] += q[6 * i + k] * left[k]
+                x[i] += q[6 * i + k] * residual[k]
             for k in range(6):
-                left[k] -= x[i] * q[6 * i + k]
+                residual[k] -= x[i] * q[6 * i + k]
         for i in range(count - 1, -1, -1):
             for r in range(i + 1, count):
                 x[i] -= upper[6 * i + r] * x[r]
             x[i] /= upper[7 * i]
             v[j + i] = x[i]
         j += count
-    return found
+    return velocities
 
 
 def numbers(jptr_, jidx_, jval_, scale_, double dt, v_, smooth_, aref_, r_, inverse_, force_, vel_, b_, push_, a_, double usual):
-    """(b, compliance, v*, whether the door takes them as usual numbers, max |efc_R efc_D - 1|, gaps) of J scaled by row.
+    """Return (b, compliance, v*, whether they are valid and usual, max |efc_R efc_D - 1|, gaps) of J with scaled rows.
 
         b = dt (aref - J a0),   v* = v + dt a0,   a0 = qacc_smooth
 
-    The gaps are how far J is from vectors that were made by it, each by the size of its terms:
+    The gaps are the relative errors of products of J that MuJoCo stored, each divided by the size of its terms:
 
         J v = efc_vel   (1)      J a0 - aref = efc_b   (2)      J^T f = qfrc_constraint   (3)
 
-    with v before the step and f = efc_force. 0 where such a vector is all zeros: one that a copy did not fill. The size
-    of terms is |J_i|_1 |x|_max for (1) and (2), the largest of |J|^T |f| for (3). The fourth is NaN where a is not finite.
+    with v before the step and f = efc_force. A gap is 0 if the stored vector is all zeros, as in a copy that does not fill it.
+    The size of terms is |J_i|_1 |x|_max for (1) and (2), max |J|^T |f| for (3). The fourth gap is NaN if a is not finite.
+    Compliances up to `usual` count as usual.
     """
     cdef int32_t i, j, m = <int32_t>len(aref_), n = <int32_t>len(v_)
     cdef Py_ssize_t q
@@ -457,7 +462,7 @@ def numbers(jptr_, jidx_, jval_, scale_, double dt, v_, smooth_, aref_, r_, inve
     cdef const double* push = doubles(push_, n)
     cdef const double* a = doubles(a_, n)
     cdef double c, size, s_v, s_free, f, finite = 0.0, gap_0 = 0.0, gap_1 = 0.0, gap_2 = 0.0, gap_3 = 0.0
-    cdef double big_1 = 0.0, big_2 = 0.0, big_3 = 0.0, said_1 = 0.0, said_2 = 0.0, said_3 = 0.0
+    cdef double big_1 = 0.0, big_2 = 0.0, big_3 = 0.0, stored_1 = 0.0, stored_2 = 0.0, stored_3 = 0.0
     cdef double top_v = 0.0, top_free = 0.0, top_b = 0.0
     cdef bint sound = True
     rhs_, compliance_, free_ = new(m), new(m), new(n)
@@ -465,16 +470,16 @@ def numbers(jptr_, jidx_, jval_, scale_, double dt, v_, smooth_, aref_, r_, inve
     cdef double* compliance = doubles(compliance_, m)
     cdef double* free = doubles(free_, n)
     cdef Workspace scratch = allocate_workspace(3 * n * sizeof(double))
-    cdef double* pushed = <double*>scratch.at           # J^T f, and the same of absolute values
-    cdef double* change = pushed + 2 * n                # dt a0
+    cdef double* force_sum = <double*>scratch.at           # J^T f, then |J|^T |f|
+    cdef double* change = force_sum + 2 * n                # dt a0
     for j in range(n):
         change[j] = dt * smooth[j]
-        pushed[j] = pushed[n + j] = 0.0
+        force_sum[j] = force_sum[n + j] = 0.0
         free[j] = v[j] + change[j]
         sound &= is_number(free[j])
-        top_v = widest(top_v, v[j])
-        top_free = widest(top_free, change[j])
-        said_3 = widest(said_3, push[j])
+        top_v = max_abs(top_v, v[j])
+        top_free = max_abs(top_free, change[j])
+        stored_3 = max_abs(stored_3, push[j])
         finite += 0.0 * a[j]
     for i in range(m):
         size = s_v = s_free = 0.0
@@ -486,31 +491,31 @@ def numbers(jptr_, jidx_, jval_, scale_, double dt, v_, smooth_, aref_, r_, inve
             s_free += c * change[j]
             size += fabs(c)
             c *= f
-            pushed[j] += c
-            pushed[n + j] += fabs(c)
+            force_sum[j] += c
+            force_sum[n + j] += fabs(c)
         rhs[i] = dt * scale[i] * aref[i] - s_free
         compliance[i] = r[i] * scale[i] * scale[i]
-        top_b = widest(top_b, rhs[i])
-        sound &= is_size(compliance[i]) and compliance[i] <= usual
-        gap_0 = widest(gap_0, r[i] * inverse[i] - 1.0)
+        top_b = max_abs(top_b, rhs[i])
+        sound &= is_valid_magnitude(compliance[i]) and compliance[i] <= usual
+        gap_0 = max_abs(gap_0, r[i] * inverse[i] - 1.0)
         c = scale[i] * vel[i]
-        gap_1 = widest(gap_1, s_v - c)
-        big_1 = widest(big_1, size * top_v + fabs(c))
-        said_1 = widest(said_1, vel[i])
+        gap_1 = max_abs(gap_1, s_v - c)
+        big_1 = max_abs(big_1, size * top_v + fabs(c))
+        stored_1 = max_abs(stored_1, vel[i])
         c = scale[i] * dt * b[i]
-        gap_2 = widest(gap_2, rhs[i] + c)
-        big_2 = widest(big_2, size * top_free + fabs(rhs[i]) + fabs(c))
-        said_2 = widest(said_2, b[i])
+        gap_2 = max_abs(gap_2, rhs[i] + c)
+        big_2 = max_abs(big_2, size * top_free + fabs(rhs[i]) + fabs(c))
+        stored_2 = max_abs(stored_2, b[i])
     for j in range(n):
-        gap_3 = widest(gap_3, pushed[j] - push[j])
-        big_3 = widest(big_3, pushed[n + j] + fabs(push[j]))
-    return frozen(rhs_), frozen(compliance_), frozen(free_), sound and is_size(top_b), gap_0, (
-        gap_1 / big_1 if said_1 != 0.0 and big_1 != 0.0 else 0.0,
-        gap_2 / big_2 if said_2 != 0.0 and big_2 != 0.0 else 0.0,
-        gap_3 / big_3 if said_3 != 0.0 and big_3 != 0.0 else 0.0, finite)
+        gap_3 = max_abs(gap_3, force_sum[j] - push[j])
+        big_3 = max_abs(big_3, force_sum[n + j] + fabs(push[j]))
+    return freeze(rhs_), freeze(compliance_), freeze(free_), sound and is_valid_magnitude(top_b), gap_0, (
+        gap_1 / big_1 if stored_1 != 0.0 and big_1 != 0.0 else 0.0,
+        gap_2 / big_2 if stored_2 != 0.0 and big_2 != 0.0 else 0.0,
+        gap_3 / big_3 if stored_3 != 0.0 and big_3 != 0.0 else 0.0, finite)
 
 
-cdef inline double larger(double so_far, double x) noexcept nogil:
-    """The larger of |x| and what was largest so far, which never was NaN: one is left out."""
+cdef inline double larger(double maximum, double x) noexcept nogil:
+    """Return the larger of `maximum` and |x|, ignoring a NaN x."""
     x = fabs(x)
-    return x if x > so_far else so_far
+    return x if x > maximum else maximum

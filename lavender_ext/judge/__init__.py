@@ -1,1 +1,1 @@
-"""The judge's pass over an impulse, and when sweeps stop: by the same arithmetic, and where they get nowhere."""
+"""The judge's pass over an impulse, and the stopping test of sweeps, which uses the same arithmetic."""

@@ -1,42 +1,43 @@
-"""The best impulse seen so far, island by island.
+"""The best impulse of all checks so far, selected separately for each island.
 
-An island's impulse is replaced by a later one
+The impulse of an island is replaced by a later one if either
 
-    that solves it, relative residual r <= tol, unless it is solved already; or                            (1)
-    whose energy E of the island is lower, and r no larger than that of the start                          (2)
+    the later one solves the island (relative residual r <= tol) and the present one does not; or          (1)
+    its energy error E of the island is lower, and its r is not above that of the start                    (2)
 
-(score.pxd has E and r.) So a row that no impulse can satisfy, which keeps r at 1, costs no other row its answer, and no
-island ends worse than it began.
+(E and r: score.pxd.) A row that no impulse satisfies, which keeps r at 1, therefore does not affect the results of other
+islands, and no island ends with a larger residual than it started with.
 """
 from libc.math cimport INFINITY
 from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memcpy
 
-from lavender_ext.core.parts cimport blocks_t
+from lavender_ext.core.block_types cimport blocks_t
 from lavender_ext.judge.score cimport score_t
 
 
 cdef struct best_t:
-    int32_t n                   # islands
-    int32_t seen                # impulses so far
+    int32_t n                   # number of islands
+    int32_t seen                # number of impulses so far
     double* impulse             # (m) N s
-    double* relative            # (n) -, of it
-    double* energy              # (n) sqrt J, of it
+    double* relative            # (n) -, relative residual of `impulse`
+    double* energy              # (n) sqrt J, energy error of `impulse`
     double* start               # (n) -, lowest relative residual of the impulses that a run may begin from
-    double* now                 # (n, 2) -, sqrt J, of the impulse to be seen next: for `score_t.by_island`
+    double* now                 # (n, 2) -, sqrt J: relative residual and energy of the next impulse, for `score_t.by_island`
 
 
 cdef inline int32_t count_islands(const blocks_t* p) noexcept nogil:
+    """Return the number of islands, at least 1."""
     return p.islands.n if p.islands != NULL else 1
 
 
 cdef inline int64_t best_workspace_size(int64_t m, int64_t n) noexcept nogil:
-    """Number of doubles for m rows in n islands."""
+    """Return the number of doubles that `bind_best` needs for m rows in n islands."""
     return m + 5 * n
 
 
 cdef inline void bind_best(best_t* s, const blocks_t* p, double* workspace) noexcept nogil:
-    """Before the first impulse; workspace (`best_workspace_size`)."""
+    """Initialise s before the first impulse; workspace (`best_workspace_size`)."""
     cdef int32_t n = count_islands(p)
     s.n, s.seen = n, 0
     s.impulse, s.relative = workspace, workspace + p.n_rows
@@ -44,7 +45,7 @@ cdef inline void bind_best(best_t* s, const blocks_t* p, double* workspace) noex
 
 
 cdef inline void note_score(best_t* s, const blocks_t* p, const score_t* x, double relative) noexcept nogil:
-    """Complete `now` after a pass with its relative residual: without islands nothing was written there."""
+    """Write the score of a pass to `now` if the problem has no islands; otherwise the pass has already written it."""
     if p.islands == NULL:
         s.now[0], s.now[1] = relative, x.energy if x.finite else INFINITY
 
@@ -61,7 +62,7 @@ cdef inline void copy_island(const blocks_t* p, int32_t island, const double* la
 
 
 cdef inline bint is_better(const best_t* s, int32_t island, double tol) noexcept nogil:
-    """(1) or (2) for `now`."""
+    """Return whether (1) or (2) holds for `now`."""
     cdef double relative = s.now[2 * island]
     if s.relative[island] <= tol:
         return False
@@ -69,7 +70,7 @@ cdef inline bint is_better(const best_t* s, int32_t island, double tol) noexcept
 
 
 cdef inline void see_start(best_t* s, const blocks_t* p, const double* lam) noexcept nogil:
-    """Keep lam (m), scored in `now`, for the islands where no earlier start has a lower relative residual."""
+    """Store the start lam (m), scored in `now`, in the islands in which no earlier start has a lower relative residual."""
     cdef int32_t i
     for i in range(s.n):
         if s.seen == 0 or s.now[2 * i] < s.start[i]:
@@ -80,7 +81,10 @@ cdef inline void see_start(best_t* s, const blocks_t* p, const double* lam) noex
 
 
 cdef inline bint see_impulse(best_t* s, const blocks_t* p, const double* lam, double tol) noexcept nogil:
-    """Keep lam (m), scored in `now`, for the islands where it is better; return whether there is one. The first is a start."""
+    """Store lam (m), scored in `now`, in the islands in which it is better; return whether there is such an island.
+
+    The first impulse is a start.
+    """
     cdef int32_t i
     cdef bint changed = False
     if s.seen == 0:
@@ -97,7 +101,7 @@ cdef inline bint see_impulse(best_t* s, const blocks_t* p, const double* lam, do
 
 
 cdef inline double relative_of_best(const best_t* s) noexcept nogil:
-    """Relative residual of the best impulse: the largest of its islands."""
+    """Return the relative residual of the best impulse: the largest over its islands."""
     cdef double worst = 0.0
     cdef int32_t i
     for i in range(s.n):

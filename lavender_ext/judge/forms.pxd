@@ -1,52 +1,52 @@
-"""The judge's pass over each form of A: w = A lam - b formed anew, error e of every block, their sums, and round-off limits.
+"""The judge's pass over each form of A: slack w = A lam - b, error e of every block, their norms, and round-off floors.
 
-    F_i = 2^-53 (|A| |lam| + |b|)_i             [m/s]; factored: |J| |M^-1| |J|^T |lam| + c |lam| for |A| |lam|;
-                                                at least d_i |lam_i| if a pair is cut to its bound;
-                                                0 if w_i holds the row at its bound by more than F_i
+    F_i = 2^-53 (|A| |lam| + |b|)_i             [m/s]; factored form: |A| |lam| is |J| |M^-1| |J|^T |lam| + c |lam|;
+                                                |A| |lam| is at least d_i |lam_i| if a pair is projected to its bound;
+                                                F_i = 0 if w_i keeps the row at its bound by more than F_i
     floor energy sqrt(sum F^2 / d), floor velocity max F sqrt(nu / d)
 
-A row's products serve w and F: A is read once. Factored, core/velocity.pxd forms M^-1 J^T lam, and a second loop reads
-J v.
+The products of a row are used for w and F, so that A is read once. In the factored form core/velocity.pxd computes
+v = M^-1 J^T lam, and a second loop computes J v.
 """
 from libc.math cimport fabs
 from libc.stdint cimport int32_t
 
 from lavender_ext.core.block cimport block_error
 from lavender_ext.core.csr cimport csr_dot, csr_dot_long
-from lavender_ext.core.generalized cimport panel_push_size, panel_size
-from lavender_ext.core.parts cimport blocks_t, is_rows, n_directions, n_turns
+from lavender_ext.core.generalized cimport panel_transpose_add_abs, panel_times_abs
+from lavender_ext.core.block_types cimport blocks_t, is_rows, n_tangents, n_angular_rows
 from lavender_ext.core.rows cimport cross
 from lavender_ext.core.velocity cimport add6, rows_velocity
 from lavender_ext.core.view cimport csr_t, generalized_t, rows_t
 from lavender_ext.judge.score cimport score_t
 from lavender_ext.judge.slack cimport general_slack, rows_slack
 from lavender_ext.judge.tally cimport (add_block_floor, add_row_floor, begin_islands, block_at, close_island,
-                                       floor_from, floor_t, island_begin, island_end, no_floor, nothing, score_from,
+                                       floor_from, floor_t, island_begin, island_end, no_floor, empty_tally, score_from,
                                        score_rows, tally_block, tally_t)
 
 
 # -- islands --------------------------------------------------------------------------------------------
 
 
-cdef inline void join_floor(const floor_t* own, floor_t* all_) noexcept nogil:
-    """Add an island's floor to that of all."""
-    all_.energy += own.energy
-    if own.fast > all_.fast:
-        all_.fast = own.fast
+cdef inline void join_floor(const floor_t* island, floor_t* total) noexcept nogil:
+    """Add the floor of an island to the floor of all rows."""
+    total.energy += island.energy
+    if island.fast > total.fast:
+        total.fast = island.fast
 
 
 cdef inline void score_with_floor(const blocks_t* p, const rows_t* r, const double* lam, const double* w, double* e,
                                   const double* sizes, score_t* out) noexcept nogil:
-    """Errors from the slack w, sums and floors, island by island.
+    """Compute errors e, norms and floors from the slack w, island by island.
 
-    sizes: `velocity_size` over bodies r; r NULL: |A| |lam| of every row, or what is no less.
+    With bodies r, sizes is the result of `velocity_size`. If r is NULL, sizes (m) is an upper bound of |A| |lam|.
     """
     cdef int32_t island, a, i, end, n = begin_islands(p, out)
     cdef const int32_t* order = p.islands.order if p.islands != NULL else NULL
-    cdef tally_t own, s = nothing()
+    cdef tally_t own, s = empty_tally()
     cdef floor_t floor, f = no_floor()
     for island in range(n):
-        own = nothing()
+        own = empty_tally()
         floor = no_floor()
         end = island_end(p, island)
         for a in range(island_begin(p, island), end):
@@ -69,6 +69,7 @@ cdef inline void score_with_floor(const blocks_t* p, const rows_t* r, const doub
 
 
 cdef inline void csr_slack(const blocks_t* p, const csr_t* a, const double* lam, double* w) noexcept nogil:
+    """Compute w = A lam - b."""
     cdef int32_t i
     for i in range(p.n_rows):
         w[i] = csr_dot(a, i, lam) - p.b[i]
@@ -76,12 +77,12 @@ cdef inline void csr_slack(const blocks_t* p, const csr_t* a, const double* lam,
 
 cdef inline void csr_block(const blocks_t* p, const csr_t* a, int32_t i, const double* lam, double* w, double* e, tally_t* s,
                            floor_t* f) noexcept nogil:
-    """Slack, error and floor of block i."""
+    """Compute slack and error of block i; add the error to s and its rounding to f."""
     cdef int32_t j = p.ptr[i], k
     cdef double size[6]
     for k in range(j, p.ptr[i + 1]):
         w[k] = csr_dot_long(a, k, lam, size + (0 if is_rows(p, i) else k - j)) - p.b[k]
-        if is_rows(p, i):                               # of any number
+        if is_rows(p, i):                               # The block may have any number of rows.
             add_row_floor(p, k, lam[k], w[k], size[0], f)
     block_error(p, i, lam, w, e)
     tally_block(p, i, e, s)
@@ -91,23 +92,24 @@ cdef inline void csr_block(const blocks_t* p, const csr_t* a, int32_t i, const d
 
 cdef inline void csr_judge(const blocks_t* p, const csr_t* a, const double* lam, double* w, double* e, bint floor,
                            score_t* out) noexcept nogil:
+    """Judge lam over A in compressed rows."""
     cdef int32_t island, k, end, n
     cdef const int32_t* order = p.islands.order if p.islands != NULL else NULL
-    cdef tally_t own, s = nothing()
-    cdef floor_t least, f = no_floor()
+    cdef tally_t own, s = empty_tally()
+    cdef floor_t island_floor_, f = no_floor()
     if not floor:
         csr_slack(p, a, lam, w)
         score_rows(p, lam, w, e, out)
         return
     n = begin_islands(p, out)
     for island in range(n):
-        own = nothing()
-        least = no_floor()
+        own = empty_tally()
+        island_floor_ = no_floor()
         end = island_end(p, island)
         for k in range(island_begin(p, island), end):
-            csr_block(p, a, block_at(order, k), lam, w, e, &own, &least)
-        close_island(p, island, w, e, &own, &least, &s, out)
-        join_floor(&least, &f)
+            csr_block(p, a, block_at(order, k), lam, w, e, &own, &island_floor_)
+        close_island(p, island, w, e, &own, &island_floor_, &s, out)
+        join_floor(&island_floor_, &f)
     score_from(p, e, &s, out)
     floor_from(&f, out)
 
@@ -117,7 +119,7 @@ cdef inline void csr_judge(const blocks_t* p, const csr_t* a, const double* lam,
 
 cdef inline void joint_wrench_size(const blocks_t* p, const rows_t* r, int32_t i, const double* lam,
                                    double* size) noexcept nogil:
-    # |J|^T |lam| of joint i
+    """Add |J|^T |lam| of joint i to size (n, 6)."""
     cdef double x[12]
     cdef const double* row
     cdef int32_t j, k, a = r.joint_body[2 * i], b = r.joint_body[2 * i + 1]
@@ -134,7 +136,7 @@ cdef inline void joint_wrench_size(const blocks_t* p, const rows_t* r, int32_t i
 
 
 cdef inline double abs_cross(const double* x, const double* y, int32_t k) noexcept nogil:
-    # |(x x y)_k|
+    """Return |(x x y)_k|."""
     if k == 0:
         return fabs(x[1] * y[2] - x[2] * y[1])
     if k == 1:
@@ -143,8 +145,12 @@ cdef inline double abs_cross(const double* x, const double* y, int32_t k) noexce
 
 
 cdef inline void side_wrench_size(const double* n, const double* t1, const double* t2, const double* arm, int32_t nt,
-                                  int32_t turns, double x, double y, double z, const double* turn, double* out) noexcept nogil:
-    # x, y, z: |lam| of normal and tangents; turn (turns): of spin and of what rolls.
+                                  int32_t n_angular, double x, double y, double z, const double* angular,
+                                  double* out) noexcept nogil:
+    """Add |J|^T |lam| of one contact on one body to out (6).
+
+    x, y, z are |lam| of the normal and the tangents; angular (n_angular) are the impulses of the spin and rolling rows.
+    """
     cdef int32_t k
     cdef double s, l
     for k in range(3):
@@ -156,17 +162,17 @@ cdef inline void side_wrench_size(const double* n, const double* t1, const doubl
         if nt > 1:
             s += fabs(t2[k]) * z
             l += abs_cross(arm, t2, k) * z
-        if turns & 1:
-            l += fabs(n[k]) * fabs(turn[0])
-        if turns & 2:
-            l += fabs(t1[k]) * fabs(turn[turns & 1]) + fabs(t2[k]) * fabs(turn[1 + (turns & 1)])
+        if n_angular & 1:
+            l += fabs(n[k]) * fabs(angular[0])
+        if n_angular & 2:
+            l += fabs(t1[k]) * fabs(angular[n_angular & 1]) + fabs(t2[k]) * fabs(angular[1 + (n_angular & 1)])
         out[k] += s
         out[3 + k] += l
 
 
-cdef inline void contact_wrench_size(const rows_t* r, int32_t c, int32_t nt, int32_t turns, const double* lam,
+cdef inline void contact_wrench_size(const rows_t* r, int32_t c, int32_t nt, int32_t n_angular, const double* lam,
                                      double* size) noexcept nogil:
-    # |J|^T |lam| of one contact.
+    """Add |J|^T |lam| of contact c to size (n, 6)."""
     cdef double t2[3]
     cdef double y = 0.0, z = 0.0
     cdef const double* n = r.normal + 3 * c
@@ -178,14 +184,14 @@ cdef inline void contact_wrench_size(const rows_t* r, int32_t c, int32_t nt, int
         z = fabs(lam[2])
         cross(n, t1, t2)
     if a >= 0:
-        side_wrench_size(n, t1, t2, r.arm_a + 3 * c, nt, turns, fabs(lam[0]), y, z, lam + 1 + nt, size + 6 * a)
+        side_wrench_size(n, t1, t2, r.arm_a + 3 * c, nt, n_angular, fabs(lam[0]), y, z, lam + 1 + nt, size + 6 * a)
     if b >= 0:
-        side_wrench_size(n, t1, t2, r.arm_b + 3 * c, nt, turns, fabs(lam[0]), y, z, lam + 1 + nt, size + 6 * b)
+        side_wrench_size(n, t1, t2, r.arm_b + 3 * c, nt, n_angular, fabs(lam[0]), y, z, lam + 1 + nt, size + 6 * b)
 
 
 cdef inline void velocity_size(const blocks_t* p, const rows_t* r, const double* lam, double* size) noexcept nogil:
-    """|M^-1| |J|^T |lam|, (n, 6)."""
-    cdef int32_t i, j, c, k, nt, turns
+    """Compute size (n, 6) = |M^-1| |J|^T |lam|."""
+    cdef int32_t i, j, c, k, nt, n_angular
     cdef double* x
     cdef const double* inv
     cdef double t[3]
@@ -196,10 +202,10 @@ cdef inline void velocity_size(const blocks_t* p, const rows_t* r, const double*
     for c in range(r.n_contacts):
         i = r.n_joints + c
         j = p.ptr[i]
-        nt = n_directions(p, i)
-        turns = n_turns(p, i)
-        if turns or nt == 1:                            # the two common kinds with their sizes as constants
-            contact_wrench_size(r, c, nt, turns, lam + j, size)
+        nt = n_tangents(p, i)
+        n_angular = n_angular_rows(p, i)
+        if n_angular or nt == 1:                            # the two common kinds below have constant sizes
+            contact_wrench_size(r, c, nt, n_angular, lam + j, size)
         elif nt == 2:
             contact_wrench_size(r, c, 2, 0, lam + j, size)
         else:
@@ -215,7 +221,7 @@ cdef inline void velocity_size(const blocks_t* p, const rows_t* r, const double*
 
 
 cdef inline double joint_size(const double* jac, const double* size, int32_t a, int32_t b) noexcept nogil:
-    # |J| size of one row; two sums side by side, for two lanes.
+    """Return |J| size of one joint row; two sums, for two vector lanes."""
     cdef double s = 0.0, t = 0.0
     cdef const double* x
     cdef int32_t k
@@ -233,7 +239,7 @@ cdef inline double joint_size(const double* jac, const double* size, int32_t a, 
 
 
 cdef inline double side_size(const double* axis, const double* arm, const double* size) noexcept nogil:
-    # |axis| . linear + |arm x axis| . angular
+    """Return |axis| . linear + |arm x axis| . angular of size (6)."""
     cdef double s = 0.0, t = 0.0
     cdef int32_t k
     for k in range(3):
@@ -242,18 +248,18 @@ cdef inline double side_size(const double* axis, const double* arm, const double
     return s + t
 
 
-cdef inline void contact_sizes(const rows_t* r, int32_t c, int32_t nt, int32_t turns, const double* size,
+cdef inline void contact_sizes(const rows_t* r, int32_t c, int32_t nt, int32_t n_angular, const double* size,
                                double* out) noexcept nogil:
-    # |J| size of the rows of one contact
+    """Compute |J| size of the rows of contact c."""
     cdef double t2[3]
     cdef const double* n = r.normal + 3 * c
     cdef const double* t1 = r.tangent + 3 * c
     cdef const double* arm
     cdef const double* x
-    cdef int32_t k, side, body, roll = 1 + nt + (turns & 1)
+    cdef int32_t k, side, body, roll = 1 + nt + (n_angular & 1)
     if nt > 1:
         cross(n, t1, t2)
-    for k in range(1 + nt + turns):
+    for k in range(1 + nt + n_angular):
         out[k] = 0.0
     for side in range(2):
         body = r.contact_body[2 * c + side]
@@ -266,10 +272,10 @@ cdef inline void contact_sizes(const rows_t* r, int32_t c, int32_t nt, int32_t t
             out[1] += side_size(t1, arm, x)
         if nt > 1:
             out[2] += side_size(t2, arm, x)
-        if turns & 1:
+        if n_angular & 1:
             for k in range(3):
                 out[1 + nt] += fabs(n[k]) * x[3 + k]
-        if turns & 2:
+        if n_angular & 2:
             for k in range(3):
                 out[roll] += fabs(t1[k]) * x[3 + k]
                 out[roll + 1] += fabs(t2[k]) * x[3 + k]
@@ -277,7 +283,7 @@ cdef inline void contact_sizes(const rows_t* r, int32_t c, int32_t nt, int32_t t
 
 cdef inline void joint_floor(const blocks_t* p, const rows_t* r, int32_t i, const double* lam, const double* w,
                              const double* sizes, floor_t* f) noexcept nogil:
-    # (|J| |M^-1| |J|^T |lam| + c |lam|) of the rows of joint i; sizes of `velocity_size`
+    """Add the rounding of the rows of joint i to f; sizes is the result of `velocity_size`."""
     cdef int32_t j, a = r.joint_body[2 * i], b = r.joint_body[2 * i + 1]
     for j in range(p.ptr[i], p.ptr[i + 1]):
         add_row_floor(p, j, lam[j], w[j], r.compliance[j] * fabs(lam[j]) + joint_size(r.jac + 12 * j, sizes, a, b), f)
@@ -285,11 +291,11 @@ cdef inline void joint_floor(const blocks_t* p, const rows_t* r, int32_t i, cons
 
 cdef inline void contact_floor(const blocks_t* p, const rows_t* r, int32_t c, const double* lam, const double* w,
                                const double* e, const double* sizes, floor_t* f) noexcept nogil:
-    # the same of contact c
-    cdef int32_t k, i = r.n_joints + c, j = p.ptr[i], n = p.ptr[i + 1] - j, nt = n_directions(p, i), turns = n_turns(p, i)
+    """Add the rounding of the rows of contact c to f; sizes is the result of `velocity_size`."""
+    cdef int32_t k, i = r.n_joints + c, j = p.ptr[i], n = p.ptr[i + 1] - j, nt = n_tangents(p, i), n_angular = n_angular_rows(p, i)
     cdef double size[6]
-    if turns or nt == 1:                                # the two common kinds with their sizes as constants
-        contact_sizes(r, c, nt, turns, sizes, size)
+    if n_angular or nt == 1:                                # the two common kinds below have constant sizes
+        contact_sizes(r, c, nt, n_angular, sizes, size)
     elif nt == 2:
         contact_sizes(r, c, 2, 0, sizes, size)
     else:
@@ -301,6 +307,7 @@ cdef inline void contact_floor(const blocks_t* p, const rows_t* r, int32_t c, co
 
 cdef inline void rows_judge(const blocks_t* p, const rows_t* r, const double* lam, double* w, double* e, double* v,
                             bint floor, score_t* out) noexcept nogil:
+    """Judge lam over bodies; v (12 n) is scratch, (6 n) without a floor."""
     cdef double* sizes = v + 6 * <ssize_t>r.n_bodies
     rows_velocity(p, r, lam, v)
     rows_slack(p, r, lam, v, w)
@@ -314,34 +321,34 @@ cdef inline void rows_judge(const blocks_t* p, const rows_t* r, const double* la
 # -- generalised coordinates ---------------------------------------------------------------------------
 
 
-cdef inline const double* general_sizes(const blocks_t* p, const generalized_t* g, const double* lam, const double* more,
+cdef inline const double* general_sizes(const blocks_t* p, const generalized_t* g, const double* lam, const double* extra,
                                         double* x) noexcept nogil:
-    """|Y| |Y|^T |lam| + c |lam| + more (m), a bound of |A| |lam|, in x (n + m); more: (m) or NULL."""
+    """Return |Y| |Y|^T |lam| + c |lam| + extra (m), an upper bound of |A| |lam|, inside x (n + m); extra is (m) or NULL."""
     cdef int32_t i
     cdef double* size = x + g.n
     for i in range(g.n):
         x[i] = 0.0
     for i in range(g.n_panels):
-        panel_push_size(g, i, lam, x)
+        panel_transpose_add_abs(g, i, lam, x)
     for i in range(g.n_panels):
-        panel_size(g, i, x, size)
+        panel_times_abs(g, i, x, size)
     for i in range(p.n_rows):
         size[i] += g.compliance[i] * fabs(lam[i])
-    if more != NULL:
+    if extra != NULL:
         for i in range(p.n_rows):
-            size[i] += more[i]
+            size[i] += extra[i]
     return size
 
 
 cdef inline void general_errors(const blocks_t* p, const generalized_t* g, const double* lam, const double* w, double* e,
-                               double* x, const double* more, score_t* out) noexcept nogil:
-    """Errors from the slack w, their sums and the floor; more as `general_sizes`. x (n + m) is scratch."""
-    score_with_floor(p, NULL, lam, w, e, general_sizes(p, g, lam, more, x), out)
+                               double* x, const double* extra, score_t* out) noexcept nogil:
+    """Compute errors e from the slack w, their norms and floors; extra as in `general_sizes`, x (n + m) is scratch."""
+    score_with_floor(p, NULL, lam, w, e, general_sizes(p, g, lam, extra, x), out)
 
 
 cdef inline void general_judge(const blocks_t* p, const generalized_t* g, const double* lam, double* w, double* e,
                                double* x, bint floor, score_t* out) noexcept nogil:
-    """The pass over J and M. x (n) is scratch, with the floor (n + m)."""
+    """Judge lam over J and M; x (n + m) is scratch, (n) without a floor."""
     general_slack(p, g, lam, x, w)
     if floor:
         general_errors(p, g, lam, w, e, x, NULL, out)

@@ -1,21 +1,21 @@
-"""The judge for other modules: its pass is compiled once, in `measure.pyx`, and called by pointer."""
+"""The judge for other modules: the pass is compiled once, in `measure.pyx`."""
 from libc.stdint cimport int32_t, int64_t
 
-from lavender_ext.core.parts cimport blocks_t, islands_t
+from lavender_ext.core.block_types cimport blocks_t, islands_t
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.view cimport generalized_t, view_t
 from lavender_ext.judge.score cimport above_floor, are_numbers, hides, relative, score_t
 
 
 cdef inline int64_t scratch_of(const view_t* v) noexcept nogil:
-    """Numbers that `judge_view` needs besides w and e, and over J and M what refines it (judge/refine.pxd)."""
+    """Return the number of scratch doubles of `judge_view`, and over J and M of its refinement (judge/refine.pxd)."""
     return 6 * <int64_t>v.g.n + 2 * <int64_t>v.p.n_rows if v.g != NULL else 12 * <int64_t>v.r.n_bodies if v.r != NULL else 0
 
 
 cdef void judge_view(const view_t* v, const double* lam, double* w, double* e, double* scratch, bint floor,
                      score_t* out) noexcept nogil
 cdef bint refine_view(const view_t* v, const double* lam, double* w, double* e, double* scratch, double reference_energy,
-                      double reference_velocity, double tol, double found, score_t* out) noexcept nogil
+                      double reference_velocity, double tol, double relative_, score_t* out) noexcept nogil
 cdef void general_score(const blocks_t* p, const generalized_t* g, const double* lam, const double* w, double* e, double* x,
                         score_t* out) noexcept nogil
 cdef void score_slack(const blocks_t* p, const double* lam, const double* w, double* e, score_t* out) noexcept nogil
@@ -28,7 +28,7 @@ cdef void judge_zero_impulse(view_t* v, int32_t* index, islands_t* islands, doub
 
 
 cdef inline bint set_zero_impulse(const blocks_t* p, double* x, double* w) noexcept nogil:
-    """x (m) = Pi(0), and w (m) = -b, its slack without a pass over A; is x other than 0?"""
+    """Write x (m) = Pi(0) and w (m) = -b, the slack of the zero vector; return whether x is nonzero."""
     cdef int32_t i
     cdef bint moves = False
     for i in range(p.n_rows):
@@ -44,10 +44,10 @@ cdef inline bint set_zero_impulse(const blocks_t* p, double* x, double* w) noexc
 
 cdef inline double relative_of(const score_t* s, const double* w, int32_t m, double reference_energy,
                                double reference_velocity) noexcept nogil:
-    """Relative residual of a pass, slack w (m); inf where a number of it is not finite.
+    """Return the relative residual of a pass with slack w (m); inf if a number is not finite.
 
-    No less than a floor of 1e-3 and more, where the pass made one: the impulse is so large that rounding hides a thousandth
-    of the zero impulse's error, and a slack that comes out as 0 says nothing.
+    If the pass computed a floor of at least 1e-3, the result is at least that floor: the impulse is so large that rounding
+    hides a thousandth of the error of the zero impulse, and even a computed slack of 0 is meaningless.
     """
     cdef double now, floor
     if s.relative >= 0.0:
@@ -62,27 +62,30 @@ cdef inline double relative_of(const score_t* s, const double* w, int32_t m, dou
 
 
 cdef inline double floor_of(const score_t* s, double reference_energy, double reference_velocity) noexcept nogil:
-    """Floor of a pass that made one, as a relative residual: with islands of the one with the largest residual."""
+    """Return the floor of a pass as a relative residual; with islands, that of the island with the largest residual."""
     return s.floor if s.relative >= 0.0 else relative(s.floor_energy, s.floor_velocity, reference_energy, reference_velocity)
 
 
 cdef inline double above_floor_of(const score_t* s, double now, double floor) noexcept nogil:
-    """Relative residual that rounding does not explain, 0 if it explains all; now and floor of the functions before."""
+    """Return the relative residual that rounding does not explain, 0 if it explains all.
+
+    now and floor are the results of `relative_of` and `floor_of`.
+    """
     return s.above_floor if s.relative >= 0.0 else above_floor(now, floor)
 
 
 cdef class Judged:
-    cdef readonly Data data                             # of the problem
+    cdef readonly Data data                             # problem data
     cdef readonly object impulse                        # (m,) N s
     cdef object both                                    # w (m,) m/s, then e (m,) N s
-    cdef readonly double energy, velocity               # sqrt J, m/s; inf where e is not finite
-    cdef readonly double floor_energy                   # sqrt J, what rounding leaves
-    cdef readonly double relative, roundoff_floor                # -
-    cdef readonly double above_floor                    # - that rounding does not explain
-    cdef readonly double float64_relative               # of the first pass, by float64 alone; NaN if it was not refined
+    cdef readonly double energy, velocity               # sqrt J, m/s; inf if e is not finite
+    cdef readonly double floor_energy                   # sqrt J, energy error that rounding explains
+    cdef readonly double relative, roundoff_floor       # relative residual and its floor, -
+    cdef readonly double above_floor                    # relative residual that rounding does not explain, -
+    cdef readonly double float64_relative               # relative residual before refinement; NaN if it was not refined
     cdef double known_loss                              # `loss`, negative before it is computed
-    cdef readonly int worst                             # row of the largest velocity error, -1
-    cdef readonly int island                            # of the largest relative residual
+    cdef readonly int worst                             # row of the largest velocity error, or -1
+    cdef readonly int island                            # island with the largest relative residual, or -1
 
 
 cdef Judged judged_from(Data p, object impulse, object both, const score_t* s, double relative_, double floor,

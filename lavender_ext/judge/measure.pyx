@@ -1,15 +1,15 @@
-"""The judge: its pass over any form of A, compiled once, its entries for Python, and the residuals of quadratic programs."""
+"""The judge: its pass over any form of A, its functions for Python, and the residuals of quadratic programs."""
 from libc.math cimport NAN, fabs, sqrt
 from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memcmp, memcpy
 
 import numpy as np
 
-from lavender_ext.core cimport door
+from lavender_ext.core cimport validate
 from lavender_ext.core.arrays cimport doubles, ints
-from lavender_ext.core.generalized cimport whitened_gather
+from lavender_ext.core.generalized cimport whitened_transpose_times
 from lavender_ext.core.islands cimport find_islands, is_immovable, islands_index, list_one_island
-from lavender_ext.core.parts cimport blocks_t, islands_t
+from lavender_ext.core.block_types cimport blocks_t, islands_t
 from lavender_ext.core.problem cimport Data, Workspace, allocate_workspace
 from lavender_ext.core.velocity cimport rows_velocity
 from lavender_ext.core.view cimport generalized_t, view_t
@@ -21,12 +21,12 @@ from lavender_ext.judge.refine cimport loss_by_factor, refine_general
 from lavender_ext.judge.rounding cimport mass_t, relative_size, squares32
 from lavender_ext.judge.score cimport are_numbers, is_at_floor, new_score, relative, score_t
 from lavender_ext.judge.slack cimport general_slack, rows_slack
-from lavender_ext.judge.tally cimport norms_of_rhs, nothing, score_rows, tally_block, tally_t
+from lavender_ext.judge.tally cimport norms_of_rhs, empty_tally, score_rows, tally_block, tally_t
 
 
 cdef void judge_view(const view_t* v, const double* lam, double* w, double* e, double* scratch, bint floor,
                      score_t* out) noexcept nogil:
-    """Slack into w (m), error into e (m), the sums into out; scratch: `scratch_of`, half of it over bodies without floor."""
+    """Compute slack w (m), error e (m) and their norms; scratch (`scratch_of`; half of it over bodies without a floor)."""
     if v.g != NULL:
         general_judge(&v.p, v.g, lam, w, e, scratch, floor, out)
     elif v.r != NULL:
@@ -36,15 +36,16 @@ cdef void judge_view(const view_t* v, const double* lam, double* w, double* e, d
 
 
 cdef bint refine_view(const view_t* v, const double* lam, double* w, double* e, double* scratch, double reference_energy,
-                      double reference_velocity, double tol, double found, score_t* out) noexcept nogil:
-    """The refined pass in place of that of `judge_view` if (2) asks for it; w, e and out are of that, found its residual.
+                      double reference_velocity, double tol, double relative_, score_t* out) noexcept nogil:
+    """Repeat the pass of `judge_view` with refinement if judge/refine.pxd (2) requires it; return whether it was repeated.
 
-    scratch: `scratch_of`. Nothing is written if the pass is not repeated; A and bodies have no factor that loses anything.
+    w, e and out are the results of `judge_view`, relative_ is its relative residual. They are unchanged if the pass is not
+    repeated. Problems given by A or by bodies need no refinement. scratch (`scratch_of`).
     """
-    if v.g == NULL or v.p.n_rows == 0 or not found < 1.0 / 0.0:
+    if v.g == NULL or v.p.n_rows == 0 or not relative_ < 1.0 / 0.0:
         return False
     if loss_by_factor(&v.p, v.g, lam, w, scratch, reference_energy, reference_velocity,
-                      0.1 * (tol if tol > found else found)) == 0.0:
+                      0.1 * (tol if tol > relative_ else relative_)) == 0.0:
         return False
     refine_general(&v.p, v.g, lam, w, e, scratch, out)
     return True
@@ -52,25 +53,26 @@ cdef bint refine_view(const view_t* v, const double* lam, double* w, double* e, 
 
 cdef void general_score(const blocks_t* p, const generalized_t* g, const double* lam, const double* w, double* e, double* x,
                         score_t* out) noexcept nogil:
-    """Errors e (m) of the slack w over J and M, their sums and the floor; x (n + m) is scratch."""
+    """Compute errors e (m) from the slack w over J and M, their norms and floors; x (n + m) is scratch."""
     general_errors(p, g, lam, w, e, x, NULL, out)
 
 
 cdef void score_slack(const blocks_t* p, const double* lam, const double* w, double* e, score_t* out) noexcept nogil:
-    """Errors e (m) of the slack w and their sums, without a floor."""
+    """Compute errors e (m) from the slack w and their norms, without floors."""
     score_rows(p, lam, w, e, out)
 
 
 cdef void find_reference(blocks_t* p, const double* x, const double* w, const double* e, double* out) noexcept nogil:
-    """`reference_of` of judge/reference.pxd."""
+    """Compute `reference_of` of judge/reference.pxd."""
     reference_of(p, x, w, e, out)
 
 
 cdef void judge_zero_impulse(view_t* v, int32_t* index, islands_t* islands, double* reference, double* x, double* w, double* e,
                         double* scratch, double* out) noexcept nogil:
-    """The zero impulse into x (m), and of it (3) of `reference_of`; with several islands v.p has them, and their references.
+    """Judge the zero impulse, written to x (m), and write the results of `reference_of` to out (3).
 
-    index (`islands_index`), islands and reference (2 k) must live as long as v; w, e (m); scratch as `judge_view`, without floor.
+    If there are several islands, v.p receives them with their references. index (`islands_index`), islands and reference
+    (2 k) must live as long as v. w, e (m) and scratch (as in `judge_view` without a floor) are scratch.
     """
     cdef score_t s = new_score()
     cdef int32_t i
@@ -94,7 +96,7 @@ cdef void judge_zero_impulse(view_t* v, int32_t* index, islands_t* islands, doub
 
 
 def slack(Data p, const double[::1] lam, double[::1] w):
-    """w = A lam - b [m/s] into w (m,)."""
+    """Compute w (m,) = A lam - b [m/s]."""
     cdef double[::1] v
     if p.blocks.n_rows == 0:
         return
@@ -113,14 +115,14 @@ def slack(Data p, const double[::1] lam, double[::1] w):
 
 
 def at_floor(double relative_, double floor):
-    """`is_at_floor` of judge/score.pxd."""
+    """Return `is_at_floor` of judge/score.pxd."""
     return is_at_floor(relative_, floor)
 
 
 def judge(Data p, const double[::1] lam, double[::1] w, double[::1] e, bint floor=True):
-    """Slack into w, error into e; return (energy, velocity, relative residual, `above_floor_of` it).
+    """Compute slack w and error e; return (energy [sqrt J], velocity [m/s], relative residual, `above_floor_of`).
 
-    inf, inf, inf, inf if a slack or an error is not finite; without the floor the last is the relative residual.
+    All four are inf if a slack or an error is not finite. Without a floor the last is the relative residual.
     """
     cdef score_t s = new_score()
     cdef double now, above
@@ -139,7 +141,7 @@ def judge(Data p, const double[::1] lam, double[::1] w, double[::1] e, bint floo
 
 
 cdef double loss_of(Data p, impulse, both) except -1.0:
-    """What M's factor may lose of the slack in `both`, as a relative residual."""
+    """Return the possible error of the slack in `both` due to the factor of M, as a relative residual."""
     cdef const double[::1] lam = impulse, w = both
     cdef Workspace workspace
     if p.blocks.n_rows == 0:
@@ -150,23 +152,24 @@ cdef double loss_of(Data p, impulse, both) except -1.0:
 
 
 cdef Judged judged_from(Data p, impulse, both, const score_t* s, double relative_, double floor, double float64_relative=NAN):
-    """What a pass over `impulse` found, w and e in `both` (2 m + 1)."""
-    cdef Judged made = Judged.__new__(Judged)
-    made.data, made.impulse, made.both = p, impulse, both
-    made.energy = s.energy if s.finite else 1.0 / 0.0
-    made.velocity = s.velocity if s.finite else 1.0 / 0.0
-    made.floor_energy = s.floor_energy
-    made.worst, made.island = s.worst, s.island
-    made.relative, made.roundoff_floor, made.above_floor = relative_, floor, above_floor_of(s, relative_, floor)
-    made.float64_relative = float64_relative
-    made.known_loss = -1.0 if p.is_general and float64_relative != float64_relative else 0.0
-    return made
+    """Create the result of a pass over `impulse`, with w and e in `both` (2 m + 1)."""
+    cdef Judged judged = Judged.__new__(Judged)
+    judged.data, judged.impulse, judged.both = p, impulse, both
+    judged.energy = s.energy if s.finite else 1.0 / 0.0
+    judged.velocity = s.velocity if s.finite else 1.0 / 0.0
+    judged.floor_energy = s.floor_energy
+    judged.worst, judged.island = s.worst, s.island
+    judged.relative, judged.roundoff_floor, judged.above_floor = relative_, floor, above_floor_of(s, relative_, floor)
+    judged.float64_relative = float64_relative
+    judged.known_loss = -1.0 if p.is_general and float64_relative != float64_relative else 0.0
+    return judged
 
 
 cdef class Judged:
-    """The judge's pass over one impulse, with its floor, beside the error of doing nothing, which `p` must know.
+    """Result of the judge's pass over one impulse, with its floor.
 
-    `impulse` (m,) is kept as it is and must not change any more; the other arrays belong to this.
+    `p` must know the references of the zero impulse. `impulse` (m,) is not copied and must not change afterwards; the other
+    arrays belong to this object.
     """
 
     def __init__(self, Data p, impulse):
@@ -201,13 +204,13 @@ cdef class Judged:
 
     @property
     def loss(self):
-        """What M's factor may lose of it, as a relative residual (judge/refine.pxd (2)); 0 after it was refined."""
+        """Possible error due to the factor of M, as a relative residual (judge/refine.pxd (2)); 0 after refinement."""
         if self.known_loss < 0.0:
             self.known_loss = loss_of(self.data, self.impulse, self.both)
         return self.known_loss
 
     def refine(self, double tol):
-        """Return the refined pass if a residual of `tol` needs one (judge/refine.pxd (2)), or this one."""
+        """Return the refined pass if a tolerance of `tol` requires it (judge/refine.pxd (2)), otherwise self."""
         cdef Data p = self.data
         cdef int32_t m = p.blocks.n_rows
         cdef view_t v = p.view()
@@ -232,27 +235,27 @@ cdef class Judged:
 
     @property
     def slack(self):
-        """w (m,) m/s"""
+        """Slack w (m,) [m/s]."""
         return self.both[:self.data.blocks.n_rows]
 
     @property
     def error(self):
-        """e (m,) N s"""
+        """Error e (m,) [N s]."""
         return self.both[self.data.blocks.n_rows:2 * self.data.blocks.n_rows]
 
 
 def compare(double energy, double velocity, double reference_energy, double reference_velocity):
-    """Relative residual: the larger of both errors over those of doing nothing; inf where one is not finite."""
+    """Return the relative residual: the larger ratio of an error to its reference; inf if a number is not finite."""
     return relative(energy, velocity, reference_energy, reference_velocity)
 
 
 def all_finite(const double[::1] x):
-    """Does x hold neither NaN nor infinity?"""
-    return door.all_finite(&x[0], x.shape[0]) if x.shape[0] else True
+    """Return whether x holds neither NaN nor infinity."""
+    return validate.all_finite(&x[0], x.shape[0]) if x.shape[0] else True
 
 
 def rhs_norms(Data p):
-    """(sqrt J, m/s): b in the judge's two norms."""
+    """Return b in the judge's two norms [sqrt J, m/s]."""
     cdef double energy, velocity
     with nogil:
         norms_of_rhs(&p.blocks, &energy, &velocity)
@@ -260,13 +263,13 @@ def rhs_norms(Data p):
 
 
 def same_bits(const double[::1] x, const double[::1] y):
-    """Are two arrays equal to the bit?"""
+    """Return whether two arrays are bit-identical."""
     cdef Py_ssize_t n = x.shape[0]
     return y.shape[0] == n and (n == 0 or memcmp(&x[0], &y[0], n * sizeof(double)) == 0)
 
 
 def score(Data p, const double[::1] lam, const double[::1] w, double[::1] e):
-    """Error of (lam, w) as they are, w given: (energy, velocity, worst row, finite)."""
+    """Compute the error e of lam with the given slack w; return (energy, velocity, worst row, whether all are finite)."""
     cdef score_t s = new_score()
     if p.blocks.n_rows == 0:
         return 0.0, 0.0, -1, True
@@ -276,7 +279,7 @@ def score(Data p, const double[::1] lam, const double[::1] w, double[::1] e):
 
 
 def begin(Data p):
-    """Judge the zero impulse; keep islands, references and its relative residual with the data; return it (m,), read-only."""
+    """Judge the zero impulse, store islands, references and its relative residual in the data, and return it (m,), read-only."""
     cdef Py_ssize_t m = p.blocks.n_rows, k = p.blocks.n_blocks
     cdef view_t v = p.view()
     cdef double[::1] x
@@ -294,7 +297,7 @@ def begin(Data p):
 
 
 def by_island(Data p, const double[::1] lam):
-    """(label (k,), table (n, 5)) of an impulse (m,) [N s], one row for each island.
+    """Return the islands of the blocks (k,) and a table (n, 5) of an impulse (m,) [N s], with one row per island.
 
     Columns: relative residual, E [sqrt J], V [m/s] (worst row), E0 [sqrt J], V0 [m/s]; the last two -1 if no row acts.
     """
@@ -320,7 +323,7 @@ def by_island(Data p, const double[::1] lam):
     for i in range(p.blocks.n_blocks):
         label[i] = s.label[i]
     for i in range(n):
-        t = nothing()
+        t = empty_tally()
         for a in range(s.ptr[i], s.ptr[i + 1]):
             tally_block(&p.blocks, s.order[a], &w[m], &t)
         table[i, 0], table[i, 1] = score.by_island[2 * i], score.by_island[2 * i + 1]
@@ -330,7 +333,7 @@ def by_island(Data p, const double[::1] lam):
 
 
 def best_of_islands(Data p, list starts, list impulses, double tol):
-    """The best of starts and impulses (m,) in each island, by `see_start` and `see_impulse` in this order: a new array."""
+    """Combine the best island impulses of starts and impulses (m,), compared by judge/best.pxd, in a new array."""
     cdef Py_ssize_t m = p.blocks.n_rows
     cdef view_t v = p.view()
     cdef best_t best
@@ -356,9 +359,9 @@ def best_of_islands(Data p, list starts, list impulses, double tol):
 
 
 def velocity_change(Data p, const double[::1] lam, double[:, ::1] v):
-    """M^-1 J^T lam (n, 6) of a factored problem, Y^T lam (nv) of J and M, into v."""
+    """Write M^-1 J^T lam (n, 6) of a factored problem, or Y^T lam (nv) over J and M, to v."""
     if p.is_general and p.blocks.n_rows > 0:
-        whitened_gather(&p.general, &lam[0], &v[0, 0])
+        whitened_transpose_times(&p.general, &lam[0], &v[0, 0])
         return
     if not p.factored or p.rows.n_bodies == 0:
         return
@@ -370,9 +373,9 @@ def velocity_change(Data p, const double[::1] lam, double[:, ::1] v):
 
 
 def squares_of_float32(Data p, mass, const double[::1] free, const double[::1] lam):
-    """What float32 makes of w in generalised coordinates, (1), (4) and (5) of `judge/rounding.pxd`: (3, m) [m2/s2].
+    """Return the squared changes of w (3, m) [m2/s2] by rounding to float32: (1), (4), (5) of judge/rounding.pxd.
 
-    mass: (indptr, indices, data) of M's lower triangle; free (n,): v*, both in the order of the factor.
+    mass is (indptr, indices, data) of the lower triangle of M, free (n,) is v*, both in the order of the factor.
     """
     cdef const int32_t[::1] ptr = mass[0], idx = mass[1]
     cdef const double[::1] val = mass[2]
@@ -392,7 +395,7 @@ def squares_of_float32(Data p, mass, const double[::1] free, const double[::1] l
 
 
 def size_of_square(Data p, const double[::1] square):
-    """Changes of w in the judge's two norms, relative to the zero impulse: (n,) of each island, from their squares (m) [m2/s2]."""
+    """Return the size of a change of w relative to the zero impulse in each island, from its squares (m) [m2/s2]."""
     cdef const double* x = &square[0] if square.shape[0] else NULL
     cdef const islands_t* s = p.blocks.islands
     cdef int32_t i
@@ -402,23 +405,24 @@ def size_of_square(Data p, const double[::1] square):
 
 
 cdef inline double max_nan(double s, double x) noexcept nogil:
-    # NaN if either is
+    """Return the larger of s and x; NaN if either is NaN."""
     return s if x <= s or s != s else x
 
 
 cdef inline double ratio(double x, double scale) noexcept nogil:
+    """Return x / scale; if scale is 0, inf for positive x, otherwise x."""
     return x / scale if scale > 0.0 else 1.0 / 0.0 if x > 0.0 else x
 
 
-# Rows that are zero at the solution, as x >= 0, have no terms of their own there. They are compared with what acting rows
-# make of their variables, and with this share of the largest variable; equations whose target is more than TARGET_ROUNDING of
-# that, and so is their size, with EQUATION_SHARE of both.
-cdef double SHARE_OF_LARGEST = 1e-3
-cdef double EQUATION_SHARE = 1e-3
+# Rows that are zero at the solution, such as x >= 0, have no terms of their own. Their scale is the size of their variables in
+# acting rows, at least MIN_VARIABLE_FRACTION of the largest variable. An equation whose target is above TARGET_ROUNDING times
+# that scale has a size of its own, so the scale is multiplied by EQUATION_SCALE_FACTOR. Larger values accept larger residuals.
+cdef double MIN_VARIABLE_FRACTION = 1e-3
+cdef double EQUATION_SCALE_FACTOR = 1e-3
 cdef double TARGET_ROUNDING = 1e-12
-# The gap is compared with at least this share of the sum of |terms|: an objective whose terms cancel has no size of its
-# own. Of 81 public programs the largest sum is 1000 times the objective.
-cdef double SHARE_OF_TERMS = 1e-3
+# The scale of the gap is at least this fraction of the sum of |terms|, because an objective whose terms cancel is not a
+# meaningful scale. The largest ratio of that sum to the objective in 81 public programs is 1000.
+cdef double MIN_TERMS_FRACTION = 1e-3
 
 
 def program_residuals(x_, q_, px_, force_, jx_, target_, lam_, int32_t free, jac, ordered_,
@@ -465,7 +469,7 @@ def program_residuals(x_, q_, px_, force_, jx_, target_, lam_, int32_t free, jac
     cdef Workspace workspace = allocate_workspace((n + 2 * m) * sizeof(double))
     cdef double* size = <double*>workspace.at
     cdef double* terms = size + n
-    cdef double* acts = terms + m                       # 1 of a row that acts, else 0
+    cdef double* acts = terms + m                       # 1 for a row that acts, otherwise 0
     cdef double primal = 0.0, dual = 0.0, gap = 0.0, row_error = 0.0, force_error = 0.0, negative = 0.0
     cdef double forces = 0.0, far = 0.0, curvature = 0.0, linear = 0.0, sums = 0.0
     cdef double uncancelled = 0.0, rows = 0.0, violation, own, scale, largest, floor
@@ -499,10 +503,10 @@ def program_residuals(x_, q_, px_, force_, jx_, target_, lam_, int32_t free, jac
         for k in range(ptr[i], ptr[i + 1]):
             if value[k] != 0.0:
                 size[column[k]] = max_nan(size[column[k]], own / fabs(value[k]))
-    floor = SHARE_OF_LARGEST * far
+    floor = MIN_VARIABLE_FRACTION * far
     if homogeneous:
-        kept = sizes_without_rows()
-        unbounded = doubles(kept, n)
+        sizes_array = sizes_without_rows()
+        unbounded = doubles(sizes_array, n)
     for j in range(n):
         if homogeneous:
             size[j] = max_nan(size[j], unbounded[j])
@@ -515,7 +519,7 @@ def program_residuals(x_, q_, px_, force_, jx_, target_, lam_, int32_t free, jac
             largest = max_nan(largest, fabs(value[k]))
             scale = max_nan(scale, fabs(value[k]) * size[column[k]])
         if i < free and fabs(target[i]) > TARGET_ROUNDING * scale:
-            scale *= EQUATION_SHARE
+            scale *= EQUATION_SCALE_FACTOR
         scale = max_nan(terms[i], scale)
         if not homogeneous:
             scale = min(scale, rows)
@@ -527,7 +531,7 @@ def program_residuals(x_, q_, px_, force_, jx_, target_, lam_, int32_t free, jac
             dual = max_nan(dual, -lam[i])
             negative = max_nan(negative, -lam[i] * largest)
     dual = max_nan(dual, force_error)
-    scale = max_nan(fabs(0.5 * curvature + linear), SHARE_OF_TERMS * sums)
+    scale = max_nan(fabs(0.5 * curvature + linear), MIN_TERMS_FRACTION * sums)
     gap = fabs(gap)
     force_error = ratio(max_nan(force_error, negative), forces)
     scale = ratio(uncancelled, scale)

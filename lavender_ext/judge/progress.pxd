@@ -1,40 +1,41 @@
-"""Whether a run of sweeps still gets anywhere: by the residuals r of its checks, and by where its impulses go.
+"""Detect stalled runs of sweeps from the residuals r of the checks and the motion of the impulses.
 
-A run of t sweeps rests where its residual has not leapt up (f > 3/2) and neither of these comes within 64 t more:
+A run of t sweeps has stalled unless its residual has risen sharply (f > 3/2) or one of two events is predicted within 64 t
+further sweeps:
 
-    half of the best, by the lower envelope: f = least r in (t/2, t] / least r in (t/4, t/2], k sweeps apart,
-    r f^(n/k) <= best / 2 after n                                                               (1)
-    the end of a plateau: a row that moved one way from check to check, by the last three, at the slower of both
-    speeds, meets a bound or leaves its cone                                                    (2)
+    The residual halves. With the lower envelope f = min r in (t/2, t] / min r in (t/4, t/2], whose minima are k sweeps
+    apart, r f^(n/k) <= best / 2 after n sweeps                                                 (1)
+    A plateau ends. A row whose impulse moved in one direction over the last three checks reaches a bound or the boundary
+    of its cone at the slower of its two speeds                                                 (2)
 
-A residual that swings as it falls has a falling envelope. On a plateau it stands still while some impulse is carried
-to its bound, and falls behind that. In a cycle no row keeps its way, and infeasible rows have no bound in sight.
+A residual that oscillates while it falls has a falling envelope. On a plateau the residual is constant while an impulse
+moves to its bound, and falls afterwards. In a cycle no row keeps its direction, and infeasible rows approach no bound.
 """
 from libc.math cimport fabs
 from libc.stdint cimport int32_t
 from libc.string cimport memcpy
 
 from lavender_ext.core.block cimport norm2
-from lavender_ext.core.parts cimport blocks_t, is_rows, parts_of, parts_t
+from lavender_ext.core.block_types cimport blocks_t, is_rows, get_friction_components, friction_components_t
 
 
 cdef enum:
-    CHECKS = 32                 # kept: eight to sixteen lie in (t/4, t]
-    HORIZON = 64                # sweeps that are looked ahead, for each one done
+    N_STORED_CHECKS = 32        # Eight to sixteen of these checks lie in (t/4, t].
+    HORIZON_RATIO = 64          # Events are predicted for this multiple of the sweeps done.
 
 
 cdef struct progress_t:
-    int32_t n                   # checks so far; check k stands in place k % CHECKS
-    int32_t at[CHECKS]          # sweeps
-    double r[CHECKS]            # relative residual
-    int32_t last_at             # sweeps at which `last`
-    int32_t before_at           # and `before` were kept; -1: they were not
-    double* last                # (m) N s, of the last check
-    double* before              # (m) N s, of the one before
+    int32_t n                   # number of checks; check k has index k % N_STORED_CHECKS
+    int32_t at[N_STORED_CHECKS]     # sweeps at each check
+    double r[N_STORED_CHECKS]       # relative residual at each check
+    int32_t last_at             # sweeps at which `last` was stored, -1 if it was not
+    int32_t before_at           # sweeps at which `before` was stored, -1 if it was not
+    double* last                # (m) N s, impulse of the last check
+    double* before              # (m) N s, impulse of the check before
 
 
 cdef inline void open_progress(progress_t* s, double* workspace, int32_t m) noexcept nogil:
-    """Before the first check; workspace (2 m)."""
+    """Initialise s before the first check; workspace (2 m)."""
     s.n = 0
     s.last_at = s.before_at = -1
     s.last = workspace
@@ -42,12 +43,14 @@ cdef inline void open_progress(progress_t* s, double* workspace, int32_t m) noex
 
 
 cdef inline void see(progress_t* s, int32_t at, double r) noexcept nogil:
-    s.at[s.n % CHECKS] = at
-    s.r[s.n % CHECKS] = r
+    """Store the residual r of a check after `at` sweeps."""
+    s.at[s.n % N_STORED_CHECKS] = at
+    s.r[s.n % N_STORED_CHECKS] = r
     s.n += 1
 
 
 cdef inline void keep(progress_t* s, int32_t at, const double* lam, int32_t m) noexcept nogil:
+    """Store the impulse lam (m) of a check after `at` sweeps."""
     cdef double* x = s.before
     s.before = s.last
     s.before_at = s.last_at
@@ -57,13 +60,13 @@ cdef inline void keep(progress_t* s, int32_t at, const double* lam, int32_t m) n
 
 
 cdef inline int32_t envelope(const progress_t* s, double* fall, double* low) noexcept nogil:
-    """k, f and the later of the two minima, at the last check; k = 0 where there are too few checks."""
-    cdef int32_t i = s.n - 1, first = s.n - CHECKS if s.n > CHECKS else 0, t, at, late_at = 0, early_at = 0
+    """Return k of (1) at the last check, with f in `fall` and the later minimum in `low`; 0 if there are too few checks."""
+    cdef int32_t i = s.n - 1, first = s.n - N_STORED_CHECKS if s.n > N_STORED_CHECKS else 0, t, at, late_at = 0, early_at = 0
     cdef double late = 1.0 / 0.0, early = 1.0 / 0.0, r
-    t = s.at[i % CHECKS] if i >= 0 else 0
-    while i >= first and s.at[i % CHECKS] > t // 4:
-        at = s.at[i % CHECKS]
-        r = s.r[i % CHECKS]
+    t = s.at[i % N_STORED_CHECKS] if i >= 0 else 0
+    while i >= first and s.at[i % N_STORED_CHECKS] > t // 4:
+        at = s.at[i % N_STORED_CHECKS]
+        r = s.r[i % N_STORED_CHECKS]
         if at > t // 2:
             if r < late:
                 late = r
@@ -77,48 +80,49 @@ cdef inline int32_t envelope(const progress_t* s, double* fall, double* low) noe
     return late_at - early_at if late < 1.0 / 0.0 and early < 1.0 / 0.0 else 0
 
 
-cdef inline bint moves(const progress_t* s, double aim, double most) noexcept nogil:
-    """(1): whether the envelope meets `aim` within `most` sweeps, or has leapt up: then it has not come to rest yet."""
+cdef inline bint residual_moves(const progress_t* s, double target, double max_sweeps) noexcept nogil:
+    """Return whether the envelope reaches `target` within `max_sweeps` sweeps (1), or has risen sharply."""
     cdef double fall, r, n = 0.0
     cdef int32_t k = envelope(s, &fall, &r)
     if k == 0 or not fall < 1.0:
         return k > 0 and fall > 1.5
-    while r > aim and n <= most:
+    while r > target and n <= max_sweeps:
         r *= fall
         n += k
-    return n <= most
+    return n <= max_sweeps
 
 
 cdef inline double speed(const progress_t* s, const double* lam, int32_t now, int32_t i) noexcept nogil:
-    """N s a sweep of row i, the slower of its last two; 0 where it turned."""
+    """Return the slower of the last two speeds of row i [N s per sweep], 0 if its direction changed."""
     cdef double x = (lam[i] - s.last[i]) / (now - s.last_at), y = (s.last[i] - s.before[i]) / (s.last_at - s.before_at)
     if not x * y > 0.0:
         return 0.0
     return x if fabs(x) < fabs(y) else y
 
 
-cdef inline bint meets(double gap, double closing, double most) noexcept nogil:
-    return gap > 0.0 and closing > 0.0 and gap <= most * closing
+cdef inline bint meets(double gap, double closing_speed, double max_sweeps) noexcept nogil:
+    """Return whether a positive gap [N s] closes within `max_sweeps` sweeps."""
+    return gap > 0.0 and closing_speed > 0.0 and gap <= max_sweeps * closing_speed
 
 
 cdef inline bint meets_disk(const progress_t* s, const double* lam, int32_t now, int32_t first, int32_t end, double slope,
-                            double normal, double rate, double most) noexcept nogil:
-    # rows first to end, whose norm is at most slope times the normal
+                            double normal, double rate, double max_sweeps) noexcept nogil:
+    """Return whether rows [first, end), with norm at most slope times the normal, reach that bound in time."""
     cdef double size = 0.0, along = 0.0, v = 0.0
     cdef int32_t k
     for k in range(first, end):
         size = norm2(size, lam[k])
         along += lam[k] * speed(s, lam, now, k)
         v = norm2(v, speed(s, lam, now, k))
-    return meets(slope * normal - size, (along / size if size > 0.0 else v) - slope * rate, most)
+    return meets(slope * normal - size, (along / size if size > 0.0 else v) - slope * rate, max_sweeps)
 
 
 cdef inline bint meets_bound(const progress_t* s, const blocks_t* p, const double* lam, int32_t now,
-                             double most) noexcept nogil:
-    """(2): whether a row does within `most` sweeps."""
+                             double max_sweeps) noexcept nogil:
+    """Return whether (2) holds for a row within `max_sweeps` sweeps."""
     cdef int32_t i, j, k, g
     cdef double v, rate
-    cdef parts_t q
+    cdef friction_components_t q
     if not now > s.last_at > s.before_at >= 0:
         return False
     for i in range(p.n_blocks):
@@ -126,24 +130,24 @@ cdef inline bint meets_bound(const progress_t* s, const blocks_t* p, const doubl
         if is_rows(p, i):
             for k in range(j, p.ptr[i + 1]):
                 v = speed(s, lam, now, k)
-                if meets(lam[k] - p.lower[k], -v, most) or meets(p.upper[k] - lam[k], v, most):
+                if meets(lam[k] - p.lower[k], -v, max_sweeps) or meets(p.upper[k] - lam[k], v, max_sweeps):
                     return True
             continue
         if not lam[j] > 0.0:
             continue
         rate = speed(s, lam, now, j)
-        if meets(lam[j], -rate, most):
+        if meets(lam[j], -rate, max_sweeps):
             return True
-        parts_of(p, i, &q)
+        get_friction_components(p, i, &q)
         for g in range(q.n):
             k = j + q.first[g]
-            if meets_disk(s, lam, now, k, k + q.size[g], q.reach[g], lam[j], rate, most):
+            if meets_disk(s, lam, now, k, k + q.size[g], q.friction_coefficient[g], lam[j], rate, max_sweeps):
                 return True
     return False
 
 
-cdef inline bint rests(const progress_t* s, const blocks_t* p, const double* lam, int32_t now,
-                       double best) noexcept nogil:
-    """Nothing is in sight of what was last seen, at sweep `now` with the impulse lam (m)."""
-    cdef double most = HORIZON * <double>now
-    return not (moves(s, 0.5 * best, most) or meets_bound(s, p, lam, now, most))
+cdef inline bint has_stalled(const progress_t* s, const blocks_t* p, const double* lam, int32_t now,
+                             double best) noexcept nogil:
+    """Return whether neither (1) nor (2) is predicted after `now` sweeps with the impulse lam (m)."""
+    cdef double max_sweeps = HORIZON_RATIO * <double>now
+    return not (residual_moves(s, 0.5 * best, max_sweeps) or meets_bound(s, p, lam, now, max_sweeps))

@@ -1,4 +1,4 @@
-"""Reference errors E0 [sqrt J] and V0 [m/s] of an island: what its relative residual is divided by.
+"""Reference errors E0 [sqrt J] and V0 [m/s] of an island, the denominators of its relative residual.
 
 They are E and V (score.pxd) of the zero impulse x = Pi(0), slack w = A x - b, error e, unless the zero impulse solves the island.
 It does if no row's error is more than the rounding of the row's own terms, s_k = |b_k|:
@@ -16,26 +16,27 @@ If (2) is zero, no row acts: each row is compared with its own terms, a contact 
 
     relative = max d_k |e_k| / s_k,   of a contact sqrt(d_n sum d_k e_k^2) / s_n       (3) `relative_by_rows`
 
-So a row that does not act changes no verdict about rows that do, however large its b is. Two kinds of rows have no scale of
-their own and are compared with all rows, sqrt(sum E0_i^2) and max V0_i: blocks that nothing moves, and, in (3), rows with
-b = 0 (there sqrt(d) |e| over the former).
+A row that does not act therefore does not change the residual of rows that do, however large its b is. Two kinds of rows
+have no scale of their own and are compared with all rows, sqrt(sum E0_i^2) and max V0_i: blocks that no impulse moves, and,
+in (3), rows with b = 0 (there sqrt(d) |e| is divided by the former).
 """
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
 
 from lavender_ext.core.block cimport length
-from lavender_ext.core.parts cimport CONE, blocks_t, groups_of, is_rows, islands_t, parts_of, parts_t
+from lavender_ext.core.block_types cimport (CONE, blocks_t, get_row_groups, is_rows, islands_t, get_friction_components,
+                                            friction_components_t)
 from lavender_ext.judge.score cimport relative
-from lavender_ext.judge.tally cimport block_at, nothing, relative_by_rows, tally_block, tally_t
+from lavender_ext.judge.tally cimport block_at, empty_tally, relative_by_rows, tally_block, tally_t
 
 
 cdef inline double reference_rounding() noexcept nogil:
-    """2^-48: largest error beside a row's own terms that counts as their rounding."""
+    """Return 2^-48, the largest ratio of an error to the terms of its row that counts as rounding."""
     return 3.5527136788005009e-15
 
 
 cdef inline bint is_inactive_row(const blocks_t* p, int32_t k, double x, double w) noexcept nogil:
-    """Whether the bounded row k is strictly inactive at x, slack w."""
+    """Return whether the bounded row k is strictly inactive at x with slack w."""
     cdef double rounding = reference_rounding() * fabs(p.b[k])
     if p.lower[k] == p.upper[k]:
         return True
@@ -43,20 +44,20 @@ cdef inline bint is_inactive_row(const blocks_t* p, int32_t k, double x, double 
 
 
 cdef inline bint is_inactive_contact(const blocks_t* p, int32_t i, const double* w) noexcept nogil:
-    """Whether contact i is strictly inactive at zero impulse, slack w (m)."""
+    """Return whether contact i is strictly inactive at zero impulse with slack w (m)."""
     cdef int32_t g, j = p.ptr[i]
     cdef double gap = w[j], size = fabs(p.b[j])
-    cdef parts_t q
+    cdef friction_components_t q
     if p.law == CONE:
-        parts_of(p, i, &q)
+        get_friction_components(p, i, &q)
         for g in range(q.n):
-            gap -= q.reach[g] * length(w + j + q.first[g], q.size[g])
-            size += q.reach[g] * length(p.b + j + q.first[g], q.size[g])
+            gap -= q.friction_coefficient[g] * length(w + j + q.first[g], q.size[g])
+            size += q.friction_coefficient[g] * length(p.b + j + q.first[g], q.size[g])
     return gap > reference_rounding() * size
 
 
 cdef inline bint is_at_rest(const blocks_t* p, int32_t i, const double* e) noexcept nogil:
-    """(1) for the rows of block i."""
+    """Return whether (1) holds for the rows of block i."""
     cdef int32_t k
     for k in range(p.ptr[i], p.ptr[i + 1]):
         if not p.d[k] * fabs(e[k]) <= reference_rounding() * fabs(p.b[k]):
@@ -65,7 +66,7 @@ cdef inline bint is_at_rest(const blocks_t* p, int32_t i, const double* e) noexc
 
 
 cdef inline void add_terms(const blocks_t* p, int32_t k, int32_t n, double* energy, double* fast) noexcept nogil:
-    """Add n rows from k on to the sums of (2); the maximum takes the norm of the n rows."""
+    """Add rows [k, k + n) to the sum and the maximum of (2); the maximum is over the norm of these rows."""
     cdef int32_t i
     cdef double t, both = 0.0
     for i in range(k, k + n):
@@ -78,9 +79,9 @@ cdef inline void add_terms(const blocks_t* p, int32_t k, int32_t n, double* ener
 
 cdef inline void add_block_terms(const blocks_t* p, int32_t i, const double* x, const double* w, double* energy,
                                  double* fast) noexcept nogil:
-    """Add the rows of block i that act to the sums of (2)."""
+    """Add the rows of block i that act to the sum and the maximum of (2)."""
     cdef int32_t k, g, j = p.ptr[i]
-    cdef parts_t q
+    cdef friction_components_t q
     if is_rows(p, i):
         for k in range(j, p.ptr[i + 1]):
             if not is_inactive_row(p, k, x[k], w[k]):
@@ -89,21 +90,21 @@ cdef inline void add_block_terms(const blocks_t* p, int32_t i, const double* x, 
     if is_inactive_contact(p, i, w):
         return
     add_terms(p, j, 1, energy, fast)
-    groups_of(p, i, &q)
+    get_row_groups(p, i, &q)
     for g in range(q.n):
         add_terms(p, j + q.first[g], q.size[g], energy, fast)
 
 
 cdef inline double set_reference(const blocks_t* p, const int32_t* order, int32_t first, int32_t end, const double* x,
                                  const double* w, const double* e, double* out) noexcept nogil:
-    """E0 and V0 of blocks order[first:end] into out (2); return the relative residual of the zero impulse x.
+    """Write E0 and V0 of blocks order[first:end] to out (2); return the relative residual of the zero impulse x.
 
-    Of errors that are not finite both are 0, which makes every relative residual infinite.
+    If an error is not finite both are 0, which makes every relative residual infinite.
     """
     cdef int32_t a, i, k
     cdef double energy = 0.0, fast = 0.0, check = 0.0       # check: 0, or NaN once a slack is not finite
     cdef bint rest = True
-    cdef tally_t s = nothing()
+    cdef tally_t s = empty_tally()
     for a in range(first, end):
         i = block_at(order, a)
         rest = rest and is_at_rest(p, i, e)
@@ -124,13 +125,14 @@ cdef inline double set_reference(const blocks_t* p, const int32_t* order, int32_
         out[0], out[1] = sqrt(energy), sqrt(fast)
         return relative(s.energy, s.fast, out[0], out[1])
     out[0] = out[1] = -1.0
-    return relative_by_rows(p, order, first, end, e, 0.0)   # 0, or as small as (1) says
+    return relative_by_rows(p, order, first, end, e, 0.0)   # 0, or bounded by (1)
 
 
 cdef inline void reference_of(blocks_t* p, const double* x, const double* w, const double* e, double* out) noexcept nogil:
-    """E0 [sqrt J], V0 [m/s] and the relative residual (3) of the zero impulse x, slack w, error e (m each).
+    """Write E0 [sqrt J], V0 [m/s] and the relative residual of the zero impulse x, slack w, error e (m each) to out (3).
 
-    With several islands their references are set, and the first two are sqrt(sum E0_i^2) and max V0_i over those that have one.
+    With several islands their references are set, and the first two are sqrt(sum E0_i^2) and max V0_i over the islands with
+    a positive reference.
     """
     cdef islands_t* s = <islands_t*>p.islands
     cdef int32_t i
@@ -150,5 +152,5 @@ cdef inline void reference_of(blocks_t* p, const double* x, const double* w, con
 
 
 cdef inline bint needs_rows(const blocks_t* p, const double* out) noexcept nogil:
-    """Whether (3) applies to a problem of one island, which then must be listed for it."""
+    """Return whether (3) applies to a problem without an islands list, which then needs one."""
     return p.islands == NULL and out[0] < 0.0 and p.n_rows > 0

@@ -1,4 +1,4 @@
-"""Refinement of the judge's pass over J and M, for an M so ill-conditioned that its factor loses what the judge measures.
+"""Refinement of the judge's pass over J and M, for an M so ill-conditioned that its factor is not accurate enough.
 
 With H = S M S of unit diagonal, S = diag(M)^-1/2, and u = 2^-53, a solve by the factor of M computes x' for x = M^-1 J^T lam with
 
@@ -25,21 +25,21 @@ from libc.string cimport memcpy
 
 from lavender_ext.core.dot cimport dot
 from lavender_ext.core.generalized cimport bound_condition, get_condition, tree_solve
-from lavender_ext.core.parts cimport blocks_t
+from lavender_ext.core.block_types cimport blocks_t
 from lavender_ext.core.view cimport generalized_t
 from lavender_ext.judge.forms cimport general_errors
 from lavender_ext.judge.score cimport relative, score_t, smallest_reference, unit_roundoff
 
 
 cdef enum:
-    MAX_CORRECTIONS = 16        # After so many the last correction enters the floor: each is less than half of the one before.
+    MAX_CORRECTIONS = 16        # Each correction is less than half of the previous one; the last one enters the floor.
 
 
 # -- sums of two float64 -----------------------------------------------------------------------------
 
 
 cdef inline double upper_half(double x) noexcept nogil:
-    """The first 26 bits of x."""
+    """Return x truncated to its first 26 bits."""
     cdef uint64_t bits
     memcpy(&bits, &x, sizeof(bits))
     bits &= <uint64_t>0xFFFFFFFFF8000000
@@ -48,23 +48,23 @@ cdef inline double upper_half(double x) noexcept nogil:
 
 
 cdef inline void add_product(double x, double y, double* high, double* low) noexcept nogil:
-    """high + low += x y"""
+    """Add x y to high + low."""
     cdef double a = upper_half(x), b = upper_half(y), c = x - a, d = y - b, product = x * y
-    cdef double rest = ((a * b - product) + a * d + c * b) + c * d
+    cdef double product_error = ((a * b - product) + a * d + c * b) + c * d
     cdef double total = high[0] + product, part = total - high[0]
-    low[0] += ((high[0] - (total - part)) + (product - part)) + rest
+    low[0] += ((high[0] - (total - part)) + (product - part)) + product_error
     high[0] = total
 
 
 cdef inline void add_number(double x, double* high, double* low) noexcept nogil:
-    """high + low += x"""
+    """Add x to high + low."""
     cdef double total = high[0] + x, part = total - high[0]
     low[0] += (high[0] - (total - part)) + (x - part)
     high[0] = total
 
 
 cdef inline void add_force(const generalized_t* g, const double* lam, double* high, double* low) noexcept nogil:
-    """high + low (n) = J^T lam."""
+    """Compute high + low (n) = J^T lam."""
     cdef int32_t i, q
     for i in range(g.n):
         high[i] = 0.0
@@ -77,7 +77,7 @@ cdef inline void add_force(const generalized_t* g, const double* lam, double* hi
 
 cdef inline void subtract_momentum(const generalized_t* g, const double* x, const double* x_low, double* high,
                                    double* low) noexcept nogil:
-    """high + low (n) -= M (x + x_low)"""
+    """Subtract M (x + x_low) from high + low (n)."""
     cdef int32_t i, j, q
     cdef double a
     for i in range(g.n):
@@ -95,11 +95,14 @@ cdef inline void subtract_momentum(const generalized_t* g, const double* x, cons
 
 
 cdef inline double loss_by_factor(const blocks_t* p, const generalized_t* g, const double* lam, const double* w, double* x,
-                                  double reference_energy, double reference_velocity, double enough) noexcept nogil:
-    """The left of (2), or 0 if it is at most `enough`; w (m) is the slack of the first pass, x (2 n) scratch."""
+                                  double reference_energy, double reference_velocity, double threshold) noexcept nogil:
+    """Return the left side of (2), or 0 if it is at most `threshold`.
+
+    w (m) is the slack of the first pass, x (2 n) is scratch.
+    """
     cdef int32_t i = 0
     cdef double energy = 0.0, other = 0.0, nu = 0.0, size
-    while i + 2 <= p.n_rows:                            # two sums: half of the time that their additions wait
+    while i + 2 <= p.n_rows:                            # two sums, to halve the latency of the additions
         energy += lam[i] * (w[i] + (p.b[i] - g.compliance[i] * lam[i]))
         other += lam[i + 1] * (w[i + 1] + (p.b[i + 1] - g.compliance[i + 1] * lam[i + 1]))
         nu = p.nu[i] if p.nu[i] > nu else nu
@@ -109,22 +112,22 @@ cdef inline double loss_by_factor(const blocks_t* p, const generalized_t* g, con
         energy += lam[i] * (w[i] + (p.b[i] - g.compliance[i] * lam[i]))
         nu = p.nu[i] if p.nu[i] > nu else nu
     energy += other
-    if g.n == 0 or energy == 0.0:                       # no impulse, or none that moves anything
+    if g.n == 0 or energy == 0.0:                       # no impulse moves anything
         return 0.0
     energy = sqrt(fabs(energy))                         # negative only by rounding
     smallest_reference(p, &reference_energy, &reference_velocity)
     size = 0.1 * relative(energy, sqrt(nu) * energy, reference_energy, reference_velocity)
     size = g.n * unit_roundoff() * (size if size > 1.0 else 1.0)
-    if g.condition == 0.0 and size * bound_condition(g) <= enough:
+    if g.condition == 0.0 and size * bound_condition(g) <= threshold:
         return 0.0
     size *= get_condition(g, x)
-    return size if size > enough else 0.0
+    return size if size > threshold else 0.0
 
 
 cdef inline double refine_change(const generalized_t* g, const double* lam, double loss, double* x) noexcept nogil:
-    """x + x_low (n each, the first of x (6 n)) = M^-1 J^T lam by (3); what may remain of it, in the norm of M.
+    """Compute x + x_low = M^-1 J^T lam by (3) in the first 2 n of x (6 n); return its remaining error in the norm of M.
 
-    loss: n u |H^-1|.
+    loss is n u |H^-1|.
     """
     cdef int32_t i, n = g.n
     cdef double* x_low = x + n
@@ -132,14 +135,14 @@ cdef inline double refine_change(const generalized_t* g, const double* lam, doub
     cdef double* force_low = x + 3 * n
     cdef double* r = x + 4 * n
     cdef double* r_low = x + 5 * n
-    cdef double whole, last, size, rate = loss if loss < 0.5 else 0.5
+    cdef double norm, last, size, rate = loss if loss < 0.5 else 0.5
     add_force(g, lam, force, force_low)
     for i in range(n):
         x[i] = force[i]
         x_low[i] = 0.0
     tree_solve(g, x)
-    whole = dot(force, x, n)
-    whole = last = sqrt(fabs(whole))                    # negative only by rounding
+    norm = dot(force, x, n)
+    norm = last = sqrt(fabs(norm))                    # negative only by rounding
     for _step in range(MAX_CORRECTIONS):
         memcpy(r, force, n * sizeof(double))
         memcpy(r_low, force_low, n * sizeof(double))
@@ -156,18 +159,18 @@ cdef inline double refine_change(const generalized_t* g, const double* lam, doub
         if size > rate * last:
             rate = size / last
         last = size
-        if size * rate <= unit_roundoff() * whole:
+        if size * rate <= unit_roundoff() * norm:
             return size * rate
     return last
 
 
 cdef inline void refine_general(const blocks_t* p, const generalized_t* g, const double* lam, double* w, double* e,
                                 double* scratch, score_t* out) noexcept nogil:
-    """w (m) of the first pass becomes that of the refined one, with its errors e (m), sums and floor; scratch (6 n + 2 m)."""
+    """Replace w (m) of the first pass by the refined one, with its errors e (m), norms and floor; scratch (6 n + 2 m)."""
     cdef int32_t i, q, n = g.n
-    cdef double* more = scratch
+    cdef double* extra = scratch
     cdef double* x = scratch + p.n_rows
-    cdef double left = refine_change(g, lam, n * unit_roundoff() * get_condition(g, x), x), high, low
+    cdef double remaining = refine_change(g, lam, n * unit_roundoff() * get_condition(g, x), x), high, low
     for i in range(p.n_rows):
         high = -p.b[i]
         low = 0.0
@@ -176,6 +179,6 @@ cdef inline void refine_general(const blocks_t* p, const generalized_t* g, const
             add_product(g.jval[q], x[g.jidx[q]], &high, &low)
             low += g.jval[q] * x[n + g.jidx[q]]
         high += low
-        more[i] = (fabs(high - w[i]) + sqrt(2.0 * p.d[i]) * left) / unit_roundoff()
+        extra[i] = (fabs(high - w[i]) + sqrt(2.0 * p.d[i]) * remaining) / unit_roundoff()
         w[i] = high
-    general_errors(p, g, lam, w, e, x, more, out)
+    general_errors(p, g, lam, w, e, x, extra, out)

@@ -1,17 +1,17 @@
-"""What rounding to float32 makes of a slack in generalised coordinates: squares of its changes, entry by entry.
+"""Effect of rounding to float32 on a slack in generalised coordinates: squared changes of each entry.
 
 With z_i = M^-1 J_i^T, A_ij = J_j . z_i + theta_i (i = j), x = M^-1 J^T lambda, f = M^2 x^2 + J^T^2 lambda^2, every matrix
 squared entry by entry, and u = 2^-24 (the formulas of lavender/judge/residuals.py):
 
     impulse     u^2 A^2 lambda^2                                                                          (1)
     data        u^2 (J^2 x^2 + z^2 f + theta^2 lambda^2 + target^2 + 2 J^2 v*^2),  target = b + J v*      (4)
-    velocities  u^2 A^2 ((J^2 x^2 + b^2 + theta^2 lambda^2) / theta^2 on rows that act), 0 where one is rigid     (5)
+    velocities  u^2 A^2 ((J^2 x^2 + b^2 + theta^2 lambda^2) / theta^2 on rows that act), 0 if one of them is rigid     (5)
 """
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.generalized cimport jac_push, jac_row, tree_solve, whitened_push
-from lavender_ext.core.parts cimport blocks_t
+from lavender_ext.core.generalized cimport jac_transpose_times, jac_row, tree_solve, add_scaled_whitened_row
+from lavender_ext.core.block_types cimport blocks_t
 from lavender_ext.core.view cimport generalized_t
 from lavender_ext.judge.score cimport relative, score_t
 from lavender_ext.judge.tally cimport block_at
@@ -24,7 +24,7 @@ cdef struct mass_t:             # the lower triangle of M with its diagonal, col
 
 
 cdef inline double square_row(const generalized_t* g, int32_t i, const double* x) noexcept nogil:
-    """(J_i)^2 x"""
+    """Return (J_i)^2 x, with squared entries of row i."""
     cdef int32_t q
     cdef double s = 0.0
     for q in range(g.jptr[i], g.jptr[i + 1]):
@@ -32,13 +32,13 @@ cdef inline double square_row(const generalized_t* g, int32_t i, const double* x
     return s
 
 
-cdef inline void unwhitened(const generalized_t* g, int32_t panel, int32_t row, double* z) noexcept nogil:
-    """z (n) = M^-1 J_row^T = L^-1 D^-1/2 Y_row^T: half of a solve by M's factor."""
+cdef inline void unwhiten_row(const generalized_t* g, int32_t panel, int32_t row, double* z) noexcept nogil:
+    """Compute z (n) = M^-1 J_row^T = L^-1 D^-1/2 Y_row^T, half of a solve with the factor of M."""
     cdef int32_t k, q
     cdef double x
     for k in range(g.n):
         z[k] = 0.0
-    whitened_push(g, panel, row, 1.0, z)
+    add_scaled_whitened_row(g, panel, row, 1.0, z)
     for k in range(g.n):
         x = z[k] * g.root[k]
         for q in range(g.lptr[k], g.lptr[k + 1]):
@@ -49,16 +49,16 @@ cdef inline void unwhitened(const generalized_t* g, int32_t panel, int32_t row, 
 cdef inline void squares32(const blocks_t* p, const generalized_t* g, const mass_t* mass, const double* free,
                            const double* lam, double* impulse, double* data, double* velocities,
                            double* work) noexcept nogil:
-    """(1), (4) and (5), (m) [m2/s2] each; free (n) is v*, work (4 n + m)."""
+    """Compute (1), (4) and (5), (m) [m2/s2] each; free (n) is v*, work (4 n + m) is scratch."""
     cdef int32_t i, j, q, k, m = p.n_rows, n = g.n, panel = 0
     cdef double* x = work
     cdef double* xx = x + n
     cdef double* f = xx + n
     cdef double* z = f + n
     cdef double* off = z + n
-    cdef double unit = 5.9604644775390625e-08 * 5.9604644775390625e-08, s, seen, soft, target
+    cdef double unit = 5.9604644775390625e-08 * 5.9604644775390625e-08, s, row_square, soft, target
     cdef bint rigid = False
-    jac_push(g, lam, x)
+    jac_transpose_times(g, lam, x)
     tree_solve(g, x)
     for k in range(n):
         xx[k] = x[k] * x[k]
@@ -69,33 +69,33 @@ cdef inline void squares32(const blocks_t* p, const generalized_t* g, const mass
             f[g.jidx[q]] += g.jval[q] * g.jval[q] * s
     for k in range(n):
         for q in range(mass.ptr[k], mass.ptr[k + 1]):
-            if mass.val[q] == 0.0:                      # none, beside an infinite velocity too
+            if mass.val[q] == 0.0:                      # Skip zeros: 0 times an infinite velocity is NaN.
                 continue
             s = mass.val[q] * mass.val[q]
             f[k] += s * xx[mass.idx[q]]
             if mass.idx[q] != k:
                 f[mass.idx[q]] += s * xx[k]
     for i in range(m):
-        seen = square_row(g, i, xx)
+        row_square = square_row(g, i, xx)
         soft = g.compliance[i] * lam[i]
         off[i] = 0.0
         if lam[i] != 0.0 and lam[i] != p.lower[i] and lam[i] != p.upper[i]:
             rigid |= g.compliance[i] == 0.0
-            off[i] = (seen + p.b[i] * p.b[i] + soft * soft) / (g.compliance[i] * g.compliance[i])
+            off[i] = (row_square + p.b[i] * p.b[i] + soft * soft) / (g.compliance[i] * g.compliance[i])
         target = p.b[i] + jac_row(g, i, free)
-        data[i] = seen + soft * soft + target * target
+        data[i] = row_square + soft * soft + target * target
     for k in range(n):
         xx[k] = free[k] * free[k]
     for i in range(m):
         while g.prow[panel + 1] <= i:
             panel += 1
-        unwhitened(g, panel, i, z)
+        unwhiten_row(g, panel, i, z)
         data[i] += 2.0 * square_row(g, i, xx)
         for k in range(n):
             data[i] += z[k] * z[k] * f[k]
         data[i] *= unit
         impulse[i] = velocities[i] = 0.0
-        # A_ij stands for A_ji, and is not asked for between two rows that do not push.
+        # A is symmetric, and A_ij is not needed for two rows without an impulse.
         for j in range(i + 1):
             if lam[i] == 0.0 and lam[j] == 0.0:
                 continue
@@ -109,7 +109,7 @@ cdef inline void squares32(const blocks_t* p, const generalized_t* g, const mass
 
 
 cdef inline double relative_size(const blocks_t* p, int32_t island, const double* square, double e0, double v0) noexcept nogil:
-    """Changes of w over an island relative to E0 and V0, from their squares (m); island -1: over all rows."""
+    """Return the size of changes of w over an island relative to E0 and V0, from their squares (m); island -1 is all rows."""
     cdef int32_t a, i, k, first = 0, end = p.n_blocks
     cdef const int32_t* order = NULL
     cdef double energy = 0.0, velocity = 0.0, v, own = 0.0
@@ -123,21 +123,21 @@ cdef inline double relative_size(const blocks_t* p, int32_t island, const double
             if not v <= velocity:
                 velocity = v
             v = sqrt(square[k])
-            if v > own * fabs(p.b[k]):                  # each row beside its own terms
+            if v > own * fabs(p.b[k]):                  # relative to the row's own terms
                 own = v / fabs(p.b[k]) if p.b[k] != 0.0 else 1.0 / 0.0
     return own if island >= 0 and e0 < 0.0 else relative(sqrt(energy), velocity, e0, v0)
 
 
 cdef inline bint rounds_in_float32(double residual, double floor) noexcept nogil:
-    """Whether rounding to float32 explains a relative residual: its floor is a root of squares, so four times that."""
+    """Return whether rounding to float32 explains a relative residual: at most four times the root-mean-square floor."""
     return residual <= 4.0 * floor < 1.0 / 0.0 and residual < 1.0
 
 
 cdef inline double floor_in_float32(const blocks_t* p, const double* square, const score_t* s, double now, double e0, double v0,
                                     double* above) noexcept nogil:
-    """The floor of float32 of a pass, with islands of the one with the largest residual; `above`: as `above_floor_of`.
+    """Return the float32 floor of a pass; with islands, that of the island with the largest residual.
 
-    With islands s.by_island must hold the relative residual of each.
+    `above` receives the counterpart of `above_floor_of`. With islands, s.by_island must hold the relative residuals.
     """
     cdef int32_t i
     cdef double floor, worst = 0.0, own

@@ -1,15 +1,15 @@
-"""Scores of an impulse: norms of the rows' errors, their round-off limits, and both relative to the zero impulse.
+"""Scores of an impulse: norms of the errors of its rows, their round-off floors, and both relative to the zero impulse.
 
     E   = sqrt(sum d e^2)                       [sqrt J]
-    V   = max sqrt(nu d) |e|                    [m/s], |e| the pair's norm on tangents
+    V   = max sqrt(nu d) |e|                    [m/s], |e| is the norm of the pair on tangents
     relative = max(E / E0, V / V0)              E0, V0 of the zero impulse (reference.pxd)         (1)
 
-With several islands (1) is the largest of all islands, E, V, E0, V0 of each taken over its own rows, and so is the floor.
+With several islands (1) is the maximum over the islands, with E, V, E0, V0 over the rows of each island; so is the floor.
 The judge, the stopping test of sweeps and warm starts use these functions, and Newton's refinement uses (1).
 """
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.parts cimport blocks_t
+from lavender_ext.core.block_types cimport blocks_t
 
 
 cdef struct score_t:
@@ -17,69 +17,69 @@ cdef struct score_t:
     double velocity             # m/s
     double floor_energy         # sqrt J
     double floor_velocity       # m/s
-    int32_t worst               # row of the largest velocity error, -1 where there is none
-    int32_t finite              # 0 where e holds a NaN or an infinity
-    int32_t island              # with islands: the one with the largest relative residual; -1 without
+    int32_t worst               # row of the largest velocity error, -1 without rows
+    int32_t finite              # 0 if e holds a NaN or an infinity
+    int32_t island              # with islands: island with the largest relative residual; -1 without
     double relative             # with islands: (1), infinite if a slack or an error is not finite; -1 without
     double floor                # with islands: floor of `island`, as a relative residual
-    double above_floor          # with islands: largest (1) of those not at their floor
-    double* by_island           # NULL, or (n, 2): takes (1) and E of each island
+    double above_floor          # with islands: largest (1) over the islands that are not at their floor
+    double* by_island           # NULL, or (n, 2): receives (1) and E of each island
 
 
 cdef inline score_t new_score() noexcept nogil:
-    """The score of a problem without rows."""
+    """Return the score of a problem without rows."""
     return score_t(0.0, 0.0, 0.0, 0.0, -1, 1, -1, -1.0, 0.0, 0.0, NULL)
 
 
 cdef inline double unit_roundoff() noexcept nogil:
-    """2^-53: the largest relative error of one operation."""
+    """Return 2^-53, the largest relative rounding error of one operation."""
     return 1.1102230246251565e-16
 
 
 cdef inline int32_t are_numbers(const double* x, int32_t n) noexcept nogil:
-    """Does x hold neither NaN nor infinity? A slack that overflows has lost its sign, and a bound would hide it."""
+    """Return whether x holds neither NaN nor infinity. A bound can hide an overflowed slack, whose sign is meaningless."""
     cdef int32_t i
-    cdef double s = 0.0                                 # stays 0, or becomes NaN
+    cdef double s = 0.0                                 # This stays 0, or becomes NaN.
     for i in range(n):
         s += 0.0 * x[i]
     return s == 0.0
 
 
 cdef inline double ratio(double x, double reference) noexcept nogil:
-    """0 where x is, inf where x is not finite or has nothing to be compared with."""
+    """Return x / reference: 0 if x is 0, inf if x is not finite or the reference is not positive."""
     if x == 0.0:
         return 0.0
     return x / reference if x < 1.0 / 0.0 and reference > 0.0 else 1.0 / 0.0
 
 
 cdef inline double relative(double energy, double velocity, double reference_energy, double reference_velocity) noexcept nogil:
-    """(1)"""
+    """Return the relative residual (1)."""
     cdef double x = ratio(energy, reference_energy), y = ratio(velocity, reference_velocity)
     return x if x > y else y
 
 
 cdef inline bint hides(double floor) noexcept nogil:
-    """Whether rounding hides a thousandth of what doing nothing leaves: then the floor is the residual."""
+    """Return whether the floor is at least a thousandth of the zero impulse's error; it then replaces the residual."""
     return floor >= 1e-3
 
 
 cdef inline bint is_at_floor(double relative, double floor) noexcept nogil:
-    """Whether a relative residual is within twice its floor, and at most 1e-5; no floor hides it (`hides`).
+    """Return whether a relative residual is at most twice its floor and at most 1e-5, and the floor does not hide it.
 
-    The floor grows with the impulse, so one that runs away, as where there is no solution, excuses any residual: it
-    says nothing of the problem. At 1e-5 A lambda is made of terms 1e11 times as large as what they leave, or what
-    float64 makes of M^-1 J^T lambda is off by as much, as with an M of condition 1e12 (judge/refine.pxd).
+    The floor grows with the impulse. The floor of a diverging impulse, as in a problem without a solution, would therefore
+    explain any residual. At a residual of 1e-5 the terms of A lambda are 1e11 times as large as their sum, or M^-1 J^T lambda
+    in float64 has an equally large relative error, as with an M of condition 1e12 (judge/refine.pxd).
     """
     return relative <= 2.0 * floor and relative <= 1e-5 and not hides(floor)
 
 
 cdef inline double above_floor(double relative, double floor) noexcept nogil:
-    """0 if rounding explains a relative residual (`is_at_floor`), else that residual."""
+    """Return 0 if rounding explains a relative residual (`is_at_floor`), otherwise that residual."""
     return 0.0 if is_at_floor(relative, floor) else relative
 
 
 cdef inline void smallest_reference(const blocks_t* p, double* energy, double* velocity) noexcept nogil:
-    """Replace E0 and V0 of all rows by the smallest of an island, for estimates over all rows that no island may exceed."""
+    """Replace E0 and V0 of all rows by the smallest of any island, for estimates over all rows that must hold in each island."""
     cdef const double* own
     cdef int32_t i
     if p.islands == NULL:

@@ -1,37 +1,41 @@
-"""Sums over the errors of blocks and over what rounding leaves of them, island by island: how a `score_t` is made."""
+"""Sums and maxima over the errors of blocks and over their rounding, island by island, from which a `score_t` is computed."""
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
 
 from lavender_ext.core.block cimport block_error, length
-from lavender_ext.core.parts cimport CONE, blocks_t, disk_of, groups_of, is_disk, is_rows, parts_of, parts_t
+from lavender_ext.core.block_types cimport (CONE, blocks_t, disk_of, get_row_groups, is_disk, is_rows,
+                                            get_friction_components, friction_components_t)
 from lavender_ext.judge.score cimport above_floor, hides, is_at_floor, ratio, relative, score_t, unit_roundoff
 
 
 cdef struct tally_t:
     double energy               # sum (d e) e
     double fast                 # max (d e) (nu e)
-    int32_t worst
+    int32_t worst               # row of the maximum, -1 without rows
 
 
-cdef struct floor_t:            # of F, what rounding leaves of a slack
+cdef struct floor_t:            # norms of F, the rounding of a slack
     double energy               # sum (F / d) F
     double fast                 # max nu (F / d) F
-    double own                  # max F / |b|, with islands, of a contact's rows over b of its normal
+    double own                  # with islands: max F / |b|; rows of a contact use b of its normal
 
 
 cdef inline int32_t block_at(const int32_t* order, int32_t a) noexcept nogil:
-    """Block number `a` of a list; NULL: of all blocks."""
+    """Return entry `a` of a list of blocks; a NULL list means all blocks."""
     return a if order == NULL else order[a]
 
 
 cdef inline double ratio_by_row(double size, double own, double scale) noexcept nogil:
-    """Size of an error [m/s] over the row's own terms; without these sqrt(d) |e| over the E0 of all rows (scale)."""
+    """Return the size of an error [m/s] over the terms of its row; if these are 0, `scale`: sqrt(d) |e| over E0 of all rows."""
     return ratio(size, own) if own > 0.0 or size == 0.0 else scale
 
 
 cdef inline double relative_by_rows(const blocks_t* p, const int32_t* order, int32_t first, int32_t end, const double* e,
-                                    double whole) noexcept nogil:
-    """(3) of judge/reference.pxd over blocks order[first:end]; order NULL: blocks first to end. whole: E0 of all rows."""
+                                    double total_energy) noexcept nogil:
+    """Return (3) of judge/reference.pxd over blocks order[first:end]; if order is NULL, over blocks [first, end).
+
+    total_energy is E0 of all rows.
+    """
     cdef int32_t a, i, j, k
     cdef double r, worst = 0.0, s
     for a in range(first, end):
@@ -39,18 +43,19 @@ cdef inline double relative_by_rows(const blocks_t* p, const int32_t* order, int
         j = p.ptr[i]
         if is_rows(p, i):
             for k in range(j, p.ptr[i + 1]):
-                r = ratio_by_row(p.d[k] * fabs(e[k]), fabs(p.b[k]), ratio(sqrt(p.d[k]) * fabs(e[k]), whole))
+                r = ratio_by_row(p.d[k] * fabs(e[k]), fabs(p.b[k]), ratio(sqrt(p.d[k]) * fabs(e[k]), total_energy))
                 worst = r if r > worst else worst
             continue
         s = 0.0
         for k in range(j, p.ptr[i + 1]):
             s += (p.d[k] * e[k]) * e[k]
-        r = ratio_by_row(sqrt(p.d[j]) * sqrt(s), fabs(p.b[j]), ratio(sqrt(s), whole))
+        r = ratio_by_row(sqrt(p.d[j]) * sqrt(s), fabs(p.b[j]), ratio(sqrt(s), total_energy))
         worst = r if r > worst else worst
     return worst
 
 
-cdef inline tally_t nothing() noexcept nogil:
+cdef inline tally_t empty_tally() noexcept nogil:
+    """Return the tally of no rows."""
     cdef tally_t s
     s.energy = 0.0
     s.fast = -1.0
@@ -59,6 +64,7 @@ cdef inline tally_t nothing() noexcept nogil:
 
 
 cdef inline void tally_row(const blocks_t* p, int32_t k, double e, tally_t* s) noexcept nogil:
+    """Add the error e of row k."""
     cdef double v = p.d[k] * e, t = v * (p.nu[k] * e)
     s.energy += v * e
     if t > s.fast:
@@ -67,7 +73,7 @@ cdef inline void tally_row(const blocks_t* p, int32_t k, double e, tally_t* s) n
 
 
 cdef inline void tally_pair(const blocks_t* p, int32_t k, const double* e, tally_t* s) noexcept nogil:
-    # Rows k, k + 1, by the norm of the two in the maximum.
+    """Add the errors of rows k and k + 1; the maximum is over the norm of the two."""
     cdef double x = p.d[k] * e[k], y = p.d[k] * e[k + 1]
     s.energy += x * e[k] + y * e[k + 1]
     x = x * (p.nu[k] * e[k]) + y * (p.nu[k] * e[k + 1])
@@ -77,17 +83,18 @@ cdef inline void tally_pair(const blocks_t* p, int32_t k, const double* e, tally
 
 
 cdef inline void tally_block(const blocks_t* p, int32_t i, const double* e, tally_t* s) noexcept nogil:
+    """Add the errors of block i; e (m) is the error of all rows."""
     cdef int32_t k, g, j = p.ptr[i]
-    cdef parts_t q
+    cdef friction_components_t q
     if is_rows(p, i):
         for k in range(j, p.ptr[i + 1]):
             tally_row(p, k, e[k], s)
         return
     tally_row(p, j, e[j], s)
-    if is_disk(p, i):                                   # compiled apart
+    if is_disk(p, i):                                   # the common case, compiled with constant sizes
         tally_pair(p, j + 1, e, s)
         return
-    groups_of(p, i, &q)
+    get_row_groups(p, i, &q)
     for g in range(q.n):
         if q.size[g] == 2:
             tally_pair(p, j + q.first[g], e, s)
@@ -95,8 +102,8 @@ cdef inline void tally_block(const blocks_t* p, int32_t i, const double* e, tall
             tally_row(p, j + q.first[g], e[j + q.first[g]], s)
 
 
-cdef inline int32_t lost_row(const double* e, int32_t m) noexcept nogil:
-    """The first row whose error is no number, or -1."""
+cdef inline int32_t first_nonfinite_row(const double* e, int32_t m) noexcept nogil:
+    """Return the first row whose error is not finite, or -1."""
     cdef int32_t i
     for i in range(m):
         if not fabs(e[i]) < 1.0 / 0.0:
@@ -105,23 +112,23 @@ cdef inline int32_t lost_row(const double* e, int32_t m) noexcept nogil:
 
 
 cdef inline void score_from(const blocks_t* p, const double* e, const tally_t* s, score_t* out) noexcept nogil:
-    """The two sums over e (m); the floor entries are left alone."""
+    """Write the norms of e (m) to the score; the floor entries are not changed."""
     out.energy = sqrt(s.energy)
     out.velocity = sqrt(s.fast) if s.fast > 0.0 else 0.0
     out.worst = s.worst
     out.finite = out.energy + out.velocity < 1.0 / 0.0
     if not out.finite:
         out.velocity = 1.0 / 0.0
-        out.worst = lost_row(e, p.n_rows)
+        out.worst = first_nonfinite_row(e, p.n_rows)
         if out.worst < 0:
             out.worst = s.worst
 
 
 cdef inline void norms_of_rhs(const blocks_t* p, double* energy, double* velocity) noexcept nogil:
-    """sqrt(sum b^2 / d) and max |b| sqrt(nu / d), of two rows of a part by their norm."""
+    """Compute sqrt(sum b^2 / d) and max |b| sqrt(nu / d); two rows of a group count by their norm."""
     cdef int32_t i, j, k, g
     cdef double t, pair, sum_ = 0.0, fast = 0.0
-    cdef parts_t q
+    cdef friction_components_t q
     for i in range(p.n_blocks):
         j = p.ptr[i]
         for k in range(j, p.ptr[i + 1]):
@@ -130,7 +137,7 @@ cdef inline void norms_of_rhs(const blocks_t* p, double* energy, double* velocit
             t = t * p.nu[k]
             if t > fast:
                 fast = t
-        groups_of(p, i, &q)
+        get_row_groups(p, i, &q)
         for g in range(q.n):
             if q.size[g] == 2:
                 k = j + q.first[g]
@@ -143,16 +150,17 @@ cdef inline void norms_of_rhs(const blocks_t* p, double* energy, double* velocit
 
 
 cdef inline floor_t no_floor() noexcept nogil:
+    """Return the floor of no rows."""
     return floor_t(0.0, 0.0, 0.0)
 
 
 cdef inline double row_rounding(const blocks_t* p, int32_t k, double size) noexcept nogil:
-    """F_k: rounding of the slack of row k, size = (|A| |lam|)_k."""
+    """Return F_k, the rounding of the slack of row k, with size = (|A| |lam|)_k."""
     return unit_roundoff() * (size + fabs(p.b[k]))
 
 
 cdef inline void add_floor(const blocks_t* p, int32_t k, int32_t first, double f, floor_t* s) noexcept nogil:
-    """Add the rounding f of the slack of row k to the floor; first: the normal of a contact, else k."""
+    """Add the rounding f of the slack of row k to the floor; `first` is the normal of a contact, otherwise k."""
     cdef double t = f / p.d[k]
     s.energy += t * f
     t = p.nu[k] * t * f
@@ -165,58 +173,59 @@ cdef inline void add_floor(const blocks_t* p, int32_t k, int32_t first, double f
 
 
 cdef inline void add_row_floor(const blocks_t* p, int32_t k, double lam, double w, double size, floor_t* s) noexcept nogil:
-    """Add the rounding of the bounded row k, unless its slack holds it at a bound by more than that: its error is then 0."""
+    """Add the rounding of the bounded row k, unless its slack exceeds it and keeps the row at a bound: its error is then 0."""
     cdef double f = row_rounding(p, k, size)
-    # without branches: which rows are held is hard to predict
-    cdef bint held = ((lam == p.lower[k]) & (w > f)) | ((lam == p.upper[k]) & (-w > f))
-    add_floor(p, k, k, 0.0 if held else f, s)
+    # Without branches, because active rows are hard to predict.
+    cdef bint is_active = ((lam == p.lower[k]) & (w > f)) | ((lam == p.upper[k]) & (-w > f))
+    add_floor(p, k, k, 0.0 if is_active else f, s)
 
 
 cdef inline bint holds_at_zero(const blocks_t* p, int32_t i, const double* lam, const double* w, const double* size) noexcept nogil:
-    """Whether contact i has no impulse, and its slack keeps it there by more than rounding: its error is then 0."""
+    """Return whether contact i has no impulse and its slack is positive beyond rounding: its error is then 0."""
     cdef int32_t k, g, j = p.ptr[i], n = p.ptr[i + 1] - j
     cdef double gap = w[j], rounding
-    cdef parts_t q
+    cdef friction_components_t q
     for k in range(n):
         if lam[j + k] != 0.0:
             return False
     rounding = row_rounding(p, j, size[0])
     if p.law == CONE:
-        parts_of(p, i, &q)
+        get_friction_components(p, i, &q)
         for g in range(q.n):
-            gap -= q.reach[g] * length(w + j + q.first[g], q.size[g])
+            gap -= q.friction_coefficient[g] * length(w + j + q.first[g], q.size[g])
             for k in range(q.first[g], q.first[g] + q.size[g]):
-                rounding += q.reach[g] * row_rounding(p, j + k, size[k])
+                rounding += q.friction_coefficient[g] * row_rounding(p, j + k, size[k])
     return gap > rounding
 
 
 cdef inline void add_block_floor(const blocks_t* p, int32_t i, const double* lam, const double* w, const double* e,
                                  const double* size, floor_t* s) noexcept nogil:
-    """Add the rounding of a block's rows, of those whose error it changes; size from its first row on, at least |A_kk| |lam_k|.
+    """Add the rounding of the rows of block i to the floor, for the rows whose error it changes.
 
-    If the norm of two rows is cut to its bound, e = lam - Pi has the rounding of lam itself, (2^-53 |lam_k|) d_k as a
-    velocity; d_k, of both rows, may be far above A_kk.
+    size begins at the first row of the block and is at least |A_kk| |lam_k|. If the norm of two rows is projected to its
+    bound, e = lam - Pi also has the rounding of lam, (2^-53 |lam_k|) d_k as a velocity; the common d_k of both rows may be
+    far above A_kk.
     """
     cdef int32_t k, g, j = p.ptr[i], n = p.ptr[i + 1] - j
-    cdef parts_t q
+    cdef friction_components_t q
     cdef double x, own
-    cdef bint held
+    cdef bint is_active
     if is_rows(p, i):
         for k in range(n):
             add_row_floor(p, j + k, lam[j + k], w[j + k], size[k], s)
         return
     if n == 1:
         x = row_rounding(p, j, size[0])
-        held = (lam[j] == 0.0) & (w[j] > x)
-        add_floor(p, j, j, 0.0 if held else x, s)
+        is_active = (lam[j] == 0.0) & (w[j] > x)
+        add_floor(p, j, j, 0.0 if is_active else x, s)
         return
     if holds_at_zero(p, i, lam, w, size):
         return
     add_floor(p, j, j, row_rounding(p, j, size[0]), s)
-    if is_disk(p, i):                                   # compiled apart
+    if is_disk(p, i):                                   # the common case, compiled with constant sizes
         disk_of(p, i, &q)
     else:
-        groups_of(p, i, &q)
+        get_row_groups(p, i, &q)
     for g in range(q.n):
         for k in range(q.first[g], q.first[g] + q.size[g]):
             x = size[k]
@@ -227,13 +236,13 @@ cdef inline void add_block_floor(const blocks_t* p, int32_t i, const double* lam
 
 
 cdef inline void floor_from(const floor_t* s, score_t* out) noexcept nogil:
-    """The floor entries of out."""
+    """Write the floor entries of the score."""
     out.floor_energy = sqrt(s.energy)
     out.floor_velocity = sqrt(s.fast)
 
 
 cdef inline int32_t begin_islands(const blocks_t* p, score_t* out) noexcept nogil:
-    """Before the first `close_island`: the number of islands."""
+    """Initialise the score before the first `close_island`; return the number of islands."""
     if p.islands == NULL:
         return 1
     out.relative = out.floor = out.above_floor = 0.0
@@ -242,16 +251,17 @@ cdef inline int32_t begin_islands(const blocks_t* p, score_t* out) noexcept nogi
 
 
 cdef inline int32_t island_begin(const blocks_t* p, int32_t island) noexcept nogil:
-    """Place in `order` of the first block of an island; without islands all blocks are one, in their order."""
+    """Return the index in `order` of the first block of an island; without islands all blocks form one."""
     return p.islands.ptr[island] if p.islands != NULL else 0
 
 
 cdef inline int32_t island_end(const blocks_t* p, int32_t island) noexcept nogil:
+    """Return one past the index in `order` of the last block of an island."""
     return p.islands.ptr[island + 1] if p.islands != NULL else p.n_blocks
 
 
 cdef inline double island_relative(const blocks_t* p, int32_t island, const double* e, const tally_t* s) noexcept nogil:
-    """(1) of one island."""
+    """Return the relative residual (1) of judge/score.pxd of one island."""
     cdef const double* reference = p.islands.reference + 2 * island
     cdef double energy = sqrt(s.energy), velocity = sqrt(s.fast) if s.fast > 0.0 else 0.0
     if not energy + velocity < 1.0 / 0.0:
@@ -263,7 +273,7 @@ cdef inline double island_relative(const blocks_t* p, int32_t island, const doub
 
 
 cdef inline double island_floor(const blocks_t* p, int32_t island, const floor_t* f) noexcept nogil:
-    """The floor of one island, as a relative residual."""
+    """Return the floor of one island as a relative residual."""
     cdef const double* reference = p.islands.reference + 2 * island
     if reference[0] < 0.0:
         return f.own
@@ -272,12 +282,12 @@ cdef inline double island_floor(const blocks_t* p, int32_t island, const floor_t
 
 cdef inline void close_island(const blocks_t* p, int32_t island, const double* w, const double* e, const tally_t* s,
                               const floor_t* f, tally_t* total, score_t* out) noexcept nogil:
-    """Add an island's sums to those of all and its (1) to the score; f NULL: without its floor.
+    """Add the sums of an island to the total and its relative residual to the score; f is NULL without a floor.
 
-    Of a problem that is one island the sums alone, from which callers make (1).
+    A problem without an islands list has only the sums, from which the caller computes the relative residual.
     """
     cdef double now, floor = 0.0
-    cdef double check = 0.0                             # stays 0, or becomes NaN
+    cdef double check = 0.0                             # This stays 0, or becomes NaN.
     cdef int32_t a, i, k
     if p.islands == NULL:
         total[0] = s[0]
@@ -306,12 +316,12 @@ cdef inline void close_island(const blocks_t* p, int32_t island, const double* w
 
 
 cdef inline void score_rows(const blocks_t* p, const double* lam, const double* w, double* e, score_t* out) noexcept nogil:
-    """Errors e (m) of all blocks and their two sums; the floor entries are left alone."""
+    """Compute the errors e (m) of all blocks and their norms; the floor entries are not changed."""
     cdef int32_t island, a, i, end, n = begin_islands(p, out)
     cdef const int32_t* order = p.islands.order if p.islands != NULL else NULL
-    cdef tally_t own, s = nothing()
+    cdef tally_t own, s = empty_tally()
     for island in range(n):
-        own = nothing()
+        own = empty_tally()
         end = island_end(p, island)
         for a in range(island_begin(p, island), end):
             i = block_at(order, a)

@@ -1,1 +1,1 @@
-"""The problem of one block solved exactly, and the sweeps that do so block by block."""
+"""Exact solution of the problem of one block, and block Gauss-Seidel sweeps."""

@@ -1,12 +1,12 @@
-"""The contact alone under Coulomb's law with each tangent bounded by itself, solved exactly: w = W lam + q.
+"""Exact solution of one contact under Coulomb's law with a separate bound on each tangent: w = W lam + q.
 
 With a, h, S, r of local/coulomb.pxd, lam_n = a - h.t and w_t = S t + r after eliminating w_n = 0:
 
     open    q_n >= 0: lam = 0                                                                     (1)
     stick   S t = -r, |t_i| <= c_i lam_n on both tangents                                         (2)
-    slip    of one or both of them t_i = s_i c_i lam_n, s_i = +-1, s_i w_i <= 0, the other as (2)  (3)
+    slip    t_i = s_i c_i lam_n, s_i = +-1, s_i w_i <= 0 on one or both tangents, the other as (2)  (3)
 
-Nine cases, each a system of at most three rows; the first that is tried is the one that (2) points at.
+There are nine cases, each a system of at most three rows. The case that the solution of (2) violates is tried first.
 """
 from libc.math cimport fabs
 from libc.stdint cimport int32_t
@@ -14,14 +14,14 @@ from libc.stdint cimport int32_t
 from lavender_ext.local.small cimport FAILED, OPEN, SLIP, STICK
 
 
-cdef inline bint keeps(double s, double x, double y, double r, double w) noexcept nogil:
-    # s w <= 0 to rounding, w = x + y + r: on the border both answers are the same
+cdef inline bint opposes_sliding(double s, double x, double y, double r, double w) noexcept nogil:
+    """Return whether s w <= 0 within rounding, w = x + y + r; at equality both cases have the same solution."""
     return s * w <= 1e-14 * (fabs(x) + fabs(y) + fabs(r))
 
 
 cdef inline bint slip_box(const double* g, double a, double h0, double h1, double r0, double r1, double c0, double c1,
                           double s0, double s1, double* lam) noexcept nogil:
-    """(3) with signs s, 0 where a tangent sticks; g of `prepare3`. False leaves lam alone."""
+    """Solve (3) for signs s (0: the tangent sticks), with g from `prepare3`; return False, lam unchanged, if it is violated."""
     cdef double u = s0 * c0, v = s1 * c1, n, x, y, det = 1.0 + h0 * u + h1 * v, b = a
     if s1 == 0.0:
         if not g[13] > 0.0:
@@ -43,12 +43,12 @@ cdef inline bint slip_box(const double* g, double a, double h0, double h1, doubl
     if s0 == 0.0:
         if fabs(x) > c0 * n:
             return False
-    elif not keeps(s0, g[10] * x, g[11] * y, r0, g[10] * x + g[11] * y + r0):
+    elif not opposes_sliding(s0, g[10] * x, g[11] * y, r0, g[10] * x + g[11] * y + r0):
         return False
     if s1 == 0.0:
         if fabs(y) > c1 * n:
             return False
-    elif not keeps(s1, g[12] * x, g[13] * y, r1, g[12] * x + g[13] * y + r1):
+    elif not opposes_sliding(s1, g[12] * x, g[13] * y, r1, g[12] * x + g[13] * y + r1):
         return False
     lam[0] = n
     lam[1] = x
@@ -57,13 +57,15 @@ cdef inline bint slip_box(const double* g, double a, double h0, double h1, doubl
 
 
 cdef inline double side(double x, double bound) noexcept nogil:
+    """Return 1 above `bound`, -1 below -`bound`, otherwise 0."""
     return 1.0 if x > bound else (-1.0 if x < -bound else 0.0)
 
 
 cdef inline int32_t box3_from(const double* g, const double* w, double c0, double c1, double* lam) noexcept nogil:
-    """lam (3) of (1)-(3) from the slack w (3) of the present lam; g of `prepare3`. FAILED leaves lam alone."""
+    """Solve (1)-(3) for lam (3) from the slack w (3) of the present lam, with g from `prepare3`; FAILED keeps lam."""
     cdef double q0, q1, q2, n, x, y, a, h0, h1, r0, r1, s0, s1, first0, first1
     cdef int32_t i
+    # open
     q0 = w[0] - (g[0] * lam[0] + g[1] * lam[1] + g[2] * lam[2])
     if q0 >= 0.0:
         lam[0] = 0.0
@@ -72,7 +74,7 @@ cdef inline int32_t box3_from(const double* g, const double* w, double c0, doubl
         return OPEN
     if not g[9] > 0.0 or not g[14] > 0.0 or not q0 < 0.0:
         return FAILED
-    # w = 0 at lam - W^-1 w
+    # sticking: w = 0 at lam - W^-1 w
     n = lam[0] - (g[16] * w[0] + g[17] * w[1] + g[18] * w[2])
     x = lam[1] - (g[19] * w[0] + g[20] * w[1] + g[21] * w[2])
     y = lam[2] - (g[22] * w[0] + g[23] * w[1] + g[24] * w[2])
@@ -87,6 +89,7 @@ cdef inline int32_t box3_from(const double* g, const double* w, double c0, doubl
     else:
         first0 = side(x, 0.0)
         first1 = side(y, 0.0)
+    # sliding: the most likely case, then all others
     q1 = w[1] - (g[3] * lam[0] + g[4] * lam[1] + g[5] * lam[2])
     q2 = w[2] - (g[6] * lam[0] + g[7] * lam[1] + g[8] * lam[2])
     a = -q0 * g[9]

@@ -1,24 +1,24 @@
-"""The contact alone under the cone law, solved exactly: w = W lam + q in K*, lam.w = 0.
+"""Exact solution of one contact under the cone law: w = W lam + q in K*, lam.w = 0.
 
-Open where q is in K*, stick as in local/coulomb.pxd (2); instead of its (3)
+The contact is open if q is in K*, and sticks as in local/coulomb.pxd (2). Instead of its (3), a sliding contact satisfies
 
     (W + beta J) lam = -q,   J = diag(-mu^2, 1, 1)
     v(beta) = -adj(W + beta J) q = det lam,  |v_t| = mu sign(det) v_n                             (1)
 
-On 0 <= beta < beta*, the positive root of det(W + beta J), W + beta J is positive definite; the sign of
-v_n at beta* says on which side of it the root of (1) with lam_n > 0 lies (W symmetric positive definite).
+W is symmetric positive definite. W + beta J is positive definite for 0 <= beta < beta*, the positive root of
+det(W + beta J). The sign of v_n at beta* determines on which side of beta* the root of (1) with lam_n > 0 lies.
 """
 from libc.math cimport fabs
 from libc.stdint cimport int32_t
 
 from lavender_ext.core.block cimport norm2
-from lavender_ext.local.coulomb cimport slides
-from lavender_ext.local.small cimport FAILED, OPEN, SLIP, STICK, bracketed, eliminate, rests
+from lavender_ext.local.coulomb cimport opposes_friction
+from lavender_ext.local.small cimport FAILED, OPEN, SLIP, STICK, newton_or_bisect, eliminate, slack_is_zero
 
 
-cdef inline int32_t on_ray(const double* W, const double* q, double mu, double s0, double s1,
+cdef inline int32_t minimize_on_ray(const double* W, const double* q, double mu, double s0, double s1,
                            double* lam) noexcept nogil:
-    # The least of the energy on lam = l (1, mu s), l > 0: lam.w = 0.
+    """Minimise the energy on the ray lam = l (1, mu s), l > 0, where lam.w = 0; FAILED if that is not a solution."""
     cdef double x0 = mu * s0, x1 = mu * s1
     cdef double n = (W[0] + (W[1] + W[3]) * x0 + (W[2] + W[6]) * x1 + W[4] * x0 * x0 + (W[5] + W[7]) * x0 * x1
                      + W[8] * x1 * x1)
@@ -29,7 +29,7 @@ cdef inline int32_t on_ray(const double* W, const double* q, double mu, double s
     y[0] = l
     y[1] = l * x0
     y[2] = l * x1
-    if not slides(W, q, s0, s1, y):
+    if not opposes_friction(W, q, s0, s1, y):
         return FAILED
     lam[0] = l
     lam[1] = y[1]
@@ -37,14 +37,14 @@ cdef inline int32_t on_ray(const double* W, const double* q, double mu, double s
     return SLIP
 
 
-cdef inline int32_t rests_singular(const double* W, const double* q, double* x) noexcept nogil:
-    # Nearly the shortest x with W x = -q, W singular: refined from W + 1e-6 diag W. 0 where there is none.
+cdef inline int32_t solve_singular(const double* W, const double* q, double* x) noexcept nogil:
+    """Compute nearly the shortest x with W x = -q for a singular W, by refinement with W + 1e-6 diag W; return 0 if none."""
     cdef double a[9]
     cdef double y[3]
-    cdef int32_t i, j, _turn
+    cdef int32_t i, j, _iteration
     for i in range(3):
         x[i] = 0.0
-    for _turn in range(4):
+    for _iteration in range(4):
         for i in range(3):
             y[i] = -q[i]
             for j in range(3):
@@ -55,17 +55,17 @@ cdef inline int32_t rests_singular(const double* W, const double* q, double* x) 
             return 0
         for i in range(3):
             x[i] += y[i]
-    return rests(3, W, q, x)
+    return slack_is_zero(3, W, q, x)
 
 
 cdef inline int32_t cone3(const double* W, const double* q, double mu, double* lam) noexcept nogil:
-    """lam (3) of (1); FAILED leaves lam alone."""
+    """Solve for lam (3); FAILED keeps lam."""
     cdef double m2 = mu * mu, d1, d2, beta, top, f, df, step, lo, hi, side, P, U, d0
     cdef double v0[3]
     cdef double v1[3]
     cdef double v2[3]
     cdef double v[3]
-    cdef int32_t _turn, k, done = 0
+    cdef int32_t _iteration, k, done = 0
     if q[0] >= mu * norm2(q[1], q[2]):
         lam[0] = 0.0
         lam[1] = 0.0
@@ -97,18 +97,18 @@ cdef inline int32_t cone3(const double* W, const double* q, double mu, double* l
     if d0 > 0.0 and v0[0] >= 0.0 and norm2(v0[1], v0[2]) <= mu * v0[0]:
         for k in range(3):
             v[k] = v0[k] / d0
-        if rests(3, W, q, v):
+        if slack_is_zero(3, W, q, v):
             for k in range(3):
                 lam[k] = v[k]
             return STICK
         return FAILED
-    if d0 <= 1e-10 * (W[0] * W[4] * W[8]) and rests_singular(W, q, v) and norm2(v[1], v[2]) <= mu * v[0]:
+    if d0 <= 1e-10 * (W[0] * W[4] * W[8]) and solve_singular(W, q, v) and norm2(v[1], v[2]) <= mu * v[0]:
         for k in range(3):
             lam[k] = v[k]
         return STICK
-    # beta*: Newton from the right of every root falls onto the largest.
+    # beta*: Newton's method from the right of all roots converges to the largest.
     top = W[0] / m2
-    for _turn in range(60):
+    for _iteration in range(60):
         f = d0 + top * (d1 + top * (d2 - m2 * top))
         df = d1 + top * (2.0 * d2 - 3.0 * m2 * top)
         if not f < 0.0 or not df < 0.0:
@@ -125,7 +125,7 @@ cdef inline int32_t cone3(const double* W, const double* q, double mu, double* l
     lo = 0.0 if side > 0.0 else top
     hi = top if side > 0.0 else -1.0
     beta = 0.5 * top if side > 0.0 else 2.0 * top
-    for _turn in range(200):
+    for _iteration in range(200):
         for k in range(3):
             v[k] = v0[k] + beta * (v1[k] + beta * v2[k])
         U = norm2(v[1], v[2])
@@ -141,15 +141,15 @@ cdef inline int32_t cone3(const double* W, const double* q, double mu, double* l
               - side * mu * (v1[0] + 2.0 * beta * v2[0]))
         step = f / df
         done = fabs(f) <= 1e-8 * U and fabs(step) <= 1e-7 * beta
-        beta = bracketed(beta, step, lo, hi, &done)
+        beta = newton_or_bisect(beta, step, lo, hi, &done)
     if not U > 0.0 or not done:
         return FAILED
     U = side / U
-    return on_ray(W, q, mu, v[1] * U, v[2] * U, lam)
+    return minimize_on_ray(W, q, mu, v[1] * U, v[2] * U, lam)
 
 
 cdef inline int32_t cone2(const double* W, const double* q, double mu, double* lam) noexcept nogil:
-    """One tangent under the cone law, in closed form; W (2, 2)."""
+    """Solve a contact with one tangent under the cone law in closed form; W (2, 2)."""
     cdef double det, n, t, s, l
     cdef double y[2]
     cdef int32_t _side
@@ -163,7 +163,7 @@ cdef inline int32_t cone2(const double* W, const double* q, double mu, double* l
     if det > 0.0 and n >= 0.0 and fabs(t) <= mu * n:
         y[0] = n / det
         y[1] = t / det
-        if rests(2, W, q, y):
+        if slack_is_zero(2, W, q, y):
             lam[0] = y[0]
             lam[1] = y[1]
             return STICK

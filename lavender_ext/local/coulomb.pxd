@@ -1,4 +1,4 @@
-"""The contact alone under Coulomb's law, solved exactly: w = W lam + q with the other blocks held still.
+"""Exact solution of one contact under Coulomb's law: w = W lam + q with the other blocks fixed.
 
 A contact (normal, tangents) with a = -q_n / W_nn, h = W_nt / W_nn, S = W_tt - W_tn h, r = q_t + W_tn a, after
 eliminating w_n = 0:
@@ -11,21 +11,21 @@ With Delta = det(S + beta), u = -adj(S + beta) r = Delta lam_t, (3) is the scala
 
     mu (a Delta(beta) - h.u(beta)) = |u(beta)|                                                    (4)
 
-negative on the left minus right at beta = 0 where (2) fails, positive at infinity, so a bracket is at
-hand whenever Delta > 0 between; for S = s I Newton on the quotient of both sides is exact in one step.
+The left side minus the right side is negative at beta = 0 if (2) fails, and positive at infinity, which is a bracket if
+Delta > 0 in between. For S = s I one step of Newton's method on the quotient of both sides is exact.
 """
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
 
-from lavender_ext.local.small cimport FAILED, OPEN, SLIP, STICK, bracketed
+from lavender_ext.local.small cimport FAILED, OPEN, SLIP, STICK, newton_or_bisect
 
 
 cdef enum:
-    PREPARED = 25               # doubles of a prepared 3x3 block
+    PREPARED = 25               # number of doubles of a prepared 3x3 block
 
 
 cdef inline void prepare3(const double* W, double* g) noexcept nogil:
-    """g (25): W row by row, 1 / W_nn (0: not positive), S row by row, det S (0: singular), 0, W^-1 where det S > 0."""
+    """Compute g (25): W, 1 / W_nn (0 if not positive), S, det S (0 if singular), 0, and W^-1 if det S > 0; row by row."""
     cdef double h0, h1, k0, k1, inv, det, size, t00, t01, t10, t11
     cdef int32_t i
     for i in range(9):
@@ -43,12 +43,12 @@ cdef inline void prepare3(const double* W, double* g) noexcept nogil:
     g[12] = W[7] - W[6] * h0
     g[13] = W[8] - W[6] * h1
     det = g[10] * g[13] - g[11] * g[12]
-    # S is a difference: below 1e-14 of what was subtracted nothing of its determinant is left.
+    # S is a difference of terms; a determinant below 1e-14 times their squared size is rounding.
     size = fabs(W[4]) + fabs(W[8]) + fabs(W[3] * h0) + fabs(W[6] * h1)
     g[14] = det if fabs(det) > 1e-14 * size * size else 0.0
     if not g[14] > 0.0:
         return
-    # T = S^-1 stands in the corner of W^-1.
+    # T = S^-1 is the tangential block of W^-1.
     det = 1.0 / det
     t00 = g[13] * det
     t01 = -g[11] * det
@@ -67,8 +67,8 @@ cdef inline void prepare3(const double* W, double* g) noexcept nogil:
     g[16] = inv - (h0 * g[19] + h1 * g[22])
 
 
-cdef inline int32_t slides(const double* W, const double* q, double x0, double x1, const double* lam) noexcept nogil:
-    # w_t against the direction x of the friction: what cancellation may have spoiled where W is nearly singular.
+cdef inline int32_t opposes_friction(const double* W, const double* q, double x0, double x1, const double* lam) noexcept nogil:
+    """Return whether w_t opposes the friction direction x within rounding; cancellation may break this for a singular W."""
     cdef double a = W[3] * lam[0], b = W[6] * lam[0], w0, w1, size
     size = fabs(a) + fabs(b) + fabs(q[1]) + fabs(q[2])
     w0 = a + q[1] + W[4] * lam[1] + W[5] * lam[2]
@@ -79,11 +79,11 @@ cdef inline int32_t slides(const double* W, const double* q, double x0, double x
 
 
 cdef inline int32_t coulomb3(const double* g, const double* q, double mu, double beta, double* lam) noexcept nogil:
-    """lam (3) of (1)-(4); `beta` is a guess of the slip's, 0 for none. FAILED leaves lam alone."""
+    """Solve (1)-(4) for lam (3), with a guess `beta` for slip (0: none); FAILED keeps lam."""
     cdef double a, h0, h1, r0, r1, u0, u1, x0, x1, det, tr, hr, delta, n, P, U, U2, f, step, lo = 0.0, hi = -1.0
     cdef double hu, size
     cdef double y[3]
-    cdef int32_t i, _turn, done = 0
+    cdef int32_t i, _iteration, done = 0
     if q[0] >= 0.0:
         lam[0] = 0.0
         lam[1] = 0.0
@@ -134,17 +134,17 @@ cdef inline int32_t coulomb3(const double* g, const double* q, double mu, double
         if det < 0.0:
             det = 0.0
     else:
-        # Delta changes its sign at the positive root: look to the right of it.
+        # Delta changes its sign at the positive root; search to the right of it.
         lo = -0.5 * tr + sqrt(0.25 * tr * tr - det)
     hr = h0 * r0 + h1 * r1
     if not beta > lo:
-        # The root if S were (tr / 2) I.
+        # initial guess: the root for S = (tr / 2) I
         beta = (sqrt(r0 * r0 + r1 * r1) - mu * hr) / (mu * a) - 0.5 * tr
         if not beta > lo:
             beta = lo + 1e-3 * (fabs(tr) + lo)
             if not beta > 0.0:
                 return FAILED
-    for _turn in range(100):
+    for _iteration in range(100):
         delta = det + beta * (tr + beta)
         x0 = u0 - beta * r0
         x1 = u1 - beta * r1
@@ -164,9 +164,9 @@ cdef inline int32_t coulomb3(const double* g, const double* q, double mu, double
             hi = beta
         # Newton on P / U - 1: P' = mu (a (tr + 2 beta) + h.r), U' = -x.r / U
         step = f * U2 / (mu * (a * (tr + 2.0 * beta) + hr) * U2 + P * (x0 * r0 + x1 * r1))
-        # Quadratic convergence: the next point is exact to rounding.
+        # Convergence is quadratic: the next point is exact within rounding.
         done = fabs(f) <= 1e-8 * U and fabs(step) <= 1e-7 * beta
-        beta = bracketed(beta, step, lo, hi, &done)
+        beta = newton_or_bisect(beta, step, lo, hi, &done)
     n = U + mu * hu
     if not n > 0.0 or not a / n < 1.0 / 0.0 or not done:
         return FAILED
@@ -174,7 +174,7 @@ cdef inline int32_t coulomb3(const double* g, const double* q, double mu, double
     y[0] = n * U
     y[1] = mu * n * x0
     y[2] = mu * n * x1
-    if not slides(g, q, x0, x1, y):
+    if not opposes_friction(g, q, x0, x1, y):
         return FAILED
     for i in range(3):
         lam[i] = y[i]
@@ -182,7 +182,7 @@ cdef inline int32_t coulomb3(const double* g, const double* q, double mu, double
 
 
 cdef inline int32_t coulomb3_from(const double* g, const double* w, double mu, double* lam) noexcept nogil:
-    """The same from the slack w (3) of the present lam: open and sticking contacts by products alone."""
+    """Solve for lam (3) from the slack w (3) of the present lam; open and sticking contacts need only products."""
     cdef double q[3]
     cdef double n, x, y, s, f
     q[0] = w[0] - (g[0] * lam[0] + g[1] * lam[1] + g[2] * lam[2])
@@ -203,14 +203,14 @@ cdef inline int32_t coulomb3_from(const double* g, const double* w, double mu, d
             return STICK
     q[1] = w[1] - (g[3] * lam[0] + g[4] * lam[1] + g[5] * lam[2])
     q[2] = w[2] - (g[6] * lam[0] + g[7] * lam[1] + g[8] * lam[2])
-    # Sliding as now would need beta = |w_t| / |lam_t|.
+    # guess: beta = |w_t| / |lam_t| of the present sliding
     s = lam[1] * lam[1] + lam[2] * lam[2]
     f = -(w[1] * lam[1] + w[2] * lam[2])
     return coulomb3(g, q, mu, f / s if s > 0.0 and f > 0.0 else 0.0, lam)
 
 
 cdef inline int32_t coulomb2(const double* W, const double* q, double mu, double* lam) noexcept nogil:
-    """One tangent: (1)-(3) in closed form; W (2, 2)."""
+    """Solve (1)-(3) for a contact with one tangent in closed form; W (2, 2)."""
     cdef double a, h, s, r, n, t, det
     cdef int32_t _side
     if q[0] >= 0.0:

@@ -1,28 +1,28 @@
-"""The problem of one block alone, solved exactly: w = W lam + q with the other blocks held still.
+"""Exact solution of the problem of one block: w = W lam + q with the other blocks fixed.
 
-W is the block's own part of A, any 1x1 to 8x8, not necessarily symmetric. A contact of one part is that of
+W is the diagonal block of A, 1x1 to 8x8, not necessarily symmetric. A contact with one friction component is solved by
 local/coulomb.pxd or local/cone.pxd.
 
-A second part of one row s, its reach a: either w_s = 0, and lam_s is eliminated; or lam_s = +-a lam_n, and its column
-(cone: and row) is added to the normal's. Three problems of one part; the one whose answer keeps the bound is the answer.
-Any other parts: local/parts.pxd.
+If there is a second component of one row s with friction coefficient a, either w_s = 0 and lam_s is eliminated, or
+lam_s = +-a lam_n and its column (cone law: also its row) is added to that of the normal. These are three problems with one
+component; the solution is the one that satisfies the bound of row s. All other contacts: local/friction_components.pxd.
 
-Several rows: boxed complementarity by principal pivoting.
+Blocks of bounded rows are box-constrained complementarity problems, solved by principal pivoting.
 """
 from libc.math cimport fabs
 from libc.stdint cimport int32_t
 
 from lavender_ext.core.block cimport clip, cone_error, relax_normal, relax_row, relax_tangents, round_error
-from lavender_ext.core.parts cimport CONE, parts_t
+from lavender_ext.core.block_types cimport CONE, friction_components_t
 from lavender_ext.local.cone cimport cone2, cone3
 from lavender_ext.local.coulomb cimport PREPARED, coulomb2, coulomb3, prepare3
-from lavender_ext.local.parts cimport contact_of_parts
+from lavender_ext.local.friction_components cimport solve_contact_newton
 from lavender_ext.local.small cimport FAILED, MAX_ROWS, OPEN, STICK, eliminate
 
 
-cdef inline int32_t contact_of_one(int32_t law, int32_t nt, const double* W, const double* q, double mu,
+cdef inline int32_t solve_one_component(int32_t law, int32_t nt, const double* W, const double* q, double mu,
                                    double* lam) noexcept nogil:
-    """lam (1 + nt), of a part of one or two rows; W (1 + nt, 1 + nt)."""
+    """Solve a contact with one component of nt = 1 or 2 rows for lam (1 + nt); W (1 + nt, 1 + nt)."""
     cdef double g[PREPARED]
     if nt == 1:
         return cone2(W, q, mu, lam) if law == CONE else coulomb2(W, q, mu, lam)
@@ -32,15 +32,15 @@ cdef inline int32_t contact_of_one(int32_t law, int32_t nt, const double* W, con
     return coulomb3(g, q, mu, 0.0, lam)
 
 
-cdef inline int32_t contact_of_two(int32_t law, int32_t nt, const double* W, const double* q, double mu, double bound,
+cdef inline int32_t solve_two_components(int32_t law, int32_t nt, const double* W, const double* q, double mu, double bound,
                                    double* lam) noexcept nogil:
-    """lam (2 + nt), the second part last, its reach in `bound`; W (2 + nt, 2 + nt)."""
+    """Solve for lam (2 + nt); the second component is the last row, with friction coefficient `bound`; W (2 + nt, 2 + nt)."""
     cdef double w[9]
     cdef double c[3]
     cdef double x[3]
     cdef double s, ws, y, size
     cdef int32_t n = 1 + nt, m = 2 + nt, i, j, k, trial, found
-    # The first guess is what the block did last: sliding at a bound, or held.
+    # The first case is that of the present impulse: sliding at a bound, or sticking.
     s = 1.0 if lam[n] >= bound * lam[0] else (-1.0 if lam[n] <= -bound * lam[0] else 0.0)
     for trial in range(3):
         if trial > 0:
@@ -59,7 +59,7 @@ cdef inline int32_t contact_of_two(int32_t law, int32_t nt, const double* W, con
             for j in range(n):
                 w[j] += s * bound * W[m * n + j]
             w[0] += bound * bound * W[m * n + n]
-        found = contact_of_one(law, nt, w, c, mu, x)
+        found = solve_one_component(law, nt, w, c, mu, x)
         if found == FAILED:
             continue
         ws = q[n]
@@ -69,7 +69,7 @@ cdef inline int32_t contact_of_two(int32_t law, int32_t nt, const double* W, con
             size += fabs(W[m * n + j] * x[j])
         if s == 0.0:
             y = -ws / W[m * n + n]
-            # Rounding decides on the border, where both answers are the same.
+            # At the bound both cases have the same solution, and rounding decides.
             if fabs(y) > bound * x[0] + 1e-14 * size / W[m * n + n]:
                 continue
             y = clip(y, -bound * x[0], bound * x[0])
@@ -87,6 +87,7 @@ cdef inline int32_t contact_of_two(int32_t law, int32_t nt, const double* W, con
 
 
 cdef inline void local_slack(int32_t m, const double* W, const double* q, const double* lam, double* w) noexcept nogil:
+    """Compute w (m) = W lam + q."""
     cdef int32_t i, j
     for i in range(m):
         w[i] = q[i]
@@ -94,19 +95,19 @@ cdef inline void local_slack(int32_t m, const double* W, const double* q, const 
             w[i] += W[m * i + j] * lam[j]
 
 
-cdef inline int32_t exact_contact(int32_t law, int32_t m, const double* W, const double* q, const double* d,
-                                  const parts_t* part, double* lam) noexcept nogil:
-    """lam (m) of a contact with parts, the present one before; FAILED where no exact answer is found."""
+cdef inline int32_t solve_contact(int32_t law, int32_t m, const double* W, const double* q, const double* d,
+                                  const friction_components_t* part, double* lam) noexcept nogil:
+    """Solve a contact with friction components for lam (m), starting from the present lam; FAILED if no solution is found."""
     if part.n == 1 and part.size[0] <= 2:
-        return contact_of_one(law, part.size[0], W, q, part.reach[0], lam)
+        return solve_one_component(law, part.size[0], W, q, part.friction_coefficient[0], lam)
     if part.n == 2 and part.size[1] == 1:
-        return contact_of_two(law, part.size[0], W, q, part.reach[0], part.reach[1], lam)
-    return contact_of_parts(law, m, W, q, d, part, lam)
+        return solve_two_components(law, part.size[0], W, q, part.friction_coefficient[0], part.friction_coefficient[1], lam)
+    return solve_contact_newton(law, m, W, q, d, part, lam)
 
 
 cdef inline void project_locally(int32_t law, bint round_, int32_t m, const double* W, const double* q, const double* d,
-                                 const double* step, const parts_t* part, double* lam) noexcept nogil:
-    """Where no exact answer is found: the update of core/block.pxd (cone: projected gradient) on the block alone."""
+                                 const double* step, const friction_components_t* part, double* lam) noexcept nogil:
+    """Iterate the update of core/block.pxd (cone law: projected gradient) on the block, if no exact solution is found."""
     cdef int32_t _sweep, i, g
     cdef double w[MAX_ROWS]
     cdef double e[MAX_ROWS]
@@ -121,7 +122,7 @@ cdef inline void project_locally(int32_t law, bint round_, int32_t m, const doub
                 high[i] = m * d[i]
             local_slack(m, W, q, lam, w)
             if round_:
-                round_error(lam, w, high, part.reach[0], m - 1, e)
+                round_error(lam, w, high, part.friction_coefficient[0], m - 1, e)
             else:
                 cone_error(lam, w, high, part, e)
             for i in range(m):
@@ -133,19 +134,19 @@ cdef inline void project_locally(int32_t law, bint round_, int32_t m, const doub
             for g in range(part.n):
                 i = part.first[g]
                 local_slack(m, W, q, lam, w)
-                relax_tangents(lam + i, w + i, step[i], part.reach[g] * lam[0], part.size[g])
+                relax_tangents(lam + i, w + i, step[i], part.friction_coefficient[g] * lam[0], part.size[g])
             for i in range(m):
                 change += fabs(lam[i] - e[i])
         if not change > 1e-12 * fabs(lam[0]):
             break
 
 
-cdef inline int32_t boxed_rows(int32_t n, const double* W, const double* w, const double* step, const double* low,
+cdef inline int32_t solve_boxed_rows(int32_t n, const double* W, const double* w, const double* step, const double* low,
                                const double* high, double* lam) noexcept nogil:
-    """lam (n) between its bounds, complementary to W (lam - lam_0) + w; from the current lam_0.
+    """Solve for lam (n) between its bounds, complementary to W (lam - lam_0) + w, from the present lam_0.
 
-    Principal pivoting, all wrong rows at once, then the first wrong one alone (Murty). Returns STICK, or FAILED
-    after sweeps over the rows where neither ends.
+    Principal pivoting exchanges all violated rows at once, later only the first one (Murty). Returns STICK. If pivoting does
+    not end, the rows are swept and the result is FAILED.
     """
     cdef int32_t at[MAX_ROWS]   # -1 lower, 1 upper, 0 free
     cdef int32_t row[MAX_ROWS]
@@ -185,7 +186,7 @@ cdef inline int32_t boxed_rows(int32_t n, const double* W, const double* w, cons
             if at[i] == 0:
                 s = lam[i] + y[i]
                 j = -1 if s < low[i] else (1 if s > high[i] else 0)
-                if fabs(z[i]) > 1e-10 * size:           # a dependent row that is not met
+                if fabs(z[i]) > 1e-10 * size:           # an unsatisfied, linearly dependent row
                     wrong = -1
                     break
             else:

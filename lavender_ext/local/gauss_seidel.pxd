@@ -1,7 +1,7 @@
-"""Sweeps of block Gauss-Seidel, compiled once, in `gauss_seidel.pyx`."""
+"""Sweeps of block Gauss-Seidel, which are compiled once, in `gauss_seidel.pyx`."""
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.parts cimport blocks_t
+from lavender_ext.core.block_types cimport blocks_t
 from lavender_ext.core.view cimport csr_t, generalized_t, rows_t, view_t
 
 

@@ -1,17 +1,17 @@
-"""Block Gauss-Seidel: one block's own part of A, prepared once, and its update in a sweep.
+"""Block Gauss-Seidel: preparation of the diagonal blocks of A, and sweeps of exact block updates.
 
-Prepared numbers of block i stand from g[start[i]] on:
+The prepared numbers of block i begin at g[start[i]]:
 
     one row                      nothing: lam <- clip(lam - w / d)
-    rows, 2 to 8, all free       W^-1 (n, n), then 1; where W is singular W, then 0
+    rows, 2 to 8, all free       W^-1 (n, n), then 1; if W is singular, W, then 0
     rows, 2 to 8, bounded        W (n, n), then 0
-    normal, two tangents, disk or box    prepare3 of local/exact.pxd; g[15] = 1 where the rows of A share one pattern
+    normal, two tangents, disk or box    prepare3 of local/coulomb.pxd; g[15] = 1 if its rows of A share one pattern
     round cones                  prepare_round of local/round.pxd
     other contacts               W (n, n)
 
-A sweep solves each block exactly with the others held still (local/exact.pxd):
+A sweep solves each block exactly with the others fixed (local/exact.pxd):
 
-    over A in compressed rows    w = A lam - b of the block's rows                                  (1)
+    over A in compressed rows    w = A lam - b on the rows of the block                                  (1)
     over the factored form       w = J v + c lam - b, then v += M^-1 J^T (change)                   (2)
     over J and M                 w = Y u + c lam - b, then u += Y^T (change)                        (3)
 """
@@ -20,38 +20,40 @@ from libc.stdint cimport int32_t
 from lavender_ext.core.block cimport relax_normal, relax_row
 from lavender_ext.core.csr cimport csr_dot
 from lavender_ext.core.dot cimport dot
-from lavender_ext.core.generalized cimport whitened_dot, whitened_push
-from lavender_ext.core.parts cimport (CONE, blocks_t, is_box, is_disk, is_round, is_rows, n_directions, n_turns,
-                                      parts_of, parts_t)
-from lavender_ext.core.rows cimport (contact_jacobian, contact_slack, cross, dot12, dot3, joint_push, joint_velocity,
-                                     minv_times, push_bodies, relative_velocity, relax_joint, swing_body)
+from lavender_ext.core.generalized cimport whitened_dot, add_scaled_whitened_row
+from lavender_ext.core.block_types cimport (CONE, blocks_t, is_box, is_disk, is_round, is_rows, n_tangents, n_angular_rows,
+                                      get_friction_components, friction_components_t)
+from lavender_ext.core.rows cimport (contact_jacobian, contact_velocity, cross, dot12, dot3, apply_joint_impulse, joint_velocity,
+                                     minv_times, apply_impulse_to_bodies, relative_velocity, relax_joint, apply_contact_impulse)
 from lavender_ext.core.view cimport csr_t, generalized_t, rows_t, view_t
 from lavender_ext.local.box cimport box3_from
 from lavender_ext.local.cone cimport cone3
 from lavender_ext.local.coulomb cimport PREPARED, coulomb3_from, prepare3
-from lavender_ext.local.exact cimport boxed_rows, exact_contact, project_locally
+from lavender_ext.local.exact cimport solve_boxed_rows, solve_contact, project_locally
 from lavender_ext.local.round cimport prepare_round, round_contact
 from lavender_ext.local.small cimport FAILED, MAX_ROWS, eliminate
 
 
-cdef inline bint is_plain3(const blocks_t* p, int32_t i) noexcept nogil:
-    # a normal and two tangents, in a disk or a box
+cdef inline bint is_disk_or_box(const blocks_t* p, int32_t i) noexcept nogil:
+    """Return whether block i is a contact with two tangents, in a disk or a box."""
     return is_disk(p, i) or is_box(p, i)
 
 
 cdef inline int32_t coulomb_block3(const blocks_t* p, int32_t i, const double* g, const double* w, double* lam) noexcept nogil:
-    cdef parts_t q
+    """Solve a disk or box under Coulomb's law from its slack w (3)."""
+    cdef friction_components_t q
     if is_disk(p, i):
         return coulomb3_from(g, w, p.mu[i], lam)
-    parts_of(p, i, &q)
-    return box3_from(g, w, q.reach[0], q.reach[1], lam)
+    get_friction_components(p, i, &q)
+    return box3_from(g, w, q.friction_coefficient[0], q.friction_coefficient[1], lam)
 
 
 cdef inline int32_t prepared_size(const blocks_t* p, int32_t i) noexcept nogil:
+    """Return the number of prepared doubles of block i."""
     cdef int32_t n = p.ptr[i + 1] - p.ptr[i]
     if is_rows(p, i):
         return n * n + 1 if 1 < n <= MAX_ROWS else 0
-    if is_plain3(p, i):
+    if is_disk_or_box(p, i):
         return PREPARED
     if is_round(p, i):
         return n * n + (n - 1) * n
@@ -60,15 +62,15 @@ cdef inline int32_t prepared_size(const blocks_t* p, int32_t i) noexcept nogil:
 
 cdef inline void prepare_block(const blocks_t* p, int32_t i, const double* W, int32_t one_pattern,
                                double* g) noexcept nogil:
-    """g from the block's part W (n, n) of A; not for blocks of one row or of more than MAX_ROWS."""
+    """Compute g from the diagonal block W (n, n) of A; blocks of one row or of more than MAX_ROWS rows are excluded."""
     cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, q, k, free = 1
     cdef double inf = 1.0 / 0.0
     cdef double a[MAX_ROWS * MAX_ROWS]
     cdef double x[MAX_ROWS]
     if not is_rows(p, i):
-        if is_plain3(p, i):
+        if is_disk_or_box(p, i):
             prepare3(W, g)
-            # A normal whose d falls back has no trustworthy W_nn to divide by.
+            # If d of the normal is a fallback value, W_nn is too small to divide by.
             if W[0] != p.d[j]:
                 g[9] = 0.0
                 if is_box(p, i):
@@ -106,9 +108,9 @@ cdef inline void prepare_block(const blocks_t* p, int32_t i, const double* W, in
 
 cdef inline int32_t solve_block(const blocks_t* p, int32_t i, const double* g, const double* w,
                                 double* lam) noexcept nogil:
-    """The exact update of block i from its slack w; lam at its first row. 1 where it fell back."""
+    """Solve block i exactly from its slack w; lam points at its first row. Return 1 if the fallback was used."""
     cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, k, t, found = FAILED
-    cdef parts_t part
+    cdef friction_components_t part
     cdef double q[MAX_ROWS]
     cdef double x[MAX_ROWS]
     cdef double s
@@ -125,11 +127,11 @@ cdef inline int32_t solve_block(const blocks_t* p, int32_t i, const double* g, c
             for k in range(n):
                 lam[k] -= x[k]
             return 0
-        return boxed_rows(n, g, w, p.step + j, p.lower + j, p.upper + j, lam) == FAILED
+        return solve_boxed_rows(n, g, w, p.step + j, p.lower + j, p.upper + j, lam) == FAILED
     if n == 1:
         lam[0] = relax_normal(lam[0], w[0], p.step[j])
         return 0
-    if is_plain3(p, i) and p.law != CONE:
+    if is_disk_or_box(p, i) and p.law != CONE:
         if coulomb_block3(p, i, g, w, lam) != FAILED:
             return 0
     # q = w - W lam
@@ -138,11 +140,11 @@ cdef inline int32_t solve_block(const blocks_t* p, int32_t i, const double* g, c
         for t in range(n):
             s -= g[n * k + t] * lam[t]
         q[k] = s
-    parts_of(p, i, &part)
+    get_friction_components(p, i, &part)
     if is_round(p, i):
         found = round_contact(n, g, q, p.d + j, p.mu[i], lam)
     elif not is_disk(p, i):
-        found = exact_contact(p.law, n, g, q, p.d + j, &part, lam)
+        found = solve_contact(p.law, n, g, q, p.d + j, &part, lam)
     elif p.law == CONE:
         found = cone3(g, q, p.mu[i], lam) if g[9] > 0.0 or q[0] >= 0.0 else FAILED
     if found == FAILED:
@@ -152,7 +154,7 @@ cdef inline int32_t solve_block(const blocks_t* p, int32_t i, const double* g, c
 
 
 cdef inline void csr_dot3(const csr_t* a, int32_t i, const double* x, double* out) noexcept nogil:
-    # Rows i, i + 1, i + 2 of one pattern.
+    """Compute rows i, i + 1, i + 2 of A x, which share one pattern."""
     cdef int32_t p, n = a.indptr[i + 1] - a.indptr[i]
     cdef const int32_t* idx = a.indices + a.indptr[i]
     cdef const double* u = a.data + a.indptr[i]
@@ -182,13 +184,14 @@ cdef inline void csr_dot3(const csr_t* a, int32_t i, const double* x, double* ou
 
 cdef inline int32_t solve_csr_block(const blocks_t* p, const csr_t* a, int32_t i, const double* g,
                                     double* lam) noexcept nogil:
+    """Update block i by (1); return 1 if the fallback was used."""
     cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, k
     cdef double w[MAX_ROWS]
     if n > MAX_ROWS:                                    # bounded rows, one by one
         for k in range(j, j + n):
             lam[k] = relax_row(lam[k], csr_dot(a, k, lam) - p.b[k], p.step[k], p.lower[k], p.upper[k])
         return 1
-    if is_plain3(p, i) and g[15] != 0.0:
+    if is_disk_or_box(p, i) and g[15] != 0.0:
         csr_dot3(a, j, lam, w)
         w[0] -= p.b[j]
         w[1] -= p.b[j + 1]
@@ -201,7 +204,7 @@ cdef inline int32_t solve_csr_block(const blocks_t* p, const csr_t* a, int32_t i
 
 cdef inline int32_t solve_general_block(const blocks_t* p, const generalized_t* o, int32_t i, const double* g, double* lam,
                                         double* u) noexcept nogil:
-    """Over J and M, u (nv) = Y^T lam."""
+    """Update block i by (3), u (nv) = Y^T lam; return 1 if the fallback was used."""
     cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, b = o.home[i], k, found
     cdef double w[MAX_ROWS]
     cdef double old[MAX_ROWS]
@@ -210,7 +213,7 @@ cdef inline int32_t solve_general_block(const blocks_t* p, const generalized_t* 
         for k in range(j, j + n):
             now = relax_row(lam[k], whitened_dot(o, b, k, u) + (o.compliance[k] * lam[k] - p.b[k]), p.step[k],
                             p.lower[k], p.upper[k])
-            whitened_push(o, b, k, now - lam[k], u)
+            add_scaled_whitened_row(o, b, k, now - lam[k], u)
             lam[k] = now
         return 1
     for k in range(n):
@@ -218,13 +221,13 @@ cdef inline int32_t solve_general_block(const blocks_t* p, const generalized_t* 
         old[k] = lam[j + k]
     found = solve_block(p, i, g, w, lam + j)
     for k in range(n):
-        whitened_push(o, b, j + k, lam[j + k] - old[k], u)
+        add_scaled_whitened_row(o, b, j + k, lam[j + k] - old[k], u)
     return found
 
 
 cdef inline int32_t solve_sliding_contact(const blocks_t* p, const rows_t* r, int32_t i, const double* g, double* lam,
                                           double* v) noexcept nogil:
-    # The common kinds, normal and two tangents under Coulomb's law; lam at its normal.
+    """Update a disk or box under Coulomb's law by (2); lam points at its normal."""
     cdef int32_t j = p.ptr[i], c = i - r.n_joints, a = r.contact_body[2 * c], b = r.contact_body[2 * c + 1], k
     cdef double w[3]
     cdef double u[3]
@@ -234,7 +237,7 @@ cdef inline int32_t solve_sliding_contact(const blocks_t* p, const rows_t* r, in
     cdef double n = lam[0], x = lam[1], y = lam[2]
     cdef const double* normal = r.normal + 3 * c
     cdef const double* t1 = r.tangent + 3 * c
-    cdef const double* swing = r.swing + 6 * (j - p.ptr[r.n_joints])
+    cdef const double* inv_inertia_arm = r.inv_inertia_arm + 6 * (j - p.ptr[r.n_joints])
     relative_velocity(v, a, b, r.arm_a + 3 * c, r.arm_b + 3 * c, u, omega)
     cross(normal, t1, t2)
     w[0] = dot3(normal, u) + (r.compliance[j] * n - p.b[j])
@@ -250,15 +253,16 @@ cdef inline int32_t solve_sliding_contact(const blocks_t* p, const rows_t* r, in
     impulse[1] = n * normal[1] + x * t1[1] + y * t2[1]
     impulse[2] = n * normal[2] + x * t1[2] + y * t2[2]
     if a >= 0:
-        swing_body(v + 6 * a, r.inv_mass[a], swing, impulse, n, x, y, 0.0, 2, 0, -1.0)
+        apply_contact_impulse(v + 6 * a, r.inv_mass[a], inv_inertia_arm, impulse, n, x, y, 0.0, 2, 0, -1.0)
     if b >= 0:
-        swing_body(v + 6 * b, r.inv_mass[b], swing + 3, impulse, n, x, y, 0.0, 2, 0, 1.0)
+        apply_contact_impulse(v + 6 * b, r.inv_mass[b], inv_inertia_arm + 3, impulse, n, x, y, 0.0, 2, 0, 1.0)
     return k
 
 
 cdef inline int32_t solve_rows_block(const blocks_t* p, const rows_t* r, int32_t i, const double* g, double* lam,
                                      double* v) noexcept nogil:
-    cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, c = i - r.n_joints, k, a, b, nt, turns, roll, found
+    """Update block i by (2); return 1 if the fallback was used."""
+    cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, c = i - r.n_joints, k, a, b, nt, n_angular, roll, found
     cdef double w[MAX_ROWS]
     cdef double old[MAX_ROWS]
     cdef double t2[3]
@@ -267,7 +271,7 @@ cdef inline int32_t solve_rows_block(const blocks_t* p, const rows_t* r, int32_t
     cdef const double* normal
     cdef const double* t1
     t2[0] = t2[1] = t2[2] = 0.0
-    if c >= 0 and is_plain3(p, i) and p.law != CONE:
+    if c >= 0 and is_disk_or_box(p, i) and p.law != CONE:
         return solve_sliding_contact(p, r, i, g, lam + j, v)
     if c < 0:
         if n > MAX_ROWS:
@@ -280,16 +284,16 @@ cdef inline int32_t solve_rows_block(const blocks_t* p, const rows_t* r, int32_t
             old[k] = lam[j + k]
         found = solve_block(p, i, g, w, lam + j)
         for k in range(n):
-            joint_push(r.minv_jac + 12 * (j + k), lam[j + k] - old[k], v, a, b)
+            apply_joint_impulse(r.minv_jac + 12 * (j + k), lam[j + k] - old[k], v, a, b)
         return found
     a = r.contact_body[2 * c]
     b = r.contact_body[2 * c + 1]
-    turns = n_turns(p, i)
-    nt = n_directions(p, i)
-    roll = 1 + nt + (turns & 1)
+    n_angular = n_angular_rows(p, i)
+    nt = n_tangents(p, i)
+    roll = 1 + nt + (n_angular & 1)
     normal = r.normal + 3 * c
     t1 = r.tangent + 3 * c
-    contact_slack(r, c, nt, turns, v, w)
+    contact_velocity(r, c, nt, n_angular, v, w)
     for k in range(n):
         w[k] += r.compliance[j + k] * lam[j + k] - p.b[j + k]
         old[k] = lam[j + k]
@@ -306,18 +310,18 @@ cdef inline int32_t solve_rows_block(const blocks_t* p, const rows_t* r, int32_t
         cross(normal, t1, t2)
         for k in range(3):
             impulse[k] += w[2] * t2[k]
-    if turns & 1:
+    if n_angular & 1:
         for k in range(3):
             twist[k] = w[1 + nt] * normal[k]
-    if turns & 2:
+    if n_angular & 2:
         for k in range(3):
             twist[k] += w[roll] * t1[k] + w[roll + 1] * t2[k]
-    push_bodies(v, a, b, r.inv_mass, r.inv_inertia, r.arm_a + 3 * c, r.arm_b + 3 * c, impulse, twist)
+    apply_impulse_to_bodies(v, a, b, r.inv_mass, r.inv_inertia, r.arm_a + 3 * c, r.arm_b + 3 * c, impulse, twist)
     return found
 
 
 cdef double prepared_sizes(const blocks_t* p, int32_t* start) noexcept nogil:
-    """First place of each block's prepared numbers, start (k); returns their number."""
+    """Write the first index of the prepared numbers of each block to start (k); return the total number."""
     cdef int32_t i
     cdef double n = 0
     for i in range(p.n_blocks):
@@ -326,8 +330,8 @@ cdef double prepared_sizes(const blocks_t* p, int32_t* start) noexcept nogil:
     return n
 
 
-cdef inline bint part_of_csr(const blocks_t* p, const csr_t* a, int32_t i, double* W) noexcept nogil:
-    """The part W (n, n) of A that is block i's own; whether its rows share one pattern."""
+cdef inline bint csr_diagonal_block(const blocks_t* p, const csr_t* a, int32_t i, double* W) noexcept nogil:
+    """Extract the diagonal block W (n, n) of block i from A; return whether its rows share one pattern."""
     cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, k, q
     cdef bint one = True
     for k in range(n):
@@ -343,31 +347,31 @@ cdef inline bint part_of_csr(const blocks_t* p, const csr_t* a, int32_t i, doubl
     return one
 
 
-cdef inline void part_of_rows(const blocks_t* p, const rows_t* r, int32_t i, double* W) noexcept nogil:
-    """The same from J and M^-1: the slack that each row's unit impulse makes on the block."""
+cdef inline void rows_diagonal_block(const blocks_t* p, const rows_t* r, int32_t i, double* W) noexcept nogil:
+    """Compute the diagonal block W (n, n) of block i from J and M^-1."""
     cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, k, q, c = i - r.n_joints
     cdef double jac[72]
-    cdef double push[12]
+    cdef double minv_jac_row[12]
     cdef const double* row = r.jac + 12 * j
     cdef const double* change
     if c >= 0:
-        contact_jacobian(r, c, n_directions(p, i), n_turns(p, i), jac)
+        contact_jacobian(r, c, n_tangents(p, i), n_angular_rows(p, i), jac)
         row = jac
     for k in range(n):
         change = r.minv_jac + 12 * (j + k)
         if c >= 0:
-            minv_times(row + 12 * k, r.inv_mass, r.inv_inertia, r.contact_body[2 * c], r.contact_body[2 * c + 1], push)
-            change = push
+            minv_times(row + 12 * k, r.inv_mass, r.inv_inertia, r.contact_body[2 * c], r.contact_body[2 * c + 1], minv_jac_row)
+            change = minv_jac_row
         for q in range(n):
             W[n * q + k] = dot12(row + 12 * q, change)
     for k in range(n):
         W[(n + 1) * k] += r.compliance[j + k]
     if c >= 0 and W[0] > 0.0:
-        W[0] = p.d[j]                                   # the same number summed in another order
+        W[0] = p.d[j]                                   # W_nn has the bits of d, which is summed in another order.
 
 
-cdef inline void part_of_general(const blocks_t* p, const generalized_t* o, int32_t i, double* W) noexcept nogil:
-    """The same from the rows of Y."""
+cdef inline void general_diagonal_block(const blocks_t* p, const generalized_t* o, int32_t i, double* W) noexcept nogil:
+    """Compute the diagonal block W (n, n) of block i from the rows of Y."""
     cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, k, q, b = o.home[i], nc = o.pcol[b + 1] - o.pcol[b]
     cdef const double* y = o.y + o.pval[b] + <ssize_t>(j - o.prow[b]) * nc
     for k in range(n):
@@ -378,7 +382,7 @@ cdef inline void part_of_general(const blocks_t* p, const generalized_t* o, int3
 
 
 cdef void prepare_blocks(const view_t* v, const int32_t* start, double* g) noexcept nogil:
-    """Each block's own part of A into g (`prepared_sizes`, zeroed)."""
+    """Prepare the diagonal blocks of A in g (`prepared_sizes`, zero-initialised)."""
     cdef int32_t i
     cdef bint one
     cdef double W[MAX_ROWS * MAX_ROWS]
@@ -387,17 +391,17 @@ cdef void prepare_blocks(const view_t* v, const int32_t* start, double* g) noexc
             continue
         one = False
         if v.g != NULL:
-            part_of_general(&v.p, v.g, i, W)
+            general_diagonal_block(&v.p, v.g, i, W)
         elif v.r != NULL:
-            part_of_rows(&v.p, v.r, i, W)
+            rows_diagonal_block(&v.p, v.r, i, W)
         else:
-            one = part_of_csr(&v.p, v.a, i, W)
+            one = csr_diagonal_block(&v.p, v.a, i, W)
         prepare_block(&v.p, i, W, one, g + start[i])
 
 
 cdef int32_t solve_blocks(const blocks_t* p, const csr_t* a, const rows_t* r, const generalized_t* o, const int32_t* start,
                           const double* g, const int32_t* order, double* lam, double* v) noexcept nogil:
-    """One sweep over A, or over J and M (`o`), or over bodies (`r`), whose velocities v keeps; counts what fell back."""
+    """Sweep once over A (`a`), J and M (`o`) or bodies (`r`), with velocities v; return the number of fallbacks."""
     cdef int32_t q, i, fallbacks = 0
     if o != NULL:
         for q in range(p.n_blocks):

@@ -1,15 +1,15 @@
-"""A round cone alone, solved exactly: w = W lam + q in K*, lam in K = {|lam_T| <= mu lam_n}, lam.w = 0.
+"""Exact solution of one round cone: w = W lam + q in K*, lam in K = {|lam_T| <= mu lam_n}, lam.w = 0.
 
-One to five tangents in one cone, law CONE, W symmetric positive semidefinite. For a normal s the tangents minimise
-over a ball of radius mu s (More, Sorensen 1983); with W_TT = Q diag(h) Q^T
+The cone has one to five tangents, the law is CONE, and W is symmetric positive semidefinite. For a given normal impulse s
+the tangents minimise the energy over a ball of radius mu s (More, Sorensen 1983); with W_TT = Q diag(h) Q^T
 
     c = Q^T (q_T + s W_Tn),   z = -c / (h + beta),   beta >= 0:  beta = 0 or |z| = mu s               (1)
 
-and s is where the derivative of that convex minimum rises through 0,
+s is the root of the derivative of that minimum, which is convex in s:
 
     f(s) = W_nn s + q_n + W_nT Q z - mu^2 beta s                                                      (2)
 
-which is w_n = mu |w_T| where it slides (w_T = -beta Q z) and w = 0 where it sticks. Prepared: W (n, n), Q (nt, nt)
+A sliding contact then has w_n = mu |w_T| (w_T = -beta Q z), a sticking one w = 0. Prepared: W (n, n), Q (nt, nt)
 by columns, h (nt).
 """
 from libc.math cimport fabs, sqrt
@@ -20,19 +20,19 @@ from lavender_ext.local.small cimport FAILED, OPEN, SLIP, STICK
 
 
 cdef enum:
-    TANGENTS = 5
-    TURNS = 60                  # of Jacobi's method, of each root
+    MAX_TANGENTS = 5
+    MAX_ITERATIONS = 60         # sweeps of Jacobi's method, and iterations of each root search
 
 
-cdef inline void eigen_of(int32_t n, double* a, double* vectors, double* h) noexcept nogil:
-    """Jacobi's method: a (n, n) symmetric, destroyed, = Q diag(h) Q^T; vectors (n, n) holds Q by rows of Q^T."""
-    cdef int32_t i, j, k, _turn
+cdef inline void symmetric_eigen(int32_t n, double* a, double* vectors, double* h) noexcept nogil:
+    """Decompose a symmetric a (n, n) = Q diag(h) Q^T by Jacobi's method; a is overwritten, vectors (n, n) is Q^T."""
+    cdef int32_t i, j, k, _iteration
     cdef double off, size, t, c, s, x, y
     for i in range(n * n):
         vectors[i] = 0.0
     for i in range(n):
         vectors[i * n + i] = 1.0
-    for _turn in range(TURNS):
+    for _iteration in range(MAX_ITERATIONS):
         off = 0.0
         size = 0.0
         for i in range(n):
@@ -68,20 +68,20 @@ cdef inline void eigen_of(int32_t n, double* a, double* vectors, double* h) noex
 
 
 cdef inline void prepare_round(int32_t n, const double* W, double* g) noexcept nogil:
-    """W, Q and h of a contact of n rows."""
+    """Write W, Q and h of a contact of n rows to g."""
     cdef int32_t nt = n - 1, i, j
-    cdef double a[TANGENTS * TANGENTS]
+    cdef double a[MAX_TANGENTS * MAX_TANGENTS]
     for i in range(n * n):
         g[i] = W[i]
     for i in range(nt):
         for j in range(nt):
             a[i * nt + j] = 0.5 * (W[(1 + i) * n + 1 + j] + W[(1 + j) * n + 1 + i])
-    eigen_of(nt, a, g + n * n, g + n * n + nt * nt)
+    symmetric_eigen(nt, a, g + n * n, g + n * n + nt * nt)
 
 
-cdef inline double in_ball(int32_t nt, const double* h, const double* c, double radius, double* z) noexcept nogil:
-    """z and beta of (1); beta from below, where Newton's method on 1 / |z| does not overshoot."""
-    cdef int32_t i, _turn
+cdef inline double minimize_in_ball(int32_t nt, const double* h, const double* c, double radius, double* z) noexcept nogil:
+    """Compute z and return beta of (1). Newton's method on 1 / |z| starts from below, from where it does not overshoot."""
+    cdef int32_t i, _iteration
     cdef double beta = 0.0, size, slope, x, top = 0.0
     for i in range(nt):
         if h[i] > top:
@@ -90,12 +90,12 @@ cdef inline double in_ball(int32_t nt, const double* h, const double* c, double 
         x = fabs(c[i]) / radius - h[i]
         if x > beta:
             beta = x
-    for _turn in range(TURNS):
+    for _iteration in range(MAX_ITERATIONS):
         size = 0.0
         slope = 0.0
         for i in range(nt):
             if c[i] == 0.0 or (beta == 0.0 and h[i] <= 1e-14 * top):
-                z[i] = 0.0                              # nothing pulls where nothing resists
+                z[i] = 0.0                              # no force, or no stiffness
                 continue
             z[i] = -c[i] / (h[i] + beta)
             size += z[i] * z[i]
@@ -110,35 +110,35 @@ cdef inline double in_ball(int32_t nt, const double* h, const double* c, double 
     return beta
 
 
-cdef inline double normal_at(int32_t n, const double* g, const double* q, double mu, double s, double* z) noexcept nogil:
-    """f of (2), z of (1)."""
+cdef inline double normal_derivative(int32_t n, const double* g, const double* q, double mu, double s, double* z) noexcept nogil:
+    """Return f(s) of (2) and compute z of (1)."""
     cdef int32_t nt = n - 1, i, j
-    cdef const double* turn = g + n * n
-    cdef double c[TANGENTS]
+    cdef const double* rotation = g + n * n
+    cdef double c[MAX_TANGENTS]
     cdef double f = g[0] * s + q[0], beta, x
     for i in range(nt):
         x = 0.0
         for j in range(nt):
-            x += turn[i * nt + j] * (q[1 + j] + s * g[(1 + j) * n])
+            x += rotation[i * nt + j] * (q[1 + j] + s * g[(1 + j) * n])
         c[i] = x
-    beta = in_ball(nt, turn + nt * nt, c, mu * s, z)
+    beta = minimize_in_ball(nt, rotation + nt * nt, c, mu * s, z)
     for i in range(nt):
         x = 0.0
         for j in range(nt):
-            x += turn[i * nt + j] * g[1 + j]
+            x += rotation[i * nt + j] * g[1 + j]
         f += x * z[i]
     return f - mu * mu * beta * s
 
 
 cdef inline int32_t round_contact(int32_t n, const double* g, const double* q, const double* d, double mu,
                                   double* lam) noexcept nogil:
-    """lam (n); FAILED leaves it alone."""
-    cdef int32_t nt = n - 1, i, j, _turn, side = 0
-    cdef const double* turn = g + n * n
-    cdef double z[TANGENTS]
-    cdef double x[TANGENTS + 1]
-    cdef double w[TANGENTS + 1]
-    cdef double e[TANGENTS + 1]
+    """Solve for lam (n); FAILED keeps lam."""
+    cdef int32_t nt = n - 1, i, j, _iteration, side = 0
+    cdef const double* rotation = g + n * n
+    cdef double z[MAX_TANGENTS]
+    cdef double x[MAX_TANGENTS + 1]
+    cdef double w[MAX_TANGENTS + 1]
+    cdef double e[MAX_TANGENTS + 1]
     cdef double low = 0.0, high, at_low, at_high, s, f, size = length(q + 1, nt), wrong
     if q[0] >= mu * size:
         for i in range(n):
@@ -153,18 +153,18 @@ cdef inline int32_t round_contact(int32_t n, const double* g, const double* q, c
         return SLIP
     at_low = q[0] - mu * size
     high = lam[0] if lam[0] > 0.0 else fabs(at_low) / g[0]
-    at_high = normal_at(n, g, q, mu, high, z)
-    for _turn in range(200):
+    at_high = normal_derivative(n, g, q, mu, high, z)
+    for _iteration in range(200):
         if at_high >= 0.0:
             break
         low = high
         at_low = at_high
         high = 2.0 * high
-        at_high = normal_at(n, g, q, mu, high, z)
+        at_high = normal_derivative(n, g, q, mu, high, z)
     if not at_high >= 0.0:
         return FAILED
     s = high
-    for _turn in range(3 * TURNS):                      # regula falsi with halved ends (Dowell, Jarratt 1971)
+    for _iteration in range(3 * MAX_ITERATIONS):                      # regula falsi with halved end values (Dowell, Jarratt 1971)
         if at_high == 0.0 or high - low <= 2e-16 * high:
             s = high
             break
@@ -173,7 +173,7 @@ cdef inline int32_t round_contact(int32_t n, const double* g, const double* q, c
             s = 0.5 * (low + high)
             if not low < s < high:
                 break
-        f = normal_at(n, g, q, mu, s, z)
+        f = normal_derivative(n, g, q, mu, s, z)
         if f == 0.0:
             break
         if f < 0.0:
@@ -188,13 +188,13 @@ cdef inline int32_t round_contact(int32_t n, const double* g, const double* q, c
             if side > 0:
                 at_low *= 0.5
             side = 1
-    normal_at(n, g, q, mu, s, z)
+    normal_derivative(n, g, q, mu, s, z)
     x[0] = s
     for j in range(nt):
         x[1 + j] = 0.0
         for i in range(nt):
-            x[1 + j] += turn[i * nt + j] * z[i]
-    # W may lack symmetry: the judge's own error has the last word.
+            x[1 + j] += rotation[i * nt + j] * z[i]
+    # W may be unsymmetric; accept the result only if the judge's error is small.
     size = 0.0
     wrong = 0.0
     for i in range(n):

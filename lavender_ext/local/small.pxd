@@ -1,6 +1,6 @@
-"""A few unknowns: elimination with pivots, what a contact may do, and whether it rests where it is.
+"""Helpers of the exact block solvers: dense elimination, bracketed Newton steps, and states of contacts.
 
-W is the block's own part of A, any 1x1 to 8x8, not necessarily symmetric; w = W lam + q.
+W is the diagonal block of A, 1x1 to 8x8, not necessarily symmetric; w = W lam + q.
 """
 from libc.math cimport fabs
 from libc.stdint cimport int32_t
@@ -13,11 +13,14 @@ cdef enum:
     FAILED = -1
 
 cdef enum:
-    MAX_ROWS = 8                # of a block that is solved exactly
+    MAX_ROWS = 8                # Blocks of more rows are not solved exactly.
 
 
-cdef inline double bracketed(double x, double step, double lo, double hi, int32_t* done) noexcept nogil:
-    """x - step where that is between lo and hi; else their middle, and done where they are one number; 4 x without a hi (< 0)."""
+cdef inline double newton_or_bisect(double x, double step, double lo, double hi, int32_t* done) noexcept nogil:
+    """Return x - step if it lies between lo and hi, otherwise their midpoint, or 4 x if hi is unknown (negative).
+
+    `done` is set if lo and hi are equal within rounding.
+    """
     if lo < x - step and (hi < 0.0 or x - step < hi):
         return x - step
     done[0] = hi >= 0.0 and hi - lo <= 1e-15 * hi
@@ -25,9 +28,9 @@ cdef inline double bracketed(double x, double step, double lo, double hi, int32_
 
 
 cdef inline int32_t eliminate(int32_t n, double* a, double* x) noexcept nogil:
-    """x <- a^-1 x by elimination with row pivoting, a (n, n) destroyed; a dependent row leaves its x at 0.
+    """Overwrite x (n) with a^-1 x by elimination with row pivoting; return the rank of a (n, n), which is overwritten.
 
-    Returns the rank.
+    The entries of x of dependent columns are 0.
     """
     cdef int32_t col[MAX_ROWS]
     cdef int32_t i, j, k, p, rank = 0
@@ -37,7 +40,7 @@ cdef inline int32_t eliminate(int32_t n, double* a, double* x) noexcept nogil:
             size = fabs(a[i])
     for k in range(n):
         col[k] = -1
-    for k in range(n):                                  # column k
+    for k in range(n):
         p = -1
         big = 1e-13 * size
         for i in range(rank, n):
@@ -67,10 +70,10 @@ cdef inline int32_t eliminate(int32_t n, double* a, double* x) noexcept nogil:
         col[rank] = k
         rank += 1
     if rank == n:
-        return n                                        # col is the identity
+        return n                                        # the columns are in order
     k = n - 1
     p = rank - 1
-    while k >= 0:                                       # back to the columns; from the end, nothing is overwritten
+    while k >= 0:                                       # scatter to the columns, from the end to avoid overwriting
         if p >= 0 and col[p] == k:
             x[k] = x[p]
             p -= 1
@@ -80,8 +83,8 @@ cdef inline int32_t eliminate(int32_t n, double* a, double* x) noexcept nogil:
     return rank
 
 
-cdef inline int32_t rests(int32_t m, const double* W, const double* q, const double* lam) noexcept nogil:
-    # w = 0 to rounding.
+cdef inline int32_t slack_is_zero(int32_t m, const double* W, const double* q, const double* lam) noexcept nogil:
+    """Return whether w = W lam + q is 0 within rounding."""
     cdef int32_t i, j
     cdef double w, size
     for i in range(m):

@@ -1,6 +1,7 @@
 """What Newton's method over bodies factors, from a problem's own arrays: an order of elimination and a panel, in given workspace.
 
-First the memory of the pattern (`index_workspace_size`, `lay_pattern`, `make_pattern`), then the numbers (`body_workspace_size`,
+First the memory of the pattern (`index_workspace_size`, `bind_pattern_workspace`, `make_pattern`), then the numbers
+(`body_workspace_size`,
 `furnish_bodies`), six columns for a body. A host that allocates in between gives the factor's pattern its workspace after
 `order_bodies`, and its numbers theirs, of fewer columns, by `factor_workspace_size` and `furnish_factor`.
 """
@@ -8,14 +9,14 @@ from libc.math cimport sqrt
 from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memset
 
-from lavender_ext.core.parts cimport blocks_t
+from lavender_ext.core.block_types cimport blocks_t
 from lavender_ext.core.view cimport bodies_of, generalized_t, rows_t, view_t
 from lavender_ext.factor.blocks cimport factor_t, sparse_t
 from lavender_ext.factor.graph cimport eliminate_bodies, pattern_workspace_size
 from lavender_ext.factor.symbolic cimport block_pattern, block_tree
 from lavender_ext.newton.elements cimport elements_t
 from lavender_ext.newton.panel cimport fill_panel, inertia_root
-from lavender_ext.newton.run cimport furnish, lay_index, newton_t, own_index, own_workspace_size
+from lavender_ext.newton.run cimport bind_real_workspace, bind_index_workspace, newton_t, own_index, own_workspace_size
 from lavender_ext.newton.scaling cimport find_elements, is_known, scaled_t
 from lavender_ext.newton.system cimport BODIES
 
@@ -26,7 +27,7 @@ cdef enum:
 
 
 cdef inline int64_t index_workspace_size(const blocks_t* p, const rows_t* r) noexcept nogil:
-    """Whole numbers that `lay_pattern` hands out, as if every row were an element; 0 where the method does not apply."""
+    """Whole numbers that `bind_pattern_workspace` hands out, as if every row were an element; 0 where the method does not apply."""
     cdef int64_t k = p.n_rows, n = r.n_bodies
     if n == 0 or n > MOST_BODIES or k == 0 or not is_known(p):
         return 0
@@ -60,7 +61,7 @@ cdef struct pattern_t:
     int32_t* turned
 
 
-cdef inline int32_t* lay_pattern(pattern_t* a, int32_t* index, int64_t n, int64_t k, int64_t most) noexcept nogil:
+cdef inline int32_t* bind_pattern_workspace(pattern_t* a, int32_t* index, int64_t n, int64_t k, int64_t most) noexcept nogil:
     """Places in index, a multiple of 8 bytes, for k elements, and for `most` blocks of L; where the next begins."""
     a.n, a.k = <int32_t>n, <int32_t>k
     a.scratch = index
@@ -82,10 +83,10 @@ cdef inline int32_t* lay_pattern(pattern_t* a, int32_t* index, int64_t n, int64_
     return a.rind + most + 1
 
 
-cdef inline void lay_bodies(newton_t* s, pattern_t* a, int32_t* index, const blocks_t* p, const rows_t* r) noexcept nogil:
+cdef inline void bind_bodies(newton_t* s, pattern_t* a, int32_t* index, const blocks_t* p, const rows_t* r) noexcept nogil:
     """Places in index (`index_workspace_size`) for s and a."""
     cdef int64_t n = r.n_bodies
-    lay_index(s, p.n_rows, lay_pattern(a, index, n, p.n_rows, n * (n - 1) // 2))
+    bind_index_workspace(s, p.n_rows, bind_pattern_workspace(a, index, n, p.n_rows, n * (n - 1) // 2))
 
 
 cdef inline int64_t order_bodies(pattern_t* a) noexcept nogil:
@@ -205,7 +206,7 @@ cdef inline void furnish_factor(newton_t* s, const pattern_t* a, double* panel, 
     f.nval, f.mval, f.lval, f.uval, f.dval, f.work, f.work2 = x[1], x[2], x[3], x[4], x[5], x[6], x[7]
 
 
-cdef inline void furnish_bodies(newton_t* s, pattern_t* a, double* real, const view_t* v) noexcept nogil:
+cdef inline void bind_body_workspace(newton_t* s, pattern_t* a, double* real, const view_t* v) noexcept nogil:
     """Everything of s in real (`body_workspace_size`): what every form has, then panel and factor."""
     cdef const blocks_t* p = &v.p
     cdef const rows_t* r = v.r
@@ -216,7 +217,7 @@ cdef inline void furnish_bodies(newton_t* s, pattern_t* a, double* real, const v
     cdef double* panel
     cdef double* x
     memset(real, 0, own_workspace_size(p.n_rows, s.sc.small) * sizeof(double))
-    panel = furnish(s, v, real)
+    panel = bind_real_workspace(s, v, real)
     x = panel + 12 * <int64_t>p.n_rows
     for i in range(6):
         column[i] = i

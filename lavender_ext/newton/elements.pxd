@@ -16,7 +16,7 @@ Nothing here squares J twice, and rows that depend on each other cost nothing.
 from libc.math cimport fabs
 from libc.stdint cimport int32_t, int64_t
 
-from lavender_ext.core.parts cimport parts_t
+from lavender_ext.core.block_types cimport friction_components_t
 
 
 cdef struct elements_t:
@@ -46,12 +46,12 @@ cdef inline bint is_row(const elements_t* e, int32_t i) noexcept nogil:
     return e.part[i] == e.part[i + 1]
 
 
-cdef inline void element_parts(const elements_t* e, int32_t i, parts_t* q) noexcept nogil:
+cdef inline void element_parts(const elements_t* e, int32_t i, friction_components_t* q) noexcept nogil:
     """The parts of element i, its reach in the metric of d."""
     cdef int32_t g, at = e.part[i]
     q.n = e.part[i + 1] - at
     for g in range(q.n):
-        q.first[g], q.size[g], q.reach[g] = e.first[at + g] - e.ptr[i], e.size[at + g], e.reach[at + g]
+        q.first[g], q.size[g], q.friction_coefficient[g] = e.first[at + g] - e.ptr[i], e.size[at + g], e.reach[at + g]
 
 
 cdef inline void invert_small(double* a, double* inv, int32_t n) noexcept nogil:

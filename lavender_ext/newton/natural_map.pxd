@@ -13,7 +13,7 @@ from libc.stdint cimport int32_t
 
 from lavender_ext.core.block cimport length
 from lavender_ext.core.contact_map cimport contact_map
-from lavender_ext.core.parts cimport CONE, parts_t
+from lavender_ext.core.block_types cimport CONE, friction_components_t
 from lavender_ext.newton.elements cimport element_parts, elements_t, invert_small, is_row
 
 
@@ -22,7 +22,7 @@ cdef inline void natural_contact(const elements_t* e, int32_t i, int32_t law, co
     """F (nr) and P (nr, nr) of one contact, Pi in the metric of d."""
     cdef int32_t nr = e.ptr[i + 1] - e.ptr[i], k
     cdef double y[6]
-    cdef parts_t q
+    cdef friction_components_t q
     element_parts(e, i, &q)
     for k in range(nr):
         y[k] = z[k] - s[k]

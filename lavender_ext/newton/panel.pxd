@@ -2,7 +2,7 @@
 from libc.math cimport sqrt
 from libc.stdint cimport int32_t, int64_t
 
-from lavender_ext.core.parts cimport blocks_t, n_directions, n_turns
+from lavender_ext.core.block_types cimport blocks_t, n_tangents, n_angular_rows
 from lavender_ext.core.rows cimport contact_jacobian
 from lavender_ext.core.view cimport bodies_of, rows_t
 from lavender_ext.newton.elements cimport elements_t
@@ -134,7 +134,7 @@ cdef inline void fill_panel(const blocks_t* p, const rows_t* r, const double* ro
         if c < 0:
             row = r.jac + 12 * j
         else:
-            contact_jacobian(r, c, n_directions(p, i), n_turns(p, i), jac)
+            contact_jacobian(r, c, n_tangents(p, i), n_angular_rows(p, i), jac)
             row = jac
         for q in range(j, p.ptr[i + 1]):
             out = panel + 12 * <int64_t>q

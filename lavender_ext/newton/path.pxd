@@ -29,8 +29,8 @@ from libc.math cimport fabs, floor, sqrt
 from libc.stdint cimport int32_t
 from libc.string cimport memset
 
-from lavender_ext.core.door cimport all_finite
-from lavender_ext.core.parts cimport COULOMB
+from lavender_ext.core.validate cimport all_finite
+from lavender_ext.core.block_types cimport COULOMB
 from lavender_ext.newton.cones cimport is_high, is_low
 from lavender_ext.newton.elements cimport elements_t, invert_small, is_row
 from lavender_ext.newton.phases cimport begin_rounds, enter_rounds

@@ -18,8 +18,8 @@ from libc.math cimport fabs
 from libc.stdint cimport int32_t
 from libc.string cimport memset
 
-from lavender_ext.core.door cimport all_finite, largest
-from lavender_ext.core.parts cimport CONE
+from lavender_ext.core.validate cimport all_finite, norm_inf
+from lavender_ext.core.block_types cimport CONE
 from lavender_ext.judge.score cimport relative
 from lavender_ext.newton.cones cimport cone_gap, cone_size, gather, is_high, is_low
 from lavender_ext.newton.elements cimport elements_t, is_row
@@ -211,7 +211,7 @@ cdef inline void ask_interior(newton_t* n) noexcept nogil:
     cdef system_t* s = &n.s
     cdef const elements_t* e = s.e
     cdef int32_t i, j, _, resting = 1, left = RESTS
-    if not largest(n.ip.hz, e.m) < 1e-3 * largest(n.ip.z, e.m):
+    if not norm_inf(n.ip.hz, e.m) < 1e-3 * norm_inf(n.ip.z, e.m):
         return
     take(n, n.direction, n.ip.z)
     for i in range(e.n):
@@ -394,7 +394,7 @@ cdef inline bint ask(newton_t* n, const proximal_t* x) noexcept nogil:
     cdef double big
     for j in range(n.s.e.m):
         n.direction[j] = x.z[j] - n.c[j]
-    big = largest(n.direction, n.s.e.m)
+    big = norm_inf(n.direction, n.s.e.m)
     if not 0.0 < big < 1.0 / 0.0:
         return False
     for j in range(n.s.e.m):            # rounding leaves rows that do not take part slightly on the wrong side

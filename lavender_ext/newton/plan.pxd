@@ -14,8 +14,8 @@ from libc.stdint cimport int32_t
 from libc.string cimport memset
 
 from lavender_ext.core.method cimport CERTIFICATE, ROUNDOFF_LIMIT, MORE, REACHED, SPENT, STUCK
-from lavender_ext.core.parts cimport CONE, COULOMB
-from lavender_ext.core.start cimport is_nothing
+from lavender_ext.core.block_types cimport CONE, COULOMB
+from lavender_ext.core.start cimport is_zero_impulse
 from lavender_ext.judge.score cimport relative
 from lavender_ext.newton.cones cimport is_high, is_low
 from lavender_ext.newton.phases cimport (FIRST, LIMITLESS, STRETCH, begin_approach, begin_exchanges, begin_rounds, begin_steps,
@@ -338,7 +338,7 @@ cdef inline void newton_start(newton_t* n, const double* lam) noexcept nogil:
     n.above_floor = 1.0 / 0.0
     n.kept.seen = 0
     n.loops = n.s.form == BODIES and n.s.others != NULL and n.s.e.m <= LARGEST_AUGMENTED
-    n.cold = is_nothing(&n.problem.p, lam)
+    n.cold = is_zero_impulse(&n.problem.p, lam)
     unknown_of(n, lam, n.trial)
     take(n, n.best_z, n.trial)
     score(n, n.trial)

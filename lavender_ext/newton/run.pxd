@@ -6,14 +6,15 @@ at a time, so that whoever asked can look at a clock in between.
 from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memcpy, memset
 
-from lavender_ext.core.parts cimport blocks_t
+from lavender_ext.core.block_types cimport blocks_t
 from lavender_ext.core.view cimport csr_t, generalized_t, rows_t, view_t
 from lavender_ext.factor.blocks cimport factor_t
 from lavender_ext.judge.best cimport best_workspace_size, best_t, bind_best, note_score, relative_of_best, see_impulse
 from lavender_ext.judge.measure cimport above_floor_of, floor_of, judge_view, relative_of
 from lavender_ext.judge.score cimport new_score, relative, score_t, smallest_reference
 from lavender_ext.newton.natural_map cimport convex_error
-from lavender_ext.newton.scaling cimport (lay_elements, lay_numbers, scale_elements, scaled_index, scaled_real, scaled_t)
+from lavender_ext.newton.scaling cimport (bind_element_workspace, bind_scaling_workspace, scale_elements, scaled_index,
+                                          scaled_real, scaled_t)
 from lavender_ext.newton.system cimport system_t, system_times
 
 
@@ -46,7 +47,7 @@ cdef enum:                      # what is counted
 
 cdef enum:
     DEEP = 8                    # of the stack
-    VECTORS = 31                # (m) of `lay_vectors`
+    VECTORS = 31                # (m) of `bind_vector_workspace`
     INNER = 20                  # Newton steps of one proximal round at most
 
 
@@ -247,14 +248,14 @@ cdef inline void aim(newton_t* n, const blocks_t* p, const csr_t* a, const rows_
 
 
 cdef inline int64_t judge_workspace_size(const blocks_t* p, const rows_t* r, const generalized_t* g) noexcept nogil:
-    """Doubles that `lay_judge` hands out."""
+    """Doubles that `bind_judge_workspace` hands out."""
     cdef int64_t m = p.n_rows, own = 4 * m + best_workspace_size(m, <int64_t>p.n_blocks + 1)
     if r != NULL:
         return own + 12 * <int64_t>r.n_bodies
     return own + (g.n + m if g != NULL else 0)
 
 
-cdef inline double* lay_judge(newton_t* n, double* workspace) noexcept nogil:
+cdef inline double* bind_judge_workspace(newton_t* n, double* workspace) noexcept nogil:
     """What the judge writes to, of `aim`; what is behind it."""
     cdef int64_t m = n.problem.p.n_rows
     n.lam, n.proof = workspace, workspace + m
@@ -265,12 +266,12 @@ cdef inline double* lay_judge(newton_t* n, double* workspace) noexcept nogil:
 
 
 cdef inline int64_t own_index(int64_t m) noexcept nogil:
-    """Whole numbers that `lay_index` hands out, of m rows."""
+    """Whole numbers that `bind_index_workspace` hands out, of m rows."""
     return scaled_index(m) + 3 * m
 
 
-cdef inline void lay_index(newton_t* n, int64_t m, int32_t* index) noexcept nogil:
-    lay_elements(&n.sc, m, index)
+cdef inline void bind_index_workspace(newton_t* n, int64_t m, int32_t* index) noexcept nogil:
+    bind_element_workspace(&n.sc, m, index)
     index += scaled_index(m)
     n.exchange.side, n.s.swap, n.s.free = index, index + m, index + 2 * m
 
@@ -280,7 +281,7 @@ cdef inline int64_t own_workspace_size(int64_t m, int64_t small) noexcept nogil:
     return scaled_real(m) + VECTORS * m + 5 * small
 
 
-cdef inline void lay_vectors(newton_t* n, double* workspace, int64_t m) noexcept nogil:
+cdef inline void bind_vector_workspace(newton_t* n, double* workspace, int64_t m) noexcept nogil:
     """Places in workspace (VECTORS m)."""
     cdef double** at[VECTORS]
     cdef int32_t i
@@ -296,16 +297,16 @@ cdef inline void lay_vectors(newton_t* n, double* workspace, int64_t m) noexcept
         at[i][0] = workspace + i * m
 
 
-cdef inline double* furnish(newton_t* n, const view_t* v, double* workspace) noexcept nogil:
+cdef inline double* bind_real_workspace(newton_t* n, const view_t* v, double* workspace) noexcept nogil:
     """Elements (`find_elements`) scaled, with vectors and small matrices, in workspace of zeros; what is behind.
 
     What factors is still to come: form, symmetric and what belongs to the form.
     """
     cdef int64_t rows = n.problem.p.n_rows, small = n.sc.small
     cdef double* x = workspace + scaled_real(rows)
-    lay_numbers(&n.sc, rows, workspace)
+    bind_scaling_workspace(&n.sc, rows, workspace)
     scale_elements(&n.sc, v, n.problem.w, n.problem.x)
-    lay_vectors(n, x, rows)
+    bind_vector_workspace(n, x, rows)
     x += VECTORS * rows
     n.s.v, n.s.einv, n.s.p, n.s.pair, n.s.bt = x, x + small, x + 2 * small, x + 3 * small, x + 4 * small
     if n.sc.e.n == n.sc.e.m:                            # bounded rows alone

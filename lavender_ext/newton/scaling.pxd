@@ -10,7 +10,7 @@ from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memset
 
-from lavender_ext.core.parts cimport blocks_t, is_round, is_rows, parts_of, parts_t
+from lavender_ext.core.block_types cimport blocks_t, is_round, is_rows, get_friction_components, friction_components_t
 from lavender_ext.core.velocity cimport rows_velocity
 from lavender_ext.core.view cimport csr_t, rows_t, view_t
 from lavender_ext.judge.slack cimport general_slack, rows_slack
@@ -52,12 +52,12 @@ cdef inline double high_of(const blocks_t* p, int32_t i, int32_t j) noexcept nog
 
 cdef inline double reach_of(const blocks_t* p, int32_t i, int32_t j) noexcept nogil:
     """Largest impulse of row j of contact i, behind its normal, over lam_n."""
-    cdef parts_t q
+    cdef friction_components_t q
     cdef int32_t g = 0
-    parts_of(p, i, &q)
+    get_friction_components(p, i, &q)
     while g + 1 < q.n and j - p.ptr[i] >= q.first[g + 1]:
         g += 1
-    return q.reach[g]
+    return q.friction_coefficient[g]
 
 
 cdef inline double compliance_of(const view_t* v, int32_t j) noexcept nogil:
@@ -85,7 +85,7 @@ cdef inline bint is_empty(const view_t* v, int32_t i, int32_t j) noexcept nogil:
             if b >= 0:
                 x += r.inv_mass[b]
         for q in range(6 * (j - v.p.ptr[r.n_joints]), 6 * (j - v.p.ptr[r.n_joints]) + 6):
-            x += fabs(r.swing[q])
+            x += fabs(r.inv_inertia_arm[q])
     return x == 0.0
 
 
@@ -116,7 +116,7 @@ cdef inline int64_t scaled_real(int64_t m) noexcept nogil:
     return (8 + KEPT) * m
 
 
-cdef inline void lay_elements(scaled_t* s, int64_t m, int32_t* index) noexcept nogil:
+cdef inline void bind_element_workspace(scaled_t* s, int64_t m, int32_t* index) noexcept nogil:
     """Places in index (`scaled_index`), of at most m rows."""
     s.keep = index
     s.block = index + m
@@ -131,7 +131,7 @@ cdef inline void lay_elements(scaled_t* s, int64_t m, int32_t* index) noexcept n
     s.e.s = 1
 
 
-cdef inline void lay_numbers(scaled_t* s, int64_t m, double* real) noexcept nogil:
+cdef inline void bind_scaling_workspace(scaled_t* s, int64_t m, double* real) noexcept nogil:
     """Places in real (`scaled_real`)."""
     s.fixed, s.scale, s.speed = real, real + m, real + 2 * m
     s.e.theta, s.e.g, s.e.lower, s.e.upper = real + 3 * m, real + 4 * m, real + 5 * m, real + 6 * m
@@ -140,7 +140,7 @@ cdef inline void lay_numbers(scaled_t* s, int64_t m, double* real) noexcept nogi
 
 
 cdef inline void find_elements(scaled_t* s, const view_t* v) noexcept nogil:
-    """Which rows move, and how they stand together; in the places of `lay_elements`."""
+    """Which rows move, and how they stand together; in the places of `bind_element_workspace`."""
     cdef const blocks_t* p = &v.p
     cdef int32_t i, j, g, q, n = 0, m = 0, parts = 0, normal
     cdef int32_t* ptr = <int32_t*>s.e.ptr
@@ -149,7 +149,7 @@ cdef inline void find_elements(scaled_t* s, const view_t* v) noexcept nogil:
     cdef int32_t* size = <int32_t*>s.e.size
     cdef int32_t* wptr = <int32_t*>s.e.wptr
     cdef double x
-    cdef parts_t own
+    cdef friction_components_t own
     part[0] = 0
     for i in range(p.n_blocks):
         normal = m
@@ -165,10 +165,10 @@ cdef inline void find_elements(scaled_t* s, const view_t* v) noexcept nogil:
                 part[n] = parts
         if is_row(p, i):
             continue
-        parts_of(p, i, &own)
+        get_friction_components(p, i, &own)
         normal += 1
         for g in range(own.n):
-            if own.reach[g] > 0.0:
+            if own.friction_coefficient[g] > 0.0:
                 first[parts], size[parts] = normal, own.size[g]
                 normal += own.size[g]
                 parts += 1
@@ -204,7 +204,7 @@ cdef inline bint hold(scaled_t* s, const view_t* v) noexcept nogil:
 
 
 cdef inline void scale_elements(scaled_t* s, const view_t* v, double* w, double* scratch) noexcept nogil:
-    """Their numbers, in the places of `lay_numbers`; w (rows) and scratch (velocities) are lost."""
+    """Their numbers, in the places of `bind_scaling_workspace`; w (rows) and scratch (velocities) are lost."""
     cdef const blocks_t* p = &v.p
     cdef int32_t i, j, q, h, g
     cdef double x

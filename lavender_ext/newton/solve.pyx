@@ -14,17 +14,18 @@ import numpy as np
 from lavender_ext.factor.symbolic import block_panels
 
 from lavender_ext.core.arrays cimport address, zeros
-from lavender_ext.core.method cimport CERTIFICATE, MORE, NEEDS_WORKSPACE, Method, grant, method_t, options_t, workspace_t, said_t
-from lavender_ext.core.parts cimport COULOMB
+from lavender_ext.core.method cimport (CERTIFICATE, MORE, NEEDS_WORKSPACE, Method, require_workspace, method_t, options_t,
+                                       workspace_t, info_t)
+from lavender_ext.core.block_types cimport COULOMB
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.view cimport rows_t, view_t
 from lavender_ext.factor.blocks cimport sparse_t
 from lavender_ext.factor.sparse cimport SparsePanels
 from lavender_ext.factor.symbolic cimport block_pattern
 from lavender_ext.factor.tiles cimport has_wide
-from lavender_ext.newton.bodies cimport (PARTS, body_workspace_size, factor_workspace_size, furnish_bodies, furnish_factor,
-                                         index_workspace_size,
-                                         lay_bodies, lay_pattern, make_pattern, order_bodies, order_index, panel_of,
+from lavender_ext.newton.bodies cimport (PARTS, body_workspace_size, factor_workspace_size,
+                                         bind_body_workspace, furnish_factor, index_workspace_size, bind_bodies,
+                                         bind_pattern_workspace, make_pattern, order_bodies, order_index, panel_of,
                                          panel_of_velocities, pattern_t)
 from lavender_ext.newton.elements cimport elements_t
 from lavender_ext.newton.interior cimport ipm_scale
@@ -32,8 +33,9 @@ from lavender_ext.newton.path cimport path_compliance, smooth
 from lavender_ext.newton.phases cimport begin_exchanges, exchange_once, sides
 from lavender_ext.newton.plan cimport newton_start, newton_step
 from lavender_ext.newton.run cimport (APPROACH, DE_SAXCE, EXCHANGES, INTERIOR, N_COUNTED, PATH, POLISH, PROXIMAL, PURSUIT,
-                                      RELAXED, aim, furnish, impulse_of, judge_workspace_size, lay_index, lay_judge, newton_t,
-                                      own_index, own_workspace_size, proof_of, relative_at, set_reference)
+                                      RELAXED, aim, bind_real_workspace, impulse_of, judge_workspace_size,
+                                      bind_index_workspace, bind_judge_workspace, newton_t, own_index, own_workspace_size,
+                                      proof_of, relative_at, set_reference)
 from lavender_ext.newton.scaling cimport dense_matrix, find_elements, is_known
 from lavender_ext.newton.steps cimport begin_interior, duals, interior_step, slips, turn
 from lavender_ext.newton.system cimport (DENSE, OF_BARRIER, OF_NATURAL, OF_PAIR, SPARSE, dense_workspace_size,
@@ -96,7 +98,7 @@ cdef inline int32_t begin(newton_t* n, const options_t* o, const double* lam) no
 
 
 cdef int32_t system_step(const view_t* v, const options_t* o, const workspace_t* r, int32_t work, double* lam,
-                                said_t* said) noexcept nogil:
+                                info_t* info) noexcept nogil:
     cdef newton_t* n = state_of(r)
     cdef int32_t how
     n.budget, n.proven, n.stop = o.budget, o.proven, o.stop
@@ -105,9 +107,9 @@ cdef int32_t system_step(const view_t* v, const options_t* o, const workspace_t*
         impulse_of(n, n.best_z, lam)
     else:
         memcpy(lam, n.kept.impulse, v.p.n_rows * sizeof(double))
-    said.work = said.factorisations = n.s.factorisations
-    said.relative, said.tried = n.best, n.lam
-    said.direction = proof_of(n) if how == CERTIFICATE else NULL
+    info.work = info.factorisations = n.s.factorisations
+    info.relative, info.tried = n.best, n.lam
+    info.direction = proof_of(n) if how == CERTIFICATE else NULL
     return how
 
 
@@ -125,15 +127,15 @@ cdef int32_t rows_start(const view_t* v, const options_t* o, workspace_t* r, con
     cdef workspace_t need
     cdef double* x
     rows_workspace_size(v, o, &need)
-    if not grant(r, need.n_index, need.n_real):
+    if not require_workspace(r, need.n_index, need.n_real):
         return NEEDS_WORKSPACE
     memset(n, 0, sizeof(newton_t))
     aim(n, &v.p, v.a, NULL, NULL)
-    x = lay_judge(n, r.real)
-    lay_index(n, m, r.index + head())
+    x = bind_judge_workspace(n, r.real)
+    bind_index_workspace(n, m, r.index + head())
     find_elements(&n.sc, v)
     memset(x, 0, own_workspace_size(m, n.sc.small) * sizeof(double))
-    x = furnish(n, v, x)
+    x = bind_real_workspace(n, v, x)
     n.s.form, n.s.wide = DENSE, o.wide
     n.s.h, n.s.whole, n.s.lower = x, x + m * m, x + 2 * m * m
     n.s.symmetric = dense_matrix(&n.sc, v.a, <int32_t>m, n.s.swap, x)
@@ -150,18 +152,18 @@ cdef int32_t bodies_workspace_size(const view_t* v, const options_t* o, workspac
 cdef int32_t bodies_start(const view_t* v, const options_t* o, workspace_t* r, const double* lam) noexcept nogil:
     cdef newton_t* n = state_of(r)
     cdef pattern_t* a = &(<state_t*>r.index).a
-    if not r.laid:
-        if not grant(r, head() + index_workspace_size(&v.p, v.r), 0):
+    if not r.is_bound:
+        if not require_workspace(r, head() + index_workspace_size(&v.p, v.r), 0):
             return NEEDS_WORKSPACE
         memset(n, 0, sizeof(newton_t))
-        lay_bodies(n, a, r.index + head(), &v.p, v.r)
+        bind_bodies(n, a, r.index + head(), &v.p, v.r)
         find_elements(&n.sc, v)
         make_pattern(&n.sc, a, v.r)
-        r.laid = 1
-    if not grant(r, r.n_index, judge_workspace_size(&v.p, v.r, NULL) + body_workspace_size(n, a, &v.p, v.r)):
+        r.is_bound = 1
+    if not require_workspace(r, r.n_index, judge_workspace_size(&v.p, v.r, NULL) + body_workspace_size(n, a, &v.p, v.r)):
         return NEEDS_WORKSPACE
     aim(n, &v.p, NULL, v.r, NULL)
-    furnish_bodies(n, a, lay_judge(n, r.real), v)
+    bind_body_workspace(n, a, bind_judge_workspace(n, r.real), v)
     return begin(n, o, lam)
 
 
@@ -218,7 +220,7 @@ cdef class Layout:
         cdef int64_t k = body.shape[0], below
         cdef int32_t i
         self.index = np.empty(order_index(n, k) + 2, np.int32)
-        lay_pattern(a, <int32_t*>address(self.index), n, k, 0)
+        bind_pattern_workspace(a, <int32_t*>address(self.index), n, k, 0)
         if k:
             memcpy(a.body, &body[0, 0], 2 * k * sizeof(int32_t))
         with nogil:
@@ -280,11 +282,11 @@ cdef class Solve(Method):
         set_reference(&n.problem, data.reference_energy, data.reference_velocity)
         judge = zeros(judge_workspace_size(&n.problem.p, n.problem.r, n.problem.g))
         self.held = [matrix, judge]
-        lay_judge(n, <double*>address(judge))
-        lay_index(n, rows, self.space.index + head())
+        bind_judge_workspace(n, <double*>address(judge))
+        bind_index_workspace(n, rows, self.space.index + head())
         find_elements(&n.sc, &v)
         self.real = zeros(own_workspace_size(rows, n.sc.small))
-        furnish(n, &v, <double*>address(self.real))
+        bind_real_workspace(n, &v, <double*>address(self.real))
         m = self.m = n.sc.e.m
         k = n.sc.e.n
         self.keep, self.block = part(self.index, n.sc.keep, m), part(self.index, n.sc.block, k)

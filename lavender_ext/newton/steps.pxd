@@ -27,7 +27,7 @@ from libc.stdint cimport int32_t
 from libc.string cimport memset
 
 from lavender_ext.core.block cimport length
-from lavender_ext.core.door cimport all_finite
+from lavender_ext.core.validate cimport all_finite
 from lavender_ext.newton.cones cimport is_high, is_low, load_dual, scatter
 from lavender_ext.newton.elements cimport elements_t, is_row
 from lavender_ext.newton.interior cimport ipm_affine, ipm_rhs, ipm_scale, ipm_start, ipm_update

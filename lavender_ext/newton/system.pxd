@@ -13,9 +13,9 @@ from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memcpy, memset
 
 from lavender_ext.core.csr cimport csr_dot
-from lavender_ext.core.door cimport largest
+from lavender_ext.core.validate cimport norm_inf
 from lavender_ext.core.dot cimport dot
-from lavender_ext.core.parts cimport CONE
+from lavender_ext.core.block_types cimport CONE
 from lavender_ext.core.view cimport csr_t
 from lavender_ext.factor.blocks cimport factor_t
 from lavender_ext.factor.cholesky cimport block_cholesky, block_solve
@@ -356,13 +356,13 @@ cdef inline void natural_times(system_t* s, const double* dz, double* out) noexc
 cdef inline void solve_refined(system_t* s, const double* rhs, double* x, double* r, double* dx) noexcept nogil:
     """(3) with its eps mostly refined away; the next Newton step does the rest. r, dx (m) are scratch."""
     cdef int32_t j, _, m = s.e.m
-    cdef double left, last = 1.0 / 0.0, size = largest(rhs, m)
+    cdef double left, last = 1.0 / 0.0, size = norm_inf(rhs, m)
     solve_natural(s, rhs, x)
     for _ in range(ROUNDS):
         natural_times(s, x, r)
         for j in range(m):
             r[j] = rhs[j] - r[j]
-        left = largest(r, m)
+        left = norm_inf(r, m)
         if not left < 0.5 * last or left <= 1e-16 * size:
             return
         last = left

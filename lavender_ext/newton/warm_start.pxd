@@ -11,7 +11,7 @@ tol) is left to the caller, with lam as it came.
 """
 from libc.stdint cimport int32_t, int64_t
 
-from lavender_ext.core.parts cimport blocks_t
+from lavender_ext.core.block_types cimport blocks_t
 from lavender_ext.core.view cimport rows_t
 
 
@@ -51,7 +51,7 @@ cdef inline int64_t room_of(const blocks_t* p, int32_t width) noexcept nogil:
     return (3 + <int64_t>width) * p.n_rows
 
 
-cdef inline void lay_out(warm_t* s, double* real, int32_t* index, const blocks_t* p, const rows_t* r) noexcept nogil:
+cdef inline void bind_warm_workspace(warm_t* s, double* real, int32_t* index, const blocks_t* p, const rows_t* r) noexcept nogil:
     # index (n_bodies + 2 joints)
     s.kept = real
     s.slack = real + p.n_rows

@@ -5,26 +5,26 @@ from libc.stdint cimport int32_t, int64_t
 import numpy as np
 
 from lavender_ext.core.block cimport row_error
-from lavender_ext.core.parts cimport COULOMB, blocks_t, is_rows
+from lavender_ext.core.block_types cimport COULOMB, blocks_t, is_rows
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.rows cimport dot6, relax_rows_block
-from lavender_ext.core.start cimport is_nothing
+from lavender_ext.core.start cimport is_zero_impulse
 from lavender_ext.core.velocity cimport rows_velocity
 from lavender_ext.core.view cimport rows_t
 from lavender_ext.factor.band cimport ldl_factor, ldl_solve, pivots_t
 from lavender_ext.judge.measure cimport score_slack
 from lavender_ext.judge.score cimport new_score, relative, score_t
 from lavender_ext.judge.slack cimport rows_slack
-from lavender_ext.judge.tally cimport nothing, tally_row, tally_t
+from lavender_ext.judge.tally cimport empty_tally, tally_row, tally_t
 from lavender_ext.newton.warm_start cimport (FIRST_SWEEPS, JUDGED, MOST_ROWS, MOST_BAND, MOST_SWEEPS, MOST_TRACED, PATIENT_SWEEPS,
-                                             SOLVED, SWEPT, UNDECIDED, lay_out, room_of, warm_t)
+                                             SOLVED, SWEPT, UNDECIDED, bind_warm_workspace, room_of, warm_t)
 
 
 cdef int32_t start_errors(const blocks_t* p, double* energy, double* velocity) noexcept nogil:
     """E0, V0 of lam = 0, w = -b; 0 where they are not plainly the judge's."""
     cdef int32_t i, j
     cdef double e, rhs = 0.0, least = 1.0 / 0.0, inf = 1.0 / 0.0
-    cdef tally_t s = nothing()
+    cdef tally_t s = empty_tally()
     for i in range(p.n_blocks):
         for j in range(p.ptr[i], p.ptr[i + 1]):
             if not 0.0 < p.d[j] < inf:
@@ -213,7 +213,7 @@ cdef int32_t warm_solve(const blocks_t* p, const rows_t* r, warm_t* s, double to
     s.sweeps = 0
     s.factorisations = 0
     s.traced = 0
-    if is_nothing(p, lam) or p.n_rows > MOST_ROWS or p.law != COULOMB or not start_errors(p, &e0, &v0):
+    if is_zero_impulse(p, lam) or p.n_rows > MOST_ROWS or p.law != COULOMB or not start_errors(p, &e0, &v0):
         return UNDECIDED
     if not has_velocity:
         rows_velocity(p, r, lam, v)
@@ -244,7 +244,7 @@ def from_guess(Data data, double[::1] impulse, double tol):
     s.width = band_width(&data.blocks, &data.rows, &index[0])
     cdef double[::1] real = np.empty(6 * data.rows.n_bodies + room_of(&data.blocks, s.width))
     s.trace = NULL
-    lay_out(&s, &real[6 * data.rows.n_bodies], &index[0], &data.blocks, &data.rows)
+    bind_warm_workspace(&s, &real[6 * data.rows.n_bodies], &index[0], &data.blocks, &data.rows)
     with nogil:
         how = warm_solve(&data.blocks, &data.rows, &s, tol, &impulse[0], &real[0], 0)
     return how, s.sweeps, s.factorisations

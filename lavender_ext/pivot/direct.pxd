@@ -12,7 +12,7 @@ The best judged impulse stands in `best` after each call.
 """
 from libc.stdint cimport int32_t, int64_t
 
-from lavender_ext.core.parts cimport blocks_t
+from lavender_ext.core.block_types cimport blocks_t
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.view cimport csr_t, view_t
 from lavender_ext.judge.score cimport score_t

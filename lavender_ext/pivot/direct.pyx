@@ -19,7 +19,7 @@ from libc.string cimport memcpy
 import numpy as np
 
 from lavender_ext.core.block cimport clip
-from lavender_ext.core.parts cimport blocks_t
+from lavender_ext.core.block_types cimport blocks_t
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.view cimport csr_t, view_t
 from lavender_ext.judge.measure cimport above_floor_of, floor_of, judge_view, judged_from, relative_of, scratch_of

@@ -1,7 +1,7 @@
 """Lemke's method for other compiled loops: memory of the caller's, then calls of `lemke_run` until it says DONE."""
 from libc.stdint cimport int32_t, int64_t, uint64_t
 
-from lavender_ext.core.parts cimport blocks_t
+from lavender_ext.core.block_types cimport blocks_t
 from lavender_ext.pivot.direct cimport direct_t
 
 

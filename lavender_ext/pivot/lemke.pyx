@@ -29,9 +29,9 @@ from libc.string cimport memcpy
 
 import numpy as np
 
-from lavender_ext.core.door cimport largest
+from lavender_ext.core.validate cimport norm_inf
 from lavender_ext.core.order cimport next_random
-from lavender_ext.core.parts cimport blocks_t
+from lavender_ext.core.block_types cimport blocks_t
 from lavender_ext.judge.score cimport is_at_floor
 from lavender_ext.pivot.direct cimport (HALVED, Pivoting, direct_begin, direct_begin_passes, direct_pass, direct_rounds, direct_t,
                                         judge_now)
@@ -268,7 +268,7 @@ cdef inline int32_t free_pivot(const lemke_t* l, int32_t end, int32_t* one, int3
     cdef int32_t i, j, first = l.bounded + l.caps
     cdef double size, most = 1e-11
     for i in range(first, end):
-        size = largest(d.t + i * d.width, d.n)          # of row i of M
+        size = norm_inf(d.t + i * d.width, d.n)          # of row i of M
         for j in range(first, end):
             if fabs(d.t[i * d.width + j]) > most * size:
                 one[0], two[0], most = i, j, fabs(d.t[i * d.width + j]) / size
@@ -285,7 +285,7 @@ cdef inline int32_t bounded_pivot(lemke_t* l, int32_t end, int32_t* one, int32_t
     cdef double share, across, most = 1e-11
     cdef const double* y
     for i in range(end):
-        d.t[i * d.width + d.n] = largest(d.t + i * d.width, d.n)    # z has no column yet
+        d.t[i * d.width + d.n] = norm_inf(d.t + i * d.width, d.n)    # z has no column yet
     for j in range(first):
         y = d.t + j * d.width
         share, across, r, c = 0.0, 0.0, first, first

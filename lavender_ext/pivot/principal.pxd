@@ -1,7 +1,7 @@
 """Principal pivoting for other compiled loops: its state, its outcomes, and its steps by name."""
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.parts cimport blocks_t
+from lavender_ext.core.block_types cimport blocks_t
 from lavender_ext.core.view cimport csr_t
 from lavender_ext.factor.band cimport pivots_t
 

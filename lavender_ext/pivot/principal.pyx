@@ -15,7 +15,7 @@ from libc.stdint cimport int32_t, int64_t
 
 from lavender_ext.core.block cimport relax_row
 from lavender_ext.core.csr cimport csr_dot
-from lavender_ext.core.parts cimport blocks_t
+from lavender_ext.core.block_types cimport blocks_t
 from lavender_ext.core.view cimport csr_t
 from lavender_ext.factor.band cimport ldl_back_all, ldl_factor, ldl_factor_2, ldl_solve, no_pivots
 from lavender_ext.factor.dense_lu cimport lu_factor, lu_solve

@@ -2,7 +2,7 @@
 from libc.stdint cimport int32_t
 
 from lavender_ext.core.method cimport workspace_t
-from lavender_ext.core.parts cimport blocks_t
+from lavender_ext.core.block_types cimport blocks_t
 from lavender_ext.core.view cimport view_t
 from lavender_ext.judge.score cimport score_t
 

@@ -18,7 +18,8 @@ import numpy as np
 from lavender_ext.core.arrays cimport doubles
 from lavender_ext.core.csr cimport scan_entries
 from lavender_ext.core.order cimport sort_by_level
-from lavender_ext.core.parts cimport CONE, CONTACT_ROLLING, FRICTIONS, ROUND, blocks_t, frictions_of, is_rows, lay_frictions
+from lavender_ext.core.block_types cimport (CONE, CONTACT_ROLLING, N_FRICTION_ARRAYS, ROUND, blocks_t, get_friction_arrays,
+                                            is_rows, bind_friction_arrays)
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.method cimport workspace_t
 from lavender_ext.core.view cimport bodies_of, csr_t, rows_t
@@ -268,7 +269,7 @@ cdef class Rules:
 cdef enum:                      # doubles of an island's data
     ROW_DOUBLES = 7             # per row: lower, upper, b, d, nu, step, start
     JOINT_ROW_DOUBLES = 24      # per joint row: J, M^-1 J^T
-    CONTACT_ROW_DOUBLES = 6     # per contact row: swing
+    CONTACT_ROW_DOUBLES = 6     # per contact row: inv_inertia_arm
     CONTACT_DOUBLES = 17        # per contact: normal, tangent, arm_a, arm_b, coupling
     BODY_DOUBLES = 10           # per body: 1/m, I^-1
     N_SIZES = 5                 # rows, blocks, entries of A, joint rows, joints
@@ -303,7 +304,7 @@ cdef inline void lay(island_t* x, double* numbers, int32_t* integers, const int3
     p.n_blocks, p.n_rows, p.islands = k, m, NULL
     p.lower, p.upper, p.b = take_next(&numbers, m), take_next(&numbers, m), take_next(&numbers, m)
     p.d, p.nu, p.step, x.s.lam = take_next(&numbers, m), take_next(&numbers, m), take_next(&numbers, m), take_next(&numbers, m)
-    lay_frictions(p, take_next(&numbers, FRICTIONS * k), k)
+    bind_friction_arrays(p, take_next(&numbers, N_FRICTION_ARRAYS * k), k)
     p.ptr, p.kind = integers, integers + k + 1
     integers += 2 * k + 1
     x.s.v.a = x.s.v.r = x.s.v.g = NULL
@@ -316,7 +317,7 @@ cdef inline void lay(island_t* x, double* numbers, int32_t* integers, const int3
         r.jac, r.minv_jac = take_next(&numbers, 12 * mj), take_next(&numbers, 12 * mj)
         r.normal, r.tangent = take_next(&numbers, 3 * c), take_next(&numbers, 3 * c)
         r.arm_a, r.arm_b, r.coupling = take_next(&numbers, 3 * c), take_next(&numbers, 3 * c), take_next(&numbers, 5 * c)
-        r.swing, r.compliance = take_next(&numbers, CONTACT_ROW_DOUBLES * (m - mj)), take_next(&numbers, m)
+        r.inv_inertia_arm, r.compliance = take_next(&numbers, CONTACT_ROW_DOUBLES * (m - mj)), take_next(&numbers, m)
         r.inv_mass, r.inv_inertia = take_next(&numbers, n), take_next(&numbers, 9 * n)
         r.joint_body, r.contact_body = integers, integers + 2 * size[4]
         integers += 2 * k
@@ -329,19 +330,19 @@ cdef inline void copy_blocks(island_t* x, const blocks_t* p, const int32_t* bloc
                              int32_t* place) noexcept nogil:
     """Copy the blocks `block` of the complete problem; place (rows of the problem) receives the row indices in the island."""
     cdef const double* of_row[ROW_DOUBLES]
-    cdef const double* of_block[FRICTIONS]
+    cdef const double* of_block[N_FRICTION_ARRAYS]
     cdef blocks_t* own = &x.s.v.p
     cdef int32_t i, j, k, q, row, n = 0
     cdef int32_t* ptr = <int32_t*>own.ptr
     of_row[0], of_row[1], of_row[2], of_row[3], of_row[4], of_row[5] = p.lower, p.upper, p.b, p.d, p.nu, p.step
     of_row[6] = lam
-    frictions_of(p, of_block)
+    get_friction_arrays(p, of_block)
     own.law = p.law
     ptr[0] = 0
     for k in range(own.n_blocks):
         i = block[k]
         (<int32_t*>own.kind)[k] = p.kind[i]
-        for q in range(FRICTIONS):
+        for q in range(N_FRICTION_ARRAYS):
             x.numbers[ROW_DOUBLES * own.n_rows + q * own.n_blocks + k] = of_block[q][i]
         j = p.ptr[i]
         for q in range(ROW_DOUBLES):
@@ -406,7 +407,8 @@ cdef inline void copy_bodies(island_t* x, const blocks_t* p, const rows_t* r, co
             memcpy(<void*>(y.jac + 12 * m), r.jac + 12 * j, 12 * n * sizeof(double))
             memcpy(<void*>(y.minv_jac + 12 * m), r.minv_jac + 12 * j, 12 * n * sizeof(double))
             continue
-        memcpy(<void*>(y.swing + CONTACT_ROW_DOUBLES * (m - first)), r.swing + CONTACT_ROW_DOUBLES * (j - p.ptr[r.n_joints]),
+        memcpy(<void*>(y.inv_inertia_arm + CONTACT_ROW_DOUBLES * (m - first)),
+               r.inv_inertia_arm + CONTACT_ROW_DOUBLES * (j - p.ptr[r.n_joints]),
                CONTACT_ROW_DOUBLES * n * sizeof(double))
         c, i = k - y.n_joints, i - r.n_joints
         copy_entry(y.normal + 3 * c, 3, r.normal, i)
@@ -558,7 +560,7 @@ cdef class Islands(Small):
         cdef island_t* last
         cdef bint good = True
         m, k, q, _, _ = self.size.max(axis=0)
-        cdef int64_t each = (ROW_DOUBLES + 1) * <int64_t>m + FRICTIONS * k + q, whole = 4 * k + m + 2 + q
+        cdef int64_t each = (ROW_DOUBLES + 1) * <int64_t>m + N_FRICTION_ARRAYS * k + q, whole = 4 * k + m + 2 + q
         if over_bodies:
             n = min(2 * k, n_bodies)
             each += (JOINT_ROW_DOUBLES + CONTACT_ROW_DOUBLES + 1) * <int64_t>m + CONTACT_DOUBLES * k + BODY_DOUBLES * n

@@ -8,8 +8,8 @@ from libc.string cimport memcmp, memcpy, memset
 
 from lavender_ext.accelerate.accelerated cimport lav_anderson, sweep_data_t
 from lavender_ext.accelerate.mixing cimport CONTROL, MAX_MEMORY, UNDONE
-from lavender_ext.core.method cimport CERTIFICATE, MORE, NEEDS_WORKSPACE, options_t, workspace_t, said_t
-from lavender_ext.core.parts cimport CONE, blocks_t
+from lavender_ext.core.method cimport CERTIFICATE, MORE, NEEDS_WORKSPACE, options_t, workspace_t, info_t
+from lavender_ext.core.block_types cimport CONE, blocks_t
 from lavender_ext.core.view cimport csr_t, view_t
 from lavender_ext.driver.driver cimport NEWTON, lav_workspace_size, lav_start, lav_step
 from lavender_ext.small.workspace cimport has_workspace_size
@@ -71,7 +71,7 @@ cdef struct alternation_t:      # state of one subproblem
     sweep_data_t c
     options_t options
     workspace_t workspace
-    said_t said
+    info_t info
     int32_t how
     double sweep                # estimated cost of a sweep, ns; no clock is read
     double factor               # estimated cost of a factorisation with its steps, ns
@@ -105,7 +105,7 @@ cdef inline void lay_turns(alternation_t* t, double* work, int32_t* order, uint6
 
 cdef inline double cost_so_far(const alternation_t* t) noexcept nogil:
     """Return the estimated cost [ns] of this subproblem so far."""
-    return t.c.turn * t.sweep + t.said.factorisations * t.factor
+    return t.c.turn * t.sweep + t.info.factorisations * t.factor
 
 
 cdef inline double relative_residual_of(alternation_t* t, const double* lam) noexcept nogil:
@@ -150,7 +150,7 @@ cdef inline bint start_newton(alternation_t* t) noexcept nogil:
     t.how = 0
     if not lav_workspace_size(&t.s.v, &t.options, &t.workspace):
         return False
-    t.said.factorisations = 0
+    t.info.factorisations = 0
     while True:
         if not has_workspace_size(r, t.workspace.n_index, t.workspace.n_real):
             return False
@@ -163,9 +163,9 @@ cdef inline bint start_newton(alternation_t* t) noexcept nogil:
 cdef inline double step_newton(alternation_t* t, int32_t steps) noexcept nogil:
     """Run up to `steps` factorisations and return the relative residual of `answer`."""
     cdef double fit = (t.o.remaining_cost - cost_so_far(t)) / t.factor
-    cdef int32_t last = t.said.factorisations + (steps if fit > steps else <int32_t>max(fit, 0.0))
-    while t.said.factorisations < last and (t.how == MORE or t.how == CERTIFICATE):
-        t.how = lav_step(&t.s.v, &t.options, &t.workspace, last - t.said.factorisations, t.s.answer, &t.said)
+    cdef int32_t last = t.info.factorisations + (steps if fit > steps else <int32_t>max(fit, 0.0))
+    while t.info.factorisations < last and (t.how == MORE or t.how == CERTIFICATE):
+        t.how = lav_step(&t.s.v, &t.options, &t.workspace, last - t.info.factorisations, t.s.answer, &t.info)
     return relative_residual_of(t, t.s.answer)
 
 
@@ -205,7 +205,7 @@ cdef inline bint solve_subproblem(subproblem_t* s, friction_run_t* o, workspace_
     # residual of the start
     memcpy(t.swept, s.lam, p.n_rows * sizeof(double))
     form_velocity(&t.sweeps, t.swept)
-    t.said.factorisations = 0
+    t.info.factorisations = 0
     if memcmp(t.swept, s.answer, p.n_rows * sizeof(double)) != 0:
         now = relative_residual_of(&t, t.swept)
     else:
@@ -224,10 +224,10 @@ cdef inline bint solve_subproblem(subproblem_t* s, friction_run_t* o, workspace_
     # counters
     o.swept += t.c.turn
     o.undone += <int64_t>t.c.control[UNDONE]
-    o.factorisations += t.said.factorisations
-    o.factored += t.said.factorisations * (<double>p.n_rows * p.n_rows * p.n_rows)
-    if t.c.turn + t.said.factorisations > o.longest:
-        o.longest = t.c.turn + t.said.factorisations
+    o.factorisations += t.info.factorisations
+    o.factored += t.info.factorisations * (<double>p.n_rows * p.n_rows * p.n_rows)
+    if t.c.turn + t.info.factorisations > o.longest:
+        o.longest = t.c.turn + t.info.factorisations
     o.remaining_cost -= cost_so_far(&t)
     # at the cost limit the better of both iterates is the result
     if now > o.tol and not o.remaining_cost > 0.0 and not relative_residual_of(&t, s.answer) <= relative_residual_of(&t, t.swept):

@@ -8,7 +8,7 @@ Y: entries of J L^-1, m: rows, w: multiply-adds to factorise N of every island, 
 from libc.math cimport INFINITY
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.parts cimport COULOMB, blocks_t, has_friction, is_rows
+from lavender_ext.core.block_types cimport COULOMB, blocks_t, has_friction, is_rows
 from lavender_ext.core.view cimport generalized_t
 
 

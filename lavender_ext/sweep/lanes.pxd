@@ -18,7 +18,7 @@ Where a block has no partner both lanes hold it, and what the second computes is
 from libc.stdint cimport int32_t, int64_t
 
 from lavender_ext.core.block cimport relax_tangents
-from lavender_ext.core.parts cimport blocks_t, is_box, n_directions, parts_of, parts_t
+from lavender_ext.core.block_types cimport blocks_t, is_box, n_tangents, get_friction_components, friction_components_t
 from lavender_ext.core.rows cimport cross, relax_rows_block
 from lavender_ext.core.view cimport bodies_of, rows_t
 from lavender_ext.sweep.pair cimport (LANES, all_within, any_beyond, at, both, clip_pair, gather, gather_six,
@@ -90,7 +90,7 @@ cdef inline int32_t kind_of(const blocks_t* p, const rows_t* r, int32_t i) noexc
         return JOINT + 4 * (n - 1) + 2 * (r.joint_body[2 * i] >= 0) + (r.joint_body[2 * i + 1] >= 0)
     if is_box(p, i):
         return SQUARE
-    return n if n == NORMAL or n_directions(p, i) == 2 else ALONE
+    return n if n == NORMAL or n_tangents(p, i) == 2 else ALONE
 
 
 cdef inline int32_t rows_of(int32_t kind) noexcept nogil:
@@ -119,7 +119,7 @@ cdef inline void pack_contact(const blocks_t* p, const rows_t* r, int32_t i, int
     cdef int32_t c = i - r.n_joints, d = j - r.n_joints, e = p.ptr[i], f = p.ptr[j], first = p.ptr[r.n_joints], k
     cdef const int32_t* x = r.contact_body + 2 * c
     cdef const int32_t* y = r.contact_body + 2 * d
-    cdef parts_t part_i, part_j
+    cdef friction_components_t part_i, part_j
     cdef double t2[6]
     cdef double m[2]
     put(out + C_NORMAL, 3, r.normal + 3 * c, r.normal + 3 * d)
@@ -134,7 +134,7 @@ cdef inline void pack_contact(const blocks_t* p, const rows_t* r, int32_t i, int
         out[0] = gather(r.compliance + e + k, r.compliance + f + k)
         out[1] = gather(p.b + e + k, p.b + f + k)
         out[2] = gather(p.step + e + k, p.step + f + k)
-        put(out + 3, 6, r.swing + 6 * (e - first + k), r.swing + 6 * (f - first + k))
+        put(out + 3, 6, r.inv_inertia_arm + 6 * (e - first + k), r.inv_inertia_arm + 6 * (f - first + k))
         out += C_ROW_SIZE
     if n == NORMAL:
         return
@@ -142,13 +142,13 @@ cdef inline void pack_contact(const blocks_t* p, const rows_t* r, int32_t i, int
     cross(r.normal + 3 * c, r.tangent + 3 * c, t2)
     cross(r.normal + 3 * d, r.tangent + 3 * d, t2 + 3)
     put(out + 3, 3, t2, t2 + 3)
-    parts_of(p, i, &part_i)
-    parts_of(p, j, &part_j)
-    out[T_MU] = gather(part_i.reach, part_j.reach)
+    get_friction_components(p, i, &part_i)
+    get_friction_components(p, j, &part_j)
+    out[T_MU] = gather(part_i.friction_coefficient, part_j.friction_coefficient)
     put(out + T_COUPLING, 2, r.coupling + 5 * c, r.coupling + 5 * d)
     out += T_SIZE
     if n == SPIN or n == ROLL_SPIN or is_box(p, i):
-        out[0] = gather(part_i.reach + 1, part_j.reach + 1)
+        out[0] = gather(part_i.friction_coefficient + 1, part_j.friction_coefficient + 1)
         if is_box(p, i):
             m[0] = r.coupling[5 * c + 2] * p.step[e + 2]
             m[1] = r.coupling[5 * d + 2] * p.step[f + 2]
@@ -157,7 +157,7 @@ cdef inline void pack_contact(const blocks_t* p, const rows_t* r, int32_t i, int
         put(out + 1, 3, r.coupling + 5 * c + 2, r.coupling + 5 * d + 2)
         out += S_SIZE
     if n >= ROLL:
-        out[0] = gather(part_i.reach + part_i.n - 1, part_j.reach + part_j.n - 1)
+        out[0] = gather(part_i.friction_coefficient + part_i.n - 1, part_j.friction_coefficient + part_j.n - 1)
 
 
 cdef inline void pack_joint(const blocks_t* p, const rows_t* r, int32_t i, int32_t j, int32_t n,
@@ -224,7 +224,7 @@ cdef inline void project_tangents(pair_t* x, pair_t radius) noexcept nogil:
 
 
 cdef inline void relax_contact_lanes(const contact_t* c, pair_t* lam, double* v, const int64_t* to) noexcept nogil:
-    """relax_contact of core/rows.pxd for no tangents or two, then relax_rolls; lam (1 + nt + spin + roll), to: where a and
+    """relax_contact of core/rows.pxd for no tangents or two, then relax_rolling; lam (1 + nt + spin + roll), to: where a and
     b are written."""
     cdef int32_t nt = 0 if contact_t is normal_t else 2, spin = 1 if contact_t is spin_t or contact_t is roll_spin_t else 0
     cdef int32_t roll = 2 if contact_t is roll_t or contact_t is roll_spin_t else 0

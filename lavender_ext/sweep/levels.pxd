@@ -7,7 +7,7 @@ round. Impulses stay where they are, and a record holds where.
 """
 from libc.stdint cimport int32_t, int64_t
 
-from lavender_ext.core.parts cimport blocks_t
+from lavender_ext.core.block_types cimport blocks_t
 from lavender_ext.core.view cimport rows_t
 from lavender_ext.sweep.lanes cimport MOST_ROWS, P_CODE, P_OWN, P_WRITE, relax_record, rows_of
 from lavender_ext.sweep.packed cimport packed_t

@@ -17,7 +17,7 @@ fill the same slots: none waits for another.
 """
 from libc.stdint cimport int32_t, int64_t, uintptr_t
 
-from lavender_ext.core.parts cimport blocks_t
+from lavender_ext.core.block_types cimport blocks_t
 from lavender_ext.core.view cimport bodies_of, rows_t
 from lavender_ext.sweep.lanes cimport (ALONE, BODY, HEADER, KINDS, MOST_ROWS, P_CODE, P_OWN, P_WRITE, kind_of, pack_blocks,
                                        record_size, relax_record, rows_of)

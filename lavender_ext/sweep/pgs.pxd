@@ -10,31 +10,31 @@ from libc.stdint cimport int32_t
 
 from lavender_ext.core.block cimport relax_normal, relax_row, relax_tangents
 from lavender_ext.core.csr cimport csr_dot
-from lavender_ext.core.generalized cimport whitened_dot, whitened_push
-from lavender_ext.core.parts cimport blocks_t, is_rows, parts_of, parts_t
+from lavender_ext.core.generalized cimport whitened_dot, add_scaled_whitened_row
+from lavender_ext.core.block_types cimport blocks_t, is_rows, get_friction_components, friction_components_t
 from lavender_ext.core.view cimport csr_t, generalized_t, rows_t
 
 
 cdef inline void relax_csr_block(const blocks_t* p, const csr_t* a, int32_t i, double* lam) noexcept nogil:
     cdef int32_t j = p.ptr[i], g, k, q
     cdef double w[2]
-    cdef parts_t part
+    cdef friction_components_t part
     if is_rows(p, i):
         for q in range(j, p.ptr[i + 1]):
             lam[q] = relax_row(lam[q], csr_dot(a, q, lam) - p.b[q], p.step[q], p.lower[q], p.upper[q])
         return
     lam[j] = relax_normal(lam[j], csr_dot(a, j, lam) - p.b[j], p.step[j])
-    parts_of(p, i, &part)
+    get_friction_components(p, i, &part)
     for g in range(part.n):
         k = j + part.first[g]
         for q in range(part.size[g]):
             w[q] = csr_dot(a, k + q, lam) - p.b[k + q]
-        relax_tangents(lam + k, w, p.step[k], part.reach[g] * lam[j], part.size[g])
+        relax_tangents(lam + k, w, p.step[k], part.friction_coefficient[g] * lam[j], part.size[g])
 
 
 cdef inline void take_general(const generalized_t* g, int32_t panel, int32_t q, double now, double* lam,
                               double* u) noexcept nogil:
-    whitened_push(g, panel, q, now - lam[q], u)
+    add_scaled_whitened_row(g, panel, q, now - lam[q], u)
     lam[q] = now
 
 
@@ -61,16 +61,16 @@ cdef inline void relax_general_block(const blocks_t* p, const generalized_t* g, 
                                      double* u) noexcept nogil:
     cdef int32_t j = p.ptr[i], b = g.home[i], k, q
     cdef double x
-    cdef parts_t part
+    cdef friction_components_t part
     if is_rows(p, i):
         for q in range(j, p.ptr[i + 1]):
             x = general_slack_of(p, g, b, q, lam, u)
             take_general(g, b, q, relax_row(lam[q], x, p.step[q], p.lower[q], p.upper[q]), lam, u)
         return
     take_general(g, b, j, relax_normal(lam[j], general_slack_of(p, g, b, j, lam, u), p.step[j]), lam, u)
-    parts_of(p, i, &part)
+    get_friction_components(p, i, &part)
     for k in range(part.n):
-        relax_general_disk(p, g, b, j + part.first[k], part.size[k], part.reach[k] * lam[j], lam, u)
+        relax_general_disk(p, g, b, j + part.first[k], part.size[k], part.friction_coefficient[k] * lam[j], lam, u)
 
 
 cdef void relax_matrix(const blocks_t* p, const csr_t* a, const int32_t* order, double* lam) noexcept nogil

@@ -6,7 +6,7 @@ from libc.stdint cimport int32_t
 
 from lavender_ext.core.block cimport relax_row
 from lavender_ext.core.csr cimport csr_dot
-from lavender_ext.core.parts cimport blocks_t
+from lavender_ext.core.block_types cimport blocks_t
 from lavender_ext.core.rows cimport relax_rows_block
 from lavender_ext.core.view cimport csr_t, generalized_t, rows_t
 from lavender_ext.sweep.pgs cimport relax_csr_block, relax_general_block

@@ -8,13 +8,13 @@
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t, int64_t, uint64_t
 
-from lavender_ext.core.generalized cimport whitened_gather
+from lavender_ext.core.generalized cimport whitened_transpose_times
 from lavender_ext.core.order cimport GIVEN, SYMMETRIC, advance_order
-from lavender_ext.core.parts cimport blocks_t
+from lavender_ext.core.block_types cimport blocks_t
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.velocity cimport rows_velocity
 from lavender_ext.core.view cimport csr_t, generalized_t, rows_t, view_t
-from lavender_ext.judge.watch cimport STALLED, begins_again, sweep_t, watch_t, watched
+from lavender_ext.judge.stopping_test cimport STALLED, begins_again, sweep_t, stopping_test_t, run_until_stop
 from lavender_ext.local.gauss_seidel cimport prepare_blocks, prepared_sizes
 from lavender_ext.sweep.packed cimport MOST, pack_order, packed_t
 
@@ -98,7 +98,7 @@ cdef inline bint is_packed(context_t* c, const double* lam, int64_t sweeps) noex
 cdef inline void form_velocity(const context_t* c, const double* lam) noexcept nogil:
     """v of lam (m); nothing to do where A is swept."""
     if c.general != NULL:
-        whitened_gather(c.general, lam, c.v)
+        whitened_transpose_times(c.general, lam, c.v)
     elif c.n_v > 0:
         rows_velocity(c.blocks, c.rows, lam, c.v)
 
@@ -161,7 +161,7 @@ cdef inline void sweeps_start(sweeping_t* x, const view_t* v, const int32_t* pla
         x.of = c
 
 
-cdef inline int32_t sweeps_step(sweeping_t* x, watch_t* s, const view_t* v, const view_t* confirm, double* lam, int32_t n,
+cdef inline int32_t sweeps_step(sweeping_t* x, stopping_test_t* s, const view_t* v, const view_t* confirm, double* lam, int32_t n,
                                 double tol, int32_t* done) noexcept nogil:
     """n sweeps, fewer where a check ends them; counts them in `done`."""
     cdef int32_t status, more
@@ -170,10 +170,10 @@ cdef inline int32_t sweeps_step(sweeping_t* x, watch_t* s, const view_t* v, cons
         form_velocity(&x.c, lam)
     if x.packing.single:
         is_packed(&x.c, lam, <int64_t>s.total + n)
-    status = watched(s, v, confirm, x.step, x.of, lam, n, tol, done)
+    status = run_until_stop(s, v, confirm, x.step, x.of, lam, n, tol, done)
     while status == STALLED and x.forget != NULL and begins_again(s, AGAIN):
         x.forget(x.of, lam)
-        status = watched(s, v, confirm, x.step, x.of, lam, n - done[0], tol, &more)
+        status = run_until_stop(s, v, confirm, x.step, x.of, lam, n - done[0], tol, &more)
         done[0] += more
     return status
 

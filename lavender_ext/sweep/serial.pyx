@@ -15,9 +15,9 @@ import numpy as np
 
 from lavender_ext.core.block cimport relax_normal, relax_row, relax_tangents
 from lavender_ext.core.csr cimport csr_dot
-from lavender_ext.core.parts cimport blocks_t, is_rows, parts_of, parts_t
+from lavender_ext.core.block_types cimport blocks_t, is_rows, get_friction_components, friction_components_t
 from lavender_ext.core.problem cimport Data
-from lavender_ext.judge.watch cimport CONVERGED, RUNNING, Watch
+from lavender_ext.judge.stopping_test cimport CONVERGED, RUNNING, StoppingTest
 from lavender_ext.local.gauss_seidel cimport solve_blocks
 from lavender_ext.sweep.levels cimport sweep_levels
 from lavender_ext.sweep.packed cimport move_impulses, room_of, sweep_records
@@ -73,7 +73,7 @@ cdef void jacobi_step(void* context, double* lam, int32_t first_sweep, int32_t n
     cdef double* w = c.w
     cdef int32_t _s, i, j, g, q
     cdef double omega = c.omega
-    cdef parts_t part
+    cdef friction_components_t part
     for _s in range(n):
         for i in range(p.n_rows):
             w[i] = csr_dot(c.csr, i, lam) - p.b[i]
@@ -84,10 +84,10 @@ cdef void jacobi_step(void* context, double* lam, int32_t first_sweep, int32_t n
                     lam[q] = relax_row(lam[q], w[q], omega * p.step[q], p.lower[q], p.upper[q])
                 continue
             lam[j] = relax_normal(lam[j], w[j], omega * p.step[j])
-            parts_of(p, i, &part)
+            get_friction_components(p, i, &part)
             for g in range(part.n):
                 q = j + part.first[g]
-                relax_tangents(lam + q, w + q, omega * p.step[q], part.reach[g] * lam[j], part.size[g])
+                relax_tangents(lam + q, w + q, omega * p.step[q], part.friction_coefficient[g] * lam[j], part.size[g])
 
 
 cpdef enum:                     # kinds, which Python names too
@@ -154,7 +154,7 @@ cdef class Sweeps:
         """Blocks so far that fell back."""
         return self.x.c.fallbacks
 
-    def run(self, Watch watch, double[::1] lam, int n, double tol):
+    def run(self, StoppingTest watch, double[::1] lam, int n, double tol):
         """`n` sweeps in place, or fewer where `watch` ends them, GIL released: (status, sweeps done, `undone`)."""
         cdef int32_t status, done = 0
         cdef double before = self.undone()

@@ -16,11 +16,11 @@ from libc.string cimport memcpy, memset
 
 from lavender_ext.core.block cimport block_error, row_error
 from lavender_ext.core.contact_map cimport contact_map
-from lavender_ext.core.generalized cimport panel_push, panel_times
-from lavender_ext.core.parts cimport blocks_t, is_rows, parts_of, parts_t
+from lavender_ext.core.generalized cimport panel_transpose_add, panel_times
+from lavender_ext.core.block_types cimport blocks_t, is_rows, get_friction_components, friction_components_t
 from lavender_ext.core.view cimport generalized_t
 from lavender_ext.factor.tiles cimport combine
-from lavender_ext.judge.tally cimport nothing, tally_block, tally_row, tally_t
+from lavender_ext.judge.tally cimport empty_tally, tally_block, tally_row, tally_t
 
 
 cdef struct descent_t:          # Newton steps under one law
@@ -150,16 +150,16 @@ cdef inline void respond_contact(const flow_t* f, int32_t i, double* lam, double
     cdef int32_t j = f.p.ptr[i], n = f.p.ptr[i + 1] - j, k, l
     cdef const double* root = f.root + j
     cdef const double* soft = f.soft + j
-    cdef parts_t q
+    cdef friction_components_t q
     cdef double y[6]
     cdef double out[6]
     cdef double back[6]                                 # theta^-1/2
     for k in range(n):
         back[k] = root[k] * soft[k]
         y[k] = root[k] * lam[k]
-    parts_of(&f.p, i, &q)
+    get_friction_components(&f.p, i, &q)
     for k in range(q.n):
-        q.reach[k] = q.reach[k] * root[q.first[k]] * back[0]
+        q.friction_coefficient[k] = q.friction_coefficient[k] * root[q.first[k]] * back[0]
     contact_map(f.p.law, &q, y, out, v)
     for k in range(n):
         lam[k] = lam[k] if out[k] == y[k] else out[k] * back[k]
@@ -292,7 +292,7 @@ cdef inline bint gather(const flow_t* f, int32_t island, const double* lam, doub
                 break
         if moves:
             for b in range(f.run[2 * a], f.run[2 * a + 1]):
-                panel_push(f.g, b, lam, x)
+                panel_transpose_add(f.g, b, lam, x)
     return moves
 
 
@@ -350,7 +350,7 @@ cdef inline double measure(const flow_t* f, int32_t island, const double* lam, b
     cdef const double* phi = f.phi
     cdef const double* compliance = f.g.compliance
     cdef double* w = f.w
-    cdef tally_t t = nothing()
+    cdef tally_t t = empty_tally()
     if not moves:
         blank(f, island, w)
     elif f.formed:

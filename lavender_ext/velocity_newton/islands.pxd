@@ -5,7 +5,7 @@ Panels that share a column, directly or through others, are an island: its veloc
 from libc.stdint cimport int32_t
 
 from lavender_ext.core.order cimport sort_by_level
-from lavender_ext.core.parts cimport CONE, COULOMB, blocks_t, has_friction, is_rows
+from lavender_ext.core.block_types cimport CONE, COULOMB, blocks_t, has_friction, is_rows
 from lavender_ext.core.roots cimport root_of
 from lavender_ext.core.view cimport generalized_t
 from lavender_ext.velocity_newton.flow cimport flow_t, row_end, row_from
@@ -244,7 +244,7 @@ cdef inline ssize_t numbers_of(const flow_t* f, const need_t* need) noexcept nog
             + 2 * values + 2 * size + need.most[2] + need.most[1] + need.most[3] + 1 + <ssize_t>need.formed + 2 * need.rows)
 
 
-cdef inline void furnish(flow_t* f, const need_t* need, double* x) noexcept nogil:
+cdef inline void bind_real_workspace(flow_t* f, const need_t* need, double* x) noexcept nogil:
     """Arrays of the iterate, of V and of N in x (`numbers_of`)."""
     cdef ssize_t m = f.p.n_rows, n = max(<ssize_t>f.g.n, m), nv = f.vptr[f.p.n_blocks]
     cdef ssize_t size = max(need.most[0], need.rows), values = <ssize_t>need.values

@@ -4,10 +4,10 @@ The unit of work is a step of one island; 0 judges what is there. `workspace_t.w
 """
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.method cimport MORE, NEEDS_WORKSPACE, SPENT, UNFIT, grant, options_t, workspace_t, said_t
+from lavender_ext.core.method cimport MORE, NEEDS_WORKSPACE, SPENT, UNFIT, require_workspace, options_t, workspace_t, info_t
 from lavender_ext.core.view cimport view_t
 from lavender_ext.velocity_newton.flow cimport flow_t
-from lavender_ext.velocity_newton.islands cimport aim_at, furnish, marks_of, need_t, numbers_of, settle
+from lavender_ext.velocity_newton.islands cimport aim_at, bind_real_workspace, marks_of, need_t, numbers_of, settle
 from lavender_ext.velocity_newton.newton cimport descend_all
 from lavender_ext.velocity_newton.sparse cimport per_column
 
@@ -39,20 +39,21 @@ cdef inline int32_t general_start(const view_t* v, const options_t* o, workspace
     cdef need_t* need = &s.need
     cdef int32_t per
     cdef workspace_t least = r[0]
-    while not r.laid:
+    while not r.is_bound:
         general_workspace_size(v, o, &least)
-        if not grant(r, least.n_index, 0):
+        if not require_workspace(r, least.n_index, 0):
             return NEEDS_WORKSPACE
         per = per_column(v.g.n) << r.tries
         settle(&s.f, &v.p, v.g, per, r.index + sizeof(state_t) // sizeof(int32_t), need)
-        r.laid = not need.crowded
+        r.is_bound = not need.crowded
         r.work, r.islands = need.work, s.f.n_islands
-        if (need.crowded and is_past(o, need, <double>per * v.g.n, v.g.n)) or (r.laid and max(need.values, need.formed) > o.most):
+        if (need.crowded and is_past(o, need, <double>per * v.g.n, v.g.n)
+                or r.is_bound and max(need.values, need.formed) > o.most):
             return UNFIT
-        least.tries = r.tries = r.tries + (1 - r.laid)  # L has more entries than that in a row
-    if not grant(r, r.n_index, numbers_of(&s.f, need)):
+        least.tries = r.tries = r.tries + (1 - r.is_bound)  # L has more entries than that in a row
+    if not require_workspace(r, r.n_index, numbers_of(&s.f, need)):
         return NEEDS_WORKSPACE
-    furnish(&s.f, need, r.real)
+    bind_real_workspace(&s.f, need, r.real)
     s.f.wide = o.wide
     aim_at(&s.f, o.tol, 0, o.e0, o.v0)
     s.done = 0
@@ -60,18 +61,18 @@ cdef inline int32_t general_start(const view_t* v, const options_t* o, workspace
 
 
 cdef inline int32_t general_step(const view_t* v, const options_t* o, const workspace_t* r, int32_t work, double* lam,
-                                 said_t* said) noexcept nogil:
+                                 info_t* info) noexcept nogil:
     """All islands, the one that waits first."""
     cdef state_t* s = <state_t*>r.index
     cdef int32_t how = SPENT, left = o.budget - s.done
-    said.direction = said.tried = NULL
-    said.relative = -1.0
+    info.direction = info.tried = NULL
+    info.relative = -1.0
     if left > 0 and not o.stop:
         s.f.steps = work = work if work < left else left
         how = descend_all(&s.f, lam)
         s.done += work - s.f.steps
         if how == MORE and s.done >= o.budget:
             how = SPENT
-    said.work, said.factorisations = s.done, s.f.factorisations
-    said.rounds, said.evaluations = s.f.rounds, s.f.evaluations
+    info.work, info.factorisations = s.done, s.f.factorisations
+    info.rounds, info.evaluations = s.f.rounds, s.f.evaluations
     return how

@@ -27,8 +27,8 @@ from libc.stdint cimport int32_t
 from lavender_ext.core.block cimport length
 from lavender_ext.core.dot cimport dot
 from lavender_ext.core.method cimport BROKEN, LOST, MORE, REACHED, STUCK
-from lavender_ext.core.parts cimport CONE, COULOMB, blocks_t, is_rows, parts_of, parts_t
-from lavender_ext.core.start cimport is_nothing, zero_impulse
+from lavender_ext.core.block_types cimport CONE, COULOMB, blocks_t, is_rows, get_friction_components, friction_components_t
+from lavender_ext.core.start cimport is_zero_impulse, zero_impulse
 from lavender_ext.core.view cimport generalized_t
 from lavender_ext.velocity_newton.flow cimport (NOWHERE, blank, block_end, block_from, descent_t, flow_t, gather, keep,
                                             measure, renew, respond_all, row_end, row_from, wait_t)
@@ -184,7 +184,7 @@ cdef inline void soften(const flow_t* f, int32_t island, double share) noexcept 
     Rows of one part get the largest.
     """
     cdef int32_t a, i, j, k, g, end, last
-    cdef parts_t q
+    cdef friction_components_t q
     cdef const double* compliance = f.g.compliance
     cdef const double* d = f.p.d
     cdef double* theta = f.theta
@@ -205,7 +205,7 @@ cdef inline void soften(const flow_t* f, int32_t island, double share) noexcept 
                     x += share * d[k]
                 theta[k] = x
             if not is_rows(&f.p, i):
-                parts_of(&f.p, i, &q)
+                get_friction_components(&f.p, i, &q)
                 for g in range(q.n):
                     if q.size[g] > 1:
                         one_theta(theta, j + q.first[g], j + q.first[g] + q.size[g])
@@ -386,10 +386,10 @@ cdef inline double slip(const flow_t* f, int32_t i) noexcept nogil:
     """phi of (3) from w of block i, whose normal it leaves out."""
     cdef int32_t g
     cdef double out = 0.0
-    cdef parts_t q
-    parts_of(&f.p, i, &q)
+    cdef friction_components_t q
+    get_friction_components(&f.p, i, &q)
     for g in range(q.n):
-        out += q.reach[g] * length(f.w + f.p.ptr[i] + q.first[g], q.size[g])
+        out += q.friction_coefficient[g] * length(f.w + f.p.ptr[i] + q.first[g], q.size[g])
     return out
 
 
@@ -562,7 +562,7 @@ cdef inline int32_t descend_all(flow_t* f, double* impulse) noexcept nogil:
     cdef int32_t i, end, first = f.wait.island
     if first < 0:
         first = 0
-        f.wait.worst, f.wait.cold = REACHED, f.law == COULOMB and is_nothing(&f.p, impulse)
+        f.wait.worst, f.wait.cold = REACHED, f.law == COULOMB and is_zero_impulse(&f.p, impulse)
     for i in range(first, f.n_islands):
         end = solve_island(f, i, impulse)
         if end == MORE:                                # N is of this one

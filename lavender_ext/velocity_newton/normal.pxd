@@ -14,8 +14,8 @@ from libc.stdint cimport int32_t
 from libc.string cimport memcpy
 
 from lavender_ext.core.dot cimport dot
-from lavender_ext.core.tree cimport ldl_solve, take_two
-from lavender_ext.core.parts cimport is_rows
+from lavender_ext.core.tree cimport ldl_solve, axpy_subtract_2
+from lavender_ext.core.block_types cimport is_rows
 from lavender_ext.factor.dense_lu cimport lu_factor, lu_solve
 from lavender_ext.factor.tiles cimport combine
 from lavender_ext.velocity_newton.flow cimport block_end, block_from, find_column, flow_t, spread
@@ -207,7 +207,7 @@ cdef inline int32_t factor_rows(const flow_t* f) noexcept nogil:
         for a in range(k - 2, -1, -1):
             to -= a + 1
             x, y = row[a] * r, up[a] * s
-            take_two(to, row, x, up, y, a + 1)
+            axpy_subtract_2(to, row, x, up, y, a + 1)
             row[a], up[a] = x, y
         k -= 2
     return 1

@@ -1,7 +1,7 @@
 """Rows of J and M that are soft enough to need no proximal term."""
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.parts cimport blocks_t, is_rows
+from lavender_ext.core.block_types cimport blocks_t, is_rows
 from lavender_ext.core.view cimport generalized_t
 
 

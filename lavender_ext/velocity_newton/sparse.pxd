@@ -9,7 +9,7 @@ than a dense one would.
 """
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.tree cimport take_two, tree_pattern
+from lavender_ext.core.tree cimport axpy_subtract_2, tree_pattern
 from lavender_ext.core.view cimport generalized_t
 
 
@@ -171,7 +171,7 @@ cdef inline int32_t sparse_factor(int32_t n, const int32_t* lptr, const int32_t*
                         at += 1
                     to[at] = (to[at] - f * row[b]) - g * up[b]
             elif two:
-                take_two(to + at, row, f, up, g, a)
+                axpy_subtract_2(to + at, row, f, up, g, a)
             else:
                 take_row(to + at, row, f, a)
             row[a] = f

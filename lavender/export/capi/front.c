@@ -1,6 +1,6 @@
 /* -- the functions of lavender.h, which use the kernels above --------------------------------------------------------- */
 
-typedef struct core_parts_blocks_t blocks_t;
+typedef struct core_block_types_blocks_t blocks_t;
 typedef struct core_view_csr_t csr_t;
 typedef struct core_view_rows_t rows_t;
 typedef struct core_view_generalized_t general_t;
@@ -42,13 +42,13 @@ struct lav_solver {
   uint64_t *key;
   double *impulse, *v_free, *score_workspace, *compare;
   double start[3]; /* Reference energy E0 [sqrt J] and velocity V0 [m/s], relative residual of the zero impulse. */
-  struct core_parts_islands_t islands;
+  struct core_block_types_islands_t islands;
   double *reference; /* E0 and V0 of each island. */
   int32_t *order, *empty, *marks, *island_marks;
   int32_t split, mode;
   uint64_t rng;
   struct core_view_view_t read; /* The problem for the judge. */
-  struct judge_watch_watch_t watch;
+  struct judge_stopping_test_stopping_test_t stopping_test;
   struct sweep_serial_sweeping_t swept;
   double deadline;  /* Time on the clock of the budget. */
 #ifndef LAV_SWEEPS_ONLY
@@ -143,7 +143,7 @@ static int32_t are_finite(const double *x, int64_t n) {
   return sum == 0.0;
 }
 
-static int32_t is_bound(double x) { return isinf(x) || core_door_is_number(x); }
+static int32_t is_bound(double x) { return isinf(x) || core_validate_is_number(x); }
 
 static int32_t check_counts(const lav_problem *q) {
   const int64_t m = q->n_rows, n = q->n_velocities;
@@ -168,7 +168,7 @@ static int32_t check_options(const lav_options *o) {
   if (o->memory < 1 || o->memory > 16 || o->sweep < LAV_DEFAULT_SWEEP || o->sweep > LAV_BLOCK_SWEEP) return LAV_ERROR_OPTION;
   if (o->convex < 0 || (o->keeps != 0 && o->keeps != 1)) return LAV_ERROR_OPTION;
   if (o->method == LAV_SOR && !(o->omega > 0.0 && o->omega < 2.0)) return LAV_ERROR_OPTION;
-  if (o->method == LAV_JACOBI && !(o->omega >= 0.0 && core_door_is_number(o->omega))) return LAV_ERROR_OPTION;
+  if (o->method == LAV_JACOBI && !(o->omega >= 0.0 && core_validate_is_number(o->omega))) return LAV_ERROR_OPTION;
   if (o->method == LAV_GAUSS_SEIDEL && o->omega != 1.0) return LAV_ERROR_OPTION;
   return LAV_OK;
 }
@@ -236,11 +236,11 @@ static int32_t check_blocks(const lav_problem *q, where_t *at) {
     const double mu = q->mu ? q->mu[i] : 0.0, radius = q->patch_radius ? q->patch_radius[i] : 0.0;
     const double rolling = q->rolling ? q->rolling[i] : 0.0;
     if (kind < LAV_ROW || kind > LAV_CONTACT_ROLLING) return refuse(at, LAV_ERROR_BLOCKS, "kind", i);
-    if (!core_parts_fits(kind, end - first)) return refuse(at, LAV_ERROR_BLOCKS, "block_ptr", i + 1);
+    if (!core_block_types_fits(kind, end - first)) return refuse(at, LAV_ERROR_BLOCKS, "block_ptr", i + 1);
     if (q->form == LAV_BODIES && (kind == LAV_ROW) != (i < q->n_joints)) return refuse(at, LAV_ERROR_BLOCKS, "kind", i);
-    if (!core_door_is_size(mu)) return refuse(at, LAV_ERROR_FRICTION, "mu", i);
-    if (!core_door_is_size(radius) || (kind != LAV_ROW && !core_door_is_size(mu * radius))) return refuse(at, LAV_ERROR_FRICTION, "patch_radius", i);
-    if (!core_door_is_size(rolling)) return refuse(at, LAV_ERROR_FRICTION, "rolling", i);
+    if (!core_validate_is_valid_magnitude(mu)) return refuse(at, LAV_ERROR_FRICTION, "mu", i);
+    if (!core_validate_is_valid_magnitude(radius) || (kind != LAV_ROW && !core_validate_is_valid_magnitude(mu * radius))) return refuse(at, LAV_ERROR_FRICTION, "patch_radius", i);
+    if (!core_validate_is_valid_magnitude(rolling)) return refuse(at, LAV_ERROR_FRICTION, "rolling", i);
     if (kind == LAV_CONTACT && end - first == 1 && mu > 0.0 && q->form == LAV_BODIES)
       return refuse(at, LAV_ERROR_FRICTION, "mu", i);
     for (j = first; kind == LAV_ROW && j < end; j++) {
@@ -282,7 +282,7 @@ static int32_t check_pairs(const int32_t *body, int32_t n, int32_t n_bodies, int
 static int32_t check_numbers(const double *x, int64_t n, int32_t is_needed, const char *name, where_t *at) {
   int64_t i;
   if (!x) return is_needed && n > 0 ? refuse(at, LAV_ERROR_NULL, name, 0) : LAV_OK;
-  i = core_door_first_outside(x, n);
+  i = core_validate_first_invalid(x, n);
   return i < 0 ? LAV_OK : refuse(at, LAV_ERROR_NUMBER, name, i);
 }
 
@@ -293,7 +293,7 @@ static int32_t check_numbers(const double *x, int64_t n, int32_t is_needed, cons
 static double off_frame(const double *n, const double *t) {
   double nn = core_rows_dot3(n, n), tt = core_rows_dot3(t, t), most;
   const double nt = fabs(core_rows_dot3(n, t));
-  if (core_door_is_frame(n, t, EXACT)) return 0.0; /* The usual case, which needs no square root. */
+  if (core_validate_is_frame(n, t, EXACT)) return 0.0; /* The usual case, which needs no square root. */
   nn = fabs(sqrt(nn) - 1.0), tt = fabs(sqrt(tt) - 1.0);
   most = nn > tt ? nn : tt;
   return most > nt ? most : nt;
@@ -312,9 +312,9 @@ static int32_t check_bodies(const lav_problem *q, where_t *at) {
   NEEDED(arm_b, 3 * c);
   for (i = 0; i < n; i++) {
     if (q->inv_mass[i] < 0.0) return refuse(at, LAV_ERROR_MASS, "inv_mass", i);
-    if (!core_door_is_size(q->inv_mass[i])) return refuse(at, LAV_ERROR_NUMBER, "inv_mass", i);
-    if (!core_door_is_size(core_door_largest(q->inv_inertia + 9 * i, 9))) return refuse(at, LAV_ERROR_NUMBER, "inv_inertia", 9 * i);
-    if (!core_door_is_definite(q->inv_inertia + 9 * i, ROUNDED, ROUNDED, 0.0)) return refuse(at, LAV_ERROR_MASS, "inv_inertia", 9 * i);
+    if (!core_validate_is_valid_magnitude(q->inv_mass[i])) return refuse(at, LAV_ERROR_NUMBER, "inv_mass", i);
+    if (!core_validate_is_valid_magnitude(core_validate_norm_inf(q->inv_inertia + 9 * i, 9))) return refuse(at, LAV_ERROR_NUMBER, "inv_inertia", 9 * i);
+    if (!core_validate_is_definite(q->inv_inertia + 9 * i, ROUNDED, ROUNDED, 0.0)) return refuse(at, LAV_ERROR_MASS, "inv_inertia", 9 * i);
   }
   GIVE_BACK(check_pairs(q->joint_body, q->n_joints, q->n_bodies, 0, "joint_body", at));
   GIVE_BACK(check_pairs(q->contact_body, (int32_t)c, q->n_bodies, 1, "contact_body", at));
@@ -348,7 +348,7 @@ static int32_t check_problem(const lav_problem *q, where_t *at) {
     if (!isfinite(q->impulse[i])) return refuse(at, LAV_ERROR_NUMBER, "impulse", i);
   for (i = 0; q->compliance && i < m; i++) {
     if (q->compliance[i] < 0.0) return refuse(at, LAV_ERROR_MASS, "compliance", i);
-    if (!core_door_is_size(q->compliance[i])) return refuse(at, LAV_ERROR_NUMBER, "compliance", i);
+    if (!core_validate_is_valid_magnitude(q->compliance[i])) return refuse(at, LAV_ERROR_NUMBER, "compliance", i);
   }
   if (q->form == LAV_BODIES) return check_bodies(q, at);
   if (q->form == LAV_VELOCITIES) return check_velocities(q, at);

@@ -12,10 +12,10 @@ static const general_t *general_of(const lav_solver *s) { return (void)s, (const
 static double judge(lav_solver *s, const double *impulse, int32_t floor, double tol, lav_verdict *out) {
   score_t t = judge_score_new_score();
   double first = NAN, found;
-  if (s->p.n_rows > 0) judge_measure_judge_view(&s->read, impulse, s->watch.w, s->watch.e, s->watch.v, floor, &t);
+  if (s->p.n_rows > 0) judge_measure_judge_view(&s->read, impulse, s->stopping_test.w, s->stopping_test.e, s->stopping_test.v, floor, &t);
 #ifndef LAV_SWEEPS_ONLY
-  found = judge_measure_relative_of(&t, s->watch.w, s->p.n_rows, s->start[0], s->start[1]);
-  if (floor && judge_measure_refine_view(&s->read, impulse, s->watch.w, s->watch.e, s->watch.v, s->start[0], s->start[1], tol,
+  found = judge_measure_relative_of(&t, s->stopping_test.w, s->p.n_rows, s->start[0], s->start[1]);
+  if (floor && judge_measure_refine_view(&s->read, impulse, s->stopping_test.w, s->stopping_test.e, s->stopping_test.v, s->start[0], s->start[1], tol,
                                         found, &t))
     first = found;
 #else
@@ -26,7 +26,7 @@ static double judge(lav_solver *s, const double *impulse, int32_t floor, double 
   out->unused = 0;
   out->energy = t.finite ? t.energy : INFINITY;
   out->velocity = t.finite ? t.velocity : INFINITY;
-  out->relative = judge_measure_relative_of(&t, s->watch.w, s->p.n_rows, s->start[0], s->start[1]);
+  out->relative = judge_measure_relative_of(&t, s->stopping_test.w, s->p.n_rows, s->start[0], s->start[1]);
   out->floor = floor ? judge_measure_floor_of(&t, s->start[0], s->start[1]) : 0.0;
   return first;
 }
@@ -37,8 +37,8 @@ static double see(lav_solver *s, struct judge_best_best_t *best, const double *i
   score_t t = judge_score_new_score();
   double relative;
   t.by_island = best->now;
-  judge_measure_judge_view(&s->read, impulse, s->watch.w, s->watch.e, s->watch.v, 0, &t);
-  relative = judge_measure_relative_of(&t, s->watch.w, s->p.n_rows, s->start[0], s->start[1]);
+  judge_measure_judge_view(&s->read, impulse, s->stopping_test.w, s->stopping_test.e, s->stopping_test.v, 0, &t);
+  relative = judge_measure_relative_of(&t, s->stopping_test.w, s->p.n_rows, s->start[0], s->start[1]);
   judge_best_note_score(best, &s->p, &t, relative);
   if (tol < 0.0) judge_best_see_start(best, &s->p, impulse);
   else judge_best_see_impulse(best, &s->p, impulse, tol);
@@ -76,8 +76,8 @@ int32_t lav_judge(lav_solver *solver, const double *impulse, int32_t n, double *
   found.size = out->size;
   judge(solver, impulse, 1, 1e-6, &found);
   *out = found;
-  if (slack && n > 0) COPY(slack, solver->watch.w, n);
-  if (error && n > 0) COPY(error, solver->watch.e, n);
+  if (slack && n > 0) COPY(slack, solver->stopping_test.w, n);
+  if (error && n > 0) COPY(error, solver->stopping_test.e, n);
   return leave(solver, LAV_OK);
 }
 
@@ -87,7 +87,7 @@ static void change_of(lav_solver *s, const double *x, double *v) {
   if (s->n_v == 0 || s->p.n_rows == 0) return;
 #ifndef LAV_SWEEPS_ONLY
   if (s->form == LAV_VELOCITIES) {
-    core_generalized_jac_push(&s->g, x, v);
+    core_generalized_jac_transpose_times(&s->g, x, v);
     core_generalized_tree_solve(&s->g, v);
     return;
   }
@@ -136,14 +136,14 @@ int32_t lav_motion_error(lav_solver *solver, const double *impulse, const double
   judge(s, reference, 0, INFINITY, &verdict);
   for (i = 0; i < n; i++) delta[i] = impulse[i] - reference[i];
   if (n > 0) {
-    wrong = energy_of(s, s->watch.e, v, slope, &y);
+    wrong = energy_of(s, s->stopping_test.e, v, slope, &y);
     energy_of(s, reference, v, slope, &own);
     x = energy_of(s, delta, v, slope, &y);
   }
   found.energy = sqrt(x);
   found.kinetic = sqrt(y);
   found.relative = y == 0.0 ? 0.0 : own > 0.0 && y < INFINITY ? sqrt(y / own) : INFINITY;
-  found.bound = s->p.law == LAV_COULOMB && core_parts_has_friction(&s->p) ? INFINITY : found.energy + sqrt(wrong);
+  found.bound = s->p.law == LAV_COULOMB && core_block_types_has_friction(&s->p) ? INFINITY : found.energy + sqrt(wrong);
   for (i = 0; i < n; i++)
     if (fabs(slope[i]) > found.rows || found.row < 0) found.rows = fabs(slope[i]), found.row = i;
   for (i = 0; n > 0 && i < (s->form == LAV_BODIES ? s->n_v / 6 : s->n_v); i++) {

@@ -40,7 +40,7 @@ static int32_t start_sweeps(lav_solver *s) {
   x->c.split = s->split;
   x->c.mode = s->mode;
   x->c.rng = &s->rng;
-  x->c.omega = o->method == LAV_JACOBI && o->omega == 0.0 ? sweep_serial_safe_damping(&s->p, &s->a, s->watch.e) : o->omega;
+  x->c.omega = o->method == LAV_JACOBI && o->omega == 0.0 ? sweep_serial_safe_damping(&s->p, &s->a, s->stopping_test.e) : o->omega;
   x->step = row_of(o->method)->sweep;
   numbers = sweep_serial_sweeps_workspace_size(x, &s->read, place);
   if (numbers < 0) return LAV_ERROR_COUNT;
@@ -68,14 +68,14 @@ static int32_t is_late(const lav_solver *s, const lav_budget *budget) {
 static void run_sweeps(lav_solver *s, const lav_budget *budget, lav_result *out) {
   const double begin = is_timed(budget) ? budget->clock(budget->clock_data) : 0.0;
   double now = begin, left;
-  int32_t status = judge_watch_RUNNING, n = is_timed(budget) ? 1 : budget->iterations, done;
+  int32_t status = judge_stopping_test_RUNNING, n = is_timed(budget) ? 1 : budget->iterations, done;
 
 #ifndef LAV_SWEEPS_ONLY
   const int32_t before = s->options.method == LAV_BLOCK_GAUSS_SEIDEL || s->options.method == LAV_ADMM ? restarts_of(s) : 0;
 #endif
-  while (out->iterations < budget->iterations && status == judge_watch_RUNNING) {
+  while (out->iterations < budget->iterations && status == judge_stopping_test_RUNNING) {
     if (n > budget->iterations - out->iterations) n = budget->iterations - out->iterations;
-    status = sweep_serial_sweeps_step(&s->swept, &s->watch, &s->read, NULL, s->impulse, n, budget->tol, &done);
+    status = sweep_serial_sweeps_step(&s->swept, &s->stopping_test, &s->read, NULL, s->impulse, n, budget->tol, &done);
     out->iterations += done;
 #ifndef LAV_SWEEPS_ONLY
     if (s->is_broken) {
@@ -83,7 +83,7 @@ static void run_sweeps(lav_solver *s, const lav_budget *budget, lav_result *out)
       break;
     }
 #endif
-    if (is_timed(budget) && status == judge_watch_RUNNING) {
+    if (is_timed(budget) && status == judge_stopping_test_RUNNING) {
       now = budget->clock(budget->clock_data);
       left = s->deadline - now;
       if (!(left > 0.0)) {
@@ -94,15 +94,15 @@ static void run_sweeps(lav_solver *s, const lav_budget *budget, lav_result *out)
       n = left < 1.0 ? 1 : left > 4.0 * n ? (n < 250000000 ? 4 * n : n) : (int32_t)left;
     }
   }
-  if (status != judge_watch_RUNNING) out->outcome = status; /* Both enums have the same numbers. */
+  if (status != judge_stopping_test_RUNNING) out->outcome = status; /* Both enums have the same numbers. */
   out->sweeps = out->iterations;
 #ifndef LAV_SWEEPS_ONLY
   out->restarts = restarts_of(s) - before;
   if (s->mode == core_order_SYMMETRIC && is_accelerated(&s->options)) out->sweeps *= 2;
 #endif
-  if (budget->tol > 0.0 && s->watch.best_at >= 0 && out->outcome != LAV_CONVERGED) { /* The residual may have risen: return the best iterate. */
-    if (see(s, &s->watch.best, s->impulse, budget->tol) > budget->tol) {
-      COPY(s->impulse, s->watch.best.impulse, s->p.n_rows);
+  if (budget->tol > 0.0 && s->stopping_test.best_at >= 0 && out->outcome != LAV_CONVERGED) { /* The residual may have risen: return the best iterate. */
+    if (see(s, &s->stopping_test.best, s->impulse, budget->tol) > budget->tol) {
+      COPY(s->impulse, s->stopping_test.best.impulse, s->p.n_rows);
       sweep_serial_form_velocity(&s->swept.c, s->impulse);
     }
   }
@@ -188,14 +188,14 @@ static void keep_better(lav_solver *s, const double *begin, double tol) {
   struct judge_best_best_t best;
   judge_best_bind_best(&best, &s->p, s->score_workspace);
   double *zero = s->compare + s->p.n_rows; /* `begin` is stored before it. */
-  judge_measure_set_zero_impulse(&s->p, zero, s->watch.w);
+  judge_measure_set_zero_impulse(&s->p, zero, s->stopping_test.w);
   see(s, &best, begin, -1.0);
   see(s, &best, zero, -1.0);
   if (see(s, &best, s->impulse, tol) > tol) COPY(s->impulse, best.impulse, s->p.n_rows);
 }
 
 static void run_newton(lav_solver *s, const lav_budget *budget, lav_result *out) {
-  struct core_method_said_t said = {0, 0, 0, 0, 0.0, NULL, NULL};
+  struct core_method_info_t info = {0, 0, 0, 0, 0.0, NULL, NULL};
   double closer = 1.0;
   int32_t how = core_method_MORE, before = 0;
   lav_verdict now;
@@ -204,8 +204,8 @@ static void run_newton(lav_solver *s, const lav_budget *budget, lav_result *out)
     how = begin_newton(s, budget->tol, budget->iterations);
   s->driven = 0;
   while (out->outcome == LAV_MAX_ITERATIONS && out->iterations < budget->iterations) {
-    how = k_step(&s->view, &s->newton_options, &s->drive, is_timed(budget) ? 1 : 1 << 30, s->impulse, &said);
-    out->iterations = before + said.work;
+    how = k_step(&s->view, &s->newton_options, &s->drive, is_timed(budget) ? 1 : 1 << 30, s->impulse, &info);
+    out->iterations = before + info.work;
     if (how == core_method_SPENT) break;
     if (how == core_method_REACHED) {
       judge(s, s->impulse, 1, INFINITY, &now); /* Confirm it: the velocity form rounds sums in another order, and its squares may underflow. */

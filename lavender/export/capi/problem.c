@@ -45,14 +45,14 @@ static void take_blocks(lav_solver *s, const lav_problem *q) {
   s->marks = TAKE(s, int32_t, 4 * ((int64_t)s->kept.most_blocks + k) + m + 2 * n + 4 * nv + 16); /* Scratch. */
   s->island_marks = TAKE(s, int32_t, 4 * k + 1 + (q->form == LAV_VELOCITIES ? 2 * nv : q->form == LAV_BODIES ? n : m));
   s->reference = TAKE(s, double, 2 * k);
-  s->score_workspace = TAKE(s, double, judge_watch_watch_workspace_size(m, k + 1));
-  s->watch.w = TAKE(s, double, m);
-  s->watch.e = TAKE(s, double, m);
+  s->score_workspace = TAKE(s, double, judge_stopping_test_stopping_test_workspace_size(m, k + 1));
+  s->stopping_test.w = TAKE(s, double, m);
+  s->stopping_test.e = TAKE(s, double, m);
   s->form = q->form;
   s->n_v = q->form == LAV_BODIES ? 6 * q->n_bodies : q->form == LAV_VELOCITIES ? q->n_velocities : 0;
   s->v_free = TAKE(s, double, s->n_v);
   s->compare = TAKE(s, double, 2 * m + s->n_v);
-  s->watch.v = TAKE(s, double, q->form == LAV_BODIES ? 12 * n : q->form == LAV_VELOCITIES ? 6 * nv + 2 * m : 0);
+  s->stopping_test.v = TAKE(s, double, q->form == LAV_BODIES ? 12 * n : q->form == LAV_VELOCITIES ? 6 * nv + 2 * m : 0);
 }
 
 /* Numbers of rows of joints and of contacts of bodies, from block_ptr, or else the largest possible numbers. */
@@ -103,13 +103,13 @@ static void take_form(lav_solver *s, const lav_problem *q) {
   s->r.arm_b = TAKE(s, double, 3 * c);
   s->r.contact_body = TAKE(s, int32_t, 2 * c);
   s->r.coupling = TAKE(s, double, 5 * (c + 1));
-  s->r.swing = TAKE(s, double, 6 * (mc + 1));
+  s->r.inv_inertia_arm = TAKE(s, double, 6 * (mc + 1));
   s->r.inv_mass = TAKE(s, double, n);
   s->r.inv_inertia = TAKE(s, double, 9 * n);
   if (s->is_short) return;
   memset((void *)(uintptr_t)s->r.minv_jac, 0, 12 * (size_t)(mj + 1) * sizeof(double));
   memset((void *)(uintptr_t)s->r.coupling, 0, 5 * (size_t)(c + 1) * sizeof(double));
-  memset((void *)(uintptr_t)s->r.swing, 0, 6 * (size_t)(mc + 1) * sizeof(double));
+  memset((void *)(uintptr_t)s->r.inv_inertia_arm, 0, 6 * (size_t)(mc + 1) * sizeof(double));
 }
 
 /* -- copy of the problem ---------------------------------------------------------------------------------------------- */
@@ -136,7 +136,7 @@ static int32_t fill_blocks(lav_solver *s, const lav_problem *q) {
   }
   copy_or(s->p.lower, q->lower, m, -INFINITY);
   copy_or(s->p.upper, q->upper, m, INFINITY);
-  core_parts_spell_bounds(&s->p);
+  core_block_types_spell_bounds(&s->p);
   copy_or(s->p.mu, q->mu, k, 0.0);
   copy_or(s->p.patch_radius, q->patch_radius, k, 0.0);
   copy_or(s->p.rolling, q->rolling, k, 0.0);
@@ -217,12 +217,12 @@ static void fill_bodies(lav_solver *s, const lav_problem *q) {
   copy_or(s->v_free, q->velocity, 6 * n, 0.0);
   copy_or(b, q->b, q->n_rows, 0.0);
   if (!q->b) {
-    core_rows_rows_times(&s->p, &s->r, s->v_free, s->watch.w);
-    for (i = 0; i < q->n_rows; i++) b[i] = (q->target ? q->target[i] : 0.0) - s->watch.w[i];
+    core_rows_rows_times(&s->p, &s->r, s->v_free, s->stopping_test.w);
+    for (i = 0; i < q->n_rows; i++) b[i] = (q->target ? q->target[i] : 0.0) - s->stopping_test.w[i];
   }
   k_rows_diagonal(&s->p, &s->r, (double *)(uintptr_t)s->p.d, (double *)(uintptr_t)s->p.nu, (double *)(uintptr_t)s->p.step,
                   s->empty, (double *)(uintptr_t)s->r.minv_jac, (double *)(uintptr_t)s->r.coupling,
-                  (double *)(uintptr_t)s->r.swing);
+                  (double *)(uintptr_t)s->r.inv_inertia_arm);
 }
 
 #ifndef LAV_SWEEPS_ONLY
@@ -257,7 +257,7 @@ static int32_t factor_mass(lav_solver *s, const lav_problem *q) {
   s->g.lval = lval = TAKE(s, double, count);
   memmove(lidx, columns, (size_t)count * sizeof *lidx);
   memmove(lval, values, (size_t)count * sizeof *lval);
-  s->g.condition = core_generalized_estimate_condition(&s->g, s->watch.v);
+  s->g.condition = core_generalized_estimate_condition(&s->g, s->stopping_test.v);
   return LAV_OK;
 }
 
@@ -306,10 +306,10 @@ static int32_t fill_velocities(lav_solver *s, const lav_problem *q) {
 /* Check the range of computed numbers: b, and A_ii of J and M. */
 static int32_t check_derived(lav_solver *s, const lav_problem *q) {
   const int64_t m = q->n_rows;
-  const double top = core_door_largest(s->p.b, m);
-  int64_t i = core_door_first_outside(s->p.b, m);
+  const double top = core_validate_norm_inf(s->p.b, m);
+  int64_t i = core_validate_first_invalid(s->p.b, m);
   if (i >= 0) return refuse(&s->refused, LAV_ERROR_NUMBER, q->b ? "b" : "target", i);
-  if (!core_door_is_size(top)) return refuse(&s->refused, LAV_ERROR_NUMBER, q->b ? "b" : "target", 0);
-  i = core_door_first_outside(s->p.d, m);
+  if (!core_validate_is_valid_magnitude(top)) return refuse(&s->refused, LAV_ERROR_NUMBER, q->b ? "b" : "target", 0);
+  i = core_validate_first_invalid(s->p.d, m);
   return i < 0 ? LAV_OK : refuse(&s->refused, LAV_ERROR_NUMBER, q->form == LAV_BODIES ? "inv_mass" : "value", i);
 }

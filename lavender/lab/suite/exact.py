@@ -20,7 +20,7 @@ from lavender.base.errors import InputError
 from lavender.base.lazy_import import sparse as sp
 from lavender.base.lu import sparse_lu
 from lavender.problem import Problem
-from lavender_ext.core.checks import LEAST
+from lavender_ext.core.checks import MIN_MAGNITUDE
 
 VELTKAMP_FACTOR = 2.0**27 + 1.0  # Multiplier that splits the 53 bits of a float64 into two halves.
 MAX_SVD_ROWS = 2000  # Up to this many rows, singular rows are found by a singular value decomposition.
@@ -156,7 +156,7 @@ def solve_rest_impulse(problem: Problem) -> FloatArray:
     normal = c.ptr[:-1]
     weight = np.repeat(np.stack([1.0 / rows.inv_mass, 1.0 / rows.inv_inertia[:, 0, 0]], 1), 3, axis=1)
     momentum = -weight * rows.v_free
-    largest = np.abs(momentum).max(axis=1, initial=LEAST)
+    largest = np.abs(momentum).max(axis=1, initial=MIN_MAGNITUDE)
     operator = ExtendedOperator(problem)
     # Try two scales of the balance: the largest weight of all (heavy on light), and each body's own (light on heavy).
     for scale in (np.full_like(largest, largest.max()), largest):
@@ -258,7 +258,7 @@ def _solvers(a: sp.csc_matrix) -> Iterator[Callable[[FloatArray], FloatArray]]:
     """Yield solvers: a factorisation, or inverses on ever smaller ranges of A, for dependent rows."""
     if a.shape[0] <= MAX_SVD_ROWS:
         dense = a.toarray()
-        d = 1.0 / np.sqrt(np.maximum(np.abs(dense.diagonal()), LEAST))
+        d = 1.0 / np.sqrt(np.maximum(np.abs(dense.diagonal()), MIN_MAGNITUDE))
         u, s, vt = np.linalg.svd(dense * d[:, None] * d[None, :])
         for cut in (4e-15, 1e-12):
             kept_values = s > cut * s[0]

@@ -10,7 +10,7 @@ import numpy as np
 from lavender.base.arrays import FloatArray, as_array, check_float, shape_of
 from lavender.base.errors import InputError
 from lavender.sim.scene.arithmetic import norm, rotate_back, sine_cosine
-from lavender_ext.core.checks import LEAST, MOST
+from lavender_ext.core.checks import MAX_MAGNITUDE, MIN_MAGNITUDE
 
 # Relative excess of the largest moment over the sum of the others that is accepted as rounding, as for a flat plate.
 PLATE_MOMENT_TOLERANCE = 1e-6
@@ -237,10 +237,10 @@ def inertia_of(label: str, inertia: Any, shape: Any, mass: float) -> FloatArray:
     else:
         x, quantity = _tensor(label, inertia), f"inertia of {label}"
     moments = np.linalg.eigvalsh(x) if np.isfinite(x).all() else x
-    if not mass >= LEAST or not np.all((moments >= LEAST) & (moments <= MOST)):
+    if not mass >= MIN_MAGNITUDE or not np.all((moments >= MIN_MAGNITUDE) & (moments <= MAX_MAGNITUDE)):
         raise InputError(
-            f"{quantity} is {np.diag(x).tolist()} kg m^2; it and the mass must be from {LEAST:g} to {MOST:g}: use "
-            "other units of mass or length"
+            f"{quantity} is {np.diag(x).tolist()} kg m^2; it and the mass must be from {MIN_MAGNITUDE:g} "
+            f"to {MAX_MAGNITUDE:g}: use other units of mass or length"
         )
     return x
 

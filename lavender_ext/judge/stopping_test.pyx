@@ -1,4 +1,4 @@
-"""The checks of judge/watch.pxd, compiled once, and the same for Python: where a run of sweeps stands."""
+"""The checks of judge/stopping_test.pxd, compiled once, and their Python class."""
 from libc.math cimport NAN, log10
 from libc.stdint cimport int32_t
 from libc.string cimport memcpy
@@ -6,38 +6,37 @@ from libc.string cimport memcpy
 import numpy as np
 
 from lavender_ext.core.problem cimport Data
-from lavender_ext.core.parts cimport blocks_t
+from lavender_ext.core.block_types cimport blocks_t
 from lavender_ext.core.view cimport view_t
 from lavender_ext.judge.best cimport count_islands, note_score, relative_of_best, see_impulse
 from lavender_ext.judge.measure cimport above_floor_of, floor_of, judge_view, refine_view, relative_of, scratch_of
-from lavender_ext.judge.progress cimport envelope, keep, rests, see
+from lavender_ext.judge.progress cimport envelope, keep, has_stalled, see
 from lavender_ext.judge.score cimport new_score, relative, score_t, smallest_reference
-from lavender_ext.judge.watch cimport (AT_FLOOR, CONVERGED, DIVERGED, EARLY, RUNNING, STALLED, begin_watch, sweep_t,
-                                       watch_workspace_size,
-                                       watch_t)
+from lavender_ext.judge.stopping_test cimport (AT_FLOOR, CONVERGED, DIVERGED, N_EARLY_SWEEPS, RUNNING, STALLED,
+                                               begin_stopping_test, sweep_t, stopping_test_workspace_size, stopping_test_t)
 
 
-cdef inline double relative_to_start(const watch_t* s, const score_t* x) noexcept nogil:
-    """Relative residual of a pass without floor; inf if an error is not finite."""
+cdef inline double relative_to_start(const stopping_test_t* s, const score_t* x) noexcept nogil:
+    """Return the relative residual of a pass without a floor; inf if an error is not finite."""
     if x.relative >= 0.0:
         return x.relative
     return relative(x.energy, x.velocity, s.reference_energy, s.reference_velocity) if x.finite else 1.0 / 0.0
 
 
-cdef inline bint is_rounding(const watch_t* s, const score_t* x, double now, double tol) noexcept nogil:
-    """Whether rounding explains what a pass with its floor found above tol, in each island."""
+cdef inline bint is_rounding(const stopping_test_t* s, const score_t* x, double now, double tol) noexcept nogil:
+    """Return whether rounding explains the residuals above tol of a pass with a floor, in each island."""
     return above_floor_of(x, now, floor_of(x, s.reference_energy, s.reference_velocity)) <= tol
 
 
-cdef inline double judge_with_floor(const watch_t* s, const view_t* v, const double* lam, score_t* x) noexcept nogil:
-    """The judge's relative residual with its floor."""
+cdef inline double judge_with_floor(const stopping_test_t* s, const view_t* v, const double* lam, score_t* x) noexcept nogil:
+    """Return the judge's relative residual of a pass with a floor."""
     judge_view(v, lam, s.w, s.e, s.v, True, x)
     return relative_of(x, s.w, v.p.n_rows, s.reference_energy, s.reference_velocity)
 
 
-cdef inline double judge_closely(const watch_t* s, const view_t* v, const double* lam, double tol, score_t* x,
+cdef inline double judge_closely(const stopping_test_t* s, const view_t* v, const double* lam, double tol, score_t* x,
                                  bint* refined) noexcept nogil:
-    """The judge's relative residual with its floor, refined if an ill-conditioned M needs it."""
+    """Return the judge's relative residual of a pass with a floor, refined if M is ill-conditioned."""
     cdef double now = judge_with_floor(s, v, lam, x)
     refined[0] = refine_view(v, lam, s.w, s.e, s.v, s.reference_energy, s.reference_velocity, tol, now, x)
     if refined[0]:
@@ -45,8 +44,8 @@ cdef inline double judge_closely(const watch_t* s, const view_t* v, const double
     return now
 
 
-cdef inline bint rounds_much(const watch_t* s, const blocks_t* p, const double* lam) noexcept nogil:
-    """Whether rounding of so large an impulse may hide the residual: 2^-53 sqrt(sum d lam^2) > 1e-7 E0 of some island."""
+cdef inline bint rounds_much(const stopping_test_t* s, const blocks_t* p, const double* lam) noexcept nogil:
+    """Return whether rounding may hide the residual of a large impulse: 2^-53 sqrt(sum d lam^2) > 1e-7 E0 of an island."""
     cdef double size = 0.0, energy = s.reference_energy, velocity = s.reference_velocity
     cdef int32_t k
     for k in range(p.n_rows):
@@ -55,8 +54,8 @@ cdef inline bint rounds_much(const watch_t* s, const blocks_t* p, const double* 
     return size > 8e17 * energy * energy and energy > 0.0
 
 
-cdef inline int32_t end_refined(const watch_t* s, const score_t* x, double now, double tol) noexcept nogil:
-    """The claim of an impulse whose first pass is within tol, by its refined residual: more sweeps reduce that to its floor."""
+cdef inline int32_t end_refined(const stopping_test_t* s, const score_t* x, double now, double tol) noexcept nogil:
+    """Return the status of an impulse whose first pass is within tol, from its refined residual."""
     if now <= tol:
         return CONVERGED
     if is_rounding(s, x, now, tol):
@@ -64,25 +63,25 @@ cdef inline int32_t end_refined(const watch_t* s, const score_t* x, double now, 
     return STALLED if not floor_of(x, s.reference_energy, s.reference_velocity) <= tol else RUNNING
 
 
-cdef inline int32_t until_next(const watch_t* s, double now, double tol) noexcept nogil:
-    """Sweeps until the next check."""
-    cdef double least = s.total >> 3, most = s.total, n = 0.0, gap = s.total - s.last_at, fall, r = now
-    if least < 1.0:
-        least = 1.0
+cdef inline int32_t until_next(const stopping_test_t* s, double now, double tol) noexcept nogil:
+    """Return the number of sweeps until the next check."""
+    cdef double min_sweeps = s.total >> 3, max_sweeps = s.total, n = 0.0, gap = s.total - s.last_at, fall, r = now
+    if min_sweeps < 1.0:
+        min_sweeps = 1.0
     if gap >= 1.0 and now < s.last:
         fall = now / s.last
-        while r > tol and n < 2.0 * most:
+        while r > tol and n < 2.0 * max_sweeps:
             r *= fall
             n += gap
         n = 0.5 * n
-    n = n if n < most else most
-    n = n if n > least else least
-    most = 2147483647.0 - s.total
-    return <int32_t>(n if n < most else most)
+    n = n if n < max_sweeps else max_sweeps
+    n = n if n > min_sweeps else min_sweeps
+    max_sweeps = 2147483647.0 - s.total
+    return <int32_t>(n if n < max_sweeps else max_sweeps)
 
 
-cdef inline bint is_progress(watch_t* s, double now, double tol) noexcept nogil:
-    """Whether a check is better, after `see_impulse`."""
+cdef inline bint is_progress(stopping_test_t* s, double now, double tol) noexcept nogil:
+    """Return whether a check is better (see the header of stopping_test.pxd), after `see_impulse`."""
     cdef bint better = now < s.lowest
     cdef int32_t i
     if better:
@@ -94,8 +93,8 @@ cdef inline bint is_progress(watch_t* s, double now, double tol) noexcept nogil:
     return better
 
 
-cdef inline int32_t check(watch_t* s, const view_t* v, double* lam, double tol) noexcept nogil:
-    """One check; sets the sweeps of the next."""
+cdef inline int32_t check(stopping_test_t* s, const view_t* v, double* lam, double tol) noexcept nogil:
+    """Perform one check and schedule the next; return the status."""
     cdef score_t x = new_score()
     cdef const blocks_t* p = &v.p
     cdef double now, last, inf = 1.0 / 0.0
@@ -104,13 +103,13 @@ cdef inline int32_t check(watch_t* s, const view_t* v, double* lam, double tol) 
     x.by_island = s.best.now
     judge_view(v, lam, s.w, s.e, s.v, False, &x)
     now = relative_to_start(s, &x)
-    if now <= tol:                                      # once more, with what rounding hides
+    if now <= tol:                                      # repeat the pass with a floor
         now = judge_closely(s, v, lam, tol, &x, &refined)
     elif rounds_much(s, p, lam):
         now = judge_with_floor(s, v, lam, &x)
     note_score(&s.best, p, &x, now)
     lost = not now < inf and (s.reference_energy > 0.0 or not x.finite)
-    if s.total <= EARLY and s.start < now < inf:
+    if s.total <= N_EARLY_SWEEPS and s.start < now < inf:
         s.start = now
     see(&s.progress, s.total, now)
     s.check_at = s.total + until_next(s, now, tol)
@@ -125,7 +124,7 @@ cdef inline int32_t check(watch_t* s, const view_t* v, double* lam, double tol) 
     if not lost or s.best.seen > 0:
         see_impulse(&s.best, p, lam, tol)
         s.best_relative = relative_of_best(&s.best)
-    if s.best_relative <= tol:                          # each island at another check
+    if s.best_relative <= tol:                          # islands were solved at different checks
         x = new_score()
         last = judge_closely(s, v, s.best.impulse, tol, &x, &refined)
         end = CONVERGED if last <= tol else end_refined(s, &x, last, tol) if refined else RUNNING
@@ -146,15 +145,16 @@ cdef inline int32_t check(watch_t* s, const view_t* v, double* lam, double tol) 
         if is_rounding(s, &x, last if refined else s.best_relative, tol):
             memcpy(lam, s.best.impulse, p.n_rows * sizeof(double))
             return AT_FLOOR
-    if s.total > 32 * <double>s.best_at + s.patience and rests(&s.progress, p, lam, s.total, s.lowest):
+    if s.total > 32 * <double>s.best_at + s.patience and has_stalled(&s.progress, p, lam, s.total, s.lowest):
         memcpy(lam, s.best.impulse, p.n_rows * sizeof(double))
         return STALLED
     keep(&s.progress, s.total, lam, p.n_rows)
     return RUNNING
 
 
-cdef inline int32_t confirmed(const watch_t* s, const view_t* v, const double* lam, double tol, int32_t status) noexcept nogil:
-    """The claim `status`, judged in another form: what does not hold there goes on, or has stalled."""
+cdef inline int32_t confirm_status(const stopping_test_t* s, const view_t* v, const double* lam, double tol,
+                                   int32_t status) noexcept nogil:
+    """Judge lam in another form of the problem; return `status` if it holds there, otherwise RUNNING or STALLED."""
     cdef score_t x = new_score()
     cdef double now
     cdef bint within
@@ -172,31 +172,32 @@ cdef inline int32_t confirmed(const watch_t* s, const view_t* v, const double* l
     return AT_FLOOR if is_rounding(s, &x, now, tol) else STALLED
 
 
-cdef inline int32_t due(watch_t* s, const view_t* v, const view_t* confirm, double* lam, double tol, int32_t* step) noexcept nogil:
-    """A check, where one is due; the sweeps until the next into step, where these are fewer. tol = 0 checks nothing.
+cdef inline int32_t check_if_due(stopping_test_t* s, const view_t* v, const view_t* confirm, double* lam, double tol,
+                        int32_t* step) noexcept nogil:
+    """Perform a check if one is due, and reduce `step` to the sweeps until the next; with tol = 0 there are no checks.
 
-    confirm: the same problem in another form, which a claim must hold in too, or NULL.
+    confirm is NULL, or the same problem in another form in which the status must also hold.
     """
     cdef int32_t status = RUNNING
     if not tol > 0.0:
         return RUNNING
-    if s.total >= s.check_at:                           # later, after sweeps that were not checked
+    if s.total >= s.check_at:                           # total exceeds check_at after sweeps without checks
         status = check(s, v, lam, tol)
         if confirm != NULL and (status == CONVERGED or status == AT_FLOOR):
-            status = confirmed(s, confirm, lam, tol, status)
+            status = confirm_status(s, confirm, lam, tol, status)
     if s.check_at - s.total < step[0]:
         step[0] = s.check_at - s.total
     return status
 
 
-cdef int32_t watched(watch_t* s, const view_t* v, const view_t* confirm, sweep_t sweep, void* context, double* lam,
+cdef int32_t run_until_stop(stopping_test_t* s, const view_t* v, const view_t* confirm, sweep_t sweep, void* context, double* lam,
                      int32_t n, double tol, int32_t* done) noexcept nogil:
-    """n sweeps, fewer where a check ends them; counts them in `done`."""
+    """Run n sweeps, or fewer if a check stops them; write their number to `done` and return the status."""
     cdef int32_t step, status
     done[0] = 0
     while done[0] < n:
         step = n - done[0]
-        status = due(s, v, confirm, lam, tol, &step)
+        status = check_if_due(s, v, confirm, lam, tol, &step)
         if status != RUNNING:
             return status
         sweep(context, lam, s.total == 0, step)
@@ -205,10 +206,17 @@ cdef int32_t watched(watch_t* s, const view_t* v, const view_t* confirm, sweep_t
     return RUNNING
 
 
-cdef class Watch:
-    """Where a run of sweeps stands; `data` is what the judge reads, its start error known.
+cdef class StoppingTest:
+    """State of the stopping test of a run of sweeps.
 
-    `confirm`: the same problem in another form, which a claim must hold in too.
+    Parameters
+    ----------
+    data : Data
+        Problem to judge, with known references.
+    patience : int
+        Minimum number of sweeps without a better check before a run stalls.
+    confirm : Data, optional
+        The same problem in another form, in which a status must also hold.
     """
 
     def __init__(self, Data data, int patience=64, Data confirm=None):
@@ -218,10 +226,10 @@ cdef class Watch:
         if confirm is not None:
             self.other = confirm.view()
             self.confirm = &self.other
-        workspace = watch_workspace_size(m, count_islands(&self.view.p))
+        workspace = stopping_test_workspace_size(m, count_islands(&self.view.p))
         scratch = np.empty(workspace + 2 * m + scratch_of(&self.other) + 4)
         self.keep = data, confirm, scratch
-        begin_watch(&self.state, &self.view.p, data.reference_energy, data.reference_velocity, patience, &scratch[0])
+        begin_stopping_test(&self.state, &self.view.p, data.reference_energy, data.reference_velocity, patience, &scratch[0])
         self.state.w = &scratch[workspace]
         self.state.e = &scratch[workspace + m]
         self.state.v = &scratch[workspace + 2 * m]
@@ -239,8 +247,8 @@ cdef class Watch:
         return self.state.best_relative, np.array(self.keep[2])[:self.view.p.n_rows]
 
     def keep_best(self, double[::1] lam, double tol):
-        """Replace lam (m,), unless it meets tol, by the best of each island of it and of all checks."""
-        cdef watch_t* s = &self.state
+        """Replace lam (m,), unless its residual is at most tol, by the best impulse of each island, including lam."""
+        cdef stopping_test_t* s = &self.state
         cdef score_t x = new_score()
         cdef double now
         if s.best.seen == 0 or lam.shape[0] == 0:
@@ -259,13 +267,13 @@ cdef class Watch:
 
     @property
     def sweeps_per_decade(self):
-        """Sweeps in which the residual falls tenfold, by its lower envelope at the last check; NaN where it does not."""
+        """Sweeps per tenfold decrease of the residual, from its lower envelope at the last check; NaN if it does not fall."""
         cdef double fall = 0.0, low = 0.0
         cdef int32_t k = envelope(&self.state.progress, &fall, &low)
         return -k / log10(fall) if k > 0 and 0.0 < fall < 1.0 else NAN
 
     def run_python(self, sweep, double[::1] lam, int n, double tol):
-        """`watched` with a Python callable sweep(count, first); returns (status, sweeps done)."""
+        """Run `run_until_stop` with a Python callable sweep(count, first); return (status, sweeps done)."""
         cdef int32_t done = 0, step, status
         if lam.shape[0] == 0:
             if tol > 0.0:
@@ -274,7 +282,7 @@ cdef class Watch:
         while done < n:
             step = n - done
             with nogil:
-                status = due(&self.state, &self.view, self.confirm, &lam[0], tol, &step)
+                status = check_if_due(&self.state, &self.view, self.confirm, &lam[0], tol, &step)
             if status != RUNNING:
                 return status, done
             sweep(step, self.state.total == 0)

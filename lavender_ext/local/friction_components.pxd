@@ -1,4 +1,4 @@
-"""One contact of any parts, with the other blocks held still: in z = sqrt(d) lam, with y = z - (H z - g):
+"""Solution of one contact with any friction components and the other blocks fixed: with z = sqrt(d) lam, y = z - (H z - g),
 
     z = Pi(y),   (I - P + P H) dz = -(z - Pi(y)),   P in the derivative of Pi                    (1)
 
@@ -8,19 +8,21 @@ from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
 
 from lavender_ext.core.contact_map cimport contact_map
-from lavender_ext.core.parts cimport parts_t
+from lavender_ext.core.block_types cimport friction_components_t
 from lavender_ext.local.small cimport FAILED, MAX_ROWS, OPEN, STICK, eliminate
 
 
 cdef enum:
-    STEPS = 40                  # of Newton's method
-    HALVINGS = 6                # of a step, which is then taken as it is
-    SLOW = 4                    # steps that leave more than 0.9: where none leads on, all 40 cost a hundred updates
+    MAX_NEWTON_STEPS = 40
+    MAX_STEP_HALVINGS = 6       # After so many halvings the step is used even if the residual does not fall.
+    # Newton's method stops after this many steps that reduce the residual by less than 10 %; all 40 steps cost as much as a
+    # hundred updates of the block.
+    MAX_SLOW_STEPS = 4
 
 
-cdef inline double residue(int32_t law, int32_t n, const double* H, const double* g, const parts_t* part, const double* z,
-                           double* out, double* p, double* size) noexcept nogil:
-    # |z - Pi(y)|, Pi(y) in out; size: of what is added up
+cdef inline double natural_residual(int32_t law, int32_t n, const double* H, const double* g, const friction_components_t* part,
+                           const double* z, double* out, double* p, double* size) noexcept nogil:
+    """Return |z - Pi(y)| with Pi(y) in `out` and P in `p`; `size` is the largest sum of absolute terms of a row."""
     cdef double y[MAX_ROWS]
     cdef double total = 0.0, s, x
     cdef int32_t i, j
@@ -39,9 +41,9 @@ cdef inline double residue(int32_t law, int32_t n, const double* H, const double
     return sqrt(total)
 
 
-cdef inline int32_t contact_of_parts(int32_t law, int32_t n, const double* W, const double* q, const double* d,
-                                     const parts_t* part, double* lam) noexcept nogil:
-    """lam (n) from the present one; FAILED, lam left alone, where Newton's method does not end."""
+cdef inline int32_t solve_contact_newton(int32_t law, int32_t n, const double* W, const double* q, const double* d,
+                                     const friction_components_t* part, double* lam) noexcept nogil:
+    """Solve for lam (n), starting from the present lam; FAILED, lam unchanged, if Newton's method does not converge."""
     cdef double H[MAX_ROWS * MAX_ROWS]
     cdef double P[MAX_ROWS * MAX_ROWS]
     cdef double A[MAX_ROWS * MAX_ROWS]
@@ -51,7 +53,7 @@ cdef inline int32_t contact_of_parts(int32_t law, int32_t n, const double* W, co
     cdef double to[MAX_ROWS]
     cdef double out[MAX_ROWS]
     cdef double root[MAX_ROWS]
-    cdef parts_t a = part[0]                            # with their reach in the metric of d
+    cdef friction_components_t a = part[0]              # friction coefficients in the metric of d
     cdef double now, next_, size, x
     cdef int32_t i, j, k, _step, _halving, start, slow
     if not W[0] > 0.0:
@@ -63,8 +65,8 @@ cdef inline int32_t contact_of_parts(int32_t law, int32_t n, const double* W, co
         for j in range(n):
             H[n * i + j] = W[n * i + j] / (root[i] * root[j])
     for i in range(a.n):
-        a.reach[i] = a.reach[i] * root[a.first[i]] / root[0]
-    for start in range(2):                              # from where it is, then from where everything sticks
+        a.friction_coefficient[i] = a.friction_coefficient[i] * root[a.first[i]] / root[0]
+    for start in range(2):                              # from the present impulse, then from the sticking solution
         for i in range(n):
             z[i] = root[i] * lam[i] if start == 0 else g[i]
         if start == 1:
@@ -72,8 +74,8 @@ cdef inline int32_t contact_of_parts(int32_t law, int32_t n, const double* W, co
                 A[i] = H[i]
             eliminate(n, A, z)
         slow = 0
-        now = residue(law, n, H, g, &a, z, out, P, &size)
-        for _step in range(STEPS):
+        now = natural_residual(law, n, H, g, &a, z, out, P, &size)
+        for _step in range(MAX_NEWTON_STEPS):
             if not now > 1e-15 * size:
                 break
             for i in range(n):
@@ -85,18 +87,18 @@ cdef inline int32_t contact_of_parts(int32_t law, int32_t n, const double* W, co
                     A[n * i + j] = x
             eliminate(n, A, f)
             x = 1.0
-            for _halving in range(HALVINGS):
+            for _halving in range(MAX_STEP_HALVINGS):
                 for i in range(n):
                     to[i] = z[i] + x * f[i]
-                next_ = residue(law, n, H, g, &a, to, out, P, &size)
+                next_ = natural_residual(law, n, H, g, &a, to, out, P, &size)
                 if next_ < now:
                     break
                 x = 0.5 * x
             if not next_ < now and now <= 1e-13 * size:
-                residue(law, n, H, g, &a, z, out, P, &size)
+                natural_residual(law, n, H, g, &a, z, out, P, &size)
                 break
             slow += not next_ < 0.9 * now
-            if slow > SLOW:
+            if slow > MAX_SLOW_STEPS:
                 break
             for i in range(n):
                 z[i] = to[i]

@@ -1,0 +1,139 @@
+"""Input validation: the range of the numbers in the arrays of a problem, checked once, so that kernels need no checks.
+
+    |x| <= 1e60             every finite number, and the derived b and d = diag(A)                                     (1)
+    x = 0 or x >= 1e-60     masses, inertias, pivots of M, friction coefficients, compliances, the largest |b|         (2)
+
+Other units bring any practical problem into this range without changing its solution. Sums of products of four such
+numbers, and their squares, do not overflow float64. A row of A whose largest entry is below 1e-60 counts as empty.
+"""
+from libc.math cimport fabs
+from libc.stdint cimport int32_t, int64_t
+
+
+cdef inline double max_magnitude() noexcept nogil:
+    """Return the largest valid magnitude (1)."""
+    return 1e60
+
+
+cdef inline double min_magnitude() noexcept nogil:
+    """Return the smallest valid nonzero magnitude (2)."""
+    return 1e-60
+
+
+cdef inline bint is_number(double x) noexcept nogil:
+    """Return whether x satisfies (1); False for NaN."""
+    return fabs(x) <= max_magnitude()
+
+
+cdef inline bint is_valid_magnitude(double x) noexcept nogil:
+    """Return whether x satisfies (1) and (2)."""
+    return x == 0.0 or min_magnitude() <= x <= max_magnitude()
+
+
+cdef inline int64_t first_invalid(const double* x, int64_t n) noexcept nogil:
+    """Return the index of the first number that violates (1), or -1."""
+    cdef int64_t i
+    for i in range(n):
+        if not is_number(x[i]):
+            return i
+    return -1
+
+
+cdef inline int64_t first_invalid_magnitude(const double* x, int64_t n) noexcept nogil:
+    """Return the index of the first number that violates (1) or (2), or -1."""
+    cdef int64_t i
+    for i in range(n):
+        if not is_valid_magnitude(x[i]):
+            return i
+    return -1
+
+
+cdef inline bint is_beyond(const double* x, int64_t n, double bound) noexcept nogil:
+    """Return whether any |x_i| is above `bound`. The loop has no branch, so that compilers vectorise it."""
+    cdef int64_t i
+    cdef int exceeds = 0
+    for i in range(n):
+        exceeds |= fabs(x[i]) > bound
+    return exceeds
+
+
+cdef inline bint has_invalid(const double* x, int64_t n) noexcept nogil:
+    """Return whether any number violates (1). The loop never ends early, because almost all arrays are valid."""
+    cdef int64_t i
+    cdef double limit = max_magnitude()
+    cdef int32_t invalid = 0
+    for i in range(n):
+        invalid |= not fabs(x[i]) <= limit
+    return invalid
+
+
+cdef inline double max_abs(double maximum, double x) noexcept nogil:
+    """Return the larger of `maximum` and |x|; NaN if either is NaN."""
+    x = fabs(x)
+    return maximum if x <= maximum or maximum != maximum else x
+
+
+cdef inline double norm_inf(const double* x, int64_t n) noexcept nogil:
+    """Return max |x_i|: 0 if n = 0, NaN if any x_i is NaN."""
+    cdef int64_t i
+    cdef double s = 0.0
+    for i in range(n):
+        if not fabs(x[i]) <= s:
+            s = fabs(x[i])
+            if s != s:
+                break
+    return s
+
+
+cdef inline bint all_finite(const double* x, int64_t n) noexcept nogil:
+    """Return whether x holds neither NaN nor infinity."""
+    cdef double s = 0.0, t = 0.0, u = 0.0, v = 0.0      # These stay 0, or become NaN.
+    cdef int64_t i = 0
+    while i + 4 <= n:
+        s += 0.0 * x[i]
+        t += 0.0 * x[i + 1]
+        u += 0.0 * x[i + 2]
+        v += 0.0 * x[i + 3]
+        i += 4
+    while i < n:
+        s += 0.0 * x[i]
+        i += 1
+    return (s + t) + (u + v) == 0.0
+
+
+cdef inline bint are_pairs(const int32_t* pair, int64_t k, int32_t n, bint moves) noexcept nogil:
+    """Return whether all pairs (k, 2) name two different bodies, -1 (static) to n - 1.
+
+    If `moves` is true, at least one body of each pair must not be static.
+    """
+    cdef int64_t i
+    cdef int32_t a, b
+    for i in range(k):
+        a, b = pair[2 * i], pair[2 * i + 1]
+        if not -1 <= a < n or not -1 <= b < n or a == b and (moves or a >= 0):
+            return False
+    return True
+
+
+cdef inline bint is_frame(const double* n, const double* t, double tolerance) noexcept nogil:
+    """Return whether n.n and t.t are 1 and n.t is 0, all within `tolerance`."""
+    cdef double nn = n[0] * n[0] + n[1] * n[1] + n[2] * n[2], tt = t[0] * t[0] + t[1] * t[1] + t[2] * t[2]
+    return (fabs(nn - 1.0) <= tolerance and fabs(tt - 1.0) <= tolerance
+            and fabs(n[0] * t[0] + n[1] * t[1] + n[2] * t[2]) <= tolerance)
+
+
+cdef inline bint is_definite(const double* x, double skew, double shift, double pivot) noexcept nogil:
+    """Return whether x (3, 3) is zero or positive definite.
+
+    With s = max |x_ij|, x / s must be symmetric within `skew`, and the pivots of x / s + shift I must be above `pivot`.
+    """
+    cdef double s = norm_inf(x, 9), p, q, r, a, b, c
+    if s == 0.0:
+        return True
+    if not (fabs(x[3] - x[1]) <= skew * s and fabs(x[6] - x[2]) <= skew * s and fabs(x[7] - x[5]) <= skew * s):
+        return False
+    q, r, p = x[3] / s, x[6] / s, x[0] / s + shift
+    if not p > pivot:
+        return False
+    a, b, c = x[4] / s + shift - q * (q / p), x[7] / s - r * (q / p), x[8] / s + shift - r * (r / p)
+    return a > pivot and c - b * (b / a) > pivot

@@ -1,0 +1,110 @@
+"""Stopping test of sweep solvers: the judge's arithmetic, at sweep counts that depend only on the residuals.
+
+The first checks are at the start and after the first sweep. From the residuals r0, r of the last two checks, k sweeps apart,
+the end is predicted after n more sweeps, r (r/r0)^(n/k) <= tol. The next check is after n/2 sweeps, but at least an eighth
+of the sweeps done so far and at most as many again. If the residual does not fall, it is after that eighth. The relative
+residual r decides:
+
+    r <= tol                                        CONVERGED
+    r of the best of each island (best.pxd) <= tol  CONVERGED, with these
+    r not finite, or > 1e6 max(1, r of the first 8) DIVERGED; if E0 = 0 (r = 0 or inf), E not finite
+    first pass <= tol < refined one (judge/refine.pxd)
+        refined <= 2 floor and <= 1e-5              AT_FLOOR
+        else floor > tol                            STALLED
+    no better than the best so far, and
+        best <= 1e-6 and best <= 2 floor            AT_FLOOR
+        sweeps > 32 * sweeps of the best + patience, and no
+        progress predicted (judge/progress.pxd)     STALLED
+
+"Better": r is lower than ever, or E of an island that is not solved fell by 1 % since the last better check. Except at
+CONVERGED by r, the best impulse of each island is restored. A check costs about one sweep. Checks are compiled once, in
+`stopping_test.pyx`; `run_until_stop` is called by pointer.
+"""
+from libc.stdint cimport int32_t, int64_t
+
+from lavender_ext.core.block_types cimport blocks_t
+from lavender_ext.core.view cimport view_t
+from lavender_ext.judge.best cimport best_workspace_size, best_t, bind_best
+from lavender_ext.judge.progress cimport open_progress, progress_t
+
+
+cpdef enum:
+    RUNNING = 0
+    CONVERGED = 1
+    DIVERGED = 2
+    STALLED = 3
+    AT_FLOOR = 4
+
+
+cdef enum:
+    N_EARLY_SWEEPS = 8          # Residuals of these sweeps may rise, because the zero impulse is nearly a solution.
+
+
+cdef struct stopping_test_t:
+    int32_t total               # sweeps done
+    int32_t check_at            # sweeps at the next check
+    int32_t last_at             # sweeps at the last check
+    int32_t best_at             # sweeps at the last better check, -1 before any
+    int32_t patience            # minimum number of sweeps without a better check before a run stalls
+    int32_t again_at            # best_at of the impulse from which the run was restarted, 0 before any restart
+    double start                # largest relative residual of the first N_EARLY_SWEEPS sweeps
+    double last                 # relative residual at the last check
+    double best_relative        # relative residual of `best`
+    double lowest               # lowest relative residual of all checks
+    double reference_energy     # sqrt J, of the zero impulse
+    double reference_velocity   # m/s, of the zero impulse
+    best_t best
+    double* marked              # (n) sqrt J, E of each island's best at the last better check
+    double* w                   # (m) scratch
+    double* e                   # (m) scratch
+    double* v                   # scratch (`scratch_of`)
+    progress_t progress
+
+
+ctypedef void (*sweep_t)(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil
+
+
+cdef inline int64_t stopping_test_workspace_size(int64_t m, int64_t n) noexcept nogil:
+    """Return the number of doubles that `begin_stopping_test` needs for m rows in n islands."""
+    return best_workspace_size(m, n) + n + 2 * m
+
+
+cdef inline void begin_stopping_test(stopping_test_t* s, const blocks_t* p, double reference_energy,
+                                     double reference_velocity, int32_t patience, double* workspace) noexcept nogil:
+    """Initialise s before the first sweep; workspace (`stopping_test_workspace_size`)."""
+    s.total = s.check_at = s.last_at = 0
+    s.start = 0.0
+    s.last = s.best_relative = s.lowest = 1.0 / 0.0
+    s.best_at = -1
+    s.again_at = 0
+    s.patience = patience
+    s.reference_energy = reference_energy
+    s.reference_velocity = reference_velocity
+    bind_best(&s.best, p, workspace)
+    s.marked = workspace + best_workspace_size(p.n_rows, s.best.n)
+    open_progress(&s.progress, s.marked + s.best.n, p.n_rows)
+
+
+cdef inline bint begins_again(stopping_test_t* s, int32_t patience) noexcept nogil:
+    """Return whether a STALLED run may restart from its best impulse without memory, once for each best impulse.
+
+    This is for accelerated sweeps, whose memory may be the reason of the stall. They get `patience` sweeps to find a better
+    impulse.
+    """
+    if s.best_at <= s.again_at:
+        return False
+    s.again_at = s.best_at
+    s.patience = s.total - 32 * s.best_at + patience
+    return True
+
+
+cdef int32_t run_until_stop(stopping_test_t* s, const view_t* v, const view_t* confirm, sweep_t sweep, void* context, double* lam,
+                     int32_t n, double tol, int32_t* done) noexcept nogil
+
+
+cdef class StoppingTest:
+    cdef object keep
+    cdef view_t view
+    cdef view_t other
+    cdef const view_t* confirm  # pointer to `other`, or NULL
+    cdef stopping_test_t state
