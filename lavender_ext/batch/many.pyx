@@ -1,4 +1,4 @@
-"""Python interface to batches: problems by J and M, by A or by bodies, converted, solved and judged by `job.pxd`.
+"""Python interface to batches: problems by J and M, by A or by bodies, converted, solved and judged by `task.pxd`.
 
 `Worlds` holds problems and their results. Each `Worker` belongs to one thread and processes the next world without the
 interpreter. The caller solves deferred worlds with the general solvers.
@@ -18,7 +18,7 @@ from lavender_ext.core.problem cimport Data, derived_t
 from lavender_ext.core.problem import LAWS
 from lavender_ext.core.view cimport view_t
 from lavender_ext.small.call cimport N_COUNTS, Rules, small_rules_t, small_problem_t, judge_small
-from lavender_ext.batch.job cimport (copy_judgement, ensure_derived, judge_task, judge_zero, judging_size, prepare_small,
+from lavender_ext.batch.task cimport (copy_judgement, ensure_derived, judge_task, judge_zero, judging_size, prepare_small,
                                      solve_small_task, solve_task, task_t, task_workspaces_t)
 from lavender_ext.small.limits cimport allowed, cost_of, limits_t
 from lavender_ext.small.workspace cimport has_workspace_size, free_workspace

@@ -371,7 +371,7 @@ cdef inline void copy_matrix(island_t* x, const blocks_t* p, const csr_t* a, con
 
 
 cdef inline int32_t number_bodies(const rows_t* r, const int32_t* block, int32_t k, int32_t* number, int32_t* body) noexcept nogil:
-    """Number the bodies of k blocks in order of appearance: `body` lists them, `number` is the inverse. Return their number."""
+    """Assign indices to the bodies of k blocks by appearance: `body` lists them, `number` is the inverse. Return their count."""
     cdef const int32_t* two
     cdef int32_t i, side, n = 0
     for i in range(k):
