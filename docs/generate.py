@@ -452,9 +452,7 @@ def by_law(records):
             names = sorted(
                 (t, name) for name, (t, solved, _) in by_tolerance[tolerance].items() if solved == most
             )
-            cells.append(
-                "<br>".join(f"**{name}** {seconds(t)}" for t, name in names[:3]) if most else "nobody"
-            )
+            cells.append("<br>".join(f"**{name}** {seconds(t)}" for t, name in names[:3]) if most else "none")
         rows.append((LAW_NAMES[law], *cells))
     return wide(table(("", *(f"to {format_tolerance(x)}" for x in TOLERANCES)), rows))
 

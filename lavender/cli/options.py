@@ -378,10 +378,10 @@ class ErrorReporter:
             raise click.exceptions.Exit(code)
 
 
-def parse_parameters(words: tuple[str, ...]) -> dict[str, Any]:
+def parse_parameters(assignments: tuple[str, ...]) -> dict[str, Any]:
     """Return {"n": 20} for `n=20`. Values are numbers, true, false, none, or else texts."""
     parameters: dict[str, Any] = {}
-    for word in words:
+    for word in assignments:
         name, equals, value = word.partition("=")
         if not equals or not name:
             raise InputError(f"--set {word!r}; NAME=VALUE is needed")

@@ -55,7 +55,7 @@ def test_every_cell_is_that_of_the_report(pages):
     assert [[c.replace(" / ", " ") for c in row] for row in rows] == shown
     assert len(rows) >= 3
     names = {cell.split()[0] for row in rows[1:] for cell in row[1:]}
-    assert names <= {"auto", "direct", "newton", "sequential_impulses", "nobody"} and names
+    assert names <= {"auto", "direct", "newton", "sequential_impulses", "none"} and names
 
 
 def test_the_page_of_measurements_leads_to_the_report(pages):

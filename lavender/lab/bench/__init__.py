@@ -12,11 +12,11 @@ from lavender.lab.bench.record import CaseInfo, Record, Run, Skip, format_tolera
 from lavender.lab.bench.running.alternating import time_alternately
 from lavender.lab.bench.running.plan import CampaignPlan, Plan
 from lavender.lab.bench.running.runner import Event, carry, run, solver_names
-from lavender.lab.bench.running.timing import Ask, Task, measure, one_thread
+from lavender.lab.bench.running.timing import CallSpec, Task, measure, one_thread
 from lavender.lab.bench.store import Records, Store, read, write_csv, write_json
 
 __all__ = [
-    "Ask",
+    "CallSpec",
     "CampaignPlan",
     "CaseInfo",
     "Event",

@@ -14,7 +14,7 @@ from lavender.lab.bench.recommendation import SHORT_TIME_RATIO, Advice, Subject,
 from lavender.lab.bench.resampling import TimedCall, rank_calls_in_time, select_calls
 from lavender.lab.bench.running.alternating import time_alternately
 from lavender.lab.bench.running.plan import UNLIMITED_ITERATIONS, Plan
-from lavender.lab.bench.running.timing import Ask
+from lavender.lab.bench.running.timing import CallSpec
 from lavender.lab.bench.statistics import drop_idle_cases
 from lavender.lab.bench.store import Records
 from lavender.lab.bench.timed_call import exceeds_default_budget
@@ -28,13 +28,13 @@ MAX_CANDIDATES = 4  # Solvers timed for a tolerance and for each time limit, at 
 TIME_LIMIT_FRACTIONS = (0.5, 0.8)
 
 
-def list_candidates(records: Records, times: Sequence[float] = ()) -> list[Ask]:
+def list_candidates(records: Records, times: Sequence[float] = ()) -> list[CallSpec]:
     """List the calls to time alternately.
 
     These are calls to the middle tolerance, the same as a batch, and calls with each time limit in `times` [s]. Without
     `times`, the time limits are the ones from `choose_time_budgets` that are short enough to be reported.
     """
-    asks: list[Ask] = []
+    call_specs: list[CallSpec] = []
     for subject in list_subjects(records, times):
         tolerance, best = subject.best.target, subject.best.best
         if best is None:
@@ -45,15 +45,15 @@ def list_candidates(records: Records, times: Sequence[float] = ()) -> list[Ask]:
             max_iter = _required_max_iter(records, solver, tolerance)
             # Carrying impulses has its price: if steps are quick, a cold start may be faster.
             for start in ("cold", "carried") if subject.timing_mode == "steps" else ("cold",):
-                asks.append(
-                    Ask(solver, "tol", tolerance, max_iter, timing_mode=subject.timing_mode, start=start)
+                call_specs.append(
+                    CallSpec(solver, "tol", tolerance, max_iter, timing_mode=subject.timing_mode, start=start)
                 )
-            asks.append(Ask(solver, "tol", tolerance, max_iter, timing_mode="batch"))
+            call_specs.append(CallSpec(solver, "tol", tolerance, max_iter, timing_mode="batch"))
         single = select_calls(records, subject.timing_mode, interleaved=False)
         for advice in subject.quick:
             if times or advice.target <= SHORT_TIME_RATIO * best.score:
-                asks += _list_time_limited(records, subject, single, advice, tolerance)
-    return list(dict.fromkeys(asks))
+                call_specs += _list_time_limited(records, subject, single, advice, tolerance)
+    return list(dict.fromkeys(call_specs))
 
 
 def _required_max_iter(records: Records, solver: str, tolerance: float) -> int:
@@ -64,14 +64,14 @@ def _required_max_iter(records: Records, solver: str, tolerance: float) -> int:
 
 def _list_time_limited(
     records: Records, subject: Subject, single: Sequence[TimedCall], advice: Advice, tolerance: float
-) -> list[Ask]:
+) -> list[CallSpec]:
     """List time limits for the solvers that come closest, and the budgets of sweeps that stay within the time."""
     start = "carried" if subject.timing_mode == "steps" else "cold"
     own = [
         c.solver for c in advice.ranking if not (s := specs().get(c.solver)) or not (s.external or s.requires)
     ]
-    asks = [
-        Ask(
+    call_specs = [
+        CallSpec(
             solver,
             "time",
             tolerance,
@@ -86,8 +86,8 @@ def _list_time_limited(
     for call, choice in () if ranking is None else ranking.ranking[:MAX_CANDIDATES]:
         if choice.solved:
             line = call.line
-            asks.append(
-                Ask(
+            call_specs.append(
+                CallSpec(
                     line.solver,
                     "budget",
                     0.0,
@@ -96,7 +96,7 @@ def _list_time_limited(
                     start=line.start,
                 )
             )
-    return asks
+    return call_specs
 
 
 def time_candidates(

@@ -85,12 +85,12 @@ class Advice:
     target: float  # tolerance [-] or time [s]
     ranking: tuple[Choice, ...]
     equal: int = 1  # number of solvers at the head that are the best within noise; their order is fixed
-    least: float = 0.0  # A solver must serve at least this fraction of the cases to be recommended.
+    min_share: float = 0.0  # A solver must serve at least this fraction of the cases to be recommended.
 
     @property
     def best(self) -> Choice | None:
         """The recommended solver; None if no solver reached the tolerance, or none serves enough cases in the time."""
-        return self.ranking[0] if self.ranking and self.ranking[0].is_for(self.least) else None
+        return self.ranking[0] if self.ranking and self.ranking[0].is_for(self.min_share) else None
 
     @property
     def ties(self) -> tuple[str, ...]:
@@ -190,8 +190,8 @@ def _group_runs(records: Records) -> RunGroups:
             group = groups.setdefault((r.solver, "", ""), _RunGroup(r.solver))
         else:
             tol, budget = (r.tol, 0) if r.mode == "tol" else (0.0, r.max_iter)
-            new = _RunGroup(r.solver, f"{r.asked}, {r.start}", budget, tol)
-            group = groups.setdefault((r.solver, r.asked, r.start), new)
+            new = _RunGroup(r.solver, f"{r.target}, {r.start}", budget, tol)
+            group = groups.setdefault((r.solver, r.target, r.start), new)
         group.runs.setdefault(r.case, []).extend([r] if r.usable else [])
     return groups
 
@@ -264,7 +264,7 @@ def rank_in_time(
     choices = _keep_best_of_each(rank_group(group, limit) for group in selected)
     advice = rank_choices(family, limit, choices, RESIDUAL_NOISE_FACTOR)
     # Solvers that serve fewer cases have a residual of 1 at the 90th percentile, so that noise would rank them.
-    advice = replace(advice, least=SERVED_QUANTILE)
+    advice = replace(advice, min_share=SERVED_QUANTILE)
     if advice.best is None or math.isinf(limit):
         return advice
     late_choices = _keep_best_of_each(rank_group(group, TIME_NOISE_FACTOR * limit) for group in selected)

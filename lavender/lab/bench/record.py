@@ -340,7 +340,7 @@ class Record(_PrintableEntry):
         return measurement_key(self)
 
     @property
-    def asked(self) -> str:
+    def target(self) -> str:
         """Budget or tolerance, and the sweep order if it is not "given"."""
         order = "" if self.order == "given" else f", order {self.order}"
         return describe_target(self.mode, self.tol, self.max_iter) + order

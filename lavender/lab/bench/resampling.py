@@ -1,9 +1,9 @@
-"""Rank calls that were timed alternately, and measure by resampling how sure the ranking is.
+"""Rank calls that were timed alternately, and measure the certainty of the ranking by resampling.
 
 A resampling draws the cases and the repetitions with replacement (the steps of a sequence in blocks of consecutive
 ones, since neighbours are alike). In each resampling the calls are ranked by the rule of `recommendation`; every call
-within noise of the best wins it. Noise is the difference of a score between repetitions of the whole, not between
-repeats in one loop.
+within noise of the best wins it. Noise is the difference of a score between repetitions of the whole measurement, not
+between repetitions in one loop.
 """
 
 from __future__ import annotations
@@ -32,25 +32,29 @@ from lavender.lab.bench.timed_call import format_call
 
 SAMPLES = 500  # Resamplings of a ranking.
 MAX_ARRAY_ENTRIES = 1_000_000  # Numbers of the resamplings that are computed at a time.
-SURE_SHARE = 0.8  # A second solver is named if the first wins a smaller share of the resamplings.
-EQUAL_SHARE = (
-    0.2  # A solver that wins at least this share of the resamplings is as good a choice as the first.
-)
-MIN_TIME_NOISE = 1.05  # Factor between two times that counts as noise, at least: a user does not notice it.
+CERTAIN_SHARE = 0.8  # A second solver is named if the first wins a smaller share of the resamplings.
+# A solver that wins this share of the resamplings is as good a choice as the first.
+EQUAL_SHARE = 0.2
+MIN_TIME_NOISE = 1.05  # Times within this factor always count as equal: users do not notice it.
 SEQUENCE_BLOCKS = 10  # The steps of a sequence are cut into this many blocks, which are drawn as a whole.
-TIME_QUANTILE = (
-    0.25  # Quantile of the repetitions that is the time of a call: other processes only ever add time.
-)
-MIN_TIME = 1e-12  # s; smaller than the resolution of any clock, so that a logarithm exists.
+# The time of a call is this quantile of its repetitions, since other processes only add time.
+TIME_QUANTILE = 0.25
+MIN_TIME = 1e-12  # [s] Smaller times are replaced by this, so that their logarithm exists.
 IN_TIME_SHARE = 0.95  # Share of the repetitions that must end in time.
 
 
 @dataclass(frozen=True)
 class TimedCall:
-    """One call of `lv.solve` or `lv.solve_many` on all of its cases."""
+    """One call of `lv.solve` or `lv.solve_many` on all of its cases.
 
-    runs: Mapping[str, Record]  # by case
-    guessed: bool  # some cases have a guess
+    Parameters
+    ----------
+    runs : records by case
+    guessed : whether some cases have a guess
+    """
+
+    runs: Mapping[str, Record]
+    guessed: bool
 
     @property
     def line(self) -> Record:
@@ -71,18 +75,26 @@ class TimedCall:
 
 @dataclass(frozen=True)
 class ResampledRanking:
-    """A ranking of calls, and how often each wins a resampling."""
+    """A ranking of calls, and how often each wins a resampling.
 
-    ranking: tuple[tuple[TimedCall, Choice], ...]  # the recommended call first
-    shares: tuple[float, ...]  # share of the resamplings that each call wins, in this order
-    loss: float  # median of the recommended call's score over the best's in resamplings that it does not win; else 1
+    Parameters
+    ----------
+    ranking : calls with their results, the recommended call first
+    shares : share of the resamplings that each call wins, in this order
+    loss : median ratio of the recommended call's score to the best score in the resamplings that it does not win;
+        1 if it wins all
+    """
+
+    ranking: tuple[tuple[TimedCall, Choice], ...]
+    shares: tuple[float, ...]
+    loss: float
 
     @property
     def named(self) -> tuple[str, ...]:
-        """The recommended solver and those that are as good a choice; the second if the first is not sure."""
+        """The recommended solver and the equally good ones; the second one if the first is not certain."""
         solvers = [choice.solver for _, choice in self.ranking]
         others = [s for s, share in zip(solvers[1:], self.shares[1:], strict=True) if share >= EQUAL_SHARE]
-        if not others and self.shares[0] < SURE_SHARE and len(solvers) > 1:
+        if not others and self.shares[0] < CERTAIN_SHARE and len(solvers) > 1:
             others = [solvers[1 + int(np.argmax(self.shares[1:]))]]
         return tuple(dict.fromkeys([solvers[0], *others]))
 
@@ -102,11 +114,11 @@ def select_calls(records: Records, timing_mode: str, interleaved: bool = True) -
         if same_mode and compared and bool(r.interleave_group) is interleaved and r.case in records.cases:
             key = (r.solver, r.mode, r.tol, r.max_iter, r.time_limit, r.start)
             groups.setdefault(key, {})[r.case] = r
-    most = max((len(runs) for runs in groups.values()), default=0)
+    max_cases = max((len(runs) for runs in groups.values()), default=0)
     calls = [
         TimedCall(runs, any(records.cases[c].guess for c in runs))
         for runs in groups.values()
-        if len(runs) == most
+        if len(runs) == max_cases
     ]
     if timing_mode != "batch":
         return calls
@@ -117,7 +129,7 @@ def select_calls(records: Records, timing_mode: str, interleaved: bool = True) -
     return [f for f in calls if (f.line.solver, *sorted(f.runs)) in complete]
 
 
-STARTS = {"cold": "cold", "carried": "warm from the step before"}
+STARTS = {"cold": "cold", "carried": "warm from the previous step"}
 
 
 def _keep_best_of_each(calls: Sequence[TimedCall], tolerance: float) -> list[TimedCall]:
@@ -200,7 +212,7 @@ def recommend_for_cases(
         return alone
     hows = {c.solver: c.how for c in alone.ranking}
     interleaved = [
-        replace(c, how=f"{f.line.asked}, {f.line.start}" if f.line.step >= 0 else hows.get(c.solver, ""))
+        replace(c, how=f"{f.line.target}, {f.line.start}" if f.line.step >= 0 else hows.get(c.solver, ""))
         for f, c in resampled.ranking
     ]
     named = resampled.named
@@ -273,9 +285,12 @@ def _stack_repetitions(
     calls: Sequence[TimedCall], names: Sequence[str], values_of: Callable[[Record], Sequence[float]]
 ) -> FloatArray:
     """Return values by (calls, cases, repetitions): nan if a case did not run, repeated if repetitions are fewer."""
-    most = max(len(values_of(r)) for f in calls for r in f.runs.values())
+    max_repeats = max(len(values_of(r)) for f in calls for r in f.runs.values())
     return np.array(
-        [[np.resize(values_of(f.runs[c]) if c in f.runs else np.nan, most) for c in names] for f in calls],
+        [
+            [np.resize(values_of(f.runs[c]) if c in f.runs else np.nan, max_repeats) for c in names]
+            for f in calls
+        ],
         float,
     )
 
@@ -294,17 +309,17 @@ def _group_blocks(records: Records, names: Sequence[str]) -> list[list[int]]:
 
 
 def _draw_samples(
-    blocks: Sequence[Sequence[int]], repeats: int, most: int
+    blocks: Sequence[Sequence[int]], repeats: int, max_samples: int
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yield up to `most` samples of equally many cases: indices of (samples, cases) and (samples, repetitions)."""
+    """Yield up to `max_samples` samples of equally many cases: indices (samples, cases), (samples, repetitions)."""
     draw = np.random.default_rng(0)
     by_count: dict[int, list[tuple[list[int], np.ndarray]]] = {}
     for _ in range(SAMPLES):
         cases = [i for b in draw.integers(0, len(blocks), len(blocks)) for i in blocks[b]]
         by_count.setdefault(len(cases), []).append((cases, draw.integers(0, repeats, repeats)))
     for samples in by_count.values():
-        for start in range(0, len(samples), most):
-            case_indices, repetitions = zip(*samples[start : start + most], strict=True)
+        for start in range(0, len(samples), max_samples):
+            case_indices, repetitions = zip(*samples[start : start + max_samples], strict=True)
             yield np.array(case_indices), np.array(repetitions)
 
 
@@ -321,7 +336,7 @@ def _resample(
     n, _, repeats = values.shape
     blocks = _group_blocks(records, names)
     single = np.array([score(values[:, :, k : k + 1]) for k in range(repeats)])  # (repetitions, calls)
-    # Two standard errors of the difference of two scores; the error of a quartile is 1.36 times that of a mean.
+    # Two standard errors of the difference of two scores; the error of a quartile is 1.36 times the error of a mean.
     deviation = float(np.median(np.log(single).std(axis=0)))
     noise = max(MIN_TIME_NOISE, math.exp(2.0 * math.sqrt(2.0) * 1.36 * deviation / math.sqrt(repeats)))
     scores = score(values)
@@ -342,8 +357,8 @@ def _resample(
     order = sorted(
         range(n),
         key=lambda i: (
-            shares[i] < SURE_SHARE * shares.max(),
-            -shares[i] if shares[i] < SURE_SHARE * shares.max() else 0.0,
+            shares[i] < CERTAIN_SHARE * shares.max(),
+            -shares[i] if shares[i] < CERTAIN_SHARE * shares.max() else 0.0,
             calls[i].line.solver != PREFERRED_SOLVER,
             calls[i].line.solver,
             scores[i],

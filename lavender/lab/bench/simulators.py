@@ -35,8 +35,8 @@ from lavender.lab.bench.running.runner import carry
 from lavender.problem import Problem
 from lavender.solving.solve import solve
 
-TARGET = 1e-6  # Judged relative residual that both solvers must reach.
-STRICT = 1e-9  # Tighter relative residual tolerance with which lavender's solver is run, too.
+TARGET_RESIDUAL = 1e-6  # Judged relative residual that both solvers must reach.
+STRICT_RESIDUAL = 1e-9  # Tighter relative residual tolerance with which lavender's solver is run, too.
 MUJOCO_TOLERANCES = (1e-2, 1e-4, 1e-6, 1e-8, 1e-10, 1e-12, 1e-15)  # loosest first
 N_REPEATS = 5
 BATCH_SIZE = 64  # Number of problems in one call of solve_many.
@@ -78,7 +78,7 @@ class Step(WarmStep):
     many : float, s
         Time of lavender's solver per problem in solve_many.
     strict : float
-        Relative residual of lavender's solver with the tolerance STRICT.
+        Relative residual of lavender's solver with the tolerance STRICT_RESIDUAL.
     coulomb : float or None
         The same under Coulomb's law; None if a contact has more than two tangents.
     """
@@ -117,7 +117,7 @@ def time_engine(mj: Any, model: Any, data: Any, problem: Problem) -> tuple[float
         model.opt.tolerance = tolerance or default
         mj.mj_fwdConstraint(model, data)
         accepted = tolerance, residual(problem, adapter.impulse(model, data)).relative
-        if accepted[1] <= TARGET:
+        if accepted[1] <= TARGET_RESIDUAL:
             break
     seconds = min_time(lambda: mj.mj_fwdConstraint(model, data), 4 * N_REPEATS)
     return accepted[0], seconds, accepted[1]
@@ -129,7 +129,7 @@ def time_one_call(problem: Problem, impulse: Any = None) -> tuple[float, Solutio
     for _ in range(N_REPEATS):
         cold_problem = copy_cold(problem)
         begin = perf_counter()
-        solution = solve(cold_problem, tol=TARGET, impulse=impulse)
+        solution = solve(cold_problem, tol=TARGET_RESIDUAL, impulse=impulse)
         best = min(best, perf_counter() - begin)
     return float(best), solution
 
@@ -141,7 +141,7 @@ def time_cold_solves(problem: Problem) -> tuple[float, float, float]:
     for _ in range(N_REPEATS):
         batch = [copy_cold(problem) for _ in range(BATCH_SIZE)]
         begin = thread_time()  # CPU time: the batch takes milliseconds and may be interrupted.
-        solutions = solve_many(batch, tol=TARGET)
+        solutions = solve_many(batch, tol=TARGET_RESIDUAL)
         batch_time = min(batch_time, (thread_time() - begin) / BATCH_SIZE)
         residual_found = max(residual_found, *(solution.residual.relative for solution in solutions))
     return single_time, float(batch_time), float(residual_found)
@@ -172,11 +172,11 @@ def measure(mj: Any, path: Path, steps: int, every: int) -> list[Step]:
             continue
         tolerance, engine, engine_residual = time_engine(mj, model, data, problem)
         ours, batch_time, residual_found = time_cold_solves(problem)
-        strict = solve(copy_cold(problem), tol=STRICT).residual
+        strict = solve(copy_cold(problem), tol=STRICT_RESIDUAL).residual
         coulomb = None
         if not problem.cones.has_round:
             coulomb_residual = solve(
-                problem.relaxed("coulomb"), tol=STRICT, impulse=problem.start(), time_limit=5.0
+                problem.relaxed("coulomb"), tol=STRICT_RESIDUAL, impulse=problem.start(), time_limit=5.0
             ).residual
             coulomb = 0.0 if coulomb_residual.at_floor else coulomb_residual.relative
         out.append(

@@ -163,7 +163,7 @@ class Claims:
     runs : int
     claims, wrong : int
         Runs with the status CONVERGED, ROUNDOFF_LIMIT or INFEASIBLE, and those that the judge contradicts.
-    asked, reached : int
+    attempted, reached : int
         Runs to a tolerance, and those that reached it by the judge.
     crashed : int
         Runs with the status ERROR, KILLED or CRASHED.
@@ -174,7 +174,7 @@ class Claims:
     claims: int
     wrong: int
     reached: int
-    asked: int
+    attempted: int
     crashed: int
 
 
@@ -204,8 +204,8 @@ def reaches(records: Records, tolerances: Sequence[float] | None = None) -> list
     for (case, solver, start), group in pairs(records).items():
         good = [r for r in group if r.usable]
         best = min(good, key=lambda r: (r.relative, r.time_min), default=None)
-        asked = [r for r in group if r.mode == "tol"] or group
-        last = asked[-1]
+        to_tolerance = [r for r in group if r.mode == "tol"] or group
+        last = to_tolerance[-1]
         out.append(
             Reach(
                 case=case,
@@ -290,7 +290,7 @@ def claims(records: Records) -> list[Claims]:
                 claims=sum(r.claims for r in runs),
                 wrong=sum(r.claims and bool(r.status_conflict) for r in runs),
                 reached=sum(r.success for r in to_tolerance),
-                asked=len(to_tolerance),
+                attempted=len(to_tolerance),
                 crashed=sum(r.status.startswith(DEATH_STATUSES) for r in runs),
             )
         )
@@ -455,7 +455,7 @@ class Backend:
     ----------
     solver : str
     solved : int
-    whole : float, s
+    total_time : float, s
         Geometric mean of the time of the complete call.
     backend_time : float, s
         Geometric mean of the time in the solver's own interface, on converted data.
@@ -465,7 +465,7 @@ class Backend:
 
     solver: str
     solved: int
-    whole: float
+    total_time: float
     backend_time: float
     wins: int
 
@@ -488,11 +488,15 @@ def backends(records: Records) -> list[Backend]:
     for solver in sorted({r.solver for r in best.values() if r.backend_time_min is not None}):
         mine = {c: r for (s, c), r in best.items() if s == solver and r.backend_time_min is not None}
         backend_times = {c: r.backend_time_min or 0.0 for c, r in mine.items()}
-        whole = geometric_mean([r.time_min for r in mine.values()], MEAN_TIME_SHIFT)
+        total_time = geometric_mean([r.time_min for r in mine.values()], MEAN_TIME_SHIFT)
         wins = sum(t < ours.get(c, math.inf) for c, t in backend_times.items())
         out.append(
             Backend(
-                solver, len(mine), whole, geometric_mean(list(backend_times.values()), MEAN_TIME_SHIFT), wins
+                solver,
+                len(mine),
+                total_time,
+                geometric_mean(list(backend_times.values()), MEAN_TIME_SHIFT),
+                wins,
             )
         )
     return sorted(out, key=lambda b: b.backend_time)
@@ -608,7 +612,7 @@ class Pass:
     residuals: Mapping[str, tuple[float, ...]]  # start -> of each step
 
     @property
-    def asked(self) -> str:
+    def target(self) -> str:
         """Budget or tolerance."""
         return describe_target(self.mode, self.tol, self.max_iter)
 

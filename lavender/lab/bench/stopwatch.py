@@ -12,10 +12,11 @@ from contextlib import ExitStack, contextmanager
 from time import perf_counter
 from typing import Any
 
-SETUP = ("setup", "init")  # methods of these classes that receive the data
+SETUP_METHODS = ("setup", "init")  # Methods of the backends' classes that receive the data.
 
-#: module:class.method or module:function, as the calls in `lavender.external` and in qpsolvers look them up.
-OWN = {
+#: Entry points of each backend, as lavender.external and qpsolvers look them up: module:class.method or
+#: module:function.
+BACKEND_ENTRY_POINTS = {
     "clarabel": ("clarabel:DefaultSolver.solve",),
     "clarabel_cone": ("clarabel:DefaultSolver.solve",),
     "daqp": ("daqp:solve",),
@@ -71,16 +72,16 @@ def measure_backend_time(
         return call
 
     with ExitStack() as stack:
-        for place in OWN.get(solver, ()):
-            path, _, name = place.partition(":")
+        for entry_point in BACKEND_ENTRY_POINTS.get(solver, ()):
+            path, _, name = entry_point.partition(":")
             name, _, method = name.partition(".")
             module = pkgutil.resolve_name(path)
-            true = getattr(module, name)
+            original = getattr(module, name)
 
-            def watched(*args: Any, true: Any = true, method: str = method, **kwargs: Any) -> Any:
-                make, more = (timed(true), SETUP) if setup else (true, ())
+            def make_timed(*args: Any, original: Any = original, method: str = method, **kwargs: Any) -> Any:
+                make, more = (timed(original), SETUP_METHODS) if setup else (original, ())
                 return _TimedObject(make(*args, **kwargs), (method, *more), timed)
 
-            stack.callback(setattr, module, name, true)
-            setattr(module, name, watched if method else timed(true))
+            stack.callback(setattr, module, name, original)
+            setattr(module, name, make_timed if method else timed(original))
         yield spent

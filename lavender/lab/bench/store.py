@@ -40,7 +40,7 @@ from lavender.lab.bench.record import (
 )
 
 MAX_LINE_BYTES = 2**26  # A longer line is not a record; the longest records have a few thousand bytes.
-SYNC_INTERVAL = 1.0  # s; a power cut loses the records of at most this time, a killed process none.
+SYNC_INTERVAL = 1.0  # [s] A power cut loses at most the records of this time, a killed process none.
 
 
 @dataclass(repr=False)
@@ -62,7 +62,7 @@ class Records:
 
     @property
     def left_out(self) -> dict[str, list[Skip]]:
-        """Cases that did not load, by sequence ("" if none). No number includes them, and each table says so."""
+        """Cases that did not load, by sequence ("" if none). All numbers leave them out, and each table states this."""
         found: dict[str, list[Skip]] = {}
         for skip in self._skips.values():
             if not skip.solver:

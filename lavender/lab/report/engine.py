@@ -1,8 +1,8 @@
 """Read and rank the answers of the engine that recorded a folder of steps.
 
-The judge scores them like all answers. Their time is measured inside the engine: it includes neither a copy of the
-problem nor the judge, and the engine starts from the step before.
-`engine_choice` ranks it as solvers are ranked: by cases brought to a tolerance, then by the mean time.
+The judge scores them like all results. Their time is measured inside the engine: it includes neither a copy of the
+problem nor the judge, and the engine starts from its previous step. `rank_engine` ranks it as
+solvers are ranked: by cases brought to a tolerance, then by the mean time.
 """
 
 from __future__ import annotations
@@ -22,43 +22,54 @@ from lavender.lab.bench.record import printable
 from lavender.lab.bench.statistics import MEAN_TIME_SHIFT, geometric_mean, limit_of
 from lavender.lab.bench.store import Records
 
-_NUMBERS = ("rows", "seconds", "relative")
-INSIDE = "inside the engine, warm from the step before, without copy and judge"
+_NUMERIC_KEYS = ("rows", "seconds", "relative")
+INSIDE = "inside the engine, warm-started, without copy and judge"
 
 
 @dataclass(frozen=True)
 class EngineAnswers:
-    """Answers of an engine to one folder of recorded steps; residuals are relative."""
+    """Answers of an engine to one folder of recorded steps.
+
+    Parameters
+    ----------
+    folder, source : name of the folder, and its path as in the records
+    solver : solver of the engine
+    steps, left_out : recorded steps, and steps that could not be recorded
+    rows : median number of rows
+    relative, worst : median and largest relative residual [-]
+    above_floor : answers above the round-off floor
+    unconverged : those of them that stopped before convergence or are wrong, by more than the recording's threshold
+    velocity, where : largest velocity error of a row, nan if it was not recorded [m/s]; and that row
+    answers : time inside the engine [s] and relative residual by file name
+    """
 
     folder: str
-    source: str  # the folder's path as the records have it
-    solver: str  # of the engine
+    source: str
+    solver: str
     steps: int
-    left_out: int  # steps of the recording that could not be kept
-    rows: float  # median
-    relative: float  # median
+    left_out: int
+    rows: float
+    relative: float
     worst: float
-    above_floor: int  # answers that rounding does not explain
-    # of these, answers that stopped before convergence or are wrong, by more than the threshold of the recording
+    above_floor: int
     unconverged: int
-    velocity: float  # m/s, of the worst row of all answers; nan where the recording does not say
-    where: str  # that row
-    answers: Mapping[
-        str, tuple[float, float]
-    ]  # by the file's name: time inside the engine [s], relative residual
+    velocity: float
+    where: str
+    answers: Mapping[str, tuple[float, float]]
 
 
-def read_engine_answers(words: Sequence[str], records: Records) -> list[EngineAnswers]:
-    """Read the engine's answers in the folders among `words` and in those of the records' files.
+def read_engine_answers(sources: Sequence[str], records: Records) -> list[EngineAnswers]:
+    """Read the engine's answers in the folders among `sources`, and in the folders of the records' files.
 
     Lines that cannot be read are left out.
     """
     parents = (Path(x.source).parent for x in records.cases.values() if x.source.endswith(SUFFIXES))
-    engines = (_read_folder(folder) for folder in dict.fromkeys([*map(Path, words), *parents]))
+    engines = (_read_folder(folder) for folder in dict.fromkeys([*map(Path, sources), *parents]))
     return [engine for engine in engines if engine is not None]
 
 
 def _read_folder(folder: Path) -> EngineAnswers | None:
+    """Read the answers in one folder; return None if it has none."""
     path = folder / ENGINE
     if not path.is_file():
         return None
@@ -67,7 +78,7 @@ def _read_folder(folder: Path) -> EngineAnswers | None:
         try:
             entry = json.loads(line)
             left_out += "left_out" in entry
-            rows, time, relative = (float(entry[name]) for name in _NUMBERS)
+            rows, time, relative = (float(entry[name]) for name in _NUMERIC_KEYS)
             row = float(entry.get("velocity", math.nan)), str(entry.get("worst", ""))
             verdict = str(entry["verdict"])
             verdict = VERDICTS_OF_OLD.get(verdict, verdict)
@@ -98,7 +109,7 @@ def _read_folder(folder: Path) -> EngineAnswers | None:
 
 
 def list_cases_of(engine: EngineAnswers, records: Records) -> tuple[str, ...]:
-    """The cases of the records that are files of its folder."""
+    """Return the cases of the records that are files of the engine's folder."""
     sources = {name: Path(info.source) for name, info in records.cases.items()}
     return tuple(name for name, path in sources.items() if str(path.parent) == engine.source)
 
@@ -128,5 +139,5 @@ def rank_engine(
 
 
 def ranks_before(one: Choice, other: Choice) -> bool:
-    """Whether one solver ranks before another: more cases, or as many in less time."""
+    """Return whether one solver ranks before another: it solves more cases, or as many in less time."""
     return (-one.solved, one.score) < (-other.solved, other.score)

@@ -21,17 +21,28 @@ MIN_RESIDUAL = 1e-17  # A residual of exactly zero is drawn here.
 
 @dataclass(frozen=True)
 class Curve:
-    """A line of a figure: points, each with the budget or tolerance of its run."""
+    """A line of a figure: points, each with the budget or tolerance of its run.
+
+    Parameters
+    ----------
+    solver, label : solver, and name in the figure
+    x, y : coordinates
+    notes : target of each point: "to 1e-6", "16 iterations"
+    thin : whether this is a warm start, drawn thin
+    steps : whether the line is a step function
+    points : whether points are drawn without a line
+    low, high : edges of a band about the line, as `y`; empty without a band
+    """
 
     solver: str
     label: str
     x: tuple[float, ...]
     y: tuple[float, ...]
-    notes: tuple[str, ...] = ()  # budget or tolerance of each point: "to 1e-6", "16 iterations"
-    thin: bool = False  # warm starts
+    notes: tuple[str, ...] = ()
+    thin: bool = False
     steps: bool = False
-    points: bool = False  # without a line between them
-    low: tuple[float, ...] = ()  # lower edge of a band about the line, as `y`; empty without one
+    points: bool = False
+    low: tuple[float, ...] = ()
     high: tuple[float, ...] = ()
 
     @classmethod
@@ -54,9 +65,20 @@ class Curve:
 
 @dataclass(frozen=True)
 class Figure:
-    """Titles, scales and curves of a diagram."""
+    """Titles, scales and curves of a diagram.
 
-    name: str  # file name, without suffix
+    Parameters
+    ----------
+    name : file name without suffix
+    title, x_title, y_title : title, titles of the axes
+    curves : lines
+    x_log, y_log : whether the axes are logarithmic
+    tolerances : horizontal lines
+    roundoff_floor : dotted line; nan without one
+    left_out : solvers without a curve, so that the others can be distinguished
+    """
+
+    name: str
     title: str
     x_title: str
     y_title: str
@@ -65,13 +87,13 @@ class Figure:
     y_log: bool = True
     tolerances: tuple[float, ...] = ()
     roundoff_floor: float = math.nan
-    left_out: tuple[str, ...] = ()  # solvers without a curve, so that the others can be distinguished
+    left_out: tuple[str, ...] = ()
 
     @property
     def heading(self) -> str:
         """The title, with the number of solvers that are left out."""
-        left = format_count(len(self.left_out), "more solver")
-        return f"{self.title}; {left} not drawn" if self.title and self.left_out else self.title
+        omitted = format_count(len(self.left_out), "more solver")
+        return f"{self.title}; {omitted} not drawn" if self.title and self.left_out else self.title
 
 
 def _sort_by_work(runs: list[Record]) -> list[Record]:
@@ -87,9 +109,9 @@ def build_work_precision(records: Records, case: str) -> Figure:
     for (name, solver, start), group in sorted(statistics.pairs(records).items()):
         runs = _sort_by_work([r for r in group if r.usable]) if name == case else []
         if runs:
-            points, asked = [(r.time_min, r.relative) for r in runs], tuple(r.asked for r in runs)
+            points, targets = [(r.time_min, r.relative) for r in runs], tuple(r.target for r in runs)
             curves.append(
-                Curve.of(solver, name_run(solver, start), points, notes=asked, thin=start != "cold")
+                Curve.of(solver, name_run(solver, start), points, notes=targets, thin=start != "cold")
             )
     return _build_case_figure("work-precision", "time: set-up and solve [s]", records, case, curves)
 
@@ -113,7 +135,7 @@ GRID_SIZE = 49  # Times at which the residuals of all cases are compared.
 def build_overall_figure(records: Records) -> Figure:
     """Plot the residual that a solver has reached by a time, over all cases: the median, and a band of the middle half.
 
-    A case without a result by that time counts with residual 1, that of the zero impulse; so does a case that a solver
+    A case without a result by that time counts with residual 1, as the zero impulse; so does a case that a solver
     does not accept, which the title states. Cases are single problems from a cold start. If there are only sequences,
     each step is a case, with carried impulses if there are any.
     """
@@ -141,7 +163,7 @@ def build_overall_figure(records: Records) -> Figure:
             for t, x in own.get(case, ()):
                 np.minimum(row, x, out=row, where=grid * (1.0 + 1e-9) >= t)
         bands = np.quantile(reached, (0.25, 0.5, 0.75), axis=0, method="inverted_cdf")
-        # from the last time at which half of the cases have nothing
+        # The curve starts after the last time at which half of the cases have no result.
         first = max(np.flatnonzero(bands[0] == 1.0), default=0)
         across, lower, middle, upper = (tuple(x[first:].tolist()) for x in (grid, *bands))
         curves.append(Curve(solver, solver, across, middle, low=lower, high=upper))
@@ -174,9 +196,9 @@ def build_pass_figure(sequence: str, passes: list[statistics.Pass]) -> Figure:
             cold = start == "cold" and len(w.residuals) > 1
             label = f"{w.solver} (cold)" if cold else w.solver
             curves.append(Curve.of(w.solver, label, enumerate(values), thin=cold))
-    asked = passes[0].asked
+    target = passes[0].target
     return Figure(
-        f"sequence {sequence} {asked}", f"{sequence}: {asked}", "step",
+        f"sequence {sequence} {target}", f"{sequence}: {target}", "step",
         "time: set-up and solve [s]" if timed else "relative residual [-]", tuple(curves), x_log=False,
     )  # fmt: skip
 
@@ -185,7 +207,7 @@ MAX_CURVES = 5  # Curves of a profile: more cannot be distinguished, and mislead
 
 
 def build_profile_figure(profile: statistics.Profile) -> Figure:
-    """Plot a Dolan-More profile of the five solvers that solve most cases and are nearest to the fastest."""
+    """Plot a Dolan-More profile of the five solvers that solve the largest number of cases in the shortest times."""
 
     def standing(name: str) -> tuple[float, float, str]:
         steps = profile.curves[name]
@@ -208,18 +230,27 @@ def build_profile_figure(profile: statistics.Profile) -> Figure:
     )  # fmt: skip
 
 
-Group = Mapping[str, tuple[Figure, ...]]  # by case, law or sequence
+Group = Mapping[str, tuple[Figure, ...]]  # Figures by case, law or sequence.
 
 
 @dataclass(frozen=True)
 class Figures:
-    """Every figure of a report that has a curve, by its place on the page."""
+    """Every figure of a report that has a curve, by its place on the page.
 
-    over: Group = field(default_factory=dict)  # "all": the one over all cases
-    profiles: Group = field(default_factory=dict)  # by law, one for each tolerance
+    Parameters
+    ----------
+    over : figure over all cases, under the key "all"
+    profiles : performance profiles by law, one for each tolerance
+    sequences : figures by sequence
+    cases : error against time and residual against iterations, by case
+    moved : the same with motion errors [m/s] in place of residuals, if they are known
+    """
+
+    over: Group = field(default_factory=dict)
+    profiles: Group = field(default_factory=dict)
     sequences: Group = field(default_factory=dict)
-    cases: Group = field(default_factory=dict)  # error against time, residual against iterations
-    moved: Figures | None = None  # the same with motion errors [m/s] in place of residuals, where known
+    cases: Group = field(default_factory=dict)
+    moved: Figures | None = None
 
     @property
     def places(self) -> dict[str, Group]:
@@ -246,7 +277,7 @@ def build_figures(records: Records) -> Figures:
 
 
 def _relabel_for_motion(figures: Figures) -> Figures:
-    """Return figures of `convert_to_motion_errors`, with names and titles that say so."""
+    """Return figures of `convert_to_motion_errors`, with matching names and titles."""
 
     def relabel(figure: Figure) -> Figure:
         return replace(
@@ -264,7 +295,7 @@ def _relabel_for_motion(figures: Figures) -> Figures:
 
 
 def _build_figures(records: Records) -> Figures:
-    parts: dict[str, Records] = {}  # records of each case
+    parts: dict[str, Records] = {}  # Records by case.
     for r in records:
         if r.step < 0:
             parts.setdefault(r.case, Records(records.runs)).add(r)
@@ -292,7 +323,7 @@ def _keep_drawn(*some: Figure) -> tuple[Figure, ...]:
 
 
 def _build_pass_figures(name: str, passes: list[statistics.Pass]) -> tuple[Figure, ...]:
-    # The middle budget, and the solvers that have none.
+    # The middle budget, and the solvers without budgets.
     budgets = sorted({w.max_iter for w in passes if w.mode == "budget"})
     middle = [w for w in passes if w.mode == "budget" and w.max_iter == budgets[len(budgets) // 2]]
     to_tolerance = [w for w in passes if w.mode == "tol"]

@@ -19,7 +19,7 @@ from lavender.problem.derived import cached_property
 
 @dataclass(frozen=True, eq=False)
 class Report:
-    """Records, what they are compared with, and the budgets of interest.
+    """Contents of a report: records, earlier records, and requested budgets.
 
     Parameters
     ----------
@@ -28,9 +28,9 @@ class Report:
     earlier : Records, optional
         An earlier run to compare with.
     time_budgets : s, optional
-        Times with a recommended solver; those of the plan, or `recommendation.choose_time_budgets`, if there are none.
+        Times with a recommended solver; default: those of the plan, or `recommendation.choose_time_budgets`.
     sweep_budgets : int, optional
-        Numbers of sweeps with a recommended solver; those of the plan if there are none.
+        Numbers of sweeps with a recommended solver; default: those of the plan.
     engines : sequence of EngineAnswers
         Answers of the engines that recorded the steps: `lavender.lab.report.engine.read_engine_answers`.
     """
@@ -48,7 +48,7 @@ class Report:
 
     @cached_property
     def records(self) -> Records:
-        """The newest run without cases whose solution is the zero impulse."""
+        """The newest run without cases that the zero impulse solves."""
         return statistics.drop_idle_cases(self.newest)
 
     @cached_property
@@ -66,7 +66,7 @@ class Report:
         """A warning if the run ended before everything was measured; else empty."""
         if all(run.whole for run in self.newest.runs.values()):
             return ""
-        return "Stopped before the end: what was not measured is in no number here."
+        return "Stopped before the end: the numbers contain only the completed measurements."
 
     @cached_property
     def busy(self) -> str:
@@ -75,22 +75,22 @@ class Report:
             return ""
         (run,) = self.newest.runs.values()
         loads = [load for r in self.newest if (load := run.load if r.load is None else r.load) is not None]
-        # Half a core more than there are: on one core this process makes a load of 1, and the system adds a little.
+        # The limit is the number of cores plus 0.5: this process alone has a load of 1, and the system adds a little.
         if not loads or fmean(loads) <= run.cores + 0.5:
             return ""
         return (
-            f"The machine was busy: load {fmean(loads):.1f} on {format_count(run.cores, 'core')} while this was timed. "
-            "These times are void; measure again with --no-reuse."
+            f"The machine was busy: load {fmean(loads):.1f} on {format_count(run.cores, 'core')} during the "
+            "measurement. The times are invalid; measure again with --no-reuse."
         )
 
     @cached_property
     def tolerances(self) -> tuple[float, ...]:
-        """Levels of the residual, loosest first."""
+        """Residual tolerances, largest first."""
         return statistics.get_tolerances(self.records)
 
     @cached_property
     def speeds(self) -> tuple[float, ...]:
-        """Levels of the motion error [m/s]; empty without motion errors."""
+        """Velocity tolerances [m/s]; empty without motion errors."""
         return get_velocity_tolerances(self.records)
 
     @cached_property

@@ -33,7 +33,7 @@ from lavender.lab.report.plotting import assign_styles, plot_figure
 from lavender.lab.report.table import Cell, Table
 from lavender.lab.report.text import format_count, format_left_out
 
-FIGURE_SIZE = (5.5, 3.4)  # Inches: the width of the text of a page.
+FIGURE_SIZE = (5.5, 3.4)  # [inches] The width is the text width of a page.
 
 
 def write_paper(report: Report, folder: str | Path) -> Path:
@@ -99,7 +99,7 @@ def _build_folder_figures(records: Records) -> Group:
 def _select_leaders(figure: Figure, leaders: Sequence[str]) -> Figure:
     """Reduce a figure to five solvers, bands to two: the leaders of the verdict, then those that end lowest."""
     if all(c.steps for c in figure.curves):
-        return figure  # the curves of a profile are selected already
+        return figure  # The curves of a profile are selected already.
     ends = sorted(figure.curves, key=lambda c: c.y[-1] if math.isfinite(c.y[-1]) else math.inf)
     solvers = list(dict.fromkeys(c.solver for c in ends))
     solvers.sort(key=lambda name: leaders.index(name) if name in leaders else len(leaders))
@@ -120,7 +120,7 @@ _SPECIAL = {
 def escape_tex(text: str) -> str:
     """Return text with the special characters of LaTeX escaped."""
     escaped = re.sub(r"[\\~^&%$#_{}µ≈✗–]", lambda match: _SPECIAL[match[0]], " ".join(text.split()))
-    # After the end of a line, LaTeX would read [ and * as arguments of it.
+    # LaTeX would read [ and * after a line end as its arguments.
     return f"{{}}{escaped}" if escaped.startswith(("[", "*")) else escaped
 
 
@@ -140,11 +140,11 @@ def _name_file(figure: Figure) -> str:
 
 
 def _state_own_times(records: Records, solvers: Iterable[str]) -> str:
-    """Return a sentence on the timing of solvers of other packages among these; empty if there are none."""
+    """Return a sentence on the timing of third-party solvers among these; empty without such solvers."""
     names = sorted({r.solver for r in records if r.backend_time_min is not None}.intersection(solvers))
     if not names:
         return ""
-    return f" Time of its own interface, on data given before, without conversion: {', '.join(names)}."
+    return f" Time in its own interface, without conversion: {', '.join(names)}."
 
 
 def _state_lost_cases(records: Records) -> str:
@@ -194,7 +194,7 @@ def _write_tables(report: Report, own: Records) -> str:
         )
         caption += _state_own_times(own, solvers) + _state_lost_cases(records)
         parts.append(format_latex(table_specs.tabulate_means(by_tolerance), caption, f"means-{law}"))
-    caption = "Claims of solvers against the judge, who recomputes every residual from the problem's data."
+    caption = "Claims of solvers against the judge, which recomputes every residual from the problem's data."
     caption += _state_lost_cases(records)
     parts.append(format_latex(table_specs.tabulate_claims(records), caption, "claims"))
     return "% \\usepackage{booktabs}\n" + "\n".join(parts)
@@ -217,7 +217,7 @@ def _describe_method(report: Report) -> str:
     budgets = sorted({r.max_iter for r in own if r.mode == "budget"})
     swept = f" and with exact budgets of {', '.join(map(str, budgets))} iterations" if budgets else ""
     versions = ", ".join(f"{name} {version}" for name, version in run.versions.items())
-    least = f"the least of {repeats[0]}{f' to {repeats[-1]}' if len(repeats) > 1 else ''} repeats"
+    minimum = f"the minimum of {repeats[0]}{f' to {repeats[-1]}' if len(repeats) > 1 else ''} repeats"
     limit, threads = seconds(statistics.limit_of(records)), format_count(run.threads, "thread")
     solvers = format_count(len({r.solver for r in own}), "solver")
     lost = format_left_out(sum(map(len, records.left_out.values())))
@@ -228,8 +228,8 @@ def _describe_method(report: Report) -> str:
         f"We ran {solvers} on {problems}{lost} ({', '.join(laws)}; {rows[0]} to {rows[-1]} rows),",
         f"{runs} in all, to relative residuals of {tolerances}{swept}. The residual of an impulse is",
         "computed from the problem's data, whatever the solver reports: the larger of its errors in energy norm and",
-        "in velocity, each over that of doing nothing, so that 1 is doing nothing and 0 a solution. Times are those",
-        f"of set-up and solve, {least}, within a limit of {limit}; BLAS and OpenMP had {threads}.",
+        "in velocity, each divided by that of the zero impulse: 1 is the zero impulse, 0 a solution. Times are those",
+        f"of set-up and solve, {minimum}, within a limit of {limit}; BLAS and OpenMP had {threads}.",
         f"{own_times} {report.stopped} {report.busy} Means of times are",
         f"geometric, with {shift} added to each and a miss charged the limit. Profiles follow Dolan and Moré",
         f"(2002). Machine: {run.cpu}, {run.cores} cores, {run.platform}; lavender {run.lavender},",

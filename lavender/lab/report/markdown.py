@@ -43,7 +43,7 @@ def summarise_report(report: Report) -> str:
     failures = statistics.failures(records)
     if failures:
         lines += [
-            f"{len(failures)} runs missed what they were asked for, or claimed falsely; see the page.",
+            f"{len(failures)} runs missed their target or made a false claim; see the page.",
             "",
         ]
     return "\n".join(lines)

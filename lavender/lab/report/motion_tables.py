@@ -8,18 +8,25 @@ from dataclasses import dataclass, replace
 from lavender.lab.bench.record import format_tolerance
 from lavender.lab.bench.store import Records
 
-DEFAULT_VELOCITY_TOLERANCES = (1e-2, 1e-3)  # m/s, if the plan has none
+DEFAULT_VELOCITY_TOLERANCES = (1e-2, 1e-3)  # [m/s] Used if the plan has none.
 
 
 @dataclass(frozen=True)
 class IdleCase:
-    """A case whose solution is the zero impulse, and the worst answer of any solver to it."""
+    """A case that the zero impulse solves, and the worst result of any solver on it.
+
+    Parameters
+    ----------
+    case, rows : name, number of rows
+    solver : solver with the largest velocity error
+    velocity, energy : residual of that solver [m/s], [sqrt J]
+    """
 
     case: str
     rows: int
-    solver: str  # with the largest velocity error
-    velocity: float  # m/s
-    energy: float  # sqrt J
+    solver: str
+    velocity: float
+    energy: float
 
 
 def format_speed(tolerance: float) -> str:
@@ -53,7 +60,7 @@ def convert_to_motion_errors(records: Records) -> Records:
 
 
 def list_idle_cases(records: Records) -> list[IdleCase]:
-    """List cases whose solution is the zero impulse, with the worst residual of any run in units."""
+    """List cases that the zero impulse solves, with the worst residual of any run in units."""
     worst: dict[str, tuple[str, float, float]] = {}
     for r in sorted(records, key=lambda r: -r.velocity):
         worst.setdefault(r.case, (r.solver, r.velocity, r.energy))

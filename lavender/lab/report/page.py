@@ -63,7 +63,7 @@ def create_environment() -> Any:
 def render_page(report: Report, figures: Figures, saved: bool = True) -> str:
     """Return the page. Every text from a file, a problem or a backend is escaped.
 
-    `figures` show the records of the report; `saved` says that the folder of the page has them as SVG and PNG, too.
+    `figures` show the records of the report; `saved`: the folder of the page has them as SVG and PNG, too.
     """
     records = report.records
     return create_environment().get_template("index.html.j2").render(

@@ -1,9 +1,9 @@
 """Draw figures with matplotlib: as SVG and PNG files, as PDF of a paper, and as SVG within a page.
 
-In files a solver keeps its colour, dash and mark in a whole report. Colours are those of Okabe and Ito (distinct under
+In files a solver keeps its colour, dash and mark in a whole report. The colours are from Okabe and Ito (distinct under
 the common colour-vision deficiencies); dashes and marks distinguish solvers that share a colour, also in grey print.
 
-Within a page colours are those of its style sheet, so that they follow the theme and the selected solvers. The drawing
+Within a page the colours are from its style sheet, so that they follow the theme and the selected solvers. The drawing
 has classes in place of matplotlib's styles, whole coordinates, and the ranges of its axes, from which the page's script
 computes the values of points.
 """
@@ -26,14 +26,14 @@ from lavender.lab.bench.record import file_name, format_tolerance
 from lavender.lab.report.figures import Curve, Figure
 
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#8C6D31", "#7F7F7F")
-DASHES = ("-", "--", ":", "-.")  # as matplotlib names them
+DASHES = ("-", "--", ":", "-.")  # Line styles of matplotlib.
 MARKERS = ("o", "s", "^", "D", "X", "*", "v")
-LEGEND_COLUMNS = 3  # of a legend above the axes
+LEGEND_COLUMNS = 3  # Columns of a legend above the axes.
 MAX_MARKED_POINTS = 60  # A curve with more points has no marks: they would cover it.
-MAX_TITLE_LENGTH = 80  # characters; a longer title is cut
-MAX_NAME_LENGTH = 24  # characters of a solver's name at the end of its curve; a longer one is cut
+MAX_TITLE_LENGTH = 80  # [characters] Longer titles are cut.
+MAX_NAME_LENGTH = 24  # [characters] Longer names of solvers at the ends of curves are cut.
 MIN_DECADES = 1.0  # A logarithmic axis has at least this length.
-MARGIN = 0.03  # Part of the data's range that is added at either end of an axis.
+AXIS_MARGIN = 0.03  # This fraction of the data's range is added at each end of an axis.
 TIME_UNITS = ((1.0, "s"), (1e-3, "ms"), (1e-6, "µs"), (1e-9, "ns"))
 
 
@@ -46,7 +46,7 @@ def choose_limits(values: Sequence[float], log: bool) -> tuple[float, float]:
     low, high = min(values), max(values)
     if log and high - low < MIN_DECADES:
         low, high = 0.5 * (low + high - MIN_DECADES), 0.5 * (low + high + MIN_DECADES)
-    margin = MARGIN * (high - low) if high > low else 0.5
+    margin = AXIS_MARGIN * (high - low) if high > low else 0.5
     low, high = low - margin, high + margin
     return (10.0**low, 10.0**high) if log else (low, high)
 
@@ -71,7 +71,7 @@ def label_axis(
     scale, unit = (
         next((u for u in TIME_UNITS if middle >= u[0]), TIME_UNITS[-1]) if is_time else TIME_UNITS[0]
     )
-    smallest = 9e-4 if is_time else 0.09  # smaller numbers of a logarithmic axis are written as powers of ten
+    smallest = 9e-4 if is_time else 0.09  # Smaller numbers of a logarithmic axis are powers of ten.
 
     def write(value: float) -> str:
         return f"{value:.6g}" if not log or smallest < value < 1e4 else format_tolerance(value)
@@ -115,7 +115,7 @@ def _draw(axes: Any, figure: Figure) -> list[tuple[Curve, list[tuple[float, floa
     artists = []
     for c, points in curves:
         x, y = map(list, zip(*points, strict=True))
-        if c.steps:  # to the end of the axis
+        if c.steps:  # Extend the last step to the end of the axis.
             x, y = [*x, x_limits[1]], [*y, y[-1]]
         (line,) = axes.plot(x, y, label=_shorten(c.label), drawstyle="steps-post" if c.steps else "default")
         band = axes.fill_between(c.x, c.low, c.high) if c.low else None
@@ -159,7 +159,7 @@ class CurveStyle:
     marker: str
 
 
-# These solvers get the first styles, so that those compared most often never share a colour.
+# These solvers get the first styles, so that the solvers that are often compared have different colours.
 FIRST_SOLVERS = ("auto", "direct", "newton", "anderson", "nncg", "osqp", "pgs", "sequential_impulses")
 
 
@@ -187,7 +187,7 @@ def plot_figure(
     entries = len(figure.curves) + (figure.roundoff_floor > 0.0)
     rows = -(-entries // LEGEND_COLUMNS) + bool(figure.left_out)
     right, top = (2.05, 0.41) if figure.title else (0.15, 0.17 * rows + 0.1)
-    # The axes have a fixed place: fitting it to the labels would take most of the time of a figure.
+    # The axes have a fixed place: fitting it to the labels would take longer than the rest of the figure.
     width, height = 1.0 - (0.76 + right) / size[0], 1.0 - (0.6 + top) / size[1]
     axes = canvas.add_axes((0.76 / size[0], 0.6 / size[1], width, height))
     _draw_styled(axes, figure, styles)
@@ -236,7 +236,7 @@ def plot_panels(figures: Sequence[Figure], styles: Mapping[str, CurveStyle]) -> 
 
 def _draw_styled(axes: Any, figure: Figure, styles: Mapping[str, CurveStyle]) -> None:
     """Draw a figure with the colours, dashes and marks of its solvers, and with its title."""
-    has_bands = any(c.low for c in figure.curves)  # over all cases: its points are no runs
+    has_bands = any(c.low for c in figure.curves)  # Points over all cases are not single runs.
     for c, points, line, band in _draw(axes, figure):
         style = styles[c.solver]
         line.set(
@@ -270,10 +270,15 @@ def save_figures(figures: Iterable[Figure], folder: Path, solvers: Iterable[str]
 
 # -- within a page ---------------------------------------------------------------------------------------------
 
-WIDTH, HEIGHT = 1000, 640  # of a drawing in a page, about twice as many units as a phone shows pixels
-LEFT, RIGHT, TOP, BOTTOM = 118, 256, 62, 92  # margins: labels of the axes; names at the ends of curves
-FONT_SIZE = 22  # units; the page's style sheet has the same
-MIN_NAME_DISTANCE = 30  # units between two names of leaders
+WIDTH, HEIGHT = 1000, 640  # [units] Size of a drawing in a page, about two units per pixel of a phone.
+LEFT, RIGHT, TOP, BOTTOM = (
+    118,
+    256,
+    62,
+    92,
+)  # [units] Margins for the labels of the axes and the names at the ends of curves.
+FONT_SIZE = 22  # [units] The page's style sheet has the same size.
+MIN_NAME_DISTANCE = 30  # [units] Smallest distance between two names of leaders.
 SVG = "{http://www.w3.org/2000/svg}"
 
 
@@ -292,7 +297,7 @@ def plot_for_page(
     title : str, optional
         Replaces the figure's heading, which may repeat a heading of the page.
     """
-    canvas = _create_canvas((WIDTH / 72.0, HEIGHT / 72.0), dpi=72)  # a unit is a pixel
+    canvas = _create_canvas((WIDTH / 72.0, HEIGHT / 72.0), dpi=72)  # One unit is one pixel.
     right, bottom = WIDTH - RIGHT, HEIGHT - BOTTOM
     axes = canvas.add_axes(
         (LEFT / WIDTH, BOTTOM / HEIGHT, (right - LEFT) / WIDTH, (bottom - TOP) / HEIGHT), frame_on=False
@@ -340,11 +345,11 @@ def _tag_axes(axes: Any, figure: Figure) -> None:
     low, high = axes.get_ylim()
     if low <= figure.roundoff_floor <= high:
         place["transform"] = axes.get_yaxis_transform()
-        axes.text(0.99, figure.roundoff_floor, "roundoff_floor", ha="right", va="bottom", **place)
+        axes.text(0.99, figure.roundoff_floor, "floor", ha="right", va="bottom", **place)
 
 
 def _describe_axis(limits: tuple[float, float], log: bool, first: int, last: int) -> str:
-    """Return what a script needs to compute a value from a coordinate: scale, its ends, and their coordinates."""
+    """Return the numbers that convert a coordinate to a value: scale, its ends, and their coordinates."""
     low, high = map(math.log10, limits) if log else limits
     return f"{int(log)} {low:.4f} {high:.4f} {first} {last}"
 
@@ -352,12 +357,12 @@ def _describe_axis(limits: tuple[float, float], log: bool, first: int, last: int
 def _place_names(
     curves: Sequence[Curve], places: Mapping[int, Sequence[tuple[float, float]]], leaders: Sequence[str]
 ) -> dict[int, tuple[float, float]]:
-    """Return where the name of each curve goes: at its end, with a distance between those of the leaders."""
+    """Return the positions of the names of curves: at their ends, with a distance between the names of leaders."""
     ends = {}
     for i, c in enumerate(curves):
         if not c.thin:
             last = places[i][-1][1]
-            # Beside the rightmost point at the height of the end.
+            # Next to the rightmost point at the height of the end.
             right = (
                 WIDTH - RIGHT
                 if c.steps
@@ -367,7 +372,7 @@ def _place_names(
     leading = sorted((i for i in ends if curves[i].solver in leaders), key=lambda i: ends[i][1])
     for above, i in pairwise(leading):
         ends[i] = (ends[i][0], max(ends[i][1], ends[above][1] + MIN_NAME_DISTANCE))
-    lowest = HEIGHT - BOTTOM + 4.0  # above the numbers of the axis
+    lowest = HEIGHT - BOTTOM + 4.0  # Above the numbers of the axis.
     for i in reversed(leading):
         ends[i] = (ends[i][0], min(ends[i][1], lowest))
         lowest = ends[i][1] - MIN_NAME_DISTANCE
@@ -401,9 +406,9 @@ def _rewrite_svg(canvas: Any, curves: Sequence[Curve], number: Mapping[str, int]
         c = curves[int(owner[1:])]
         # "16" for 16 iterations: the page's script adds the word.
         notes = "|".join(note.removesuffix(" iterations") for note in c.notes)
-        asked = f' data-n="{escape(notes)}"' if notes else ""
+        attribute = f' data-n="{escape(notes)}"' if notes else ""
         kinds = f"c s{number.get(c.solver, 0)}{' w' if c.thin else ''}"
-        yield f'<g class="{kinds}" data-l="{escape(c.label)}"{asked}>'
+        yield f'<g class="{kinds}" data-l="{escape(c.label)}"{attribute}>'
         for kind, group in parts:
             data = _format_path(group)
             if kind == "b":
@@ -424,10 +429,10 @@ def _format_path(group: ElementTree.Element) -> str:
     return "".join(f"{name}{round(float(x))} {round(float(y))}" for some in commands for name, x, y in some)
 
 
-def _rewrite_texts(group: ElementTree.Element, attributes: str, words: str = "") -> Iterable[str]:
-    """Yield the texts of a group in whole units; `words` replace their own."""
+def _rewrite_texts(group: ElementTree.Element, attributes: str, replacement: str = "") -> Iterable[str]:
+    """Yield the texts of a group in whole units; `replacement` replaces each text."""
     for text in group.iter(f"{SVG}text"):
         style = text.get("style", "")
         anchor = "".join(f' text-anchor="{a}"' for a in ("middle", "end") if f"text-anchor: {a}" in style)
         x, y = (round(float(text.get(name, "0"))) for name in "xy")
-        yield f'<text{attributes} x="{x}" y="{y}"{anchor}>{escape(words or text.text or "")}</text>'
+        yield f'<text{attributes} x="{x}" y="{y}"{anchor}>{escape(replacement or text.text or "")}</text>'

@@ -7,19 +7,19 @@ from typing import TypeVar
 
 import numpy as np
 
-from lavender.lab.bench.simulators import STRICT, TARGET, Step, WarmStep
+from lavender.lab.bench.simulators import STRICT_RESIDUAL, TARGET_RESIDUAL, Step, WarmStep
 from lavender.lab.bench.statistics import geometric_mean
 from lavender.lab.report.markdown import format_markdown
 from lavender.lab.report.table import Table
 
 S = TypeVar("S", bound=WarmStep)
 OVER = "lavender's time over MuJoCo's, geometric means, above 1 MuJoCo is faster"
-CLASSES = ((0, 10), (10, 50), (50, 300), (300, 10**9))  # rows
+ROW_CLASSES = ((0, 10), (10, 50), (50, 300), (300, 10**9))  # Ranges of the number of rows.
 
 
 def _by_class(steps: Sequence[S]) -> list[tuple[str, list[S]]]:
     classes = []
-    for low, high in CLASSES:
+    for low, high in ROW_CLASSES:
         name = f"under {high}" if low == 0 else f"{low} and more" if high > 10**6 else f"{low}-{high}"
         classes.append((name, [s for s in steps if low <= s.rows < high]))
     return [(name, part) for name, part in classes if part]
@@ -43,16 +43,16 @@ def table(steps: Sequence[Step]) -> str:
         [*_row(name, part), f"{geometric_mean([s.many / s.engine for s in part]):.2f}"]
         for name, part in _by_class(steps)
     ]
-    convex = [s for s in steps if s.strict <= STRICT]
+    convex = [s for s in steps if s.strict <= STRICT_RESIDUAL]
     coulomb = [s for s in steps if s.coulomb is not None]
-    solved = sum(s.coulomb <= STRICT for s in coulomb if s.coulomb is not None)
-    never = sum(s.tolerance == 0.0 for s in steps)
+    solved = sum(s.coulomb <= STRICT_RESIDUAL for s in coulomb if s.coulomb is not None)
+    unreached = sum(s.tolerance == 0.0 for s in steps)
     summary = (
-        f"{len(convex)} of {len(steps)} solved to {STRICT:.0e} or the floor of float64 under MuJoCo's own law, "
-        f"{solved} of {len(coulomb)} under Coulomb's (contacts of up to two tangents); {never} that MuJoCo brings "
-        f"to {TARGET:.0e} at no tolerance count with its default."
+        f"{len(convex)} of {len(steps)} solved to {STRICT_RESIDUAL:.0e} or the floor of float64 under MuJoCo's own "
+        f"law, {solved} of {len(coulomb)} under Coulomb's (contacts of up to two tangents). {unreached} are not solved "
+        f"to {TARGET_RESIDUAL:.0e} by MuJoCo with any tolerance; they count with its default tolerance."
     )
-    start = f"Cold, both sides from nothing, to a judged residual of {TARGET:.0e}. `one call`, `solve_many`: {OVER}."
+    start = f"Cold start, to a judged residual of {TARGET_RESIDUAL:.0e}. `one call`, `solve_many`: {OVER}."
     return "\n".join([start, "", *format_markdown(Table(heads, rows)), "", summary])
 
 
@@ -69,7 +69,7 @@ def warm_table(steps: Sequence[WarmStep]) -> str:
     residuals = ["MuJoCo's residual, median", "worst", "ours, median", "worst"]
     start = (
         "Warm, each side from its own last step, MuJoCo at the model's tolerance, lavender to "
-        f"{TARGET:.0e}. `one call`: {OVER}."
+        f"{TARGET_RESIDUAL:.0e}. `one call`: {OVER}."
     )
     heads = ["rows", "models", "steps", "MuJoCo [µs]", "one call", *residuals]
     return "\n".join([start, "", *format_markdown(Table(heads, rows))])

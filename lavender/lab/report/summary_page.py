@@ -22,14 +22,21 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class PageSection:
-    """A heading with its tables, figures and lines to copy."""
+    """A heading with its tables, figures and lines to copy.
+
+    Parameters
+    ----------
+    title, tables, figures, note : heading, tables, figures, note
+    code : lines to copy
+    short : number of rows of the first table that a terminal shows
+    """
 
     title: str
     tables: Sequence[Table] = ()
     figures: Sequence[Figure] = ()
     note: str = ""
-    code: Sequence[str] = ()  # lines to copy
-    short: int = 0  # rows of the first table that a terminal shows
+    code: Sequence[str] = ()
+    short: int = 0
 
     @property
     def is_shown(self) -> bool:
@@ -40,13 +47,21 @@ class PageSection:
 
 @dataclass(frozen=True)
 class SummaryPage:
-    """A title, the sentence that sums up the page, sections, and numbers for programs."""
+    """A title, the sentence that summarises the page, sections, and numbers for programs.
+
+    Parameters
+    ----------
+    title, head : title, summarising sentence
+    sections : sections
+    numbers : content of numbers.json
+    stopped : whether the measurement ended early, so that all numbers are of the completed part
+    """
 
     title: str
     head: str
     sections: Sequence[PageSection]
     numbers: dict[str, Any]
-    stopped: bool = False  # the measurement ended early; all numbers are of the part before
+    stopped: bool = False
 
     def render_html(self) -> str:
         """Return one file without external parts; every text is escaped."""

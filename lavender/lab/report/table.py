@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 #: Heads of columns of words; all other columns have numbers.
 WORDS = frozenset({
-    "case", "solver", "status", "claim", "form", "structure", "law", "change", "asked", "hardest", "sequence",
+    "case", "solver", "status", "claim", "form", "structure", "law", "change", "target", "hardest", "sequence",
     "message", "worst row", "reason", "residual by order", "recorded", "engine's own", "first here",
     "furthest off",
 })  # fmt: skip
@@ -19,16 +19,26 @@ COLOURS = {"good": "green", "warn": "yellow", "bad": "red"}
 
 @dataclass(frozen=True)
 class Cell:
-    """The text of a cell, and additions that a page can show."""
+    """The text of a cell, and additions that a page can show.
+
+    Parameters
+    ----------
+    text, lead, after : text, name before it, remark after it
+    more : further remark, only on the page
+    title : text that the page shows while the pointer is on the cell
+    link : id of the part of the page that the cell links to
+    value : number by which the page sorts
+    mark : key of `COLOURS`
+    """
 
     text: str
-    lead: str = ""  # a name before the text
-    after: str = ""  # a remark behind the text
-    more: str = ""  # a further remark, on the page alone
-    title: str = ""  # shown on the page while the pointer is on the cell
-    link: str = ""  # id of the part of the page that the cell links to
-    value: float | None = None  # number by which the page sorts
-    mark: str = ""  # key of `COLOURS`
+    lead: str = ""
+    after: str = ""
+    more: str = ""
+    title: str = ""
+    link: str = ""
+    value: float | None = None
+    mark: str = ""
 
     def __str__(self) -> str:
         return f"{self.lead} {self.text}".strip() + self.after
@@ -36,12 +46,20 @@ class Cell:
 
 @dataclass(frozen=True)
 class Table:
-    """Heads of columns and the cells of each row, a text or a `Cell`."""
+    """Heads of columns and the cells of each row, a text or a `Cell`.
+
+    Parameters
+    ----------
+    heads, rows : heads of the columns, cells of the rows
+    marks : key of `COLOURS` for each row; empty without marks
+    folds : whether cells have several words, which are wrapped in a narrow table
+    words : heads of columns of words
+    """
 
     heads: Sequence[str]
     rows: Sequence[Sequence[str | Cell]]
-    marks: Sequence[str] = ()  # of each row, keys of `COLOURS`; empty without marks
-    folds: bool = False  # cells have several words, which fold in a narrow table
+    marks: Sequence[str] = ()
+    folds: bool = False
     words: frozenset[str] = field(default=WORDS, repr=False)
 
     @classmethod

@@ -1,7 +1,7 @@
 """Describe every table of a report once: its page, the terminal, the summary and a paper show the same rows.
 
-`sections` is their order for those who read from top to bottom: the terminal and the summary walk it. The page has the
-same tables between its figures.
+`list_sections` defines the order of the tables in the terminal and the summary. The page shows the same tables between
+its figures.
 """
 
 from __future__ import annotations
@@ -37,33 +37,41 @@ GOOD = ("CONVERGED", "ROUNDOFF_LIMIT")
 CLAIM_MARKS = {CONFIRMED: "", NOT_PROVEN: NOT_PROVEN, CONTRADICTED: "✗ contradicted"}
 SHOWN_TIES = 2
 DIFFICULTY = (
-    "sweeps of pgs to a thousandth of doing nothing; condition of A scaled to a diagonal of 1; share of blocks at the "
-    "boundary of two states, among those whose error has a bound; "
-    "solvers with the same bits and no iteration, whose times are of one shortcut"
+    "sweeps of pgs to a thousandth of the error of the zero impulse; condition of A scaled to a unit diagonal; "
+    "share of blocks at the boundary between two states, among blocks with an error bound; "
+    "solvers with bit-identical results and no iteration, whose times are times of one shortcut"
 )
 INTERLEAVED, ALONE = (
     "interleaved",
     "alone",
-)  # lines of a recommendation, timed again; runs one after the other
-ENGINES_OWN = "engine's own"  # column of the solver of the engine that recorded the cases
+)  # Marks of times: calls of the recommendation, repeated alternately; single runs.
+ENGINES_OWN = "engine's own"  # Column of the solver of the engine that recorded the cases.
 NOT_COMPARED = "no case has the same numbers in both (steps of sequences are not compared)"
 
 
 @dataclass(frozen=True)
 class Section:
-    """A table under its heading."""
+    """A table under its heading.
+
+    Parameters
+    ----------
+    title, note : heading, and the meaning of the numbers
+    table : the table
+    grouped : whether rows of one case or structure form groups
+    empty : text in place of an empty table; without it, a section without rows is left out
+    """
 
     title: str
-    note: str  # what its numbers are
+    note: str
     table: Table
-    grouped: bool = False  # rows of one case or structure stand together
-    empty: str = ""  # what is said in place of no rows; a section without rows and this is left out
+    grouped: bool = False
+    empty: str = ""
 
 
 def list_sections(report: Report) -> list[Section]:
     """List the tables of a report with their headings, from the recommendations to changes since an earlier report."""
     records, tolerances = report.records, report.tolerances
-    moved = "how wrong the body moves that is furthest off"
+    moved = "largest velocity error of a body"
     if report.is_campaign:
         shares = tabulate_robustness(statistics.robustness(records), tolerances)
         by_speed = tabulate_robustness(statistics.robustness(report.by_speed), report.speeds, " m/s")
@@ -79,13 +87,13 @@ def list_sections(report: Report) -> list[Section]:
             else ALONE
         )
         by_structure = (
-            f"to a tolerance: mean time, {timed} (cold, if not carried), share of cases that get there, budget; "
+            f"to a tolerance: mean time, {timed} (cold, if not carried), share of cases solved, budget; "
             "in a time or with sweeps: share of cases served, nine of ten at least, residual at the 90th percentile; "
             "≈ as good within noise"
         )
         by_sweeps = "share of cases served, residual at the 90th percentile"
         inside = (
-            "its own answers, judged like ours; its time holds no copy of the problem and no judge; ranked as in the "
+            "judged like all solvers; its time excludes the copy of the problem and the judge; ranked as in the "
             "first sentence"
         )
         every = "floor: rounding to float64 allows no better"
@@ -141,14 +149,14 @@ def has_interleaved_calls(report: Report) -> bool:
 
 
 def _tabulate_solvers(report: Report, tolerance: float) -> Table:
-    """Tabulate the solvers of the only structure to a tolerance: first those of the first sentence, with its times."""
+    """Tabulate the solvers of the only structure to a tolerance; the solvers of the first sentence come first."""
     raced = {choice.solver: (final.line, choice) for final, choice in report.verdict.ranking if choice.solved}
     alone = [c for c in report.lines[0].by_tolerance[tolerance].ranking if c.solved and c.solver not in raced]
     rows: Rows = [
         [
             c.solver,
             seconds(c.score) + format_share(c.solved, c.cases),
-            f"{line.asked}, {line.start}",
+            f"{line.target}, {line.start}",
             INTERLEAVED if line.interleave_group else ALONE,
         ]
         for line, c in raced.values()
@@ -160,7 +168,7 @@ def _tabulate_solvers(report: Report, tolerance: float) -> Table:
         before = sum(not ranks_before(engine, choice) for choice in ranked)
         time = seconds(engine.score) + format_share(engine.solved, engine.cases)
         rows.insert(before, [f"engine's {engine.solver}", time, "own, warm", "inside the engine"])
-    return Table(["solver", f"to {format_tolerance(tolerance)}", "asked", "timed"], rows)
+    return Table(["solver", f"to {format_tolerance(tolerance)}", "target", "timed"], rows)
 
 
 # -- recommendations ---------------------------------------------------------------------------------------
@@ -171,7 +179,7 @@ def format_advice(advice: Advice, in_time: bool) -> Cell:
     best, ties = advice.best, advice.ties
     if best is None:
         most = advice.ranking[0] if advice.ranking else None
-        return Cell("nobody", after=f" ({most.solved}/{most.cases} at most)" if most and most.solved else "")
+        return Cell("none", after=f" ({most.solved}/{most.cases} at most)" if most and most.solved else "")
     write = format_residual if in_time else seconds
     after = f", {best.how}" if best.how else ""
     if ties:
@@ -267,7 +275,7 @@ def tabulate_cases(
         rows.append(
             [
                 Cell(name, link=f"case-{file_name(name)}"), info.law, str(info.rows), str(info.contacts),
-                ", ".join(info.structure), "nobody" if best is None else best.solver, Cell(seconds(time), value=time),
+                ", ".join(info.structure), "none" if best is None else best.solver, Cell(seconds(time), value=time),
                 Cell(answer, value=info.stored),
             ]
         )  # fmt: skip
@@ -337,12 +345,12 @@ def tabulate_motion_errors(report: Report) -> Table:
 
 
 def tabulate_idle_cases(records: Records) -> Table:
-    """Tabulate cases whose solution is the zero impulse, with the worst answer to each, in units."""
+    """Tabulate cases that the zero impulse solves, with the worst answer to each, in units."""
     rows: Rows = [
         [
             c.case,
             str(c.rows),
-            c.solver or "nobody",
+            c.solver or NONE,
             f"{format_residual(c.velocity)} m/s",
             f"{format_residual(c.energy)} √J",
         ]
@@ -355,7 +363,7 @@ def tabulate_failures(failures: Sequence[Record], campaign: bool) -> Table:
     """Tabulate runs that missed their tolerance or made a false claim. Cases of a campaign are not linked."""
     rows: Rows = [
         [
-            Cell(f.case, link="" if campaign else f"case-{file_name(f.case)}"), name_run(f.solver, f.start), f.asked,
+            Cell(f.case, link="" if campaign else f"case-{file_name(f.case)}"), name_run(f.solver, f.start), f.target,
             f.status, format_residual(f.relative), format_residual(f.roundoff_floor), f.worst_name,
             (f"✗ {f.status_conflict}. " if f.status_conflict else "") + f.message,
         ]
@@ -363,7 +371,7 @@ def tabulate_failures(failures: Sequence[Record], campaign: bool) -> Table:
     ]  # fmt: skip
     marks = ["bad" if f.status_conflict else "" for f in failures]
     return Table(
-        ["case", "solver", "asked", "status", "residual", "floor", "worst row", "message"],
+        ["case", "solver", "target", "status", "residual", "floor", "worst row", "message"],
         rows,
         marks,
     )
@@ -424,7 +432,7 @@ def tabulate_claims(records: Records) -> Table:
     rows: Rows = [
         [
             c.solver, str(c.runs), format_percent(c.claims - c.wrong, c.claims) if c.claims else NONE, str(c.claims),
-            f"✗ {c.wrong}" if c.wrong else "0", f"{c.reached} of {c.asked}", str(c.crashed),
+            f"✗ {c.wrong}" if c.wrong else "0", f"{c.reached} of {c.attempted}", str(c.crashed),
         ]
         for c in claims
     ]  # fmt: skip
@@ -456,12 +464,12 @@ def tabulate_backends(records: Records) -> Table:
         [
             b.solver,
             str(b.solved),
-            *map(seconds, (b.whole, b.whole - b.backend_time, b.backend_time)),
+            *map(seconds, (b.total_time, b.total_time - b.backend_time, b.backend_time)),
             str(b.wins),
         ]
         for b in statistics.backends(records)
     ]
-    return Table(["solver", "cases", "whole way", "conversion", "own interface", "less than ours"], rows)
+    return Table(["solver", "cases", "total", "conversion", "own interface", "faster than lavender"], rows)
 
 
 def tabulate_spreads(spreads: Sequence[statistics.Spread]) -> Table:
@@ -483,7 +491,7 @@ def tabulate_passes(passes: Sequence[statistics.Pass]) -> Table:
     for w in passes:
         rows.append(
             [
-                Cell(w.sequence, after=format_left_out(w.left_out)), w.solver, w.asked, str(w.steps),
+                Cell(w.sequence, after=format_left_out(w.left_out)), w.solver, w.target, str(w.steps),
                 f"{w.gain:.3g}" if math.isfinite(w.gain) and w.mode == "budget" else NONE,
                 *(format_residual(w.middle(s)) if s in w.residuals else NONE for s in starts),
                 *(seconds(w.time[s]) + format_share(len(w.times[s]), w.steps) if s in w.time else NONE for s in starts),
@@ -491,7 +499,7 @@ def tabulate_passes(passes: Sequence[statistics.Pass]) -> Table:
             ]
         )  # fmt: skip
     heads = [f"{what}, {start}" for what in ("median", "time", "iterations") for start in starts]
-    return Table(["sequence", "solver", "asked", "steps", "gain", *heads], rows)
+    return Table(["sequence", "solver", "target", "steps", "gain", *heads], rows)
 
 
 def tabulate_engines(report: Report) -> Table:

@@ -77,9 +77,9 @@ def print_report(report: Report, console: Console, complete: bool = False) -> No
 
     lines: list[Text] = []
     for i, statement in enumerate(report.verdict.statements):
-        if complete or i == 0 or statement.asked:
+        if complete or i == 0 or statement.requested:
             lines.append(Text(statement.text, style="" if i else "bold"))
-            hint = "  # the lines around it: --tables" if len(statement.code) > 1 else ""
+            hint = "  # all lines: --tables" if len(statement.code) > 1 else ""
             in_c = (f"# in C: {statement.in_c}",) * bool(statement.in_c)
             code = (*statement.code, *in_c) if complete else (statement.line + hint,) * bool(statement.line)
             lines += [Text(f"    {line}") for line in code]
@@ -155,7 +155,8 @@ def _list_notes(report: Report, most: int) -> Iterator[tuple[str, str]]:
     if idle:
         worst = max(idle, key=lambda case: case.velocity)
         cases, speed = format_count(len(idle), "case"), format_residual(worst.velocity)
-        text = (
-            f"{cases} with nothing to do; at worst {speed} m/s, by {worst.solver or 'nobody'} on {worst.case}"
+        solver = worst.solver or "no solver"
+        yield (
+            f"{cases} solved by the zero impulse; largest error {speed} m/s, by {solver} on {worst.case}",
+            "dim",
         )
-        yield text, "dim"

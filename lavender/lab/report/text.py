@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from lavender.lab.bench.record import Skip
 from lavender.lab.bench.store import Records
 
-NONE = "–"  # shown in place of a missing number
+NONE = "–"  # Shown in place of a missing number.
 
 
 def format_residual(x: float) -> str:
@@ -33,9 +33,9 @@ def format_ratio(x: float) -> str:
     return f"{x:.2g} times" if x < 99.5 else f"{x:.0f} times" if x < 1e6 else f"10^{math.log10(x):.0f} times"
 
 
-def format_count(n: int, what: str, plural: str = "") -> str:
+def format_count(n: int, noun: str, plural: str = "") -> str:
     """Return a number with its noun: 1 contact, 2 contacts."""
-    return f"{n} {what if n == 1 else plural or what + 's'}"
+    return f"{n} {noun if n == 1 else plural or noun + 's'}"
 
 
 def list_diagnostics(records: Records) -> list[tuple[str, str]]:
@@ -72,7 +72,7 @@ def list_reasons(skips: Iterable[Skip]) -> list[str]:
 
 
 def list_left_out(records: Records) -> list[tuple[str, str]]:
-    """Return (what did not load, why): cases grouped by reason, and the number of steps of each sequence."""
+    """Return (cases that did not load, reason), grouped by reason, and the number of steps of each sequence."""
     same: dict[str, list[Skip]] = {}
     for skip in records.left_out.get("", ()):
         same.setdefault(_cause_of(skip), []).append(skip)
@@ -96,7 +96,7 @@ def format_left_out(lost: int) -> str:
 
 
 def format_percent(part: int, whole: int, digits: int = 0) -> str:
-    """Return part of a whole, rounded down, with at least so many digits: 100 % is all of it, and 0 % is nothing."""
+    """Return part of a whole, rounded down, with `digits` or more digits: only all is 100 %, only nothing is 0 %."""
     while 0 < 100 * 10**digits * part < whole:
         digits += 1
     tenths = 100 * 10**digits * part // whole

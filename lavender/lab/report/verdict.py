@@ -1,4 +1,4 @@
-"""Build the sentences of a report: a recommendation and a line of Python to copy, then answers to further questions."""
+"""Build the sentences of a report: a recommendation with a line of Python, then certainty, batches and budgets."""
 
 from __future__ import annotations
 
@@ -38,26 +38,40 @@ from lavender.solvers.registry import specs
 
 @dataclass(frozen=True)
 class Statement:
-    """A sentence, and the lines of code that it describes."""
+    """A sentence, and the lines of code that it describes.
+
+    Parameters
+    ----------
+    text : the sentence
+    code : lines of Python, as they were timed
+    in_c : command that exports the call to C, or the reason why it cannot be exported
+    requested : whether the sentence is about a time or a number of sweeps that the user requested
+    """
 
     text: str
-    code: tuple[str, ...] = ()  # Python, as it was timed
-    in_c: str = ""  # the command that exports the call to C, or the reason that there is none
-    asked: bool = False  # the sentence is about a time or a number of sweeps that the user named
+    code: tuple[str, ...] = ()
+    in_c: str = ""
+    requested: bool = False
 
     @property
     def line(self) -> str:
-        """The call alone, without the loop around it; empty if there is none."""
+        """The call without the loop around it; empty without code."""
         return next((line.strip() for line in self.code if "lv.solve" in line), "")
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """All sentences of a report, the recommendation first."""
+    """All sentences of a report, the recommendation first.
+
+    Parameters
+    ----------
+    statements : sentences
+    leaders : solvers that the page shows in colour, the recommended one first
+    ranking : for a report with one subject, the ranked calls of the first sentence with their times
+    """
 
     statements: tuple[Statement, ...]
-    leaders: tuple[str, ...]  # solvers that the page shows in colour, the recommended one first
-    # Of a report with one subject: the calls among which the first sentence chooses, with the times that it states.
+    leaders: tuple[str, ...]
     ranking: tuple[tuple[TimedCall, Choice], ...] = ()
 
     @property
@@ -74,10 +88,10 @@ def build_verdict(
 ) -> Verdict:
     """Build the recommendation for all that was measured together: single cases, then sequences.
 
-    The recommendation is by motion error if the plan has velocity tolerances. If motion errors were measured besides
-    residuals, a sentence names the first solver by them. Each of `times` [s] and `sweeps` gets a sentence; those of the
-    newest plan if none are given. The first sentence also ranks the solver of the engine that recorded the cases, by
-    its answers in `engines`.
+    The recommendation is by motion error if the plan has velocity tolerances. If motion errors were measured in
+    addition to residuals, a sentence names the first solver by motion error. Each of `times` [s] and `sweeps` gets a
+    sentence; the default are the budgets of the newest plan. The first sentence also
+    ranks the solver of the engine that recorded the cases, by its answers in `engines`.
     """
     if statistics.is_campaign(records) or not len(records):
         return Verdict((), ())
@@ -106,7 +120,7 @@ def _recommend(
     sweeps: Sequence[int],
     engines: Sequence[EngineAnswers],
 ) -> Verdict:
-    """Recommend a solver for one subject by the interleaved calls, or by single runs if there are none."""
+    """Recommend a solver for one subject by the interleaved calls, or by single runs without them."""
     tolerance, n = subject.best.target, subject.best.ranking[0].cases if subject.best.ranking else 0
     interleaved, single = (
         select_calls(records, subject.timing_mode),
@@ -114,7 +128,7 @@ def _recommend(
     )
     resampled = rank_calls_to_tolerance(records, interleaved or single, tolerance, n)
     cases = _describe_subject(records, subject, n)
-    reached = f"down to {format_tolerance(tolerance)} of the error of doing nothing"
+    reached = f"down to {format_tolerance(tolerance)} of the error of the zero impulse"
     engine = rank_engine(engines, records, subject.cases, tolerance)
     if resampled is None or not resampled.ranking[0][1].solved:
         near = tuple(c.solver for c in subject.best.ranking[:3] if c.solved)
@@ -137,11 +151,11 @@ def _recommend(
         statements.append(_add_code(records, batch, f"As a batch: {seconds(batch.time)} for each problem."))
     for t in times or [a.target for a in subject.quick if a.target <= SHORT_TIME_RATIO * first.score][-1:]:
         if first.worst <= t and first.solved == first.cases:
-            continue  # the recommended call ends in this time
+            continue  # The recommended call ends within this time.
         rankings = (rank_calls_in_time(records, calls, t, n) for calls in (interleaved, single))
         quick = next((r for r in rankings if r is not None and r.ranking[0][1].is_for(SERVED_QUANTILE)), None)
         if quick is None:
-            statements.append(Statement(_state_serving_time(single, t), asked=bool(times)))
+            statements.append(Statement(_state_serving_time(single, t), requested=bool(times)))
             continue
         best, choice = quick.ranking[0]
         text = _state_service(f"If you have only {seconds(t)}", choice, t)
@@ -150,15 +164,17 @@ def _recommend(
     for budget in sweeps:
         calls = [f for f in single if f.line.mode == "budget" and f.line.max_iter == budget]
         swept = rank_calls_in_time(records, calls, math.inf, n)
-        asked = f"With {format_count(budget, 'sweep')}"
+        budget_text = f"With {format_count(budget, 'sweep')}"
         if swept is not None and swept.ranking[0][1].is_for(SERVED_QUANTILE):
             best, choice = swept.ranking[0]
-            statements.append(_add_code(records, best, _state_service(asked, choice, math.inf), True))
+            statements.append(_add_code(records, best, _state_service(budget_text, choice, math.inf), True))
         elif swept is not None:
-            statements.append(Statement(f"{asked} nothing serves nine cases of ten.", asked=True))
+            statements.append(Statement(f"{budget_text} no solver serves nine cases of ten.", requested=True))
     faster = [f"{b.solver} on {b.wins} of {b.solved} cases" for b in statistics.backends(records) if b.wins]
     if faster and subject.timing_mode == "call":
-        head = "By their own interface, on data given before, some are faster than all of ours"
+        head = (
+            "In their own interface, without conversion, some other solvers are faster than all of lavender's"
+        )
         statements.append(Statement(f"{head}: {', '.join(faster)}."))
     return Verdict(tuple(statements), tuple(dict.fromkeys(leaders))[:3], resampled.ranking)
 
@@ -195,14 +211,15 @@ def _find_tolerance(records: Records, solver: str, tolerance: float) -> float:
     if not tightest > 0.0:
         return math.nan
     power = math.floor(math.log10(tightest))
-    return float(f"{math.floor(tightest / 10.0**power + 1e-9)}e{power}")  # rounded down, so that it is enough
+    return float(f"{math.floor(tightest / 10.0**power + 1e-9)}e{power}")  # Rounded down, so that it suffices.
 
 
 # -- sentences -----------------------------------------------------------------------------------------------
 
 
 def _describe_speed(speed: float) -> str:
-    return f"until no body is wrong by more than {format_speed(speed)}"
+    """Return words for a velocity tolerance [m/s]."""
+    return f"until no body has a velocity error above {format_speed(speed)}"
 
 
 def _describe_subject(records: Records, subject: Subject, n: int) -> str:
@@ -228,9 +245,11 @@ def _describe_cases(records: Records, cases: Sequence[str]) -> str:
 
 
 def _state_choice(records: Records, first: Choice, reached: str, cases: str) -> str:
-    """Return the first sentence: the solver, its mean time, what a miss counts, and the slowest case."""
+    """Return the first sentence: the solver, its mean time, the time of a miss, and the slowest case."""
     has_misses = first.solved < first.cases
-    idle = first.cases - len({r.case for r in records if r.solver == first.solver})  # records of several runs
+    idle = first.cases - len(
+        {r.case for r in records if r.solver == first.solver}
+    )  # Records of several runs may lack some.
     solved = f"{first.solved} of " if has_misses else ""
     text = f"Use {first.solver}: it solves {solved}{cases} in {seconds(first.score)}"
     if first.cases > 1:
@@ -262,36 +281,36 @@ def _add_engine(records: Records, head: str, first: Choice | None, engine: Choic
 
 
 def _state_certainty(resampled: ResampledRanking) -> list[Statement]:
-    """State how often each named solver is among the fastest, with its time; nothing if there is one call alone."""
+    """State how often each named solver is among the fastest, with its time; empty if there is only one call."""
     if len(resampled.ranking) < 2:
         return []
     shares = [
-        f"{c.solver} ({seconds(c.score)}) in {int(100.0 * share + 1e-9)} %"  # rounded down: 100 is all
+        f"{c.solver} ({seconds(c.score)}) in {int(100.0 * share + 1e-9)} %"  # Rounded down: 100 % means all.
         for (_, c), share in zip(resampled.ranking, resampled.shares, strict=True)
         if c.solver in resampled.named
     ]
     text = f"Among the fastest, within noise, in resamplings of cases and repetitions: {', '.join(shares)}."
     if resampled.loss > 1.0:
         loss = format_ratio(resampled.loss)
-        text += f" Where {resampled.named[0]} is not, it takes {loss} the fastest's time."
+        text += f" In the others, {resampled.named[0]} takes {loss} the time of the fastest."
     return [Statement(text)]
 
 
 def _state_serving_time(calls: Sequence[TimedCall], limit: float) -> str:
-    """State that no call serves enough cases in a time, and the time in which one does."""
-    least = min(map(compute_serving_time, calls), default=math.inf)
-    text = f"Nothing serves in {seconds(limit)}"
-    if math.isfinite(least):
-        text += f": to leave at most half of the start's residual on nine cases of ten takes {seconds(least)}"
+    """State that no call serves enough cases in a time, and the shortest time in which one does."""
+    shortest = min(map(compute_serving_time, calls), default=math.inf)
+    text = f"No solver leaves at most half of the start's residual on nine cases of ten in {seconds(limit)}"
+    if math.isfinite(shortest):
+        text += f"; the shortest time for that is {seconds(shortest)}"
     return f"{text}."
 
 
-def _state_service(asked: str, choice: Choice, limit: float) -> str:
-    """State the solver to take within a budget, and what it leaves of the residual."""
+def _state_service(condition: str, choice: Choice, limit: float) -> str:
+    """State the recommended solver for a budget, and the residual that it reaches."""
     how = f", {choice.how}" if choice.how and math.isfinite(limit) else ""
     text = (
-        f"{asked}, take {choice.solver}{how}: it serves {choice.solved} of {choice.cases} (at most half of the start's "
-        f"residual), at the 90th percentile {format_residual(choice.score)}"
+        f"{condition}, use {choice.solver}{how}: it serves {choice.solved} of {choice.cases} (at most half of the "
+        f"start's residual), at the 90th percentile {format_residual(choice.score)}"
     )
     if math.isfinite(limit) and choice.overrun > 1.0:
         text += f", and takes up to {format_ratio(choice.overrun)} that time on the others"
@@ -306,18 +325,18 @@ def _explain_missing_c(records: Records, call: TimedCall) -> str:
     for case, record in call.runs.items():
         info = records.cases[case]
         if "ellipses" in info.structure:
-            return "the library has no ellipses: give it problem.disk"
+            return "the library has no ellipses: use problem.disk"
         if record.solver in ("direct", "lemke") and info.law not in ("linear", "lcp"):
-            return f"{record.solver} takes bounded rows alone there"
+            return f"{record.solver} accepts only bounded rows there"
         if record.solver in ("pgs", "jacobi") and info.bodies and record.form != "whitened J":
-            return f"{record.solver} takes no bodies there: give it the matrix, problem.csr"
+            return f"{record.solver} does not accept bodies there: use the matrix, problem.csr"
     return ""
 
 
-def _add_code(records: Records, call: TimedCall, text: str, asked: bool = False) -> Statement:
+def _add_code(records: Records, call: TimedCall, text: str, requested: bool = False) -> Statement:
     """Return a sentence with the lines of its call in Python, and with the command that exports it to C."""
     if not call.line.times:
-        text += " Records of an earlier version: the line itself was not timed."
+        text += " Records of an earlier version: the call itself was not timed."
     line, reason, in_c = call.line, _explain_missing_c(records, call), ""
     spec = specs().get(line.solver)
     if (
@@ -330,4 +349,4 @@ def _add_code(records: Records, call: TimedCall, text: str, asked: bool = False)
         source = quote(records.source or "records.jsonl")
         command = f"lavender export c liblavender --solver {line.solver} --records {source}"
         in_c = f"not in C: {reason}" if reason else command
-    return Statement(text, call.code, in_c, asked)
+    return Statement(text, call.code, in_c, requested)

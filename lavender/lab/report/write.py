@@ -24,7 +24,7 @@ def write(source: Records | Report, folder: str | Path, *, figures: bool = True)
         csv and json hold all runs.
     folder : path
     figures : bool
-        False leaves out the SVG and PNG files, which take most of the time.
+        False leaves out the SVG and PNG files, which take the largest part of the time.
 
     Returns
     -------

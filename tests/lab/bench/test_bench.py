@@ -108,13 +108,13 @@ def test_an_answer_is_no_start(tmp_path, early):
     records = bench.run([path], ["pgs"], QUICK)
     assert {r.start for r in records} == {"cold"}
     assert records.cases["step"].guess == "answer"
-    asks = [bench.Ask("pgs", "tol", 1e-6), bench.Ask("pgs", "tol", 1e-6, timing_mode="batch")]
-    made = bench.time_alternately([path], asks, records, QUICK).records
+    call_specs = [bench.CallSpec("pgs", "tol", 1e-6), bench.CallSpec("pgs", "tol", 1e-6, timing_mode="batch")]
+    made = bench.time_alternately([path], call_specs, records, QUICK).records
     assert all(r.iterations > 5 for r in made if r.mode == "tol" and r.tol <= 1e-6)
     steps = bench.sequence([p.updated(guess=answer), p.updated(guess=answer)], "steps")
     records = bench.run(steps, ["pgs"], QUICK)
     made = bench.time_alternately(
-        steps, [bench.Ask("pgs", "tol", 1e-6, timing_mode="steps")], records, QUICK
+        steps, [bench.CallSpec("pgs", "tol", 1e-6, timing_mode="steps")], records, QUICK
     ).records
     assert all(r.iterations > 5 for r in made if r.start == "cold" and r.mode == "tol" and r.tol <= 1e-6)
     assert all(r.iterations > 5 for r in made if r.start == "carried" and r.step == 0 and r.tol == 1e-8)
@@ -574,11 +574,11 @@ def test_what_is_timed_is_the_line_that_is_printed(timed):
 
 
 def test_lines_in_turns_are_those_that_are_printed_and_c_asks_for_the_same(timed):
-    asks = [
-        bench.Ask("pgs", "tol", TOLERANCE),
-        bench.Ask("pgs", "tol", TOLERANCE, 20_000),
-        bench.Ask("pgs", "budget", 0.0, 4),
-        bench.Ask("pgs", "time", TOLERANCE, time_limit=1.23456e-3),
+    call_specs = [
+        bench.CallSpec("pgs", "tol", TOLERANCE),
+        bench.CallSpec("pgs", "tol", TOLERANCE, 20_000),
+        bench.CallSpec("pgs", "budget", 0.0, 4),
+        bench.CallSpec("pgs", "time", TOLERANCE, time_limit=1.23456e-3),
     ]
     problem, plan = (
         stack(6, guess=np.ones(6)),
@@ -587,7 +587,7 @@ def test_lines_in_turns_are_those_that_are_printed_and_c_asks_for_the_same(timed
     known = bench.run([problem], ["pgs"], plan)
     n = len(known)
     timed.clear()
-    made = bench.time_alternately([problem], asks, known, plan).records[n:]
+    made = bench.time_alternately([problem], call_specs, known, plan).records[n:]
     for r in made:
         line = said(r, problem)
         assert [asked for solver, asked, guess in timed if (solver, asked, guess is None) == line]
@@ -595,11 +595,11 @@ def test_lines_in_turns_are_those_that_are_printed_and_c_asks_for_the_same(timed
 
 
 def test_lines_are_timed_in_turns_and_kept(tmp_path):
-    asks = [
-        bench.Ask("pgs", "tol", 1e-6),
-        bench.Ask("pgs", "budget", 0.0, 4),
-        bench.Ask("pgs", "time", 1e-6, time_limit=1e-3),
-        bench.Ask("pgs", "tol", 1e-6, timing_mode="batch"),
+    call_specs = [
+        bench.CallSpec("pgs", "tol", 1e-6),
+        bench.CallSpec("pgs", "budget", 0.0, 4),
+        bench.CallSpec("pgs", "time", 1e-6, time_limit=1e-3),
+        bench.CallSpec("pgs", "tol", 1e-6, timing_mode="batch"),
     ]
     problems, plan = (
         [stack(6), stack(8, "other")],
@@ -608,15 +608,15 @@ def test_lines_are_timed_in_turns_and_kept(tmp_path):
     path = tmp_path / "records.jsonl"
     known = bench.run(problems, ["pgs"], plan, path)
     before = len(known)
-    made = bench.time_alternately(problems, asks, known, plan, path).records[before:]
-    assert len(made) == len(problems) * len(asks)
+    made = bench.time_alternately(problems, call_specs, known, plan, path).records[before:]
+    assert len(made) == len(problems) * len(call_specs)
     for r in made:
         assert len(r.times) == r.repeats >= 3
         assert r.time_min == min(r.times)
         assert r.success == (r.mode == "tol")
         assert len(r.residual_per_repeat) == (r.repeats if r.mode == "time" else 0)
     assert bench.read(path).records == known.records
-    again = bench.time_alternately(problems, asks, bench.run(problems, ["pgs"], plan, path), plan, path)
+    again = bench.time_alternately(problems, call_specs, bench.run(problems, ["pgs"], plan, path), plan, path)
     assert again.records == known.records
 
 

@@ -156,13 +156,13 @@ PROC = pytest.mark.skipif(not os.path.exists("/proc/self/stat"), reason="process
 @pytest.mark.parametrize("how", ["fork", "escape"])
 def test_a_backend_that_forks_and_hangs_keeps_nobody_waiting(hostile, watchdog, monkeypatch, how):
     """Its child ends with it, or has left the group and keeps the pipe."""
-    monkeypatch.setattr(bench_worker, "GRACE", 0.5)
+    monkeypatch.setattr(bench_worker, "GRACE_TIME", 0.5)
     p = stack()
     with Worker() as worker:
         worker.measure(p, task(p, "pgs"))  # starts the process
         start_time = time.monotonic()
         assert worker.measure(p, task(p, f"x_{how}", time_limit=1.5))[0].status == "KILLED"
-        assert time.monotonic() - start_time <= 1.1 * (3.0 * 1.5 + bench_worker.GRACE)
+        assert time.monotonic() - start_time <= 1.1 * (3.0 * 1.5 + bench_worker.GRACE_TIME)
         pids = list(map(int, hostile.read_text().split()))
         assert how == "escape" or (len(pids) == 2 and wait_until(lambda: not any(map(runs, pids))))
         assert worker.measure(p, task(p, "pgs"))[0].status == "CONVERGED"  # and another worker goes on
@@ -249,7 +249,7 @@ def test_workers_of_a_campaign_end_when_it_is_killed():
 
 
 def test_a_whole_run_survives_its_backends(hostile, watchdog, monkeypatch):
-    monkeypatch.setattr("lavender.lab.bench.running.worker.GRACE", 0.5)
+    monkeypatch.setattr("lavender.lab.bench.running.worker.GRACE_TIME", 0.5)
     plan = bench.Plan(
         tolerances=(1e-3,), budgets=(), repeats=1, time_limit=1.0
     )  # a hundred times what they take
@@ -269,7 +269,7 @@ def test_a_check_survives_what_ends_its_process(hostile, watchdog, monkeypatch):
     assert table["x_leave"].note == DIED_MESSAGE and table.reference_note.endswith(
         f"(x_leave: TaskFailed: {died[0]}: {DIED_MESSAGE})"
     )
-    monkeypatch.setattr("lavender.lab.bench.running.worker.GRACE", 0.5)
+    monkeypatch.setattr("lavender.lab.bench.running.worker.GRACE_TIME", 0.5)
     (row,) = lv.cross_check(stack(4), "x_hang", time_limit=0.1)
     assert row.status == "KILLED"
 
@@ -295,7 +295,7 @@ def test_memory_is_limited_without_asking(hostile, watchdog):
 @POSIX
 @pytest.mark.parametrize("how", ["forge", "flood"])
 def test_what_a_backend_writes_into_the_pipe_is_data_and_bounded(hostile, watchdog, monkeypatch, how):
-    monkeypatch.setattr(bench_worker, "GRACE", 1.0)
+    monkeypatch.setattr(bench_worker, "GRACE_TIME", 1.0)
     p = stack()
     with Worker() as worker:
         record, _ = worker.measure(p, task(p, f"x_{how}"))

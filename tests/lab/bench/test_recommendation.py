@@ -156,7 +156,7 @@ def test_sequences_are_compared_carried_against_cold():
     assert line.by_time[1e-9].best is None
     reached = {c.solver: c for c in line.by_time[10.0].ranking}
     means = {
-        f"{w.asked}, {start}": math.exp(np.mean(np.log(np.clip(w.residuals[start], 1e-17, 1.0))))
+        f"{w.target}, {start}": math.exp(np.mean(np.log(np.clip(w.residuals[start], 1e-17, 1.0))))
         for w in (budget, tolerance)
         for start in ("cold", "carried")
     }
@@ -185,7 +185,7 @@ def test_misses_in_a_time_count():
     rest = records_of(
         *(r for r in made if r.solver != "wide")
     )  # 7 of 10 are not nine of ten, in whatever time
-    assert build_verdict(rest, [1e-3]).text.endswith("Nothing serves in 1.00 ms.")
+    assert build_verdict(rest, [1e-3]).text.endswith("residual on nine cases of ten in 1.00 ms.")
 
 
 # -- lines that were timed alternately ---------------------------------------------------------------------------
@@ -224,7 +224,7 @@ def test_cases_that_disagree_make_it_unsure_and_both_are_named():
     assert found.loss > 1.05
     text = build_verdict(interleaved(speeds, 0)).statements[1].text
     assert all(re.search(rf"{name} \([\d.]* ms\) in \d* %", text) for name in speeds)
-    assert "it takes" in text  # and what the choice loses where the other is faster
+    assert "takes" in text  # The loss of the choice in the other resamplings.
 
 
 @pytest.mark.parametrize(

@@ -44,14 +44,14 @@ def test_the_first_sentence_is_by_motion_error_if_that_was_asked_for(records):
     line, *_ = recommendation.recommend_from_single_runs(found.by_speed)
     said = found.verdict.statements[0]
     assert said.text.startswith(f"Use {line.by_tolerance[1e-4].best.solver}: it solves stack(n=16) in ")
-    assert "until no body is wrong by more than 1e-4 m/s." in said.text
+    assert "until no body has a velocity error above 1e-4 m/s." in said.text
     # the line to copy does what the sentence says
     problem = lv.suite.case("stack(n=16)").problem
     assert eval(said.line, {"lv": lv, "problem": problem}).motion_error().speed <= 1e-4
     (run,) = found.records.runs.values()
     found.records.add(dataclasses.replace(run, plan={**run.plan, "velocity_tolerances": ()}))
     first, *_, last = build_verdict(found.records).statements
-    assert "down to 1e-3 of the error of doing nothing" in first.text
+    assert "down to 1e-3 of the error of the zero impulse" in first.text
     assert last.text.startswith("By motion error ") and "1e-3 m/s" in last.text
 
 

@@ -43,14 +43,14 @@ def test_the_sentence_has_the_worst_case_and_the_line_its_command_in_c():
     parts = build_verdict(records_of(record("a", "x", 0.004, 1e-9), record("b", "y", 9.0, 0.5)))
     assert "(a miss counted as 2.00 s; on 1 it has no run)" in parts.text
     nobody = build_verdict(records_of(record("a", "x", 1.0, 0.5)))
-    assert nobody.text == "No solver brings your stack down to 1e-6 of the error of doing nothing."
+    assert nobody.text == "No solver brings your stack down to 1e-6 of the error of the zero impulse."
 
 
 @pytest.mark.parametrize(
     ("solver", "law", "structure", "sign"),
     [
         ("nncg", "coulomb", ("stack", "friction", "ellipses"), "problem.disk"),
-        ("direct", "coulomb", ("stack", "friction"), "bounded rows alone"),
+        ("direct", "coulomb", ("stack", "friction"), "only bounded rows"),
         ("pgs", "coulomb", ("stack", "friction"), "problem.csr"),
         ("nncg", "coulomb", ("stack", "friction"), ""),
     ],

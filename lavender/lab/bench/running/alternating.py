@@ -20,7 +20,7 @@ from lavender.lab.bench.record import CaseInfo, Record
 from lavender.lab.bench.running.plan import Plan
 from lavender.lab.bench.running.runner import Runner, Watch, is_foreign, open_runner
 from lavender.lab.bench.running.timing import (
-    Ask,
+    CallSpec,
     Task,
     copy_into_new_arrays,
     make_outcome,
@@ -45,7 +45,7 @@ Cases = Sequence[tuple[Item, CaseInfo]]
 @reject_former_names(fresh="reuse")
 def time_alternately(
     cases: Iterable[Source],
-    asks: Sequence[Ask],
+    call_specs: Sequence[CallSpec],
     known: Records,
     plan: Plan,
     store: Store | str | Path | None = None,
@@ -63,7 +63,7 @@ def time_alternately(
     ----------
     cases, plan, store, watch, isolate, memory, reuse
         See `lavender.lab.bench.run`.
-    asks : sequence of Ask
+    call_specs : sequence of CallSpec
         Calls of timing mode "call" on single cases, "steps" over sequences, "batch" on either.
     known : Records
 
@@ -73,12 +73,12 @@ def time_alternately(
         `known`, with the new records.
     """
     this = list(known.runs.values())[-1]
-    names = list(dict.fromkeys(call.solver for call in asks))
+    names = list(dict.fromkeys(call.solver for call in call_specs))
     with open_runner(this, plan, names, store, watch, isolate, memory, reuse) as runner:
         runner.out = known
         described = [(i, known.cases[i.name]) for i in resolve(cases) if i.name in known.cases]
-        identity = repr([asks, [info.sha for _, info in described]])
-        alternation = _Alternation(runner, asks, hashlib.sha256(identity.encode()).hexdigest()[:12])
+        identity = repr([call_specs, [info.sha for _, info in described]])
+        alternation = _Alternation(runner, call_specs, hashlib.sha256(identity.encode()).hexdigest()[:12])
         single = [(i, info) for i, info in described if not i.sequence]
         parts = [single[k : k + CASES_IN_MEMORY] for k in range(0, len(single), CASES_IN_MEMORY)]
         sequences: dict[str, list[tuple[Item, CaseInfo]]] = {}
@@ -100,8 +100,8 @@ def time_alternately(
 class _Alternation:
     """Repeats all calls on the cases of a part; `interleave_group` identifies calls and cases timed together."""
 
-    def __init__(self, runner: Runner, asks: Sequence[Ask], interleave_group: str) -> None:
-        self.runner, self.asks, self.interleave_group = runner, asks, interleave_group
+    def __init__(self, runner: Runner, call_specs: Sequence[CallSpec], interleave_group: str) -> None:
+        self.runner, self.call_specs, self.interleave_group = runner, call_specs, interleave_group
         self.known = {r.key for r in runner.known.values() if r.interleave_group == interleave_group}
         for record in runner.known.values():
             if record.key in self.known:
@@ -111,8 +111,12 @@ class _Alternation:
     def measure_part(self, part: Cases, limit: float, extra: float) -> None:
         """Repeat all calls on some cases or one sequence: at most `limit` [s], above the default number `extra` [s]."""
         is_sequence = bool(part[0][0].sequence)
-        asks = [a for a in self.asks if a.timing_mode == "batch" or (a.timing_mode == "steps") == is_sequence]
-        accepted = {call: [(i, info) for i, info in part if self.accepts(call, i)] for call in asks}
+        call_specs = [
+            a
+            for a in self.call_specs
+            if a.timing_mode == "batch" or (a.timing_mode == "steps") == is_sequence
+        ]
+        accepted = {call: [(i, info) for i, info in part if self.accepts(call, i)] for call in call_specs}
         records: RecordsByKey = {}
         start_time = perf_counter()
         for repetition in range(MAX_REPETITIONS):
@@ -120,8 +124,8 @@ class _Alternation:
             allowed = limit if repetition < DEFAULT_REPETITIONS else min(limit, extra)
             if repetition >= MIN_REPETITIONS and elapsed > allowed:
                 break
-            first = repetition % len(asks) if asks else 0
-            order = asks[first:] + asks[:first]
+            first = repetition % len(call_specs) if call_specs else 0
+            order = call_specs[first:] + call_specs[:first]
             if is_sequence:
                 for call in order:
                     self.time_steps(call, accepted[call], records)
@@ -136,14 +140,14 @@ class _Alternation:
         for repeated in records.values():
             self.runner.keep(_merge(repeated))
 
-    def accepts(self, call: Ask, item: Item) -> bool:
+    def accepts(self, call: CallSpec, item: Item) -> bool:
         """Whether the solver of a call can be timed on a case."""
         spec = self.runner.specs[call.solver]
         if is_foreign(spec) and (call.timing_mode == "batch" or call.mode == "time"):
             return False  # An isolated process adds its start to the time, or has no time limit.
         return spec.refuses(item.problem) is None
 
-    def make_task(self, call: Ask, info: CaseInfo) -> Task:
+    def make_task(self, call: CallSpec, info: CaseInfo) -> Task:
         """Return the task of one repetition of a call on one case."""
         more = {
             "time_limit": call.time_limit or self.runner.plan.time_limit,
@@ -158,7 +162,7 @@ class _Alternation:
         if record is not None and record.key not in self.known:
             records.setdefault(record.key, []).append(record)
 
-    def time_case(self, call: Ask, item: Item, info: CaseInfo, before: Any) -> tuple[Record | None, Any]:
+    def time_case(self, call: CallSpec, item: Item, info: CaseInfo, before: Any) -> tuple[Record | None, Any]:
         """Time a call on a case, starting from the step `before`; return its record and its impulses."""
         task = self.make_task(call, info)
         if task.key in self.known and call.start != "carried":
@@ -167,7 +171,7 @@ class _Alternation:
         self.runner.report_progress(info.case, call.solver, record)
         return record, after
 
-    def time_steps(self, call: Ask, steps: Cases, records: RecordsByKey) -> None:
+    def time_steps(self, call: CallSpec, steps: Cases, records: RecordsByKey) -> None:
         """Time a call on all steps of a sequence, unless their records were stored before."""
         if call.timing_mode == "batch" or all(
             self.make_task(call, info).key in self.known for _, info in steps
@@ -178,7 +182,7 @@ class _Alternation:
             record, before = self.time_case(call, item, info, before)
             self.add(records, record)
 
-    def time_batch(self, call: Ask, cases: Cases, records: RecordsByKey) -> None:
+    def time_batch(self, call: CallSpec, cases: Cases, records: RecordsByKey) -> None:
         """Time one call of `solve_many`; each problem's record has an equal part of the time."""
         tasks = [self.make_task(call, info) for _, info in cases]
         if all(task.key in self.known for task in tasks):

@@ -11,7 +11,7 @@ from typing import Any
 from lavender.base.arrays import check_bool, check_float, check_int, check_sequence
 from lavender.base.errors import InputError, UnknownName, reject_former_names
 from lavender.lab.bench.record import RENAMED_FIELDS, CaseInfo, Record
-from lavender.lab.bench.running.timing import Ask, Task
+from lavender.lab.bench.running.timing import CallSpec, Task
 from lavender.problem import Problem
 from lavender.problem.ordering import SWEEP_ORDERS
 from lavender.solvers.registry import SolverSpec
@@ -145,11 +145,11 @@ class Plan:
 
         def measure_one(mode: str, tol: float, max_iter: int, start: str, **options: Any) -> Record:
             """Make one measurement."""
-            ask = Ask(
+            call_spec = CallSpec(
                 spec.name, mode, tol, max_iter, start=start, timing_mode="" if options else self.timing_mode
             )
             more = {"options": options, "repeats": self.repeats, "time_limit": self.time_limit}
-            return make(Task.of(info, ask, **more))
+            return make(Task.of(info, call_spec, **more))
 
         starts = ["cold"]
         if self.warm and info.guess == "start" and spec.impulse and not spec.exact:
@@ -220,7 +220,7 @@ class CampaignPlan(Plan):
         return self.cap
 
 
-def list_passes(plan: Plan, spec: SolverSpec) -> list[Ask]:
+def list_passes(plan: Plan, spec: SolverSpec) -> list[CallSpec]:
     """Return the passes over a sequence: each budget and tolerance, from a cold start and with carried impulses."""
     max_iterations = UNLIMITED_ITERATIONS if spec.resumable else 0
     tolerances = plan.tolerances[-1:] if spec.exact else plan.tolerances
@@ -229,7 +229,9 @@ def list_passes(plan: Plan, spec: SolverSpec) -> list[Ask]:
         targets = [*(("budget", 0.0, n) for n in plan.budgets), *targets]
     starts = ("cold", "carried") if spec.impulse and not spec.exact else ("cold",)
     return [
-        Ask(spec.name, *target, timing_mode="steps", start=start) for start in starts for target in targets
+        CallSpec(spec.name, *target, timing_mode="steps", start=start)
+        for start in starts
+        for target in targets
     ]
 
 

@@ -27,7 +27,7 @@ from lavender.lab.bench import machine
 from lavender.lab.bench.cases import Item, Source, describe, fingerprint, resolve, resolve_again
 from lavender.lab.bench.record import CaseInfo, Entry, Record, Run, Skip, describe_target
 from lavender.lab.bench.running.plan import CampaignPlan, Plan, list_passes
-from lavender.lab.bench.running.timing import Ask, Task, measure, one_thread
+from lavender.lab.bench.running.timing import CallSpec, Task, measure, one_thread
 from lavender.lab.bench.running.worker import Worker
 from lavender.lab.bench.running.workers import check_workers, connect_backend, map_unordered
 from lavender.lab.bench.store import Records, Store, opened
@@ -411,7 +411,7 @@ class Runner:
                     self.measure_pass(steps, spec, call)
             self.done += len(items)
 
-    def measure_pass(self, steps: list[tuple[Item, CaseInfo]], spec: SolverSpec, call: Ask) -> None:
+    def measure_pass(self, steps: list[tuple[Item, CaseInfo]], spec: SolverSpec, call: CallSpec) -> None:
         """Measure one pass. It ends, with a note, when its steps have taken `Plan.sequence_time_limit` together."""
         repeats = self.plan.repeats if len(steps) <= MAX_REPEATED_STEPS else 1
         tasks = [Task.of(info, call, repeats=repeats, time_limit=self.plan.time_limit) for _, info in steps]
@@ -443,13 +443,13 @@ class Runner:
             self.report_progress(record.case, spec.name, record)
             spent, made = spent + _elapsed_time(record), made + 1
         if made < len(tasks):
-            asked = describe_target(call.mode, call.tol, call.max_iter)
+            target = describe_target(call.mode, call.tol, call.max_iter)
             reason = (
                 f"stopped after {made} of {len(tasks)} steps, which took more than the pass limit of {limit:.3g} s "
                 "together (--sequence-time-limit)"
             )
             self.keep(
-                Skip(self.this.run, f"{problems[0].sequence}, {asked}, {call.start}", spec.name, reason)
+                Skip(self.this.run, f"{problems[0].sequence}, {target}, {call.start}", spec.name, reason)
             )
 
     def measure_step(

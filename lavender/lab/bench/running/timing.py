@@ -38,7 +38,7 @@ CLAIM_STATUSES = (Status.CONVERGED, Status.ROUNDOFF_LIMIT, Status.INFEASIBLE)
 
 
 @dataclass(frozen=True)
-class Ask:
+class CallSpec:
     """A call to time on all cases that the solver accepts.
 
     Parameters
@@ -66,7 +66,7 @@ class Ask:
 
 @dataclass(frozen=True)
 class Task:
-    """One measurement: an `Ask` on a case.
+    """One measurement: a `CallSpec` on a case.
 
     `guarded`: a solve under the time limit comes first. `lead` [s] is the time that the call takes before the solve, to
     carry impulses. For the other fields see `Record`.
@@ -95,8 +95,8 @@ class Task:
         return measurement_key(self)
 
     @classmethod
-    def of(cls, info: CaseInfo, call: Ask, **arguments: Any) -> Task:
-        """Create the task of an `Ask` on a case."""
+    def of(cls, info: CaseInfo, call: CallSpec, **arguments: Any) -> Task:
+        """Create the task of a `CallSpec` on a case."""
         return cls(run=info.run, case=info.case, sha=info.sha, step=info.step, **{**vars(call), **arguments})
 
     def record(self, **results: Any) -> Record:

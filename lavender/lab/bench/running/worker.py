@@ -26,10 +26,10 @@ from lavender.solvers import registry
 from lavender.solving.solve import Prepared, check_time_limit, solve
 
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
-ORPHAN_CPU_TIME = 60.0  # s. A worker without a parent is killed this CPU time after its task's limit.
+ORPHAN_CPU_TIME = 60.0  # [s] A worker without a parent is killed this CPU time after its task's limit.
 OUTCOME_ARRAYS = ("impulse", "certificate")  # fields of `Outcome`, in the order in which they are sent
 DIED_MESSAGE = "its code ended the process that it ran in; tell its authors, and leave it out (--solvers)"
-GRACE = 2.0  # s. A worker has this time for set-up and judging, beyond the limits of the repeats, before it is killed.
+GRACE_TIME = 2.0  # [s] Time for set-up and judging beyond the repetitions' limits, before a worker is killed.
 
 
 class TaskFailed(LavenderError):
@@ -86,7 +86,7 @@ class Worker:
                 raise TaskFailed(f"{CRASHED} (did not start)", cause) from None
         # The repeats end when their sum reaches the limit, so no more than two take all of it; some backends read the
         # clock only every few seconds.
-        limit = 3.0 * task.time_limit + GRACE
+        limit = 3.0 * task.time_limit + GRACE_TIME
         start_time = time.monotonic()
         new_problem = None if self._problem_hash == task.sha else problem
         self._problem_hash = ""

@@ -16,10 +16,10 @@ from typing import Any
 
 from lavender.base.errors import InputError
 
-MAX_WORKERS = 4096  # processes: more than any machine has cores
-CALLS_PER_ROUND = 256  # calls handed out together to a backend that returns only complete lists
-CONNECT_TIMEOUT = 10.0  # s, for a scheduler to answer
-PARENT_CHECK_INTERVAL = 0.5  # s between two checks of a worker whether its parent still runs
+MAX_WORKERS = 4096  # [processes] More than any machine has cores.
+CALLS_PER_ROUND = 256  # Calls submitted together to a backend that returns only complete lists.
+CONNECT_TIMEOUT = 10.0  # [s] Time for a scheduler to answer.
+PARENT_CHECK_INTERVAL = 0.5  # [s] Time between two checks of a worker that its parent still runs.
 
 
 def check_workers(workers: Any) -> None:
@@ -51,7 +51,7 @@ def map_unordered(
         from distributed.scheduler import KilledWorker
 
         lost = (*lost, KilledWorker, FutureCancelledError)
-    parent = os.getpid() if backend == "loky" else 0  # 0: workers belong to a cluster
+    parent = os.getpid() if backend == "loky" else 0  # 0 if workers belong to a cluster.
     with joblib.parallel_config(backend=backend, n_jobs=workers):
         calls = (
             joblib.delayed(_call_in_worker)(parent, function, call_arguments) for call_arguments in arguments
@@ -59,9 +59,8 @@ def map_unordered(
         try:
             try:
                 parallel = joblib.Parallel(return_as="generator_unordered", batch_size=1)
-            except (
-                ValueError
-            ):  # ray's backend returns only complete lists: results are yielded after each round
+            except ValueError:
+                # The ray backend returns only complete lists: yield results after each round.
                 parallel = joblib.Parallel(batch_size=1)
                 while some := list(itertools.islice(calls, CALLS_PER_ROUND)):
                     yield from parallel(some)
@@ -72,7 +71,7 @@ def map_unordered(
                 for result in results:  # noqa: UP028 - `yield from` would close `results` without the filter below
                     yield result
             except GeneratorExit:
-                with warnings.catch_warnings():  # joblib warns about the calls that it cancels
+                with warnings.catch_warnings():  # joblib warns about the calls that it cancels.
                     warnings.simplefilter("ignore", UserWarning)
                     results.close()
                 raise
@@ -105,7 +104,7 @@ def _ignore_sigint() -> Iterator[None]:
     """Start processes that ignore Ctrl-C, which a terminal sends to all of them: this process ends them."""
     from joblib.externals.loky.backend import resource_tracker as loky_tracker
 
-    # Each tracker starts once, and would unblock the signal in this process.
+    # Each tracker is started only once and would unblock the signal in this process.
     resource_tracker.ensure_running()
     loky_tracker.ensure_running()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
@@ -115,7 +114,7 @@ def _ignore_sigint() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def connect_backend(word: str) -> tuple[str, contextlib.AbstractContextManager[Any]]:
+def connect_backend(spec: str) -> tuple[str, contextlib.AbstractContextManager[Any]]:
     """Return joblib's name of a backend, and a context manager that holds the connection to its cluster.
 
     Raises
@@ -125,14 +124,14 @@ def connect_backend(word: str) -> tuple[str, contextlib.AbstractContextManager[A
     """
     from joblib.parallel import BACKENDS
 
-    name, _, address = word.partition("=")
+    name, _, address = spec.partition("=")
     if name == "dask":
         return name, _connect_dask(address)
     if name == "ray":
         _connect_ray(address)
     elif name not in BACKENDS or address:
         raise InputError(
-            f"joblib has no backend {word!r}: 'loky' runs processes on this machine, 'dask' or 'dask=ADDRESS' and "
+            f"joblib has no backend {spec!r}: 'loky' runs processes on this machine, 'dask' or 'dask=ADDRESS' and "
             "'ray' or 'ray=ADDRESS' a cluster"
         )
     return name, contextlib.nullcontext()
@@ -156,7 +155,7 @@ def _connect_dask(address: str) -> contextlib.AbstractContextManager[Any]:
         raise InputError(
             f"no dask scheduler answers at {address!r} ({error}); start one there"
             if address
-            else "backend 'dask' needs a scheduler: give dask=tcp://HOST:8786, set DASK_SCHEDULER_ADDRESS, or make a "
+            else "backend 'dask' needs a scheduler: use dask=tcp://HOST:8786, set DASK_SCHEDULER_ADDRESS, or make a "
             "distributed.Client first"
         ) from None
     return contextlib.nullcontext()
