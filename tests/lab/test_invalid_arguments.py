@@ -56,13 +56,13 @@ CALLS = {
     "bench.Plan, a tolerance": Call(lambda tolerance: bench.Plan(tolerances=[tolerance]), {"tolerance": 1e-3}),
     "bench.Plan, a budget": Call(lambda budget: bench.Plan(budgets=[budget]), {"budget": 3}),
     "bench.resolve": Call(
-        bench.resolve, {"words": ["stack(n=2)"], "sequences": False}, {"words": "cases"},
+        bench.resolve, {"sources": ["stack(n=2)"], "sequences": False}, {"sources": "cases"},
         accepts={"sequences": ("None",)},
     ),
     "bench.resolve, a problem": Call(lambda case: bench.resolve([case]), {"case": LCP}),
     "bench.sequence": Call(bench.sequence, {"problems": [LCP], "name": "walk"}),
     "bench.expand_seeds": Call(
-        bench.expand_seeds, {"words": ["random_spd(n=3)"], "n": 2, "first": 0}, {"words": "cases", "n": "n|seeds"},
+        bench.expand_seeds, {"cases": ["random_spd(n=3)"], "n": 2, "first": 0}, {"cases": "cases", "n": "n|seeds"},
         accepts={"first": ("very large",)},
     ),
     "bench.solver_names": Call(lambda solvers: bench.solver_names(solvers), {"solvers": ["pgs"]}),

@@ -263,7 +263,7 @@ def test_mujoco_creeps_and_lifts_as_it_is_known_to():
     [
         ("dies", "SIGABRT"),
         ("sleeps", "no answer within 2 s"),
-        ("babbles", "no track"),
+        ("babbles", "not a track"),
         ("leaves", "exit status 0"),
     ],
 )
