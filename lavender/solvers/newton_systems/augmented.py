@@ -71,8 +71,8 @@ class Augmented:
             own = sp.eye_array(s.m) - p + p @ sp.diags_array(s.theta + eps)
             return self._factor(p, None, own)
         right = None if s.bt is None else self._block_matrix(s.bt)
-        left = s.v if s.bt is None else s.bt if what == WHATS["barrier"] else s.pair
-        return self._factor(self._block_matrix(left), right, sp.eye_array(s.m))
+        left_factor = s.v if s.bt is None else s.bt if what == WHATS["barrier"] else s.pair
+        return self._factor(self._block_matrix(left_factor), right, sp.eye_array(s.m))
 
     def solve(self, _augmented: int, r: FloatArray) -> FloatArray:
         """Return dz or x for the right-hand side -F or Q r; NaN if there is no factor."""
@@ -106,10 +106,10 @@ class Augmented:
         """Return the block-diagonal matrix (m, m) with these values."""
         return sp.csr_array((values, self.block_entries), shape=(self.kernel.m,) * 2)
 
-    def _factor(self, left: Any, right: Any, own: Any) -> bool:
+    def _factor(self, left_factor: Any, right: Any, own: Any) -> bool:
         """Factor [[I, -(right K)^T], [left K, own]]; `right` None is the identity."""
         upper = self.k if right is None else right @ self.k
-        matrix = sp.block_array([[sp.eye_array(self.k.shape[1]), -upper.T], [left @ self.k, own]])
+        matrix = sp.block_array([[sp.eye_array(self.k.shape[1]), -upper.T], [left_factor @ self.k, own]])
         self.lu = None
         if not np.isfinite(matrix.data).all():
             return False

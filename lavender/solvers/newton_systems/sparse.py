@@ -69,10 +69,10 @@ class SparseRows:
             self.is_factored = self.factor_panels() or self._factor_superlu()
         return self.is_factored
 
-    def _coupled(self, left: FloatArray, right: FloatArray | None, own: float) -> FloatArray:
+    def _coupled(self, left_factor: FloatArray, right: FloatArray | None, own: float) -> FloatArray:
         """Return the entries of L H R^T + own L + I for small matrices L and R of each element; None is I."""
         values = np.empty_like(self.h)
-        coupled(self.kernel, self.to, self.other, self.indptr, self.h, left, right, own, values)
+        coupled(self.kernel, self.to, self.other, self.indptr, self.h, left_factor, right, own, values)
         return values
 
     def factor_panels(self) -> bool:
