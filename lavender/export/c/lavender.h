@@ -1,6 +1,6 @@
-/* lavender: constraint problems of rigid-body contact solved, and judged, without Python.
+/* lavender: solve and judge constraint problems of rigid-body contact without Python.
  *
- * The same bits as the Python package: lavender.c is cut out of the C of its kernels.
+ * Results have the same bits as in the Python package: lavender.c is extracted from the C code of its kernels.
  *
  * Units      m, kg, s: impulses N s (N m s on rows that turn), velocities m/s (rad/s), A = J M^-1 J^T in 1/kg.
  * Equations  v+ = v* + M^-1 J^T lambda,   w = A lambda - b,   b = target - J v*
@@ -8,10 +8,10 @@
  *            or global variable is touched, nothing is thrown. Arrays of a problem are copied by `lav_set`: they may
  *            change or go as soon as it returns. A solver is gone when its memory is; there is nothing to close.
  * Errors     Every function that can fail returns LAV_OK or a negative number; `lav_text` says it in words. A call that
- *            fails has written nothing into the caller's arrays, and the solver is as before; after a `lav_set` that failed
- *            it has no problem until one succeeds, and still carries its impulses.
- * Threads    One thread at a time in a solver; a second one gets LAV_ERROR_BUSY. Different solvers share nothing.
- * Versions   Structs begin with `size`, sizeof of what the caller was compiled with; the `lav_default_...` functions
+ *            fails writes nothing into the caller's arrays and does not change the solver; after a `lav_set` that failed
+ *            it has no problem until one succeeds, but it keeps its stored impulses.
+ * Threads    Only one thread may use a solver at a time; a second one gets LAV_ERROR_BUSY. Solvers share no data.
+ * Versions   Structs begin with `size`, the sizeof with which the caller was compiled; the `lav_default_...` functions
  *            write it. Fields are only ever added, at the end.
  *
  * Rows of a block: ROW one or more bounded rows; CONTACT a normal, then 0 to 2 tangents; CONTACT_SPIN the same, then one
@@ -91,12 +91,12 @@ enum { /* methods; names as in Python, by `lav_name` */
   LAV_ADMM = 12                /* A, bodies; dense */
 };
 
-enum { /* how a run ended; a claim, which `relative` beside it may contradict */
+enum { /* how a run ended; this is a claim, which `relative` of the verdict may contradict */
   LAV_MAX_ITERATIONS = 0,
   LAV_CONVERGED = 1,
   LAV_DIVERGED = 2,
   LAV_STALLED = 3,
-  LAV_ROUNDOFF_LIMIT = 4,      /* as good as rounding lets it be */
+  LAV_ROUNDOFF_LIMIT = 4,      /* rounding prevents a smaller residual */
   LAV_TIME_LIMIT = 5,
   LAV_FAILED = 6               /* a factorisation failed */
 };
@@ -163,9 +163,9 @@ typedef struct lav_budget {
   void *clock_data;
 } lav_budget;
 
-typedef struct lav_verdict { /* the judge's, of any impulse */
+typedef struct lav_verdict { /* the judge's result for an impulse */
   uint32_t size;
-  int32_t worst;               /* row with the largest velocity error, -1 where there is none */
+  int32_t worst;               /* row with the largest velocity error; -1 if there is none */
   int32_t island;              /* of `relative` and `floor`, as lav_islands numbers them; -1 if all blocks are one island */
   int32_t unused;
   double relative;             /* error relative to that of the zero impulse, of the worst island; infinite if not finite */
@@ -174,7 +174,7 @@ typedef struct lav_verdict { /* the judge's, of any impulse */
   double floor;                /* what rounding of the impulse costs, and a factor of an ill-conditioned M, relative */
 } lav_verdict;
 
-typedef struct lav_motion { /* how far an impulse's motion is from that of a reference */
+typedef struct lav_motion { /* distance of the motion of an impulse from the motion of a reference */
   uint32_t size;
   int32_t row;                 /* of `rows`, -1 without one */
   int32_t body;                /* of `speed`: body or generalised velocity, -1 without one */
@@ -198,15 +198,15 @@ typedef struct lav_result {
 
 LAV_API uint32_t lav_version(void);                 /* major << 16 | minor */
 LAV_API const char *lav_text(int32_t code);         /* of an error or LAV_OK; never null */
-LAV_API const char *lav_name(int32_t method);       /* "anderson"; null where there is none */
+LAV_API const char *lav_name(int32_t method);       /* "anderson"; null if there is no such method */
 LAV_API const char *lav_outcome(int32_t outcome);   /* "converged" */
-LAV_API int32_t lav_self_test(void);                /* LAV_OK where this build has the bits of the package */
+LAV_API int32_t lav_self_test(void);                /* LAV_OK if this build has the bits of the package */
 
 LAV_API int32_t lav_default_problem(int32_t form, lav_problem *out);
 LAV_API int32_t lav_default_options(int32_t method, lav_options *out);
 LAV_API int32_t lav_default_budget(lav_budget *out); /* 1000 iterations, tol 1e-6, no clock */
 
-/* Whether a method takes a problem of this form, law and kinds, which are read; LAV_OK or LAV_ERROR_UNSUPPORTED. */
+/* Whether a method supports a problem of this form, law and kinds of blocks; LAV_OK or LAV_ERROR_UNSUPPORTED. */
 LAV_API int32_t lav_takes(const lav_problem *problem, const lav_options *options);
 
 /* Bytes for a solver of problems with at most these counts (a hint: what binds later is memory alone). Arrays may be null; block_ptr alone is read, where there are
@@ -215,14 +215,14 @@ LAV_API int32_t lav_takes(const lav_problem *problem, const lav_options *options
 LAV_API int32_t lav_workspace_size(const lav_problem *problem, const lav_options *options, uint64_t *bytes);
 LAV_API int32_t lav_open(void *memory, uint64_t bytes, const lav_problem *largest, const lav_options *options,
                          lav_solver **out);
-LAV_API uint64_t lav_needed(const lav_solver *solver); /* bytes that the last `lav_set` asked for */
+LAV_API uint64_t lav_needed(const lav_solver *solver); /* bytes that the last `lav_set` needed */
 /* The solver in other memory, with its options and the impulses that it carries: for one that lav_set found too small. What
  * it was in before is the caller's again. */
 LAV_API int32_t lav_move(lav_solver *solver, void *memory, uint64_t bytes, lav_solver **out);
-/* The array, or count, that the last lav_set refused, and the place in it; null where it refused none. */
+/* The array or count that the last lav_set rejected, and the index of the entry; null if it rejected none. */
 LAV_API const char *lav_refused(const lav_solver *solver, int32_t *index);
 
-/* A new problem, or new numbers: impulses come from `impulse`, from blocks of the same key, kind and rows, or Pi(0). */
+/* Set a problem. It starts from `impulse`, from stored impulses of blocks of the same key, kind and rows, or from Pi(0). */
 LAV_API int32_t lav_set(lav_solver *solver, const lav_problem *problem);
 /* More iterations, from where the last run ended. The best impulse found is kept, a budget of tol 0 keeps the last;
  * newton's is never worse than its start or than doing nothing. */
@@ -236,12 +236,12 @@ LAV_API int32_t lav_velocity(lav_solver *solver, double *out, int32_t n); /* v+,
 /* The judge on any impulse (m): slack w and error e (m) where not null. An ill-conditioned M hides no residual above 1e-6. */
 LAV_API int32_t lav_judge(lav_solver *solver, const double *impulse, int32_t n, double *slack, double *error,
                           lav_verdict *out);
-/* How wrong the motion of an impulse (m) is, beside a reference (m) that was solved further. */
+/* Error of the motion of an impulse (m), relative to a reference (m) that was solved more accurately. */
 LAV_API int32_t lav_motion_error(lav_solver *solver, const double *impulse, const double *reference, int32_t n,
                                  lav_motion *out);
-/* Number of the island of each block (k), which share no moving body, velocity or entry of A; how many, or an error. */
+/* Island of each block (k); islands share no moving body, velocity or entry of A. Returns their number, or an error. */
 LAV_API int32_t lav_islands(lav_solver *solver, int32_t *label, int32_t n);
-/* Hash of the bits of numbers, as test vectors have it. */
+/* Hash of the bits of numbers, as in test vectors. */
 LAV_API uint64_t lav_hash(const double *x, int32_t n, uint64_t seed);
 
 /* The engine of the package, stepped from a snapshot that it wrote: `lavender.export.engine_image(simulation)`. */
