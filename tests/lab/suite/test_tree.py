@@ -180,7 +180,7 @@ def test_every_step_goes_on_and_the_best_of_all_is_returned(monkeypatch):
     made, tree = {}, Tree(problem)
     Made.found, Made.asked = [share * solved for share in found], []
     monkeypatch.setattr(
-        "lavender.solvers.auto.make", lambda name, log, tree: made.setdefault(name, Made(name, log))
+        "lavender.solvers.auto.make_step", lambda name, log, tree: made.setdefault(name, Made(name, log))
     )
     solve(log, tree)
     assert not Made.found and set(made) == {"anderson", "newton", "admm", "nncg"}, (
@@ -200,7 +200,7 @@ def test_newton_under_friction_begins_from_nothing_where_much_is_left(sweeps, fr
     step = Newton("newton", log)
     step.state = Tree(problem).states["newton"]
     step.run(1)
-    assert step.anew == from_nothing
+    assert step.started_from_zero == from_nothing
 
 
 def test_sweeps_that_promise_little_give_way():
