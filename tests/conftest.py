@@ -145,7 +145,7 @@ def interrupted_newton(monkeypatch) -> list[float]:
 
     monkeypatch.setattr(newton, "INTERRUPT_CHECK_INTERVAL", 0.0)
     for system in (MatrixSystem, VelocitySystem):
-        monkeypatch.setattr(system, "took", interrupt)
+        monkeypatch.setattr(system, "record_factor_time", interrupt)
     return looks
 
 
