@@ -34,7 +34,7 @@ from lavender.base.arrays import (
 from lavender.base.errors import InputError
 from lavender.problem.problem import Problem
 from lavender.problem.rows import Rows, check_inertia
-from lavender_ext.core.checks import LEAST
+from lavender_ext.core.checks import MIN_MAGNITUDE
 
 Vector = tuple[float, float, float]
 
@@ -366,10 +366,10 @@ class RowBuilder:
         rest = check_float("length", length, low=0.0)
         k, c = check_float("stiffness", stiffness, low=0.0), check_float("damping", damping, low=0.0)
         resistance = c + self._dt * k
-        if self._dt * resistance < LEAST:
+        if self._dt * resistance < MIN_MAGNITUDE:
             raise InputError(
                 f"stiffness is {k:g} N/m and damping is {c:g} N s/m; at least one must be positive, so that "
-                f"dt (damping + dt stiffness) is at least {LEAST:g}"
+                f"dt (damping + dt stiffness) is at least {MIN_MAGNITUDE:g}"
             )
         row = self._linear_row(pair, direction, point_a, point_b, 0.0)._replace(
             target=-k * (present - rest) / resistance, compliance=1.0 / (self._dt * resistance)
@@ -719,7 +719,7 @@ class RowBuilder:
         point_a, point_b = self._vector("anchor_a", anchor_a, "m"), self._vector("anchor_b", anchor_b, "m")
         offset = _minus(point_b, point_a)
         size = hypot(*offset)
-        if size > LEAST:
+        if size > MIN_MAGNITUDE:
             return _scale(1.0 / size, offset), size, point_a, point_b
         return (Y_AXIS if self._is_planar else Z_AXIS), size, point_a, point_b
 
@@ -879,7 +879,7 @@ def _scale(factor: float, x: Vector) -> Vector:
 def _unit(name: str, x: Vector) -> Vector:
     """Return a vector divided by its length; raise InputError if that is 0."""
     size = hypot(*x)
-    if size < LEAST:
+    if size < MIN_MAGNITUDE:
         raise InputError(f"{name} has length {size:g}; a direction is needed")
     return x[0] / size, x[1] / size, x[2] / size
 

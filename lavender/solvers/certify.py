@@ -38,8 +38,8 @@ from lavender.solvers.newton_systems import general
 from lavender.solvers.registry import get
 from lavender.solvers.setup_times import loading_time
 from lavender.solvers.solve_log import SolveLog
-from lavender_ext.core.checks import MIN_MAGNITUDE as MIN_NUMBER
-from lavender_ext.core.checks import MOST as MAX_NUMBER
+from lavender_ext.core.checks import MAX_MAGNITUDE
+from lavender_ext.core.checks import MIN_MAGNITUDE as MIN_MAGNITUDE
 from lavender_ext.judge.measure import by_island
 
 # Linear programs are used up to this many rows of all islands together.
@@ -162,12 +162,12 @@ def least_violation(log: SolveLog) -> None:
     """
     problem, generalized = log.problem, log.problem.generalized
     assert generalized is not None and problem.compliance is not None
-    v, cones = np.clip(generalized.change(log.impulse), -MAX_NUMBER, MAX_NUMBER), problem.cones
+    v, cones = np.clip(generalized.change(log.impulse), -MAX_MAGNITUDE, MAX_MAGNITUDE), problem.cones
     if problem.law == "coulomb":
         cones = replace(cones, mu=0.0 * cones.mu, rolling=0.0 * cones.rolling)
     squares = generalized.jac.multiply(generalized.jac).tocsr()
     mass = squares.T @ (1.0 / np.maximum(squares.sum(axis=1), np.finfo(float).tiny))
-    mass[mass < MIN_NUMBER] = 1.0  # No row moves these velocities, or only by rounding noise.
+    mass[mass < MIN_MAGNITUDE] = 1.0  # No row moves these velocities, or only by rounding noise.
     d = squares @ (1.0 / mass)
     y = lam = np.zeros(generalized.m)
     has_compliance = problem.compliance > 0.0
@@ -179,7 +179,9 @@ def least_violation(log: SolveLog) -> None:
         return
     for fraction in NEARLY_RIGID_COMPLIANCES:
         eps = np.where(has_compliance, 1.0, fraction) * d
-        soft = replace(rigid, compliance=np.where(eps < MIN_NUMBER, 0.0, eps))  # Negligible rows are empty.
+        soft = replace(
+            rigid, compliance=np.where(eps < MIN_MAGNITUDE, 0.0, eps)
+        )  # Negligible rows are empty.
         kernel = general.prepare(soft)
         if kernel is None or log.ends_late(MIN_LINEAR_PROGRAM_COST):
             return

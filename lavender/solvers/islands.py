@@ -9,8 +9,8 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray, IntArray
 from lavender.problem import Problem
-from lavender_ext.core.checks import MIN_MAGNITUDE as MIN_NUMBER
-from lavender_ext.core.checks import largest as max_abs
+from lavender_ext.core.checks import MIN_MAGNITUDE as MIN_MAGNITUDE
+from lavender_ext.core.checks import norm_inf
 from lavender_ext.factor import graph
 
 
@@ -58,7 +58,7 @@ def restrict(problem: Problem, blocks: IntArray, rows: IntArray) -> Problem:
     cones = problem.cones._take_blocks(blocks)
     names = None if problem.names is None else [problem.names[i] for i in blocks]
     attributes: dict[str, Any] = {"friction": problem.friction, "names": names, "name": problem.name}
-    b: FloatArray = problem.b[rows] if max_abs(problem.b[rows]) >= MIN_NUMBER else np.zeros(len(rows))
+    b: FloatArray = problem.b[rows] if norm_inf(problem.b[rows]) >= MIN_MAGNITUDE else np.zeros(len(rows))
     if problem.generalized is not None:
         assert problem.compliance is not None
         trees = problem.generalized.trees
