@@ -38,8 +38,7 @@ from lavender.solvers.newton_systems import general
 from lavender.solvers.registry import get
 from lavender.solvers.setup_times import loading_time
 from lavender.solvers.solve_log import SolveLog
-from lavender_ext.core.checks import MAX_MAGNITUDE
-from lavender_ext.core.checks import MIN_MAGNITUDE as MIN_MAGNITUDE
+from lavender_ext.core.checks import MAX_MAGNITUDE, MIN_MAGNITUDE
 from lavender_ext.judge.measure import by_island
 
 # Linear programs are used up to this many rows of all islands together.

@@ -9,8 +9,7 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray, IntArray
 from lavender.problem import Problem
-from lavender_ext.core.checks import MIN_MAGNITUDE as MIN_MAGNITUDE
-from lavender_ext.core.checks import norm_inf
+from lavender_ext.core.checks import MIN_MAGNITUDE, norm_inf
 from lavender_ext.factor import graph
 
 
