@@ -31,7 +31,7 @@ def blocks(text):
 
 
 def markdown(text):
-    """A docstring of plain text as markdown: formulas in fences, all else as it stands."""
+    """Convert a plain-text docstring to markdown: formulas in fences, everything else unchanged."""
     out = []
     for formula, lines in blocks(text):
         body = textwrap.dedent("\n".join(lines)) if formula else _escaped("\n".join(lines))
@@ -40,7 +40,7 @@ def markdown(text):
 
 
 def _escaped(text):
-    """What markdown would read as markup, outside of code: stars, angle brackets, bars of lists."""
+    """Escape markdown markup outside of code: stars, angle brackets, bars of lists."""
     parts = re.split(r"(`[^`]*`)", text)
     for i in range(0, len(parts), 2):
         parts[i] = re.sub(r"([*<>_\[\]])", r"\\\1", parts[i])

@@ -148,7 +148,7 @@ def built_in():
 
 
 def measure(cache):
-    """Records of every solver of lavender and some backends on CASES."""
+    """Measure every solver of lavender and some backends on CASES and return the records."""
     ours = [name for name, spec in built_in().items() if not spec.external]
     cache.mkdir(parents=True, exist_ok=True)
     solvers = ours + [name for name in BACKENDS if registry.specs()[name].missing() is None]
@@ -187,7 +187,7 @@ def law_figures(records):
 
 
 def highlighted(svg, solver):
-    """The figure with one solver's curve in colour before the others in grey."""
+    """Draw the figure with the curve of one solver in colour and the others in grey."""
     style = (
         '<style type="text/css">'
         '[id*="--"] path, [id*="--"] use {stroke: #d0d0d0 !important}'
@@ -201,7 +201,7 @@ def highlighted(svg, solver):
 
 
 def image(path, text):
-    """An image of this site in markdown."""
+    """Return the markdown of an image of this site."""
     return f"```{{image}} {path}\n:class: figure\n:alt: {text}\n```"
 
 
@@ -209,7 +209,7 @@ def image(path, text):
 
 
 def abilities(spec):
-    """What a spec declares, in words."""
+    """Describe the capabilities of a spec."""
     reads = {
         "rows": "body velocities (`Problem.from_rows`)",
         "matrix": "the matrix A (formed once where it is not given)",
@@ -370,7 +370,7 @@ def solver_overview():
 
 
 def solver_pages(site, records, figures):
-    """The page of each of our solvers, and one page for the backends."""
+    """Write the page of each built-in solver, and one page for the backends."""
     specs = built_in()
     ours = [s for s in specs.values() if not s.external]
     others = [s for s in specs.values() if s.external]
@@ -396,7 +396,7 @@ def solver_pages(site, records, figures):
 
 
 def by_structure(records):
-    """The table of the report's page as markdown: what to take for each structure, to a tolerance and in a time."""
+    """Return the report's table of recommended solvers for each structure as markdown."""
 
     def cell(c):
         words = (f"**{c.lead}** {c.text}" if c.lead else c.text.replace(" / ", "<br>"), c.after.lstrip(", "))

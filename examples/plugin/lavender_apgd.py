@@ -41,7 +41,7 @@ class APGD:
         return State(problem, A, 1.0 / (max(largest, 1.0) * d))
 
     def update(self, state, problem):
-        """The same structure with new numbers: nothing worth keeping here."""
+        """Return the state for new numbers of the same structure; nothing can be reused."""
         return self.prepare(problem)
 
     def run(self, state, impulse, n, tol, time_limit=None):
@@ -68,7 +68,7 @@ class APGD:
 
 
 def refusal(problem):
-    """The step is safe for symmetric A only."""
+    """Refuse asymmetric A, for which the step size is not safe."""
     return None if problem.is_symmetric else "needs a symmetric A; use pgs"
 
 

@@ -75,7 +75,7 @@ class Part:
 
     @cached_property
     def exact(self) -> Any:
-        """A as a dense matrix of balls."""
+        """Return A as a dense matrix of balls."""
         return self._operator.block(self._kind, self.which)
 
     def times(self, x: list[Any]) -> list[Any]:
@@ -89,7 +89,7 @@ class Part:
 
     @cached_property
     def bounded(self) -> Rounded:
-        """A as float64 numbers with error bounds."""
+        """Return A as float64 numbers with error bounds."""
         if self._operator.transposed is None:
             a = self._operator.rows[self.which][:, self.which]
             return self._bounded(a, abs(a) * 0.0)
