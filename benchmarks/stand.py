@@ -35,7 +35,7 @@ from lavender.lab.phenomena.engines import (
     PACKAGES_OF_NODE,
     Stepping,
     create_engine,
-    installation_hint,
+    missing_installation_command,
     versions_of_node,
 )
 from lavender.lab.phenomena.parts import has_fallen
@@ -156,7 +156,7 @@ ENGINES: dict[str, Contestant] = {
 
 def missing(name: str) -> str:
     """Return the missing requirement of an engine, empty if it can run."""
-    return installation_hint(ENGINES[name].needs)
+    return missing_installation_command(ENGINES[name].needs)
 
 
 def installed() -> list[str]:

@@ -20,7 +20,7 @@ import numpy as np
 from benchmarks import stand
 from benchmarks.stand import Contestant, Tower
 from lavender.base.errors import UnknownName
-from lavender.lab.phenomena.engines import create_engine, installation_hint
+from lavender.lab.phenomena.engines import create_engine, missing_installation_command
 from lavender.problem import Problem
 from lavender.sim.scene import Scene
 
@@ -123,7 +123,7 @@ def measure_scene(
         if name not in ENGINES:
             raise UnknownName("engine", name, ENGINES)
     asked = Tower(0, DT, sweeps)
-    known = [ENGINES[name] for name in engines if not installation_hint(ENGINES[name].needs)]
+    known = [ENGINES[name] for name in engines if not missing_installation_command(ENGINES[name].needs)]
     notes: dict[int, str] = {}
     with ExitStack() as stack:
         made = []

@@ -248,7 +248,11 @@ class _Reader:
             if not isinstance(link, self.h5py.HardLink):
                 raise InputError(f"{path} is a {type(link).__name__}; links out of a group are not followed")
             node = node[part]
-        if isinstance(node, self.h5py.Dataset) and node.fletcher32 and node.id.chunk_iter(_is_cut_off):
+        if (
+            isinstance(node, self.h5py.Dataset)
+            and node.fletcher32
+            and node.id.chunk_iter(_stop_at_short_chunk)
+        ):
             raise InputError(f"{path}: numbers are cut off; their chunk is shorter than its checksum")
         return node
 
@@ -342,7 +346,7 @@ def _chunk(data: Any) -> int:
     return math.prod(data.chunks) if data.chunks else 0
 
 
-def _is_cut_off(chunk: Any) -> bool | None:
+def _stop_at_short_chunk(chunk: Any) -> bool | None:
     """Return True if a chunk is shorter than its checksum of 4 bytes, else None, which continues the iteration.
 
     HDF5 would read beyond the end of such a chunk.

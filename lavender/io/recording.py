@@ -246,10 +246,10 @@ def load_model(path: str | os.PathLike[str]) -> tuple[Any, Any]:
 
 def load_controls(control: Control) -> Control:
     """Return controls for `record`: the array of a file (.npy), or `control` unchanged."""
-    return _controls(control) if isinstance(control, str) and control not in CONTROLS else control
+    return _load_controls_npy(control) if isinstance(control, str) and control not in CONTROLS else control
 
 
-def _controls(path: str) -> Any:
+def _load_controls_npy(path: str) -> Any:
     """Return the array of a .npy file; raise InputError if it cannot be read or holds several arrays."""
     try:
         first_bytes(path)  # Checks that it is a regular file.

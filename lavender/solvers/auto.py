@@ -55,7 +55,12 @@ from lavender.judge.solution import Claim, Status
 from lavender.problem import OPERATORS, Problem
 from lavender.problem.derived import cached_property
 from lavender.solvers import costs
-from lavender.solvers.certify import MIN_LINEAR_PROGRAM_COST, certify, least_violation, linear_programs
+from lavender.solvers.certify import (
+    MIN_LINEAR_PROGRAM_COST,
+    certify_by_least_violation,
+    certify_infeasibility,
+    linear_programs,
+)
 from lavender.solvers.islands import count_pairs
 from lavender.solvers.newton import WARM_START_MAX_RESIDUAL, NewtonState
 from lavender.solvers.registry import SMALL_ROWS, Solver, SolverSpec, get, specs
@@ -64,7 +69,7 @@ from lavender.solvers.setup_times import (
     first_sweep_time,
     formation_time,
     forming_time,
-    row_setup_time,
+    matrix_setup_time,
 )
 from lavender.solvers.small import AUTO, ISLANDS_TIME_FRACTION, NO_TIME_MESSAGE, call_ends_within
 from lavender.solvers.solve_log import MIN_GAIN_RATIO, SolveLog
@@ -190,7 +195,7 @@ class Tree:
         p, states = self.problem, self.states
         if "newton over rows" in states or self.row_form_cost >= max_cost or self.is_late:
             return False
-        if self.deadline.is_set and self.deadline.passed(row_setup_time(p) + 3.0 * forming_time(p)):
+        if self.deadline.is_set and self.deadline.passed(matrix_setup_time(p) + 3.0 * forming_time(p)):
             return False
         both = states | self.prepare_newton("newton over rows")
         failed = self.compiled_call_failed
@@ -479,7 +484,7 @@ def solve(log: SolveLog, tree: Tree) -> None:
             break
         if stage.solver == "certificate":
             if not log.ends_late(stage.cost):
-                (linear_programs if log.problem.generalized is None else least_violation)(log)
+                (linear_programs if log.problem.generalized is None else certify_by_least_violation)(log)
             continue
         step = steps.get(stage.solver)
         if step is None:
@@ -503,7 +508,7 @@ def solve(log: SolveLog, tree: Tree) -> None:
             step.run(stage.iterations)
             tree.best = log.best
     if log.best > log.tol and log.certificate is None and (log.left > 0 or log.last_stage_failed):
-        certify(log)
+        certify_infeasibility(log)
 
 
 def tree_goes_on(tree: Tree, steps: dict[str, Step], cost: float) -> bool:

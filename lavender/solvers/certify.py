@@ -10,8 +10,8 @@ With Coulomb friction, the convex relaxation is tried last. A direction y of the
 components proves nothing for Coulomb's law, but it shows which blocks conflict: a compliance on the rows of y removes
 it (`conflict_of`).
 
-With J and M, the certificate is computed from the smallest violation of J v = target (`least_violation`), which does
-not depend on M.
+With J and M, the certificate is computed from the smallest violation of J v = target, which does not depend on M
+(`certify_by_least_violation`).
 
 One infeasible island makes the problem infeasible. The unsolved islands are tried one by one, because an upper bound in
 another island does not matter.
@@ -148,7 +148,7 @@ def drop_negligible_rows(y: FloatArray, d: FloatArray) -> FloatArray:
     return np.where(size > NEGLIGIBLE_ROW_FRACTION * size.max(), y, 0.0)
 
 
-def least_violation(log: SolveLog) -> None:
+def certify_by_least_violation(log: SolveLog) -> None:
     """Search for a certificate of a problem with J and M, from the motion with the smallest violation of J v = target.
 
     With a diagonal mass C instead of M and compliances eps d, the impulses lambda(eps) of
@@ -203,7 +203,7 @@ def least_violation(log: SolveLog) -> None:
 
 
 @np.errstate(all="ignore")  # Results that overflow are judged.
-def certify(log: SolveLog) -> None:
+def certify_infeasibility(log: SolveLog) -> None:
     """Search for a certificate that a problem has no solution; under Coulomb's law, also for the convex relaxation."""
     problem = log.problem
     if problem.generalized is None and LINEAR_PROGRAM_STAGE not in [stage.solver for stage in log.stages]:

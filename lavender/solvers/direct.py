@@ -37,7 +37,7 @@ from lavender.problem import Problem
 from lavender.solvers.factors import MAX_COMPILED_FACTOR_ROWS, GeneralFactor, PanelsLU
 from lavender.solvers.pivoting import PivotState
 from lavender.solvers.registry import Solver, SolverSpec
-from lavender.solvers.setup_times import first_solve_time, row_setup_time
+from lavender.solvers.setup_times import first_solve_time, matrix_setup_time
 from lavender.solvers.small import DIRECT
 from lavender_ext.judge import measure
 from lavender_ext.pivot.direct import CIRCLES, PASSED, SPENT
@@ -94,7 +94,7 @@ class Direct(Solver):
 
     def setup_time(self, problem: Problem) -> float:
         """Estimate the time of `prepare` [s]."""
-        return first_solve_time(problem) if problem.law == "linear" else row_setup_time(problem)
+        return first_solve_time(problem) if problem.law == "linear" else matrix_setup_time(problem)
 
     def prepare(self, problem: Problem, like: PivotState | None = None) -> DirectState:
         linear = problem.law == "linear"

@@ -26,7 +26,7 @@ from lavender.solvers.certify import CERTIFICATE_ROWS, MIN_LINEAR_PROGRAM_COST, 
 from lavender.solvers.pivoting import PivotState
 from lavender.solvers.polyhedral import count_rows
 from lavender.solvers.registry import Solver, SolverSpec
-from lavender.solvers.setup_times import loading_time, row_setup_time
+from lavender.solvers.setup_times import loading_time, matrix_setup_time
 from lavender_ext.pivot import lemke
 from lavender_ext.pivot.lemke import DONE, LATE, RAY
 
@@ -54,7 +54,7 @@ class Lemke(Solver):
 
     def setup_time(self, problem: Problem) -> float:
         """Estimate the time of `prepare` [s]."""
-        return row_setup_time(problem)
+        return matrix_setup_time(problem)
 
     def prepare(self, problem: Problem) -> PivotState:
         return PivotState(problem)

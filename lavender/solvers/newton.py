@@ -49,7 +49,7 @@ from lavender.solvers.setup_times import (
     body_setup_time,
     dense_work,
     formation_time,
-    row_setup_time,
+    matrix_setup_time,
     velocity_setup_time,
 )
 from lavender.solvers.small import NEWTON
@@ -156,7 +156,7 @@ class Newton(Solver):
         if bodies:
             return body_setup_time(problem)
         is_sparse = not use_dense_matrix(problem.max_entries, problem.m, problem.law == "cone")
-        return row_setup_time(problem) + (analysis_time(problem) if is_sparse else 0.0)
+        return matrix_setup_time(problem) + (analysis_time(problem) if is_sparse else 0.0)
 
     def prepare(self, problem: Problem) -> NewtonState:
         """Build the linear system of a problem, or the driver over its velocities."""

@@ -85,7 +85,7 @@ def comparison_time(problem: Problem) -> float:
     return 0.0 if find_known_relative else residuals.READ_TIME_PER_ENTRY * problem.max_entries
 
 
-def row_setup_time(problem: Problem) -> float:
+def matrix_setup_time(problem: Problem) -> float:
     """Estimate the time [s] to form A, check its symmetry, and lay it out for a solver."""
     entries = problem.max_entries
     imports = loading_time(*SCIPY_MODULES) if problem.m > SMALL_ROWS else 0.0
@@ -115,8 +115,8 @@ def row_sums_time(problem: Problem) -> float:
 
 
 def first_solve_time(problem: Problem) -> float:
-    """Estimate the time [s] of `row_setup_time` and the first factor of all rows."""
-    return row_setup_time(problem) + first_factor_time(problem.m, problem.max_entries)
+    """Estimate the time [s] of `matrix_setup_time` and the first factor of all rows."""
+    return matrix_setup_time(problem) + first_factor_time(problem.m, problem.max_entries)
 
 
 def dense_work(m: int) -> float:

@@ -178,7 +178,7 @@ def resolve(sources: Source | Iterable[Source], sequences: bool | None = None) -
             )
         else:
             selected = [_from_name(name) for name in suite.names(str(source))]
-            items += _as_steps(selected) if str(source).removeprefix("@") == "sequences" else selected
+            items += _number_as_steps(selected) if str(source).removeprefix("@") == "sequences" else selected
     return _unique_names(items)
 
 
@@ -358,7 +358,7 @@ def _from_name(name: str) -> Item:
         return Item(name, name, _raise_when_loaded(error))
 
 
-def _as_steps(items: list[Item]) -> list[Item]:
+def _number_as_steps(items: list[Item]) -> list[Item]:
     """Convert consecutive cases that differ only in `at` to the steps of sequences."""
     out, count = [], Counter[str]()
     for item in items:

@@ -55,7 +55,11 @@ def memory() -> int:
 
 
 def memory_share(processes: int = 1) -> int:
-    """Return the memory [bytes] that each of these backend processes may use: half of it together, 2 GiB at least."""
+    """Return the memory [bytes] that each of `processes` backend processes may use.
+
+    It is half of the memory of the machine or container divided among them, but at least 2 GiB; 0 if the memory of the
+    machine is unknown.
+    """
     return (
         max(MIN_BACKEND_MEMORY, int(BACKEND_MEMORY_FRACTION * memory() / max(1, processes)))
         if memory()

@@ -81,7 +81,7 @@ def flip_of(p: Values) -> float:
     return flip_period(moments_of_inertia(), np.array(spin_of(p)))
 
 
-def _measure_rotation(p: Values, track: Track) -> dict[str, float]:
+def _free_rotation_errors(p: Values, track: Track) -> dict[str, float]:
     """Measure the errors of momentum, energy and period of the free rotation."""
     axes = np.stack([track.axis(0, i) for i in range(3)], axis=1)  # (k, axis, world)
     omega = np.einsum("kaw,kw->ka", axes, track.velocities[:, 0, 3:])
@@ -161,7 +161,7 @@ JOINT_PHENOMENA = (
         needs=frozenset({"box"}),
         build=_free_body,
         seconds=lambda p: FREE_ROTATION_PERIODS * flip_of(p),
-        measure=_measure_rotation,
+        measure=_free_rotation_errors,
     ),
     Phenomenon(
         name="chain_load",

@@ -108,7 +108,7 @@ def _split_component(flint: Any, j: Any, target: FloatArray) -> tuple[list[int],
             k: (integer_rows[k][n] - sum(int(reduced[i, k]) * t for i, t in targets)) % prime for k in others
         }
         proofs = [
-            _depends_exactly(flint, integer_rows, rows, residuals)
+            _residual_rows_depend_on_others(flint, integer_rows, rows, residuals)
             for rows in _connected_sets(m, [(independent_rows[i], k) for i, k in entries])
         ]
         if None in proofs:
@@ -127,7 +127,7 @@ def _connected_sets(m: int, pairs: list[tuple[int, int]]) -> list[Any]:
     return [np.flatnonzero(label == k).tolist() for k in range(n)]
 
 
-def _depends_exactly(
+def _residual_rows_depend_on_others(
     flint: Any, integer_rows: list[list[int]], rows: list[int], residuals: dict[int, int]
 ) -> bool | None:
     """Whether the rows in `residuals` depend on the others, targets included if theirs is 0; None: too many."""

@@ -75,10 +75,10 @@ def to_dense(kind: Any, a: Any) -> Any:
     return kind.matrix(*dense.shape, [kind.number(x) for x in dense.ravel().tolist()])
 
 
-def sparse_times(kind: Any, a: Any, x: list[Any], at: Any) -> list[Any]:
-    """Multiply a sparse matrix by a vector; `at` lists the entries of x that are not zero, None means all."""
+def sparse_times(kind: Any, a: Any, x: list[Any], nonzeros_of_x: Any) -> list[Any]:
+    """Multiply a sparse matrix by a vector; `nonzeros_of_x`: indices of nonzero entries, None means all."""
     out, zero = [], kind.number(0.0)
-    used = None if at is None else np.isin(a.indices, at)
+    used = None if nonzeros_of_x is None else np.isin(a.indices, nonzeros_of_x)
     data, indices, ptr = a.data.tolist(), a.indices.tolist(), a.indptr.tolist()
     for i in range(a.shape[0]):
         total = zero

@@ -96,9 +96,11 @@ def test_ctrl_c_while_many_are_handed_out_to_threads_begins_no_more(solver, monk
     """The signal comes with the first problem that a thread takes, one by one or in the compiled loop."""
     n, begun, solve, hand = 2000, [], many.solve, loop.Worker
 
+    first = threading.Lock()
+
     def interrupt():
         begun.append(solver)
-        if len(begun) == 1:
+        if first.acquire(blocking=False):  # of two threads that begin at the same time, one sends the signal
             signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)
         time.sleep(1e-3)
 

@@ -12,7 +12,7 @@ from random_problems import as_matrix, good
 import lavender as lv
 from lavender import registry
 from lavender.problem.rows import Rows
-from lavender.solvers.certify import certify
+from lavender.solvers.certify import certify_infeasibility
 from lavender.solvers.newton_systems import general
 from lavender.solvers.newton_systems.systems import make_system
 from lavender.solvers.small import AUTO, FAILED_CALL_KEY
@@ -89,7 +89,7 @@ def test_an_island_without_a_solution_is_proof_enough():
     problem = lv.Problem.lcp(a, [1.0, 1.0, -1.0, 3.0], 0.0, [np.inf, np.inf, 1.0, 1.0])
     log = SolveLog(problem, 1e-6, 100)
     log.offer(problem.start())
-    certify(log)
+    certify_infeasibility(log)
     assert log.certificate is not None
     assert not log.certificate[2:].any()
     assert [stage.solver for stage in log.stages] == ["linear program"] and log.work == {"certificates": 1}

@@ -18,7 +18,7 @@ from lavender.base.deadline import Deadline
 from lavender.judge.residuals import get_reference
 from lavender.solvers import costs
 from lavender.solvers.auto import Tree, solve, tree_goes_on
-from lavender.solvers.certify import certify
+from lavender.solvers.certify import certify_infeasibility
 from lavender.solvers.solve_log import SolveLog
 from lavender.solvers.steps import METHODS, Newton, Step, Sweeps
 
@@ -369,7 +369,7 @@ def test_no_certificate_is_begun_that_would_end_late(monkeypatch):
     log = SolveLog(problem, 1e-6, 10**6, deadline=Deadline(1e-3))
     log.offer(problem.start())
     monkeypatch.setattr("lavender.solvers.certify.find_direction", lambda *asked: 1 / 0)
-    certify(log)
+    certify_infeasibility(log)
     assert not log.stages
 
 

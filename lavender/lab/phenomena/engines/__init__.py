@@ -103,11 +103,11 @@ class EngineVariant:
 
     def missing(self) -> str:
         """Return the reason why it cannot run here; empty if it can."""
-        hint = installation_hint(self.package)
+        hint = missing_installation_command(self.package)
         return f"not installed: {hint}" if hint else ""
 
 
-def installation_hint(package: str) -> str:
+def missing_installation_command(package: str) -> str:
     """Return the command that installs a Python or npm package; empty if it is installed, or no package is needed."""
     if package in PACKAGES_OF_NODE.values():
         return missing_in_node(package)
