@@ -5,6 +5,7 @@ Through qpsolvers, these backends have no warm start, and their iterations, exit
 
 from __future__ import annotations
 
+import threading
 from functools import cache
 from typing import Any
 
@@ -227,6 +228,11 @@ def _get_algebra() -> str:
     return str(osqp.default_algebra())
 
 
+# OSQP replaces the handler of Ctrl-C while it solves and then puts the previous one back. Two solves at the same time
+# would leave OSQP's own handler, with which Ctrl-C no longer raises KeyboardInterrupt.
+_OSQP_LOCK = threading.Lock()
+
+
 def call_osqp(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, Any]) -> Answer:
     """Call OSQP: operator splitting with polishing (Stellato et al. 2020)."""
     import osqp
@@ -263,7 +269,8 @@ def call_osqp(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, Any])
         return Answer(Status.NUMERICAL_ERROR, f"OSQPException {error}: {message}")
     x, zeta, xi = qp.start(impulse)
     solver.warm_start(x=x, y=np.concatenate([zeta, xi])[: len(low)])
-    result = solver.solve(raise_error=False)
+    with _OSQP_LOCK:
+        result = solver.solve(raise_error=False)
     info = result.info
     status = {
         1: Status.CONVERGED,

@@ -2,6 +2,7 @@
 
 import itertools
 import os
+import signal
 import sys
 import threading
 import warnings
@@ -77,6 +78,8 @@ def test_nothing_is_printed_or_looked_for_and_threads_run_one_each(name, capfd, 
                 assert (found.impulse.tobytes(), found.status) == (alone.impulse.tobytes(), alone.status)
         assert (sys.stdout, warnings.filters) == before
     assert capfd.readouterr() == ("", "")
+    with pytest.raises(KeyboardInterrupt):  # some backends handle Ctrl-C themselves while they solve
+        signal.raise_signal(signal.SIGINT)
 
 
 def test_highs_takes_standard_output_from_the_process_for_its_greeting_alone(monkeypatch):
