@@ -513,14 +513,7 @@ def test_a_hessian_is_singular_from_a_pivot_of_1e_13_of_its_diagonal_on():
     assert not tiny.has_singular_program
 
 
-def test_singular_programs_are_checked_proven_batched_and_continued():
-    checked = lv.cross_check(SINGULAR, tol=1e-6)
-    assert checked.reference is not None and {row.solver for row in checked} == {"auto", *BACKENDS}
-    assert not checked.contradicted and len(checked.agreed) >= 3
-    for row in checked.agreed:
-        assert abs(row.objective) <= 1e-5 and row.distance <= row.allowed
-    refused = lv.cross_check(SINGULAR, ["newton"])
-    assert refused["newton"].verdict == "refused" and "osqp" in refused["newton"].note
+def test_singular_programs_are_batched_and_continued():
     many = lv.solve_many([SINGULAR, SINGULAR, lv.Problem.lcp(np.eye(2), [1.0, 1.0])], tol=1e-9)
     assert many.success.all()
     np.testing.assert_array_equal(many[0].impulse, lv.solve(SINGULAR, tol=1e-9).impulse)
@@ -529,11 +522,6 @@ def test_singular_programs_are_checked_proven_batched_and_continued():
     assert warm.found and warm.solution.iterations == 0
     other = SINGULAR.updated(b=1.5 * SINGULAR.b)  # q and all sides times 1.5
     np.testing.assert_allclose(lv.solve_qp(other).x, 1.5 * answer.x, atol=1e-6)
-
-
-def test_a_proof_encloses_the_solution_of_a_singular_program():
-    pytest.importorskip("flint")
-    assert lv.prove(SINGULAR, lv.solve(SINGULAR, tol=1e-9)).proven
 
 
 @pytest.mark.parametrize("limit", [1e-6, 5.0])
