@@ -1,14 +1,14 @@
-"""The iterate of Newton's method over generalised velocities: what is kept of it, and what a point answers (`newton.pxd`).
+"""The iterate of Newton's method over generalised velocities: arrays, impulses of a point, products and errors (`newton.pxd`).
 
-Rows and blocks of an island stand in runs of panels; errors are those of the judge. With theta > 0 [1/kg] on every row
-and s = J (v - v*) - b [m/s], a block's law determines its impulse:
+The rows and blocks of an island are in runs of consecutive panels. Errors are computed as the judge computes them. With
+theta > 0 [1/kg] on every row and s = J (v - v*) - b [m/s], a block's law determines its impulse:
 
     z = (rho c - s) / theta
     row        lambda = clip(z, lower, upper)
     contact    lambda = Pi(z) of its law in the metric of theta (`core/contact_map.pxd`)                  (1)
     V          -d lambda / d s, of the block's rows
 
-theta is equal on all tangents of a disk, which makes (1) a closed form.
+theta is equal on all tangents of a disk, so that (1) has a closed form.
 """
 from libc.math cimport sqrt
 from libc.stdint cimport int32_t
@@ -24,55 +24,55 @@ from lavender_ext.judge.tally cimport empty_tally, tally_block, tally_row, tally
 
 
 cdef struct descent_t:          # Newton steps under one law
-    int32_t idle
-    int32_t n                   # steps of it
-    int32_t fresh               # s was formed anew, not moved
-    int32_t stale               # N is to be formed anew
-    int32_t known               # lambda and V are those at s
-    int32_t moved               # the centre has moved since the last step
-    double share                # of d
-    double least                # lowest error, that of `best`,
-    double lowest               # and of its own steps
-    double last_center
-    double sizes[3]             # |G| of the last steps
+    int32_t idle_steps          # steps since the lowest error fell by a tenth
+    int32_t steps
+    int32_t slack_is_fresh      # s was recomputed from y, not updated along a step
+    int32_t needs_matrix        # N must be formed again
+    int32_t response_is_known   # lambda and V belong to the present s
+    int32_t center_moved        # since the last step
+    double softness             # rho as a fraction of d
+    double best_error           # error of `best`, in multiples of the limits
+    double lowest_error         # lowest error of this descent
+    double error_at_last_center     # energy error when the centre moved last, -1: not yet
+    double sizes[3]             # |G| of the last three steps
 
 
-cdef struct wait_t:             # an island whose steps may be used up, to go on with
-    int32_t island              # -1: none waits
-    int32_t worst               # end of the islands before it
-    int32_t cold                # the run began from nothing; asked for Coulomb's law alone
-    int32_t at                  # of a round of Coulomb friction
-    int32_t rounds              # of Coulomb friction before this one
-    double kept                 # error of the island's best, which a cut may have found,
-    double least                # and of the best that one run knows of
+cdef struct paused_t:           # an island whose step budget ended, to be continued
+    int32_t island              # -1: no island is paused
+    int32_t worst               # worst outcome of the islands before it
+    int32_t cold                # the run started from the zero impulse (Coulomb's law only)
+    int32_t stage               # of a round of Coulomb friction
+    int32_t rounds              # completed rounds of Coulomb friction
+    double island_error         # error of `island_best`, including points at which a call ended
+    double best_error           # the same without those points, so that calls do not change the path
 
 
 cdef struct flow_t:
-    blocks_t p                  # a copy: its law is that of the convex problem while one is solved
+    blocks_t p                  # a copy: its law is CONE while a convex problem is solved
     const generalized_t* g
     int32_t law                 # of the problem
-    double share                # of d, that rho is at first
+    double softness             # first rho as a fraction of d
     int32_t n_islands
     const int32_t* iptr         # (n_islands + 1) runs of panels of each island in `run`
-    const int32_t* run          # (2 runs) first panel and the one past the last; runs <= n_panels
+    const int32_t* run          # (2 runs) first panel and one past the last; runs <= n_panels
     const int32_t* cptr         # (n_islands + 1) columns of each island in `icols`
-    const int32_t* icols        # (<= n) ascending in each
-    const int32_t* local        # (n) number of a column in its island
-    int32_t plain               # bounded rows alone
-    const int32_t* few          # (n_islands) A is less work than N
-    int32_t sparse              # one at least is not few: L is known
-    const int32_t* lptr         # (n + 1) rows of the islands' L, one after the other
-    const int32_t* lidx         # columns in their island, ascending
+    const int32_t* icols        # (<= n) ascending within an island
+    const int32_t* local        # (n) index of a column within its island
+    int32_t bounded_rows_only   # the problem has no contact with friction components
+    const int32_t* over_rows    # (n_islands) steps over the rows of A take less work than steps with N
+    int32_t sparse              # some island uses N, so that L is known
+    const int32_t* lptr         # (n + 1) rows of L, all islands
+    const int32_t* lidx         # columns within their island, ascending
     const int32_t* pblock       # (n_panels + 1) first block of each panel
-    const int32_t* vptr         # (k + 1) V of each block: its diagonal for bounded rows, else square
-    int32_t island              # the present one
-    int32_t formed              # it is few: y, u, grad and step hold numbers of its rows (`normal.pxd`)
-    int32_t still               # its y is 0
+    const int32_t* vptr         # (k + 1) V of each block: the diagonal for bounded rows, else a square matrix
+    int32_t island              # the present island
+    int32_t is_over_rows        # its steps are over rows: y, u, grad and step are indexed by rows (`normal.pxd`)
+    int32_t is_zero             # its y is 0
     double* theta               # (m) theta', > 0
-    double* soft                # (m) 1 / theta'
-    double* root                # (m) theta'^1/2
+    double* inv_theta           # (m) 1 / theta'
+    double* sqrt_theta          # (m) theta'^1/2
     double* rho                 # (m) >= 0
-    double* y                   # (max(n, m)) y, or mu
+    double* y                   # (max(n, m)) y, or mu over rows
     double* u                   # Y^T lambda, or A lambda
     double* grad                # G, or h
     double* step                # p, or pi
@@ -82,44 +82,44 @@ cdef struct flow_t:
     double* center              # (m)
     double* lam                 # (m)
     double* trial               # (m)
-    double* best                # (m) of one descent
-    double* first_best          # (m) of one island, under the problem's own law
-    double* aside               # (m) what a descent that waits began with: phi, under Coulomb's law the impulse
+    double* best                # (m) best impulse of one descent
+    double* island_best         # (m) best impulse of one island under the problem's own law
+    double* paused_start        # (m) start of a paused descent: phi, under Coulomb's law the impulse
     double* w                   # (m)
     double* e                   # (m)
     double* v                   # V at s
-    double* held                # V inside `normal`
-    double* normal              # N of the present island where L has entries; or whole: Coulomb
+    double* factored_v          # V in `normal`
+    double* normal              # N of the present island in the pattern of L; under Coulomb's law a full matrix
     double* factor              # its factor
     double* inv                 # (s) 1 / D
-    double* turned              # (rows of a panel, columns) V times Y
+    double* weighted_y          # (rows of a panel, columns) V times Y
     double* line                # (columns)
     double* local_rhs           # (s)
-    int32_t* swap               # (s)
-    int32_t n_answering         # rows of S
-    int32_t rows                # of an island that is few, and up to three more, which are 0
-    int32_t wide                # as `core/method.pxd` has it
-    int32_t* listed             # (m) those rows
-    int32_t n_own               # velocities of the island, or rows where it is few,
-    const int32_t* own          # and which they are
-    int32_t* places             # (m) of rows that answer, in the island,
-    int32_t* columns            # (m) and where their columns of A begin
-    int32_t* picks              # (m) scratch
-    int32_t* reached            # of each panel, where rows of Y^T begin
-    int32_t* home               # (m) panel of each; -1 - panel where its column of A is not known
+    int32_t* pivots             # (s)
+    int32_t n_free              # rows of S: rows with V != 0
+    int32_t rows                # rows of an island over rows, rounded up to a multiple of four; padding is 0
+    int32_t wide                # as in `core/method.pxd`
+    int32_t* row_list           # (m) rows of an island over rows
+    int32_t n_unknowns          # columns of the island, or rows if it is over rows
+    const int32_t* unknowns     # (n_unknowns) their indices
+    int32_t* places             # (m) index within the island of each free row
+    int32_t* columns            # (m) offset of its column of A
+    int32_t* picked_columns     # (m) scratch
+    int32_t* transpose_offset   # offsets of the rows of Y^T, for each panel
+    int32_t* panel_of_column    # (m) panel of each row; -1 - panel if its column of A is not formed
     double* a                   # (rows, rows) A, symmetric
-    double* across              # (s, rows) Y^T
+    double* y_transpose         # (s, rows) Y^T
     double* sum                 # (2 rows) scratch
-    double tol                  # relative residual asked of each island
-    double reference_energy         # reference of a problem of one island, sqrt J
-    double reference_velocity       # m/s
+    double tol                  # required relative residual of each island
+    double reference_energy     # sqrt J, if the problem has one island
+    double reference_velocity   # m/s
     double energy_limit         # of the present island, sqrt J
     double velocity_limit       # m/s
-    int32_t steps               # Newton steps left
+    int32_t steps               # remaining Newton steps
     int32_t factorisations
-    int32_t rounds              # of Coulomb friction
-    int32_t evaluations         # of lambda(s) along a line
-    wait_t wait
+    int32_t rounds              # rounds of Coulomb friction
+    int32_t evaluations         # evaluations of lambda(s) along a line
+    paused_t paused
     descent_t descent
 
 
@@ -145,42 +145,42 @@ cdef inline int32_t block_end(const flow_t* f, int32_t a) noexcept nogil:
 # -- lambda(s) and V -------------------------------------------------------------------------------------
 
 
-cdef inline void respond_contact(const flow_t* f, int32_t i, double* lam, double* v) noexcept nogil:
-    """(1) of contact i: z in lam becomes lambda, with V."""
+cdef inline void compute_contact_impulse(const flow_t* f, int32_t i, double* lam, double* v) noexcept nogil:
+    """Project z (in lam) of contact i by (1), in place, and write V."""
     cdef int32_t j = f.p.ptr[i], n = f.p.ptr[i + 1] - j, k, l
-    cdef const double* root = f.root + j
-    cdef const double* soft = f.soft + j
+    cdef const double* root = f.sqrt_theta + j
+    cdef const double* soft = f.inv_theta + j
     cdef friction_components_t q
     cdef double y[6]
     cdef double out[6]
-    cdef double back[6]                                 # theta^-1/2
+    cdef double inv_sqrt_theta[6]
     for k in range(n):
-        back[k] = root[k] * soft[k]
+        inv_sqrt_theta[k] = root[k] * soft[k]
         y[k] = root[k] * lam[k]
     get_friction_components(&f.p, i, &q)
     for k in range(q.n):
-        q.friction_coefficient[k] = q.friction_coefficient[k] * root[q.first[k]] * back[0]
+        q.friction_coefficient[k] = q.friction_coefficient[k] * root[q.first[k]] * inv_sqrt_theta[0]
     contact_map(f.p.law, &q, y, out, v)
     for k in range(n):
-        lam[k] = lam[k] if out[k] == y[k] else out[k] * back[k]
+        lam[k] = lam[k] if out[k] == y[k] else out[k] * inv_sqrt_theta[k]
         for l in range(n):
-            v[k * n + l] *= back[k] * back[l]
+            v[k * n + l] *= inv_sqrt_theta[k] * inv_sqrt_theta[l]
 
 
-cdef inline void respond(const flow_t* f, int32_t first, int32_t last, const double* s, double* lam,
+cdef inline void compute_impulses(const flow_t* f, int32_t first, int32_t last, const double* s, double* lam,
                          double* v) noexcept nogil:
-    """lambda and V of blocks [first, last)."""
+    """Compute lambda and V of blocks [first, last)."""
     cdef int32_t i, j, end, k, at
-    # Hoisted: what is stored to might be any of them, for all a compiler knows.
+    # Local copies of pointers: the compiler cannot exclude that the stores below change the struct.
     cdef const int32_t* ptr = f.p.ptr
     cdef const int32_t* vptr = f.vptr
     cdef const double* lower = f.p.lower
     cdef const double* upper = f.p.upper
     cdef const double* rho = f.rho
     cdef const double* center = f.center
-    cdef const double* soft = f.soft
+    cdef const double* soft = f.inv_theta
     cdef double z, low, high
-    if f.plain:                                         # V of a row stands in its place
+    if f.bounded_rows_only:                             # V has one entry for each row, at the row's index
         end = ptr[last]
         for k in range(ptr[first], end):
             z = (rho[k] * center[k] - s[k]) * soft[k]
@@ -204,70 +204,72 @@ cdef inline void respond(const flow_t* f, int32_t first, int32_t last, const dou
             continue
         for k in range(j, end):
             lam[k] = (rho[k] * center[k] - s[k]) * soft[k]
-        respond_contact(f, i, lam + j, v + at)
+        compute_contact_impulse(f, i, lam + j, v + at)
 
 
-cdef inline void respond_all(const flow_t* f, int32_t island, const double* s, double* lam) noexcept nogil:
+cdef inline void compute_island_impulses(const flow_t* f, int32_t island, const double* s, double* lam) noexcept nogil:
+    """Compute lambda and V of an island."""
     cdef int32_t a
     for a in range(f.iptr[island], f.iptr[island + 1]):
-        respond(f, block_from(f, a), block_end(f, a), s, lam, f.v)
+        compute_impulses(f, block_from(f, a), block_end(f, a), s, lam, f.v)
 
 
-# -- A of an island that is few --------------------------------------------------------------------------
+# -- products over the rows of A -------------------------------------------------------------------------
 
 
 cdef enum:
-    NOWHERE = -2147483647       # `home` of the first row, until Y^T is there
+    UNFORMED = -2147483647      # `panel_of_column` of the first row until Y^T is formed
 
 
-cdef inline void lay_across(const flow_t* f, int32_t island) noexcept nogil:
-    """Y^T; no column of A is known."""
+cdef inline void form_y_transpose(const flow_t* f, int32_t island) noexcept nogil:
+    """Form Y^T and mark every column of A as not formed."""
     cdef int32_t a, b, _i, q, nc, row = 0, size = f.cptr[island + 1] - f.cptr[island]
     cdef const int32_t* cols
     cdef int32_t* at
     cdef const double* y
     cdef double* x
-    memset(f.across, 0, <size_t>size * f.rows * sizeof(double))
+    memset(f.y_transpose, 0, <size_t>size * f.rows * sizeof(double))
     for a in range(f.iptr[island], f.iptr[island + 1]):
         for b in range(f.run[2 * a], f.run[2 * a + 1]):
             cols = f.g.cols + f.g.pcol[b]
             nc = f.g.pcol[b + 1] - f.g.pcol[b]
             y = f.g.y + f.g.pval[b]
-            at = f.reached + f.g.pcol[b]
+            at = f.transpose_offset + f.g.pcol[b]
             for q in range(nc):
                 at[q] = f.local[cols[q]] * f.rows
             for _i in range(f.g.prow[b], f.g.prow[b + 1]):
-                x = f.across + row
+                x = f.y_transpose + row
                 for q in range(nc):
                     x[at[q]] = y[q]
-                f.home[row] = -1 - b
+                f.panel_of_column[row] = -1 - b
                 y += nc
                 row += 1
 
 
-cdef inline void find_column(const flow_t* f, int32_t place) noexcept nogil:
-    """Of A, of the row at this place of the island."""
+cdef inline void form_column(const flow_t* f, int32_t place) noexcept nogil:
+    """Form the column of A of the row at this index of the island, unless it is known."""
     cdef int32_t b, nc
-    if f.home[0] == NOWHERE:
-        lay_across(f, f.island)
-    b = -1 - f.home[place]
+    cdef const double* y
+    if f.panel_of_column[0] == UNFORMED:
+        form_y_transpose(f, f.island)
+    b = -1 - f.panel_of_column[place]
     if b >= 0:
         nc = f.g.pcol[b + 1] - f.g.pcol[b]
-        combine(f.wide, f.rows, nc, f.across, f.reached + f.g.pcol[b], f.g.y + f.g.pval[b] + (f.own[place] - f.g.prow[b]) * nc,
-                f.a + place * f.rows)
-        f.home[place] = b
+        y = f.g.y + f.g.pval[b] + (f.unknowns[place] - f.g.prow[b]) * nc
+        combine(f.wide, f.rows, nc, f.y_transpose, f.transpose_offset + f.g.pcol[b], y, f.a + place * f.rows)
+        f.panel_of_column[place] = b
 
 
-cdef inline bint times_a(const flow_t* f, const double* x, double* out) noexcept nogil:
-    """out = A x on the island's rows; whether any x is other than 0."""
-    cdef int32_t a, count = 0, n = f.n_own, rows = f.rows
-    cdef const int32_t* own = f.own                     # hoisted, as in `respond`
-    cdef int32_t* picks = f.picks
+cdef inline bint multiply_a(const flow_t* f, const double* x, double* out) noexcept nogil:
+    """Compute out = A x on the island's rows; return whether any x is not 0."""
+    cdef int32_t a, count = 0, n = f.n_unknowns, rows = f.rows
+    cdef const int32_t* own = f.unknowns                # local copies, as in `compute_impulses`
+    cdef int32_t* picks = f.picked_columns
     cdef double* sums = f.sum
     cdef double* given = sums + rows
     for a in range(n):
         if x[own[a]] != 0.0:
-            find_column(f, a)
+            form_column(f, a)
             picks[count] = a * rows
             given[count] = x[own[a]]
             count += 1
@@ -277,12 +279,12 @@ cdef inline bint times_a(const flow_t* f, const double* x, double* out) noexcept
     return count > 0
 
 
-cdef inline bint gather(const flow_t* f, int32_t island, const double* lam, double* x) noexcept nogil:
-    """x = Y^T lam on the island's columns, or A lam; whether any lam is other than 0."""
+cdef inline bint apply_transpose(const flow_t* f, int32_t island, const double* lam, double* x) noexcept nogil:
+    """Compute x = Y^T lam on the island's columns, or A lam over rows; return whether any lam is not 0."""
     cdef int32_t a, b, k
     cdef bint moves = False
-    if f.formed:
-        return times_a(f, lam, x)
+    if f.is_over_rows:
+        return multiply_a(f, lam, x)
     for a in range(f.cptr[island], f.cptr[island + 1]):
         x[f.icols[a]] = 0.0
     for a in range(f.iptr[island], f.iptr[island + 1]):
@@ -296,8 +298,8 @@ cdef inline bint gather(const flow_t* f, int32_t island, const double* lam, doub
     return moves
 
 
-cdef inline void spread(const flow_t* f, int32_t island, const double* x, double* out) noexcept nogil:
-    """out = Y x on the island's rows."""
+cdef inline void apply_y(const flow_t* f, int32_t island, const double* x, double* out) noexcept nogil:
+    """Compute out = Y x on the island's rows."""
     cdef int32_t a, b, end
     for a in range(f.iptr[island], f.iptr[island + 1]):
         end = f.run[2 * a + 1]
@@ -305,42 +307,45 @@ cdef inline void spread(const flow_t* f, int32_t island, const double* x, double
             panel_times(f.g, b, x, out)
 
 
-cdef inline void keep(const flow_t* f, int32_t island, const double* x, double* to) noexcept nogil:
-    """to = x on the island's rows."""
+cdef inline void copy_rows(const flow_t* f, int32_t island, const double* x, double* to) noexcept nogil:
+    """Copy x to `to` on the island's rows."""
     cdef int32_t a, k
     for a in range(f.iptr[island], f.iptr[island + 1]):
         k = row_from(f, a)
         memcpy(to + k, x + k, (row_end(f, a) - k) * sizeof(double))
 
 
-cdef inline void blank(const flow_t* f, int32_t island, double* out) noexcept nogil:
-    """out = 0 on the island's rows."""
+cdef inline void clear_rows(const flow_t* f, int32_t island, double* out) noexcept nogil:
+    """Set out = 0 on the island's rows."""
     cdef int32_t a, k
     for a in range(f.iptr[island], f.iptr[island + 1]):
         for k in range(row_from(f, a), row_end(f, a)):
             out[k] = 0.0
 
 
-cdef inline void renew(const flow_t* f, int32_t island) noexcept nogil:
-    """s = Y y - b + phi."""
+cdef inline void recompute_slack(const flow_t* f, int32_t island) noexcept nogil:
+    """Compute s = Y y - b + phi."""
     cdef int32_t a, k
     cdef double* s = f.s
     cdef const double* phi = f.phi
     cdef const double* b = f.p.b
-    if f.still:
-        blank(f, island, s)
-    elif f.formed:
-        times_a(f, f.y, s)
+    if f.is_zero:
+        clear_rows(f, island, s)
+    elif f.is_over_rows:
+        multiply_a(f, f.y, s)
     else:
-        spread(f, island, f.y, s)
+        apply_y(f, island, f.y, s)
     for a in range(f.iptr[island], f.iptr[island + 1]):
         for k in range(row_from(f, a), row_end(f, a)):
             s[k] += phi[k] - b[k]
 
 
-cdef inline double measure(const flow_t* f, int32_t island, const double* lam, bint moves,
+cdef inline double measure_error(const flow_t* f, int32_t island, const double* lam, bint moves,
                            double* velocity) noexcept nogil:
-    """Energy [sqrt J] and velocity [m/s] of the errors of lam, with u of `gather`, 0 unless it `moves`; NaN: not finite."""
+    """Compute the energy [sqrt J] and velocity [m/s] of the errors of lam; NaN if they are not finite.
+
+    `u` must hold `apply_transpose` of lam; it is taken as 0 unless `moves`.
+    """
     cdef int32_t a, i, k, end, last
     cdef const int32_t* ptr = f.p.ptr
     cdef const double* lower = f.p.lower
@@ -352,15 +357,15 @@ cdef inline double measure(const flow_t* f, int32_t island, const double* lam, b
     cdef double* w = f.w
     cdef tally_t t = empty_tally()
     if not moves:
-        blank(f, island, w)
-    elif f.formed:
-        keep(f, island, f.u, w)
+        clear_rows(f, island, w)
+    elif f.is_over_rows:
+        copy_rows(f, island, f.u, w)
     else:
-        spread(f, island, f.u, w)
+        apply_y(f, island, f.u, w)
     for a in range(f.iptr[island], f.iptr[island + 1]):
         for k in range(row_from(f, a), row_end(f, a)):
             w[k] += compliance[k] * lam[k] - b[k] + phi[k]
-        if f.plain:
+        if f.bounded_rows_only:
             for k in range(row_from(f, a), row_end(f, a)):
                 tally_row(&f.p, k, row_error(lam[k], w[k], d[k], lower[k], upper[k]), &t)
             continue

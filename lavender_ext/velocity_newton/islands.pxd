@@ -1,6 +1,7 @@
-"""Where Newton's method over generalised velocities stands: islands of trees, and its arrays in workspace that the caller has.
+"""Islands of Newton's method over generalised velocities, and the binding of its arrays to the caller's workspace.
 
-Panels that share a column, directly or through others, are an island: its velocities move no row of another.
+Panels that share a column, directly or through other panels, form an island. The velocities of one island do not move
+the rows of another.
 """
 from libc.stdint cimport int32_t
 
@@ -12,8 +13,25 @@ from lavender_ext.velocity_newton.flow cimport flow_t, row_end, row_from
 from lavender_ext.velocity_newton.sparse cimport factor_work, find_pattern, pattern_marks
 
 
+cdef enum:
+    ASSEMBLY_WEIGHT = 5         # One multiply-add of forming N counts as this many of its factorisation.
+
+
+cdef struct requirements_t:     # sizes of the workspace, and the work of a factorisation
+    int32_t island_columns      # of the largest island
+    int32_t panel_columns       # of the widest panel
+    int32_t panel_values        # rows x columns of the largest panel
+    int32_t panel_rows          # of the panel with the largest number of rows
+    int32_t rows                # of the largest island over rows, plus 3 for padding
+    int32_t exceeds_pattern     # L has more entries than the given workspace; repeat with more
+    double values               # of the largest N of an island; its factor has as many
+    double row_matrix_values    # of A and Y^T of the largest island over rows
+    double work                 # multiply-adds of forming N and of its factorisations, all islands
+    double unused_entries       # upper bound of the entries of L of islands over rows, which are not factored
+
+
 cdef inline void join_trees(const generalized_t* g, int32_t* up) noexcept nogil:
-    """up (n): the root of each column's tree, and roots of trees that a panel joins."""
+    """Write the union-find parents up (n): columns of one tree, and trees that a panel couples, share a root."""
     cdef int32_t b, q, r, k, i, end, n = g.n, trees = 0
     cdef const int32_t* parent = g.parent
     cdef const int32_t* cols = g.cols
@@ -23,13 +41,13 @@ cdef inline void join_trees(const generalized_t* g, int32_t* up) noexcept nogil:
             trees += 1
             up[i] = i
         else:
-            up[i] = up[k]                               # which stands before it
+            up[i] = up[k]                               # A parent precedes its children.
     for b in range(g.n_panels):
         end = g.pcol[b + 1]
         if end > g.pcol[b] and trees > 1:
             r = root_of(up, cols[g.pcol[b]])
             for q in range(g.pcol[b] + 1, end):
-                if parent[cols[q]] >= 0:                # its root is in the panel as well
+                if parent[cols[q]] >= 0:                # The root of its tree is in the panel, too.
                     continue
                 k = root_of(up, cols[q])
                 if r < k:
@@ -39,43 +57,49 @@ cdef inline void join_trees(const generalized_t* g, int32_t* up) noexcept nogil:
                     r = k
 
 
-cdef inline int32_t find_islands(const blocks_t* p, const generalized_t* g, int32_t* up, int32_t* label, int32_t* iptr,
-                                 int32_t* run, int32_t* cptr, int32_t* icols, int32_t* local, int32_t* pblock,
-                                 int32_t* vptr, int32_t* most) noexcept nogil:
-    """Islands: panels that share no column, directly or through others, in the order of their first panel.
-
-    up (n) and label (max(n, n_panels)) are scratch; what is found stands in arrays as `flow_t` has them (iptr and cptr
-    with workspace for n_panels + 1). most (4): columns of the largest island, of the widest panel, rows x columns of the
-    largest panel, and its rows. A panel without columns is an island of its own.
-    """
-    cdef int32_t b, q, r, i, n = 0, size, nc, rows, end, panels = g.n_panels, at
-    cdef const int32_t* cols = g.cols
-    cdef const int32_t* ptr = p.ptr
-    join_trees(g, up)
-    i = 0
-    most[0] = most[1] = most[2] = most[3] = 0
-    for b in range(panels):
+cdef inline void measure_panels(flow_t* f, requirements_t* need) noexcept nogil:
+    """Write the first block of each panel, the offsets of V, and the sizes of the largest panels."""
+    cdef int32_t b, i = 0, size, nc, rows, at = 0
+    cdef const int32_t* ptr = f.p.ptr
+    cdef int32_t* pblock = <int32_t*>f.pblock
+    cdef int32_t* vptr = <int32_t*>f.vptr
+    cdef const generalized_t* g = f.g
+    need.panel_columns = need.panel_values = need.panel_rows = 0
+    for b in range(g.n_panels):
         while ptr[i] < g.prow[b]:
             i += 1
         pblock[b] = i
         nc = g.pcol[b + 1] - g.pcol[b]
         rows = g.prow[b + 1] - g.prow[b]
-        if nc > most[1]:
-            most[1] = nc
-        if rows * nc > most[2]:
-            most[2] = rows * nc
-        if rows > most[3]:
-            most[3] = rows
-    pblock[panels] = p.n_blocks
-    at = 0
-    for i in range(p.n_blocks):
+        need.panel_columns = max(need.panel_columns, nc)
+        need.panel_values = max(need.panel_values, rows * nc)
+        need.panel_rows = max(need.panel_rows, rows)
+    pblock[g.n_panels] = f.p.n_blocks
+    for i in range(f.p.n_blocks):
         vptr[i] = at
         size = ptr[i + 1] - ptr[i]
-        at += size if is_rows(p, i) else size * size
-    vptr[p.n_blocks] = at
+        at += size if is_rows(&f.p, i) else size * size
+    vptr[f.p.n_blocks] = at
+
+
+cdef inline void find_islands(flow_t* f, int32_t* up, int32_t* label, requirements_t* need) noexcept nogil:
+    """Number the islands in the order of their first panel, and list their panels and columns.
+
+    up (n) and label (max(n, n_panels)) are scratch. iptr and cptr have places for n_panels + 1. A panel without columns
+    is an island of its own.
+    """
+    cdef int32_t b, q, r, i, n = 0, panels = f.g.n_panels
+    cdef const generalized_t* g = f.g
+    cdef const int32_t* cols = g.cols
+    cdef int32_t* iptr = <int32_t*>f.iptr
+    cdef int32_t* run = <int32_t*>f.run
+    cdef int32_t* cptr = <int32_t*>f.cptr
+    cdef int32_t* icols = <int32_t*>f.icols
+    cdef int32_t* local = <int32_t*>f.local
+    join_trees(g, up)
+    # Label each panel with the number of its island; `local` holds the numbers of the roots.
     for i in range(g.n):
         local[i] = -1
-    # `local` numbers the islands by their root, until it numbers columns
     for b in range(panels):
         if g.pcol[b + 1] == g.pcol[b]:
             label[b] = n
@@ -86,9 +110,11 @@ cdef inline int32_t find_islands(const blocks_t* p, const generalized_t* g, int3
             local[r] = n
             n += 1
         label[b] = local[r]
+    f.n_islands = n
+    # List the runs of consecutive panels of each island.
     for i in range(n + 1):
         iptr[i] = 0
-    for b in range(panels):                             # a run begins where the panel before is of another island
+    for b in range(panels):
         if b == 0 or label[b] != label[b - 1]:
             iptr[label[b] + 1] += 1
     for i in range(n):
@@ -102,43 +128,28 @@ cdef inline int32_t find_islands(const blocks_t* p, const generalized_t* g, int3
     for i in range(n, 0, -1):
         iptr[i] = iptr[i - 1]
     iptr[0] = 0
-    # columns of each island, ascending: those of its panels
+    # List the columns of each island in ascending order, and number them within it.
     for i in range(g.n):
         local[i] = -1
     for b in range(panels):
-        end = g.pcol[b + 1]
-        for q in range(g.pcol[b], end):
+        for q in range(g.pcol[b], g.pcol[b + 1]):
             local[cols[q]] = label[b]
     sort_by_level(g.n, local, n, cptr, icols)
+    need.island_columns = 0
     for b in range(n):
-        if cptr[b + 1] - cptr[b] > most[0]:
-            most[0] = cptr[b + 1] - cptr[b]
+        need.island_columns = max(need.island_columns, cptr[b + 1] - cptr[b])
         for i in range(cptr[b], cptr[b + 1]):
             local[icols[i]] = i - cptr[b]
-    return n
 
 
-cdef enum:
-    ADDED = 5                   # multiply-adds of a factor that one counts for where N is put together
+cdef inline bint choose_row_form(const flow_t* f, int32_t island, requirements_t* need) noexcept nogil:
+    """Return whether steps over the rows of A take less work than with N, and add the work and sizes of that choice.
 
-
-cdef struct need_t:             # what the islands of a problem ask for
-    int32_t most[4]             # as `find_islands` tells
-    int32_t rows                # of the island that has most of those that are few, and three more
-    int32_t crowded             # L has more than `per` entries in a row: settle again, with more
-    double values               # of N, of the island that has most; its factor has as many
-    double formed               # of A and Y^T, of the island that has most
-    double work                 # multiply-adds of N and of its factors, of all islands
-    double idle                 # entries of L of those that are few, which nobody factors, at most
-
-
-cdef inline bint count_few(const flow_t* f, int32_t island, need_t* need) noexcept nogil:
-    """Has A less work than N? Then what it asks for is counted, else the work of N without its factor.
-
-    By multiply-adds of one step of three, half of the rows pushing; constants fitted to dense rows and to trees.
+    The counts are the multiply-adds of one step of three with half of the rows free, without the factor of N. The
+    constants were fitted to dense rows and to trees.
     """
     cdef int32_t a, b
-    cdef bint few
+    cdef bint applies
     cdef double rows = 0.0, values = 0.0, normal = 0.0, added = 0.0, formed, size = f.cptr[island + 1] - f.cptr[island], v, nc
     for a in range(f.iptr[island], f.iptr[island + 1]):
         rows += row_end(f, a) - row_from(f, a)
@@ -146,44 +157,41 @@ cdef inline bint count_few(const flow_t* f, int32_t island, need_t* need) noexce
             v = f.g.pval[b + 1] - f.g.pval[b]
             nc = f.g.pcol[b + 1] - f.g.pcol[b]
             values += v
-            added += ADDED * 0.5 * v * nc
+            added += ASSEMBLY_WEIGHT * 0.5 * v * nc
             normal += nc * (28.0 + 2.0 * nc + 0.5 * v)
-    formed = rows * (values / 6.0 + (rows + rows * rows / 24.0 if f.plain else 3.0 * rows + rows * rows / 6.0))
-    few = f.plain or (f.law != COULOMB and rows <= size)    # `swap` has workspace for these
-    if not few or formed > normal or rows * (rows + size) > 1e9:
+    formed = rows * (values / 6.0 + (rows + rows * rows / 24.0 if f.bounded_rows_only else 3.0 * rows + rows * rows / 6.0))
+    applies = f.bounded_rows_only or (f.law != COULOMB and rows <= size)    # `pivots` has `size` places.
+    if not applies or formed > normal or rows * (rows + size) > 1e9:
         need.work += added
         return False
     need.work += formed
-    need.idle += 0.5 * size * size
+    need.unused_entries += 0.5 * size * size
     rows += 3.0
-    if rows * rows > need.values:
-        need.values = rows * rows
-    if rows * (rows + size) > need.formed:
-        need.formed = rows * (rows + size)
-    if rows > need.rows:
-        need.rows = <int32_t>rows
+    need.values = max(need.values, rows * rows)
+    need.row_matrix_values = max(need.row_matrix_values, rows * (rows + size))
+    need.rows = max(need.rows, <int32_t>rows)
     return True
 
 
-cdef inline ssize_t marks_of(const blocks_t* p, const generalized_t* g, int32_t per) noexcept nogil:
-    """int32 that `settle` needs, with workspace for `per` entries in a row of L."""
+cdef inline ssize_t index_size(const blocks_t* p, const generalized_t* g, int32_t per) noexcept nogil:
+    """Return the number of int32 that `find_structure` uses with `per` entries in each row of L."""
     cdef ssize_t n = g.n, panels = g.n_panels
     return (3 * n + (n if n > panels else panels) + 6 * panels + 5 * <ssize_t>p.n_rows + g.pcol[panels] + p.n_blocks + 8
             + pattern_marks(n, g.pcol[panels], per))
 
 
-cdef inline void settle(flow_t* f, const blocks_t* p, const generalized_t* g, int32_t per, int32_t* w,
-                        need_t* need) noexcept nogil:
-    """Islands of a problem, in w (`marks_of`), and where L of each has entries."""
+cdef inline void find_structure(flow_t* f, const blocks_t* p, const generalized_t* g, int32_t per, int32_t* w,
+                        requirements_t* need) noexcept nogil:
+    """Find the islands of a problem and the pattern of L of each; w (`index_size`) is their memory."""
     cdef ssize_t n = g.n, panels = g.n_panels, at = n + (n if n > panels else panels)
     cdef int32_t i, size
-    cdef int32_t* few
+    cdef int32_t* over_rows
     cdef double values
     cdef const int32_t* lptr
     f.p = p[0]
-    f.law = p.law if has_friction(p) else CONE          # where nothing rubs, the convex problem is the whole
+    f.law = p.law if has_friction(p) else CONE          # Without friction the convex problem is the problem.
     f.p.law = f.law
-    f.share = 1e-4 if not has_friction(p) else (3e-2 if f.law == COULOMB else 3e-3)
+    f.softness = 1e-4 if not has_friction(p) else (3e-2 if f.law == COULOMB else 3e-3)
     f.g = g
     f.iptr = w + at
     f.cptr = w + at + panels + 1
@@ -194,60 +202,60 @@ cdef inline void settle(flow_t* f, const blocks_t* p, const generalized_t* g, in
     f.local = w + at + n
     f.vptr = w + at + 2 * n
     at += 2 * n + p.n_blocks + 1
-    f.listed = w + at
-    f.places, f.columns = f.listed + p.n_rows, f.listed + 2 * <ssize_t>p.n_rows
-    f.picks, f.home = f.columns + p.n_rows, f.columns + 2 * <ssize_t>p.n_rows
-    f.reached = f.home + p.n_rows
+    f.row_list = w + at
+    f.places, f.columns = f.row_list + p.n_rows, f.row_list + 2 * <ssize_t>p.n_rows
+    f.picked_columns, f.panel_of_column = f.columns + p.n_rows, f.columns + 2 * <ssize_t>p.n_rows
+    f.transpose_offset = f.panel_of_column + p.n_rows
     at += 5 * <ssize_t>p.n_rows + g.pcol[panels]
-    few = w + at
-    f.few = few
+    over_rows = w + at
+    f.over_rows = over_rows
     at += panels
-    f.n_islands = find_islands(p, g, w, w + n, <int32_t*>f.iptr, <int32_t*>f.run, <int32_t*>f.cptr,
-                               <int32_t*>f.icols, <int32_t*>f.local, <int32_t*>f.pblock, <int32_t*>f.vptr, need.most)
-    f.swap = w                                          # scratch of before
-    f.wait.island = -1
-    f.plain = True
+    measure_panels(f, need)
+    find_islands(f, w, w + n, need)
+    f.pivots = w                                        # The scratch of `find_islands` is free again.
+    f.paused.island = -1
+    f.bounded_rows_only = True
     for i in range(p.n_blocks):
         if not is_rows(p, i):
-            f.plain = False
+            f.bounded_rows_only = False
             break
     f.sparse = False
-    need.values = need.work = need.formed = need.idle = 0.0
-    need.crowded = need.rows = 0
+    need.values = need.work = need.row_matrix_values = need.unused_entries = 0.0
+    need.exceeds_pattern = need.rows = 0
     for i in range(f.n_islands):
-        few[i] = count_few(f, i, need)
-        f.sparse = f.sparse or not few[i]
+        over_rows[i] = choose_row_form(f, i, need)
+        f.sparse = f.sparse or not over_rows[i]
     if not f.sparse:
         return
-    need.crowded = find_pattern(g, f.n_islands, f.iptr, f.run, f.cptr, f.local, per, w + at) < 0
+    need.exceeds_pattern = find_pattern(g, f.n_islands, f.iptr, f.run, f.cptr, f.local, per, w + at) < 0
     f.lptr = w + at
     f.lidx = w + at + f.cptr[f.n_islands] + 1
-    for i in range(0 if need.crowded else f.n_islands):
-        if few[i]:
+    for i in range(0 if need.exceeds_pattern else f.n_islands):
+        if over_rows[i]:
             continue
         size = f.cptr[i + 1] - f.cptr[i]
         lptr = f.lptr + f.cptr[i]
         values = lptr[size] - lptr[0] + size
-        if f.law == COULOMB:                            # whole, since its own N lacks symmetry
+        if f.law == COULOMB:                            # Its N is not symmetric and is a full matrix.
             values = <double>size * size
             need.work += values * size / 3.0
         elif size > 0:
             need.work += factor_work(size, lptr, f.lidx)
-        if values > need.values:
-            need.values = values
+        need.values = max(need.values, values)
 
 
-cdef inline ssize_t numbers_of(const flow_t* f, const need_t* need) noexcept nogil:
-    """float64 that `furnish` needs."""
-    cdef ssize_t size = max(need.most[0], need.rows), values = <ssize_t>need.values
+cdef inline ssize_t real_size(const flow_t* f, const requirements_t* need) noexcept nogil:
+    """Return the number of doubles that `bind_real_workspace` assigns."""
+    cdef ssize_t size = max(need.island_columns, need.rows), values = <ssize_t>need.values
     return (4 * max(<ssize_t>f.g.n, <ssize_t>f.p.n_rows) + 15 * <ssize_t>f.p.n_rows + 2 * <ssize_t>f.vptr[f.p.n_blocks]
-            + 2 * values + 2 * size + need.most[2] + need.most[1] + need.most[3] + 1 + <ssize_t>need.formed + 2 * need.rows)
+            + 2 * values + 2 * size + need.panel_values + need.panel_columns + need.panel_rows + 1
+            + <ssize_t>need.row_matrix_values + 2 * need.rows)
 
 
-cdef inline void bind_real_workspace(flow_t* f, const need_t* need, double* x) noexcept nogil:
-    """Arrays of the iterate, of V and of N in x (`numbers_of`)."""
+cdef inline void bind_real_workspace(flow_t* f, const requirements_t* need, double* x) noexcept nogil:
+    """Assign the arrays of the iterate, of V and of N in x (`real_size`)."""
     cdef ssize_t m = f.p.n_rows, n = max(<ssize_t>f.g.n, m), nv = f.vptr[f.p.n_blocks]
-    cdef ssize_t size = max(need.most[0], need.rows), values = <ssize_t>need.values
+    cdef ssize_t size = max(need.island_columns, need.rows), values = <ssize_t>need.values
     f.y = x
     f.u = x + n
     f.grad = x + 2 * n
@@ -262,32 +270,32 @@ cdef inline void bind_real_workspace(flow_t* f, const need_t* need, double* x) n
     f.lam = x + 6 * m
     f.trial = x + 7 * m
     f.best = x + 8 * m
-    f.first_best = x + 9 * m
+    f.island_best = x + 9 * m
     f.w = x + 10 * m
     f.e = x + 11 * m
-    f.soft = x + 12 * m
-    f.aside = x + 13 * m
-    f.root = x + 14 * m
+    f.inv_theta = x + 12 * m
+    f.paused_start = x + 13 * m
+    f.sqrt_theta = x + 14 * m
     x += 15 * m
     f.v = x
-    f.held = x + nv
+    f.factored_v = x + nv
     x += 2 * nv
     f.normal = x
     f.factor = x + values
     x += 2 * values
     f.inv = x
     f.local_rhs = x + size
-    f.turned = x + 2 * size
-    f.line = x + 2 * size + need.most[2]
-    x += 2 * size + need.most[2] + need.most[1] + need.most[3] + 1
+    f.weighted_y = x + 2 * size
+    f.line = x + 2 * size + need.panel_values
+    x += 2 * size + need.panel_values + need.panel_columns + need.panel_rows + 1
     f.sum = x
-    f.across = x + 2 * need.rows
+    f.y_transpose = x + 2 * need.rows
     f.a = NULL
 
 
-cdef inline void aim_at(flow_t* f, double tol, int32_t steps, double reference_energy, double reference_velocity) noexcept nogil:
-    """The relative residual asked of each island, and the reference of a problem that is one; counts start at zero."""
+cdef inline void set_goal(flow_t* f, double tol, int32_t steps, double reference_energy, double reference_velocity) noexcept nogil:
+    """Set the required relative residual and the reference of a problem with one island; reset the counts."""
     f.tol, f.reference_energy, f.reference_velocity = tol, reference_energy, reference_velocity
     f.steps = steps
-    f.wait.island = -1
+    f.paused.island = -1
     f.factorisations = f.rounds = f.evaluations = 0

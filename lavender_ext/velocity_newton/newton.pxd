@@ -1,25 +1,34 @@
-"""Newton's method over the velocities of generalised coordinates, island by island, of which few rows form A (`normal.pxd`).
+"""Newton's method over the velocities of generalised coordinates, island by island (linear systems: `normal.pxd`).
 
-With y = D^1/2 L (v - v*), whitened, s = Y y - b, and the answer lambda(s) of softened blocks (`flow.pxd`):
+With the whitened unknown y = D^1/2 L (v - v*), s = Y y - b, and the impulses lambda(s) of softened blocks (`flow.pxd`):
 
     G(y) = y - Y^T lambda(s),    N = I + Y^T V Y,    N p = -G,    y <- y + t p                            (1)
     theta' = theta + rho,        z = (rho c - s) / theta'                                                 (2)
     s_n <- s_n + phi                                                                                      (3)
 
-Without Coulomb friction G is the gradient of a convex function with kinks in its second derivative, N is symmetric,
-and t is where the derivative along p vanishes (Todorov 2014; Castro et al. 2022): it ends in a few steps. rho (2)
-is nothing where the problem's own theta is no less than 1e-6 d, 1e-3 d on contacts, where kinks are sharp; below, and
-between tangents that differ, it is a proximal term about the centre c, which follows lambda (Rockafellar 1976), and the
-limit is the problem given. It begins the larger the further steps lead astray: 1e-4 d where nothing rubs, 3e-3 d
-under the cone law, 3e-2 d under Coulomb's.
+Convex laws. G is the gradient of a convex function with kinks in its second derivative, N is symmetric, and t is the
+zero of the derivative along p (Todorov 2014; Castro et al. 2022), which takes a few evaluations.
 
-Coulomb's law has no such function. Newton's method goes on from the convex relaxation's answer with the derivative
-that lacks symmetry, as long as |G| falls; where it does not, normals are lowered by phi = sum of a_g |w_g| over parts (3)
-and the convex problem is solved again (De Saxce, Feng 1998; Cadoux 2009).
+Proximal term. rho in (2) is 0 if the problem's own theta is at least 1e-6 d, or 1e-3 d on contacts, where kinks are
+sharper. Below that, and between tangents with different theta, rho is a proximal term about the centre c. The centre
+follows lambda (Rockafellar 1976), and the limit solves the given problem. rho starts at 1e-4 d without friction, at
+3e-3 d under the cone law and at 3e-2 d under Coulomb's law: the less reliable the steps, the larger it is.
 
-The test of the end is the judge's, on lambda itself: w = Y (Y^T lambda) - b + theta lambda, error e of every block.
-N and its factor serve the next step where no block has changed its V, and the first after the centre has moved: lambda
-leaps there, along the law that it has settled on, and so does V.
+Coulomb's law has no such function. A round has two stages:
+
+    stage           steps                                                 event                    next
+    CONVEX_STAGE    descent under the cone law                            solved or stuck          COULOMB_STAGE
+    COULOMB_STAGE   Newton's method with the derivative of Coulomb's      |G| no longer falls      CONVEX_STAGE of a new round
+                    law, which is not symmetric
+    any                                                                   error within tol         REACHED
+    any                                                                   numbers are not finite   LOST, BROKEN
+
+After the second stage the normals are lowered by phi = sum of a_g |w_g| over the friction components (3) for the next
+convex problem (De Saxce, Feng 1998; Cadoux 2009). A run that was given a start begins with the second stage.
+
+The stopping test uses the judge's error of lambda itself: w = Y (Y^T lambda) - b + theta lambda, error e of every
+block. N and its factor are reused if no block has changed its V, and in the first step after the centre has moved:
+lambda changes there along the law that it has settled on, and so does V.
 """
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
@@ -30,31 +39,29 @@ from lavender_ext.core.method cimport BROKEN, LOST, MORE, REACHED, STUCK
 from lavender_ext.core.block_types cimport CONE, COULOMB, blocks_t, is_rows, get_friction_components, friction_components_t
 from lavender_ext.core.start cimport is_zero_impulse, zero_impulse
 from lavender_ext.core.view cimport generalized_t
-from lavender_ext.velocity_newton.flow cimport (NOWHERE, blank, block_end, block_from, descent_t, flow_t, gather, keep,
-                                            measure, renew, respond_all, row_end, row_from, wait_t)
-from lavender_ext.velocity_newton.normal cimport factor, form, is_held, newton_step
-from lavender_ext.velocity_newton.soft cimport least_softness
+from lavender_ext.velocity_newton.flow cimport (UNFORMED, apply_transpose, block_end, block_from, clear_rows,
+                                                compute_island_impulses, copy_rows, descent_t, flow_t, measure_error,
+                                                paused_t, recompute_slack, row_end, row_from)
+from lavender_ext.velocity_newton.normal cimport factor_normal_matrix, form_normal_matrix, is_v_unchanged, solve_step
+from lavender_ext.velocity_newton.soft cimport min_softness
 
 
-cdef enum:                      # a round of Coulomb friction
-    BEGINS = 0
-    RELAXED = 1                 # descends under the cone law
-    OWN = 2                     # under its own
+cdef enum:                      # stages of a round of Coulomb friction
+    NEXT_ROUND = 0
+    CONVEX_STAGE = 1
+    COULOMB_STAGE = 2
 
 cdef enum:
-    IDLE_STEPS = 30             # steps without a better iterate after which an island is stuck
-    LINE_STEPS = 24             # evaluations of one line search
-    RENEW = 16                  # steps after which s is formed anew
-    UNSEEN = 8                  # steps after which errors are looked at however large |G| is,
-    FAR = 100                   # and before that where it is at most so many times their limit
-    ROUNDS = 12                 # of Coulomb friction: what these leave is not for this method
+    MAX_IDLE_STEPS = 30         # An island is stuck if this many steps in a row do not lower the error by a tenth.
+    MAX_LINE_EVALUATIONS = 24   # Evaluations of one line search.
+    MAX_COULOMB_ROUNDS = 12     # Problems that more rounds would solve are solved faster by other phases.
 
 
-# -- along a line ----------------------------------------------------------------------------------------------
+# -- line searches ----------------------------------------------------------------------------------------------
 
 
-cdef inline void along(const flow_t* f, int32_t island, double t) noexcept nogil:
-    """w = s + t q, with lambda there in `trial`, and V."""
+cdef inline void evaluate_along(const flow_t* f, int32_t island, double t) noexcept nogil:
+    """Evaluate w = s + t q, lambda (in `trial`) and V at y + t p."""
     cdef int32_t a, k
     cdef double* w = f.w
     cdef const double* s = f.s
@@ -62,11 +69,11 @@ cdef inline void along(const flow_t* f, int32_t island, double t) noexcept nogil
     for a in range(f.iptr[island], f.iptr[island + 1]):
         for k in range(row_from(f, a), row_end(f, a)):
             w[k] = s[k] + t * q[k]
-    respond_all(f, island, w, f.trial)
+    compute_island_impulses(f, island, w, f.trial)
 
 
-cdef inline void arrive(flow_t* f) noexcept nogil:
-    """What `along` found at its last t is where the iterate is."""
+cdef inline void accept_trial(flow_t* f) noexcept nogil:
+    """Make the point that `evaluate_along` evaluated last the iterate."""
     cdef double* x = f.s
     f.s = f.w
     f.w = x
@@ -75,29 +82,29 @@ cdef inline void arrive(flow_t* f) noexcept nogil:
     f.trial = x
 
 
-cdef inline double slope(flow_t* f, int32_t island, double py, double pp, double t) noexcept nogil:
-    """Derivative along p of the convex function, at y + t p; lambda there in `trial`."""
+cdef inline double directional_derivative(flow_t* f, int32_t island, double py, double pp, double t) noexcept nogil:
+    """Return the derivative of the convex function along p at y + t p; lambda there is in `trial`."""
     cdef int32_t a, k
     cdef double out = py + t * pp
     f.evaluations += 1
-    along(f, island, t)
+    evaluate_along(f, island, t)
     for a in range(f.iptr[island], f.iptr[island + 1]):
         k = row_from(f, a)
         out -= dot(f.q + k, f.trial + k, row_end(f, a) - k)
     return out
 
 
-cdef inline double search(flow_t* f, int32_t island) noexcept nogil:
-    """t where the derivative along p is at most a tenth of what it was; 0 where p is no descent."""
+cdef inline double search_line(flow_t* f, int32_t island) noexcept nogil:
+    """Find t with a derivative along p of at most a tenth of its start; return 0 if p is not a descent direction."""
     cdef int32_t a, c, n
     cdef double py = 0.0, pp = 0.0, pg = 0.0, low = 0.0, high, at_low, at_high, t, x, enough
     cdef int32_t side = 0
-    cdef const int32_t* own = f.own
+    cdef const int32_t* own = f.unknowns
     cdef const double* y = f.y
     cdef const double* grad = f.grad
     cdef const double* step = f.step
-    cdef const double* p = f.q if f.formed else f.step
-    for a in range(f.n_own):
+    cdef const double* p = f.q if f.is_over_rows else f.step
+    for a in range(f.n_unknowns):
         c = own[a]
         py += p[c] * y[c]
         pp += p[c] * step[c]
@@ -107,22 +114,22 @@ cdef inline double search(flow_t* f, int32_t island) noexcept nogil:
     enough = -0.1 * pg
     at_low = pg
     high = 1.0
-    at_high = slope(f, island, py, pp, high)
+    at_high = directional_derivative(f, island, py, pp, high)
     n = 1
-    while at_high < -enough and n < LINE_STEPS // 2:        # the minimum is beyond
+    while at_high < -enough and n < MAX_LINE_EVALUATIONS // 2:      # The minimum is at a larger t.
         low = high
         at_low = at_high
         high = 2.0 * high
-        at_high = slope(f, island, py, pp, high)
+        at_high = directional_derivative(f, island, py, pp, high)
         n += 1
     if fabs(at_high) <= enough or at_high < 0.0 or at_high != at_high:
         return high if at_high == at_high else 0.0
     t = high
-    while n < LINE_STEPS:                                   # regula falsi with halved ends (Dowell, Jarratt 1971)
+    while n < MAX_LINE_EVALUATIONS:                                 # Regula falsi with halved ends (Dowell, Jarratt 1971).
         t = low - at_low * (high - low) / (at_high - at_low)
         if not low < t < high:
             t = 0.5 * (low + high)
-        x = slope(f, island, py, pp, t)
+        x = directional_derivative(f, island, py, pp, t)
         n += 1
         if fabs(x) <= enough:
             return t
@@ -141,14 +148,14 @@ cdef inline double search(flow_t* f, int32_t island) noexcept nogil:
     return t
 
 
-cdef inline double backtrack(flow_t* f, int32_t island, double bound) noexcept nogil:
-    """t where |G| falls below the bound (Coulomb); 0 where no step tried does it."""
+cdef inline double search_residual(flow_t* f, int32_t island, double bound) noexcept nogil:
+    """Halve t until |G| is below `bound` (Coulomb's law); return 0 if that fails."""
     cdef int32_t a, c, _n
     cdef double t = 1.0, size
     for _n in range(8):
         f.evaluations += 1
-        along(f, island, t)
-        gather(f, island, f.trial, f.u)
+        evaluate_along(f, island, t)
+        apply_transpose(f, island, f.trial, f.u)
         size = 0.0
         for a in range(f.cptr[island], f.cptr[island + 1]):
             c = f.icols[a]
@@ -162,13 +169,13 @@ cdef inline double backtrack(flow_t* f, int32_t island, double bound) noexcept n
 # -- one island --------------------------------------------------------------------------------------------------
 
 
-cdef inline void follow(const flow_t* f, int32_t island) noexcept nogil:
-    """The centre of the proximal terms moves to lambda."""
-    keep(f, island, f.lam, f.center)
+cdef inline void move_center(const flow_t* f, int32_t island) noexcept nogil:
+    """Move the centre of the proximal terms to lambda."""
+    copy_rows(f, island, f.lam, f.center)
 
 
-cdef inline void one_theta(double* theta, int32_t first, int32_t end) noexcept nogil:
-    # the largest of rows [first, end) on all of them
+cdef inline void equalize_theta(double* theta, int32_t first, int32_t end) noexcept nogil:
+    """Set theta of rows [first, end) to the largest of these."""
     cdef double big = 0.0
     cdef int32_t k
     for k in range(first, end):
@@ -178,10 +185,10 @@ cdef inline void one_theta(double* theta, int32_t first, int32_t end) noexcept n
         theta[k] = big
 
 
-cdef inline void soften(const flow_t* f, int32_t island, double share) noexcept nogil:
-    """theta' of (2): rho is `share` d on rows with less than `least_softness` of their own.
+cdef inline void set_proximal_terms(const flow_t* f, int32_t island, double softness) noexcept nogil:
+    """Compute theta' of (2) with rho = softness d on rows whose own compliance is below `min_softness` d.
 
-    Rows of one part get the largest.
+    Rows of one friction component softness the largest theta'.
     """
     cdef int32_t a, i, j, k, g, end, last
     cdef friction_components_t q
@@ -189,34 +196,34 @@ cdef inline void soften(const flow_t* f, int32_t island, double share) noexcept 
     cdef const double* d = f.p.d
     cdef double* theta = f.theta
     cdef double* rho = f.rho
-    cdef double* soft = f.soft
+    cdef double* soft = f.inv_theta
     cdef double x, low
     for a in range(f.iptr[island], f.iptr[island + 1]):
         last = block_end(f, a)
         for i in range(block_from(f, a), last):
             j = f.p.ptr[i]
             end = f.p.ptr[i + 1]
-            low = least_softness(&f.p, i)
-            if share < low:
-                low = share
+            low = min_softness(&f.p, i)
+            if softness < low:
+                low = softness
             for k in range(j, end):
                 x = compliance[k]
                 if not x >= low * d[k]:
-                    x += share * d[k]
+                    x += softness * d[k]
                 theta[k] = x
             if not is_rows(&f.p, i):
                 get_friction_components(&f.p, i, &q)
                 for g in range(q.n):
                     if q.size[g] > 1:
-                        one_theta(theta, j + q.first[g], j + q.first[g] + q.size[g])
+                        equalize_theta(theta, j + q.first[g], j + q.first[g] + q.size[g])
             for k in range(j, end):
                 rho[k] = theta[k] - compliance[k]
                 soft[k] = 1.0 / theta[k]
-                f.root[k] = sqrt(theta[k])
+                f.sqrt_theta[k] = sqrt(theta[k])
 
 
-cdef inline bint is_rigid(const flow_t* f, int32_t island) noexcept nogil:
-    """Is there any proximal term that matters?"""
+cdef inline bint has_proximal_terms(const flow_t* f, int32_t island) noexcept nogil:
+    """Return whether any proximal term exceeds rounding."""
     cdef int32_t a, k
     for a in range(f.iptr[island], f.iptr[island + 1]):
         for k in range(row_from(f, a), row_end(f, a)):
@@ -225,8 +232,8 @@ cdef inline bint is_rigid(const flow_t* f, int32_t island) noexcept nogil:
     return False
 
 
-cdef inline double pull(const flow_t* f, int32_t island) noexcept nogil:
-    """Energy error that the proximal terms leave, rho (lambda - c); that of G grows with the rows of a velocity."""
+cdef inline double proximal_error(const flow_t* f, int32_t island) noexcept nogil:
+    """Return the energy error due to the proximal terms, rho (lambda - c)."""
     cdef int32_t a, k
     cdef double x, out = 0.0
     for a in range(f.iptr[island], f.iptr[island + 1]):
@@ -236,8 +243,8 @@ cdef inline double pull(const flow_t* f, int32_t island) noexcept nogil:
     return sqrt(out)
 
 
-cdef inline double excess(const flow_t* f, double energy, double velocity) noexcept nogil:
-    """How many times over its limits an error is; at most 1 where the test is met, NaN where it is lost."""
+cdef inline double error_over_limits(const flow_t* f, double energy, double velocity) noexcept nogil:
+    """Return the error as a multiple of its limits: at most 1 within tol, NaN if not finite."""
     cdef double x = 0.0, v = 0.0
     if energy != energy or velocity != velocity:
         return energy + velocity
@@ -248,142 +255,131 @@ cdef inline double excess(const flow_t* f, double energy, double velocity) noexc
     return x if x > v else v
 
 
-cdef inline void begin_descent(flow_t* f, int32_t island, int32_t law, double least) noexcept nogil:
-    """Newton steps under a law from y, s still to be formed; `best` has that error, or none has."""
+cdef inline void begin_descent(flow_t* f, int32_t island, int32_t law, double error) noexcept nogil:
+    """Begin Newton steps under a law from y; `error` is the error of `best`, or infinity."""
     cdef descent_t* x = &f.descent
     f.p.law = law
-    x.idle = x.n = x.known = x.moved = 0
-    x.fresh = x.stale = 1
-    x.share = f.share
-    x.least = least
-    x.lowest = 1.0 / 0.0
-    x.last_center = x.sizes[0] = x.sizes[1] = x.sizes[2] = -1.0
-    soften(f, island, x.share)
-    renew(f, island)
+    x.idle_steps = x.steps = x.response_is_known = x.center_moved = 0
+    x.slack_is_fresh = x.needs_matrix = 1
+    x.softness = f.softness
+    x.best_error = error
+    x.lowest_error = 1.0 / 0.0
+    x.error_at_last_center = x.sizes[0] = x.sizes[1] = x.sizes[2] = -1.0
+    set_proximal_terms(f, island, x.softness)
+    recompute_slack(f, island)
 
 
-cdef inline double weigh(flow_t* f, int32_t island, bint moves, double* energy) noexcept nogil:
-    """How many times over its limits the error of lambda is, with u of `gather`; kept where that is the least."""
+cdef inline double score_iterate(flow_t* f, int32_t island, bint moves, double* energy) noexcept nogil:
+    """Return the error of lambda over its limits (`u` as in `measure_error`), and keep lambda in `best` if it is lower."""
     cdef descent_t* x = &f.descent
     cdef double velocity, over
-    energy[0] = measure(f, island, f.lam, moves, &velocity)
-    over = excess(f, energy[0], velocity)
-    if over < x.lowest:
-        x.idle = x.idle if over > 0.9 * x.lowest else 0
-        x.lowest = over
-    if over < x.least:
-        x.least = over
-        keep(f, island, f.lam, f.best)
+    energy[0] = measure_error(f, island, f.lam, moves, &velocity)
+    over = error_over_limits(f, energy[0], velocity)
+    if over < x.lowest_error:
+        x.idle_steps = x.idle_steps if over > 0.9 * x.lowest_error else 0
+        x.lowest_error = over
+    if over < x.best_error:
+        x.best_error = over
+        copy_rows(f, island, f.lam, f.best)
     return over
 
 
-cdef inline int32_t given_up(flow_t* f, int32_t island, bint moves, bint far, double goal, int32_t end) noexcept nogil:
-    """How it ended, at an iterate that nobody has looked at where it is far."""
-    cdef double energy
-    return REACHED if far and weigh(f, island, moves, &energy) <= goal else end
-
-
-cdef inline double gradient(flow_t* f) noexcept nogil:
-    """|G|, with G in `grad`; where A is formed h, and its size."""
+cdef inline double compute_gradient(flow_t* f) noexcept nogil:
+    """Compute G into `grad` and return |G|; over rows, h and its norm."""
     cdef int32_t a, c
     cdef double size = 0.0
-    cdef const int32_t* own = f.own
+    cdef const int32_t* own = f.unknowns
     cdef const double* y = f.y
     cdef const double* u = f.u
     cdef double* grad = f.grad
-    if f.formed:
-        for a in range(f.n_own):
+    if f.is_over_rows:
+        for a in range(f.n_unknowns):
             c = own[a]
             grad[c] = (f.s[c] + f.p.b[c]) - u[c]
             size += (y[c] - f.lam[c]) * grad[c]
     else:
-        for a in range(f.n_own):
+        for a in range(f.n_unknowns):
             c = own[a]
             grad[c] = y[c] - u[c]
             size += grad[c] * grad[c]
-    return sqrt(size) if size > 0.0 else size * 0.0     # of h, rounding may leave less than 0; NaN stays
+    return sqrt(size) if size > 0.0 else size * 0.0     # Rounding may make h's square negative; NaN stays NaN.
 
 
-cdef inline int32_t descend(flow_t* f, int32_t island, double goal) noexcept nogil:
-    """Newton steps until the error is `goal` times its limits, or nothing moves; MORE: call again to go on.
+cdef inline int32_t descend_island(flow_t* f, int32_t island, double goal) noexcept nogil:
+    """Take Newton steps until the error is `goal` times its limits or no step succeeds; MORE: call again to continue.
 
-    The iterate with the least error stands in `best`; `share` of d is the softness of rows without one, lowered where the
-    centre's progress is slow. Idle is what does not lower the least error of this descent: the first step of one often
-    leaves a larger one than it began with. First iterates that are far from G = 0 are only looked at where steps end there.
+    The iterate with the lowest error is in `best`. The softness falls if an inner problem lowers the error by less
+    than 0.7. A step is idle if it does not lower the lowest error of this descent: the first step often raises the
+    error of the start.
     """
     cdef descent_t* x = &f.descent
     cdef int32_t a, c
-    cdef bint square = f.p.law == COULOMB, rigid, moves, far
+    cdef bint square = f.p.law == COULOMB, rigid, moves
     cdef double energy = 0.0, t, size, bound, over
-    rigid = is_rigid(f, island)
+    rigid = has_proximal_terms(f, island)
     while True:
-        if not x.known:
-            respond_all(f, island, f.s, f.lam)
-        x.known = 0
-        moves = gather(f, island, f.lam, f.u)
-        size = gradient(f)
-        far = not (rigid or square) and x.n < UNSEEN and size > FAR * f.energy_limit
-        if not far or f.steps <= 0:
-            over = weigh(f, island, moves, &energy)
-            if over != over:
-                return LOST
-            if over <= goal and not far:                # far: as where nobody asked
-                return REACHED
+        if not x.response_is_known:
+            compute_island_impulses(f, island, f.s, f.lam)
+        x.response_is_known = 0
+        moves = apply_transpose(f, island, f.lam, f.u)
+        size = compute_gradient(f)
+        over = score_iterate(f, island, moves, &energy)
+        if over != over:
+            return LOST
+        if over <= goal:
+            return REACHED
         if f.steps <= 0:
-            x.known = 1                                 # N, s and lambda stay as they are
+            x.response_is_known = 1                     # N, s and lambda are reused by the next call.
             return MORE
-        x.idle += 1
-        x.n += 1
-        if x.idle > IDLE_STEPS:
+        x.idle_steps += 1
+        x.steps += 1
+        if x.idle_steps > MAX_IDLE_STEPS:
             return STUCK
-        if rigid and (size <= 0.1 * energy and size <= 0.1 * pull(f, island) or size == 0.0):
-            # The softened problem is solved as well as it needs to be: its centre moves.
-            follow(f, island)
-            x.moved = 1
-            if x.last_center >= 0.0 and energy > 0.3 * x.last_center and x.share > 1e-9:
-                x.share = 0.1 * x.share
-                soften(f, island, x.share)
-                x.stale = 1
-            x.last_center = energy
+        if rigid and (size <= 0.1 * energy and size <= 0.1 * proximal_error(f, island) or size == 0.0):
+            # The softened problem is solved well enough: move its centre.
+            move_center(f, island)
+            x.center_moved = 1
+            if x.error_at_last_center >= 0.0 and energy > 0.3 * x.error_at_last_center and x.softness > 1e-9:
+                x.softness = 0.1 * x.softness
+                set_proximal_terms(f, island, x.softness)
+                x.needs_matrix = 1
+            x.error_at_last_center = energy
             f.steps -= 1
             x.sizes[0] = x.sizes[1] = x.sizes[2] = -1.0
             continue
         f.steps -= 1
-        if x.stale or not (x.moved or is_held(f, island)):
-            form(f, island, square)
-            if not factor(f, island, square):
-                return given_up(f, island, moves, far, goal, BROKEN)
-        x.stale = x.moved = 0
-        newton_step(f, island, square)
+        if x.needs_matrix or not (x.center_moved or is_v_unchanged(f, island)):
+            form_normal_matrix(f, island, square)
+            if not factor_normal_matrix(f, island, square):
+                return BROKEN
+        x.needs_matrix = x.center_moved = 0
+        solve_step(f, island, square)
         if square:
             bound = size
             for a in range(3):
                 if x.sizes[a] > bound:
                     bound = x.sizes[a]
-            x.sizes[x.n % 3] = size
-            t = backtrack(f, island, bound)
+            x.sizes[x.steps % 3] = size
+            t = search_residual(f, island, bound)
         else:
-            t = search(f, island)
+            t = search_line(f, island)
         if t == 0.0:
-            if x.fresh:
-                return given_up(f, island, moves, far, goal, STUCK)
-            x.fresh = x.stale = 1                       # s anew, once: rounding may be in the way
-            renew(f, island)
+            if x.slack_is_fresh:
+                return STUCK
+            x.slack_is_fresh = x.needs_matrix = 1       # Recompute s once: its rounding may have caused the failure.
+            recompute_slack(f, island)
             continue
-        for a in range(f.n_own):
-            c = f.own[a]
+        for a in range(f.n_unknowns):
+            c = f.unknowns[a]
             f.y[c] += t * f.step[c]
-        f.still = False
-        x.fresh = x.n % RENEW == 0
-        if x.fresh:
-            renew(f, island)
-        else:
-            arrive(f)                                   # both ended where they looked last
-            x.known = 1
+        f.is_zero = False
+        x.slack_is_fresh = 0
+        accept_trial(f)                                 # Both searches evaluated the accepted point last.
+        x.response_is_known = 1
 
 
-cdef inline double slip(const flow_t* f, int32_t i) noexcept nogil:
-    """phi of (3) from w of block i, whose normal it leaves out."""
+cdef inline double normal_shift(const flow_t* f, int32_t i) noexcept nogil:
+    """Return phi of (3) for block i from w, whose normal row must exclude phi."""
     cdef int32_t g
     cdef double out = 0.0
     cdef friction_components_t q
@@ -394,103 +390,107 @@ cdef inline double slip(const flow_t* f, int32_t i) noexcept nogil:
 
 
 cdef inline void lower_normals(const flow_t* f, int32_t island, const double* lam) noexcept nogil:
-    """phi of what lam leaves; it must be 0 before."""
+    """Compute phi from the slack of lam; phi must be 0 before."""
     cdef int32_t a, i
     cdef double velocity
-    measure(f, island, lam, gather(f, island, lam, f.u), &velocity)
+    measure_error(f, island, lam, apply_transpose(f, island, lam, f.u), &velocity)
     for a in range(f.iptr[island], f.iptr[island + 1]):
         for i in range(block_from(f, a), block_end(f, a)):
             if not is_rows(&f.p, i) and f.p.ptr[i + 1] - f.p.ptr[i] > 1:
-                f.phi[f.p.ptr[i]] = slip(f, i)
+                f.phi[f.p.ptr[i]] = normal_shift(f, i)
 
 
-cdef inline void level(const flow_t* f, int32_t island) noexcept nogil:
-    """phi = 0."""
-    blank(f, island, f.phi)
+cdef inline void clear_normal_shift(const flow_t* f, int32_t island) noexcept nogil:
+    """Set phi = 0."""
+    clear_rows(f, island, f.phi)
 
 
-cdef inline void restart(flow_t* f, int32_t island, const double* lam) noexcept nogil:
-    """y = Y^T lam and the centre at lam, the best until a descent finds a better."""
+cdef inline void restart_from(flow_t* f, int32_t island, const double* lam) noexcept nogil:
+    """Set y = Y^T lam, and the centre and the best impulse to lam."""
     cdef int32_t a, c
-    keep(f, island, lam, f.lam)
-    keep(f, island, lam, f.best)                        # errors that overflow are no better than infinity
-    follow(f, island)
-    f.still = not gather(f, island, lam, f.u)
-    for a in range(f.n_own):
-        c = f.own[a]
-        f.y[c] = lam[c] if f.formed else f.u[c]
+    copy_rows(f, island, lam, f.lam)
+    copy_rows(f, island, lam, f.best)                   # `best` must be set even if all later errors overflow.
+    move_center(f, island)
+    f.is_zero = not apply_transpose(f, island, lam, f.u)
+    for a in range(f.n_unknowns):
+        c = f.unknowns[a]
+        f.y[c] = lam[c] if f.is_over_rows else f.u[c]
 
 
-cdef inline bint offer(flow_t* f, int32_t island, const double* lam, bint moves) noexcept nogil:
-    """Keep lam in `first_best` where its error under the problem's own law is less than is kept; phi must be 0.
+cdef inline bint offer_impulse(flow_t* f, int32_t island, const double* lam, bint moves) noexcept nogil:
+    """Keep lam in `island_best` if its error under the problem's own law is lower; phi must be 0, `u` as in `measure_error`.
 
-    With u of `gather`, which says whether it moves. Is the error less than the least?
+    Return whether the error is lower than that of the points at which no call ended.
     """
     cdef double energy, velocity, over
     f.p.law = f.law
-    energy = measure(f, island, lam, moves, &velocity)
-    over = excess(f, energy, velocity)
-    if over < f.wait.kept:
-        f.wait.kept = over
-        keep(f, island, lam, f.first_best)
-    if over < f.wait.least:
-        f.wait.least = over
+    energy = measure_error(f, island, lam, moves, &velocity)
+    over = error_over_limits(f, energy, velocity)
+    if over < f.paused.island_error:
+        f.paused.island_error = over
+        copy_rows(f, island, lam, f.island_best)
+    if over < f.paused.best_error:
+        f.paused.best_error = over
         return True
     return False
 
 
-cdef inline int32_t with_coulomb(flow_t* f, int32_t island, double* impulse) noexcept nogil:
-    """Rounds of Newton's method on Coulomb's law, each from the answer of a convex problem, on from where they wait.
+cdef inline int32_t solve_coulomb(flow_t* f, int32_t island, double* impulse) noexcept nogil:
+    """Run the rounds of Coulomb's law (file header), continuing where a call ended.
 
-    What a descent that waits began with, phi or the impulse, stands `aside`: the best so far is in its place.
+    Between calls `impulse` holds the best impulse, and `paused_start` the start of the paused descent: phi, or in the
+    second stage the impulse.
     """
-    cdef wait_t* x = &f.wait
+    cdef paused_t* x = &f.paused
     cdef int32_t n
     cdef double least
-    if x.at == RELAXED:
-        keep(f, island, f.aside, f.phi)
-    elif x.at == OWN:
-        keep(f, island, f.aside, impulse)
-    while x.rounds < ROUNDS:
-        least = x.least
-        if x.at == BEGINS:
+    if x.stage == CONVEX_STAGE:
+        copy_rows(f, island, f.paused_start, f.phi)
+    elif x.stage == COULOMB_STAGE:
+        copy_rows(f, island, f.paused_start, impulse)
+    while x.rounds < MAX_COULOMB_ROUNDS:
+        least = x.best_error
+        if x.stage == NEXT_ROUND:
             f.rounds += 1
-            x.at = RELAXED if x.rounds > 0 or x.cold else OWN
-            if x.at == OWN:
-                restart(f, island, impulse)
-            begin_descent(f, island, CONE if x.at == RELAXED else COULOMB, 1.0 / 0.0)
-        f.p.law = CONE if x.at == RELAXED else COULOMB
-        n = descend(f, island, 0.1 * least if x.at == RELAXED and least > 1e2 else 1.0)
-        if x.at == RELAXED:
+            x.stage = CONVEX_STAGE if x.rounds > 0 or x.cold else COULOMB_STAGE
+            if x.stage == COULOMB_STAGE:
+                restart_from(f, island, impulse)
+            begin_descent(f, island, CONE if x.stage == CONVEX_STAGE else COULOMB, 1.0 / 0.0)
+        f.p.law = CONE if x.stage == CONVEX_STAGE else COULOMB
+        n = descend_island(f, island, 0.1 * least if x.stage == CONVEX_STAGE and least > 1e2 else 1.0)
+        if x.stage == CONVEX_STAGE:
             if n == LOST or n == BROKEN:
                 return n
             if n == MORE:
-                keep(f, island, f.phi, f.aside)
-            keep(f, island, f.best, impulse)
-            level(f, island)
-            offer(f, island, impulse, gather(f, island, impulse, f.u))
+                copy_rows(f, island, f.phi, f.paused_start)
+            copy_rows(f, island, f.best, impulse)
+            clear_normal_shift(f, island)
+            offer_impulse(f, island, impulse, apply_transpose(f, island, impulse, f.u))
         else:
             if n == MORE:
-                keep(f, island, impulse, f.aside)
-            if n != LOST and offer(f, island, f.best, gather(f, island, f.best, f.u)):
-                keep(f, island, f.best, impulse)
-        if x.least <= 1.0:
+                copy_rows(f, island, impulse, f.paused_start)
+            if n != LOST and offer_impulse(f, island, f.best, apply_transpose(f, island, f.best, f.u)):
+                copy_rows(f, island, f.best, impulse)
+        if x.best_error <= 1.0:
             return REACHED
         if n == MORE:
-            x.least = least                             # as if nobody had looked
+            x.best_error = least                        # The point at which a call ends must not change the path.
             return MORE
-        if x.at == OWN:
+        if x.stage == COULOMB_STAGE:
             lower_normals(f, island, impulse)
             x.rounds += 1
-        restart(f, island, impulse)
-        x.at = OWN if x.at == RELAXED else BEGINS
-        if x.at == OWN:
+        restart_from(f, island, impulse)
+        x.stage = COULOMB_STAGE if x.stage == CONVEX_STAGE else NEXT_ROUND
+        if x.stage == COULOMB_STAGE:
             begin_descent(f, island, COULOMB, 1.0 / 0.0)
     return STUCK
 
 
-cdef inline void set_limits(flow_t* f, int32_t island) noexcept nogil:
-    """Largest errors with which an island's relative residual is at most tol; 0 if each row is compared with its own terms."""
+cdef inline void set_error_limits(flow_t* f, int32_t island) noexcept nogil:
+    """Set the largest errors with which the island's relative residual is at most tol.
+
+    Both limits are 0 if the rows of the island are compared with their own terms.
+    """
     cdef const double* own
     cdef double energy = f.reference_energy, velocity = f.reference_velocity
     if f.p.islands != NULL:
@@ -499,26 +499,26 @@ cdef inline void set_limits(flow_t* f, int32_t island) noexcept nogil:
     f.energy_limit, f.velocity_limit = f.tol * energy, f.tol * velocity
 
 
-cdef inline void enter(flow_t* f, int32_t island) noexcept nogil:
-    """What y counts, velocities or rows, of which no column of A is known."""
+cdef inline void enter_island(flow_t* f, int32_t island) noexcept nogil:
+    """Choose the unknowns of an island, velocities or rows; no column of A is formed yet."""
     cdef int32_t a, k
-    set_limits(f, island)
-    f.formed = f.few[island]
-    f.own, f.n_own = f.icols + f.cptr[island], f.cptr[island + 1] - f.cptr[island]
-    if not f.formed:
+    set_error_limits(f, island)
+    f.is_over_rows = f.over_rows[island]
+    f.unknowns, f.n_unknowns = f.icols + f.cptr[island], f.cptr[island + 1] - f.cptr[island]
+    if not f.is_over_rows:
         return
-    f.own, f.n_own, f.rows = f.listed, 0, f.n_own       # rows: of Y^T
+    f.unknowns, f.n_unknowns, f.rows = f.row_list, 0, f.n_unknowns      # `rows`: the columns of Y^T, until the end.
     for a in range(f.iptr[island], f.iptr[island + 1]):
         for k in range(row_from(f, a), row_end(f, a)):
-            f.listed[f.n_own] = k
-            f.n_own += 1
-    k, f.rows = f.rows, f.n_own + 3 & ~3
-    f.a = f.across + k * f.rows
-    f.home[0] = NOWHERE
+            f.row_list[f.n_unknowns] = k
+            f.n_unknowns += 1
+    k, f.rows = f.rows, f.n_unknowns + 3 & ~3
+    f.a = f.y_transpose + k * f.rows
+    f.panel_of_column[0] = UNFORMED
 
 
-cdef inline bint is_settled(flow_t* f, int32_t island, double* impulse) noexcept nogil:
-    """Whether no row of the island acts; the zero impulse, which solves it, is then its impulse."""
+cdef inline bint is_at_rest(flow_t* f, int32_t island, double* impulse) noexcept nogil:
+    """Return whether no row of the island acts; its impulse is then the zero impulse, which solves it."""
     cdef int32_t a, k
     if f.p.islands == NULL or f.p.islands.reference[2 * f.p.islands.label[block_from(f, f.iptr[island])]] >= 0.0:
         return False
@@ -529,44 +529,44 @@ cdef inline bint is_settled(flow_t* f, int32_t island, double* impulse) noexcept
 
 
 cdef inline int32_t solve_island(flow_t* f, int32_t island, double* impulse) noexcept nogil:
-    """One island from `impulse`, or from where it waits, into it; how it ended."""
+    """Solve one island from `impulse`, or from where it is paused, into `impulse`; return the outcome."""
     cdef int32_t end
-    cdef bint waits = f.wait.island == island
+    cdef bint waits = f.paused.island == island
     f.island = island
     if not waits:
-        enter(f, island)
-        if is_settled(f, island, impulse):
+        enter_island(f, island)
+        if is_at_rest(f, island, impulse):
             return REACHED
-        restart(f, island, impulse)
-        level(f, island)
-        f.wait.at, f.wait.rounds = BEGINS, 0
-        f.wait.least = f.wait.kept = 1.0 / 0.0
-        if not offer(f, island, impulse, not f.still):
+        restart_from(f, island, impulse)
+        clear_normal_shift(f, island)
+        f.paused.stage, f.paused.rounds = NEXT_ROUND, 0
+        f.paused.best_error = f.paused.island_error = 1.0 / 0.0
+        if not offer_impulse(f, island, impulse, not f.is_zero):
             return LOST
-        if f.wait.least <= 1.0:
+        if f.paused.best_error <= 1.0:
             return REACHED
     if f.law == COULOMB:
-        end = with_coulomb(f, island, impulse)
-        keep(f, island, f.first_best, impulse)
+        end = solve_coulomb(f, island, impulse)
+        copy_rows(f, island, f.island_best, impulse)
     else:
         if not waits:
-            begin_descent(f, island, f.law, f.wait.least)
-        end = descend(f, island, 1.0)
-        keep(f, island, f.best, impulse)
-    f.wait.island = island if end == MORE else -1
+            begin_descent(f, island, f.law, f.paused.best_error)
+        end = descend_island(f, island, 1.0)
+        copy_rows(f, island, f.best, impulse)
+    f.paused.island = island if end == MORE else -1
     return end
 
 
-cdef inline int32_t descend_all(flow_t* f, double* impulse) noexcept nogil:
-    """All islands from `impulse` (m), or from the one that waits on, into it: REACHED, or how the worst of them ended."""
-    cdef int32_t i, end, first = f.wait.island
+cdef inline int32_t solve_islands(flow_t* f, double* impulse) noexcept nogil:
+    """Solve all islands from `impulse` (m), beginning with a paused one; return REACHED or the worst outcome."""
+    cdef int32_t i, end, first = f.paused.island
     if first < 0:
         first = 0
-        f.wait.worst, f.wait.cold = REACHED, f.law == COULOMB and is_zero_impulse(&f.p, impulse)
+        f.paused.worst, f.paused.cold = REACHED, f.law == COULOMB and is_zero_impulse(&f.p, impulse)
     for i in range(first, f.n_islands):
         end = solve_island(f, i, impulse)
-        if end == MORE:                                # N is of this one
+        if end == MORE:                                 # N and the arrays belong to this island.
             return MORE
-        if end > f.wait.worst:
-            f.wait.worst = end
-    return f.wait.worst
+        if end > f.paused.worst:
+            f.paused.worst = end
+    return f.paused.worst

@@ -1,12 +1,13 @@
-"""N = I + Y^T V Y of one island and its factor: in the pattern of L, or whole under Coulomb's law (`newton.pxd`).
+"""The linear system of a step of one island (`newton.pxd`): N = I + Y^T V Y, or over few rows a part of A = Y Y^T.
 
-Where an island has few rows, A = Y Y^T serves every step, its columns formed when their rows first push.
-y is kept as Y^T mu and p as Y^T pi; by the matrix inversion lemma, a the rows that answer, all of them bounded:
+N has the pattern of L; under Coulomb's law it is a full matrix, since it is not symmetric. If an island has few rows,
+its steps are taken over these: y = Y^T mu and p = Y^T pi. A column of A is formed when its row first becomes free
+(V != 0). By the matrix inversion lemma, with a the free rows, if all rows are bounded rows:
 
     h = A (mu - lambda) = s + b - A lambda,    S = Theta_a + A_aa,    z = S^-1 h_a                        (1)
     pi = lambda - mu + E_a z,    q = A pi = A E_a z - h,    q_a = -Theta_a z                              (2)
 
-and where blocks of V may be full, as those of contacts, a the rows of those that are not 0:
+and with contacts, whose blocks of V may be full, with a the rows of the blocks of V that are not 0:
 
     (I + A_aa V_aa) t = h_a,    x = V_aa t,    pi = lambda - mu + E_a x,    q = A E_a x - h,    q_a = -t      (3)
 """
@@ -18,46 +19,51 @@ from lavender_ext.core.tree cimport ldl_solve, axpy_subtract_2
 from lavender_ext.core.block_types cimport is_rows
 from lavender_ext.factor.dense_lu cimport lu_factor, lu_solve
 from lavender_ext.factor.tiles cimport combine
-from lavender_ext.velocity_newton.flow cimport block_end, block_from, find_column, flow_t, spread
-from lavender_ext.velocity_newton.sparse cimport sparse_factor, take_row
+from lavender_ext.velocity_newton.flow cimport block_end, block_from, form_column, flow_t, apply_y
+from lavender_ext.velocity_newton.sparse cimport sparse_factor, axpy_subtract
 
 
 cdef inline void scale_row(double* out, const double* x, double f, int32_t n) noexcept nogil:
+    """out = f x."""
     cdef int32_t i
     for i in range(n):
         out[i] = f * x[i]
 
 
 cdef inline void add_row(double* out, const double* x, double f, int32_t n) noexcept nogil:
+    """out += f x."""
     cdef int32_t i
     for i in range(n):
         out[i] += f * x[i]
 
 
-cdef inline void scale_2(double* out, const double* x, const double* y, double f, double g, int32_t n) noexcept nogil:
+cdef inline void scale_row_2(double* out, const double* x, const double* y, double f, double g, int32_t n) noexcept nogil:
+    """out = f x + g y."""
     cdef int32_t i
     for i in range(n):
         out[i] = f * x[i] + g * y[i]
 
 
-cdef inline void scale_3(double* out, const double* x, const double* y, const double* z, double f, double g, double h,
+cdef inline void scale_row_3(double* out, const double* x, const double* y, const double* z, double f, double g, double h,
                          int32_t n) noexcept nogil:
+    """out = f x + g y + h z."""
     cdef int32_t i
     for i in range(n):
         out[i] = (f * x[i] + g * y[i]) + h * z[i]
 
 
-cdef inline void add_3(double* out, const double* x, const double* y, const double* z, double f, double g, double h,
+cdef inline void add_row_3(double* out, const double* x, const double* y, const double* z, double f, double g, double h,
                        int32_t n) noexcept nogil:
+    """out += f x + g y + h z."""
     cdef int32_t i
     for i in range(n):
         out[i] += (f * x[i] + g * y[i]) + h * z[i]
 
 
-cdef inline int32_t turn_block(const flow_t* f, int32_t i, int32_t row, int32_t nc, const double* y, int32_t n) noexcept nogil:
-    """Rows n ... of `turned` = V Y of block i, of which `row` is the first in its panel; one past the last.
+cdef inline int32_t weigh_block(const flow_t* f, int32_t i, int32_t row, int32_t nc, const double* y, int32_t n) noexcept nogil:
+    """Append the non-zero rows of V Y of block i to the n rows of `weighted_y`; return their new number.
 
-    `line`, behind the columns, holds which rows of Y they belong to.
+    `row` is the block's first row within its panel. `line`, after the columns, stores the row of Y of each.
     """
     cdef int32_t j = f.p.ptr[i], size = f.p.ptr[i + 1] - j, r, c
     cdef const double* v = f.v + f.vptr[i]
@@ -66,12 +72,12 @@ cdef inline int32_t turn_block(const flow_t* f, int32_t i, int32_t row, int32_t 
     if is_rows(&f.p, i):
         for r in range(size):
             if v[r] != 0.0:
-                scale_row(f.turned + n * nc, y + <ssize_t>(row + r) * nc, v[r], nc)
+                scale_row(f.weighted_y + n * nc, y + <ssize_t>(row + r) * nc, v[r], nc)
                 f.line[nc + n] = row + r
                 n += 1
         return n
     for r in range(size):
-        out = f.turned + n * nc
+        out = f.weighted_y + n * nc
         any_ = False
         for c in range(size):
             if v[r * size + c] != 0.0:
@@ -86,36 +92,36 @@ cdef inline int32_t turn_block(const flow_t* f, int32_t i, int32_t row, int32_t 
     return n
 
 
-cdef inline void turned_row(const flow_t* f, const double* y, int32_t nc, int32_t n, int32_t a, int32_t end) noexcept nogil:
-    """Row a of Y^T turned, `end` columns of it, into `line`."""
+cdef inline void weighted_row(const flow_t* f, const double* y, int32_t nc, int32_t n, int32_t a, int32_t end) noexcept nogil:
+    """Compute row a of Y^T (V Y), columns before `end`, into `line`."""
     cdef int32_t r = 3
-    cdef const double* t = f.turned
+    cdef const double* t = f.weighted_y
     cdef double* line = f.line
-    cdef const double* at = line + nc                   # rows of Y
+    cdef const double* at = line + nc                   # row of Y of each row of `weighted_y`
     cdef double f0 = y[<int32_t>at[0] * nc + a], f1, f2
     if n == 1:
         scale_row(line, t, f0, end)
         return
     f1 = y[<int32_t>at[1] * nc + a]
     if n == 2:
-        scale_2(line, t, t + nc, f0, f1, end)
+        scale_row_2(line, t, t + nc, f0, f1, end)
         return
     f2 = y[<int32_t>at[2] * nc + a]
-    scale_3(line, t, t + nc, t + 2 * nc, f0, f1, f2, end)
+    scale_row_3(line, t, t + nc, t + 2 * nc, f0, f1, f2, end)
     while r + 3 <= n:
         f0 = y[<int32_t>at[r] * nc + a]
         f1 = y[<int32_t>at[r + 1] * nc + a]
         f2 = y[<int32_t>at[r + 2] * nc + a]
-        t = f.turned + r * nc
-        add_3(line, t, t + nc, t + 2 * nc, f0, f1, f2, end)
+        t = f.weighted_y + r * nc
+        add_row_3(line, t, t + nc, t + 2 * nc, f0, f1, f2, end)
         r += 3
     while r < n:
-        add_row(line, f.turned + r * nc, y[<int32_t>at[r] * nc + a], end)
+        add_row(line, f.weighted_y + r * nc, y[<int32_t>at[r] * nc + a], end)
         r += 1
 
 
-cdef inline void add_thin(const flow_t* f, int32_t panel, int32_t n, int32_t size) noexcept nogil:
-    """N += Y^T turned of one panel, into the pattern of L."""
+cdef inline void add_to_pattern(const flow_t* f, int32_t panel, int32_t n, int32_t size) noexcept nogil:
+    """Add Y^T (V Y) of one panel to N in the pattern of L."""
     cdef int32_t nc = f.g.pcol[panel + 1] - f.g.pcol[panel], a, b, at, i, k
     cdef int32_t c0 = f.cptr[f.island]
     cdef const int32_t* cols = f.g.cols + f.g.pcol[panel]
@@ -130,9 +136,9 @@ cdef inline void add_thin(const flow_t* f, int32_t panel, int32_t n, int32_t siz
     for a in range(nc):
         k = local[cols[a]]
         to = val + lptr[k]
-        turned_row(f, y, nc, n, a, a + 1)
+        weighted_row(f, y, nc, n, a, a + 1)
         diag[k] += line[a]
-        if lptr[k + 1] - lptr[k] == a:                  # the same columns: into their place at once
+        if lptr[k + 1] - lptr[k] == a:                  # Row k has the panel's columns only.
             for b in range(a):
                 to[b] += line[b]
             continue
@@ -145,8 +151,8 @@ cdef inline void add_thin(const flow_t* f, int32_t panel, int32_t n, int32_t siz
             to[at] += line[b]
 
 
-cdef inline void add_whole(const flow_t* f, int32_t panel, int32_t n, int32_t size) noexcept nogil:
-    """N += Y^T turned of one panel, all of it."""
+cdef inline void add_to_dense(const flow_t* f, int32_t panel, int32_t n, int32_t size) noexcept nogil:
+    """Add Y^T (V Y) of one panel to the full matrix N."""
     cdef int32_t nc = f.g.pcol[panel + 1] - f.g.pcol[panel], a, b
     cdef const int32_t* cols = f.g.cols + f.g.pcol[panel]
     cdef const int32_t* local = f.local
@@ -154,37 +160,38 @@ cdef inline void add_whole(const flow_t* f, int32_t panel, int32_t n, int32_t si
     cdef double* line = f.line
     cdef double* row
     for a in range(nc):
-        turned_row(f, y, nc, n, a, nc)
+        weighted_row(f, y, nc, n, a, nc)
         row = f.normal + <ssize_t>local[cols[a]] * size
         for b in range(nc):
             row[local[cols[b]]] += line[b]
 
 
-cdef inline bint is_held(const flow_t* f, int32_t island) noexcept nogil:
-    """Is N that of the present V?"""
+cdef inline bint is_v_unchanged(const flow_t* f, int32_t island) noexcept nogil:
+    """Return whether N was formed with the present V."""
     cdef int32_t a, k, end
     for a in range(f.iptr[island], f.iptr[island + 1]):
         end = f.vptr[block_end(f, a)]
         for k in range(f.vptr[block_from(f, a)], end):
-            if f.v[k] != f.held[k]:
+            if f.v[k] != f.factored_v[k]:
                 return False
     return True
 
 
-cdef inline void hold(const flow_t* f, int32_t island) noexcept nogil:
+cdef inline void store_v(const flow_t* f, int32_t island) noexcept nogil:
+    """Store V, with which N is formed."""
     cdef int32_t a, k, end
     for a in range(f.iptr[island], f.iptr[island + 1]):
         end = f.vptr[block_end(f, a)]
         for k in range(f.vptr[block_from(f, a)], end):
-            f.held[k] = f.v[k]
+            f.factored_v[k] = f.v[k]
 
 
-# -- S of (1), where A is formed ---------------------------------------------------------------------------------
+# -- over rows: S of (1), or I + A V of (3) ---------------------------------------------------------------------------------
 
 
-cdef inline int32_t factor_rows(const flow_t* f) noexcept nogil:
-    """S = L^T D L in place, inv = 1 / D; 0 where a pivot is not positive. Two rows at a time, as `sparse_factor`."""
-    cdef int32_t a, k = f.n_answering - 1
+cdef inline int32_t factor_row_matrix(const flow_t* f) noexcept nogil:
+    """Factor S = L^T D L in place, inv = 1 / D; return 0 if a pivot is not positive. Two rows at a time, as `sparse_factor`."""
+    cdef int32_t a, k = f.n_free - 1
     cdef double* row
     cdef double* up
     cdef double* to
@@ -198,7 +205,7 @@ cdef inline int32_t factor_rows(const flow_t* f) noexcept nogil:
             return 1
         up = row - k
         x = row[k - 1] * r
-        take_row(up, row, x, k)
+        axpy_subtract(up, row, x, k)
         row[k - 1] = x
         if not up[k - 1] > 0.0:
             return 0
@@ -213,108 +220,108 @@ cdef inline int32_t factor_rows(const flow_t* f) noexcept nogil:
     return 1
 
 
-cdef inline void solve_rows(const flow_t* f, double* z) noexcept nogil:
-    """z <- S^-1 z."""
-    cdef int32_t a, n = f.n_answering
+cdef inline void solve_row_matrix(const flow_t* f, double* z) noexcept nogil:
+    """Compute z = S^-1 z in place."""
+    cdef int32_t a, n = f.n_free
     cdef const double* l = f.factor + <ssize_t>n * (n + 1) // 2
     for a in range(n - 1, -1, -1):
         l -= a + 1
-        take_row(z, l, z[a], a)
+        axpy_subtract(z, l, z[a], a)
     for a in range(n):
         z[a] = z[a] * f.inv[a] - dot(l, z, a)
         l += a + 1
 
 
-cdef inline int32_t pass_blocks(const flow_t* f, const double* t, double* x) noexcept nogil:
-    """x = V t of (3), or where t is NULL: which rows answer, and V A of them, row by row, in x; how many they are."""
+cdef inline int32_t visit_free_blocks(const flow_t* f, const double* t, double* x) noexcept nogil:
+    """Compute x = V t of (3); if t is NULL, list the free rows instead and write the rows of V A to x. Return their number."""
     cdef int32_t a, i, r, k, size, end, place = 0, n = 0
     cdef const double* v
-    cdef bint answers
+    cdef bint is_free
     for a in range(f.iptr[f.island], f.iptr[f.island + 1]):
         for i in range(block_from(f, a), block_end(f, a)):
-            v, end = f.held + f.vptr[i], place + f.p.ptr[i + 1] - f.p.ptr[i]
+            v, end = f.factored_v + f.vptr[i], place + f.p.ptr[i + 1] - f.p.ptr[i]
             size = 1 if is_rows(&f.p, i) else end - place
             while place < end:
-                answers = False
+                is_free = False
                 for k in range(size * size):
-                    answers |= v[k] != 0.0
-                if answers and t == NULL:
+                    is_free |= v[k] != 0.0
+                if is_free and t == NULL:
                     for r in range(size):
-                        find_column(f, place + r)
+                        form_column(f, place + r)
                         f.places[n + r], f.columns[n + r] = place + r, (place + r) * f.rows
                     for r in range(size):
                         combine(f.wide, f.rows, size, f.a, f.columns + n, v + r * size, x + <ssize_t>(n + r) * f.rows)
-                elif answers:
+                elif is_free:
                     for r in range(size):
                         x[n + r] = dot(v + r * size, t + n, size)
-                n += size if answers else 0
+                n += size if is_free else 0
                 place += size
                 v += size * size
     return n
 
 
-cdef inline void form_rows(flow_t* f) noexcept nogil:
-    """The lower triangle of S, row by row, in `factor`; of (3) I + A V, in `factor` whole."""
+cdef inline void form_row_matrix(flow_t* f) noexcept nogil:
+    """Form the lower triangle of S, row by row, or the full matrix I + A V of (3), in `factor`."""
     cdef int32_t a, b, n = 0
     cdef const double* column
     cdef double* to = f.factor
-    if not f.plain:
-        f.n_answering = n = pass_blocks(f, NULL, f.normal)
+    if not f.bounded_rows_only:
+        f.n_free = n = visit_free_blocks(f, NULL, f.normal)
         for a in range(n):
             for b in range(n):
-                to[b] = f.normal[<ssize_t>b * f.rows + f.places[a]]     # V and A are symmetric
+                to[b] = f.normal[<ssize_t>b * f.rows + f.places[a]]     # V A transposed: both are symmetric.
             to[a] += 1.0
             to += n
         return
-    for a in range(f.n_own):
-        if f.v[f.own[a]] != 0.0:
-            find_column(f, a)
+    for a in range(f.n_unknowns):
+        if f.v[f.unknowns[a]] != 0.0:
+            form_column(f, a)
             f.places[n], f.columns[n] = a, a * f.rows
             n += 1
     for a in range(n):
         column = f.a + f.columns[a]
         for b in range(a + 1):
             to[b] = column[f.places[b]]
-        to[a] += f.theta[f.own[f.places[a]]]
+        to[a] += f.theta[f.unknowns[f.places[a]]]
         to += a + 1
-    f.n_answering = n
+    f.n_free = n
 
 
-cdef inline void step_by_rows(const flow_t* f) noexcept nogil:
-    """pi and q of (2) or (3)."""
+cdef inline void solve_row_step(const flow_t* f) noexcept nogil:
+    """Compute pi and q of (2) or (3)."""
     cdef int32_t a, k
     cdef double* z = f.local_rhs
     cdef double* x = z
-    for a in range(f.n_answering):
-        z[a] = f.grad[f.own[f.places[a]]]
-    if f.plain:
-        solve_rows(f, z)
+    for a in range(f.n_free):
+        z[a] = f.grad[f.unknowns[f.places[a]]]
+    if f.bounded_rows_only:
+        solve_row_matrix(f, z)
     else:
         x = f.sum + f.rows
-        lu_solve(f.n_answering, f.factor, f.swap, z)
-        pass_blocks(f, z, x)
-    combine(f.wide, f.rows, f.n_answering, f.a, f.columns, x, f.sum)
-    for a in range(f.n_own):
-        k = f.own[a]
+        lu_solve(f.n_free, f.factor, f.pivots, z)
+        visit_free_blocks(f, z, x)
+    combine(f.wide, f.rows, f.n_free, f.a, f.columns, x, f.sum)
+    for a in range(f.n_unknowns):
+        k = f.unknowns[a]
         f.step[k] = f.lam[k] - f.y[k]
         f.q[k] = f.sum[a] - f.grad[k]
-    for a in range(f.n_answering):
-        k = f.own[f.places[a]]
+    for a in range(f.n_free):
+        k = f.unknowns[f.places[a]]
         f.step[k] += x[a]
-        f.q[k] = -f.theta[k] * z[a] if f.plain else -z[a]   # without what (2) and (3) cancel
+        f.q[k] = -f.theta[k] * z[a] if f.bounded_rows_only else -z[a]   # (2) and (3) without the terms that cancel.
 
 
 # -- N -----------------------------------------------------------------------------------------------------------
 
 
-cdef inline void form(flow_t* f, int32_t island, bint square) noexcept nogil:
-    """N of the present V, or S."""
+cdef inline void form_normal_matrix(flow_t* f, int32_t island, bint square) noexcept nogil:
+    """Form N with the present V, or the matrix over rows."""
     cdef int32_t a, b, i, n, nc, size = f.cptr[island + 1] - f.cptr[island], end, last
     cdef double* normal = f.normal
     cdef const double* y
-    hold(f, island)
-    if f.formed:
-        form_rows(f)
+    store_v(f, island)
+    if f.is_over_rows:
+        form_row_matrix(f)
         return
     if square:
         for a in range(size):
@@ -336,38 +343,39 @@ cdef inline void form(flow_t* f, int32_t island, bint square) noexcept nogil:
             n = 0
             last = f.pblock[b + 1]
             for i in range(f.pblock[b], last):
-                n = turn_block(f, i, f.p.ptr[i] - f.g.prow[b], nc, y, n)
+                n = weigh_block(f, i, f.p.ptr[i] - f.g.prow[b], nc, y, n)
             if n > 0 and square:
-                add_whole(f, b, n, size)
+                add_to_dense(f, b, n, size)
             elif n > 0:
-                add_thin(f, b, n, size)
+                add_to_pattern(f, b, n, size)
 
 
-cdef inline int32_t factor(flow_t* f, int32_t island, bint square) noexcept nogil:
+cdef inline int32_t factor_normal_matrix(flow_t* f, int32_t island, bint square) noexcept nogil:
+    """Factor N, or the matrix over rows; return 0 if a pivot fails."""
     cdef int32_t size = f.cptr[island + 1] - f.cptr[island]
     cdef const int32_t* lptr = f.lptr + f.cptr[island]
     f.factorisations += 1
-    if f.formed:
-        return factor_rows(f) if f.plain else lu_factor(f.n_answering, f.factor, f.swap)
+    if f.is_over_rows:
+        return factor_row_matrix(f) if f.bounded_rows_only else lu_factor(f.n_free, f.factor, f.pivots)
     if square:
         memcpy(f.factor, f.normal, <ssize_t>size * size * sizeof(double))
-        return lu_factor(size, f.factor, f.swap)
+        return lu_factor(size, f.factor, f.pivots)
     memcpy(f.factor, f.normal, (lptr[size] - lptr[0] + size) * sizeof(double))
     return sparse_factor(size, lptr, f.lidx, f.factor, f.inv)
 
 
-cdef inline void newton_step(const flow_t* f, int32_t island, bint square) noexcept nogil:
-    """p of (1) and q = Y p."""
+cdef inline void solve_step(const flow_t* f, int32_t island, bint square) noexcept nogil:
+    """Solve for p of (1), and compute q = Y p."""
     cdef int32_t a, c0 = f.cptr[island], size = f.cptr[island + 1] - c0
-    if f.formed:
-        step_by_rows(f)
+    if f.is_over_rows:
+        solve_row_step(f)
         return
     for a in range(size):
         f.local_rhs[a] = -f.grad[f.icols[c0 + a]]
     if square:
-        lu_solve(size, f.factor, f.swap, f.local_rhs)
+        lu_solve(size, f.factor, f.pivots, f.local_rhs)
     else:
         ldl_solve(size, f.lptr + c0, f.lidx, f.factor - f.lptr[c0], f.inv, f.local_rhs)
     for a in range(size):
         f.step[f.icols[c0 + a]] = f.local_rhs[a]
-    spread(f, island, f.step, f.q)
+    apply_y(f, island, f.step, f.q)

@@ -1,20 +1,23 @@
-"""Rows of J and M that are soft enough to need no proximal term."""
+"""The compliance above which rows of J and M need no proximal term."""
 from libc.stdint cimport int32_t
 
 from lavender_ext.core.block_types cimport blocks_t, is_rows
 from lavender_ext.core.view cimport generalized_t
 
 
-cdef inline double least_softness(const blocks_t* p, int32_t i) noexcept nogil:
-    """Compliance over d with which a block needs no proximal term."""
+cdef inline double min_softness(const blocks_t* p, int32_t i) noexcept nogil:
+    """Return the compliance, as a fraction of d, from which a block needs no proximal term.
+
+    With less, Newton's method without a proximal term takes more steps, since the kinks of lambda(s) are sharper.
+    """
     return 1e-6 if is_rows(p, i) else 1e-3
 
 
 cdef inline bint is_soft(const blocks_t* p, const generalized_t* g) noexcept nogil:
-    """Needs no block one?"""
+    """Return whether no block needs a proximal term."""
     cdef int32_t i, k
     for i in range(p.n_blocks):
         for k in range(p.ptr[i], p.ptr[i + 1]):
-            if not g.compliance[k] >= least_softness(p, i) * p.d[k]:
+            if not g.compliance[k] >= min_softness(p, i) * p.d[k]:
                 return False
     return True

@@ -1,11 +1,11 @@
-"""N = L^T D L of an island, kept where L has entries: rows from the last to the first, as M.
+"""Factor N = L^T D L of an island in the pattern of L, from the last row to the first, as M is factored.
 
-A row of Y has entries in a few chains of a tree, so N = I + Y^T V Y couples columns of one panel alone, and
-eliminating row k couples those that it has an entry in (`tree_pattern`): without contacts between branches the pattern
-is that of M's factor, some 12 entries in a row of an insect; where all meet, L is a full triangle, and costs no more
-than a dense one would.
+A row of Y has entries in a few chains of a tree, so N = I + Y^T V Y couples columns of the same panel only, and
+eliminating row k couples the columns of its entries (`tree_pattern`). Without contacts between branches the pattern is
+that of the factor of M (about 12 entries in a row for an insect). If all columns are coupled, L is a full triangle and
+takes the work of a dense factor.
 
-    val     entries left of the diagonal, row by row, then the diagonal
+    val     the entries left of the diagonal, row by row, then the diagonal
 """
 from libc.stdint cimport int32_t
 
@@ -14,26 +14,26 @@ from lavender_ext.core.view cimport generalized_t
 
 
 cdef enum:
-    PER_COLUMN = 24             # entries in a row of L for which there is workspace at first,
-    MANY = 200                  # of more columns than these: of fewer for all that there may be
-    PASSED = 8                  # multiply-adds of a full factor that it costs to pass over a column
+    FIRST_ROW_ENTRIES = 24      # Entries per row of L in the first workspace above MAX_DENSE_COLUMNS columns.
+    MAX_DENSE_COLUMNS = 200     # Up to this many columns the first workspace holds a full triangle.
+    COLUMN_SEARCH_WORK = 8      # Skipping one column in the search for a row's places takes the time of this many multiply-adds.
 
 
 cdef inline int32_t per_column(int32_t n) noexcept nogil:
-    """Entries in a row of L of n columns for which there is workspace at first."""
-    return PER_COLUMN if n > MANY else (n + 1) // 2
+    """Return the entries per row of L, of n columns, that the first workspace provides."""
+    return FIRST_ROW_ENTRIES if n > MAX_DENSE_COLUMNS else (n + 1) // 2
 
 
 cdef inline ssize_t pattern_marks(ssize_t n, ssize_t reached, ssize_t per) noexcept nogil:
-    """int32 that `find_pattern` needs for n columns with `per` entries each, of which panels reach so many in all."""
+    """Return the number of int32 that `find_pattern` uses: n columns, `per` entries per row, `reached` columns of panels."""
     return (per + 7) * n + reached + 2
 
 
 cdef inline int32_t find_pattern(const generalized_t* g, int32_t n_islands, const int32_t* iptr, const int32_t* run,
                                  const int32_t* cptr, const int32_t* local, int32_t per, int32_t* w) noexcept nogil:
-    """Rows of L of all islands, one after the other, columns as in their island: how many entries, -1 without workspace.
+    """Write the rows of L of all islands, columns numbered within the island; return the entries, or -1 if w is too small.
 
-    w (`pattern_marks`) begins with the pointers (n + 1) and the columns; the rest is scratch.
+    w (`pattern_marks`) receives the row pointers (n + 1) and the columns; the rest is scratch.
     """
     cdef int32_t n = cptr[n_islands], workspace = per * g.n, i, a, b, q, k, base, first, end, most, count
     cdef int32_t* lptr = w
@@ -47,7 +47,7 @@ cdef inline int32_t find_pattern(const generalized_t* g, int32_t n_islands, cons
     cdef const int32_t* cols
     for k in range(n + 1):
         mptr[k] = 0
-    # The last column of a panel has the others in its row; elimination leaves them to those before it.
+    # The row of a panel's last column has entries in its other columns; elimination adds the entries among these.
     for i in range(n_islands):
         base = cptr[i]
         for a in range(iptr[i], iptr[i + 1]):
@@ -84,9 +84,9 @@ cdef inline int32_t find_pattern(const generalized_t* g, int32_t n_islands, cons
 
 
 cdef inline double factor_work(int32_t n, const int32_t* lptr, const int32_t* lidx) noexcept nogil:
-    """Multiply-adds of one factor, and PASSED for each column passed over to find those of a row."""
+    """Return the multiply-adds of one factor, plus COLUMN_SEARCH_WORK for each column that the search for places skips."""
     cdef int32_t k, q, first, end, theirs
-    cdef double c, s = 0.0, passed = 0.0
+    cdef double c, s = 0.0, skipped = 0.0
     for k in range(n):
         first = lptr[k]
         end = lptr[k + 1]
@@ -95,18 +95,19 @@ cdef inline double factor_work(int32_t n, const int32_t* lptr, const int32_t* li
         for q in range(first, end):
             theirs = lptr[lidx[q] + 1] - lptr[lidx[q]]
             if theirs != q - first:
-                passed += theirs
-    return s + PASSED * passed
+                skipped += theirs
+    return s + COLUMN_SEARCH_WORK * skipped
 
 
-cdef inline void take_row(double* x, const double* y, double f, int32_t n) noexcept nogil:
+cdef inline void axpy_subtract(double* x, const double* y, double f, int32_t n) noexcept nogil:
+    """x -= f y."""
     cdef int32_t i
     for i in range(n):
         x[i] -= f * y[i]
 
 
-cdef inline int32_t place_of(const int32_t* theirs, int32_t column) noexcept nogil:
-    """Where a row with these columns has this one, which is among them."""
+cdef inline int32_t find_place(const int32_t* theirs, int32_t column) noexcept nogil:
+    """Return the index of `column` in the columns of a row, which contain it."""
     cdef int32_t at = 0
     while theirs[at] != column:
         at += 1
@@ -115,10 +116,10 @@ cdef inline int32_t place_of(const int32_t* theirs, int32_t column) noexcept nog
 
 cdef inline int32_t sparse_factor(int32_t n, const int32_t* lptr, const int32_t* lidx, double* val,
                                   double* inv) noexcept nogil:
-    """L in place, inv = 1 / D (n); 0 where a pivot is not positive. lptr may begin anywhere in lidx.
+    """Factor in place, with inv = 1 / D (n); return 0 if a pivot is not positive. lptr may begin anywhere in lidx.
 
-    Two rows whose columns are the same but for the upper one's own place are eliminated together: with the bits of one
-    after the other, and half of what is read and written.
+    Two neighbouring rows with the same columns (except the upper row's own) are eliminated together. That halves the
+    memory traffic, and the bits are those of two single eliminations.
     """
     cdef int32_t k = n - 1, a, b, j, count, at, i, base = lptr[0]
     cdef double* diag = val + (lptr[n] - base)
@@ -139,14 +140,14 @@ cdef inline int32_t sparse_factor(int32_t n, const int32_t* lptr, const int32_t*
         cols = lidx + lptr[k]
         count = lptr[k + 1] - lptr[k]
         two = count > 0 and cols[count - 1] == k - 1 and lptr[k] - lptr[k - 1] == count - 1
-        if two:                                             # row k leaves row k - 1 first
+        if two:                                             # Eliminate row k from row k - 1.
             count -= 1
             up = val + (lptr[k - 1] - base)
             x = row[count]
             f = x * r
             if x != 0.0:
                 diag[k - 1] -= f * x
-                take_row(up, row, f, count)
+                axpy_subtract(up, row, f, count)
                 row[count] = f
             k -= 1
             if not diag[k] > 0.0:
@@ -163,8 +164,8 @@ cdef inline int32_t sparse_factor(int32_t n, const int32_t* lptr, const int32_t*
             diag[j] = (diag[j] - f * x) - g * y
             to = val + (lptr[j] - base)
             theirs = lidx + lptr[j]
-            at = place_of(theirs, cols[0]) if a > 0 else 0
-            if lptr[j + 1] - lptr[j] != at + a:             # not the same columns from there on
+            at = find_place(theirs, cols[0]) if a > 0 else 0
+            if lptr[j + 1] - lptr[j] != at + a:             # The remaining columns differ.
                 for b in range(a):
                     i = cols[b]
                     while theirs[at] != i:
@@ -173,7 +174,7 @@ cdef inline int32_t sparse_factor(int32_t n, const int32_t* lptr, const int32_t*
             elif two:
                 axpy_subtract_2(to + at, row, f, up, g, a)
             else:
-                take_row(to + at, row, f, a)
+                axpy_subtract(to + at, row, f, a)
             row[a] = f
             if two:
                 up[a] = g
