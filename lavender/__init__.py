@@ -52,6 +52,7 @@ from lavender.judge.solution import Claim, History, Solution, Status, SolverStag
 from lavender.solving.solve import prepare, solve
 
 if TYPE_CHECKING:
+    from lavender import contract as contract
     from lavender import export as export
     from lavender import io
     from lavender.base import errors as errors
@@ -99,6 +100,7 @@ _MODULE_OF_NAME = {name: module for module, names in _LAZY_NAMES.items() for nam
 _LAZY_MODULES = {
     "bench": "lavender.lab.bench",
     "cones": "lavender.problem.cones",
+    "contract": "lavender.contract",
     "engine": "lavender.sim.engine",
     "errors": "lavender.base.errors",
     "export": "lavender.export",

@@ -25,7 +25,7 @@ COMMAND_GROUPS = {
     "Measure": ("report", "phenomena"),
     "MuJoCo": ("record", "audit", "tune", "bench"),
     "Engine": ("run", "view", "web"),
-    "Tools": ("solvers", "cases", "problems", "doctor", "export"),
+    "Tools": ("solvers", "contract", "cases", "problems", "doctor", "export"),
 }
 _WEB_COMMANDS = ("view", "web")
 #: Module of each command.

@@ -18,12 +18,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from calls import driven, facts
-from enumeration import random_bounds
 from random_problems import CONTACTS, FORMS, as_matrix, random_contact_problem, touching
 
 import lavender as lv
 from benchmarks.core_problems import fresh, stacks
 from lavender import registry
+from lavender.contract.enumeration import random_bounds
 from lavender.judge.residuals import get_reference
 from lavender.solvers.auto import Tree, make_step
 from lavender.solvers.newton_systems import general

@@ -77,6 +77,7 @@ def files(tmp_path, monkeypatch):
     if importlib.util.find_spec("h5py") is not None:
         lv.io.save(problem, tmp_path / "pile.hdf5", impulse=solution.impulse)
     monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(ROOT / "examples" / "plugin")  # the module of plugin.md
 
 
 @pytest.mark.parametrize(

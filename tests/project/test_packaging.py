@@ -171,7 +171,16 @@ def test_every_import_is_declared():
         declared("cluster") | declared("peers") | declared("mujoco") | declared("torch") | declared("jax")
     )
     # If installed:
-    known |= {"lavendersim", "mujoco_warp", "newton", "pinocchio", "pydrake", "qoco", "siconos", "warp"}
+    known |= declared("contract") | {
+        "lavendersim",
+        "mujoco_warp",
+        "newton",
+        "pinocchio",
+        "pydrake",
+        "qoco",
+        "siconos",
+        "warp",
+    }
     known |= {"flint"}  # python-flint, of the extra `proof`
     known |= {"typing_extensions"}  # for type checkers alone, which bring its stub
     known |= {"ray"}  # a cluster that campaigns can use where it is installed

@@ -1,7 +1,8 @@
-"""The plug-in of examples/plugin, installed as a user would: found by name, kept to the contract of all solvers."""
+"""The plug-in of examples/plugin, installed as a user would: found by name, checked with `lavender contract`."""
 
 import importlib.util
 import os
+import re
 import shutil
 from importlib import metadata
 from pathlib import Path
@@ -63,11 +64,43 @@ def test_is_found_by_name_and_solves_beside_a_plug_in_that_is_broken(environment
     assert "apgd" in python("-c", SOLVES, env={**environment, "PYTHONPATH": path}).stdout
 
 
-def test_keeps_the_contract_of_every_solver(environment):
-    contract = "tests/core/solvers/test_contract.py"
+def test_meets_the_contract_of_every_solver(environment):
+    report = python("-m", "lavender", "contract", "apgd", env=environment).stdout
+    assert "NOT MET" not in report
+    met, total = re.search(r"^apgd meets (\d+) of (\d+) requirements$", report, re.M).groups()
+    assert met == total and int(met) >= 15  # each requirement of a resumable solver without orders and seeds
+    assert "orders_change_the_sweep" in report.splitlines()[-1]
+
+
+FAULTY = """
+import os
+from dataclasses import replace
+import lavender as lv
+from lavender_apgd import APGD, SPEC as APGD_SPEC
+
+class Faulty(APGD):
+    def run(self, state, impulse, n, tol, time_limit=None):
+        if len(impulse) == 1:
+            os._exit(7)
+        return lv.Claim(lv.Status.CONVERGED, 1, {"matvecs": 1})
+
+SPEC = replace(APGD_SPEC, name="faulty", factory=Faulty)
+"""
+
+
+def test_a_faulty_plug_in_costs_its_checks_alone_and_gets_sentences(environment, tmp_path):
+    info = tmp_path / "faulty-1.0.dist-info"
+    info.mkdir()
+    (tmp_path / "faulty.py").write_text(FAULTY)
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: faulty\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text("[lavender.solvers]\nfaulty = faulty:SPEC\n")
+    path = os.pathsep.join([str(tmp_path), environment["PYTHONPATH"]])
     report = python(
-        "-m", "pytest", "-q", "-p", "no:cacheprovider", contract, "-k", "apgd", env=environment
+        "-m", "lavender", "contract", "faulty", env={**environment, "PYTHONPATH": path}, status=1
     ).stdout
-    # Each general property of a resumable solver that takes a start; the spec declares no order or seed.
-    assert "passed" in report
-    assert int(report.split(" passed")[0].split()[-1]) >= 15
+    assert "np." not in report and "Traceback" not in report and "assert" not in report
+    assert (
+        "CONVERGED within a relative residual of 1e-08 is required, because the spec lists the law" in report
+    )
+    assert "the code of the solver ended its process (exit status 7)" in report
+    assert "met      The spec lists exactly the options that the factory accepts." in report

@@ -5,11 +5,11 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-from enumeration import enumerate_lcp
 from kkt_truth import Exact
 
 import lavender as lv
 from lavender import suite
+from lavender.contract.enumeration import enumerate_lcp
 from lavender.judge.certificates import check_certificate
 from lavender.lab.suite import exact, hard
 

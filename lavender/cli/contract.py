@@ -1,0 +1,49 @@
+"""Define `lavender contract`."""
+
+from __future__ import annotations
+
+import click
+
+from lavender.cli.options import echo, one_thread
+
+
+@click.command()
+@click.argument("name")
+@click.option(
+    "--list", "list_only", is_flag=True, help="List the requirements that apply to the solver; run nothing."
+)
+@click.pass_context
+def contract(context: click.Context, name: str, list_only: bool) -> None:
+    """Check that a solver meets the requirements on every solver.
+
+    NAME is a built-in solver or an installed plug-in. Each capability that the spec of the solver lists is exercised on
+    small problems; each requirement that is not met is explained in a sentence. A plug-in runs in another process, so
+    that a crash costs one check. With the extra `contract`, Hypothesis searches for small counterexamples.
+
+    Exit code 1: a requirement is not met.
+    """
+    from lavender.contract import CHECKS, check_solver, list_checks
+    from lavender.solvers import registry
+
+    one_thread()
+    spec = registry.get(name)
+    if list_only:
+        for check in list_checks(spec):
+            echo(f"{check.requirement}\n    {check.name}, {check.applies_to}")
+        return
+    unmet = total = 0
+    for outcome in check_solver(name):
+        total += 1
+        echo(
+            f"{'met    ' if outcome.met else 'NOT MET'}  {outcome.check.requirement}",
+            style="" if outcome.met else "bold red",
+        )
+        if not outcome.met:
+            unmet += 1
+            echo(f"         {outcome.failure}")
+    skipped = [check.name for check in CHECKS.values() if not check.applies(spec)]
+    echo(f"{name} meets {total - unmet} of {total} requirements")
+    if skipped:
+        echo(f"not required, because the spec does not list the capability: {', '.join(skipped)}")
+    if unmet:
+        context.exit(1)
