@@ -1,7 +1,9 @@
-"""Factorisation of M (nv, nv), whose elimination graph is a tree or nearly one.
+"""Factorisation of a symmetric matrix M (n, n), whose elimination graph is a tree or nearly one.
 
-    M = L^T D L, L unit lower triangular. Row k is eliminated into the rows before it, k = nv - 1 ... 0: each leaf of a
+    M = L^T D L, L unit lower triangular. Row k is eliminated into the rows before it, k = n - 1 ... 0: each leaf of a
     kinematic tree is eliminated before its ancestors, and there is no fill-in (Featherstone 2008, section 6.5)     (1)
+
+The mass matrix of a problem and the normal matrix of Newton's method over its velocities are factored by `eliminate_rows`.
 """
 from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memcpy
@@ -12,6 +14,11 @@ from lavender_ext.core.validate cimport min_magnitude
 cdef enum:
     MAX_CHAIN_ROWS = 8          # maximum number of rows of a chain that are eliminated together
     MIN_COLUMNS_FOR_FOUR = 16   # Four rows are subtracted at once if they have at least this many columns, otherwise two.
+
+
+cdef inline double min_pivot_of_mass() noexcept nogil:
+    """Return the fraction of M_kk that a pivot of a mass matrix must exceed: four roundings of M_kk."""
+    return 8.8817841970012523e-16
 
 
 cdef inline void sort_columns(int32_t k, const int32_t* mark, int32_t count, int32_t* cols) noexcept nogil:
@@ -99,14 +106,8 @@ cdef inline int32_t tree_pattern(int32_t n, const int32_t* mptr, const int32_t* 
 cdef inline int32_t tree_factor(int32_t n, const int32_t* mptr, const int32_t* midx, const double* mval,
                                 const int32_t* lptr, const int32_t* lidx, double* lval, double* pivot,
                                 double* inv_pivot) noexcept nogil:
-    """Compute L and 1 / D of (1); return -1, or the row whose pivot is too small.
-
-    A pivot is too small if it is at most the rounding error of M_kk, or below `min_magnitude`. Consecutive rows of a chain,
-    which have the same columns except themselves, are eliminated together. This gives the same bits as one after the other
-    with less memory traffic.
-    """
-    cdef int32_t k, q, a, j, first, count, at, s, t
-    cdef double* row[MAX_CHAIN_ROWS]
+    """Compute L and 1 / D of (1) of a mass matrix; return -1, or the row whose pivot is too small."""
+    cdef int32_t k, q, j, first, count, at
     # copy M into the pattern of L
     for k in range(n):
         at = lptr[k]
@@ -127,8 +128,20 @@ cdef inline int32_t tree_factor(int32_t n, const int32_t* mptr, const int32_t* m
                 while lidx[at] != j:
                     at += 1
                 lval[at] = mval[q]
+    return eliminate_rows(n, lptr, lidx, lval, pivot, inv_pivot, min_pivot_of_mass())
+
+
+cdef inline int32_t eliminate_rows(int32_t n, const int32_t* lptr, const int32_t* lidx, double* lval, double* pivot,
+                                   double* inv_pivot, double min_pivot) noexcept nogil:
+    """Overwrite M in the pattern of L with L, D and 1 / D of (1); return -1, or the row whose pivot is too small.
+
+    lptr indexes both lidx and lval. `pivot` and `inv_pivot` contain the diagonal of M. A pivot is too small if it is at most
+    `min_pivot` M_kk, or below `min_magnitude`. Consecutive rows of a chain, which have the same columns except themselves,
+    are eliminated together. This gives the same bits as one after the other with less memory traffic.
+    """
+    cdef int32_t k = n - 1, a, first, count, s, t
+    cdef double* row[MAX_CHAIN_ROWS]
     # eliminate chains of rows from the last
-    k = n - 1
     while k >= 0:
         first, count, s = lptr[k], lptr[k + 1] - lptr[k], 1
         while s < MAX_CHAIN_ROWS and s <= count and lidx[first + count - s] == k - s and lptr[k - s + 1] - lptr[k - s] == count - s:
@@ -138,7 +151,7 @@ cdef inline int32_t tree_factor(int32_t n, const int32_t* mptr, const int32_t* m
         # rows of the chain among each other
         for t in range(s):
             subtract_chain_rows(lptr, lidx, lval, pivot, inv_pivot, k, k - t, count - t, row, t)
-            if not has_reciprocal(pivot, inv_pivot, k - t):
+            if not has_reciprocal(pivot, inv_pivot, k - t, min_pivot):
                 return k - t
         # the other rows
         for a in range(count - s, -1, -1):
@@ -147,9 +160,9 @@ cdef inline int32_t tree_factor(int32_t n, const int32_t* mptr, const int32_t* m
     return -1
 
 
-cdef inline bint has_reciprocal(const double* pivot, double* inv_pivot, int32_t k) noexcept nogil:
+cdef inline bint has_reciprocal(const double* pivot, double* inv_pivot, int32_t k, double min_pivot) noexcept nogil:
     """Replace inv_pivot[k], which holds M_kk, by 1 / D_k; return False if the pivot is too small."""
-    if not (pivot[k] > 8.8817841970012523e-16 * inv_pivot[k] and pivot[k] >= min_magnitude()):
+    if not (pivot[k] > min_pivot * inv_pivot[k] and pivot[k] >= min_magnitude()):
         return False
     inv_pivot[k] = 1.0 / pivot[k]
     return True
@@ -160,37 +173,47 @@ cdef inline void subtract_chain_rows(const int32_t* lptr, const int32_t* lidx, d
                                      int32_t s) noexcept nogil:
     """Eliminate the s rows k, k - 1 ... of a chain from row j, which is their column number `count`.
 
-    Their `count` columns before that one are subtracted from row j in runs of consecutive columns.
+    Their `count` columns before that one are subtracted from row j.
     """
-    cdef int32_t b = 0, n, t, at = lptr[j], first = lptr[k]
+    cdef int32_t b, t, at = lptr[j], first = lptr[k]
+    cdef double x
     cdef double z[MAX_CHAIN_ROWS]
+    cdef bint are_zero = True
+    for t in range(s):
+        are_zero = are_zero and row[t][count] == 0.0
+    if are_zero:                                            # rows of contacts that do not push have no entries
+        return
     for t in range(s):
         z[t] = row[t][count] * inv_pivot[k - t]
         pivot[j] -= z[t] * row[t][count]
-    while b < count:
-        while lidx[at] != lidx[first + b]:
+    if count > 0:
+        while lidx[at] != lidx[first]:
             at += 1
-        n = count - b if lptr[j + 1] - at == count - b else 1       # the remaining columns are the same
-        while b + n < count and lidx[at + n] == lidx[first + b + n]:
-            n += 1
-        subtract_run(lval + at, row, z, s, b, n)
-        at += n
-        b += n
+    if lptr[j + 1] - at == count:                           # row j has exactly these columns
+        subtract_run(lval + at, row, z, s, count)
+    else:
+        for b in range(count):
+            while lidx[at] != lidx[first + b]:
+                at += 1
+            x = lval[at]
+            for t in range(s):
+                x -= z[t] * row[t][b]
+            lval[at] = x
     for t in range(s):
         row[t][count] = z[t]
 
 
-cdef inline void subtract_run(double* x, double** row, const double* z, int32_t s, int32_t b, int32_t n) noexcept nogil:
-    """Subtract z_0 row_0 + z_1 row_1 + ... (s rows) from x on n columns, beginning at column b of the rows."""
+cdef inline void subtract_run(double* x, double** row, const double* z, int32_t s, int32_t n) noexcept nogil:
+    """Subtract z_0 row_0 + z_1 row_1 + ... (s rows) from x (n)."""
     cdef int32_t t = 0
     while t + 4 <= s and n >= MIN_COLUMNS_FOR_FOUR:
-        axpy_subtract_4(x, row[t] + b, z[t], row[t + 1] + b, z[t + 1], row[t + 2] + b, z[t + 2], row[t + 3] + b, z[t + 3], n)
+        axpy_subtract_4(x, row[t], z[t], row[t + 1], z[t + 1], row[t + 2], z[t + 2], row[t + 3], z[t + 3], n)
         t += 4
     while t + 2 <= s:
-        axpy_subtract_2(x, row[t] + b, z[t], row[t + 1] + b, z[t + 1], n)
+        axpy_subtract_2(x, row[t], z[t], row[t + 1], z[t + 1], n)
         t += 2
     if t < s:
-        axpy_subtract(x, row[t] + b, z[t], n)
+        axpy_subtract(x, row[t], z[t], n)
 
 
 cdef inline void axpy_subtract(double* x, const double* l, double f, int32_t n) noexcept nogil:

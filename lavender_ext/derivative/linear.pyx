@@ -26,7 +26,7 @@ from lavender_ext.core.velocity cimport rows_wrench, wrenches_to_velocity
 from lavender_ext.core.view cimport generalized_t, view_t
 from lavender_ext.derivative.natural cimport (CLOSED, FREE, HIGH, LOW, OPEN, SLIDES, STICKS, block_times, linear_t,
                                               natural_all, natural_t, place_rows, scaled_csr, scaled_general, system_rows)
-from lavender_ext.factor.dense cimport PANEL, dense_lu, dense_lu_solve, dense_lu_solve_back
+from lavender_ext.factor.dense cimport dense_lu, dense_lu_solve, dense_lu_solve_transposed
 from lavender_ext.factor.tiles cimport has_wide
 from lavender_ext.judge.measure cimport above_floor_of, floor_of, judge_view, relative_of, scratch_of
 from lavender_ext.judge.score cimport new_score, score_t
@@ -106,7 +106,7 @@ cdef public void lav_adjoint(const linear_t* a, const double* y, const double* c
     for i in range(m):
         if a.place[i] >= 0:
             s[a.place[i]] = (q[i] + (c[i] if c != NULL else 0.0)) / a.x.root[i]
-    dense_lu_solve_back(a.rows, a.lu, a.swap, s)
+    dense_lu_solve_transposed(a.rows, a.lu, a.swap, s)
     for i in range(m):
         q[i] = s[a.place[i]] if a.place[i] >= 0 else 0.0
     block_times(&a.x, &v.p, a.x.p, q, True, s)
@@ -193,7 +193,7 @@ cdef ssize_t factor_workspace_size(int32_t n) noexcept nogil:
 cdef ssize_t scratch_of_factor(int32_t n, const view_t* v) noexcept nogil:
     """Return the number of scratch doubles of `factorise`."""
     cdef ssize_t width = n + (v.g.n if v.g != NULL else 0)
-    return n * (width if width > PANEL else PANEL)
+    return n * width
 
 
 cdef bint factorise(linear_t* a, const view_t* v, double shift, double* at, double* scratch) noexcept nogil:
@@ -208,9 +208,9 @@ cdef bint factorise(linear_t* a, const view_t* v, double shift, double* at, doub
         return True
     a.lu, a.swap = at, <int32_t*>(at + <ssize_t>n * n)
     form(a, v, shift, a.lu, scratch)
-    if dense_lu(has_wide(), n, a.lu, a.swap, scratch):
+    if dense_lu(has_wide(), n, a.lu, a.swap, 0.0) == 0:
         for i in range(n):
-            x = fabs(a.lu[<ssize_t>i * n + i])
+            x = 1.0 / fabs(a.lu[<ssize_t>i * n + i])    # The factor contains 1 / U_ii.
             smallest = x if x < smallest else smallest
             norm_inf = x if x > norm_inf else norm_inf
     a.regular = smallest > MIN_PIVOT_RATIO * norm_inf and norm_inf > 0.0
@@ -343,7 +343,7 @@ cdef class Linear:
         out_ = r.copy()
         cdef double[::1] out = out_
         if self.at.rows and transpose:
-            dense_lu_solve_back(self.at.rows, self.at.lu, self.at.swap, &out[0])
+            dense_lu_solve_transposed(self.at.rows, self.at.lu, self.at.swap, &out[0])
         elif self.at.rows:
             dense_lu_solve(self.at.rows, self.at.lu, self.at.swap, &out[0])
         return out_

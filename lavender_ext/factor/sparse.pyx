@@ -9,7 +9,7 @@ panel is held column by column, its own columns' rows first, then the rows below
 so that every update is C - A B^T (`tiles.pxd`). 1 / L_jj or 1 / U_jj stands on the diagonal. L U is of
 D^-1/2 A D^-1/2: what rows a panel exchanges are of one size, and how small a pivot is shows.
 """
-from libc.math cimport fabs, sqrt
+from libc.math cimport sqrt
 from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memset
 
@@ -21,64 +21,25 @@ from lavender_ext.core.csr cimport transpose_csr, scan_entries
 from lavender_ext.core.view cimport csr_t
 from lavender_ext.factor.blocks cimport sparse_t
 from lavender_ext.factor.dense cimport cholesky_workspace_size, dense_cholesky, dense_cholesky_solve
-from lavender_ext.factor.supernodal cimport begin_panels, dense_panel, hand_on, place_rows, sparse_solve, take_panels
-from lavender_ext.factor.tiles cimport has_wide, less, take
+from lavender_ext.factor.supernodal cimport begin_panels, hand_on, place_rows, sparse_solve, take_panels
+from lavender_ext.factor.panels cimport LU_STRIP, cholesky_panel, lu_panel
+from lavender_ext.factor.tiles cimport axpy_subtract, gemm_subtract_nt, has_wide
 
 
-cdef enum:
-    STRIP = 12                  # columns of a panel of L U that are finished together
+cdef inline int32_t lu_panel_with_rows(const sparse_t* f, int32_t width, int32_t rows, double* a, double* u, int32_t* swap,
+                                       double min_pivot) noexcept nogil:
+    """Factor columns a (rows, width) with L below, and u (rows - width, width), the transposed rows beside them, by (1) and (2).
 
-
-cdef inline int32_t lu_panel(const sparse_t* f, int32_t width, int32_t rows, double* a, double* u, int32_t* swap,
-                             double tiny) noexcept nogil:
-    """(1), (2) of one panel: columns a (rows, width) with L below, u (rows - width, width) beside; small pivots."""
-    cdef int32_t j, j0 = 0, t, n, i, best, lost = 0, below = rows - width
-    cdef double x, top
+    Return the number of pivots that are too small.
+    """
+    cdef int32_t j, j0 = 0, t, n, i, below = rows - width
+    cdef int32_t lost = lu_panel(f.wide, width, rows, width, a, rows, swap, min_pivot, f.temp)
+    cdef double x
     cdef double* y
     cdef double* z
-    while j0 < width:
-        n = STRIP if j0 + STRIP <= width else width - j0
-        for j in range(j0, j0 + n):
-            y = a + <int64_t>j * rows
-            for t in range(j0):
-                if swap[t] != t:
-                    x = y[t]
-                    y[t] = y[swap[t]]
-                    y[swap[t]] = x
-            for t in range(j0):
-                take(j0 - t - 1, y[t], a + (t + 1) + <int64_t>t * rows, y + t + 1)
-            for t in range(j0):
-                f.temp[t * n + j - j0] = y[t]
-        less(f.wide, rows - j0, n, j0, a + j0, rows, f.temp, n, a + j0 + <int64_t>j0 * rows, rows)
-        for j in range(j0, j0 + n):
-            y = a + <int64_t>j * rows
-            best = j
-            top = fabs(y[j])
-            for i in range(j + 1, width):
-                if fabs(y[i]) > top:
-                    top = fabs(y[i])
-                    best = i
-            swap[j] = best
-            if best != j:
-                for t in range(j0 + n):
-                    z = a + <int64_t>t * rows
-                    x = z[j]
-                    z[j] = z[best]
-                    z[best] = x
-            if top > tiny:
-                x = 1.0 / y[j]
-            else:
-                lost += 1
-                x = 0.0
-            y[j] = x
-            for i in range(j + 1, rows):
-                y[i] *= x
-            for t in range(j + 1, j0 + n):
-                z = a + <int64_t>t * rows
-                take(rows - j - 1, z[j], y + j + 1, z + j + 1)
-        j0 += n
     if below == 0:
         return lost
+    # exchange the rows of U
     for j in range(width):
         if swap[j] != j:
             y = u + <int64_t>j * below
@@ -87,13 +48,13 @@ cdef inline int32_t lu_panel(const sparse_t* f, int32_t width, int32_t rows, dou
                 x = y[i]
                 y[i] = z[i]
                 z[i] = x
-    j0 = 0
+    # solve with L
     while j0 < width:
-        n = STRIP if j0 + STRIP <= width else width - j0
-        less(f.wide, below, n, j0, u, below, a + j0, rows, u + <int64_t>j0 * below, below)
+        n = LU_STRIP if j0 + LU_STRIP <= width else width - j0
+        gemm_subtract_nt(f.wide, below, n, j0, u, below, a + j0, rows, u + <int64_t>j0 * below, below)
         for j in range(j0 + 1, j0 + n):
             for t in range(j0, j):
-                take(below, a[j + <int64_t>t * rows], u + <int64_t>t * below, u + <int64_t>j * below)
+                axpy_subtract(below, a[j + <int64_t>t * rows], u + <int64_t>t * below, u + <int64_t>j * below)
         j0 += n
     return lost
 
@@ -150,9 +111,9 @@ cdef public int32_t lav_sparse_factor(const sparse_t* f, const int32_t* indptr, 
         k = f.first[i + 1] - f.first[i]
         q = k + f.rptr[i + 1] - f.rptr[i]
         if f.lu:
-            lost += lu_panel(f, k, q, f.val + f.at[i], f.up + f.beside[i], f.swap + f.first[i], tiny)
+            lost += lu_panel_with_rows(f, k, q, f.val + f.at[i], f.up + f.beside[i], f.swap + f.first[i], tiny)
         else:
-            lost += dense_panel(f.wide, k, q, f.val + f.at[i], f.scale + f.first[i])
+            lost += cholesky_panel(f.wide, k, q, f.val + f.at[i], f.scale + f.first[i])
         hand_on(f, i, f.rptr[i])
     return lost
 
@@ -162,7 +123,7 @@ cdef inline int64_t panel_workspace_size(const sparse_t* f) noexcept nogil:
     cdef int32_t i, j, run
     cdef int64_t most = 0, needed
     for i in range(f.panels):
-        needed = <int64_t>(f.first[i + 1] - f.first[i]) * STRIP if f.lu else 0
+        needed = <int64_t>(f.first[i + 1] - f.first[i]) * LU_STRIP if f.lu else 0
         if f.rptr[i + 1] - f.rptr[i] > needed:
             needed = f.rptr[i + 1] - f.rptr[i]
         if needed > most:

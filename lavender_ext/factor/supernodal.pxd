@@ -6,68 +6,12 @@ Left-looking: what earlier panels K take from J is a dense product (`tiles.pxd`)
 is held column by column, its own columns' rows first, then the rows below; 1 / L_jj stands on the diagonal (Ng, Peyton
 1993; Davis 2006, chapter 4). `sparse.pyx` has it of any matrix, and L U; here is that of a matrix of blocks.
 """
-from libc.math cimport sqrt
 from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memset
 
 from lavender_ext.factor.blocks cimport factor_t, sparse_t
-from lavender_ext.factor.tiles cimport add, finish, less, take
-
-
-cdef enum:
-    STRIP = 12                  # columns of a product that begin at the same row
-    TOGETHER = 3                # columns of a panel that are finished together
-
-
-cdef inline int32_t dense_panel(int32_t wide, int32_t width, int32_t rows, double* a,
-                                const double* least) noexcept nogil:
-    """Columns of a panel (rows, width) from what is left of N there; how many pivots were lost to rounding.
-
-    least (width): what a pivot must be above, or NULL: 1e-15 of what stood there before the last columns.
-    """
-    cdef int32_t j, j0 = 0, t, n, lost = 0
-    cdef double x
-    cdef double top[3]
-    cdef double* y
-    while j0 < width:
-        n = TOGETHER if j0 + TOGETHER <= width else width - j0
-        less(wide, rows - j0, n, j0, a + j0, rows, a + j0, rows, a + j0 + <int64_t>j0 * rows, rows)
-        for j in range(n):
-            top[j] = a[(j0 + j) + <int64_t>(j0 + j) * rows]
-        for j in range(j0, j0 + n):
-            y = a + <int64_t>j * rows
-            for t in range(j0, j):
-                take(j0 + n - j, a[j + <int64_t>t * rows], a + j + <int64_t>t * rows, y + j)
-            x = y[j]
-            if not x > (1e-15 * top[j - j0] if least == NULL else least[j]):
-                lost += 1
-                x = 0.0
-            else:
-                x = 1.0 / sqrt(x)
-            y[j] = x
-            for t in range(j + 1, j0 + n):
-                y[t] *= x
-        y = a + j0 + <int64_t>j0 * rows
-        if n == 3:
-            finish(rows - j0 - 3, y, y + rows, y + 2 * <int64_t>rows)
-        else:
-            for j in range(n):
-                for t in range(j):
-                    take(rows - j0 - n, y[j + <int64_t>t * rows], y + n + <int64_t>t * rows, y + n + <int64_t>j * rows)
-                for t in range(n, rows - j0):
-                    y[t + <int64_t>j * rows] *= y[j + <int64_t>j * rows]
-        j0 += TOGETHER
-    return lost
-
-
-cdef inline void less_lower(int32_t wide, int32_t m, int32_t n, int32_t k, const double* a, int64_t lda, double* c,
-                            int64_t ldc) noexcept nogil:
-    """C (m, n) <- C - A B^T with B the first n rows of A (m, k), on and below the diagonal; above it, little."""
-    cdef int32_t j = 0, most
-    while j < n:
-        most = STRIP if j + STRIP <= n else n - j
-        less(wide, m - j, most, k, a + j, lda, a + j, lda, c + j + j * ldc, ldc)
-        j += most
+from lavender_ext.factor.panels cimport cholesky_panel, gemm_subtract_lower
+from lavender_ext.factor.tiles cimport add_vector, axpy_subtract, gemm_subtract_nt
 
 
 cdef inline void spread(const sparse_t* f, int32_t from_, int32_t end, int32_t skip, int32_t n, const int32_t* columns,
@@ -79,7 +23,7 @@ cdef inline void spread(const sparse_t* f, int32_t from_, int32_t end, int32_t s
         while high < end and f.rel[f.rows[high]] - f.rel[f.rows[row]] == high - row:
             high += 1
         for j in range(n):
-            add(high - row, f.temp + <int64_t>j * m + row - from_,
+            add_vector(high - row, f.temp + <int64_t>j * m + row - from_,
                 to + ld * (columns[j] - base) + f.rel[f.rows[row]] - skip)
         row = high
 
@@ -93,7 +37,7 @@ cdef inline void strip_by_strip(const sparse_t* f, int32_t m, int32_t n, int32_t
         high = j + 1
         while high < n and columns[high] - columns[j] == high - j:
             high += 1
-        less(f.wide, m, high - j, k, u, below, a + j, rows, v + <int64_t>beside * (columns[j] - base), beside)
+        gemm_subtract_nt(f.wide, m, high - j, k, u, below, a + j, rows, v + <int64_t>beside * (columns[j] - base), beside)
         j = high
 
 
@@ -114,19 +58,19 @@ cdef inline void take_panel(const sparse_t* f, int32_t to, int32_t of, const int
     run = f.rel[f.rows[end - 1]] - low == m - 1         # into the panel as it stands
     if not lu:
         if run:
-            less_lower(f.wide, m, n, width, a, rows, v + ld * low + low, ld)
+            gemm_subtract_lower(f.wide, m, n, width, a, rows, v + ld * low + low, ld)
         else:
             memset(f.temp, 0, sizeof(double) * m * n)
-            less_lower(f.wide, m, n, width, a, rows, f.temp, m)
+            gemm_subtract_lower(f.wide, m, n, width, a, rows, f.temp, m)
             spread(f, q, end, 0, n, columns, base, ld, v)
         f.next[of] = q + n
         return
     u = f.up + f.beside[of] + r
     if run:
-        less(f.wide, m, n, width, a, rows, u, below, v + ld * low + low, ld)
+        gemm_subtract_nt(f.wide, m, n, width, a, rows, u, below, v + ld * low + low, ld)
     else:
         memset(f.temp, 0, sizeof(double) * m * n)
-        less(f.wide, m, n, width, a, rows, u, below, f.temp, m)
+        gemm_subtract_nt(f.wide, m, n, width, a, rows, u, below, f.temp, m)
         spread(f, q, end, 0, n, columns, base, ld, v)
     if m > n:
         v = f.up + f.beside[to]
@@ -135,7 +79,7 @@ cdef inline void take_panel(const sparse_t* f, int32_t to, int32_t of, const int
             strip_by_strip(f, m - n, n, width, u + n, below, a, rows, columns, base, v + low - own, beside)
         else:
             memset(f.temp, 0, sizeof(double) * (m - n) * n)
-            less(f.wide, m - n, n, width, u + n, below, a, rows, f.temp, m - n)
+            gemm_subtract_nt(f.wide, m - n, n, width, u + n, below, a, rows, f.temp, m - n)
             spread(f, q + n, end, own, n, columns, base, beside, v)
     f.next[of] = q + n
 
@@ -191,7 +135,7 @@ cdef inline void less_three(int32_t n, int32_t columns, const double* a, int64_t
         for q in range(n):
             y[q] = (y[q] - t0 * a[q]) - t1 * b[q]
     else:
-        take(n, t0, a, y)
+        axpy_subtract(n, t0, a, y)
 
 
 cdef inline void less_products(int32_t n, int32_t columns, const double* a, int64_t apart, const double* x,
@@ -285,7 +229,7 @@ cdef inline void panels_solve(const sparse_t* f, double* y, const int32_t lu) no
             if lu:
                 t = own[j] * a[j + <int64_t>j * rows]
                 own[j] = t
-                take(j, t, a + <int64_t>j * rows, own)
+                axpy_subtract(j, t, a + <int64_t>j * rows, own)
             else:
                 t = own[j]
                 for q in range(j + 1, width):
@@ -327,6 +271,6 @@ cdef inline int32_t super_cholesky(const factor_t* f) noexcept nogil:
         place_rows(p, i)
         take_panels(p, i, 0)
         k = p.first[i + 1] - p.first[i]
-        lost += dense_panel(p.wide, k, k + p.rptr[i + 1] - p.rptr[i], p.val + p.at[i], NULL)
+        lost += cholesky_panel(p.wide, k, k + p.rptr[i + 1] - p.rptr[i], p.val + p.at[i], NULL)
         hand_on(p, i, p.rptr[i])
     return lost

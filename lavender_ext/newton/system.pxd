@@ -19,7 +19,7 @@ from lavender_ext.core.block_types cimport CONE
 from lavender_ext.core.view cimport csr_t
 from lavender_ext.factor.blocks cimport factor_t
 from lavender_ext.factor.cholesky cimport block_cholesky, block_solve
-from lavender_ext.factor.dense cimport (PANEL, cholesky_workspace_size, dense_cholesky, dense_cholesky_solve, dense_lu,
+from lavender_ext.factor.dense cimport (cholesky_workspace_size, dense_cholesky, dense_cholesky_solve, dense_lu, dense_lu_sign,
                                         dense_lu_solve)
 from lavender_ext.factor.lu cimport block_lu, block_lu_solve
 from lavender_ext.newton.cones cimport is_high, is_low
@@ -84,9 +84,7 @@ cdef struct system_t:
 
 cdef inline int64_t dense_workspace_size(int64_t m, int32_t cones) noexcept nogil:
     """Values of `lower`; with cones it holds L H as well."""
-    cdef int64_t workspace = cholesky_workspace_size(<int32_t>m), other = PANEL * m
-    workspace = workspace if workspace > other else other
-    return m * m if cones and m * m > workspace else workspace
+    return m * m if cones else cholesky_workspace_size(<int32_t>m)
 
 
 cdef inline void system_times(system_t* s, const double* x, double* out) noexcept nogil:
@@ -199,7 +197,7 @@ cdef inline int32_t factor_dense(system_t* s, int32_t what, double eps) noexcept
     s.by = BY_NONE
     if symmetric and dense_cholesky(s.wide, n, s.whole, NULL, s.lower) == 0:
         s.by = BY_CHOLESKY
-    elif dense_lu(s.wide, n, s.whole, s.swap, s.lower):
+    elif dense_lu(s.wide, n, s.whole, s.swap, 0.0) == 0:
         s.by = BY_LU
     return s.by != BY_NONE
 
@@ -243,18 +241,14 @@ cdef inline int32_t system_factor(system_t* s, int32_t what, double eps) noexcep
 
 cdef inline int32_t system_sign(const system_t* s) noexcept nogil:
     """Sign of the determinant of the last (3); 0 where the caller factors, who does not tell it."""
-    cdef int32_t k, n, size, sign = 1
+    cdef int32_t k, size, sign = 1
     cdef double pivot
     if s.augmented or s.form == SPARSE:
         return 0
     if s.by != BY_LU:
         return s.by == BY_CHOLESKY
     if s.form == DENSE:
-        n = s.e.m if s.n_free < 0 else s.n_free
-        for k in range(n):
-            if (s.swap[k] != k) != (s.whole[<int64_t>k * (n + 1)] < 0.0):
-                sign = -sign
-        return sign
+        return dense_lu_sign(s.e.m if s.n_free < 0 else s.n_free, s.whole, s.swap)
     size = s.f.s
     for k in range(s.f.n * size):
         pivot = s.f.dval[<int64_t>(k // size) * size * size + (k % size) * (size + 1)]

@@ -18,7 +18,8 @@ from lavender_ext.core.csr cimport csr_dot
 from lavender_ext.core.block_types cimport blocks_t
 from lavender_ext.core.view cimport csr_t
 from lavender_ext.factor.band cimport ldl_back_all, ldl_factor, ldl_factor_2, ldl_solve, no_pivots
-from lavender_ext.factor.dense_lu cimport lu_factor, lu_solve
+from lavender_ext.factor.dense cimport dense_lu, dense_lu_solve
+from lavender_ext.factor.tiles cimport has_wide
 from lavender_ext.judge.score cimport unit_roundoff
 from lavender_ext.pivot.principal cimport AT_LOWER, AT_UPPER, FREE, INDEFINITE, ROUNDS, SMALL, SOLVED, STUCK, pivoting_t
 
@@ -46,11 +47,7 @@ cdef inline void factor_lu(pivoting_t* s) noexcept nogil:
             if to >= 0:
                 row[to] = s.size[at] * a.data[q] * s.size[to]
         row[at] += s.shift
-    if not lu_factor(k, s.c, s.swap):
-        s.found.small = 1
-    else:
-        for j in range(k):
-            s.found.small += not fabs(s.c[<int64_t>j * k + j]) > s.tiny
+    s.found.small = dense_lu(has_wide(), k, s.c, s.swap, s.tiny)
     s.factorisations += 1
     s.is_factored = 1
 
@@ -124,7 +121,7 @@ cdef inline void solve_factored(const pivoting_t* s, double* y) noexcept nogil:
         return
     for j in range(s.n_free):
         y[j] *= s.size[j]
-    lu_solve(s.n_free, s.c, s.swap, y)
+    dense_lu_solve(s.n_free, s.c, s.swap, y)
     for j in range(s.n_free):
         y[j] *= s.size[j]
 

@@ -19,7 +19,7 @@ from lavender_ext.core.contact_map cimport contact_map
 from lavender_ext.core.generalized cimport panel_transpose_add, panel_times
 from lavender_ext.core.block_types cimport blocks_t, is_rows, get_friction_components, friction_components_t
 from lavender_ext.core.view cimport generalized_t
-from lavender_ext.factor.tiles cimport combine
+from lavender_ext.factor.tiles cimport combine_rows
 from lavender_ext.judge.tally cimport empty_tally, tally_block, tally_row, tally_t
 
 
@@ -256,7 +256,7 @@ cdef inline void form_column(const flow_t* f, int32_t place) noexcept nogil:
     if b >= 0:
         nc = f.g.pcol[b + 1] - f.g.pcol[b]
         y = f.g.y + f.g.pval[b] + (f.unknowns[place] - f.g.prow[b]) * nc
-        combine(f.wide, f.rows, nc, f.y_transpose, f.transpose_offset + f.g.pcol[b], y, f.a + place * f.rows)
+        combine_rows(f.wide, f.rows, nc, f.y_transpose, f.transpose_offset + f.g.pcol[b], y, f.a + place * f.rows)
         f.panel_of_column[place] = b
 
 
@@ -273,7 +273,7 @@ cdef inline bint multiply_a(const flow_t* f, const double* x, double* out) noexc
             picks[count] = a * rows
             given[count] = x[own[a]]
             count += 1
-    combine(f.wide, rows, count, f.a, picks, given, sums)
+    combine_rows(f.wide, rows, count, f.a, picks, given, sums)
     for a in range(n):
         out[own[a]] = sums[a]
     return count > 0

@@ -15,12 +15,11 @@ from libc.stdint cimport int32_t
 from libc.string cimport memcpy
 
 from lavender_ext.core.dot cimport dot
-from lavender_ext.core.tree cimport ldl_solve, axpy_subtract_2
+from lavender_ext.core.tree cimport eliminate_rows, ldl_solve
 from lavender_ext.core.block_types cimport is_rows
-from lavender_ext.factor.dense_lu cimport lu_factor, lu_solve
-from lavender_ext.factor.tiles cimport combine
+from lavender_ext.factor.dense cimport dense_cholesky, dense_cholesky_solve, dense_lu, dense_lu_solve
+from lavender_ext.factor.tiles cimport combine_rows
 from lavender_ext.velocity_newton.flow cimport block_end, block_from, form_column, flow_t, apply_y
-from lavender_ext.velocity_newton.sparse cimport sparse_factor, axpy_subtract
 
 
 cdef inline void scale_row(double* out, const double* x, double f, int32_t n) noexcept nogil:
@@ -152,7 +151,10 @@ cdef inline void add_to_pattern(const flow_t* f, int32_t panel, int32_t n, int32
 
 
 cdef inline void add_to_dense(const flow_t* f, int32_t panel, int32_t n, int32_t size) noexcept nogil:
-    """Add Y^T (V Y) of one panel to the full matrix N."""
+    """Add Y^T (V Y) of one panel to the full matrix N.
+
+    Its first row is that of the last velocity: if leaves are eliminated before their ancestors, most entries of L and U are 0.
+    """
     cdef int32_t nc = f.g.pcol[panel + 1] - f.g.pcol[panel], a, b
     cdef const int32_t* cols = f.g.cols + f.g.pcol[panel]
     cdef const int32_t* local = f.local
@@ -161,9 +163,9 @@ cdef inline void add_to_dense(const flow_t* f, int32_t panel, int32_t n, int32_t
     cdef double* row
     for a in range(nc):
         weighted_row(f, y, nc, n, a, nc)
-        row = f.normal + <ssize_t>local[cols[a]] * size
+        row = f.normal + <ssize_t>(size - 1 - local[cols[a]]) * size + size - 1
         for b in range(nc):
-            row[local[cols[b]]] += line[b]
+            row[-local[cols[b]]] += line[b]
 
 
 cdef inline bint is_v_unchanged(const flow_t* f, int32_t island) noexcept nogil:
@@ -189,49 +191,6 @@ cdef inline void store_v(const flow_t* f, int32_t island) noexcept nogil:
 # -- over rows: S of (1), or I + A V of (3) ---------------------------------------------------------------------------------
 
 
-cdef inline int32_t factor_row_matrix(const flow_t* f) noexcept nogil:
-    """Factor S = L^T D L in place, inv = 1 / D; return 0 if a pivot is not positive. Two rows at a time, as `sparse_factor`."""
-    cdef int32_t a, k = f.n_free - 1
-    cdef double* row
-    cdef double* up
-    cdef double* to
-    cdef double x, y, r, s
-    while k >= 0:
-        row = f.factor + <ssize_t>k * (k + 1) // 2
-        if not row[k] > 0.0:
-            return 0
-        f.inv[k] = r = 1.0 / row[k]
-        if k == 0:
-            return 1
-        up = row - k
-        x = row[k - 1] * r
-        axpy_subtract(up, row, x, k)
-        row[k - 1] = x
-        if not up[k - 1] > 0.0:
-            return 0
-        f.inv[k - 1] = s = 1.0 / up[k - 1]
-        to = up
-        for a in range(k - 2, -1, -1):
-            to -= a + 1
-            x, y = row[a] * r, up[a] * s
-            axpy_subtract_2(to, row, x, up, y, a + 1)
-            row[a], up[a] = x, y
-        k -= 2
-    return 1
-
-
-cdef inline void solve_row_matrix(const flow_t* f, double* z) noexcept nogil:
-    """Compute z = S^-1 z in place."""
-    cdef int32_t a, n = f.n_free
-    cdef const double* l = f.factor + <ssize_t>n * (n + 1) // 2
-    for a in range(n - 1, -1, -1):
-        l -= a + 1
-        axpy_subtract(z, l, z[a], a)
-    for a in range(n):
-        z[a] = z[a] * f.inv[a] - dot(l, z, a)
-        l += a + 1
-
-
 cdef inline int32_t visit_free_blocks(const flow_t* f, const double* t, double* x) noexcept nogil:
     """Compute x = V t of (3); if t is NULL, list the free rows instead and write the rows of V A to x. Return their number."""
     cdef int32_t a, i, r, k, size, end, place = 0, n = 0
@@ -250,7 +209,7 @@ cdef inline int32_t visit_free_blocks(const flow_t* f, const double* t, double* 
                         form_column(f, place + r)
                         f.places[n + r], f.columns[n + r] = place + r, (place + r) * f.rows
                     for r in range(size):
-                        combine(f.wide, f.rows, size, f.a, f.columns + n, v + r * size, x + <ssize_t>(n + r) * f.rows)
+                        combine_rows(f.wide, f.rows, size, f.a, f.columns + n, v + r * size, x + <ssize_t>(n + r) * f.rows)
                 elif is_free:
                     for r in range(size):
                         x[n + r] = dot(v + r * size, t + n, size)
@@ -261,7 +220,7 @@ cdef inline int32_t visit_free_blocks(const flow_t* f, const double* t, double* 
 
 
 cdef inline void form_row_matrix(flow_t* f) noexcept nogil:
-    """Form the lower triangle of S, row by row, or the full matrix I + A V of (3), in `factor`."""
+    """Form S, its entries at and after the diagonal of each row, or the full matrix I + A V of (3), in `factor`."""
     cdef int32_t a, b, n = 0
     cdef const double* column
     cdef double* to = f.factor
@@ -280,10 +239,10 @@ cdef inline void form_row_matrix(flow_t* f) noexcept nogil:
             n += 1
     for a in range(n):
         column = f.a + f.columns[a]
-        for b in range(a + 1):
+        for b in range(a, n):
             to[b] = column[f.places[b]]
         to[a] += f.theta[f.unknowns[f.places[a]]]
-        to += a + 1
+        to += n
     f.n_free = n
 
 
@@ -295,12 +254,12 @@ cdef inline void solve_row_step(const flow_t* f) noexcept nogil:
     for a in range(f.n_free):
         z[a] = f.grad[f.unknowns[f.places[a]]]
     if f.bounded_rows_only:
-        solve_row_matrix(f, z)
+        dense_cholesky_solve(f.n_free, f.normal, z)
     else:
         x = f.sum + f.rows
-        lu_solve(f.n_free, f.factor, f.pivots, z)
+        dense_lu_solve(f.n_free, f.factor, f.pivots, z)
         visit_free_blocks(f, z, x)
-    combine(f.wide, f.rows, f.n_free, f.a, f.columns, x, f.sum)
+    combine_rows(f.wide, f.rows, f.n_free, f.a, f.columns, x, f.sum)
     for a in range(f.n_unknowns):
         k = f.unknowns[a]
         f.step[k] = f.lam[k] - f.y[k]
@@ -350,18 +309,23 @@ cdef inline void form_normal_matrix(flow_t* f, int32_t island, bint square) noex
                 add_to_pattern(f, b, n, size)
 
 
-cdef inline int32_t factor_normal_matrix(flow_t* f, int32_t island, bint square) noexcept nogil:
-    """Factor N, or the matrix over rows; return 0 if a pivot fails."""
-    cdef int32_t size = f.cptr[island + 1] - f.cptr[island]
+cdef inline bint factor_normal_matrix(flow_t* f, int32_t island, bint square) noexcept nogil:
+    """Factor N, or the matrix over rows; return whether no pivot was lost."""
+    cdef int32_t a, size = f.cptr[island + 1] - f.cptr[island], values
     cdef const int32_t* lptr = f.lptr + f.cptr[island]
     f.factorisations += 1
+    if f.is_over_rows and f.bounded_rows_only:
+        return dense_cholesky(f.wide, f.n_free, f.factor, NULL, f.normal) == 0
     if f.is_over_rows:
-        return factor_row_matrix(f) if f.bounded_rows_only else lu_factor(f.n_free, f.factor, f.pivots)
+        return dense_lu(f.wide, f.n_free, f.factor, f.pivots, 0.0) == 0
     if square:
         memcpy(f.factor, f.normal, <ssize_t>size * size * sizeof(double))
-        return lu_factor(size, f.factor, f.pivots)
-    memcpy(f.factor, f.normal, (lptr[size] - lptr[0] + size) * sizeof(double))
-    return sparse_factor(size, lptr, f.lidx, f.factor, f.inv)
+        return dense_lu(f.wide, size, f.factor, f.pivots, 0.0) == 0
+    values = lptr[size] - lptr[0]
+    memcpy(f.factor, f.normal, (values + size) * sizeof(double))
+    for a in range(size):
+        f.inv[a] = f.factor[values + a]
+    return eliminate_rows(size, lptr, f.lidx, f.factor - lptr[0], f.factor + values, f.inv, 0.0) < 0
 
 
 cdef inline void solve_step(const flow_t* f, int32_t island, bint square) noexcept nogil:
@@ -370,12 +334,16 @@ cdef inline void solve_step(const flow_t* f, int32_t island, bint square) noexce
     if f.is_over_rows:
         solve_row_step(f)
         return
-    for a in range(size):
-        f.local_rhs[a] = -f.grad[f.icols[c0 + a]]
     if square:
-        lu_solve(size, f.factor, f.pivots, f.local_rhs)
+        for a in range(size):
+            f.local_rhs[size - 1 - a] = -f.grad[f.icols[c0 + a]]
+        dense_lu_solve(size, f.factor, f.pivots, f.local_rhs)
+        for a in range(size):
+            f.step[f.icols[c0 + a]] = f.local_rhs[size - 1 - a]
     else:
+        for a in range(size):
+            f.local_rhs[a] = -f.grad[f.icols[c0 + a]]
         ldl_solve(size, f.lptr + c0, f.lidx, f.factor - f.lptr[c0], f.inv, f.local_rhs)
-    for a in range(size):
-        f.step[f.icols[c0 + a]] = f.local_rhs[a]
+        for a in range(size):
+            f.step[f.icols[c0 + a]] = f.local_rhs[a]
     apply_y(f, island, f.step, f.q)

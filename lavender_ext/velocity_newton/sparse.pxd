@@ -1,4 +1,4 @@
-"""Factor N = L^T D L of an island in the pattern of L, from the last row to the first, as M is factored.
+"""The pattern of N = L^T D L of an island, which is factored from the last row to the first, as M (`core/tree.pxd`).
 
 A row of Y has entries in a few chains of a tree, so N = I + Y^T V Y couples columns of the same panel only, and
 eliminating row k couples the columns of its entries (`tree_pattern`). Without contacts between branches the pattern is
@@ -9,7 +9,7 @@ takes the work of a dense factor.
 """
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.tree cimport axpy_subtract_2, tree_pattern
+from lavender_ext.core.tree cimport tree_pattern
 from lavender_ext.core.view cimport generalized_t
 
 
@@ -97,86 +97,3 @@ cdef inline double factor_work(int32_t n, const int32_t* lptr, const int32_t* li
             if theirs != q - first:
                 skipped += theirs
     return s + COLUMN_SEARCH_WORK * skipped
-
-
-cdef inline void axpy_subtract(double* x, const double* y, double f, int32_t n) noexcept nogil:
-    """x -= f y."""
-    cdef int32_t i
-    for i in range(n):
-        x[i] -= f * y[i]
-
-
-cdef inline int32_t find_place(const int32_t* theirs, int32_t column) noexcept nogil:
-    """Return the index of `column` in the columns of a row, which contain it."""
-    cdef int32_t at = 0
-    while theirs[at] != column:
-        at += 1
-    return at
-
-
-cdef inline int32_t sparse_factor(int32_t n, const int32_t* lptr, const int32_t* lidx, double* val,
-                                  double* inv) noexcept nogil:
-    """Factor in place, with inv = 1 / D (n); return 0 if a pivot is not positive. lptr may begin anywhere in lidx.
-
-    Two neighbouring rows with the same columns (except the upper row's own) are eliminated together. That halves the
-    memory traffic, and the bits are those of two single eliminations.
-    """
-    cdef int32_t k = n - 1, a, b, j, count, at, i, base = lptr[0]
-    cdef double* diag = val + (lptr[n] - base)
-    cdef double* row
-    cdef double* up
-    cdef double* to
-    cdef const int32_t* cols
-    cdef const int32_t* theirs
-    cdef double x, y, f, g, r
-    cdef bint two
-    while k >= 0:
-        if not diag[k] > 0.0:
-            return 0
-        r = 1.0 / diag[k]
-        inv[k] = r
-        row = val + (lptr[k] - base)
-        up = row
-        cols = lidx + lptr[k]
-        count = lptr[k + 1] - lptr[k]
-        two = count > 0 and cols[count - 1] == k - 1 and lptr[k] - lptr[k - 1] == count - 1
-        if two:                                             # Eliminate row k from row k - 1.
-            count -= 1
-            up = val + (lptr[k - 1] - base)
-            x = row[count]
-            f = x * r
-            if x != 0.0:
-                diag[k - 1] -= f * x
-                axpy_subtract(up, row, f, count)
-                row[count] = f
-            k -= 1
-            if not diag[k] > 0.0:
-                return 0
-            inv[k] = 1.0 / diag[k]
-        for a in range(count - 1, -1, -1):
-            x = row[a]
-            y = up[a] if two else 0.0
-            if x == 0.0 and y == 0.0:
-                continue
-            f = x * r
-            g = y * inv[k]
-            j = cols[a]
-            diag[j] = (diag[j] - f * x) - g * y
-            to = val + (lptr[j] - base)
-            theirs = lidx + lptr[j]
-            at = find_place(theirs, cols[0]) if a > 0 else 0
-            if lptr[j + 1] - lptr[j] != at + a:             # The remaining columns differ.
-                for b in range(a):
-                    i = cols[b]
-                    while theirs[at] != i:
-                        at += 1
-                    to[at] = (to[at] - f * row[b]) - g * up[b]
-            elif two:
-                axpy_subtract_2(to + at, row, f, up, g, a)
-            else:
-                axpy_subtract(to + at, row, f, a)
-            row[a] = f
-            if two:
-                up[a] = g
-        k -= 1
-    return 1
