@@ -24,7 +24,7 @@ from lavender.io.stored import lock_output
 
 @click.command()
 @click.argument("model", metavar="MODEL.xml", type=FILE)
-@worlds_options(worlds=4096, steps=200)
+@worlds_options(worlds=None, steps=200)
 @click.option(
     "--engine",
     default="mujoco",
@@ -46,7 +46,8 @@ def audit(
 ) -> None:
     """Judge every step of many worlds of a MuJoCo model.
 
-    MODEL.xml is an MJCF file. The page shows how many steps were judged, how many of these stopped before convergence,
+    MODEL.xml is an MJCF file. Without --worlds the audit takes about a minute; the remaining time is shown. The page
+    shows how many steps were judged, how many of these stopped before convergence,
     their errors with time and body, and the numbers of rows and contacts. The worst worlds are problem files in
     OUT/worst; OUT/states.npz holds the states before them, from which --states starts again.
 

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     P = TypeVar("P", bound=Plan)
 
 PROGRESS_INTERVAL = 10.0  # [s] Time between two lines of progress if the output is not a terminal.
+MIN_ELAPSED = 1.0  # [s] The remaining time is not estimated from a shorter time.
 
 
 @dataclass(frozen=True)
@@ -205,14 +206,20 @@ def progress() -> Iterator[Callable[[Event], None]]:
         BarColumn(),
         MofNCompleteColumn(),
         TimeElapsedColumn(),
+        TextColumn("{task.fields[remaining]}", markup=False),
         TextColumn("{task.fields[what]}", markup=False),
         console=to,
         transient=True,
         refresh_per_second=4,  # Drawing takes processor time from the measurement.
     ) as bar:
-        task = bar.add_task("", total=None, what="")
+        task = bar.add_task("", total=None, what="", remaining="")
+        began = time.monotonic()
         yield lambda event: bar.update(
-            task, completed=event.done, total=event.total or None, what=_format_event(event)
+            task,
+            completed=event.done,
+            total=event.total or None,
+            remaining=format_remaining(event, time.monotonic() - began),
+            what=_format_event(event),
         )
 
 
@@ -226,9 +233,23 @@ def _print_progress_lines() -> Callable[[Event], None]:
         if now - printed >= PROGRESS_INTERVAL:
             printed = now
             count = f"{event.done} of {event.total}, " if event.total else ""
-            click.echo(f"{count}{now - began:.0f} s: {_format_event(event)}", err=True)
+            remaining = format_remaining(event, now - began)
+            remaining = f", {remaining}" if remaining else ""
+            click.echo(f"{count}{now - began:.0f} s{remaining}: {_format_event(event)}", err=True)
 
     return show_event
+
+
+def format_remaining(event: Event, elapsed: float) -> str:
+    """Return a phrase such as "about 40 s remain" after `elapsed` seconds; empty if nothing is known yet."""
+    remaining = event.remaining
+    if remaining is None:
+        if not (event.total and event.done and elapsed >= MIN_ELAPSED):
+            return ""
+        remaining = elapsed * (event.total - event.done) / event.done
+    if remaining < 90.0:
+        return f"about {max(1, round(remaining))} s remain"
+    return f"about {round(remaining / 60.0)} min remain"
 
 
 def _format_event(event: Event) -> str:

@@ -200,10 +200,11 @@ def add_options(
     return decorate
 
 
-def worlds_options(worlds: int, steps: int) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+def worlds_options(worlds: int | None, steps: int) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """Return a decorator with the options for simulating worlds of a MuJoCo model; the arguments are defaults."""
     options: list[Option] = [
-        (("--worlds",), {"default": worlds, "help": "Number of worlds; the first is the one of `lavender record`."}),
+        (("--worlds",), {"default": worlds, "type": int, "help": "Number of worlds; the first is the one of `lavender "
+                         "record`." + " Default: as many as take about a minute." * (worlds is None)}),
         (("--steps",), {"default": steps, "help": "Steps of each world."}),
         (("--spread",), {"default": 0.1, "metavar": "M/S",
                          "help": "Standard deviation by which the initial velocities of the other worlds differ."}),

@@ -181,7 +181,9 @@ def from_mujoco_many(model: Any, states: Any, *, threads: int = 1, errors: str =
     model : mujoco.MjModel
         Its options (solver, tolerance, iterations, jacobian, ...) determine the answers.
     states : (n, nq + nv), or (n, size) of mjSTATE_FULLPHYSICS or mjSTATE_INTEGRATION
-        qpos and qvel, or the result of `mj_getState`.
+        The result of `mj_getState`. MuJoCo's answer depends on its warm start and its controls, which only
+        mjSTATE_INTEGRATION contains; without them the answer is the one of a start at zero, whose errors differ.
+        A row of qpos and qvel is accepted, too.
     threads : int
         Number of threads; the results do not depend on it.
     errors : {"raise", "status"}

@@ -1,6 +1,6 @@
 """Judge every step of many worlds: which solves stopped before convergence, their errors, and the worst states.
 
-    result = audit("ant.xml", worlds=64, steps=200)
+    result = audit("ant.xml")          # as many worlds as take about a minute; or worlds=64
     result.table_of_errors; result.worst[0].problem
     result.write("lavender-audit"); result.summary_page.write("lavender-audit")
 
@@ -23,6 +23,7 @@ import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from time import perf_counter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -37,6 +38,7 @@ from lavender.io.recording import Control
 from lavender.io.states import VECTOR
 from lavender.io.stored import folder_for_steps, write_arrays
 from lavender.judge.residuals import AT_FLOOR, CLOSE, DEFAULT_THRESHOLD, UNCONVERGED, VERDICTS, WRONG
+from lavender.lab.bench import machine
 from lavender.lab.bench.running.runner import Event
 from lavender.lab.bench.running.workers import check_workers, connect_backend, map_unordered
 from lavender.lab.report.figures import Curve, Figure
@@ -60,7 +62,13 @@ NOT_JUDGED = len(VERDICTS)
 WORST_ROW_ERRORS = ("velocity", "impulse", "relative", "floor")  # [m/s, N s, -, -] errors of the worst row
 QUANTILES = (0.5, 0.9, 0.99, 0.999, 1.0)
 MAX_PROBLEMS_IN_MEMORY = 512  # Problems are built and judged in batches of this many.
-STEPS_PER_TASK = 4096  # A worker returns its results after this many steps.
+STEPS_PER_TASK = 4096  # A worker returns its results after this many steps or fewer.
+MIN_TASKS_PER_WORKER = 10  # With fewer tasks, the progress and the remaining time would be coarse.
+DEFAULT_DURATION = 60.0  # [s] Without a number of worlds, the audit takes about this time.
+MIN_PROGRESS_TIME = 1.0  # [s] The remaining time is estimated from results of at least this time.
+MAX_DEFAULT_WORLDS = (
+    4096  # Without a number of worlds, no more are simulated: their errors fill the quantiles.
+)
 N_WORST_WORLDS = 3  # Number of worlds for which the worst step is written to a file.
 MAX_CURVE_POINTS = 60  # Largest number of points of a curve over time.
 ERRORS_NOTE = (
@@ -77,6 +85,9 @@ FILES_NOTE = (
 DIVERGED_NOTE = (
     "The step in which each world diverged, the quantity that was not finite or above 1e10, and whether every solve of "
     "the world until then was exact. If so, the cause lies outside the constraint solver."
+)
+AUDIT_BUSY_CONSEQUENCE = (
+    "The audit took longer than on an idle machine; its errors do not depend on the load."
 )
 OUTSIDE_SOLVER = "outside the constraint solver (time step, integrator, actuators or the model itself)"
 # Number of a contact within its step; it is removed from row names, as it differs between steps.
@@ -160,6 +171,8 @@ class Audit:
     divergences : list of Divergence
     stopped : bool
         The audit was stopped by Ctrl-C, or workers were lost.
+    busy : str
+        A warning if other processes used the processors; else empty.
     """
 
     runs: Runs
@@ -173,6 +186,7 @@ class Audit:
     worst: list[Worst]
     divergences: list[Divergence]
     stopped: bool = False
+    busy: str = ""
 
     @property
     def is_judged(self) -> Any:
@@ -365,7 +379,8 @@ class Audit:
             "head": self.head, "engine": self.engine, "model": runs.model, "worlds": runs.worlds, "steps": runs.steps,
             "seed": runs.seed, "judged": self.judged, "unjudged": self.unjudged, "diverged": self.diverged,
             "unconverged": int(unconverged.sum()), "worlds_unconverged": int(unconverged.any(axis=1).sum()),
-            "largest": self.largest, "divergences": divergences, **self.sizes.numbers, "stopped": self.stopped,
+            "largest": self.largest, "divergences": divergences, **self.sizes.numbers, "busy": self.busy,
+            "stopped": self.stopped,
         }  # fmt: skip
 
     @property
@@ -384,14 +399,15 @@ class Audit:
                 PageSection("The worst worlds", [self.table_of_worst], short=N_WORST_WORLDS, note=FILES_NOTE),
             ],
             self.totals,
-            self.stopped,
+            stopped=self.stopped,
+            warning=self.busy,
         )  # fmt: skip
 
 
 def audit(
     model: str | os.PathLike[str],
     *,
-    worlds: int = 4096,
+    worlds: int | None = None,
     steps: int = 200,
     engine: str = "mujoco",
     control: Control = "random",
@@ -409,7 +425,9 @@ def audit(
     Parameters
     ----------
     model : path (MJCF)
-    worlds, steps, control, seed, spread
+    worlds : int, optional
+        Default: as many as take about a minute (`DEFAULT_DURATION`), at most 4096.
+    steps, control, seed, spread
         See `Runs`.
     engine : {"mujoco", "mjx", "mujoco_warp"}
     states : path of an .npz, "keyframes", or arrays, optional
@@ -443,8 +461,15 @@ def audit(
     if precision not in (None, *PRECISIONS) or (precision and engine != "mujoco"):
         raise InputError(f"precision is {precision!r}; {' or '.join(PRECISIONS)}, of MuJoCo alone, is needed")
     check_workers(workers)
-    runs = Runs(os.fspath(model), worlds, steps, control=control, seed=seed, spread=spread).start_from(states)
     judging = precision or "float64", check_float("threshold", threshold, low=0.0)
+    expected_time = None
+    if worlds is None:
+        if watch is not None:
+            watch(Event(0, 0, "timing one world", ""))
+        expected_time = DEFAULT_DURATION
+        one = Runs(os.fspath(model), 1, steps, control=control, seed=seed, spread=spread).start_from(states)
+        worlds = choose_worlds(one, judging, count_processes(workers) if engine == "mujoco" else 1)
+    runs = Runs(os.fspath(model), worlds, steps, control=control, seed=seed, spread=spread).start_from(states)
     numbers, verdict = (
         np.full((len(WORST_ROW_ERRORS), worlds, steps), np.nan),
         np.full((worlds, steps), -1, np.int8),
@@ -454,10 +479,17 @@ def audit(
         runs, engine, numbers, verdict, rows=rows, contacts=contacts, can_touch=can_touch(*runs.load()), where={},
         worst=[], divergences=[],
     )  # fmt: skip
+    loads, processes = [], 1
     if engine == "mujoco":
         pieces = _audit_mujoco(runs, judging, workers, backend)
+        processes += count_processes(workers)  # This process waits for the workers.
     else:
         pieces = _audit_frames(engine, runs, judging[1])
+    if watch is not None:
+        text = f"{format_count(worlds, 'world')} of {format_count(steps, 'step')}"
+        watch(Event(0, worlds * steps, text, "", remaining=expected_time))
+    begin = perf_counter()
+    first: tuple[int, float] | None = None  # (number of steps, time [s]) of the first results
     try:
         for piece in pieces:
             numbers[:, piece.world, piece.step] = piece.numbers
@@ -469,15 +501,44 @@ def audit(
                 result.where[name] = count + 1, max(largest, float(piece.numbers[0, i]))
             result.worst[:] = _select_worst([*result.worst, *piece.worst])
             result.divergences[:] = sorted([*result.divergences, *piece.divergences])
+            loads.append(machine.running())
             if watch is not None:
-                n = int(result.unconverged.sum())
-                watch(Event(result.done, worlds * steps, f"{n} {UNCONVERGED}", ""))
+                # The time before the first results contains the start of the workers.
+                first = first or (result.done, perf_counter())
+                elapsed, since = perf_counter() - first[1], result.done - first[0]
+                remaining = (
+                    None if expected_time is None else max(0.0, expected_time + begin - perf_counter())
+                )
+                if since and elapsed >= MIN_PROGRESS_TIME:
+                    remaining = elapsed * (worlds * steps - result.done) / since
+                text = f"steps judged, {int(result.unconverged.sum())} {UNCONVERGED}"
+                watch(Event(result.done, worlds * steps, text, "", remaining=remaining))
     except KeyboardInterrupt:
         if not result.done:
             raise
     if not result.done:
         raise InputError("no step was judged: workers were lost; fewer of them (--workers) need less memory")
-    return replace(result, stopped=result.done < worlds * steps)
+    busy = machine.describe_busy(loads, os.cpu_count() or 1, AUDIT_BUSY_CONSEQUENCE, own=processes)
+    return replace(result, stopped=result.done < worlds * steps, busy=busy)
+
+
+def count_processes(workers: int) -> int:
+    """Return the number of processes of `workers` (-1: one for each core)."""
+    return workers if workers > 0 else max(1, (os.cpu_count() or 1) + 1 + workers)
+
+
+def choose_worlds(runs: Runs, judging: tuple[str, float], processes: int) -> int:
+    """Return the number of worlds that take about `DEFAULT_DURATION` in so many processes.
+
+    `runs` are of one world, which is simulated and judged with MuJoCo; its second run is timed, because the first one
+    also imports modules.
+    """
+    _reject_unsupported_model(runs)
+    audit_worlds(replace(runs, steps=1), judging, range(1))
+    begin = perf_counter()
+    audit_worlds(runs, judging, range(1))
+    duration = max(perf_counter() - begin, 1e-6)
+    return max(1, min(MAX_DEFAULT_WORLDS, int(DEFAULT_DURATION * processes / duration)))
 
 
 def _select_worst(candidates: list[Worst]) -> list[Worst]:
@@ -490,10 +551,9 @@ def _select_worst(candidates: list[Worst]) -> list[Worst]:
 
 def _audit_mujoco(runs: Runs, judging: tuple[str, float], workers: int, backend: str) -> Iterator[Piece]:
     """Simulate and judge MuJoCo's steps in worker processes."""
-    _, model = runs.load()
-    # An unsupported model raises here, once.
-    from_mujoco_many(model, np.concatenate([model.qpos0, np.zeros(model.nv)])[None])
-    worlds_per_task = max(1, min(STEPS_PER_TASK // runs.steps, runs.worlds))
+    _reject_unsupported_model(runs)
+    share = -(-runs.worlds // (MIN_TASKS_PER_WORKER * count_processes(workers)))
+    worlds_per_task = max(1, min(STEPS_PER_TASK // runs.steps, share))
     parts = (
         (runs, judging, range(first, min(first + worlds_per_task, runs.worlds)))
         for first in range(0, runs.worlds, worlds_per_task)
@@ -502,6 +562,12 @@ def _audit_mujoco(runs: Runs, judging: tuple[str, float], workers: int, backend:
     with cluster:
         for pieces in map_unordered(audit_worlds, parts, workers, name):
             yield from pieces
+
+
+def _reject_unsupported_model(runs: Runs) -> None:
+    """Raise the error of a model whose constraint problems cannot be built, once and before any worker starts."""
+    _, model = runs.load()
+    from_mujoco_many(model, np.concatenate([model.qpos0, np.zeros(model.nv)])[None])
 
 
 def audit_worlds(runs: Runs, judging: tuple[str, float], worlds: range) -> list[Piece]:

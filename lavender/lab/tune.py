@@ -20,11 +20,13 @@ motion shows how far it deviates, and no line recommends it.
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from statistics import fmean
 from time import perf_counter
 from typing import Any
 
@@ -38,6 +40,7 @@ from lavender.io.efc import from_mujoco_many
 from lavender.io.recording import Control
 from lavender.judge.residuals import DEFAULT_THRESHOLD
 from lavender.lab.audit import MAX_PROBLEMS_IN_MEMORY
+from lavender.lab.bench import machine
 from lavender.lab.bench.running.runner import Event
 from lavender.lab.report.figures import Curve, Figure
 from lavender.lab.report.summary_page import PageSection, SummaryPage
@@ -58,6 +61,14 @@ N_TRIAL_ROUNDS = 2  # Settings near the front are varied after this many rounds.
 MAX_VARIED_TIME_RATIO = 1.5
 TOLERANCES = (1e-3, 1e-4, 1e-6, 1e-8, 1e-10, 1e-12, 1e-15)
 ITERATIONS = {"Newton": (1, 2, 3, 5, 10), "CG": (3, 6, 12, 25, 50), "PGS": (3, 6, 12, 25, 50, 100)}
+#: Kinds of measurements: the error of a setting, and the times of its steps.
+MEASUREMENTS = ("judging", "timing")
+EXPECTED_VARIED_SETTINGS = 4  # Settings whose variants are measured, for the estimate of the remaining time.
+MERGE_NOTE = (
+    "Add the line next to the model's own <option>: MuJoCo merges both. If it replaces the model's own <option>, "
+    "its integrator and time step are lost."
+)
+TUNE_BUSY_CONSEQUENCE = "The times are invalid; measure again on an idle machine."
 # Prefixes of MuJoCo's enumerators; the rest of the name is the MJCF keyword.
 ENUMS = {
     "solver": "mjSOL_",
@@ -100,6 +111,11 @@ class Setting:
         """`<option>` line to copy into the model; empty if no option differs."""
         texts = (f'{name}="{x:g}"' if isinstance(x, float) else f'{name}="{x}"' for name, x in self.options)
         return f"<option {' '.join(texts)}/>" if self.options else ""
+
+    @property
+    def name(self) -> str:
+        """The line, or "the model's own setting"."""
+        return self.line or "the model's own setting"
 
     @property
     def is_other(self) -> bool:
@@ -160,6 +176,61 @@ class Measured:
     def worst_motion(self) -> float:
         """Distance that one stretch in a hundred exceeds [m]."""
         return float(np.quantile(self.motion, ERROR_QUANTILE, method="higher"))
+
+
+class Schedule:
+    """Measurements that are done and expected, for the progress and the remaining time.
+
+    Parameters
+    ----------
+    watch : callable, optional
+        Called with an `Event` at the begin of each measurement.
+    """
+
+    def __init__(self, watch: Callable[[Event], None] | None) -> None:
+        self.watch = watch
+        self.done = 0
+        self.loads: list[float | None] = []  # number of runnable processes at each timing
+        self._expected = dict.fromkeys(MEASUREMENTS, 0)
+        self._reserved = dict.fromkeys(MEASUREMENTS, 0)
+        self._durations: dict[str, list[float]] = {kind: [] for kind in MEASUREMENTS}
+
+    def reserve(self, kind: str, count: int) -> None:
+        """Set the estimate of later measurements that are not announced yet."""
+        self._reserved[kind] = count
+
+    def expect(self, kind: str, count: int) -> None:
+        """Announce measurements; they replace reserved ones."""
+        self._expected[kind] += count
+        self._reserved[kind] = max(0, self._reserved[kind] - count)
+
+    def skip(self, kind: str) -> None:
+        """Count an announced measurement as unnecessary."""
+        self._expected[kind] -= 1
+
+    @property
+    def remaining(self) -> float | None:
+        """Estimate of the remaining time [s]: the mean durations so far; None at the beginning."""
+        total = 0.0
+        every = [t for durations in self._durations.values() for t in durations]
+        for kind in MEASUREMENTS:
+            mean = fmean(self._durations[kind] or every or [0.0])
+            total += mean * (self._expected[kind] + self._reserved[kind])
+        return total if every else None
+
+    @contextlib.contextmanager
+    def measure(self, kind: str, text: str) -> Iterator[None]:
+        """Show the progress, then run and time the block, which is one measurement."""
+        if self.watch is not None:
+            count = sum(self._expected.values()) + sum(self._reserved.values())
+            self.watch(Event(self.done, self.done + count, f"{kind}: {text}", "", remaining=self.remaining))
+        if kind == "timing":
+            self.loads.append(machine.running())
+        begin = perf_counter()
+        yield
+        self._durations[kind].append(perf_counter() - begin)
+        self._expected[kind] -= 1
+        self.done += 1
 
 
 @dataclass(eq=False)
@@ -254,19 +325,22 @@ class Stage:
             result, error=np.nan_to_num(np.concatenate(errors), nan=np.inf), motion=distance, **sizes
         )
 
-    def time(self, settings: list[Measured], repeats: int, report_progress: Callable[[str], None]) -> None:
+    def time(self, settings: list[Measured], repeats: int, schedule: Schedule) -> None:
         """Time the steps of several rounds in which all settings alternate; the first is the model's own.
 
         A setting with which a world diverges is not timed.
         """
         settings = [m for m in settings if np.isfinite(m.error).all()]
         models = [m.setting.on(self.mj, self.model) for m in settings]
+        schedule.expect("timing", len(settings) * repeats)
         for round_index in range(repeats):
             for m, model in zip(settings, models, strict=True):
                 # Medians: a step that is interrupted in the first round does not exclude a setting.
-                if round_index == 0 or np.median(m.times) <= MAX_TIME_RATIO * np.median(settings[0].times):
+                if round_index and np.median(m.times) > MAX_TIME_RATIO * np.median(settings[0].times):
+                    schedule.skip("timing")
+                    continue
+                with schedule.measure("timing", f"round {round_index + 1} of {repeats}, {m.setting.name}"):
                     m.times = np.minimum(m.times, self.run(model)[0])
-                    report_progress("timed")
 
 
 @dataclass(frozen=True, eq=False)
@@ -288,6 +362,8 @@ class Tuning:
         The measurement was stopped by Ctrl-C.
     sizes : StepSizes, optional
         Rows and contacts of the steps of all worlds with the model's own setting.
+    busy : str
+        A warning if other processes used the processors during the timing; else empty.
     """
 
     runs: Runs
@@ -297,6 +373,7 @@ class Tuning:
     threshold: float
     stopped: bool = False
     sizes: StepSizes | None = None
+    busy: str = ""
 
     @property
     def now(self) -> Measured:
@@ -426,6 +503,7 @@ class Tuning:
             head += f" In the same time the error can be {gain} less."
         if self.why_no_line:
             head += f" {self.why_no_line}"
+        merge_note = f" {MERGE_NOTE}" if self.faster or self.closer else ""
         other = [m for m in self.measured if m.setting.is_other]
         shown = [now, *(m for m in self.front if m is not now)]
         every = sorted(self.measured, key=lambda m: m.time)
@@ -436,17 +514,18 @@ class Tuning:
             [
                 PageSection("Lines to copy", code=self.lines,
                      note="None, for the reason above." if self.why_no_line
-                     else "Chosen on the worlds with even numbers, tested on the others."),
+                     else "Chosen on the worlds with even numbers, tested on the others." + merge_note),
                 PageSection("Rows and contacts", sizes, short=2, note="Of the steps with the model's own setting."),
                 PageSection("The front of time and error", [self._table(shown)], figures, short=5),
                 PageSection("Other problems", [self._table(other)], short=2,
                      note="A cone, impratio or noslip other than the model's: the error is that of its own problem."),
                 PageSection("Every setting", [self._table(every)], note="Without those with which a world diverges."),
             ],
-            {"model": self.runs.model, "lines": self.lines, "why_no_line": self.why_no_line,
+            {"model": self.runs.model, "lines": self.lines, "why_no_line": self.why_no_line, "busy": self.busy,
              **({} if self.sizes is None else self.sizes.numbers), "stopped": self.stopped,
              "measured": [_to_dict(m) for m in self.measured], "held": [_to_dict(m) for m in self.held]},
-            self.stopped,
+            stopped=self.stopped,
+            warning=self.busy,
         )  # fmt: skip
 
 
@@ -538,15 +617,7 @@ def tune(
     mj, configured = runs.load()
     # An unsupported model raises here, once.
     from_mujoco_many(configured, np.zeros((0, configured.nq + configured.nv)))
-    done = 0
-
-    def report_progress(text: str) -> None:
-        """Report one more measurement."""
-        nonlocal done
-        done += 1
-        if watch is not None:
-            watch(Event(done, 0, text, ""))
-
+    schedule = Schedule(watch)
     measured: list[Measured] = []
     held: list[Measured] = []
     sizes: StepSizes | None = None
@@ -554,15 +625,25 @@ def tune(
     def make_result(stopped: bool) -> Tuning:
         """Build the result so far."""
         timed = [m for m in measured if np.isfinite(m.time)]
-        return Tuning(runs, horizon, timed, held, threshold=threshold, stopped=stopped, sizes=sizes)
+        busy = machine.describe_busy(schedule.loads, os.cpu_count() or 1, TUNE_BUSY_CONSEQUENCE)
+        return Tuning(
+            runs, horizon, timed, held, threshold=threshold, stopped=stopped, sizes=sizes, busy=busy
+        )
 
     def judge(stage: Stage, settings: list[Setting]) -> list[Measured]:
         """Judge settings."""
-        out = []
+        results = []
+        schedule.expect("judging", len(settings))
         for setting in settings:
-            out.append(stage.measure(setting))
-            report_progress(setting.line or "as it is")
-        return out
+            with schedule.measure("judging", setting.name):
+                results.append(stage.measure(setting))
+        return results
+
+    first_settings = grid(mj, configured)
+    n_variants = len(vary(mj, configured, Setting())) * EXPECTED_VARIED_SETTINGS
+    n_first, n_trial = len(first_settings), min(N_TRIAL_ROUNDS, repeats)
+    schedule.reserve("judging", n_first + 3 + n_variants)  # 3: the worlds held back
+    schedule.reserve("timing", n_first * n_trial + (n_first + n_variants) * repeats + 3 * 2 * repeats)
 
     try:
         stage, held_back = (Stage.of(mj, configured, runs, range(i, worlds, 2), horizon) for i in (0, 1))
@@ -574,21 +655,27 @@ def tune(
         rows, contacts = (np.concatenate([getattr(m, name) for m in both]) for name in ("rows", "contacts"))
         sizes = StepSizes(rows, contacts, can_touch(mj, configured))
         if not sizes.is_enough:
-            stage.time(measured, repeats, report_progress)
+            schedule.reserve("judging", 0)
+            schedule.reserve("timing", 0)
+            stage.time(measured, repeats, schedule)
             return make_result(False)
-        measured += judge(stage, grid(mj, configured)[1:])
-        stage.time(measured, min(N_TRIAL_ROUNDS, repeats), report_progress)
+        measured += judge(stage, first_settings[1:])
+        stage.time(measured, n_trial, schedule)
         near = [
             m.setting for m in make_result(False).front if m.time <= MAX_VARIED_TIME_RATIO * measured[0].time
         ]
         known = {m.setting for m in measured}
         more = dict.fromkeys(x for s in [Setting(), *near] for x in vary(mj, configured, s) if x not in known)
+        schedule.reserve("judging", len(more) + 2)
+        schedule.reserve("timing", (len(measured) + len(more)) * repeats + 3 * 2 * repeats)
         measured += judge(stage, list(more))
-        stage.time(measured, repeats, report_progress)
+        stage.time(measured, repeats, schedule)
         chosen = make_result(False)
         other = dict.fromkeys(m.setting for m in (chosen.faster, chosen.closer) if m is not None)
         last += judge(held_back, list(other))
-        held_back.time(last, 2 * repeats, report_progress)
+        schedule.reserve("judging", 0)
+        schedule.reserve("timing", 0)
+        held_back.time(last, 2 * repeats, schedule)
         held += last if np.isfinite(last[0].time) else []
     except KeyboardInterrupt:
         if not measured or not np.isfinite(measured[0].time):

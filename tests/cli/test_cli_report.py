@@ -194,6 +194,18 @@ def test_progress_is_told_in_lines_where_there_is_no_terminal(capsys, monkeypatc
     assert capsys.readouterr().err == ""
 
 
+def test_progress_lines_have_the_remaining_time(capsys, monkeypatch):
+    monkeypatch.setattr(measuring, "PROGRESS_INTERVAL", 0.0)  # s between two lines
+    with measuring.progress() as watch:
+        watch(Event(1, 5, "timing: a setting", "", remaining=40.2))
+    assert capsys.readouterr().err == "1 of 5, 0 s, about 40 s remain: timing: a setting\n"
+    event = Event(20, 80, "stack", "newton")
+    assert measuring.format_remaining(event, 10.0) == "about 30 s remain"
+    assert measuring.format_remaining(event, 100.0) == "about 5 min remain"
+    assert measuring.format_remaining(event, 0.1) == ""  # too early
+    assert measuring.format_remaining(Event(20, 0, "", ""), 10.0) == ""  # the total is not known
+
+
 QUICK = ("--tolerances", "1e-3", "1e-6", "--budgets", "2", "4", "--repeats", "1", "--no-figures")
 
 

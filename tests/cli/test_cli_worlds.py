@@ -26,7 +26,7 @@ def test_an_audit_accepts_or_does_not(lavender, boxes, tmp_path):
     )
     code, out, _ = lavender("audit", boxes(EARLY), *words)
     assert code == 1 and "stopped before convergence" in out
-    assert len(out.splitlines()) <= 25
+    assert len(out.splitlines()) <= 26
     page = (tmp_path / "out" / "index.html").read_text()
     assert "worst_1.npz" in page and "<svg" in page
     told = json.loads((tmp_path / "out" / "numbers.json").read_text())
@@ -44,7 +44,8 @@ def test_tuning_prints_a_page_and_few_lines(lavender, boxes, tmp_path, monkeypat
         "tune", boxes(EARLY), "--worlds", 2, "--steps", 20, "--repeats", 1, "--out", tmp_path / "out"
     )
     assert code == 0 and "held back" in out
-    assert len(out.splitlines()) <= 25
+    assert "Add the line next to the model's own <option>: MuJoCo merges both." in " ".join(out.split())
+    assert len(out.splitlines()) <= 27
     page = (tmp_path / "out" / "index.html").read_text()
     assert "&lt;option" in page and "<svg" in page
     assert (tmp_path / "out" / "figures" / "time-and-error.png").is_file()
@@ -79,7 +80,7 @@ def test_no_line_is_printed_of_states_without_contact(lavender, boxes, tmp_path,
     code, out, _ = lavender(*words, "--states", low)
     told = json.loads((tmp_path / "out" / "numbers.json").read_text())
     assert code == 0 and told["contacts"]["share"] == 1.0 and "No setting" not in out
-    assert len(out.splitlines()) <= 25
+    assert len(out.splitlines()) <= 27
 
 
 def test_recordings_start_from_states(lavender, tmp_path, boxes):

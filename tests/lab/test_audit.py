@@ -45,6 +45,36 @@ def test_numbers_are_those_of_the_run_itself(boxes, options):
     assert found.unconverged.any()
 
 
+def test_without_a_number_as_many_worlds_are_judged_as_fit_in_the_duration(boxes, monkeypatch):
+    monkeypatch.setattr(module, "DEFAULT_DURATION", 0.5)
+    events = []
+    found = audit(boxes(EARLY), steps=20, workers=1, watch=events.append)
+    assert 1 <= found.runs.worlds <= module.MAX_DEFAULT_WORLDS and found.judged == 20 * found.runs.worlds
+    assert (events[0].case, events[1].remaining) == ("timing one world", 0.5)
+    assert all(event.remaining is not None and 0.0 <= event.remaining <= 60.0 for event in events[1:])
+    assert events[-1].done == events[-1].total == 20 * found.runs.worlds
+    same = audit(boxes(EARLY), worlds=found.runs.worlds, steps=20, workers=1)
+    assert same.numbers.tobytes() == found.numbers.tobytes()
+
+
+def test_the_number_of_worlds_follows_from_the_time_of_one(boxes, monkeypatch):
+    clock = iter([0.0, 0.5, 0.0, 1e-9])
+    monkeypatch.setattr(module, "perf_counter", lambda: next(clock))
+    runs = Runs(str(boxes()), 1, 5)
+    assert module.choose_worlds(runs, ("float64", 1e-6), 2) == 240  # 60 s in 2 processes, 0.5 s each
+    assert module.choose_worlds(runs, ("float64", 1e-6), 2) == module.MAX_DEFAULT_WORLDS
+
+
+def test_a_busy_machine_is_named_and_changes_no_error(boxes, monkeypatch):
+    cores = module.os.cpu_count()
+    monkeypatch.setattr(module.machine, "running", lambda: cores + 9.0)
+    found = audit(boxes(EARLY), worlds=1, steps=5, workers=1)
+    assert "The machine was busy" in found.busy and "errors do not depend on the load" in found.busy
+    assert found.busy == found.summary_page.warning
+    monkeypatch.setattr(module.machine, "running", lambda: 2.0)  # a worker and this process
+    assert not audit(boxes(EARLY), worlds=1, steps=5, workers=1).busy
+
+
 def test_workers_change_no_bit(boxes, monkeypatch):
     monkeypatch.setattr(module, "STEPS_PER_TASK", 20)
     path = boxes(EARLY)
@@ -141,7 +171,8 @@ def test_ctrl_c_keeps_what_there_is(boxes, tmp_path, monkeypatch):
     monkeypatch.setattr(module, "STEPS_PER_TASK", 20)
 
     def watch(event):
-        raise KeyboardInterrupt
+        if event.done:
+            raise KeyboardInterrupt
 
     found = audit(boxes(EARLY), worlds=3, steps=20, workers=1, watch=watch)
     assert found.stopped and found.done == 20

@@ -63,7 +63,7 @@ def test_what_interrupts_a_step_in_one_round_is_not_its_time(boxes, monkeypatch)
         return now
 
     monkeypatch.setattr(module, "perf_counter", busy)
-    stage.time(found, 6, lambda _: None)
+    stage.time(found, 6, module.Schedule(None))
     for m in found:
         assert m.time == pytest.approx(1e-6, abs=1e-9)  # the clock itself rounds to 1e-14 of its 30 s
 
@@ -153,13 +153,39 @@ def test_a_gain_that_the_held_back_worlds_do_not_have_is_told_as_none():
         assert all(("not on the worlds held back" in line) == refuted for line in lines)
 
 
+def test_progress_names_the_setting_and_the_remaining_time(boxes, monkeypatch):
+    fewer(monkeypatch)
+    events = []
+    tune(boxes(EARLY), worlds=2, steps=10, repeats=2, watch=events.append)
+    texts = [event.case for event in events]
+    assert texts[0] == "judging: the model's own setting"
+    assert any(text.startswith("judging: <option ") for text in texts)
+    assert "timing: round 2 of 2, the model's own setting" in texts
+    assert any(text.startswith("timing: round 1 of 2, <option ") for text in texts)
+    assert [event.done for event in events] == list(range(len(events)))
+    assert events[0].remaining is None and all(event.remaining >= 0.0 for event in events[1:])
+    assert events[-1].total == len(events)  # all that was expected is done or not needed
+    assert events[-1].remaining < max(event.remaining for event in events[1:])
+
+
+def test_a_busy_machine_invalidates_the_times(boxes, monkeypatch):
+    fewer(monkeypatch)
+    cores = module.os.cpu_count()
+    monkeypatch.setattr(module.machine, "running", lambda: cores + 2.0)
+    page = tune(boxes(EARLY), worlds=2, steps=10, repeats=1).summary_page
+    assert f"The machine was busy: load {cores + 2:.1f} on {cores} core" in page.warning
+    assert "The times are invalid" in page.warning and page.warning in page.render_html()
+    monkeypatch.setattr(module.machine, "running", lambda: 1.0)
+    assert not tune(boxes(EARLY), worlds=2, steps=10, repeats=1).busy
+
+
 def test_ctrl_c_keeps_what_there_is(boxes, monkeypatch):
     fewer(monkeypatch)
 
     def watch(event):
-        if event.case == "timed":
-            seen.append(event)
-            if len(seen) == 5:
+        if event.case.startswith("timing"):
+            seen.append(event)  # before each timing
+            if len(seen) == 6:
                 raise KeyboardInterrupt
 
     seen = []

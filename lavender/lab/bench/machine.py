@@ -15,6 +15,7 @@ from datetime import datetime, timezone
 from functools import cache
 from importlib import metadata
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 from lavender._version import __version__
@@ -126,6 +127,26 @@ def running() -> float | None:
     with contextlib.suppress(OSError, ValueError, IndexError):
         return float(Path("/proc/loadavg").read_text().split()[3].partition("/")[0])
     return load()
+
+
+def describe_busy(loads: Iterable[float | None], cores: int, consequence: str, own: int = 1) -> str:
+    """Return a warning if other processes used the processors, else an empty text.
+
+    Parameters
+    ----------
+    loads : numbers of runnable processes during a measurement, None if unknown
+    cores : number of processors
+    consequence : sentence on the results
+    own : number of processes of the measurement itself
+    """
+    known = [load for load in loads if load is not None]
+    # The margin of 0.5 covers processes of the system.
+    if not known or fmean(known) <= max(cores, own) + 0.5:
+        return ""
+    return (
+        f"The machine was busy: load {fmean(known):.1f} on {cores} core{'s' * (cores != 1)} during the measurement. "
+        f"{consequence}"
+    )
 
 
 def clock() -> dict[str, str]:

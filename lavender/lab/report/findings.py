@@ -4,15 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from statistics import fmean
 
-from lavender.lab.bench import statistics
+from lavender.lab.bench import machine, statistics
 from lavender.lab.bench.recommendation import FamilyAdvice, choose_time_budgets
 from lavender.lab.bench.resampling import recommend_solvers
 from lavender.lab.bench.store import Records
 from lavender.lab.report.engine import EngineAnswers
 from lavender.lab.report.motion_tables import convert_to_motion_errors, get_velocity_tolerances
-from lavender.lab.report.text import format_count
 from lavender.lab.report.verdict import Verdict, build_verdict
 from lavender.problem.derived import cached_property
 
@@ -74,13 +72,9 @@ class Report:
         if self.is_campaign or not len(self.newest):
             return ""
         (run,) = self.newest.runs.values()
-        loads = [load for r in self.newest if (load := run.load if r.load is None else r.load) is not None]
-        # The limit is the number of cores plus 0.5: this process alone has a load of 1, and the system adds a little.
-        if not loads or fmean(loads) <= run.cores + 0.5:
-            return ""
-        return (
-            f"The machine was busy: load {fmean(loads):.1f} on {format_count(run.cores, 'core')} during the "
-            "measurement. The times are invalid; measure again with --no-reuse."
+        loads = (run.load if r.load is None else r.load for r in self.newest)
+        return machine.describe_busy(
+            loads, run.cores, "The times are invalid; measure again with --no-reuse."
         )
 
     @cached_property

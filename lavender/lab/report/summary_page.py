@@ -55,6 +55,7 @@ class SummaryPage:
     sections : sections
     numbers : content of numbers.json
     stopped : whether the measurement ended early, so that all numbers are of the completed part
+    warning : a sentence on the measurement, such as a busy machine
     """
 
     title: str
@@ -62,6 +63,7 @@ class SummaryPage:
     sections: Sequence[PageSection]
     numbers: dict[str, Any]
     stopped: bool = False
+    warning: str = ""
 
     def render_html(self) -> str:
         """Return one file without external parts; every text is escaped."""
@@ -87,9 +89,13 @@ class SummaryPage:
     def print_short(self, console: Console) -> None:
         """Print the sentence, lines to copy, and the first rows of each section's first table."""
         console.print(self.head, style="bold", highlight=False, markup=False)
+        if self.warning:
+            console.print(self.warning, style="yellow", highlight=False, markup=False)
         for part in self.sections:
             for line in part.code:
                 console.print(f"    {line}", highlight=False, markup=False, soft_wrap=True)
+            if part.code and part.note:
+                console.print(part.note, highlight=False, markup=False)
             for table in part.tables[:1] if part.short else ():
                 if table.rows:
                     console.print()

@@ -51,7 +51,16 @@ Watch = Callable[["Event"], Any]
 
 @dataclass(frozen=True)
 class Event:
-    """Progress of a run: the number of pairs of case and solver that are done, and of all pairs."""
+    """Progress of a run.
+
+    Parameters
+    ----------
+    done, total : number of pairs of case and solver, or of other tasks, that are done, and of all; total 0: unknown
+    case, solver : the present task
+    record : the record that was made last
+    reused : whether this record was not measured now
+    remaining : estimate of the remaining time [s]; None if only the counts are known
+    """
 
     done: int
     total: int
@@ -59,6 +68,7 @@ class Event:
     solver: str
     record: Record | None = None
     reused: bool = False
+    remaining: float | None = None
 
 
 def carry(before: Problem, impulse: FloatArray, problem: Problem) -> FloatArray:
