@@ -168,7 +168,7 @@ cdef inline void natural_all(const blocks_t* b, const double* lam, const double*
 
 
 cdef inline int32_t place_rows(const blocks_t* b, const natural_t* x, int32_t* place) noexcept nogil:
-    """Number the rows of G that are not trivial in (3), of closed contacts and rows between bounds; return their number."""
+    """Assign a row of G to each row that is not trivial in (3): closed contacts, rows between bounds. Return their number."""
     cdef int32_t i, j, n = 0
     for i in range(b.n_blocks):
         for j in range(b.ptr[i], b.ptr[i + 1]):

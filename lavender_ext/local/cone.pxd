@@ -13,7 +13,7 @@ from libc.stdint cimport int32_t
 
 from lavender_ext.core.block cimport norm2
 from lavender_ext.local.coulomb cimport opposes_friction
-from lavender_ext.local.small cimport FAILED, OPEN, SLIP, STICK, newton_or_bisect, eliminate, slack_is_zero
+from lavender_ext.local.small cimport FAILED, OPEN, SLIP, STICK, newton_or_bisect, slack_is_zero
 
 
 cdef inline int32_t minimize_on_ray(const double* W, const double* q, double mu, double s0, double s1,
@@ -35,27 +35,6 @@ cdef inline int32_t minimize_on_ray(const double* W, const double* q, double mu,
     lam[1] = y[1]
     lam[2] = y[2]
     return SLIP
-
-
-cdef inline int32_t solve_singular(const double* W, const double* q, double* x) noexcept nogil:
-    """Compute nearly the shortest x with W x = -q for a singular W, by refinement with W + 1e-6 diag W; return 0 if none."""
-    cdef double a[9]
-    cdef double y[3]
-    cdef int32_t i, j, _iteration
-    for i in range(3):
-        x[i] = 0.0
-    for _iteration in range(4):
-        for i in range(3):
-            y[i] = -q[i]
-            for j in range(3):
-                y[i] -= W[3 * i + j] * x[j]
-                a[3 * i + j] = W[3 * i + j]
-            a[4 * i] *= 1.000001
-        if eliminate(3, a, y) < 3:
-            return 0
-        for i in range(3):
-            x[i] += y[i]
-    return slack_is_zero(3, W, q, x)
 
 
 cdef inline int32_t cone3(const double* W, const double* q, double mu, double* lam) noexcept nogil:
@@ -102,10 +81,6 @@ cdef inline int32_t cone3(const double* W, const double* q, double mu, double* l
                 lam[k] = v[k]
             return STICK
         return FAILED
-    if d0 <= 1e-10 * (W[0] * W[4] * W[8]) and solve_singular(W, q, v) and norm2(v[1], v[2]) <= mu * v[0]:
-        for k in range(3):
-            lam[k] = v[k]
-        return STICK
     # beta*: Newton's method from the right of all roots converges to the largest.
     top = W[0] / m2
     for _iteration in range(60):
@@ -146,37 +121,3 @@ cdef inline int32_t cone3(const double* W, const double* q, double mu, double* l
         return FAILED
     U = side / U
     return minimize_on_ray(W, q, mu, v[1] * U, v[2] * U, lam)
-
-
-cdef inline int32_t cone2(const double* W, const double* q, double mu, double* lam) noexcept nogil:
-    """Solve a contact with one tangent under the cone law in closed form; W (2, 2)."""
-    cdef double det, n, t, s, l
-    cdef double y[2]
-    cdef int32_t _side
-    if q[0] >= mu * fabs(q[1]):
-        lam[0] = 0.0
-        lam[1] = 0.0
-        return OPEN
-    det = W[0] * W[3] - W[1] * W[2]
-    n = W[1] * q[1] - W[3] * q[0]
-    t = W[2] * q[0] - W[0] * q[1]
-    if det > 0.0 and n >= 0.0 and fabs(t) <= mu * n:
-        y[0] = n / det
-        y[1] = t / det
-        if slack_is_zero(2, W, q, y):
-            lam[0] = y[0]
-            lam[1] = y[1]
-            return STICK
-    s = 1.0 if t > 0.0 else -1.0
-    for _side in range(2):
-        n = W[0] + mu * s * (W[1] + W[2]) + mu * mu * W[3]
-        l = -(q[0] + mu * s * q[1])
-        if n > 0.0 and l >= 0.0:
-            l = l / n
-            if (s * (W[2] * l + W[3] * mu * s * l + q[1])
-                    <= 1e-14 * (fabs(W[2]) * l + fabs(W[3]) * mu * l + fabs(q[1]))):
-                lam[0] = l
-                lam[1] = mu * s * l
-                return SLIP
-        s = -s
-    return FAILED

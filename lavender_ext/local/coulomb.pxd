@@ -22,6 +22,7 @@ from lavender_ext.local.small cimport FAILED, OPEN, SLIP, STICK, newton_or_bisec
 
 cdef enum:
     PREPARED = 25               # number of doubles of a prepared 3x3 block
+    ONE_PATTERN = 15            # index of a flag in them, which `prepare3` sets to 0
 
 
 cdef inline void prepare3(const double* W, double* g) noexcept nogil:
@@ -207,38 +208,3 @@ cdef inline int32_t coulomb3_from(const double* g, const double* w, double mu, d
     s = lam[1] * lam[1] + lam[2] * lam[2]
     f = -(w[1] * lam[1] + w[2] * lam[2])
     return coulomb3(g, q, mu, f / s if s > 0.0 and f > 0.0 else 0.0, lam)
-
-
-cdef inline int32_t coulomb2(const double* W, const double* q, double mu, double* lam) noexcept nogil:
-    """Solve (1)-(3) for a contact with one tangent in closed form; W (2, 2)."""
-    cdef double a, h, s, r, n, t, det
-    cdef int32_t _side
-    if q[0] >= 0.0:
-        lam[0] = 0.0
-        lam[1] = 0.0
-        return OPEN
-    if not W[0] > 0.0 or not q[0] < 0.0:
-        return FAILED
-    a = -q[0] / W[0]
-    h = W[1] / W[0]
-    s = W[3] - W[2] * h
-    r = q[1] + W[2] * a
-    t = -r / s if fabs(s) > 1e-15 * (fabs(W[3]) + fabs(W[2] * h)) else 0.0
-    n = a - h * t
-    if fabs(t) <= mu * n and (t != 0.0 or fabs(r) <= 1e-15 * (fabs(q[1]) + fabs(W[2]) * a)):
-        lam[0] = n
-        lam[1] = t
-        return STICK
-    s = -1.0 if r > 0.0 else 1.0
-    for _side in range(2):
-        det = 1.0 + mu * h * s
-        if det > 0.0:
-            n = a / det
-            t = mu * n * s
-            if (n < 1.0 / 0.0 and s * (W[2] * n + W[3] * t + q[1])
-                    <= 1e-15 * (fabs(W[2]) * n + fabs(W[3] * t) + fabs(q[1]))):
-                lam[0] = n
-                lam[1] = t
-                return SLIP
-        s = -s
-    return FAILED

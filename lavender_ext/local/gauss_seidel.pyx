@@ -3,13 +3,13 @@
 The prepared numbers of block i begin at g[start[i]]:
 
     one row                      nothing: lam <- clip(lam - w / d)
-    rows, 2 to 8, all free       W^-1 (n, n), then 1; if W is singular, W, then 0
-    rows, 2 to 8, bounded        W (n, n), then 0
-    normal, two tangents, disk or box    prepare3 of local/coulomb.pxd; g[15] = 1 if its rows of A share one pattern
-    round cones                  prepare_round of local/round.pxd
-    other contacts               W (n, n)
+    rows, 2 to 8, all free       1, then W^-1 (n, n); if W is singular, as bounded rows
+    rows, 2 to 8, bounded        0, then `prepare_newton` of local/block_newton.pxd
+    normal, two tangents, disk   `prepare3` of local/coulomb.pxd, with 1 at ONE_PATTERN if its rows of A share one pattern
+    other contacts               1 if there are three rows and they share one pattern, then `prepare_newton`
 
-A sweep solves each block exactly with the others fixed (local/exact.pxd):
+A sweep solves each block exactly with the others fixed: disks by local/coulomb.pxd and local/cone.pxd, all others, and disks
+that these reject, by local/block_newton.pxd:
 
     over A in compressed rows    w = A lam - b on the rows of the block                                  (1)
     over the factored form       w = J v + c lam - b, then v += M^-1 J^T (change)                   (2)
@@ -21,136 +21,117 @@ from lavender_ext.core.block cimport relax_normal, relax_row
 from lavender_ext.core.csr cimport csr_dot
 from lavender_ext.core.dot cimport dot
 from lavender_ext.core.generalized cimport whitened_dot, add_scaled_whitened_row
-from lavender_ext.core.block_types cimport (CONE, blocks_t, is_box, is_disk, is_round, is_rows, n_tangents, n_angular_rows,
-                                      get_friction_components, friction_components_t)
+from lavender_ext.core.block_types cimport (CONE, blocks_t, is_disk, is_rows, n_tangents, n_angular_rows,
+                                      friction_components_t, get_friction_components)
 from lavender_ext.core.rows cimport (contact_jacobian, contact_velocity, cross, dot12, dot3, apply_joint_impulse, joint_velocity,
                                      minv_times, apply_impulse_to_bodies, relative_velocity, relax_joint, apply_contact_impulse)
 from lavender_ext.core.view cimport csr_t, generalized_t, rows_t, view_t
-from lavender_ext.local.box cimport box3_from
+from lavender_ext.local.block_newton cimport prepare_newton, scaled_block_t, solve_block_newton
 from lavender_ext.local.cone cimport cone3
-from lavender_ext.local.coulomb cimport PREPARED, coulomb3_from, prepare3
-from lavender_ext.local.exact cimport solve_boxed_rows, solve_contact, project_locally
-from lavender_ext.local.round cimport prepare_round, round_contact
+from lavender_ext.local.coulomb cimport ONE_PATTERN, PREPARED, coulomb3_from, prepare3
 from lavender_ext.local.small cimport FAILED, MAX_ROWS, eliminate
-
-
-cdef inline bint is_disk_or_box(const blocks_t* p, int32_t i) noexcept nogil:
-    """Return whether block i is a contact with two tangents, in a disk or a box."""
-    return is_disk(p, i) or is_box(p, i)
-
-
-cdef inline int32_t coulomb_block3(const blocks_t* p, int32_t i, const double* g, const double* w, double* lam) noexcept nogil:
-    """Solve a disk or box under Coulomb's law from its slack w (3)."""
-    cdef friction_components_t q
-    if is_disk(p, i):
-        return coulomb3_from(g, w, p.mu[i], lam)
-    get_friction_components(p, i, &q)
-    return box3_from(g, w, q.friction_coefficient[0], q.friction_coefficient[1], lam)
 
 
 cdef inline int32_t prepared_size(const blocks_t* p, int32_t i) noexcept nogil:
     """Return the number of prepared doubles of block i."""
     cdef int32_t n = p.ptr[i + 1] - p.ptr[i]
-    if is_rows(p, i):
-        return n * n + 1 if 1 < n <= MAX_ROWS else 0
-    if is_disk_or_box(p, i):
+    if is_disk(p, i):
         return PREPARED
-    if is_round(p, i):
-        return n * n + (n - 1) * n
-    return n * n
+    return 0 if n == 1 or n > MAX_ROWS else 1 + n * (n + 2)
 
 
-cdef inline void prepare_block(const blocks_t* p, int32_t i, const double* W, int32_t one_pattern,
-                               double* g) noexcept nogil:
-    """Compute g from the diagonal block W (n, n) of A; blocks of one row or of more than MAX_ROWS rows are excluded."""
+cdef inline void prepare_block(const blocks_t* p, int32_t i, double* W, int32_t one_pattern, double* g) noexcept nogil:
+    """Compute g from the diagonal block W (n, n) of A, which is overwritten; 1 < n <= MAX_ROWS."""
     cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, q, k, free = 1
     cdef double inf = 1.0 / 0.0
     cdef double a[MAX_ROWS * MAX_ROWS]
     cdef double x[MAX_ROWS]
+    cdef friction_components_t part
+    get_friction_components(p, i, &part)
+    # contacts
     if not is_rows(p, i):
-        if is_disk_or_box(p, i):
+        if is_disk(p, i):
             prepare3(W, g)
-            # If d of the normal is a fallback value, W_nn is too small to divide by.
+            g[ONE_PATTERN] = one_pattern
             if W[0] != p.d[j]:
                 g[9] = 0.0
-                if is_box(p, i):
-                    g[0] = 0.0
-            g[15] = one_pattern
-        elif is_round(p, i):
-            prepare_round(n, W, g)
-            if W[0] != p.d[j]:
-                g[0] = 0.0
-        else:
-            for q in range(n * n):
-                g[q] = W[q]
-            if W[0] != p.d[j]:
-                g[0] = 0.0
+            return
+        if W[0] != p.d[j]:                              # d of the normal is a fallback value: W_nn is too small to divide by
+            W[0] = 0.0
+        g[0] = one_pattern and n == 3
+        prepare_newton(n, W, p.d + j, &part, g + 1)
         return
+    # rows
     for q in range(j, p.ptr[i + 1]):
         if p.lower[q] != -inf or p.upper[q] != inf:
             free = 0
-    g[n * n] = free
-    if free:
-        for k in range(n):
-            for q in range(n * n):
-                a[q] = W[q]
-            for q in range(n):
-                x[q] = 1.0 if q == k else 0.0
-            if eliminate(n, a, x) < n:
-                g[n * n] = 0.0
-                break
-            for q in range(n):
-                g[n * q + k] = x[q]
-    if g[n * n] == 0.0:
+    for k in range(n if free else 0):
         for q in range(n * n):
-            g[q] = W[q]
+            a[q] = W[q]
+        for q in range(n):
+            x[q] = 1.0 if q == k else 0.0
+        if eliminate(n, a, x) < n:
+            free = 0
+            break
+        for q in range(n):
+            g[1 + n * q + k] = x[q]
+    g[0] = free
+    if not free:
+        prepare_newton(n, W, p.d + j, &part, g + 1)
+
+
+cdef int32_t solve_other_block(const blocks_t* p, int32_t i, const double* g, const double* w, double* lam) noexcept nogil:
+    """Solve block i without a closed form; return 1 if the fallback was used."""
+    cdef int32_t j = p.ptr[i]
+    cdef scaled_block_t x
+    x.law, x.n, x.bounded = p.law, p.ptr[i + 1] - j, is_rows(p, i)
+    get_friction_components(p, i, &x.part)
+    return solve_block_newton(&x, g, w, p.lower + j, p.upper + j, lam) == FAILED
+
+
+cdef int32_t solve_rejected_disk(const blocks_t* p, int32_t i, const double* g, const double* w, double* lam) noexcept nogil:
+    """Solve disk i, which its closed form rejects, with prepared numbers of `prepare3`; return 1 if the fallback was used."""
+    cdef double h[15]
+    cdef friction_components_t part
+    get_friction_components(p, i, &part)
+    prepare_newton(3, g, p.d + p.ptr[i], &part, h)
+    if not g[9] > 0.0:
+        h[0] = 0.0
+    return solve_other_block(p, i, h, w, lam)
 
 
 cdef inline int32_t solve_block(const blocks_t* p, int32_t i, const double* g, const double* w,
                                 double* lam) noexcept nogil:
     """Solve block i exactly from its slack w; lam points at its first row. Return 1 if the fallback was used."""
-    cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, k, t, found = FAILED
-    cdef friction_components_t part
-    cdef double q[MAX_ROWS]
+    cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, k, t
     cdef double x[MAX_ROWS]
     cdef double s
-    if is_rows(p, i):
-        if n == 1:
-            lam[0] = relax_row(lam[0], w[0], p.step[j], p.lower[j], p.upper[j])
-            return 0
-        if g[n * n] != 0.0:
-            for k in range(n):
-                s = 0.0
-                for t in range(n):
-                    s += g[n * k + t] * w[t]
-                x[k] = s
-            for k in range(n):
-                lam[k] -= x[k]
-            return 0
-        return solve_boxed_rows(n, g, w, p.step + j, p.lower + j, p.upper + j, lam) == FAILED
+    # one row
     if n == 1:
-        lam[0] = relax_normal(lam[0], w[0], p.step[j])
+        lam[0] = (relax_row(lam[0], w[0], p.step[j], p.lower[j], p.upper[j]) if is_rows(p, i)
+                  else relax_normal(lam[0], w[0], p.step[j]))
         return 0
-    if is_disk_or_box(p, i) and p.law != CONE:
-        if coulomb_block3(p, i, g, w, lam) != FAILED:
-            return 0
-    # q = w - W lam
-    for k in range(n):
+    # free rows
+    if is_rows(p, i) and g[0] != 0.0:
+        for k in range(n):
+            s = 0.0
+            for t in range(n):
+                s += g[1 + n * k + t] * w[t]
+            x[k] = s
+        for k in range(n):
+            lam[k] -= x[k]
+        return 0
+    if not is_disk(p, i):
+        return solve_other_block(p, i, g + 1, w, lam)
+    # a disk
+    if p.law != CONE:
+        return coulomb3_from(g, w, p.mu[i], lam) == FAILED and solve_rejected_disk(p, i, g, w, lam)
+    for k in range(3):
         s = w[k]
-        for t in range(n):
-            s -= g[n * k + t] * lam[t]
-        q[k] = s
-    get_friction_components(p, i, &part)
-    if is_round(p, i):
-        found = round_contact(n, g, q, p.d + j, p.mu[i], lam)
-    elif not is_disk(p, i):
-        found = solve_contact(p.law, n, g, q, p.d + j, &part, lam)
-    elif p.law == CONE:
-        found = cone3(g, q, p.mu[i], lam) if g[9] > 0.0 or q[0] >= 0.0 else FAILED
-    if found == FAILED:
-        project_locally(p.law, is_round(p, i), n, g, q, p.d + j, p.step + j, &part, lam)
-        return 1
-    return 0
+        for t in range(3):
+            s -= g[3 * k + t] * lam[t]
+        x[k] = s
+    return (not (g[9] > 0.0 or x[0] >= 0.0) or cone3(g, x, p.mu[i], lam) == FAILED) and solve_rejected_disk(p, i, g, w, lam)
 
 
 cdef inline void csr_dot3(const csr_t* a, int32_t i, const double* x, double* out) noexcept nogil:
@@ -191,7 +172,7 @@ cdef inline int32_t solve_csr_block(const blocks_t* p, const csr_t* a, int32_t i
         for k in range(j, j + n):
             lam[k] = relax_row(lam[k], csr_dot(a, k, lam) - p.b[k], p.step[k], p.lower[k], p.upper[k])
         return 1
-    if is_disk_or_box(p, i) and g[15] != 0.0:
+    if n == 3 and not is_rows(p, i) and g[ONE_PATTERN if is_disk(p, i) else 0] != 0.0:
         csr_dot3(a, j, lam, w)
         w[0] -= p.b[j]
         w[1] -= p.b[j + 1]
@@ -227,7 +208,7 @@ cdef inline int32_t solve_general_block(const blocks_t* p, const generalized_t* 
 
 cdef inline int32_t solve_sliding_contact(const blocks_t* p, const rows_t* r, int32_t i, const double* g, double* lam,
                                           double* v) noexcept nogil:
-    """Update a disk or box under Coulomb's law by (2); lam points at its normal."""
+    """Update a disk under Coulomb's law by (2); lam points at its normal."""
     cdef int32_t j = p.ptr[i], c = i - r.n_joints, a = r.contact_body[2 * c], b = r.contact_body[2 * c + 1], k
     cdef double w[3]
     cdef double u[3]
@@ -244,7 +225,7 @@ cdef inline int32_t solve_sliding_contact(const blocks_t* p, const rows_t* r, in
     w[1] = dot3(t1, u) + (r.compliance[j + 1] * x - p.b[j + 1])
     w[2] = dot3(t2, u) + (r.compliance[j + 2] * y - p.b[j + 2])
     k = 0
-    if coulomb_block3(p, i, g, w, lam) == FAILED:
+    if coulomb3_from(g, w, p.mu[i], lam) == FAILED:
         k = solve_block(p, i, g, w, lam)
     n = lam[0] - n
     x = lam[1] - x
@@ -271,7 +252,7 @@ cdef inline int32_t solve_rows_block(const blocks_t* p, const rows_t* r, int32_t
     cdef const double* normal
     cdef const double* t1
     t2[0] = t2[1] = t2[2] = 0.0
-    if c >= 0 and is_disk_or_box(p, i) and p.law != CONE:
+    if c >= 0 and is_disk(p, i) and p.law != CONE:
         return solve_sliding_contact(p, r, i, g, lam + j, v)
     if c < 0:
         if n > MAX_ROWS:

@@ -29,10 +29,11 @@ def blocks_of(kind, rng, n, m):
     return np.ascontiguousarray(w)
 
 
-@pytest.mark.parametrize("rows", [1, 2, 3, 4, 6])
-def test_joints_that_meet_nothing_are_solved_to_rounding_by_one_sweep(rows):
-    rng, n = np.random.default_rng(7 + rows), 100
-    w = blocks_of("full", rng, n, rows) + 0.1 * np.eye(rows)
+@pytest.mark.parametrize("matrix", ["full", "asymmetric", "diag(1, 100)", "condition 1e6"])
+@pytest.mark.parametrize("rows", [1, 2, 3, 4, 6, 8])
+def test_joints_that_meet_nothing_are_solved_to_rounding_by_one_sweep(rows, matrix):
+    rng, n = np.random.default_rng(7 + rows), 500
+    w = blocks_of(matrix, rng, n, rows) + 0.1 * np.eye(rows) * (matrix == "full")
     reach, zero = rng.uniform(0.0, 0.5, (2, n * rows)), np.zeros(n)
     low, high = np.where(rng.random((2, n * rows)) < 0.3, np.inf, reach) * [[-1.0], [1.0]]
     cones = lv.Cones(rows * np.arange(n + 1), np.zeros(n, int), low, high, zero, zero)
@@ -41,7 +42,7 @@ def test_joints_that_meet_nothing_are_solved_to_rounding_by_one_sweep(rows):
     )
     found = lv.solve(problem, "block_gauss_seidel", tol=0.0, max_iter=1)
     assert found.work["fallbacks"] == 0
-    assert found.residual.relative <= 1e-12  # condition 1e3 of W, a few roundings
+    assert found.residual.relative <= 1e-12 + 10.0 * found.residual.roundoff_floor  # a few roundings
 
 
 def test_dependent_rows_of_a_joint_are_solved():
@@ -108,11 +109,8 @@ def test_contacts_alone_are_solved_to_rounding_by_one_sweep(kind, law, matrix):
     lam = found.impulse.reshape(n, m)
     size = np.maximum(np.abs(b).max(1), (np.abs(w) * np.abs(lam)[:, None, :]).sum(2).max(1))
     off = np.abs(found.residual.error * problem.d).reshape(n, m).max(1) / size
-    # A spin under Coulomb's law may have several answers; parts of a cone are weighed by a W that is well conditioned,
-    # a round cone by one that is symmetric. What is left over goes to sweeps.
-    turns = "spin" in kind or "rolling" in kind
-    rare = turns if law == "coulomb" else matrix in ("asymmetric", "rank one") or (turns and matrix != "full")
-    most = 0.7 if (kind, matrix) == ("round", "asymmetric") else 0.1 if rare else 0.0
+    # Newton's method solves all but a few of the blocks that have no closed form; these go to projected steps.
+    most = 0.002 if kind not in ("normal", "disk", "ellipse") else 0.0
     # The direction is refined to rounding; 1e-10 leaves four digits for W of condition 1e6.
     assert np.count_nonzero(off > 1e-10) <= found.work["fallbacks"] <= most * n
     assert 0.05 * n < np.count_nonzero(lam[:, 0] == 0.0) < 0.95 * n
