@@ -5,9 +5,9 @@
 The path ends at z = 0, a solution, or on a secondary ray. For copositive-plus M (which includes positive semidefinite
 M) a ray proves that there is no solution; its direction is the certificate, which is checked before INFEASIBLE is
 returned. The method runs in `lavender_ext/pivot/lemke.pyx`, which also transforms bounded rows into nonnegative ones.
-If a path ends on a ray that proves nothing, or fails by rounding, another covering vector c is tried. After each path,
-the exchanges of `direct` solve for the free rows on A itself. Ties are broken lexicographically, which excludes cycles
-in exact arithmetic.
+After each path, the exchanges of `direct` begin at its end and solve for the free rows on A itself. If they do not end
+at a solution, another path with another covering vector c follows. Ties are broken lexicographically, which excludes
+cycles in exact arithmetic.
 """
 
 from __future__ import annotations

@@ -68,6 +68,7 @@ cdef int64_t direct_index(const view_t* v) noexcept nogil
 cdef void direct_lay(direct_t* t, const view_t* v, const csr_t* a, const blocks_t* p, int32_t band, const int32_t* order,
                      double tiny, double* real, int32_t* index) noexcept nogil
 cdef void direct_begin(direct_t* t, const double* start) noexcept nogil
+cdef void begin_exchanges(direct_t* t) noexcept nogil
 cdef int32_t is_end(const direct_t* t) noexcept nogil
 cdef void judge_now(direct_t* t) noexcept nogil
 cdef int32_t after_rounds(direct_t* t, int32_t code) noexcept nogil

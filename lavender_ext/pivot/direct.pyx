@@ -83,6 +83,12 @@ cdef void direct_begin(direct_t* t, const double* start) noexcept nogil:
     memcpy(t.start, start, t.s.n * sizeof(double))
 
 
+cdef void begin_exchanges(direct_t* t) noexcept nogil:
+    """Begin with exchanges from the bounds in s.at."""
+    pivots_start(&t.s, 0.0)
+    t.stage = EXCHANGING
+
+
 cdef inline int32_t is_good(const direct_t* t) noexcept nogil:
     """To rounding, or to the floor where it excuses that."""
     return t.relative <= t.least or (t.relative <= t.floor and is_at_floor(t.relative, t.floor))

@@ -34,7 +34,8 @@ from lavender_ext.judge.score cimport new_score
 from lavender_ext.local.gauss_seidel cimport prepare_blocks, prepared_sizes
 from lavender_ext.pivot.direct cimport (HALVED, direct_begin, direct_begin_passes, direct_factor, direct_first,
                                         direct_index, direct_lay, direct_linear, direct_pass, direct_real, direct_t, is_end)
-from lavender_ext.pivot.lemke cimport RAY, lemke_begin, lemke_index, lemke_lay, lemke_real, lemke_run, lemke_t
+from lavender_ext.pivot.lemke cimport (RAY, begin_paths, bind_lemke_workspace, follow_paths, lemke_t, lemke_workspace_doubles,
+                                       lemke_workspace_integers)
 from lavender_ext.pivot.principal cimport INDEFINITE, SMALL, SOLVED
 
 cdef object new = np.empty
@@ -173,15 +174,15 @@ cdef inline int32_t run_lemke_paths(direct_t* t, double tol, double* remaining_c
     cdef double each = 2.0 * <double>t.s.n ** 2
     cdef int32_t limit = LEMKE_PIVOTS_PER_ROW * t.s.n
     cdef int32_t last = limit if remaining_cost[0] > limit * each else <int32_t>(remaining_cost[0] / each)
-    if not has_workspace_size(workspace, lemke_index(t.s.p), lemke_real(t.s.p)):
+    if not has_workspace_size(workspace, lemke_workspace_integers(t.s.p), lemke_workspace_doubles(t.s.p)):
         return -1
-    lemke_lay(&l, t, workspace.real, workspace.index)
-    lemke_begin(&l)
-    while lemke_run(&l, last - l.pivots) == RAY:
+    bind_lemke_workspace(&l, t, workspace.real, workspace.index)
+    begin_paths(&l)
+    while follow_paths(&l, last - l.n_pivots) == RAY:
         pass
     if last < limit:
-        remaining_cost[0] -= l.pivots * each
-    return l.pivots if t.relative <= tol else -1
+        remaining_cost[0] -= l.n_pivots * each
+    return l.n_pivots if t.relative <= tol else -1
 
 
 cdef bint pivot_small(const small_problem_t* s, double* own, double tol, bint follows, double* remaining_cost,

@@ -22,8 +22,8 @@ static int32_t start_pivots(lav_solver *s) {
   real = TAKE(s, double, pivot_direct_direct_real(&s->read, band));
   index = TAKE(s, int32_t, pivot_direct_direct_index(&s->read));
   if (s->options.method == LAV_LEMKE) {
-    s->table = TAKE(s, double, pivot_lemke_lemke_real(&s->p));
-    whole = TAKE(s, int32_t, pivot_lemke_lemke_index(&s->p));
+    s->table = TAKE(s, double, pivot_lemke_lemke_workspace_doubles(&s->p));
+    whole = TAKE(s, int32_t, pivot_lemke_lemke_workspace_integers(&s->p));
   }
   if (s->is_short) return LAV_ERROR_WORKSPACE;
   t->e0 = s->start[0];
@@ -31,7 +31,7 @@ static int32_t start_pivots(lav_solver *s) {
   t->least = 1e-13;
   t->sweeps = GUESS_SWEEPS;
   pivot_direct_direct_lay(t, &s->read, &s->a, &s->q, band, NULL, TINY_PIVOT, real, index);
-  if (whole) pivot_lemke_lemke_lay(&s->lemke, t, s->table, whole);
+  if (whole) pivot_lemke_bind_lemke_workspace(&s->lemke, t, s->table, whole);
   return LAV_OK;
 }
 
@@ -55,14 +55,14 @@ static int32_t pivot_all(lav_solver *s, const lav_budget *budget) {
 static int32_t follow_paths(lav_solver *s, const lav_budget *budget) {
   struct pivot_lemke_lemke_t *l = &s->lemke;
   int32_t code, left;
-  pivot_lemke_lemke_begin(l);
+  pivot_lemke_begin_paths(l);
   do {
-    left = budget->iterations - l->pivots;
-    code = pivot_lemke_lemke_run(l, is_timed(budget) && left > BATCH ? BATCH : left);
+    left = budget->iterations - l->n_pivots;
+    code = pivot_lemke_follow_paths(l, is_timed(budget) && left > BATCH ? BATCH : left);
     if (code == pivot_lemke_DONE) return LAV_STALLED;
-  } while (l->pivots < budget->iterations && !is_late(s, budget));
-  pivot_lemke_lemke_judge(l);
-  return l->pivots < budget->iterations ? LAV_TIME_LIMIT : LAV_MAX_ITERATIONS;
+  } while (l->n_pivots < budget->iterations && !is_late(s, budget));
+  pivot_lemke_judge_unfinished_path(l);
+  return l->n_pivots < budget->iterations ? LAV_TIME_LIMIT : LAV_MAX_ITERATIONS;
 }
 
 static void run_pivots(lav_solver *s, const lav_budget *budget, lav_result *out) {
@@ -74,7 +74,7 @@ static void run_pivots(lav_solver *s, const lav_budget *budget, lav_result *out)
     out->outcome = t->relative <= budget->tol || (budget->tol == 0.0 && pivot_direct_is_end(t)) ? LAV_CONVERGED
                    : judge_score_is_at_floor(t->relative, t->floor)                            ? LAV_ROUNDOFF_LIMIT
                                                                                                 : LAV_STALLED;
-  out->iterations = s->options.method == LAV_LEMKE ? s->lemke.pivots : t->s.n_rounds;
+  out->iterations = s->options.method == LAV_LEMKE ? s->lemke.n_pivots : t->s.n_rounds;
   out->restarts = t->s.factorisations;
   out->sweeps = 2 * GUESS_SWEEPS * t->swept;
 }

@@ -173,8 +173,8 @@ def test_rows_that_contradict_each_other_cost_no_other_row_its_impulse(plug_in):
 
 
 def test_a_ray_of_lemke_does_not_blame_the_data():
-    """Three small solutions exist; a bound of 0.03 N s on all of them is no sign of contradicting constraints."""
-    m = [[0.0, 0.0, 10.0, 20.0], [0.0, 0.0, 30.0, 15.0], [10.0, 20.0, 0.0, 0.0], [30.0, 15.0, 0.0, 0.0]]
+    """A solution of at most 0.2 N s exists: a small lower bound on all solutions does not mean contradicting rows."""
+    m = [[0.0, 0.0, 30.0, 25.0], [0.0, 0.0, 10.0, 5.0], [25.0, 25.0, 0.0, 0.0], [15.0, 5.0, 0.0, 0.0]]
     problem = lv.Problem.lcp(m, np.ones(4))
     lost = lv.solve(problem, "lemke")
     assert lost.status is lv.Status.STALLED and lv.solve(problem).success

@@ -8,11 +8,44 @@ from random_problems import good, random_lcp
 import lavender as lv
 
 
-def test_free_rows_that_no_pivot_reaches_are_split():
+def test_free_rows_that_depend_on_others_stay_zero():
     g = np.array([[1.0], [1.0], [2.0]])
     problem = lv.Problem.lcp(g @ g.T, [1.0, 1.0, 2.0], [-np.inf, -np.inf, 0.0])
     solution = lv.solve(problem, "lemke", tol=1e-9)
     assert good(solution), solution
+
+
+def equality_program(seed):
+    """A convex program of n >= 0 under equalities: the free multipliers have a zero block, and A is not symmetric."""
+    rng = np.random.default_rng(seed)
+    n, k = int(rng.integers(3, 12)), int(rng.integers(1, 3))
+    g, e = rng.normal(size=(n, n // 2)), rng.normal(size=(k, n))
+    a = np.block([[g @ g.T, -e.T], [e, np.zeros((k, k))]])
+    x = np.append(np.maximum(rng.normal(size=n), 0.0), rng.normal(size=k))
+    w = np.append(np.where(x[:n] > 0.0, 0.0, rng.random(n)), np.zeros(k))
+    return lv.Problem.lcp(a, a @ x - w, np.where(np.arange(n + k) < n, 0.0, -np.inf))
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_free_rows_without_a_pivot_of_their_own_take_one_with_a_bounded_row(seed):
+    """The path is then one of a monotone problem, which ends at a solution."""
+    solution = lv.solve(equality_program(seed), "lemke", tol=1e-9)
+    assert good(solution), solution
+    assert solution.work["paths"] == 1
+
+
+def test_another_covering_vector_avoids_the_ray_of_the_first():
+    problem = lv.Problem.lcp([[1.0, 1.0], [1.0, -1.0]], [1.0, 1.0])
+    solution = lv.solve(problem, "lemke", tol=1e-9)
+    assert good(solution), solution
+    assert solution.work["paths"] > 1
+
+
+def test_exchanges_from_the_end_of_a_ray_reach_a_solution():
+    m = [[0.0, 0.0, 10.0, 20.0], [0.0, 0.0, 30.0, 15.0], [10.0, 20.0, 0.0, 0.0], [30.0, 15.0, 0.0, 0.0]]
+    solution = lv.solve(lv.Problem.lcp(m, np.ones(4)), "lemke", tol=1e-9)
+    assert good(solution), solution
+    assert solution.work["paths"] == 1
 
 
 def test_murtys_exponential_example_takes_all_its_pivots():
