@@ -1,0 +1,482 @@
+"""Convert the last step of newton's `SolverKamino` to a batch of problems, with the engine's impulses and its claims.
+
+    solver.step(state_in, state_out, control, contacts, dt)
+    step = lavender.io.from_kamino(solver)                  # before the next step or reset
+    lavender.residual_many(step.batch, step.impulse, errors="status").relative      # (n,), judged
+    step.claims.converged                                   # (n,), as the engine reports it
+
+Kamino (Tsounis et al. 2025) solves, for each world, the dual problem of one time step
+
+    w = D lambda + v_f + Gamma(w)    D = J M^-1 J^T + diag(compliance),   v_f = J u_f + biases
+
+with Coulomb's law in De Saxce's form: w + mu |w_t| n lies in the dual cone. It stores the rows scaled by a diagonal P.
+Without the scaling and with the normal row first, this is the problem of this package:
+
+    J, M     rows of all joints, bounded multipliers, limits and contacts over 6 velocities of each body
+    v*       u_f, the velocity of the bodies without constraint impulses
+    target   J u_f - v_f / P, so that b = -v_f / P (stabilisation and restitution are contained in it)
+    bounds   joints: none; bounded multipliers (joint friction, effort limits): P times the stored bounds;
+             limits: lambda >= 0; contacts: a disk of radius mu lambda_n
+    compliance  of joint dynamics and effort rows, and of soft limits and contacts
+
+Bodies that cannot move (inverse mass and inertia 0) keep their velocity: their columns of J are zero, and their motion
+is part of the target.
+
+The matrix that the engine factorised, D, is compared with the one of J, M and the compliance. This proves that the
+attributes of this version mean what is written here. The comparison runs for the first step of a solver, again
+if its layout changes, and with `verify=True`. Supported is PADMM over the dense Jacobian (the defaults). Other
+configurations are rejected by name.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+from weakref import WeakKeyDictionary
+
+import numpy as np
+
+from lavender.base.arrays import FloatArray, check_bool
+from lavender.base.errors import CapabilityError, InputError
+from lavender.batch.data import Batch
+from lavender.problem.cones import CONTACT, ROW, Cones
+
+# Largest accepted difference of the engine's D and J M^-1 J^T + compliance, relative to the largest entry of the world:
+# 200 roundings of float32. Observed: up to 4e-7. A wrong row or a missing term differs by 1e-2 or more.
+MATRIX_TOLERANCE = 2.4e-5
+# At most this many worlds, those with the most rows, are compared at a first step; `verify=True` compares all.
+MAX_VERIFIED_WORLDS = 64
+ROWS_PER_CONTACT, COLUMNS_PER_BODY = 3, 6
+# Position of each row of a contact in the engine, which stores both tangents before the normal.
+NORMAL_FIRST = np.array([2, 0, 1])
+# Entries of the lower triangle of a body's M that can differ from 0: mass three times, inertia.
+BODY_ROW, BODY_COLUMN = np.array([0, 1, 2, 3, 4, 4, 5, 5, 5]), np.array([0, 1, 2, 3, 3, 4, 3, 4, 5])
+BODY_ROW_ENTRIES = np.array([1, 1, 1, 1, 2, 3])
+RESIDUAL_NAMES = ("r_p", "r_d", "r_c")  # compared with its tolerances by the engine; see its PADMMStatus
+VERSION_ADVICE = "newton 1.8 is known; the class is declared experimental and its attributes change"
+
+
+class Claims(NamedTuple):
+    """The engine's own report about each world's solve.
+
+    Parameters
+    ----------
+    converged : (n,) bool
+    iterations : (n,) int
+    residuals : dict of (n,) arrays
+        The numbers that the engine compared with its tolerances, by its own names (PADMM: r_p, r_d, r_c).
+    """
+
+    converged: np.ndarray
+    iterations: np.ndarray
+    residuals: dict[str, FloatArray]
+
+
+class EngineStep(NamedTuple):
+    """Problems of one step of all worlds of an engine, its impulses, and its claims.
+
+    Parameters
+    ----------
+    batch : Batch
+    impulse : (rows,) N s
+        The engine's answer in the rows of the batch.
+    claims : Claims
+    """
+
+    batch: Batch
+    impulse: FloatArray
+    claims: Claims
+
+
+# For each solver: its layout, and the kinds of rows whose entries of D have been compared.
+_VERIFIED: WeakKeyDictionary[Any, tuple[Any, frozenset[str]]] = WeakKeyDictionary()
+
+
+@np.errstate(over="ignore", invalid="ignore", divide="ignore")  # Numbers of a diverged world.
+def from_kamino(solver: Any, *, verify: bool = False) -> EngineStep:
+    """Return the problems that a `SolverKamino` solved in its last step, its impulses and its claims.
+
+    Parameters
+    ----------
+    solver : newton.solvers.SolverKamino
+        After `step`, and before the next step or reset. Configured with PADMM and the dense Jacobian.
+    verify : bool, default False
+        Compare the engine's matrix of every world with the one of J, M and the compliance, not only at the first step.
+
+    Returns
+    -------
+    EngineStep
+        Worlds of any sizes, with Coulomb's law. Numbers of the engine are float32, and the batch has that precision. A
+        world with a number that is not finite has v_free = NaN: `residual_many(..., errors="status")` and
+        `solve_many(..., errors="status")` report it by its number and judge all others.
+
+    Raises
+    ------
+    InputError
+        `solver` is not a SolverKamino, or has no constraints.
+    CapabilityError
+        Another configuration (DVI, LOX, a sparse Jacobian or sparse dynamics); attributes of this version of newton are
+        missing; a body's inverse inertia is singular; or the engine's matrix differs from the one of J, M and the
+        compliance.
+    """
+    verify = check_bool("verify", verify)
+    engine = getattr(solver, "_solver_kamino", None)
+    if engine is None:
+        raise InputError(f"solver is a {type(solver).__name__}; a newton.solvers.SolverKamino is needed")
+    try:
+        _check_configuration(engine)
+        worlds = _Worlds(engine, solver._contacts_kamino)
+        step = worlds.convert()
+        claims = _claims(solver.status.numpy())
+        _verify(solver, engine, worlds, verify)
+    except AttributeError as error:
+        raise CapabilityError(
+            f"an attribute of this SolverKamino is missing: {error}. {VERSION_ADVICE}"
+        ) from None
+    return EngineStep(*step, claims)
+
+
+def _check_configuration(engine: Any) -> None:
+    """Raise an error unless the engine solves by PADMM over a dense Jacobian and has constraints."""
+    config = engine._config
+    for needed, name, value in (
+        ("padmm", "dynamics_solver", config.dynamics_solver),
+        (False, "sparse_jacobian", config.sparse_jacobian),
+        (False, "sparse_dynamics", config.sparse_dynamics),
+    ):
+        if value != needed:
+            raise CapabilityError(
+                f"{name}={value!r} stores the problem in another form; {name}={needed!r} of SolverKamino.Config is "
+                "supported"
+            )
+    if engine.problem_fd is None or engine._jacobians.data.J_cts_data is None:
+        raise InputError(
+            "this model has no joints, limits or contacts: there is no constraint problem to convert"
+        )
+
+
+def _claims(status: Any) -> Claims:
+    """Build the claims from the engine's array of status records."""
+    names = [name for name in status.dtype.names if name in RESIDUAL_NAMES]
+    residuals = {name: status[name].astype(float) for name in names}
+    return Claims(status["converged"] != 0, status["iterations"].astype(np.int64), residuals)
+
+
+class _Worlds:
+    """The engine's arrays of one step, with the positions of each world's rows and velocities in them."""
+
+    def __init__(self, engine: Any, stored_contacts: Any) -> None:
+        self.stored_contacts = stored_contacts
+        self.engine, self.problem, self.info = engine, engine.problem_fd.data, engine._model.info
+        self.bodies = _as_int(self.info.num_bodies)
+        self.n = n = len(self.bodies)
+        self.columns = COLUMNS_PER_BODY * self.bodies
+        problem = self.problem
+        self.joints, self.bounded, self.limits, self.contacts = (
+            _as_int(x)[:n] for x in (problem.njc, problem.nbc, problem.nl, problem.nc)
+        )
+        self.before_contacts = self.joints + self.bounded + self.limits
+        self.rows = self.before_contacts + ROWS_PER_CONTACT * self.contacts
+        stored = _as_int(problem.dim)[:n]
+        if (self.rows != stored).any():
+            world = int(np.flatnonzero(self.rows != stored)[0])
+            raise CapabilityError(
+                f"world {world} has {stored[world]} rows; its joints, bounded rows, limits and contacts have "
+                f"{self.rows[world]}. {VERSION_ADVICE}"
+            )
+        self.row_ptr, self.velocity_ptr = _pointers(self.rows), _pointers(self.columns)
+        self.world = np.repeat(np.arange(n), self.rows)  # world of each row
+        self.index = np.arange(self.row_ptr[-1]) - self.row_ptr[self.world]  # index within the world
+        # Index of the same row in the engine's order: both tangents of a contact, then its normal.
+        self.source = self.index.copy()
+        self.is_contact_row = self.index >= self.before_contacts[self.world]
+        rank = (self.index - self.before_contacts[self.world])[self.is_contact_row] % ROWS_PER_CONTACT
+        self.source[self.is_contact_row] += NORMAL_FIRST[rank] - rank
+        self.begins_contact = np.zeros(len(self.index), bool)
+        self.begins_contact[self.is_contact_row] = rank == 0
+        self.position = _as_int(problem.vio)[self.world] + self.source  # in vectors of all rows
+        self.velocity_world = np.repeat(np.arange(n), self.columns)
+
+    def convert(self) -> tuple[Batch, FloatArray]:
+        """Build the batch and the impulses."""
+        scale = _floats(self.problem.P)[self.position]
+        first_body = _as_int(self.info.bodies_offset)[: self.n]
+        within = np.arange(self.velocity_ptr[-1]) - self.velocity_ptr[self.velocity_world]
+        of_velocity = COLUMNS_PER_BODY * first_body[self.velocity_world] + within
+        free = _floats(self.problem.u_f).reshape(-1)[of_velocity]
+        mass, is_fixed = self._mass()
+        moves = ~np.repeat(is_fixed, COLUMNS_PER_BODY)[of_velocity]
+        jac, products = self._jacobian(free, moves)
+        target = products - _floats(self.problem.v_f)[self.position] / scale
+        self.compliance = self._compliance()
+        lower, upper, mu = self._bounds(scale)
+        wrong = self._worlds_of_rows(~np.isfinite(target) | ~np.isfinite(self.compliance) | ~(scale > 0.0))
+        wrong |= self._worlds_of_rows(np.isnan(lower) | np.isnan(upper) | (lower > upper) | ~(mu >= 0.0))
+        is_wrong_row = wrong[self.world]
+        lower[is_wrong_row], upper[is_wrong_row], mu[is_wrong_row] = -np.inf, np.inf, 0.0
+        free[wrong[self.velocity_world]] = np.nan
+        begins = self._block_begins()
+        first = np.flatnonzero(begins)
+        cones = Cones(
+            ptr=np.append(first, len(begins)),
+            kind=np.where(self.begins_contact[first], CONTACT, ROW),
+            lower=lower,
+            upper=upper,
+            mu=mu[first],
+            patch_radius=np.zeros(len(first)),
+        )
+        ragged = {"velocity_ptr": self.velocity_ptr} if jac.ndim == 1 else {}
+        batch = Batch(
+            jac, mass, free if jac.ndim == 1 else free.reshape(self.n, -1), target=target, cones=cones,
+            compliance=self.compliance, friction="coulomb", row_ptr=self.row_ptr, **ragged,
+        )  # fmt: skip
+        batch.precision = "float32"
+        batch.names_of = self._block_names(first)
+        return batch, _floats(self.engine.solver_fd.data.solution.lambdas)[self.position]
+
+    def _worlds_of_rows(self, rows: np.ndarray) -> np.ndarray:
+        """Return the worlds (n,) bool that have one of the given rows (bool)."""
+        return np.bincount(self.world[rows], minlength=self.n) > 0
+
+    @property
+    def has_equal_bodies(self) -> bool:
+        """Whether all worlds have the same number of bodies."""
+        return bool((self.bodies == self.bodies[0]).all())
+
+    def _jacobian(self, free: FloatArray, moves: np.ndarray) -> tuple[FloatArray, FloatArray]:
+        """Return J and J v*: (rows, nv) if worlds have equal numbers of bodies, else one array of all entries."""
+        data = self.engine._jacobians.data
+        values, start = data.J_cts_data.numpy(), _as_int(data.J_cts_offsets)
+        first = start[self.world] + self.source * self.columns[self.world]  # of each row
+        if self.has_equal_bodies:
+            nv = int(self.columns[0])
+            jac = values[first[:, None] + np.arange(nv)].astype(float)
+            if not moves.all():
+                jac *= moves.reshape(self.n, nv)[self.world]
+            return jac, np.einsum("ij,ij->i", jac, free.reshape(self.n, nv)[self.world])
+        width = self.columns[self.world]
+        ptr = _pointers(width)
+        entry = np.arange(ptr[-1])
+        velocity = entry + np.repeat(self.velocity_ptr[self.world] - ptr[:-1], width)
+        jac = np.where(moves[velocity], values[entry + np.repeat(first - ptr[:-1], width)], 0.0)
+        row = np.repeat(np.arange(len(width)), width)
+        products: FloatArray = np.bincount(row, jac * free[velocity], minlength=len(width))
+        return jac, products
+
+    def _mass(self) -> tuple[Any, np.ndarray]:
+        """Return M, as lower triangles of one pattern or one array of all entries, and the fixed bodies (bodies,)."""
+        inv_mass = _floats(self.engine._model.bodies.inv_m_i)
+        inv_inertia = _floats(self.engine.data.bodies.inv_I_i)
+        is_fixed = (inv_mass == 0.0) & (inv_inertia == 0.0).all(axis=(1, 2))
+        # M is not read where J is 0. A body with numbers that are not finite makes J v* and so the world NaN.
+        is_ordinary = np.isfinite(inv_mass) & np.isfinite(inv_inertia).all(axis=(1, 2)) & ~is_fixed
+        inv_mass = np.where(is_ordinary, inv_mass, 1.0)
+        inv_inertia = np.where(is_ordinary[:, None, None], inv_inertia, np.eye(3))
+        is_singular = (inv_mass <= 0.0) | (np.linalg.det(inv_inertia) <= 0.0)
+        if is_singular.any():
+            body = int(np.flatnonzero(is_singular)[0])
+            raise CapabilityError(
+                f"body {body} ({self.engine._model.bodies.label[body]!r}) can move in some directions only: its "
+                "inverse mass or inertia is singular; bodies that move freely or not at all are supported"
+            )
+        inertia = np.linalg.inv(inv_inertia)
+        values = np.concatenate(
+            [np.repeat(1.0 / inv_mass[:, None], 3, axis=1), inertia[(slice(None), *np.tril_indices(3))]],
+            axis=1,
+        )
+        if self.has_equal_bodies:
+            count = int(self.bodies[0])
+            offset = COLUMNS_PER_BODY * np.repeat(np.arange(count), len(BODY_COLUMN))
+            indptr = _pointers(np.tile(BODY_ROW_ENTRIES, count))
+            return (values.reshape(self.n, -1), np.tile(BODY_COLUMN, count) + offset, indptr), is_fixed
+        ptr = _pointers(self.columns**2)
+        mass = np.zeros(ptr[-1])
+        world = np.repeat(np.arange(self.n), self.bodies)
+        corner = COLUMNS_PER_BODY * (np.arange(len(world)) - _pointers(self.bodies)[world])
+        nv = self.columns[world]
+        for row, column, entry in zip(BODY_ROW, BODY_COLUMN, values.T, strict=True):
+            mass[ptr[world] + (corner + row) * nv + corner + column] = entry
+            mass[ptr[world] + (corner + column) * nv + corner + row] = entry
+        return mass, is_fixed
+
+    def _compliance(self) -> FloatArray:
+        """Return the compliance of each row [1/kg, 1/(kg m^2)]."""
+        problem, info, joints = self.problem, self.info, self.engine.data.joints
+        soft = (
+            np.zeros(len(self.index))
+            if problem.compliance is None
+            else _floats(problem.compliance)[self.position]
+        )
+        for kind, values in (
+            ("dynamic", joints.inv_m_j),
+            ("effort", joints.inv_m_a),
+        ):
+            names = f"num_joint_{kind}_cts", f"joint_{kind}_cts_offset", f"joint_{kind}_cts_group_offset"
+            count, offset, group = (_as_int(getattr(info, name))[: self.n] for name in names)
+            if count.any():
+                world = np.repeat(np.arange(self.n), count)
+                k = np.arange(len(world)) - _pointers(count)[world]
+                soft[self.row_ptr[world] + group[world] + k] += _floats(values)[offset[world] + k]
+        return soft
+
+    def _bounds(self, scale: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return lower and upper bounds [N s] and the coefficient of friction of each row; 0 on rows of no contact."""
+        problem, world, index = self.problem, self.world, self.index
+        lower, upper, mu = np.full(len(index), -np.inf), np.full(len(index), np.inf), np.zeros(len(index))
+        is_bounded = (index >= self.joints[world]) & (index < (self.joints + self.bounded)[world])
+        if is_bounded.any():
+            k = (_as_int(problem.bcio)[world] + index - self.joints[world])[is_bounded]
+            lower[is_bounded] = scale[is_bounded] * _floats(problem.bound_lower)[k]
+            upper[is_bounded] = scale[is_bounded] * _floats(problem.bound_upper)[k]
+        is_limit = (index >= (self.joints + self.bounded)[world]) & ~self.is_contact_row
+        lower[is_limit] = 0.0
+        at = self.begins_contact
+        k = (_as_int(problem.cio)[world] + (index - self.before_contacts[world]) // ROWS_PER_CONTACT)[at]
+        mu[at] = _floats(problem.mu)[k]
+        return lower, upper, mu
+
+    def _block_begins(self) -> np.ndarray:
+        """Return the rows (bool) that begin a block: the rows that hold one joint together form one block."""
+        begins = ~self.is_contact_row | self.begins_contact
+        joints = self.engine._model.joints
+        world, count = _as_int(joints.wid), _as_int(joints.num_kinematic_cts)
+        per_world = np.bincount(world, count, minlength=self.n).astype(np.int64)
+        group = _as_int(self.info.joint_kinematic_cts_group_offset)[: self.n]
+        if (group + per_world != self.joints).any():
+            raise CapabilityError(f"rows of joints are not dynamic and kinematic rows. {VERSION_ADVICE}")
+        before = (
+            _pointers(count)[:-1] - _pointers(per_world)[world]
+        )  # rows of joints before this one in its world
+        start = self.row_ptr[world] + group[world] + before
+        begins[np.repeat(start, count) + np.arange(count.sum()) - np.repeat(_pointers(count)[:-1], count)] = (
+            False
+        )
+        begins[start[count > 0]] = True
+        return begins
+
+    def _block_names(self, first: np.ndarray) -> Callable[[int], list[str]]:
+        """Return a function that returns the names of a world's blocks, given the first row of each block."""
+        model = self.engine._model
+        labels, bodies = list(model.joints.label), list(model.bodies.label)
+        joints = {
+            "dynamics": (model.joints.num_dynamic_cts, False),
+            "": (model.joints.num_kinematic_cts, True),
+            "friction": (model.joints.num_friction_cts, False),
+            "effort": (model.joints.num_effort_cts, False),
+        }
+        world_of_joint = _as_int(model.joints.wid)
+        counts = {kind: (_as_int(count), joined) for kind, (count, joined) in joints.items()}
+        pairs = self._contact_bodies()
+
+        def names_of(i: int) -> list[str]:
+            own = np.flatnonzero(world_of_joint == i).tolist()
+            names = []
+            for kind, (count, joined) in counts.items():
+                for joint in own:
+                    suffix = f", {kind}" if kind else ""
+                    repeats = min(int(count[joint]), 1) if joined else int(count[joint])
+                    names += [f"joint {labels[joint]}{suffix}"] * repeats
+            names += [f"limit {k}" for k in range(int(self.limits[i]))]
+            for k in range(int(self.contacts[i])):
+                sides = [bodies[b] if b >= 0 else "ground" for b in pairs.get((i, k), ())]
+                names.append(f"contact {k}" + (f" ({', '.join(sides)})" if sides else ""))
+            blocks = np.count_nonzero((first >= self.row_ptr[i]) & (first < self.row_ptr[i + 1]))
+            return names if len(names) == blocks else [f"block {k}" for k in range(blocks)]
+
+        return names_of
+
+    def _contact_bodies(self) -> dict[tuple[int, int], list[int]]:
+        """Return the two bodies of each contact by (world, number in the world); -1 is the world itself."""
+        contacts = self.stored_contacts
+        if contacts is None or not self.contacts.any():
+            return {}
+        data = contacts.data
+        count = int(data.model_active_contacts.numpy()[0])
+        world, number, pair = (x.numpy()[:count] for x in (data.wid, data.cid, data.bid_AB))
+        return {(w, k): p for w, k, p in zip(world.tolist(), number.tolist(), pair.tolist(), strict=True)}
+
+    def kinds_of_world(self) -> dict[str, np.ndarray]:
+        """Return the number of rows of each kind in each world (n,)."""
+        soft = np.bincount(self.world, self.compliance != 0.0, minlength=self.n)
+        return {
+            "joint": self.joints, "bounded": self.bounded, "limit": self.limits, "contact": self.contacts, "soft": soft
+        }  # fmt: skip
+
+    def matrix_difference(self, i: int) -> float:
+        """Return the largest difference of the engine's D of world i from J M^-1 J^T, relative to its largest entry."""
+        size, bodies = (
+            int(self.rows[i]),
+            slice(int(self.first_body(i)), int(self.first_body(i) + self.bodies[i])),
+        )
+        if size == 0:
+            return 0.0
+        start = int(_as_int(self.problem.mio)[i])
+        stored = _floats(self.problem.D[start : start + size * size]).reshape(size, size)
+        sigma = float(self.engine.solver_fd.data.state.sigma.numpy()[i][0])
+        first = int(_as_int(self.problem.vio)[i])
+        scale = _floats(self.problem.P[first : first + size])
+        data, nv = self.engine._jacobians.data, int(self.columns[i])
+        begin = int(_as_int(data.J_cts_offsets)[i])
+        jac = _floats(data.J_cts_data[begin : begin + size * nv]).reshape(size, nv)
+        blocks = jac.reshape(size, -1, 2, 3)
+        inv_mass, inv_inertia = (
+            _floats(x[bodies]) for x in (self.engine._model.bodies.inv_m_i, self.engine.data.bodies.inv_I_i)
+        )
+        linear = np.einsum("ibk,b->ibk", blocks[:, :, 0], inv_mass)
+        angular = np.einsum("ibk,bkl->ibl", blocks[:, :, 1], inv_inertia)
+        product = np.stack([linear, angular], axis=2).reshape(size, nv) @ jac.T
+        rows = slice(int(self.row_ptr[i]), int(self.row_ptr[i + 1]))
+        product[self.source[rows], self.source[rows]] += self.compliance[rows]
+        matrix = (stored - sigma * np.eye(size)) / np.outer(scale, scale)
+        largest = np.abs(product).max(initial=0.0)
+        return float(np.abs(matrix - product).max(initial=0.0) / largest) if largest > 0.0 else 0.0
+
+    def first_body(self, i: int) -> int:
+        """Return the number of world i's first body."""
+        return int(_as_int(self.info.bodies_offset)[i])
+
+
+def _verify(solver: Any, engine: Any, worlds: _Worlds, complete: bool) -> None:
+    """Compare the engine's matrix with the one of J, M and the compliance, where that has not been done.
+
+    Raises
+    ------
+    CapabilityError
+        They differ in a world whose numbers are finite.
+    """
+    kinds = worlds.kinds_of_world()
+    layout = worlds.bodies.tobytes(), _as_int(worlds.problem.maxdim).tobytes()
+    known = _VERIFIED.get(solver)
+    verified = known[1] if known is not None and known[0] == layout else frozenset()
+    new = [name for name, count in kinds.items() if count.any() and name not in verified]
+    if complete:
+        chosen = np.arange(worlds.n)
+    elif new:
+        most_rows = np.argsort(-worlds.rows, kind="stable")[:MAX_VERIFIED_WORLDS]
+        chosen = np.unique([*most_rows, *(int(np.argmax(kinds[name])) for name in new)])
+    else:
+        return
+    for i in chosen.tolist():
+        difference = worlds.matrix_difference(i)
+        if difference > MATRIX_TOLERANCE:
+            raise CapabilityError(
+                f"world {i}: the engine's matrix differs from J M^-1 J^T + compliance by {difference:.1e} of its "
+                f"largest entry (rows: {', '.join(name for name, count in kinds.items() if count[i])}). The arrays are "
+                f"not those of one step, or this version stores them otherwise. {VERSION_ADVICE}"
+            )
+    _VERIFIED[solver] = layout, verified | frozenset(new)
+
+
+def _as_int(array: Any) -> np.ndarray:
+    """Copy an integer array of the engine to the host as int64."""
+    return array.numpy().astype(np.int64)
+
+
+def _floats(array: Any) -> FloatArray:
+    """Copy an array of the engine to the host as float64."""
+    return array.numpy().astype(float)
+
+
+def _pointers(counts: np.ndarray) -> np.ndarray:
+    """Return 0 and the sums of the first 1, 2, ... counts."""
+    return np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])

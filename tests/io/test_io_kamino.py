@@ -1,0 +1,223 @@
+"""`from_kamino` on arrays that `record_kamino.py` recorded, against the engine's own matrix, laws and velocities."""
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import lavender as lv
+
+RECORDED = Path(__file__).parent / "kamino_1.8.0.npz"
+# Engine and data are float32: v+ of the impulses and the engine's own velocity differ by roundings of 1 m/s numbers.
+VELOCITY_TOLERANCE = 1e-4
+
+
+class Recorded:
+    """An array of the engine: `numpy()` and slices, as warp arrays have."""
+
+    def __init__(self, array):
+        self.array = array
+
+    def numpy(self):
+        return self.array
+
+    def __getitem__(self, index):
+        return Recorded(self.array[index])
+
+
+class Node:
+    """An object whose attributes are set from dotted paths; it can be weakly referenced."""
+
+
+def load(model, **changes):
+    """Return a stand-in of the solver with the recorded attributes, some of them replaced."""
+    solver, velocity = Node(), None
+    with np.load(RECORDED) as file:
+        for key in file.files:
+            if not key.startswith(f"{model}/"):
+                continue
+            path = key.split("/")[1].split(".")
+            if path == ["velocity"]:
+                velocity = file[key]
+                continue
+            array = changes.get(path[-1], lambda x: x)(file[key].copy())
+            at = solver
+            for name in path[:-1]:
+                if not hasattr(at, name):
+                    setattr(at, name, Node())
+                at = getattr(at, name)
+            setattr(at, path[-1], list(array) if path[-1] == "label" else Recorded(array))
+    engine = solver._solver_kamino
+    engine._config = SimpleNamespace(dynamics_solver="padmm", sparse_jacobian=False, sparse_dynamics=False)
+    engine.problem_fd.data.compliance = None
+    return solver, velocity
+
+
+def engine_world(solver, i):
+    """Return A, b, the impulses and numbers of rows of world i in the engine's order, from its D, v_f and P only."""
+    problem = solver._solver_kamino.problem_fd.data
+    size, start, first = (int(x.numpy()[i]) for x in (problem.dim, problem.mio, problem.vio))
+    scale = problem.P.numpy()[first : first + size].astype(float)
+    matrix = problem.D.numpy()[start : start + size**2].reshape(size, size).astype(float)
+    sigma = float(solver._solver_kamino.solver_fd.data.state.sigma.numpy()[i][0])
+    matrix = (matrix - sigma * np.eye(size)) / np.outer(scale, scale)
+    b = -problem.v_f.numpy()[first : first + size] / scale
+    lam = solver._solver_kamino.solver_fd.data.solution.lambdas.numpy()[first : first + size].astype(float)
+    counts = [int(x.numpy()[i]) for x in (problem.njc, problem.nbc, problem.nl, problem.nc)]
+    return matrix, b, lam, counts
+
+
+def normals_first(joints, bounded, limits, contacts):
+    before = joints + bounded + limits
+    return [*range(before), *(before + 3 * k + j for k in range(contacts) for j in (2, 0, 1))]
+
+
+@pytest.mark.parametrize("model", ["mixed", "stacks"])
+def test_problems_are_the_engines(model):
+    solver, _ = load(model)
+    step = lv.io.from_kamino(solver, verify=True)
+    assert step.claims.converged.shape == (len(step.batch),)
+    for i in range(len(step.batch)):
+        matrix, b, lam, counts = engine_world(solver, i)
+        if not np.isfinite(b).all() or not len(b):
+            continue
+        problem, order = step.batch[i], normals_first(*counts)
+        # float32 roundings of sums of up to 24 terms
+        assert np.abs(problem.dense() - matrix[np.ix_(order, order)]).max() <= 1e-6 * np.abs(matrix).max()
+        assert np.abs(problem.b - b[order]).max() <= 1e-6 * (np.abs(b).max() + 1.0)
+        np.testing.assert_array_equal(step.impulse[step.batch.rows_of(i)], lam[order])
+        # joints are free, each in one block; then bounded rows, limits, and contacts of three rows
+        joints, bounded, limits, contacts = counts
+        lower, upper = problem.cones.lower, problem.cones.upper
+        assert np.isinf(lower[:joints]).all() and np.isinf(upper[:joints]).all()
+        acts = slice(joints, joints + bounded)
+        assert (lower[acts] < 0.0).all() and (upper[acts] > 0.0).all() and np.isfinite(upper[acts]).all()
+        assert (lower[joints + bounded : joints + bounded + limits] == 0.0).all()
+        assert problem.cones.is_contact.sum() == contacts
+        assert (problem.cones.mu[problem.cones.is_contact] > 0.0).all()
+        assert len(problem.names) == problem.cones.n_blocks
+
+
+def test_verdicts_agree_with_own_arithmetic():
+    """The judge's velocity error against complementarity, cone and momentum computed here from the engine's D."""
+    solver, _ = load("mixed")
+    step = lv.io.from_kamino(solver)
+    judged = lv.residual_many(step.batch, step.impulse).velocity_error
+    for i in range(len(step.batch)):
+        matrix, b, lam, (joints, bounded, limits, contacts) = engine_world(solver, i)
+        w, d = matrix @ lam - b, np.diag(matrix)
+        mu = step.batch[i].cones.mu[step.batch[i].cones.is_contact]
+        worst = np.abs(w[:joints]).max(initial=0.0)
+        for k in range(contacts):
+            t = slice(joints + bounded + limits + 3 * k, joints + bounded + limits + 3 * k + 2)
+            n = t.stop
+            e = lam[n] - max(0.0, lam[n] - w[n] / d[n])
+            free = lam[t] - w[t] / d[t]
+            bound = mu[k] * max(0.0, lam[n])
+            e_t = lam[t] - free * min(1.0, bound / max(np.linalg.norm(free), 1e-300))
+            worst = max(worst, abs(d[n] * e), *(d[t] * np.abs(e_t)))
+        # The judge uses one d for both tangents and weights the error of a block: within a factor of 2 of this one.
+        assert 0.5 * judged[i] - 1e-6 <= worst <= 2.0 * judged[i] + 1e-6, (i, worst, judged[i])
+
+
+def test_velocity_after_the_step_is_the_engines():
+    solver, after = load("mixed")
+    step = lv.io.from_kamino(solver)
+    start = 0
+    for i in range(len(step.batch)):
+        jac, mass, free = (step.batch._array_of_world(i, k) for k in range(3))
+        velocity = free + np.linalg.solve(mass, jac.T @ step.impulse[step.batch.rows_of(i)])
+        stop = start + len(free) // 6
+        assert np.abs(velocity - after[start:stop].reshape(-1)).max() <= VELOCITY_TOLERANCE
+        start = stop
+
+
+def test_worlds_of_several_sizes_are_as_alone():
+    # The stack is world 0 of the mixed model and each world of the other one; both start alike.
+    mixed, stacks = lv.io.from_kamino(load("mixed")[0]), lv.io.from_kamino(load("stacks")[0])
+    a, b = mixed.batch[0], stacks.batch[0]
+    np.testing.assert_allclose(a.dense(), b.dense(), rtol=1e-12, atol=1e-14)
+    np.testing.assert_allclose(a.b, b.b, rtol=1e-12, atol=1e-14)
+    assert a.names == b.names
+
+
+def test_a_world_with_nan_is_named_and_touches_no_other():
+    step = lv.io.from_kamino(load("stacks")[0])
+    residuals = lv.residual_many(step.batch, step.impulse, errors="status")
+    assert set(residuals.faults) == {7}
+    assert step.claims.converged[7]  # what the engine claims of it
+    assert np.isfinite(residuals.relative[:7]).all()
+    single = [lv.residual(step.batch[i], step.impulse[step.batch.rows_of(i)]).relative for i in range(7)]
+    np.testing.assert_array_equal(residuals.relative[:7], single)
+
+
+def test_wrong_matrix_is_rejected():
+    with pytest.raises(lv.CapabilityError, match=r"world \d: the engine's matrix differs"):
+        lv.io.from_kamino(load("mixed", inv_m_i=lambda x: 1.01 * x)[0])
+
+
+def test_matrix_is_compared_once_or_on_request():
+    solver, _ = load("mixed")
+    lv.io.from_kamino(solver)
+    solver._solver_kamino.problem_fd.data.D = Recorded(2.0 * solver._solver_kamino.problem_fd.data.D.numpy())
+    lv.io.from_kamino(solver)
+    with pytest.raises(lv.CapabilityError, match="the engine's matrix differs"):
+        lv.io.from_kamino(solver, verify=True)
+
+
+@pytest.mark.parametrize(
+    ("option", "value"), [("dynamics_solver", "dvi"), ("sparse_jacobian", True), ("sparse_dynamics", True)]
+)
+def test_other_configurations_are_rejected_by_name(option, value):
+    solver, _ = load("mixed")
+    setattr(solver._solver_kamino._config, option, value)
+    with pytest.raises(lv.CapabilityError, match=f"{option}={value!r}"):
+        lv.io.from_kamino(solver)
+
+
+def test_missing_attributes_and_other_objects_are_rejected():
+    solver, _ = load("mixed")
+    del solver._solver_kamino.problem_fd.data.bound_lower
+    with pytest.raises(lv.CapabilityError, match="bound_lower"):
+        lv.io.from_kamino(solver)
+    with pytest.raises(lv.InputError, match="a dict; a newton"):
+        lv.io.from_kamino({})
+
+
+def test_singular_inertia_is_rejected_by_its_body():
+    def flatten(x):
+        x[2, 0, :] = x[2, :, 0] = 0.0
+        return x
+
+    with pytest.raises(lv.CapabilityError, match=r"body 2 .* singular"):
+        lv.io.from_kamino(load("mixed", inv_I_i=flatten)[0])
+
+
+def test_immovable_bodies_keep_their_velocity():
+    def fix(array):
+        array[1] = 0.0
+        return array
+
+    solver, _ = load("stacks", inv_m_i=fix, inv_I_i=fix, D=lambda x: 0.0 * x)
+    worlds = lv.io.kamino._Worlds(solver._solver_kamino, solver._contacts_kamino)
+    batch, _ = worlds.convert()
+    problem = batch[0]
+    jac = problem.jacobian.toarray()
+    assert not jac[:, 6:].any() and jac[:, :6].any()
+    np.testing.assert_allclose(
+        problem.velocity(np.ones(problem.m))[6:], batch._array_of_world(0, 2)[6:], rtol=1e-15
+    )
+
+
+def test_engine_itself():
+    """The recorded arrays are those of the engine that is installed."""
+    pytest.importorskip("newton")
+    from record_kamino import step_worlds
+
+    from newton.tests.utils import basics  # isort: skip
+
+    solver, after = step_worlds([basics.build_boxes_hinged()] * 2, False)
+    step = lv.io.from_kamino(solver, verify=True)
+    assert (lv.residual_many(step.batch, step.impulse).velocity_error < 1e-4).all()
+    assert len(after) == 4
