@@ -260,7 +260,7 @@ class _Worlds:
         velocity = entry + np.repeat(self.velocity_ptr[self.world] - ptr[:-1], width)
         jac = np.where(moves[velocity], values[entry + np.repeat(first - ptr[:-1], width)], 0.0)
         row = np.repeat(np.arange(len(width)), width)
-        products: FloatArray = np.bincount(row, jac * free[velocity], minlength=len(width))
+        products: Any = np.bincount(row, jac * free[velocity], minlength=len(width))
         return jac, products
 
     def _mass(self) -> tuple[Any, np.ndarray]:
