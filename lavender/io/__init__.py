@@ -7,8 +7,8 @@
 | `.hdf5`, `.h5` | FCLIB, local (W, q, mu) and global (M, H, f, w, mu), 2D, 3D; extra `fclib` | yes |
 
 An error names everything that a format cannot hold. `docs/formats.md` lists every entry. Problems can also be built
-from the data of another engine: `from_mujoco`, `from_pinocchio`, `from_drake`; `from_mujoco_many`, `from_efc` and
-`from_kamino` for many worlds at once; `record` writes the steps of a simulation to a folder.
+from the data of another engine: `from_mujoco`, `from_pinocchio`, `from_drake`; `from_mujoco_many`, `from_efc`,
+`from_kamino` and `from_genesis` for many worlds at once; `record` writes the steps of a simulation to a folder.
 """
 
 from __future__ import annotations
@@ -22,6 +22,8 @@ from lavender.base.errors import InputError
 from lavender.io import drake, efc, fclib, mujoco, npz
 from lavender.io.drake import from_drake
 from lavender.io.efc import from_efc, from_mujoco_many
+from lavender.io.engine_step import Claims, EngineStep
+from lavender.io.genesis import from_genesis
 from lavender.io.kamino import from_kamino
 from lavender.io.mujoco import from_mujoco
 from lavender.io.pinocchio import from_pinocchio
@@ -30,12 +32,15 @@ from lavender.io.stored import HDF5, MAX_BYTES, Stored, as_path, first_bytes
 from lavender.problem import Problem
 
 __all__ = [
+    "Claims",
+    "EngineStep",
     "Recording",
     "Stored",
     "drake",
     "efc",
     "from_drake",
     "from_efc",
+    "from_genesis",
     "from_kamino",
     "from_mujoco",
     "from_mujoco_many",

@@ -32,6 +32,7 @@ from lavender.base.errors import CapabilityError, InputError
 from lavender.base.threads import run_on_threads
 from lavender.batch.data import ERRORS, Batch, check_counts, check_triangle
 from lavender.io import mujoco as single
+from lavender.problem import FRICTION_LAWS
 from lavender.problem.cones import Cones, kinds_of
 from lavender_ext.judge.measure import all_finite
 
@@ -82,6 +83,7 @@ def from_efc(
     contacts: tuple[Any, Any, Any, Any] | None = None,
     efc_force: Any = None,
     qfrc_smooth: Any = None,
+    friction: str = "cone",
 ) -> Imported:
     """Build constraint problems from stacked arrays of n worlds with at most m rows each, in float32 or float64.
 
@@ -108,11 +110,14 @@ def from_efc(
         The engine's answer.
     qfrc_smooth : (n, nv), optional
         Compared with M qacc_smooth, to the precision of the data.
+    friction : {"cone", "coulomb"}, default "cone"
+        Law of elliptic contacts: "cone" is MuJoCo's convex relaxation. Engines that solve the Signorini condition with
+        Coulomb's law need "coulomb"; their contacts have three rows and one coefficient for both tangents.
 
     Returns
     -------
     Imported
-        The batch, with the law "cone", and `impulse` if `efc_force` was given.
+        The batch, and `impulse` if `efc_force` was given.
 
     Raises
     ------
@@ -120,8 +125,10 @@ def from_efc(
         Shapes do not fit; an efc_type is not a value of mjtConstraint; a D is not above 0; a friction loss is below 0;
         an elliptic row is named by no contact or by several.
     CapabilityError
-        M qacc_smooth is not the smooth force: the problem was built with another matrix.
+        M qacc_smooth is not the smooth force: the problem was built with another matrix. Or friction="coulomb" for a
+        contact with torsional or rolling friction, or with different coefficients of its tangents.
     """
+    friction = check_choice("friction", friction, FRICTION_LAWS)
     jac, before = as_floats("efc_J", efc_J), as_floats("qvel", qvel)
     # MJX and Warp store the time step as an array of one number.
     is_one = np.prod(shape_of("timestep", timestep)) == 1
@@ -160,11 +167,16 @@ def from_efc(
         target[i : i + step] += np.einsum("nij,nj->ni", jac[i : i + step].astype(float), before[i : i + step])
     compliance = np.where(used_rows, 1.0 / inv_compliance, 0.0)
     cones, scale = _blocks(row_type, loss, used_rows, contacts, dt)
+    if friction == "coulomb" and (scale is not None or cones.has_round):
+        raise CapabilityError(
+            "friction='coulomb' is for contacts of three rows with one coefficient; a contact with torsional or "
+            "rolling friction, or with different coefficients of its tangents, has the law 'cone' only"
+        )
     if scale is not None:
         jac = jac * scale[:, :, None].astype(jac.dtype)
         target, compliance = target * scale, compliance * scale * scale
     batch = Batch(
-        jac, mass, free, target=target, cones=cones, compliance=compliance, friction="cone", count=count
+        jac, mass, free, target=target, cones=cones, compliance=compliance, friction=friction, count=count
     )
     batch.precision = precision
     if efc_force is None:

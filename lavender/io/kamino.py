@@ -31,7 +31,7 @@ configurations are rejected by name.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -39,6 +39,7 @@ import numpy as np
 from lavender.base.arrays import FloatArray, check_bool
 from lavender.base.errors import CapabilityError, InputError
 from lavender.batch.data import Batch
+from lavender.io.engine_step import Claims, EngineStep
 from lavender.problem.cones import CONTACT, ROW, Cones
 
 # Largest accepted difference of the engine's D and J M^-1 J^T + compliance, relative to the largest entry of the world:
@@ -54,38 +55,6 @@ BODY_ROW, BODY_COLUMN = np.array([0, 1, 2, 3, 4, 4, 5, 5, 5]), np.array([0, 1, 2
 BODY_ROW_ENTRIES = np.array([1, 1, 1, 1, 2, 3])
 RESIDUAL_NAMES = ("r_p", "r_d", "r_c")  # compared with its tolerances by the engine; see its PADMMStatus
 VERSION_ADVICE = "newton 1.8 is known; the class is declared experimental and its attributes change"
-
-
-class Claims(NamedTuple):
-    """The engine's own report about each world's solve.
-
-    Parameters
-    ----------
-    converged : (n,) bool
-    iterations : (n,) int
-    residuals : dict of (n,) arrays
-        The numbers that the engine compared with its tolerances, by its own names (PADMM: r_p, r_d, r_c).
-    """
-
-    converged: np.ndarray
-    iterations: np.ndarray
-    residuals: dict[str, FloatArray]
-
-
-class EngineStep(NamedTuple):
-    """Problems of one step of all worlds of an engine, its impulses, and its claims.
-
-    Parameters
-    ----------
-    batch : Batch
-    impulse : (rows,) N s
-        The engine's answer in the rows of the batch.
-    claims : Claims
-    """
-
-    batch: Batch
-    impulse: FloatArray
-    claims: Claims
 
 
 # For each solver: its layout, and the kinds of rows whose entries of D have been compared.

@@ -285,3 +285,24 @@ def test_malformed_arrays_are_refused_by_name(what):
     change, words = MALFORMED[what]
     with pytest.raises(lv.InputError, match=words):
         lv.io.from_efc(**given | change(given))
+
+
+def test_the_law_of_contacts_can_be_coulombs():
+    model = mj.MjModel.from_xml_string(scene(cone="elliptic", condim=3))
+    given = stacked(model, states_of(model, 4), np.float64)
+    relaxed, rigid = lv.io.from_efc(**given), lv.io.from_efc(**given, friction="coulomb")
+    assert (relaxed.batch.friction, rigid.batch.friction) == ("cone", "coulomb")
+    np.testing.assert_array_equal(relaxed.impulse, rigid.impulse)
+    for i in range(len(rigid.batch)):  # only the law differs
+        np.testing.assert_array_equal(rigid.batch[i].b, relaxed.batch[i].b)
+        np.testing.assert_array_equal(rigid.batch[i].dense(), relaxed.batch[i].dense())
+        assert rigid.batch[i].friction == "coulomb"
+
+
+def test_coulombs_law_is_rejected_where_it_is_not_defined():
+    model = mj.MjModel.from_xml_string(scene(cone="elliptic", condim=4))
+    given = stacked(model, states_of(model, 2), np.float64)
+    with pytest.raises(lv.CapabilityError, match="torsional or rolling"):
+        lv.io.from_efc(**given, friction="coulomb")
+    with pytest.raises(lv.InputError, match="friction"):
+        lv.io.from_efc(**given, friction="ccp")

@@ -1,0 +1,154 @@
+"""Convert the last step of a Genesis scene to a batch of problems, with the engine's impulses and its claims.
+
+    scene.step()
+    step = lavender.io.from_genesis(scene)
+    lavender.residual_many(step.batch, step.impulse, errors="status").velocity_error      # (n,) m/s, judged
+
+The rigid solver of Genesis solves MuJoCo's problem (`lavender.io.efc`) for each environment. Its arrays store the
+environment last, and rows in the order equalities, dry friction, contacts, joint limits. Friction cones are pyramids,
+or elliptic, and elliptic contacts are solved by one of two laws:
+
+    contact_resolution = convex       MuJoCo's relaxation: the law "cone"
+    contact_resolution = signorini    Coulomb's law over softened rows: the law "coulomb"
+
+The velocity before the step is the velocity after it minus dt qacc. With several substeps only the last one is visible.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from lavender.base.arrays import FloatArray
+from lavender.base.errors import CapabilityError, InputError
+from lavender.io.efc import ELLIPTIC, EQUALITY, FRICTION, from_efc
+from lavender.io.engine_step import Claims, EngineStep
+
+LIMIT, PYRAMIDAL = 3, 6  # values of mjtConstraint: a joint limit, an edge of a pyramid
+ROWS_OF_NORMAL_AND_TANGENTS = 3
+VERSION_ADVICE = "genesis-world 1.4 is known"
+
+
+def from_genesis(scene: Any) -> EngineStep:
+    """Return the problems that a Genesis scene solved in its last step, its impulses and its claims.
+
+    Parameters
+    ----------
+    scene : genesis.Scene
+        Built, with rigid bodies, after `step`.
+
+    Returns
+    -------
+    EngineStep
+        One world for each environment, in float32 or float64 as the engine computed. `claims.converged` is False in
+        environments whose iterations were used up.
+
+    Raises
+    ------
+    InputError
+        `scene` is not a built scene with rigid bodies.
+    CapabilityError
+        The scene uses noslip iterations, hibernation, or the SAP or IPC coupler; the Signorini condition with torsional
+        or rolling friction; attributes of this version are missing; or M qacc_smooth is not the smooth force.
+    """
+    solver = getattr(getattr(scene, "sim", None), "rigid_solver", None)
+    if solver is None or not getattr(scene, "is_built", False):
+        raise InputError(
+            f"scene is a {type(scene).__name__}; a built genesis.Scene with rigid bodies is needed"
+        )
+    try:
+        return _convert(scene, solver)
+    except AttributeError as error:
+        raise CapabilityError(f"an attribute of this scene is missing: {error}. {VERSION_ADVICE}") from None
+
+
+def _convert(scene: Any, solver: Any) -> EngineStep:
+    """Read the engine's arrays and build the batch."""
+    config, constraints = solver.rigid_config, solver.constraint_solver.constraint_state
+    _check_configuration(scene, solver)
+    rows = _host(constraints.n_constraints).astype(np.int32)
+    equalities, losses, contact_rows = (
+        _host(x).astype(np.int64)
+        for x in (
+            constraints.n_constraints_equality,
+            constraints.n_constraints_frictionloss,
+            constraints.n_constraints_cone,
+        )
+    )
+    n, m = len(rows), int(rows.max(initial=0))
+    size = int(config.rows_per_contact)
+    is_elliptic = bool(config.enable_elliptic_friction)
+    if not is_elliptic:
+        contact_rows = size * _host(solver.collider.collider_state.n_contacts).astype(np.int64)
+    index = np.arange(m)
+    ends = np.cumsum([equalities, losses, contact_rows], axis=0)[:, :, None]  # (3, n, 1)
+    contact_type = ELLIPTIC if is_elliptic else PYRAMIDAL
+    row_type = np.select(
+        [index < ends[0], index < ends[1], index < ends[2]], [EQUALITY, FRICTION[0], contact_type], LIMIT
+    )
+    loss = _host(constraints.efc_frictionloss, m).T
+    contacts = _contacts(loss, ends[1, :, 0], contact_rows // size, size) if is_elliptic else None
+    dofs, dt = solver.dyn_state.dofs, float(solver.substep_dt)
+    jac = np.ascontiguousarray(np.moveaxis(_host(constraints.jac, m), 2, 0))
+    velocity = _host(dofs.vel).T.astype(float) - dt * _host(constraints.qacc).T
+    result = from_efc(
+        efc_J=jac,
+        efc_D=_host(constraints.efc_D, m).T,
+        efc_aref=_host(constraints.aref, m).T,
+        efc_type=row_type,
+        M=np.ascontiguousarray(np.moveaxis(_host(solver.rigid_info.mass_mat), 2, 0)),
+        qvel=velocity.astype(jac.dtype),
+        qacc_smooth=_host(dofs.acc_smooth).T,
+        timestep=dt,
+        efc_frictionloss=np.abs(loss),
+        nefc=rows,
+        contacts=contacts,
+        efc_force=_host(constraints.efc_force, m).T,
+        qfrc_smooth=_host(dofs.qf_smooth).T,
+        friction="coulomb" if config.enable_signorini_contact else "cone",
+    )
+    converged = ~_host(constraints.improved).astype(bool)
+    if result.impulse is None:
+        raise AssertionError("from_efc returns impulses if it is given forces")
+    return EngineStep(result.batch, result.impulse, Claims(converged, np.full(n, -1), {}))
+
+
+def _contacts(loss: FloatArray, first: Any, count: Any, size: int) -> tuple[Any, Any, Any, Any]:
+    """Return (world, efc_address, dim, friction) of all elliptic contacts.
+
+    The first row of a contact stores its coefficient of sliding friction in `loss` (n, m), and each row of torsional or
+    rolling friction its own coefficient.
+    """
+    world = np.repeat(np.arange(len(count)), count)
+    number = np.arange(len(world)) - np.repeat(np.cumsum(count) - count, count)
+    address = first[world] + size * number
+    coefficient = loss[world, address]
+    friction = np.repeat(coefficient[:, None], 5, axis=1).astype(float)
+    for j in range(ROWS_OF_NORMAL_AND_TANGENTS, size):
+        friction[:, j - 1] = loss[world, address + j]
+    return world, address, np.full(len(world), size), friction
+
+
+def _check_configuration(scene: Any, solver: Any) -> None:
+    """Raise CapabilityError for options whose problem is another one."""
+    config = solver.rigid_config
+    coupler = type(scene.sim.coupler).__name__
+    has_more_friction = config.enable_torsional_friction or config.enable_rolling_friction
+    for is_used, name in (
+        (solver._options.noslip_iterations > 0, "noslip_iterations changes impulses after the solve"),
+        (config.use_hibernation, "use_hibernation leaves bodies out of the problem"),
+        (coupler != "LegacyCoupler" and coupler != "NoneType", f"the {coupler} solves contacts of its own"),
+        (config.enable_signorini_contact and has_more_friction,
+         "contact_resolution=signorini with torsional or rolling friction is not one of the known laws"),
+    ):  # fmt: skip
+        if is_used:
+            raise CapabilityError(f"{name}: it is not supported here")
+
+
+def _host(array: Any, rows: int | None = None) -> Any:
+    """Copy the first `rows` rows of an array of the engine to the host, in its canonical order."""
+    from genesis.utils.misc import qd_to_torch
+
+    tensor = qd_to_torch(array, copy=None)
+    return np.array((tensor if rows is None else tensor[:rows]).cpu().numpy())
