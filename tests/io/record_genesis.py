@@ -76,9 +76,10 @@ def main(out):
     from genesis.utils.misc import qd_to_numpy
 
     arrays = {"versions": np.array([f"{name} {version(name)}" for name in ("genesis-world", "torch")])}
+    convex = {"contact_resolution": "convex", "enable_torsional_friction": True}
     for name, with_arm, options in (
         ("arm", True, {"friction_cone": "elliptic"}),
-        ("convex", False, {"friction_cone": "elliptic", "contact_resolution": "convex", "enable_torsional_friction": True}),
+        ("convex", False, {"friction_cone": "elliptic"} | convex),
         ("pyramids", False, {"friction_cone": "pyramidal"}),
     ):  # fmt: skip
         scene = step_scene(with_arm, **options)
