@@ -27,7 +27,7 @@ from lavender.io.engine_step import Claims, EngineStep
 
 LIMIT, PYRAMIDAL = 3, 6  # values of mjtConstraint: a joint limit, an edge of a pyramid
 ROWS_OF_NORMAL_AND_TANGENTS = 3
-VERSION_ADVICE = "genesis-world 1.4 is known"
+GENESIS_ADVICE = "genesis-world 1.4 is known"
 
 
 def from_genesis(scene: Any) -> EngineStep:
@@ -41,8 +41,8 @@ def from_genesis(scene: Any) -> EngineStep:
     Returns
     -------
     EngineStep
-        One world for each environment, in float32 or float64 as the engine computed. `claims.converged` is False in
-        environments whose iterations were used up.
+        One world for each environment, in float32 or float64 as the engine computed. `claims.converged` is False for
+        an environment that used up its iterations.
 
     Raises
     ------
@@ -60,7 +60,7 @@ def from_genesis(scene: Any) -> EngineStep:
     try:
         return _convert(scene, solver)
     except AttributeError as error:
-        raise CapabilityError(f"an attribute of this scene is missing: {error}. {VERSION_ADVICE}") from None
+        raise CapabilityError(f"an attribute of this scene is missing: {error}. {GENESIS_ADVICE}") from None
 
 
 def _convert(scene: Any, solver: Any) -> EngineStep:
@@ -131,7 +131,7 @@ def _contacts(loss: FloatArray, first: Any, count: Any, size: int) -> tuple[Any,
 
 
 def _check_configuration(scene: Any, solver: Any) -> None:
-    """Raise CapabilityError for options whose problem is another one."""
+    """Raise CapabilityError if an option makes the engine solve another problem."""
     config = solver.rigid_config
     coupler = type(scene.sim.coupler).__name__
     has_more_friction = config.enable_torsional_friction or config.enable_rolling_friction

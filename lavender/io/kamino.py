@@ -54,10 +54,10 @@ NORMAL_FIRST = np.array([2, 0, 1])
 BODY_ROW, BODY_COLUMN = np.array([0, 1, 2, 3, 4, 4, 5, 5, 5]), np.array([0, 1, 2, 3, 3, 4, 3, 4, 5])
 BODY_ROW_ENTRIES = np.array([1, 1, 1, 1, 2, 3])
 RESIDUAL_NAMES = ("r_p", "r_d", "r_c")  # compared with its tolerances by the engine; see its PADMMStatus
-VERSION_ADVICE = "newton 1.8 is known; the class is declared experimental and its attributes change"
+KAMINO_ADVICE = "newton 1.8 is known; the class is declared experimental and its attributes change"
 
 
-# For each solver: its layout, and the kinds of rows whose entries of D have been compared.
+# For each solver: its layout, and the kinds of rows that have been compared with D.
 _VERIFIED: WeakKeyDictionary[Any, tuple[Any, frozenset[str]]] = WeakKeyDictionary()
 
 
@@ -100,7 +100,7 @@ def from_kamino(solver: Any, *, verify: bool = False) -> EngineStep:
         _verify(solver, engine, worlds, verify)
     except AttributeError as error:
         raise CapabilityError(
-            f"an attribute of this SolverKamino is missing: {error}. {VERSION_ADVICE}"
+            f"an attribute of this SolverKamino is missing: {error}. {KAMINO_ADVICE}"
         ) from None
     return EngineStep(*step, claims)
 
@@ -151,7 +151,7 @@ class _Worlds:
             world = int(np.flatnonzero(self.rows != stored)[0])
             raise CapabilityError(
                 f"world {world} has {stored[world]} rows; its joints, bounded rows, limits and contacts have "
-                f"{self.rows[world]}. {VERSION_ADVICE}"
+                f"{self.rows[world]}. {KAMINO_ADVICE}"
             )
         self.row_ptr, self.velocity_ptr = _pointers(self.rows), _pointers(self.columns)
         self.world = np.repeat(np.arange(n), self.rows)  # world of each row
@@ -237,7 +237,7 @@ class _Worlds:
         inv_mass = _floats(self.engine._model.bodies.inv_m_i)
         inv_inertia = _floats(self.engine.data.bodies.inv_I_i)
         is_fixed = (inv_mass == 0.0) & (inv_inertia == 0.0).all(axis=(1, 2))
-        # M is not read where J is 0. A body with numbers that are not finite makes J v* and so the world NaN.
+        # M is not read if J is 0. A body with numbers that are not finite makes J v* and so the world NaN.
         is_ordinary = np.isfinite(inv_mass) & np.isfinite(inv_inertia).all(axis=(1, 2)) & ~is_fixed
         inv_mass = np.where(is_ordinary, inv_mass, 1.0)
         inv_inertia = np.where(is_ordinary[:, None, None], inv_inertia, np.eye(3))
@@ -312,7 +312,7 @@ class _Worlds:
         per_world = np.bincount(world, count, minlength=self.n).astype(np.int64)
         group = _as_int(self.info.joint_kinematic_cts_group_offset)[: self.n]
         if (group + per_world != self.joints).any():
-            raise CapabilityError(f"rows of joints are not dynamic and kinematic rows. {VERSION_ADVICE}")
+            raise CapabilityError(f"rows of joints are not dynamic and kinematic rows. {KAMINO_ADVICE}")
         before = (
             _pointers(count)[:-1] - _pointers(per_world)[world]
         )  # rows of joints before this one in its world
@@ -406,12 +406,12 @@ class _Worlds:
 
 
 def _verify(solver: Any, engine: Any, worlds: _Worlds, complete: bool) -> None:
-    """Compare the engine's matrix with the one of J, M and the compliance, where that has not been done.
+    """Compare the engine's matrix with the one of J, M and the compliance if this has not been done.
 
     Raises
     ------
     CapabilityError
-        They differ in a world whose numbers are finite.
+        They differ in a world of finite numbers.
     """
     kinds = worlds.kinds_of_world()
     layout = worlds.bodies.tobytes(), _as_int(worlds.problem.maxdim).tobytes()
@@ -431,7 +431,7 @@ def _verify(solver: Any, engine: Any, worlds: _Worlds, complete: bool) -> None:
             raise CapabilityError(
                 f"world {i}: the engine's matrix differs from J M^-1 J^T + compliance by {difference:.1e} of its "
                 f"largest entry (rows: {', '.join(name for name, count in kinds.items() if count[i])}). The arrays are "
-                f"not those of one step, or this version stores them otherwise. {VERSION_ADVICE}"
+                f"not those of one step, or this version stores them otherwise. {KAMINO_ADVICE}"
             )
     _VERIFIED[solver] = layout, verified | frozenset(new)
 
