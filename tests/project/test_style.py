@@ -56,6 +56,16 @@ def test_a_long_call_is_seen():
 
 #: Documented in spite of their underscore: named tuples, ctypes, IPython, sys and os.
 DOCUMENTED = {"_asdict", "_replace", "_fields_", "_repr_html_", "_current_frames", "_exit"}
+#: Attributes of other engines that the importers read, which tests of the importers imitate.
+DOCUMENTED |= {
+    "_solver_kamino",
+    "_contacts_kamino",
+    "_jacobians",
+    "_model",
+    "_config",
+    "_options",
+    "_initialized",
+}
 PRIVATE = re.compile(r"_[a-zA-Z]\w*")
 TAKEN = re.compile(r"(\b(import|from)\b.*|[.'\"])\b_[a-zA-Z]")
 
