@@ -6,6 +6,7 @@ import contextlib
 import json
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -89,8 +90,9 @@ def report(context: click.Context, /, files: tuple[str, ...], out: Path, **optio
 
     FILES are problems (.npz, .hdf5), folders of them, folders of recorded steps, or cases of the built-in
     suite such as "stack(n=64)"; without any, the built-in suite runs. A MuJoCo model (.xml) is simulated first,
-    and its steps are recorded in the folder of the report. For a records.jsonl, the report is
-    written again without solving. After an interruption, the same command continues where it stopped.
+    and its steps are recorded in the folder of the report. For a records.jsonl, the report is written again
+    without solving; --solvers then selects the solvers that it shows. After an interruption, the same command
+    continues where it stopped.
 
     Exit code 1: a file in a folder cannot be read, a step could not be recorded, or nothing was measured. Exit code 2:
     a named file cannot be read, or another report is writing to the folder.
@@ -120,6 +122,8 @@ def report(context: click.Context, /, files: tuple[str, ...], out: Path, **optio
         measured = Measured(bench.read(records_files[0]), False)
         if not (measured.records.records or measured.records.skips):
             raise InputError(f"{records_files[0]} has no records")
+        if options["solvers"]:
+            measured = replace(measured, records=measured.records.of_solvers(options["solvers"]))
     else:
         measured = measure(context, files, path, sweeps)
     engines = [] if is_campaign(context) else read_engine_answers(files, measured.records.latest())
@@ -153,7 +157,9 @@ def _reject_unused_options(
 ) -> None:
     """Raise InputError for each option that would be ignored."""
     if any(f.endswith(".jsonl") for f in files):
-        used = {"files", "out", "compare", "time_budgets", "budgets", "tables", "paper", "no_figures"}
+        used = {
+            "files", "out", "compare", "time_budgets", "budgets", "tables", "paper", "no_figures", "solvers"
+        }  # fmt: skip
         unused = [p.name for p in context.command.params if p.name and p.name not in used]
         reject_unused_options(context, unused, "if records are shown again, since nothing is solved")
     elif is_campaign(context):
@@ -165,7 +171,8 @@ def _reject_unused_options(
     else:
         reject_unused_options(context, ["seeds"], "without --workers")
     reject_unused_recording_options(context, any(Path(f).suffix.lower() == ".xml" for f in files))
-    reject_options_without_effect(context, solvers)
+    if not any(f.endswith(".jsonl") for f in files):  # Records may hold solvers that are not installed.
+        reject_options_without_effect(context, solvers)
 
 
 def _record_model(

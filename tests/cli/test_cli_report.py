@@ -206,6 +206,24 @@ def test_progress_lines_have_the_remaining_time(capsys, monkeypatch):
     assert measuring.format_remaining(Event(20, 0, "", ""), 10.0) == ""  # the total is not known
 
 
+def test_records_are_shown_again_with_some_solvers(lavender, path, tmp_path):
+    code, *_ = lavender(
+        "report", path, "--solvers", "pgs", "jacobi", "newton", *QUICK, "--out", tmp_path / "out"
+    )
+    assert code == 0
+    records = tmp_path / "out" / "records.jsonl"
+    again = ("--no-figures", "--paper", "--out", tmp_path / "again")
+    code, out, _ = lavender("report", records, "--solvers", "jacobi", "pgs", *again)
+    page = (tmp_path / "again" / "index.html").read_text(encoding="utf-8")
+    assert code == 0 and "newton" not in out and 'data-l="newton"' not in page
+    assert 'data-l="jacobi"' in page and 'data-l="pgs"' in page
+    assert "We ran 2 solvers" in (tmp_path / "again" / "paper" / "method.tex").read_text(encoding="utf-8")
+    assert len(bench.read(records)) > len(bench.read(records).of_solvers(["pgs"])) > 0  # the file keeps all
+    code, _, err = lavender("report", records, "--solvers", "nncg", *again)
+    assert code == cli.EXIT_BAD_INPUT
+    assert "no records of solver 'nncg'; there are records of jacobi, newton, pgs" in err
+
+
 QUICK = ("--tolerances", "1e-3", "1e-6", "--budgets", "2", "4", "--repeats", "1", "--no-figures")
 
 

@@ -129,7 +129,7 @@ def running() -> float | None:
     return load()
 
 
-def describe_busy(loads: Iterable[float | None], cores: int, consequence: str, own: int = 1) -> str:
+def describe_busy(loads: Iterable[float | None], cores: int, consequence: str = "", own: int = 1) -> str:
     """Return a warning if other processes used the processors, else an empty text.
 
     Parameters
@@ -146,7 +146,7 @@ def describe_busy(loads: Iterable[float | None], cores: int, consequence: str, o
     return (
         f"The machine was busy: load {fmean(known):.1f} on {cores} core{'s' * (cores != 1)} during the measurement. "
         f"{consequence}"
-    )
+    ).rstrip()
 
 
 def clock() -> dict[str, str]:

@@ -12,6 +12,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from statistics import median
 
+from lavender.base.arrays import check_choice
 from lavender.judge.residuals import at_floor
 from lavender.judge.solution import CLAIM_CHECKS, CONFIRMED
 from lavender.lab.bench.record import Record, describe_target
@@ -388,12 +389,13 @@ def drift(old: Records, new: Records, case: str = "") -> float:
 
 @dataclass(frozen=True)
 class Profile:
-    """Dolan-More performance profile of one tolerance over the cases of one law."""
+    """Dolan-More performance profile of one tolerance over the cases of one law, by time or by work."""
 
     law: str
     tolerance: float
     cases: int
     curves: Mapping[str, tuple[tuple[float, float], ...]]  # solver -> steps of (ratio, fraction of cases)
+    measure: str = "time"
 
 
 def geometric_mean(values: Sequence[float], shift: float = 0.0) -> float:
@@ -415,6 +417,35 @@ def times_to(records: Records, tolerance: float) -> dict[str, dict[str, float]]:
     for reach in reaches(records, [tolerance]):
         if reach.start == "cold":
             out[reach.case][reach.solver] = reach.times[tolerance]
+    return out
+
+
+#: Counters of `work` of which each is a pass over the entries of A: a sweep over all blocks, or a product with A.
+PASS_COUNTERS = frozenset({"sweeps", "products", "matvecs"})
+#: Counters of work that cannot be expressed in passes; solvers with such work are not in a profile by work.
+OTHER_WORK_COUNTERS = frozenset({"factorisations", "solves", "pivots", "backend_calls"})
+
+
+def count_passes(record: Record) -> float:
+    """Return the passes over A of a run (sweeps and products); nan if it did other work, or counted none."""
+    if any(record.work.get(name, 0) for name in OTHER_WORK_COUNTERS):
+        return math.nan
+    passes = [n for name, n in record.work.items() if name in PASS_COUNTERS]
+    return float(sum(passes)) if passes else math.nan
+
+
+def passes_to(records: Records, tolerance: float) -> dict[str, dict[str, float]]:
+    """Return the passes over A to a tolerance from a cold start by case and solver, inf if missed.
+
+    Only solvers whose runs do no other work are compared (`count_passes`); fewer than one pass counts as one.
+    """
+    groups = {k[:2]: [r for r in group if r.usable] for k, group in pairs(records).items() if k[2] == "cold"}
+    excluded = {s for (_, s), group in groups.items() if any(math.isnan(count_passes(r)) for r in group)}
+    out: dict[str, dict[str, float]] = defaultdict(dict)
+    for (case, solver), group in groups.items():
+        if solver not in excluded:
+            reached = [max(1.0, count_passes(r)) for r in group if r.relative <= tolerance]
+            out[case][solver] = min(reached, default=math.inf)
     return out
 
 
@@ -518,15 +549,22 @@ def _complete_solvers(times: Mapping[str, Mapping[str, float]], cases: Sequence[
     return [s for s in everyone if all(s in times.get(c, {}) for c in cases)]
 
 
-def profiles(records: Records) -> list[Profile]:
-    """Compute the share of cases that a solver solves within `ratio` times the fastest; a miss is infinite.
+def profiles(records: Records, measure: str = "time") -> list[Profile]:
+    """Compute the share of cases that a solver solves within `ratio` times the best; a miss is infinite.
 
     The cases have one law and are of one run (`Records.latest`); a case that no solver solves is a miss of all.
+
+    Parameters
+    ----------
+    records : Records
+    measure : {"time", "work"}
+        "work": passes over A, of the solvers that do no other work (`passes_to`).
     """
+    check_choice("measure", measure, ("time", "work"))
     out = []
     for law, cases in _laws(records).items():
         for tolerance in get_tolerances(records):
-            times = times_to(records, tolerance)
+            times = (times_to if measure == "time" else passes_to)(records, tolerance)
             curves: dict[str, tuple[tuple[float, float], ...]] = {}
             for solver in sorted({s for c in cases for s in times.get(c, {})}):
                 ratios = []
@@ -539,7 +577,7 @@ def profiles(records: Records) -> list[Profile]:
                     (r, sum(q <= r for q in ratios) / len(cases)) for r in sorted(set(ratios)) if r > 1.0
                 ]
                 curves[solver] = tuple(steps)
-            out.append(Profile(law, tolerance, len(cases), curves))
+            out.append(Profile(law, tolerance, len(cases), curves, measure))
     return out
 
 

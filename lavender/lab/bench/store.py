@@ -123,6 +123,24 @@ class Records:
             found.add(entry)
         return found
 
+    def of_solvers(self, names: Iterable[str]) -> Records:
+        """Return the records of some solvers, with the notes about them and all cases.
+
+        Raises
+        ------
+        InputError
+            There are no records of a solver.
+        """
+        wanted = list(names)
+        known = sorted({r.solver for r in self.records} | {s.solver for s in self.skips if s.solver})
+        for name in wanted:
+            if name not in known:
+                raise InputError(f"no records of solver {name!r}; there are records of {', '.join(known)}")
+        return self.having(
+            (r for r in self.records if r.solver in wanted),
+            lambda e: not isinstance(e, Skip) or e.solver in ("", *wanted),
+        )
+
     def success(self, record: Record) -> bool | None:
         """Return whether a run succeeded, or None if the zero impulse solves the case."""
         info = self.cases.get(record.case)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -15,6 +15,7 @@ from lavender.lab.bench.record import Record, format_tolerance
 from lavender.lab.bench.store import Records
 from lavender.lab.report.motion_tables import convert_to_motion_errors, get_velocity_tolerances
 from lavender.lab.report.text import format_count, name_run
+from lavender.solvers import registry
 
 MIN_RESIDUAL = 1e-17  # A residual of exactly zero is drawn here.
 
@@ -76,6 +77,7 @@ class Figure:
     tolerances : horizontal lines
     roundoff_floor : dotted line; nan without one
     left_out : solvers without a curve, so that the others can be distinguished
+    note : a sentence that explains the curves, for the caption
     """
 
     name: str
@@ -88,6 +90,7 @@ class Figure:
     tolerances: tuple[float, ...] = ()
     roundoff_floor: float = math.nan
     left_out: tuple[str, ...] = ()
+    note: str = ""
 
     @property
     def heading(self) -> str:
@@ -129,6 +132,10 @@ def _build_case_figure(name: str, x_title: str, records: Records, case: str, cur
     )  # fmt: skip
 
 
+FLAT_LINES_NOTE = (
+    "A curve is flat after its solver has stopped: it met a tolerance (grey lines) and did not go on, so the residual "
+    "of its last run remains."
+)
 GRID_SIZE = 49  # Times at which the residuals of all cases are compared.
 
 
@@ -173,7 +180,7 @@ def build_overall_figure(records: Records) -> Figure:
     return Figure(
         "over all", f"Error against time{over if len(cases) > 1 else ''}",
         "time: set-up and solve [s]", "relative residual [-]", tuple(curves),
-        tolerances=statistics.get_tolerances(records),
+        tolerances=statistics.get_tolerances(records), note=FLAT_LINES_NOTE,
     )  # fmt: skip
 
 
@@ -204,10 +211,24 @@ def build_pass_figure(sequence: str, passes: list[statistics.Pass]) -> Figure:
 
 
 MAX_CURVES = 5  # Curves of a profile: more cannot be distinguished, and mislead about the second place.
+MIN_COMPARED = 2  # At least this many other solvers are drawn with plug-ins.
+
+
+def is_plug_in(solver: str) -> bool:
+    """Return whether a solver is not part of lavender: a plug-in of the user, installed here or not."""
+    spec = registry.specs().get(solver)
+    return spec is None or not spec.builtin
+
+
+def select_drawn(ranked: Sequence[str]) -> list[str]:
+    """Select the solvers of a figure: every plug-in, then the first of the others, up to `MAX_CURVES` in all."""
+    plug_ins = [name for name in ranked if is_plug_in(name)]
+    others = [name for name in ranked if name not in plug_ins]
+    return [*plug_ins, *others[: max(MAX_CURVES - len(plug_ins), MIN_COMPARED)]]
 
 
 def build_profile_figure(profile: statistics.Profile) -> Figure:
-    """Plot a Dolan-More profile of the five solvers that solve the largest number of cases in the shortest times."""
+    """Plot a Dolan-More profile of the plug-ins and of the solvers that solve the largest number of cases fastest."""
 
     def standing(name: str) -> tuple[float, float, str]:
         steps = profile.curves[name]
@@ -218,15 +239,21 @@ def build_profile_figure(profile: statistics.Profile) -> Figure:
             name,
         )
 
-    shown = [name for name in sorted(profile.curves, key=standing) if standing(name)[0] < 0.0][:MAX_CURVES]
+    ranked = sorted(profile.curves, key=standing)
+    drawn = set(select_drawn([name for name in ranked if standing(name)[0] < 0.0 or is_plug_in(name)]))
+    shown = [name for name in ranked if name in drawn]
     curves = [
         Curve.of(name, name, [(r, 100.0 * s) for r, s in profile.curves[name]], steps=True) for name in shown
     ]
     left_out = tuple(sorted(set(profile.curves) - set(shown)))
+    by_work = profile.measure == "work"
+    name = f"{'work profile' if by_work else 'profile'} {profile.law} {format_tolerance(profile.tolerance)}"
+    cases = format_count(profile.cases, "case")
     return Figure(
-        f"profile {profile.law} {format_tolerance(profile.tolerance)}",
-        f"{profile.law}, to {format_tolerance(profile.tolerance)} ({format_count(profile.cases, 'case')})",
-        "time / fastest time", "cases solved [%]", tuple(curves), y_log=False, left_out=left_out,
+        name,
+        f"{profile.law}, to {format_tolerance(profile.tolerance)} ({cases}){', by work' if by_work else ''}",
+        "passes over A / fewest passes" if by_work else "time / fastest time",
+        "cases solved [%]", tuple(curves), y_log=False, left_out=left_out,
     )  # fmt: skip
 
 
@@ -240,7 +267,7 @@ class Figures:
     Parameters
     ----------
     over : figure over all cases, under the key "all"
-    profiles : performance profiles by law, one for each tolerance
+    profiles : performance profiles by law, one for each tolerance: by time, then by work
     sequences : figures by sequence
     cases : error against time and residual against iterations, by case
     moved : the same with motion errors [m/s] in place of residuals, if they are known
@@ -300,8 +327,8 @@ def _build_figures(records: Records) -> Figures:
         if r.step < 0:
             parts.setdefault(r.case, Records(records.runs)).add(r)
     profiles: dict[str, list[Figure]] = {}
-    for profile in statistics.profiles(records):
-        if profile.cases > 1:
+    for profile in (*statistics.profiles(records), *statistics.profiles(records, "work")):
+        if profile.cases > 1 and (profile.measure == "time" or len(profile.curves) > 1):
             profiles.setdefault(profile.law, []).append(build_profile_figure(profile))
     over = _keep_drawn(build_overall_figure(records))
     return Figures(

@@ -66,16 +66,20 @@ class Report:
             return ""
         return "Stopped before the end: the numbers contain only the completed measurements."
 
-    @cached_property
+    @property
     def busy(self) -> str:
-        """A warning if other processes used the processors while times were taken; else empty."""
+        """A warning if other processes used the processors while times were taken, with advice; else empty."""
+        advice = "The times are invalid; measure again with --no-reuse."
+        return f"{self.high_load} {advice}" if self.high_load else ""
+
+    @cached_property
+    def high_load(self) -> str:
+        """A sentence on the load if other processes used the processors while times were taken; else empty."""
         if self.is_campaign or not len(self.newest):
             return ""
         (run,) = self.newest.runs.values()
         loads = (run.load if r.load is None else r.load for r in self.newest)
-        return machine.describe_busy(
-            loads, run.cores, "The times are invalid; measure again with --no-reuse."
-        )
+        return machine.describe_busy(loads, run.cores)
 
     @cached_property
     def tolerances(self) -> tuple[float, ...]:

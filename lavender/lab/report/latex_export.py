@@ -4,7 +4,8 @@ Figures and mean times show the time of its own interface for a solver of anothe
 
 paper/over-all.pdf          error against time over all cases: medians, and bands of the middle half
 paper/class-FOLDER.pdf      the same for each folder that the cases came from, if there are several
-paper/profile-LAW-X.pdf     performance profiles, for each problem class and tolerance
+paper/profile-LAW-X.pdf     performance profiles by time, for each problem class and tolerance
+paper/work-profile-....pdf  the same by passes over A, of the solvers that do no other work
 paper/sequence-....pdf      each step of a sequence
 paper/figures.tex           these figures with their captions
 paper/tables.tex            recommendations, mean times by law, claims against the judge (booktabs)
@@ -27,12 +28,16 @@ from lavender.lab.bench.record import file_name, format_tolerance
 from lavender.lab.bench.statistics import TIME_NOISE_FACTOR
 from lavender.lab.bench.store import Records
 from lavender.lab.report import table_specs
-from lavender.lab.report.figures import MAX_CURVES, Figure, Group, build_figures, build_overall_figure
+from lavender.lab.report.figures import Figure, Group, build_figures, build_overall_figure, select_drawn
 from lavender.lab.report.findings import Report
 from lavender.lab.report.plotting import assign_styles, plot_figure
 from lavender.lab.report.table import Cell, Table
 from lavender.lab.report.text import format_count, format_left_out
 
+FEWEST_PASSES = (
+    "the fewest passes over A (sweeps and products with A, as each solver counts them; solvers that factorise or pivot "
+    "are not compared)"
+)
 FIGURE_SIZE = (5.5, 3.4)  # [inches] The width is the text width of a page.
 
 
@@ -97,15 +102,16 @@ def _build_folder_figures(records: Records) -> Group:
 
 
 def _select_leaders(figure: Figure, leaders: Sequence[str]) -> Figure:
-    """Reduce a figure to five solvers, bands to two: the leaders of the verdict, then those that end lowest."""
+    """Reduce a figure to plug-ins and leaders of the verdict, then those that end lowest; bands to two solvers."""
     if all(c.steps for c in figure.curves):
         return figure  # The curves of a profile are selected already.
     ends = sorted(figure.curves, key=lambda c: c.y[-1] if math.isfinite(c.y[-1]) else math.inf)
     solvers = list(dict.fromkeys(c.solver for c in ends))
     solvers.sort(key=lambda name: leaders.index(name) if name in leaders else len(leaders))
-    selected = [c for name in solvers[:MAX_CURVES] for c in figure.curves if c.solver == name]
+    drawn = select_drawn(solvers)
+    selected = [c for name in drawn for c in figure.curves if c.solver == name]
     selected[2:] = [replace(c, low=(), high=()) for c in selected[2:]]
-    return replace(figure, curves=tuple(selected), left_out=tuple(sorted(solvers[MAX_CURVES:])))
+    return replace(figure, curves=tuple(selected), left_out=tuple(sorted(set(solvers) - set(drawn))))
 
 
 # -- LaTeX ------------------------------------------------------------------------------------------------
@@ -158,7 +164,10 @@ def _include_figure(figure: Figure, records: Records) -> str:
     own_times = _state_own_times(records, {c.solver for c in figure.curves})
     caption = f"{figure.title}.{own_times}{_state_lost_cases(records)}"
     if any(c.steps for c in figure.curves):
-        caption = f"Share of cases solved within a multiple of the fastest solver's time: law {caption}"
+        cost = FEWEST_PASSES if figure.name.startswith("work ") else "the fastest solver's time"
+        caption = f"Share of cases solved within a multiple of {cost}: law {caption}"
+    if figure.note:
+        caption += f" {figure.note}"
     if figure.left_out:
         caption += f" Not drawn: {', '.join(figure.left_out)}."
     return (
@@ -230,7 +239,7 @@ def _describe_method(report: Report) -> str:
         "computed from the problem's data, whatever the solver reports: the larger of its errors in energy norm and",
         "in velocity, each divided by that of the zero impulse: 1 is the zero impulse, 0 a solution. Times are those",
         f"of set-up and solve, {minimum}, within a limit of {limit}; BLAS and OpenMP had {threads}.",
-        f"{own_times} {report.stopped} {report.busy} Means of times are",
+        f"{own_times} {report.stopped} {report.high_load} Means of times are",
         f"geometric, with {shift} added to each and a miss charged the limit. Profiles follow Dolan and Moré",
         f"(2002). Machine: {run.cpu}, {run.cores} cores, {run.platform}; lavender {run.lavender},",
         f"Python {run.python}, {versions}; run {run.run}, {run.started}.",

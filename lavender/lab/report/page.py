@@ -13,7 +13,7 @@ from lavender.lab.bench.record import file_name, format_tolerance
 from lavender.lab.bench.statistics import RESIDUAL_NOISE_FACTOR, TIME_NOISE_FACTOR
 from lavender.lab.bench.store import Records
 from lavender.lab.report import table_specs
-from lavender.lab.report.figures import Figures
+from lavender.lab.report.figures import FLAT_LINES_NOTE, Figures
 from lavender.lab.report.findings import Report
 from lavender.lab.report.plotting import plot_for_page
 from lavender.lab.report.text import (
@@ -56,6 +56,7 @@ def create_environment() -> Any:
         residual_noise=RESIDUAL_NOISE_FACTOR,
         max_failures=MAX_FAILURES,
         max_spreads=MAX_SPREADS,
+        flat_lines_note=FLAT_LINES_NOTE,
     )
     return environment
 

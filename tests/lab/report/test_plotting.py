@@ -137,8 +137,9 @@ def test_the_picture_of_all_cases_is_the_median_of_what_was_reached_by_each_time
 def test_a_paper_has_a_figure_for_each_folder_and_backends_by_their_own_interface(tmp_path, monkeypatch):
     """What is not drawn, and whose time is another, stands in the caption."""
     made, places = [], {"a": "piles", "b": "piles", "c": "chains", "d": "chains"}
+    others = ("admm", "anderson", "jacobi", "newton", "nncg", "pgs")
     for case in places:
-        made += [record(case, f"solver_{i}", 1e-3 * (1 + i), 10.0 ** (i - 9)) for i in range(6)]
+        made += [record(case, name, 1e-3 * (1 + i), 10.0 ** (i - 9)) for i, name in enumerate(others)]
         made.append(record(case, "osqp", 12.7e-3, 1e-12, backend_time_min=1.1e-3))
     found = records_of(*made)
     for case, folder in places.items():
@@ -152,10 +153,39 @@ def test_a_paper_has_a_figure_for_each_folder_and_backends_by_their_own_interfac
         (osqp,) = (c for c in drawn[name].curves if c.solver == "osqp")
         assert osqp.x[0] == pytest.approx(1.1e-3, rel=0.04)  # a step of the grid: 6^(1/48)
         assert len(drawn[name].curves) == figures.MAX_CURVES and len(drawn[name].left_out) == 2
-    solvers = ["osqp", *(f"solver_{i}" for i in range(6))]
+    solvers = ["osqp", *others]
     canvas = plot(dataclasses.replace(drawn["over all"], title=""), assign_styles(solvers))
     place = canvas.axes[0].get_position()
     assert place.x0 < 0.15 and place.x1 > 0.95  # no third of it is left to a legend
     assert canvas.axes[0].get_legend().get_title().get_text() == "5 of 7 solvers"
     with pytest.raises(lv.InputError, match="runs with times"):
         latex_export.write_paper(Report(records_of()), tmp_path / "none")
+
+
+@pytest.mark.slow
+def test_a_paper_draws_every_plug_in_profiles_by_work_and_gives_no_advice(tmp_path, monkeypatch):
+    """The plug-in is slower than six others, which fill a figure without it; it makes the fewest passes."""
+    others, made = ("anderson", "jacobi", "nncg", "pgs", "sequential_impulses", "sor"), []
+    for case in "ab":
+        made += [
+            record(case, name, 1e-3 * (1 + i), 1e-7, work={"sweeps": 40 + i}, load=99.0)
+            for i, name in enumerate(others)
+        ]
+        made.append(record(case, "my_solver", 5e-2, 2e-7, work={"matvecs": 20}, load=99.0))
+        made.append(record(case, "direct", 5e-4, 1e-15, work={"factorisations": 1}, load=99.0))
+    found, drawn, plot = records_of(*made), {}, latex_export.plot_figure
+    monkeypatch.setattr(
+        latex_export, "plot_figure", lambda f, *more: drawn.update({f.name: f}) or plot(f, *more)
+    )
+    report = Report(found)
+    assert "measure again" in report.busy and "measure again" not in report.high_load
+    latex_export.write_paper(report, tmp_path)
+    for name in ("over all", "profile lcp 1e-6", "work profile lcp 1e-6"):
+        assert "my_solver" in {c.solver for c in drawn[name].curves}
+        assert len({c.solver for c in drawn[name].curves}) == figures.MAX_CURVES
+    work = {c.solver: c for c in drawn["work profile lcp 1e-6"].curves}
+    assert "direct" not in work and work["my_solver"].x == (1.0,) and work["my_solver"].y == (100.0,)
+    assert work["anderson"].x == (1.0, 2.0) and work["anderson"].y[1] == 100.0  # 40 passes against 20
+    tex = "".join((tmp_path / f"{name}.tex").read_text() for name in ("figures", "tables", "method"))
+    assert "load 99.0" in tex and "measure again" not in tex and "--no-reuse" not in tex
+    assert "A curve is flat after its solver has stopped" in tex and "fewest passes over A" in tex
