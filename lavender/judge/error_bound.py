@@ -1,7 +1,7 @@
 """Bound the distance between an answer and an exact solution.
 
 In the metric of d, with z = D^1/2 lambda, s = D^-1/2 w, y = z - s, H = D^-1/2 A D^-1/2, Pi the projection of each
-block's law and P = dPi/dy (lavender_ext/derivative/natural.pxd), a solution z* = z + dz is a root of F(z) = z - Pi(y).
+block's law and P = dPi/dy (lavender_ext/core/block_projection.pxd), a solution z* = z + dz is a root of F(z) = z - Pi(y).
 Along the segment from z to z* the mean value of P is P0 + L E R^T, with P0 and unit columns L, R chosen below for each
 block, and
 
@@ -14,8 +14,8 @@ If this contracts, it bounds dy and dz block by block:
     |R_g^T dy| <= ((I - Q)^-1 r)_g         if the norms Q of the blocks of R^T T L diag(e) have a spectral radius
                                            below 1; r_g = |R_g^T T F|                                               (4)
 
-A row or friction component whose margin (natural.pxd) is larger than its bound is certain: P0 is P there. Any other one
-is uncertain: P0 is the middle of all values that P may have, and the bound is computed again.
+A row or friction component whose margin (derivative/natural.pxd) is larger than its bound is certain: P0 is P there.
+Any other one is uncertain: P0 is the middle of all values that P may have, and the bound is computed again.
 
     uncertain row               P in [0, 1]                    P0 = 1/2, e = 1/2
     uncertain contact, cone     0 <= P <= I, symmetric         P0 = I / 2, e = 1/2

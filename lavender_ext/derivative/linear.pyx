@@ -25,7 +25,7 @@ from lavender_ext.core.rows cimport rows_times
 from lavender_ext.core.velocity cimport rows_wrench, wrenches_to_velocity
 from lavender_ext.core.view cimport generalized_t, view_t
 from lavender_ext.derivative.natural cimport (CLOSED, FREE, HIGH, LOW, OPEN, SLIDES, STICKS, block_times, linear_t,
-                                              natural_all, natural_t, place_rows, scaled_csr, scaled_general, system_rows)
+                                              linearise_blocks, natural_t, place_rows, scaled_csr, scaled_general, system_rows)
 from lavender_ext.factor.dense cimport dense_lu, dense_lu_solve, dense_lu_solve_transposed
 from lavender_ext.factor.tiles cimport has_wide
 from lavender_ext.judge.measure cimport above_floor_of, floor_of, judge_view, relative_of, scratch_of
@@ -179,7 +179,7 @@ cdef void linearise(linear_t* a, const double* lam, double energy, double veloci
     a.x = natural_t(at + 2 * m, at + 3 * m, at + 4 * m, <int8_t*>(a.place + m), ptr, at + 5 * m, at + 5 * m + values)
     memcpy(a.lam, lam, m * sizeof(double))
     judge_view(&a.v, a.lam, a.w, scratch, scratch + m, True, &s)
-    natural_all(b, a.lam, a.w, ptr, &a.x)
+    linearise_blocks(b, a.lam, a.w, ptr, &a.x)
     a.rows = place_rows(b, &a.x, a.place)
     a.relative = relative_of(&s, a.w, m, energy, velocity)
     a.above_floor = above_floor_of(&s, a.relative, floor_of(&s, energy, velocity))

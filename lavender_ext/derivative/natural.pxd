@@ -1,25 +1,20 @@
-"""Derivative of the natural map of the blocks at a solution, the case of each row, and its distance to the next case.
+"""The linearised natural map of the blocks at a solution, the case of each row, and its distance to the next case.
 
-With z = D^1/2 lambda, s = D^-1/2 w, y = z - s, Pi and P = dPi/dy of contact_map.pxd, H = D^-1/2 A D^-1/2,
+With z = D^1/2 lambda, s = D^-1/2 w, y = z - s, Pi and P = dPi/dy of core/block_projection.pxd, H = D^-1/2 A D^-1/2,
 
     F = z - Pi(y) = 0                                                                                       (1)
     (I - P) dz + P ds = (dPi/da) da + dl,   ds = H dz + ...                                                 (2)
     G = I - P + P H,   the identity on rows with P = 0: open contacts, rows at a bound                      (3)
 
-Any metric D is valid at a solution, so a round cone has one d for all its tangents. For a friction component g that slides,
-with u = y_g / |y_g|, ray as in contact_map.pxd and s_n the normal of Pi,
-
-    dPi/da_g = s_n u on its own rows;   cone law: plus ray (|y_g| - 2 a_g s_n) / |ray|^2                    (4)
-
-because s_n = (y_n + sum a |y|) / (1 + sum a^2). The margin of a row is the distance of y to the next case, in N s: the distance
-of y to the bound of a row; -y_n of an open contact, -(y_n + sum a |y|) under the cone law; s_n of a closed contact, and
-||y_g| - a_g s_n| of each of its friction components.
+Any metric D is valid at a solution, so a round cone has one d for all its tangents. The margin of a row is the distance of y to
+the next case, in N s: the distance of y to the bound of a row; -y_n of an open contact, -(y_n + sum a |y|) under the cone law;
+the normal s_n of Pi(y) of a closed contact, and ||y_g| - a_g s_n| of each of its friction components.
 """
 from libc.math cimport INFINITY, fabs, sqrt
 from libc.stdint cimport int8_t, int32_t
 
 from lavender_ext.core.block cimport length
-from lavender_ext.core.contact_map cimport contact_map
+from lavender_ext.core.block_projection cimport active_bound, differentiate_by_coefficients, evaluate_natural_map
 from lavender_ext.core.dot cimport dot
 from lavender_ext.core.block_types cimport CONE, blocks_t, is_rows, get_friction_components, friction_components_t
 from lavender_ext.core.view cimport csr_t, generalized_t, view_t
@@ -62,93 +57,77 @@ cdef struct linear_t:           # a judged and linearised solution
     ssize_t first               # first index of its numbers in the results of several
 
 
-cdef inline void natural_row(double lam, double w, double low, double high, double root, double* f, double* margin,
-                             int8_t* case_, double* p) noexcept nogil:
+cdef inline void linearise_row(double lam, double w, double low, double high, double root, double* f, double* margin,
+                               int8_t* case_, double* p) noexcept nogil:
     """Compute (1), P, case and margin of one bounded row."""
-    cdef double y = lam - w / (root * root), below = y - low, above = high - y
-    p[0] = 0.0
-    if below > 0.0 and above > 0.0:
+    cdef double y = lam - w / (root * root)
+    cdef int32_t side = active_bound(y, low, high)
+    p[0] = 1.0 if side == 0 else 0.0
+    if side == 0:
         case_[0] = FREE
-        p[0] = 1.0
         f[0] = w / root
-        margin[0] = below if below < above else above
-    elif above > 0.0 or (above == 0.0 and below == 0.0):
+        margin[0] = y - low if y - low < high - y else high - y
+    elif side < 0:
         case_[0] = LOW
         f[0] = root * (lam - low)
-        margin[0] = fabs(below)
+        margin[0] = fabs(y - low)
     else:
         case_[0] = HIGH
         f[0] = root * (lam - high)
-        margin[0] = fabs(above)
+        margin[0] = fabs(high - y)
     if low == high:
         margin[0] = INFINITY
 
 
-cdef inline void natural_contact(const blocks_t* b, int32_t i, const double* lam, const double* w,
-                                 const natural_t* out) noexcept nogil:
-    """Compute (1), P, (4), cases and margins of contact i."""
+cdef inline void linearise_contact(const blocks_t* b, int32_t i, const double* lam, const double* w,
+                                   const natural_t* out) noexcept nogil:
+    """Compute (1), P, dPi/de, cases and margins of contact i."""
     cdef int32_t j = b.ptr[i], n = b.ptr[i + 1] - j, k, g, first, size
     cdef double* root = out.root + j
     cdef double* margin = out.margin + j
-    cdef double* p = out.p + out.at[i]
     cdef double* edge = out.edge + out.at[i]
+    cdef double z[6]
+    cdef double s[6]
     cdef double y[6]
-    cdef double to[6]
-    cdef double ray[6]
+    cdef double projected[6]
     cdef friction_components_t q
-    cdef double t, s, gone, norm = 1.0, over
+    cdef double excess, gap, normal
     get_friction_components(b, i, &q)
+    # the metric: one d for the rows of a component
     root[0] = sqrt(b.d[j])
     for g in range(q.n):
         for k in range(q.first[g], q.first[g] + q.size[g]):
             root[k] = sqrt(b.d[j + q.first[g]])
         q.friction_coefficient[g] = q.friction_coefficient[g] * root[q.first[g]] / root[0]
     for k in range(n):
-        y[k] = root[k] * lam[j + k] - w[j + k] / root[k]
-        ray[k] = 0.0
+        z[k] = root[k] * lam[j + k]
+        s[k] = w[j + k] / root[k]
+        y[k] = z[k] - s[k]
         margin[k] = INFINITY
-    contact_map(b.law, &q, y, to, p)
-    for k in range(n):
-        out.f[j + k] = w[j + k] / root[k] if to[k] == y[k] else root[k] * lam[j + k] - to[k]
-        out.case_[j + k] = OPEN
-    for k in range(n * n):
-        edge[k] = 0.0
-    s = to[0]
-    gone = -y[0]
-    ray[0] = 1.0
-    if s > 0.0:
-        out.case_[j] = CLOSED
+    evaluate_natural_map(b.law, &q, n, z, s, projected, out.f + j, out.p + out.at[i])
+    normal = projected[0]
+    # dPi/de with a_g = e_g root_g / root_n
+    differentiate_by_coefficients(b.law, &q, n, y, normal, edge)
+    for g in range(q.n):
+        for k in range(n):
+            edge[k * n + q.first[g]] *= root[q.first[g]] / root[0]
+    # cases and margins
+    gap = -y[0]
     for g in range(q.n):
         first, size = q.first[g], q.size[g]
-        t = length(y + first, size)
-        gone -= q.friction_coefficient[g] * t
-        if not s > 0.0:
-            continue
-        over = t - q.friction_coefficient[g] * s
+        excess = length(y + first, size)
+        gap -= q.friction_coefficient[g] * excess
+        excess -= q.friction_coefficient[g] * normal
         for k in range(first, first + size):
-            out.case_[j + k] = STICKS if over <= 0.0 and q.friction_coefficient[g] > 0.0 else SLIDES
-            if over > 0.0:
-                ray[k] = q.friction_coefficient[g] * y[k] / t
-                edge[k * n + first] = s * y[k] / t
-        if q.friction_coefficient[g] > 0.0:
-            margin[first] = fabs(over) / root[first]
-        if over > 0.0:
-            norm += q.friction_coefficient[g] * q.friction_coefficient[g]
-    if s > 0.0:
-        margin[0] = s / root[0]
-    else:
-        margin[0] = (gone if b.law == CONE else -y[0]) / root[0]
-    for g in range(q.n if s > 0.0 else 0):
-        first, size = q.first[g], q.size[g]
-        t = length(y + first, size)
-        if b.law == CONE and t > q.friction_coefficient[g] * s:
-            for k in range(n):
-                edge[k * n + first] += ray[k] * (t - 2.0 * q.friction_coefficient[g] * s) / norm
-        for k in range(n):                              # chain rule: a_g = e_g root_g / root_n
-            edge[k * n + first] *= root[first] / root[0]
+            out.case_[j + k] = (OPEN if not normal > 0.0
+                                else STICKS if excess <= 0.0 and q.friction_coefficient[g] > 0.0 else SLIDES)
+        if normal > 0.0 and q.friction_coefficient[g] > 0.0:
+            margin[first] = fabs(excess) / root[first]
+    out.case_[j] = CLOSED if normal > 0.0 else OPEN
+    margin[0] = (normal if normal > 0.0 else gap if b.law == CONE else -y[0]) / root[0]
 
 
-cdef inline void natural_all(const blocks_t* b, const double* lam, const double* w, int32_t* at,
+cdef inline void linearise_blocks(const blocks_t* b, const double* lam, const double* w, int32_t* at,
                              const natural_t* out) noexcept nogil:
     """Compute (1) and (2) of all blocks; `at` (k + 1) is the array of `out`."""
     cdef int32_t i, j, k, n
@@ -158,12 +137,12 @@ cdef inline void natural_all(const blocks_t* b, const double* lam, const double*
         n = b.ptr[i + 1] - j
         at[i + 1] = at[i] + (n if is_rows(b, i) else n * n)
         if not is_rows(b, i):
-            natural_contact(b, i, lam, w, out)
+            linearise_contact(b, i, lam, w, out)
             continue
         for k in range(n):
             out.root[j + k] = sqrt(b.d[j + k])
-            natural_row(lam[j + k], w[j + k], b.lower[j + k], b.upper[j + k], out.root[j + k], out.f + j + k,
-                        out.margin + j + k, out.case_ + j + k, out.p + at[i] + k)
+            linearise_row(lam[j + k], w[j + k], b.lower[j + k], b.upper[j + k], out.root[j + k], out.f + j + k,
+                          out.margin + j + k, out.case_ + j + k, out.p + at[i] + k)
             out.edge[at[i] + k] = 0.0
 
 

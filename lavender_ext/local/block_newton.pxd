@@ -1,7 +1,7 @@
 """Solution of one block of any kind with the other blocks fixed, by Newton's method on its natural map.
 
 With z = sqrt(d) lam, s = w / sqrt(d), H = D^-1/2 W D^-1/2, from the present z_0 with slack s_0, and with the projection Pi of
-the block and its derivative P (core/contact_map.pxd)
+the block and its derivative P (core/block_projection.pxd)
 
     s = s_0 + H (z - z_0),   y = z - t s,   F = z - Pi(y) = 0,   (I - P + t P H) dz = -F                        (1)
 
@@ -19,8 +19,8 @@ from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
 
 from lavender_ext.core.block cimport length
+from lavender_ext.core.block_projection cimport active_bound, evaluate_natural_map
 from lavender_ext.core.block_types cimport CONE, friction_components_t
-from lavender_ext.core.contact_map cimport contact_map
 from lavender_ext.local.small cimport FAILED, MAX_ROWS, OPEN, STICK, eliminate
 
 
@@ -48,6 +48,7 @@ cdef struct scaled_block_t:
     double start[MAX_ROWS]      # z at which Newton's method starts
     double z[MAX_ROWS]
     double projected[MAX_ROWS]  # Pi(y)
+    double F[MAX_ROWS]
     double P[MAX_ROWS * MAX_ROWS]
     double size                 # largest sum of absolute terms of a row, for the tolerance
 
@@ -71,31 +72,33 @@ cdef inline void prepare_newton(int32_t n, const double* W, const double* d, con
 
 
 cdef inline double evaluate(scaled_block_t* x, const int32_t n, double t) noexcept nogil:
-    """Return |F| at z and compute Pi(y), P and `size`."""
-    cdef double y[MAX_ROWS]
+    """Return |F| at z and compute Pi(y), F, P and `size`."""
+    cdef double ts[MAX_ROWS]
     cdef double change[MAX_ROWS]
     cdef double total = 0.0, size = 0.0, s
-    cdef int32_t i, j
+    cdef int32_t i, j, side
     for i in range(n):
         change[i] = x.z[i] - x.z0[i]
         s = fabs(x.z[i]) + fabs(x.s0[i]) + fabs(change[i])
         size = s if s > size else size
+    x.size = size
     for i in range(n):
         s = x.s0[i]
         for j in range(n):
             s += x.H[n * i + j] * change[j]
-        y[i] = x.z[i] - t * s
+        ts[i] = t * s
     if x.bounded:
         for i in range(n * n):
             x.P[i] = 0.0
         for i in range(n):
-            x.projected[i] = x.lower[i] if y[i] < x.lower[i] else (x.upper[i] if y[i] > x.upper[i] else y[i])
-            x.P[(n + 1) * i] = 1.0 if x.projected[i] == y[i] else 0.0
+            side = active_bound(x.z[i] - ts[i], x.lower[i], x.upper[i])
+            x.projected[i] = x.z[i] - ts[i] if side == 0 else x.lower[i] if side < 0 else x.upper[i]
+            x.F[i] = ts[i] if side == 0 else x.z[i] - x.projected[i]
+            x.P[(n + 1) * i] = 1.0 if side == 0 else 0.0
     else:
-        contact_map(x.law, &x.part, y, x.projected, x.P)
+        evaluate_natural_map(x.law, &x.part, n, x.z, ts, x.projected, x.F, x.P)
     for i in range(n):
-        total += (x.z[i] - x.projected[i]) * (x.z[i] - x.projected[i])
-    x.size = size
+        total += x.F[i] * x.F[i]
     return sqrt(total)
 
 
@@ -111,7 +114,7 @@ cdef inline bint iterate_newton(scaled_block_t* x, const int32_t n, double t) no
             break
         for i in range(n):
             z[i] = x.z[i]
-            f[i] = x.projected[i] - z[i]
+            f[i] = -x.F[i]
             for j in range(n):
                 a = 0.0
                 for k in range(n):

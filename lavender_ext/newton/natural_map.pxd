@@ -12,61 +12,42 @@ from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
 
 from lavender_ext.core.block cimport length
-from lavender_ext.core.contact_map cimport contact_map
+from lavender_ext.core.block_projection cimport active_bound, evaluate_natural_map
 from lavender_ext.core.block_types cimport CONE, friction_components_t
 from lavender_ext.newton.elements cimport element_parts, elements_t, invert_small, is_row
 
 
 cdef inline void natural_contact(const elements_t* e, int32_t i, int32_t law, const double* z, const double* s, double* f,
                                  double* p) noexcept nogil:
-    """F (nr) and P (nr, nr) of one contact, Pi in the metric of d."""
-    cdef int32_t nr = e.ptr[i + 1] - e.ptr[i], k
-    cdef double y[6]
+    """Compute F (nr) and P (nr, nr) of one contact, with Pi in the metric of d."""
+    cdef double out[6]
     cdef friction_components_t q
     element_parts(e, i, &q)
-    for k in range(nr):
-        y[k] = z[k] - s[k]
-    contact_map(law, &q, y, f, p)
-    for k in range(nr):
-        f[k] = s[k] if f[k] == y[k] else z[k] - f[k]
+    evaluate_natural_map(law, &q, e.ptr[i + 1] - e.ptr[i], z, s, out, f, p)
 
 
 cdef inline double natural(const elements_t* e, const double* z, const double* s, int32_t law, double eps,
                                double* f, double* p, double* einv, double* v) noexcept nogil:
-    """F, P, E^-1 and V = E^-1 P of (5) for every element; returns |F|, the judge's energy error.
+    """Compute F, P, E^-1 and V = E^-1 P of (5) for every element; return |F|, the judge's energy error.
 
-    law: CONE or COULOMB. einv, v may be NULL: F and P alone.
+    law is CONE or COULOMB. If v is NULL, only F and P are computed.
     """
-    cdef int32_t i, j, k, l, q, nr, piece
+    cdef int32_t i, j, k, l, q, nr, side, c
     cdef double total = 0.0
-    cdef double y, x
+    cdef double x
     cdef double a[36]
     for i in range(e.n):
         j = e.ptr[i]
         nr = e.ptr[i + 1] - j
         q = e.wptr[i]
         if is_row(e, i):
-            y = z[j] - s[j]
-            piece = 1
-            if y < e.lower[j]:
-                f[j] = z[j] - e.lower[j]
-                p[q] = 0.0
-                piece = 0
-            elif y > e.upper[j]:
-                f[j] = z[j] - e.upper[j]
-                p[q] = 0.0
-                piece = 2
-            else:
-                f[j] = s[j]
-                p[q] = 1.0
+            side = active_bound(z[j] - s[j], e.lower[j], e.upper[j])
+            f[j] = s[j] if side == 0 else z[j] - (e.lower[j] if side < 0 else e.upper[j])
+            p[q] = 1.0 if side == 0 else 0.0
             total += f[j] * f[j]
             if v != NULL:
-                if piece == 1:
-                    einv[q] = 1.0 / (e.theta[j] + eps)
-                    v[q] = einv[q]
-                else:
-                    einv[q] = 1.0
-                    v[q] = 0.0
+                einv[q] = 1.0 / (e.theta[j] + eps) if side == 0 else 1.0
+                v[q] = einv[q] if side == 0 else 0.0
             continue
         natural_contact(e, i, law, z + j, s + j, f + j, p + q)
         for k in range(nr):
@@ -81,8 +62,8 @@ cdef inline double natural(const elements_t* e, const double* z, const double* s
             for k in range(nr):
                 for l in range(nr):
                     x = 0.0
-                    for piece in range(nr):
-                        x += einv[q + k * nr + piece] * p[q + piece * nr + l]
+                    for c in range(nr):
+                        x += einv[q + k * nr + c] * p[q + c * nr + l]
                     v[q + k * nr + l] = x
     return sqrt(total)
 
@@ -120,8 +101,3 @@ cdef inline void convex_error(const elements_t* e, const double* z, const double
             worst = x if x > worst else worst
     energy[0] = sqrt(total)
     velocity[0] = worst
-
-
-cdef inline double z_end(const elements_t* e, int32_t j, double y) noexcept nogil:
-    # which bound y is beyond: -1, 1 or 0 for none
-    return -1.0 if y < e.lower[j] else 1.0 if y > e.upper[j] else 0.0

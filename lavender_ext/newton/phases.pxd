@@ -18,12 +18,12 @@ from libc.math cimport fabs
 from libc.stdint cimport int32_t
 from libc.string cimport memset
 
+from lavender_ext.core.block_projection cimport active_bound
 from lavender_ext.core.validate cimport all_finite, norm_inf
 from lavender_ext.core.block_types cimport CONE
 from lavender_ext.judge.score cimport relative
 from lavender_ext.newton.cones cimport cone_gap, cone_size, gather, is_high, is_low
 from lavender_ext.newton.elements cimport elements_t, is_row
-from lavender_ext.newton.natural_map cimport z_end
 from lavender_ext.newton.run cimport (APPROACH, EXCHANGES, INNER, INTERIOR, N_AUGMENTED, N_AUGMENTED_DE_SAXCE,
                                       N_AUGMENTED_INTERIOR, N_DE_SAXCE, N_EXCHANGES, N_INTERIOR, N_ROUNDS, POLISH,
                                       PROXIMAL, PURSUIT, SECOND, at_floor, begin_apart, done, end_apart, enter, exchange_t,
@@ -73,7 +73,7 @@ cdef inline int32_t sides(const elements_t* e, const double* z, const double* hz
     """The bound that every row rests on by its natural map; how many have changed since, where `counted`."""
     cdef int32_t j, now, changed = 0
     for j in range(e.m):
-        now = <int32_t>z_end(e, j, z[j] - hz[j] + e.g[j])
+        now = active_bound(z[j] - hz[j] + e.g[j], e.lower[j], e.upper[j])
         if counted:
             changed += now != side[j]
         else:

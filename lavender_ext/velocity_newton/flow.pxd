@@ -5,7 +5,7 @@ theta > 0 [1/kg] on every row and s = J (v - v*) - b [m/s], a block's law determ
 
     z = (rho c - s) / theta
     row        lambda = clip(z, lower, upper)
-    contact    lambda = Pi(z) of its law in the metric of theta (`core/contact_map.pxd`)                  (1)
+    contact    lambda = Pi(z) of its law in the metric of theta (`core/block_projection.pxd`)                  (1)
     V          -d lambda / d s, of the block's rows
 
 theta is equal on all tangents of a disk, so that (1) has a closed form.
@@ -14,8 +14,8 @@ from libc.math cimport sqrt
 from libc.stdint cimport int32_t
 from libc.string cimport memcpy, memset
 
+from lavender_ext.core.block_projection cimport active_bound, project_contact
 from lavender_ext.core.block cimport block_error, row_error
-from lavender_ext.core.contact_map cimport contact_map
 from lavender_ext.core.generalized cimport panel_transpose_add, panel_times
 from lavender_ext.core.block_types cimport blocks_t, is_rows, get_friction_components, friction_components_t
 from lavender_ext.core.view cimport generalized_t
@@ -160,7 +160,7 @@ cdef inline void compute_contact_impulse(const flow_t* f, int32_t i, double* lam
     get_friction_components(&f.p, i, &q)
     for k in range(q.n):
         q.friction_coefficient[k] = q.friction_coefficient[k] * root[q.first[k]] * inv_sqrt_theta[0]
-    contact_map(f.p.law, &q, y, out, v)
+    project_contact(f.p.law, &q, y, out, v)
     for k in range(n):
         lam[k] = lam[k] if out[k] == y[k] else out[k] * inv_sqrt_theta[k]
         for l in range(n):
@@ -186,7 +186,7 @@ cdef inline void compute_impulses(const flow_t* f, int32_t first, int32_t last, 
             z = (rho[k] * center[k] - s[k]) * soft[k]
             low = lower[k]
             high = upper[k]
-            v[k] = soft[k] if low < z < high else 0.0
+            v[k] = soft[k] if active_bound(z, low, high) == 0 else 0.0
             lam[k] = low if z < low else (high if z > high else z)
         return
     for i in range(first, last):
@@ -199,7 +199,7 @@ cdef inline void compute_impulses(const flow_t* f, int32_t first, int32_t last, 
                 z = (rho[k] * center[k] - s[k]) * soft[k]
                 low = lower[k]
                 high = upper[k]
-                v[at + k] = soft[k] if low < z < high else 0.0
+                v[at + k] = soft[k] if active_bound(z, low, high) == 0 else 0.0
                 lam[k] = low if z < low else (high if z > high else z)
             continue
         for k in range(j, end):

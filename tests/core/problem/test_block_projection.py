@@ -1,0 +1,125 @@
+"""The projection of one block and its derivatives against a dense twin in long double and its finite differences."""
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from judge_twin import ROUND, project_cone, spec_of
+from judge_twin import Problem as Twin
+
+import lavender as lv
+from lavender.judge.states import linear_of
+
+L = np.longdouble
+H = L(1e-7)  # step of central differences: 1e-14 of truncation, 1e-12 of rounding in long double
+CONES = {
+    "rows": lambda mu, arm, n: lv.Cones(
+        3 * np.arange(n + 1), np.zeros(n, int), -np.repeat(arm, 3), np.repeat(mu, 3), np.zeros(n), np.zeros(n)
+    ),
+    "normal": lambda mu, arm, n: lv.Cones.contacts(0.0 * mu, 0),
+    "one tangent": lambda mu, arm, n: lv.Cones.contacts(mu, 1),
+    "disk": lambda mu, arm, n: lv.Cones.contacts(mu),
+    "spin": lambda mu, arm, n: lv.Cones.contacts(mu, patch_radius=arm),
+    "spin alone": lambda mu, arm, n: lv.Cones.contacts(mu, 0, arm),
+    "box": lambda mu, arm, n: lv.Cones.contacts(np.stack([mu, arm], 1), shape="box"),
+    "ellipse": lambda mu, arm, n: lv.Cones.contacts(np.stack([mu + 0.1, arm], 1)),
+    "rolling": lambda mu, arm, n: lv.Cones.contacts(mu, rolling=arm),
+    "rolling and spin": lambda mu, arm, n: lv.Cones.contacts(mu, patch_radius=0.5 * mu + 0.1, rolling=arm),
+    "round": lambda mu, arm, n: lv.Cones.contacts(mu, 5),
+}
+
+
+def project(law, y, components):
+    """Pi(y) of a contact from its definition; components: (rows, coefficient)."""
+    if law == "cone":
+        return project_cone(y, np.ones(len(y), L), components)
+    out = y.copy()
+    out[0] = max(L(0.0), y[0])
+    for rows, coefficient in components:
+        size, bound = np.sqrt(np.sum(y[rows] ** 2)), coefficient * out[0]
+        if size > bound:
+            out[rows] *= bound / size
+    return out
+
+
+def difference(function, x, i):
+    """Central difference of function(x) by x[i]."""
+    step = np.zeros(len(x), L)
+    step[i] = H
+    return (function(x + step) - function(x - step)) / (2 * H)
+
+
+@pytest.mark.parametrize("law", ["coulomb", "cone"])
+@pytest.mark.parametrize("kind", CONES)
+def test_projection_and_its_derivatives_are_those_of_a_dense_twin(kind, law):
+    if (kind, law) == ("round", "coulomb"):
+        return
+    rng, n = np.random.default_rng(5), 200
+    mu, arm = rng.uniform(0.05, 1.5, n), rng.uniform(0.05, 1.5, n)
+    mu[::15] = 0.0
+    cones = CONES[kind](mu, arm, n)
+    ptr, m = cones.ptr, cones.n_rows
+    g = rng.standard_normal((n, 6, 6))
+    blocks = [x[:k, :k] @ x[:k, :k].T + 0.1 * np.eye(k) for x, k in zip(g, np.diff(ptr), strict=True)]
+    problem = lv.Problem(rng.standard_normal(m), cones, sp.block_diag(blocks, format="csr"), friction=law)
+    impulse = rng.standard_normal(m)
+    impulse[ptr[:-1]] += 0.5
+    linear, disk = linear_of(problem, impulse), problem.disk
+    twin, root = Twin(spec_of(disk)), linear.root.astype(L)
+    z, s = root * linear.impulse, linear.slack / root
+    y = z - s
+    if kind == "rows":
+        low, high = root * disk.cones.lower, root * disk.cones.upper
+        np.testing.assert_allclose(linear.residual.astype(L), z - np.clip(y, low, high), rtol=1e-13)
+        np.testing.assert_array_equal(linear.p, (low < y) & (y < high))
+        return
+    states, at = set(), 0
+    for k in range(n):
+        block = slice(ptr[k], ptr[k + 1])
+        size = ptr[k + 1] - ptr[k]
+        components = [(list(range(1, size)), twin.mu[k])] if disk.cones.kind[k] == ROUND else twin.parts(k)
+        components = [(rows, a * root[block][rows[0]] / root[block][0]) for rows, a in components]
+        states.add(tuple(linear.case[block]))
+        p, at = linear.p[at : at + size**2].reshape(size, size), at + size**2
+        expected = project(law, y[block], components)
+        scale = np.abs(z[block]).max() + np.abs(s[block]).max()
+        np.testing.assert_allclose(
+            (z[block] - linear.residual[block]).astype(float),
+            expected.astype(float),
+            rtol=0,
+            atol=1e-14 * scale,
+        )
+        if (linear.margin[block] * linear.root[block]).min() < 1e-3:
+            continue  # near a kink, where differences do not converge
+        derivative = np.stack(
+            [difference(lambda x, c=components: project(law, x, c), y[block], i) for i in range(size)], 1
+        )
+        np.testing.assert_allclose(p, derivative.astype(float), rtol=0, atol=1e-10)
+        for rows, a in components:
+            if a < 1e-3:
+                continue  # at the lowest coefficient
+            unit = np.zeros(m)
+            unit[ptr[k] + rows[0]] = 1.0
+
+            def by_coefficient(x, rows=rows, block=block, components=components):
+                return project(law, y[block], [(r, x[0] if r == rows else c) for r, c in components])
+
+            edge = linear.times(unit, edge=True)[block] * (root[block][0] / root[block][rows[0]])
+            np.testing.assert_allclose(
+                edge.astype(float),
+                difference(by_coefficient, np.array([a], L), 0).astype(float),
+                rtol=0,
+                atol=1e-9,
+            )
+    cases = np.array(
+        [(*case, -1, -1, -1, -1, -1)[:6] for case in states]
+    )  # open, and closed with every component in both
+    assert {0, 1} <= set(cases[:, 0])
+    assert all({2, 3} <= set(cases[:, rows[0]]) for rows, _ in components)
+
+
+@pytest.mark.parametrize("law", ["coulomb", "cone"])
+def test_not_a_number_is_not_hidden(law):
+    cones = lv.Cones.contacts(np.full(1, 0.5))
+    problem = lv.Problem(np.zeros(3), cones, np.eye(3), friction=law)
+    linear = linear_of(problem, np.array([1.0, np.nan, 0.0]))
+    assert np.isnan(linear.residual).any()
