@@ -47,6 +47,55 @@ def read_only(array: np.ndarray) -> np.ndarray:
     return array
 
 
+def to_numpy(name: str, value: Any) -> np.ndarray:
+    """Convert array-like data, or an array of another library, to a NumPy array.
+
+    Arrays with `__dlpack__` (PyTorch, JAX, CuPy) or `__array__` (Warp) are views if they are in the memory of the
+    processor, and are copied once if they are on another device.
+
+    Raises
+    ------
+    InputError
+        The value is not an array of numbers, requires a gradient, or is on a device that cannot be read.
+    """
+    if not hasattr(value, "__dlpack__") or isinstance(value, np.ndarray):
+        try:
+            return np.asarray(value)
+        except (TypeError, ValueError) as error:
+            raise InputError(f"{name} is not an array of numbers ({error})") from None
+    if getattr(value, "requires_grad", False):
+        raise InputError(
+            f"{name} requires a gradient, which would be lost: give {name}.detach(), or use lavender.torch to "
+            "differentiate"
+        )
+    reason: Exception | None = None
+    for read in (
+        np.from_dlpack,
+        lambda x: np.from_dlpack(x, device="cpu", copy=True),
+        lambda x: x.cpu().numpy(),
+        lambda x: x.get(),
+        np.asarray,
+    ):
+        try:
+            array = read(value)
+        except (
+            AttributeError,
+            BufferError,
+            NotImplementedError,
+            RuntimeError,
+            TypeError,
+            ValueError,
+        ) as error:
+            reason = error
+            continue
+        if isinstance(array, np.ndarray) and array.dtype != object:
+            return array
+    raise InputError(
+        f"{name} is a {type(value).__name__} on device {getattr(value, 'device', 'unknown')} that cannot be read "
+        f"({reason}): copy it to the host"
+    )
+
+
 def as_array(
     name: str,
     value: Any,
@@ -98,10 +147,7 @@ def as_array(
     elif type(value) is np.ndarray and value.dtype is INT32 and _matches_shape(value.shape, shape):
         return read_only(value.copy() if copy or not value.flags.c_contiguous else value)
     label = f"{name} [{unit}]" if unit and unit != "-" else name
-    try:
-        array = np.asarray(value)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{label} is not an array of numbers ({error})") from None
+    array = to_numpy(label, value)
     if array.dtype.kind not in "buif":
         raise InputError(f"{label} has dtype {array.dtype}; real numbers are needed")
     check_unmasked(label, value)
@@ -146,7 +192,7 @@ def as_floats(name: str, value: Any) -> np.ndarray:
     """
     shape_of(name, value)
     check_unmasked(name, value)
-    array = np.asarray(value)
+    array = to_numpy(name, value)
     if array.dtype in FLOAT_DTYPES:
         return array
     native = array.dtype.newbyteorder("=")
