@@ -8,7 +8,8 @@
 
 An error names everything that a format cannot hold. `docs/formats.md` lists every entry. Problems can also be built
 from the data of another engine: `from_mujoco`, `from_pinocchio`, `from_drake`; `from_mujoco_many`, `from_efc`,
-`from_kamino` and `from_genesis` for many worlds at once; `record` writes the steps of a simulation to a folder.
+`from_kamino` and `from_genesis` for many worlds at once. `record` writes the steps of a MuJoCo simulation to a folder,
+`Recorder` those of any loop.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from lavender.io.genesis import from_genesis
 from lavender.io.kamino import from_kamino
 from lavender.io.mujoco import from_mujoco
 from lavender.io.pinocchio import from_pinocchio
+from lavender.io.recorder import Recorder, StepVerdict, read_recorded_state
 from lavender.io.recording import Recording, record
 from lavender.io.stored import HDF5, MAX_BYTES, Stored, as_path, first_bytes
 from lavender.problem import Problem
@@ -34,7 +36,9 @@ from lavender.problem import Problem
 __all__ = [
     "Claims",
     "EngineStep",
+    "Recorder",
     "Recording",
+    "StepVerdict",
     "Stored",
     "drake",
     "efc",
@@ -49,6 +53,7 @@ __all__ = [
     "load_solution",
     "mujoco",
     "read",
+    "read_recorded_state",
     "record",
     "save",
 ]

@@ -1,0 +1,304 @@
+"""Record problems of any simulation loop in a folder: every k-th step, the worst ones, or those selected.
+
+    with lavender.io.Recorder("failing", keep_worst=16, when=lambda v: v.verdict == "wrong") as recorder:
+        for _ in range(10_000):
+            scene.step()
+            recorder.add(lavender.io.from_genesis(scene), state={"qpos": scene.get_qpos()})
+
+The folder holds a problem file for each recorded world and step with the engine's impulse, `engine.jsonl` with a line
+of JSON for each (verdict, errors, the engine's claims), and `states` with the states (docs/formats.md).
+`lavender report`, `lavender check` and `lavender explain` read it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import heapq
+import json
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lavender.base.arrays import check_bool, check_float, check_int, to_numpy
+from lavender.base.errors import InputError, LavenderError
+from lavender.batch.data import Batch
+from lavender.batch.residuals import residual_many
+from lavender.io import npz
+from lavender.io.engine_step import Claims, EngineStep
+from lavender.io.stored import ENGINE, folder_for_steps, make_folder, write_arrays, write_text
+from lavender.judge.residuals import DEFAULT_THRESHOLD, residual
+from lavender.problem import Problem
+
+STATES_FOLDER = "states"
+
+
+@dataclass(frozen=True)
+class StepVerdict:
+    """Verdict about the engine's answer for one world in one step, which `when` receives.
+
+    Parameters
+    ----------
+    step, world : int
+        Number of the call of `add`, from 0, and the world's index in it.
+    rows : int
+    velocity_error : float, m/s
+        Of the worst row; NaN if the world cannot be judged.
+    relative : float
+        Relative residual [-].
+    verdict : str
+        As `Residual.verdict`; "" if the world cannot be judged.
+    claimed : bool or None
+        Whether the engine reports convergence; None if it makes no claim.
+    """
+
+    step: int
+    world: int
+    rows: int
+    velocity_error: float
+    relative: float
+    verdict: str
+    claimed: bool | None = None
+
+
+class Recorder:
+    """Write problems of a simulation loop to a folder.
+
+    A world of a step is recorded if at least one of `every`, `when` and `keep_worst` selects it.
+
+    Parameters
+    ----------
+    folder : path
+        Created if it does not exist. It is locked until `close`, or until the end of a `with` block.
+    every : int, optional
+        Record all worlds of every k-th step.
+    keep_worst : int, default 0
+        Keep the k answers with the largest velocity errors so far; files of answers that are no longer among them are
+        removed, unless `every` or `when` selected them.
+    when : callable, optional
+        Called with the `StepVerdict` of each world; a true result selects it.
+    threshold : float, default 1e-4 m/s
+        Velocity error up to which an answer is close enough (`Residual.verdict`).
+    solver : str, default "engine"
+        Name of the engine's solver in the records.
+    replace : bool, default False
+        Remove the problem files of another recording from the folder. Without it, such a folder is an error.
+
+    Raises
+    ------
+    InputError
+        Nothing is selected, an argument is invalid, or the folder holds a recording or cannot be written.
+    """
+
+    def __init__(
+        self,
+        folder: str | os.PathLike[str],
+        *,
+        every: int | None = None,
+        keep_worst: int = 0,
+        when: Callable[[StepVerdict], object] | None = None,
+        threshold: float = DEFAULT_THRESHOLD,
+        solver: str = "engine",
+        replace: bool = False,
+    ) -> None:
+        self.every = None if every is None else check_int("every", every, 1)
+        self.keep_worst, self.threshold = (
+            check_int("keep_worst", keep_worst),
+            check_float("threshold", threshold, low=0.0),
+        )
+        if when is not None and not callable(when):
+            raise InputError(f"when is {when!r:.60}; a function of a StepVerdict is needed")
+        if self.every is None and not self.keep_worst and when is None:
+            raise InputError("nothing would be recorded: give every=, keep_worst= or when=")
+        self.when, self.solver, self.n_steps = when, solver, 0
+        self._stack = contextlib.ExitStack()
+        self.folder = self._stack.enter_context(folder_for_steps(folder, check_bool("replace", replace)))
+        self._lines: dict[str, dict[str, Any]] = {}
+        self._worst: list[tuple[float, str]] = []  # heap of (velocity error, file), the smallest first
+        self._unjudged: set[int] = set()  # worlds whose first invalid step has a line
+
+    def __enter__(self) -> Recorder:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Release the folder's lock; the recording is complete after each `add`."""
+        self._stack.close()
+
+    @property
+    def files(self) -> tuple[str, ...]:
+        """Names of the problem files."""
+        return tuple(name for name, line in self._lines.items() if "left_out" not in line)
+
+    def add(
+        self,
+        problems: EngineStep | Batch | Problem | tuple[Any, Any],
+        impulse: Any = None,
+        *,
+        claims: Claims | None = None,
+        state: Mapping[str, Any] | None = None,
+    ) -> list[StepVerdict]:
+        """Judge one step of all worlds and record the selected ones.
+
+        Parameters
+        ----------
+        problems : EngineStep, Batch or Problem, or a pair of one of the latter two and the impulses
+            Results of `from_kamino`, `from_genesis`, `from_efc`, `from_mujoco_many` and `from_mujoco`.
+        impulse : array, N s
+            The engine's answer, unless `problems` contains it.
+        claims : Claims, optional
+            The engine's claims, unless `problems` contains them.
+        state : dict of arrays, optional
+            State before the step. Arrays have one entry for each world of a batch in their first dimension.
+
+        Returns
+        -------
+        list of StepVerdict
+            One for each world.
+
+        Raises
+        ------
+        InputError
+            The impulses are missing or have another shape, a state has another number of worlds, or a file cannot be
+            written. Worlds that cannot be judged raise no error; their first step has a line with the reason.
+        """
+        if isinstance(problems, EngineStep):
+            problems, impulse, claims = problems
+        elif isinstance(problems, tuple):
+            problems, impulse = problems
+        if impulse is None:
+            raise InputError("impulse is missing: give the engine's answer [N s] to judge")
+        verdicts, reasons = self._judge(problems, impulse, claims)
+        states = self._split_states(state, len(verdicts), isinstance(problems, Problem))
+        changed = False
+        for verdict in verdicts:
+            changed |= self._record(
+                verdict, problems, impulse, claims, states, reasons.get(verdict.world, "")
+            )
+        if changed:
+            lines = "".join(f"{json.dumps(line)}\n" for line in self._lines.values())
+            write_text(self.folder / ENGINE, lines)
+        self.n_steps += 1
+        return verdicts
+
+    def _judge(
+        self, problems: Any, impulse: Any, claims: Claims | None
+    ) -> tuple[list[StepVerdict], dict[int, str]]:
+        """Return the verdict of each world, and the reasons why worlds could not be judged."""
+        if isinstance(problems, Problem):
+            own = residual(problems, impulse, threshold=self.threshold)
+            rows, numbers, reasons = [problems.m], [(own.velocity, own.relative, own.verdict)], {}
+        elif isinstance(problems, Batch):
+            many = residual_many(problems, impulse, threshold=self.threshold, errors="status")
+            rows = problems.row_counts.tolist()
+            numbers = list(
+                zip(many.velocity_error.tolist(), many.relative.tolist(), many.verdict.tolist(), strict=True)
+            )
+            reasons = {i: str(error) for i, error in many.faults.items()}
+        else:
+            raise InputError(
+                f"problems is a {type(problems).__name__}; a Problem, a Batch or the result of an importer is needed"
+            )
+        claimed = [None] * len(rows) if claims is None else claims.converged.tolist()
+        verdicts = [
+            StepVerdict(self.n_steps, i, rows[i], *numbers[i], claimed=claimed[i]) for i in range(len(rows))
+        ]
+        return verdicts, reasons
+
+    def _split_states(
+        self, state: Mapping[str, Any] | None, n: int, is_single: bool
+    ) -> Callable[[int], dict[str, Any]] | None:
+        """Return a function that returns the state of a world, or None without states."""
+        if state is None:
+            return None
+        arrays = {name: to_numpy(f"state {name!r}", x) for name, x in state.items()}
+        if is_single:
+            return lambda i: arrays
+        for name, x in arrays.items():
+            if x.ndim == 0 or len(x) != n:
+                raise InputError(f"state {name!r} has shape {x.shape}; {n} worlds first are needed")
+        return lambda i: {name: x[i] for name, x in arrays.items()}
+
+    def _record(
+        self,
+        verdict: StepVerdict,
+        problems: Any,
+        impulse: Any,
+        claims: Claims | None,
+        states: Any,
+        reason: str,
+    ) -> bool:
+        """Record a world of this step if it is selected; return whether the records changed."""
+        i, error = verdict.world, verdict.velocity_error
+        is_selected = self.every is not None and verdict.step % self.every == 0
+        is_selected = bool(self.when is not None and self.when(verdict)) or is_selected
+        name = f"step_{verdict.step:06d}_world_{i:04d}.npz"
+        if reason:
+            if not is_selected and i in self._unjudged:
+                return False
+            self._unjudged.add(i)
+            self._lines[name] = {"file": name, "step": verdict.step, "world": i, "left_out": reason}
+            return True
+        is_worst = self.keep_worst > 0 and verdict.rows > 0 and (
+            len(self._worst) < self.keep_worst or error > self._worst[0][0]
+        )  # fmt: skip
+        if not (is_selected or is_worst) or verdict.rows == 0:
+            return False
+        is_single = isinstance(problems, Problem)
+        problem = problems if is_single else problems[i]
+        lam = to_numpy("impulse", impulse)
+        own = lam if is_single else lam.reshape(-1)[problems.rows_of(i)]
+        line: dict[str, Any] = {
+            "file": name, "step": verdict.step, "world": i, "rows": verdict.rows, "relative": verdict.relative,
+            "velocity": error, "verdict": verdict.verdict, "solver": self.solver, "seconds": float("nan"),
+            "threshold": self.threshold, "precision": problem.precision,
+        }  # fmt: skip
+        try:
+            judged = residual(problem, own, threshold=self.threshold)
+            line["worst"], line["floor"] = judged.worst_name, judged.roundoff_floor
+            npz.write(problem, self.folder / name, impulse=own)
+        except LavenderError as failure:
+            self._lines[name] = {"file": name, "step": verdict.step, "world": i, "left_out": str(failure)}
+            return True
+        if claims is not None:
+            line["claimed"], line["iterations"] = bool(claims.converged[i]), int(claims.iterations[i])
+            line["claimed_residuals"] = {key: float(x[i]) for key, x in claims.residuals.items()}
+        if states is not None:
+            write_arrays(make_folder(self.folder / STATES_FOLDER) / name, states(i))
+        self._lines[name] = line
+        if is_worst:
+            self._replace_worst(error, name)
+        if is_selected:
+            line["selected"] = True
+        return True
+
+    def _replace_worst(self, error: float, name: str) -> None:
+        """Add a file to the worst ones; remove the file that leaves them unless it was selected."""
+        if len(self._worst) < self.keep_worst:
+            heapq.heappush(self._worst, (error, name))
+            return
+        _, removed = heapq.heapreplace(self._worst, (error, name))
+        if not self._lines[removed].get("selected"):
+            del self._lines[removed]
+            for path in (self.folder / removed, self.folder / STATES_FOLDER / removed):
+                Path(path).unlink(missing_ok=True)
+
+
+def read_recorded_state(folder: str | os.PathLike[str], file: str) -> dict[str, np.ndarray]:
+    """Return the state (dict of arrays) that a `Recorder` stored with a problem file of its folder.
+
+    Raises
+    ------
+    InputError
+        The file has no state.
+    """
+    path = Path(folder) / STATES_FOLDER / file
+    if not path.is_file():
+        raise InputError(f"{path} does not exist: {file} was recorded without state=")
+    with np.load(path, allow_pickle=False) as stored:
+        return dict(stored)
