@@ -32,6 +32,7 @@ from lavender.solving.solve import (
     compute_late_fields,
     create_unjudged,
     solve,
+    solve_prepared,
 )
 from lavender_ext.batch.many import CODE, NUMBER, PLACE, Worker
 from lavender_ext.judge.measure import all_finite
@@ -376,8 +377,7 @@ def solve_many(
             solutions.mark_late(i)
             return
         problem, start = worlds[i], solutions.start(i)
-        if small is not None and solutions._worlds.code[i] == CODE["tried"] and not deadline.is_set:
-            small.record_failure(problem, start, tol, solutions._counts(problem, i))
+        has_failed = solutions._worlds.code[i] == CODE["tried"]
         if deadline.is_set:
             if not isinstance(worlds, Batch):
                 deadline.reserve(-LATE_WORLD_TIME)
@@ -386,9 +386,13 @@ def solve_many(
                 unsolved = create_unjudged(problem, spec, named, start, tol, f"{NO_STAGE_MESSAGE}, unjudged")
                 solutions.store_late(i, unsolved)
                 return
-        solution = solve(
-            problem, solver, impulse=start, time_limit=deadline.remaining(MIN_TIME_LIMIT), **more
-        )
+        if has_failed:
+            own = Deadline(deadline.remaining(MIN_TIME_LIMIT))
+            counts = solutions._counts(problem, i)
+            solution = solve_prepared(problem, spec, named, start, tol, max_iter, own, failed_call=counts)
+        else:
+            left = deadline.remaining(MIN_TIME_LIMIT)
+            solution = solve(problem, solver, impulse=start, time_limit=left, **more)
         is_judged = solution.status is not Status.TIME_LIMIT or "residual" in vars(solution)
         store = solutions.store if is_judged else solutions.store_late
         store(i, solution if "callback" in options else uninterrupted(solution))

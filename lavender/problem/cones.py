@@ -635,11 +635,32 @@ def project(cones: Cones, impulse: FloatArray) -> FloatArray:
     if cones.has_ellipse:
         return cones.stretch * project(cones.disks, impulse / cones.stretch)
     out = np.clip(impulse, cones.lower, cones.upper)
-    coefficient = cones.reach
-    for block, rows in cones.parts():
-        bound, size = coefficient[rows[0]] * out[cones.ptr[block]], np.hypot.reduce(out[rows])
-        if len(rows) == 1:
-            out[rows] = np.clip(out[rows], -bound, bound)
-        elif size > bound:
-            out[rows] *= bound / size
+    first, tangents = cones.ptr[:-1], cones.n_together
+
+    def bounds(blocks: Any, rows: Any) -> FloatArray:
+        bound: FloatArray = cones.reach[rows] * out[first[blocks]]
+        return bound
+
+    # components of one row
+    for blocks, rows in (
+        (np.flatnonzero(tangents == 1), first + 1),
+        (np.flatnonzero(cones.apart_rows >= 0), cones.apart_rows),
+    ):
+        bound = bounds(blocks, rows[blocks])
+        out[rows[blocks]] = np.clip(out[rows[blocks]], -bound, bound)
+    # components of two rows
+    for blocks, rows in (
+        (np.flatnonzero(tangents == 2), first + 1),
+        (np.flatnonzero(cones.rolling_rows >= 0), cones.rolling_rows),
+    ):
+        pairs = rows[blocks][:, None] + np.arange(2)
+        bound, size = bounds(blocks, pairs[:, 0]), np.hypot(*out[pairs].T)
+        outside = size > bound
+        out[pairs[outside]] *= (bound[outside] / size[outside])[:, None]
+    # round cones
+    for block in np.flatnonzero(tangents > 2).tolist():
+        tangent_rows = slice(first[block] + 1, first[block] + 1 + tangents[block])
+        radius, length = bounds(block, first[block] + 1), np.hypot.reduce(out[tangent_rows])
+        if length > radius:
+            out[tangent_rows] *= radius / length
     return out

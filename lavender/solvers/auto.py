@@ -63,15 +63,16 @@ from lavender.solvers.certify import (
 )
 from lavender.solvers.islands import count_pairs
 from lavender.solvers.newton import WARM_START_MAX_RESIDUAL, NewtonState
-from lavender.solvers.registry import SMALL_ROWS, Solver, SolverSpec, get, specs
+from lavender.solvers.registry import Solver, SolverSpec, get, specs
 from lavender.solvers.setup_times import (
     first_factor_time,
     first_sweep_time,
     formation_time,
     forming_time,
     matrix_setup_time,
+    tight_limit,
 )
-from lavender.solvers.small import AUTO, ISLANDS_TIME_FRACTION, NO_TIME_MESSAGE, call_ends_within
+from lavender.solvers.small import AUTO, NO_TIME_MESSAGE, time_fraction
 from lavender.solvers.solve_log import MIN_GAIN_RATIO, SolveLog
 from lavender.solvers.steps import (
     METHODS,
@@ -106,9 +107,6 @@ MAX_DIRECT_BAND = 100
 RELIABLE_BUDGET_RATIO = 4.0  # Within this multiple of the estimated cost, nine of ten problems converge.
 # Fraction of the estimated cost after which an interior point has an impulse that improves on sweeps.
 EARLY_RESULT_FRACTION = 0.25
-# Sweeps start from the given impulse up to this relative residual, even if the zero impulse has a smaller one, because
-# the given impulse shows which rows are free.
-MAX_START_RESIDUAL = 1e3
 # A quadratic program with a singular P is solved by the first of these that is installed and solves it; osqp is always
 # installed.
 PROGRAM_BACKENDS = ("piqp", "clarabel", "osqp")
@@ -226,6 +224,8 @@ class Tree:
         )
         if name == "newton" and "states" in vars(self):
             return not self.deadline.passed(needed)
+        if not self.deadline.passed(tight_limit(self.problem) + needed):
+            return True
         return not self.deadline.passed(setup_time(name, self.problem) + needed)
 
     @property
@@ -362,46 +362,61 @@ class Tree:
             self.sweeps_failed = self.best > MIN_GAIN_RATIO * before
 
 
+@dataclass
+class AutoState:
+    """State of one solve.
+
+    Parameters
+    ----------
+    problem : Problem
+    failed_call : tuple of int or None
+        Counts of a compiled call that has failed; None if it has not been made.
+    """
+
+    problem: Problem
+    failed_call: tuple[int, ...] | None = None
+
+
 @dataclass(frozen=True)
 class Auto(Solver):
     """Select and combine other solvers; the solution's message and `stages` name them."""
 
-    def prepare(self, problem: Problem) -> Problem:
-        """Return the problem: nothing is prepared."""
-        return problem
+    def prepare(self, problem: Problem) -> AutoState:
+        """Return the state of a new solve: nothing is prepared."""
+        return AutoState(problem)
 
-    def start_workers(self, problem: Problem, time_limit: float) -> None:
+    def start_workers(self, state: AutoState, time_limit: float) -> None:
         """Start the process of the backend that solves a program with a singular P."""
-        if problem.has_singular_program:
+        if state.problem.has_singular_program:
             for spec in program_backends()[:1]:
-                spec.load()().start_workers(problem, time_limit)
+                spec.load()().start_workers(state.problem, time_limit)
 
     def run(
-        self, problem: Problem, impulse: FloatArray, max_iter: int, tol: float, time_limit: float | None
+        self, state: AutoState, impulse: FloatArray, max_iter: int, tol: float, time_limit: float | None
     ) -> Claim:
-        deadline, failed = Deadline(time_limit), list[tuple[str, Claim]]()
+        problem, deadline = state.problem, Deadline(time_limit)
         if problem.has_singular_program:
             return run_backends(problem, impulse, max_iter, tol, deadline)
-        if max_iter >= MIN_ITERATIONS_FOR_COMPILED_CALL and call_ends_within(problem, deadline.remaining()):
-            fraction = 1.0 if problem.m <= SMALL_ROWS else ISLANDS_TIME_FRACTION
-            result, counts = AUTO.attempt(problem, impulse, tol, fraction * deadline.nanoseconds())
-            if result is not None and result.relative <= tol:
-                claim = AUTO.claim(problem, counts, impulse, result.relative)
-                if claim.iterations <= max_iter:
-                    impulse[:] = result.impulse
-                    return claim
-            failed = AUTO.failed_claims(problem, counts)
+        counts: tuple[int, ...] | None = state.failed_call
+        if counts is None and max_iter >= MIN_ITERATIONS_FOR_COMPILED_CALL:
+            fraction = time_fraction(problem, deadline.remaining() or inf)
+            if fraction > 0.0:
+                result, counts = AUTO.attempt(problem, impulse, tol, fraction * deadline.nanoseconds())
+                if result is not None and result.relative <= tol:
+                    claim = AUTO.claim(problem, counts, impulse, result.relative)
+                    if claim.iterations <= max_iter:
+                        impulse[:] = result.impulse
+                        return claim
+        failed = AUTO.failed_claims(problem, counts)
         if problem.m == 0:
             return Claim(Status.CONVERGED, 0, {}, "nothing to solve")
         if deadline.passed(first_sweep_time(problem)):
+            impulse[:] = best_of_islands(problem, (impulse, problem._start), (), tol)
             return Claim(Status.TIME_LIMIT, 0, {}, NO_TIME_MESSAGE)
         tree = Tree(problem, deadline)
         tree.compiled_call_failed = bool(failed) and problem.generalized is not None
         log = SolveLog(problem, tol, max_iter, deadline)
-        log.offer(impulse)
-        if log.best > 1.0:
-            log.bad_start = impulse.copy() if log.best < MAX_START_RESIDUAL else None
-            log.offer(problem.start())  # The zero impulse is better.
+        log.begin(impulse)
         try:
             if max_iter > 0 and log.best > tol and not log.done():
                 for name, claim in failed:
@@ -411,10 +426,7 @@ class Auto(Solver):
             log.interrupted = True  # The best impulse is returned all the same.
         except BREAKDOWN as error:
             log.failure = format_error(error)
-        if log.best > tol and log.result is not None:
-            impulse[:] = best_of_islands(problem, (impulse,), (log.result,), tol)
-        else:
-            impulse[:] = log.impulse
+        impulse[:] = log.result if log.best > tol else log.impulse
         return log.claim()
 
 
@@ -443,7 +455,7 @@ def run_backends(
             claim = solver.run(state, trial, min(log.left, spec.max_iter), tol, log.time_left)
             log.offer(trial)
             log.note(spec.name, claim, before)
-            for result in (trial, log.impulse if log.result is None else log.result):
+            for result in (trial, log.impulse if log.best <= tol else log.result):
                 if program_error(problem, result) < error:
                     error, best = program_error(problem, result), result.copy()
             if tol == 0.0:

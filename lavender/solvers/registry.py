@@ -56,11 +56,6 @@ class SolverOptions(TypedDict, total=False):
 class SmallCall(Protocol):
     """Compiled call that solves a small problem with the bits of `run`, or leaves it to `run`."""
 
-    def record_failure(
-        self, problem: Problem, impulse: FloatArray | None, tol: float, counts: tuple[int, ...]
-    ) -> None:
-        """Record that the call from `impulse` failed after work `counts`, so that it is not repeated before `run`."""
-
     @property
     def limits(self) -> Any:
         """Limits of its cost in generalised coordinates; None if it does not accept this form."""

@@ -36,6 +36,18 @@ DISK_J, DISK_J_ROW, DISK_J_ENTRY = 1e-4, 3e-8, 2.5e-9
 DISK_A, DISK_A_ROW, DISK_A_ENTRY = 1.5e-4, 4e-8, 8e-9
 
 
+# The time of `tight_limit` [s]: constant, and per entry of a full A.
+TIGHT_LIMIT, TIGHT_LIMIT_PER_ENTRY = 1e-2, 1e-6
+
+
+def tight_limit(problem: Problem) -> float:
+    """Return a time [s] that is about a hundred times that of the set-up and the judge, from the number of rows alone.
+
+    A longer limit needs no other estimate before the solve. Estimates would take longer than a small problem.
+    """
+    return TIGHT_LIMIT + TIGHT_LIMIT_PER_ENTRY * float(len(problem.b)) ** 2
+
+
 def forming_time(problem: Problem) -> float:
     """Estimate the time [s] to form A; 0 if it is known."""
     if problem.m == 0 or problem.matrix is not None or "_compressed" in problem.__dict__:

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from lavender.base.arrays import FloatArray
-from lavender.judge.residuals import get_reference, judge_impulse
+from lavender.judge.residuals import get_reference, judge_impulse, reading_time
 from lavender.judge.solution import Claim, SolverStage, Status, counted, summed
 from lavender.problem import Problem
 from lavender.solvers.costs import (
@@ -32,15 +32,12 @@ from lavender.solvers.islands import islands
 from lavender.solvers.newton_systems import general
 from lavender.solvers.newton_systems.systems import MAX_ALWAYS_DENSE_ROWS
 from lavender.solvers.registry import SMALL_ROWS
-from lavender.solvers.setup_times import forming_time
+from lavender.solvers.setup_times import forming_time, tight_limit
 from lavender_ext.batch.many import Limits, solve_first
 from lavender_ext.small.call import Islands, Rules, Small
 
-# Keys of `Derived.cache`.
-# A `Small` or `Islands`; False if the problem has no compiled call.
+# Key of `Derived.cache`: a `Small` or `Islands`; False if the problem has no compiled call.
 COMPILED_CALL_KEY = "lavender.solvers.small: compiled call"
-# (solver, tol, start) of a compiled call that did not converge, and its counts: the call is not repeated.
-FAILED_CALL_KEY = "lavender.solvers.small: failed call"
 
 #: Messages if no solver ran, by the status of the start.
 NO_WORK_MESSAGES = {
@@ -52,7 +49,8 @@ WARM_START_MAX_RESIDUAL = 1e-3  # Newton's method starts from an iterate up to t
 # Largest number of rows of an island. Up to it, dense factors cost less than sweeps and factors of all islands.
 MAX_ISLAND_ROWS = 150
 MAX_SWEEPS_BEFORE_FACTOR = 32  # Largest number of sweeps of an island before its first factorisation.
-ISLANDS_TIME_FRACTION = 0.25  # Fraction of the remaining time that islands may use.
+# A call of more than SMALL_ROWS rows may fail, so it may only use this fraction of the remaining time.
+CALL_TIME_FRACTION = 0.5
 ISLANDS_ROW_COST = 200.0  # Cost [ns] per row to separate the islands.
 TREE_OVERHEAD_COST = 2e5  # Cost [ns] of Python in two stages of the tree, which the compiled call avoids.
 # From this many rows per velocity, the matrix N is full, and small compared with the data from which it is formed.
@@ -97,24 +95,27 @@ def make_limits(
     )
 
 
-def call_ends_within(problem: Problem, seconds: float | None) -> bool:
-    """Return whether the compiled call is made within a time limit of `seconds`.
+def time_fraction(problem: Problem, seconds: float) -> float:
+    """Return the fraction of a time limit of `seconds` that the compiled call may use; 0 if it is not made.
 
-    With more than a few rows, the call may fail. It is only made if its estimated time is at most a quarter of the
-    remaining time; over velocities, the estimate is four times the largest accepted cost.
+    With at most SMALL_ROWS rows, it may use all of the time. Otherwise, its set-up must fit in CALL_TIME_FRACTION of
+    the time; after that the kernel stops at the estimated cost that it is given.
     """
-    if seconds is None or problem.m <= SMALL_ROWS:
-        return True
+    if seconds == inf or len(problem.b) <= SMALL_ROWS:
+        return 1.0
+    if problem.generalized is None and problem.law in ("linear", "lcp"):
+        return 0.0
+    if seconds > tight_limit(problem):
+        return CALL_TIME_FRACTION
     if problem.generalized is not None:
-        return ISLANDS_TIME_FRACTION * seconds >= 4e-9 * MAX_UNCLOCKED_COST
-    if problem.law in ("linear", "lcp"):
-        return False
-    cost = (
-        ISLANDS_ROW_COST * problem.m
-        + 1e9 * forming_time(problem)
-        + MAX_SWEEPS_BEFORE_FACTOR * sweep_cost(problem)
-    )
-    return 1e-9 * cost <= ISLANDS_TIME_FRACTION * seconds
+        set_up = 1e9 * reading_time(problem)
+    else:
+        set_up = (
+            ISLANDS_ROW_COST * problem.m
+            + 1e9 * forming_time(problem)
+            + MAX_SWEEPS_BEFORE_FACTOR * sweep_cost(problem)
+        )
+    return CALL_TIME_FRACTION if 1e-9 * set_up <= CALL_TIME_FRACTION * seconds else 0.0
 
 
 def prepare_call(problem: Problem) -> Any:
@@ -226,35 +227,20 @@ class SmallCall:
             (judged result, work counts). The result is None if the call did not converge; the counts are () if no call
             was made.
         """
-        cache = problem.derived.cache
         if not tol > 0.0 or not len(problem.b):
             return None, ()
-        call, failed_counts = cache.get(FAILED_CALL_KEY, (None, ()))
-        if call is not None and call == self._call(problem, impulse, tol):
-            return None, failed_counts
         if problem.generalized is not None:
             if self.limits is None:
                 return None, ()
-            result = solve_first(problem.derived.view, impulse, tol, self.limits, max_cost)
-        else:
-            small = cache.get(COMPILED_CALL_KEY)
-            if small is None and (problem.m <= SMALL_ROWS or self.hands_over):
-                small = prepare_call(problem)
-            if not small or not (self.pivots if uses_pivots(problem) else self.hands_over):
-                return None, ()
-            result = small.run(impulse, tol, self.rules, max_cost)
-        if result[0] is None and max_cost == inf:
-            self.record_failure(problem, impulse, tol, result[1])
-        return result[0], result[1]
-
-    def record_failure(
-        self, problem: Problem, impulse: FloatArray | None, tol: float, counts: tuple[int, ...]
-    ) -> None:
-        """Record that the call from this start failed with these counts, so that it is not repeated."""
-        problem.derived.cache[FAILED_CALL_KEY] = self._call(problem, impulse, tol), counts
-
-    def _call(self, problem: Problem, impulse: FloatArray | None, tol: float) -> tuple[str, float, bytes]:
-        return self.name, tol, (problem._start if impulse is None else impulse).tobytes()
+            result: tuple[Any, Any] = solve_first(problem.derived.view, impulse, tol, self.limits, max_cost)
+            return result
+        small = problem.derived.cache.get(COMPILED_CALL_KEY)
+        if small is None and (problem.m <= SMALL_ROWS or self.hands_over):
+            small = prepare_call(problem)
+        if not small or not (self.pivots if uses_pivots(problem) else self.hands_over):
+            return None, ()
+        result = small.run(impulse, tol, self.rules, max_cost)
+        return result
 
     def failed_claims(self, problem: Problem, counts: tuple[int, ...] | None) -> list[tuple[str, Claim]]:
         """Return (solver name, claim) for each solver that ran in a failed call, from its counts."""

@@ -23,6 +23,9 @@ from lavender.solvers.small import NO_TIME_MESSAGE, NO_WORK_MESSAGES, describe_s
 
 __all__ = ["MIN_GAIN_RATIO", "SolveLog"]
 
+# Sweeps start from the given impulse up to this relative residual, even if the zero impulse has a smaller one, because
+# the given impulse shows which rows are free.
+MAX_START_RESIDUAL = 1e3
 MIN_GAIN_RATIO = (
     0.99  # A stage has failed if the residual after it is more than this fraction of the one before.
 )
@@ -42,7 +45,7 @@ class SolveLog:
             np.inf,
             problem._start,
         )  # Smallest relative residual, and its impulse (m,) [N s].
-        self.result: FloatArray | None = None  # (m,) [N s]: best impulse of each island, until one meets tol.
+        self.result = problem._start  # (m,) [N s]: best impulse of each island, until one impulse meets tol.
         self.bad_start: FloatArray | None = None  # (m,) [N s]: a start that is worse than the zero impulse.
         self.stages: list[SolverStage] = []
         self.work: dict[str, int] = {}
@@ -51,8 +54,18 @@ class SolveLog:
         self.direction: FloatArray | None = None  # (m,): not a certificate, but it bounds the impulses.
         self.conflict: Any = None  # `certify.Conflict` of the convex relaxation.
 
-    def offer(self, impulse: FloatArray) -> None:
-        """Judge an impulse (m,) [N s] and store it in the islands in which it is the best."""
+    def begin(self, start: FloatArray) -> None:
+        """Begin from the better of `start` (m,) [N s] and the zero impulse in each island."""
+        self.offer(start, is_start=True)
+        if self.best > 1.0:
+            self.bad_start = start.copy() if self.best < MAX_START_RESIDUAL else None
+            self.offer(self.problem._start, is_start=True)  # The zero impulse is better.
+
+    def offer(self, impulse: FloatArray, is_start: bool = False) -> None:
+        """Judge an impulse (m,) [N s] and store it in the islands in which it is the best.
+
+        No island of `result` has a larger relative residual than an impulse that was offered with `is_start`.
+        """
         relative = find_known_relative(self.problem, impulse)
         if relative is None:
             last = judge_impulse(self.problem, impulse.copy())
@@ -62,8 +75,8 @@ class SolveLog:
         if relative < self.best:
             self.best, self.impulse = relative, impulse.copy()
         if self.best > self.tol:
-            start = self.problem._start if self.result is None else self.result
-            self.result = best_of_islands(self.problem, (start,), (impulse,), self.tol)
+            starts, impulses = ((self.result, impulse), ()) if is_start else ((self.result,), (impulse,))
+            self.result = best_of_islands(self.problem, starts, impulses, self.tol)
 
     def note(self, name: str, claim: Claim, before: float) -> None:
         """Record a stage that has ended; the relative residual before it was `before`."""

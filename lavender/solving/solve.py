@@ -28,6 +28,7 @@ from lavender.base.renamed import suggest_argument
 from lavender.external.foreign import Foreign
 from lavender.judge.certificates import prove
 from lavender.judge.residuals import (
+    RESULT_TIME,
     Residual,
     best_of_islands,
     convert_from_disk,
@@ -61,7 +62,9 @@ from lavender.solvers.setup_times import (
     estimate_disk_time,
     estimate_refusal_time,
     loading_time,
+    tight_limit,
 )
+from lavender.solvers.small import time_fraction
 from lavender.solving.outcome import decide_empty_rows, finish, name_lost_row
 from lavender_ext.judge.measure import all_finite, by_island
 from lavender_ext.judge.stopping_test import StoppingTest
@@ -74,6 +77,8 @@ if TYPE_CHECKING:
 LATE_FIELDS = ("iterations", "work", "solver", "message", "history", "dual", "certificate", "impulse_bound",
          "claim_check", "status_conflict", "sweeps_per_decade", "stages")  # fmt: skip
 COST_PER_SECOND = 0.9e9  # Largest estimated cost [ns] of a compiled call per second of its time limit.
+# `auto` judges its last iterate and selects the best one of each island in as many passes of the judge.
+SELECTION_PASSES = 3
 SETUP_LATE_MESSAGE = "what has to be set up first takes longer than the time limit"
 NO_STAGE_MESSAGE = "the time limit was over before its turn: the start"
 JUDGE_LATE_MESSAGE = "what the judge reads takes longer than the time limit: the start, unjudged"
@@ -149,14 +154,32 @@ def solve(
         )
     spec = get(solver)
     limit = math.inf if time_limit is None else check_time_limit(time_limit)
+    failed_call = None
     if max_iter is None and callback is None and history is False and not options:
-        solution = solve_small(problem, spec, impulse, tol, limit)
+        solution, failed_call = solve_small(problem, spec, impulse, tol, limit)
         if solution is not None:
             return solution
-    deadline = _deadline(spec, limit, begun)
-    return Prepared(problem, spec, cast("dict[str, Any]", options), False, deadline)._solve(
-        None, impulse, tol, max_iter, deadline, history, callback
-    )
+    return solve_prepared(
+        problem, spec, cast("dict[str, Any]", options), impulse, tol, max_iter, _deadline(spec, limit, begun),
+        history, callback, failed_call,
+    )  # fmt: skip
+
+
+def solve_prepared(
+    problem: Problem,
+    spec: SolverSpec,
+    options: dict[str, Any],
+    impulse: ArrayLike | None,
+    tol: float,
+    max_iter: int | None,
+    deadline: Deadline,
+    history: bool = False,
+    callback: Callback | None = None,
+    failed_call: tuple[int, ...] | None = None,
+) -> Solution:
+    """Prepare a solver and solve once; `failed_call` is as in `solve_small`."""
+    prepared = Prepared(problem, spec, options, False, deadline)
+    return prepared._solve(None, impulse, tol, max_iter, deadline, history, callback, failed_call)
 
 
 def prepare(problem: Problem, solver: str = "auto", **options: Unpack[SolverOptions]) -> Prepared:
@@ -298,7 +321,9 @@ class Prepared:
         deadline: Deadline,
         history: bool,
         callback: Callback | None,
+        failed_call: tuple[int, ...] | None = None,
     ) -> Solution:
+        """Solve as `solve`; `failed_call` holds the counts if the compiled call has been made for this solve."""
         if not self._lock.acquire(False):
             raise InUse(
                 f"this prepared {self.spec.name!r} is already solving, and it can run one solve at a time: "
@@ -307,9 +332,9 @@ class Prepared:
         try:
             original = self._original if problem is None else problem
             is_default = max_iter is None and callback is None and history is False
-            if is_default and self.spec.delegates and not self.options:
+            if failed_call is None and is_default and self.spec.delegates and not self.options:
                 limit = deadline.remaining(MIN_TIME_LIMIT) or math.inf
-                solution = solve_small(original, self.spec, impulse, tol, limit)
+                solution, failed_call = solve_small(original, self.spec, impulse, tol, limit)
                 if solution is not None:
                     self._replace_problem(problem)
                     return solution
@@ -321,7 +346,7 @@ class Prepared:
                 return create_unjudged(original, self.spec, self.options, impulse, tol, JUDGE_LATE_MESSAGE)
             disk = original.disk
             start = None if impulse is None else original.on_disk(disk.impulse_array(impulse))
-            if deadline.is_set:
+            if is_tight(original, deadline):
                 # The judge measures the result, and the start if it is not zero.
                 passes = 2 if start is not None or disk.guess is not None else 1
                 judge_time = passes * judging_time(disk)
@@ -331,10 +356,15 @@ class Prepared:
                         original, self.spec, self.options, impulse, tol, JUDGE_LATE_MESSAGE
                     )
                 deadline.reserve(judge_time)
+                selection_time = SELECTION_PASSES * (judging_time(disk) - RESULT_TIME)
+                if self.spec.delegates and not deadline.passed(4.0 * selection_time):
+                    deadline.reserve(selection_time)
             if self.solver is None:
                 self._replace_problem(problem)
                 self._prepare_solver(deadline)
             self._refresh(problem, deadline)
+            if self.spec.delegates and self.state is not None:
+                self.state.failed_call = failed_call
             loop = self._loop(start, tol, deadline, history, callback)
             return self._run(loop, max_iter)
         finally:
@@ -397,9 +427,11 @@ class Prepared:
             claim = loop.run(max_iter) if spec.resumable else loop.run_once(max_iter)
             if loop.tol > 0.0 and claim.status not in (CONVERGED, ROUNDOFF_LIMIT):
                 claim = name_lost_row(problem, loop.impulse, claim)
-                # The checks of sweeps already store the best of each island, including the start.
-                if claim.status is TIME_LIMIT or not isinstance(
-                    getattr(self.state, "watch", None), StoppingTest
+                # `auto` and the checks of sweeps already store the best of each island, including the start.
+                keeps_best = spec.delegates and not problem.has_singular_program
+                if not keeps_best and (
+                    claim.status is TIME_LIMIT
+                    or not isinstance(getattr(self.state, "watch", None), StoppingTest)
                 ):
                     loop.restore_better(start, or_zero=claim.status is TIME_LIMIT)
             if (
@@ -588,21 +620,31 @@ def solve_small(
     impulse: Any,
     tol: float,
     limit: float = math.inf,
-) -> Solution | None:
-    """Solve and judge a small problem by one compiled call; return None if `Prepared` has to solve it.
+) -> tuple[Solution | None, tuple[int, ...] | None]:
+    """Solve and judge a small problem by one compiled call.
 
-    If the estimated cost reaches the limit [s], the result is the best of the iterate so far and the start. The fields
-    of claim, counts and residual are computed when they are first accessed.
+    With at most SMALL_ROWS rows, the result at an estimated cost of the limit [s] is the best of the iterate so far and
+    the start. The fields of claim, counts and residual are computed when they are first accessed.
+
+    Returns
+    -------
+    Solution or None
+        None if `Prepared` has to solve the problem.
+    tuple of int or None
+        Counts of a call that has failed; None if no call was made.
     """
     small = spec.small
     if small is None or not spec.builtin or type(problem) is not Problem or not isinstance(tol, float):
-        return None
+        return None, None
     if not 0.0 < tol < math.inf or problem.has_singular_program:
-        return None
-    if problem.cones._blocks.has_ellipse or (
-        len(problem.b) > SMALL_ROWS and (problem.generalized is None or limit < math.inf)
-    ):
-        return None  # Islands may take long: they are solved where Ctrl-C and the clock are checked.
+        return None, None
+    if problem.cones._blocks.has_ellipse or (len(problem.b) > SMALL_ROWS and problem.generalized is None):
+        return None, None  # Islands may take long: they are solved after the checks of the clock.
+    fraction = 1.0
+    if limit < math.inf:
+        fraction = time_fraction(problem, limit)
+        if fraction == 0.0:
+            return None, ()
     start = perf_counter()
     if impulse is None:
         first = problem.guess
@@ -613,24 +655,25 @@ def solve_small(
         first = impulse
     else:
         first = problem.impulse_array(impulse)
-    judged, counts = small.attempt(problem, first, tol, COST_PER_SECOND * limit)
+    judged, counts = small.attempt(problem, first, tol, COST_PER_SECOND * fraction * limit)
     if judged is None:
-        return None
+        return None, counts
     status = CONVERGED
     if judged.relative > tol:
-        if limit == math.inf or judged.relative == judged.roundoff_floor:
-            return None  # The limit is not the reason: next to such impulses, rounding hides b.
+        if limit == math.inf or fraction < 1.0 or judged.relative == judged.roundoff_floor:
+            return None, counts  # Time remains, or rounding hides b next to such impulses.
         status, judged = TIME_LIMIT, best_of(problem, judged, first, tol)
     # The caller may change an impulse array of their own later.
     start_point = first if first is None or impulse is None else first.copy()
     judged.impulse.setflags(write=False)
-    return Solution.late(
+    solution = Solution.late(
         judged.impulse,
         status,
         tol,
         perf_counter() - start,
         (compute_late_fields, (problem, spec, judged, counts, start_point, status)),
     )
+    return solution, None
 
 
 def compute_late_fields(
@@ -682,7 +725,7 @@ def is_too_late(problem: Problem, spec: SolverSpec, deadline: Deadline) -> bool:
     These are `problem.disk`, and A if a solver of another package refuses problems by its entries. Such a call returns
     its start.
     """
-    if not deadline.is_set:
+    if not is_tight(problem, deadline):
         return False
     if problem.rows is not None and problem.cones.has_ellipse and deadline.passed(setup_time(problem)):
         return True  # Even the couplings of bodies, from which the entries of A are counted, would take too long.
@@ -699,6 +742,14 @@ def is_too_late(problem: Problem, spec: SolverSpec, deadline: Deadline) -> bool:
         deadline.reserve(-watch.seconds)
         needed = estimate_disk_time(problem) + estimate_refusal_time(problem, spec)
     return needed > 0.0 and deadline.passed(needed)
+
+
+def is_tight(problem: Problem, deadline: Deadline) -> bool:
+    """Return whether the set-up of the problem and the judge may use more than a hundredth of the remaining time.
+
+    Otherwise, nothing is estimated before the solve, because the estimates would take longer than a small problem.
+    """
+    return deadline.is_set and deadline.passed(tight_limit(problem))
 
 
 def check_time_limit(time_limit: Any) -> float:

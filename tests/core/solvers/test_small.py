@@ -17,7 +17,7 @@ import lavender as lv
 from benchmarks.core_problems import forms, fresh, stacks
 from lavender import registry
 from lavender.solvers.costs import newton_cost
-from lavender.solvers.small import AUTO, SmallCall, call_ends_within, describe_call, make_limits
+from lavender.solvers.small import AUTO, SmallCall, describe_call, make_limits, time_fraction
 from lavender_ext.batch.many import solve_first
 
 
@@ -212,7 +212,7 @@ def test_an_island_that_does_not_end_leaves_the_whole_to_the_long_way():
 def test_islands_are_no_one_call_where_that_may_take_too_long():
     problem = forms(stacks(40, 2, 0.4, False))["matrix"]
     assert registry.get("auto").small.attempt(fresh(problem), None, 1e-6)[0] is not None
-    assert not call_ends_within(problem, 1e-6) and call_ends_within(problem, 10.0)
+    assert time_fraction(problem, 1e-6) == 0.0 < time_fraction(problem, 10.0) < time_fraction(problem, np.inf)
     pile = stacks(3, 30, 0.4, False)  # few islands, but large ones
     assert registry.get("auto").small.attempt(pile, None, 1e-6)[0] is None
     assert registry.get("newton").small.attempt(fresh(problem), None, 1e-6)[0] is None
@@ -286,3 +286,52 @@ def test_one_call_has_steps_for_every_island_of_velocities():
     )
     found = solve_first(problem.metric, None, 1e-6, AUTO.limits)
     assert found and found[1][0] > many
+
+
+ATTEMPTED = {
+    "few rows": lambda: draw("matrix coulomb", 3),
+    "few rows that the call does not solve": lambda: lv.Problem.lcp([[0.0, 1.0], [-1.0, 0.0]], [1.0, 1.0]),
+    "J and M, more rows": lambda: random_general(1, "cone", n=40, compliance=True, contacts=40),
+    "J and M, rigid": lambda: random_general(1, "coulomb", n=60, compliance=False, contacts=50),
+    "islands": lambda: forms(stacks(40, 2, 0.4, False, 1))["bodies"],
+    "islands that the call does not solve": lambda: side_by_side(
+        [
+            forms(stacks(40, 2, 0.4, False, corners=1))["matrix"].relaxed("cone"),
+            lv.Problem(np.array([1.0, -1.0]), lv.Cones.free(2), np.ones((2, 2)), friction="cone"),
+        ]
+    ),
+    "a matrix": lambda: random_lcp(0, m=80),
+}
+
+
+@pytest.mark.parametrize("limit", [None, 60.0])
+@pytest.mark.parametrize("call", ["solve", "prepared", "many", "max_iter"])
+@pytest.mark.parametrize("name", ATTEMPTED)
+def test_the_compiled_call_is_attempted_exactly_once(name, call, limit, monkeypatch):
+    problem, attempts = ATTEMPTED[name](), []
+    attempt = SmallCall.attempt
+
+    def count(self, *of):
+        attempts.append(self.name)
+        return attempt(self, *of)
+
+    monkeypatch.setattr(SmallCall, "attempt", count)
+    if call == "solve":
+        lv.solve(problem, time_limit=limit)
+    elif call == "prepared":
+        lv.prepare(problem).solve(time_limit=limit)
+    elif call == "many":
+        lv.solve_many([problem], time_limit=limit)
+        assert len(attempts) <= 1  # the loop over the worlds makes the same call by itself
+        return
+    else:
+        lv.solve(problem, time_limit=limit, max_iter=10**6)
+    bounded_matrix = problem.generalized is None and problem.law in ("lcp", "linear") and problem.m > 64
+    assert len(attempts) == (0 if bounded_matrix and limit else 1)
+
+
+@pytest.mark.parametrize("name", ATTEMPTED)
+def test_a_limit_that_does_not_bind_changes_no_bit(name):
+    problem = ATTEMPTED[name]()
+    without, within = lv.solve(fresh(problem)), lv.solve(fresh(problem), time_limit=60.0)
+    assert without.impulse.tobytes() == within.impulse.tobytes() and without.work == within.work
