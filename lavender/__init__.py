@@ -9,7 +9,7 @@ Worlds     `Batch` (many problems in arrays), `solve_many`, `residual_many`
 Solving    `solve`, `solve_qp`, `prepare` (for repeated steps), `available`, `known`, `explain` (decision trace
            of `auto`)
 Results    `Solution`, `residual` (judge any impulse), `prove` (an exact solution near by), `diagnose` (mistakes in the
-           data), `motion_error`, `redundancy`
+           data), `motion_error`, `redundancy`, `explain_slip` (why contacts slide)
 Engine     `Scene`, `Simulation`
 Measuring  `bench`, `report`, `suite` (built-in problems), `io` (files and other simulators)
 
@@ -67,6 +67,7 @@ if TYPE_CHECKING:
     from lavender.lab.diagnostics.redundancy import Redundancy, redundancy
     from lavender.lab.motion import MotionError, SolutionSet, find_solutions, motion_error
     from lavender.lab.proof import Enclosure, prove
+    from lavender.lab.slip import SlipExplanation, explain_slip
     from lavender.problem import cones as cones
     from lavender.problem.row_builder import RowBuilder
     from lavender.programs.quadratic import solve_qp
@@ -88,6 +89,7 @@ _LAZY_NAMES = {
     "lavender.lab.diagnostics.redundancy": ("Redundancy", "redundancy"),
     "lavender.lab.motion": ("MotionError", "SolutionSet", "find_solutions", "motion_error"),
     "lavender.lab.proof": ("Enclosure", "prove"),
+    "lavender.lab.slip": ("SlipExplanation", "explain_slip"),
     "lavender.problem.row_builder": ("RowBuilder",),
     "lavender.sim.engine": ("SOLVER_FIELDS", "Simulation", "Snapshot"),
     "lavender.sim.scene": ("Scene",),
@@ -146,6 +148,7 @@ __all__ = [
     "Rows",
     "Scene",
     "Simulation",
+    "SlipExplanation",
     "Snapshot",
     "Solution",
     "SolutionSet",
@@ -165,6 +168,7 @@ __all__ = [
     "diagnose",
     "engine",
     "explain",
+    "explain_slip",
     "find_solutions",
     "get",
     "io",

@@ -23,7 +23,7 @@ from lavender.cli.options import EXIT_BAD_INPUT, EXIT_INTERRUPTED, discard_outpu
 COMMAND_GROUPS = {
     "Solve and judge": ("solve", "check", "prove", "reference", "explain"),
     "Measure": ("report", "phenomena"),
-    "MuJoCo": ("record", "audit", "tune", "bench"),
+    "MuJoCo": ("record", "audit", "tune", "slip", "bench"),
     "Engine": ("run", "view", "web"),
     "Tools": ("solvers", "contract", "cases", "problems", "doctor", "export"),
 }

@@ -1,9 +1,9 @@
 """Bound the distance between an answer and an exact solution.
 
 In the metric of d, with z = D^1/2 lambda, s = D^-1/2 w, y = z - s, H = D^-1/2 A D^-1/2, Pi the projection of each
-block's law and P = dPi/dy (lavender_ext/core/block_projection.pxd), a solution z* = z + dz is a root of F(z) = z - Pi(y).
-Along the segment from z to z* the mean value of P is P0 + L E R^T, with P0 and unit columns L, R chosen below for each
-block, and
+block's law and P = dPi/dy (lavender_ext/core/block_projection.pxd), a solution z* = z + dz is a root of
+F(z) = z - Pi(y). Along the segment from z to z* the mean value of P is P0 + L E R^T, with P0 and unit columns L, R
+chosen below for each block, and
 
     G dz = -F + L v,   v = E R^T dy,   dy = (I - H) dz,   G = I - P0 + P0 H                                       (1)
     R^T dy = -R^T T F + (R^T T L) v,   T = (I - H) G^-1,   |v_g| <= e_g |R_g^T dy| for each group g                 (2)

@@ -13,6 +13,6 @@ def test_commands_read_the_folder(tmp_path, lavender):
     assert "step_000000_world_0000" in lavender("check", tmp_path / "a")[1]
     assert lavender("explain", tmp_path / "a" / recorder.files[0])[0] == 0
     arguments = ["--solvers", "pgs,newton", "--time-limit", "1", "--out", tmp_path / "page"]
-    code, output, error = lavender("report", tmp_path / "a", *arguments)
+    code, _, error = lavender("report", tmp_path / "a", *arguments)
     assert code == 0, error
     assert "their solver" in (tmp_path / "page" / "index.html").read_text()

@@ -1,0 +1,45 @@
+"""Define `lavender slip`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from lavender.cli.options import EXIT_UNMET, FILE, console, echo, one_thread
+
+
+@click.command()
+@click.argument("model", metavar="MODEL.xml", type=FILE)
+@click.option(
+    "--states",
+    metavar="FILE.npz|keyframes",
+    help="States to explain, such as states.npz of an audit; default: the initial state.",
+)
+@click.option("--steps", type=int, default=1, show_default=True,
+              help="Steps simulated from each state, with its controls; the last one is explained.")  # fmt: skip
+@click.option("--contact", "contacts", multiple=True, metavar="GEOM",
+              help="Contacts of geoms whose names contain this; may be repeated. Default: all.")  # fmt: skip
+def slip(model: Path, states: str | None, steps: int, contacts: tuple[str, ...]) -> None:
+    """Explain why contacts of a MuJoCo model slip.
+
+    MODEL.xml is an MJCF file. For each contact, the table shows its mean sliding speed in the engine's answer, in the
+    exact solution of the same problem, with round cones, with friction that is not softened, and with Coulomb's law.
+    The dominant cause is the replacement that changes the speed most, or a load above the friction limit.
+
+    Exit code 1: no state has a contact with friction.
+    """
+    from lavender.base.arrays import check_int
+    from lavender.io.recording import load_model
+    from lavender.lab.report.terminal import print_table
+    from lavender.lab.slip import explain_mujoco_slip, summarize_slip
+
+    steps = check_int("--steps", steps, 1)
+    one_thread()
+    explanations = explain_mujoco_slip(load_model(model)[1], states, contacts=contacts or None, steps=steps)
+    if not explanations:
+        echo(f"{model}: no contact with friction in these states; give other --states, or more --steps")
+        raise click.exceptions.Exit(EXIT_UNMET)
+    print_table(console(), summarize_slip(explanations))
+    worst = max(explanations, key=lambda e: float(e.variants[0].speeds.max(initial=0.0)))
+    echo(worst.sentence)

@@ -1,0 +1,386 @@
+"""Explain why contacts slip: solve the step of an engine again with one property of its model replaced after the other.
+
+    explanation = lavender.explain_slip(problem, impulse)           # a step's problem and the engine's answer
+    print(explanation.table); print(explanation.sentence)
+
+The sliding speed of a contact is the norm of the tangential relative velocity v_t = J_t v+ after the step. It is
+computed from these impulses, each with the replacements of the ones before it:
+
+    engine      the engine's answer
+    solved      the exact solution of the engine's own problem
+    disk        a round friction cone in place of a pyramid or box
+    hard        friction rows without compliance and with target velocity 0, in place of softened ones
+    coulomb     Coulomb's law in place of the convex relaxation
+
+The difference of two neighbours is the part of the slip that the replaced property causes: unfinished iterations, the
+shape of the cone, softness, the relaxation. The rest is sliding that Coulomb friction cannot prevent, because the load
+along the surface exceeds mu times the normal force. Differences are of vectors, so the parts of one contact can add up
+to more than its speed. If the last problem has several solutions, the range of the speed over the solutions that were
+found is given.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from lavender.base.arrays import FloatArray, as_array, check_float
+from lavender.base.errors import InputError
+from lavender.judge.residuals import residual
+from lavender.lab.motion import find_solutions
+from lavender.lab.report.table import Table
+from lavender.lab.report.text import NONE, format_size
+from lavender.problem import Problem
+from lavender.problem.data import check_problem
+from lavender.solving.solve import solve
+
+#: Causes in the order of replacement: cause of the difference from the next variant, variant of the larger slip.
+CAUSES = {
+    "engine": "unfinished solving",
+    "solved": "shape of the cone",
+    "disk": "softness of friction",
+    "hard": "convex relaxation",
+    "coulomb": "load above the friction limit",
+}
+# Slip below this speed is not explained: it is far below the speeds at which objects leave a gripper, and above the
+# velocity error of solutions to 1e-9.
+MIN_EXPLAINED_SLIP = 1e-6
+MAX_SEARCHED_ROWS = 120  # Several solutions are searched for only in problems of at most this many rows.
+
+
+@dataclass(frozen=True, eq=False)
+class SlipVariant:
+    """Slip of the chosen contacts in one variant of the step.
+
+    Parameters
+    ----------
+    name : str
+        Key of `CAUSES`.
+    velocity : tuple of (tangents,) arrays, m/s
+        Tangential velocity of each contact after the step.
+    relative : float
+        Relative residual of the impulses in this variant's problem; at most 1e-9 for solutions that were found.
+    note : str
+        Reason why the variant is the same as the one before, or why its solution is not accepted; "" otherwise.
+    speed_range : (2, contacts) array or None, m/s
+        Smallest and largest speed of each contact over several solutions; None if one solution was found.
+    """
+
+    name: str
+    velocity: tuple[FloatArray, ...]
+    relative: float
+    note: str = ""
+    speed_range: FloatArray | None = None
+
+    @property
+    def speeds(self) -> FloatArray:
+        """Sliding speed of each contact [m/s]."""
+        return np.array([np.linalg.norm(v) for v in self.velocity])
+
+
+@dataclass(frozen=True, eq=False)
+class SlipExplanation:
+    """Slip of contacts in each variant of one step; `str()` gives the table and the sentence.
+
+    Parameters
+    ----------
+    contacts : tuple of str
+        Names of the chosen contacts.
+    variants : tuple of SlipVariant
+        In the order of replacement.
+    """
+
+    contacts: tuple[str, ...]
+    variants: tuple[SlipVariant, ...]
+
+    def __str__(self) -> str:
+        rows = [self.table.heads, *self.table.rows]
+        return "\n".join("  ".join(map(str, row)) for row in rows) + f"\n{self.sentence}"
+
+    @property
+    def parts(self) -> dict[str, FloatArray]:
+        """Part of each contact's slip (contacts,) [m/s] by its cause."""
+        following = [v.velocity for v in self.variants[1:]]
+        zero = tuple(np.zeros_like(v) for v in self.variants[-1].velocity)
+        return {
+            CAUSES[variant.name]: np.array(
+                [np.linalg.norm(a - b) for a, b in zip(variant.velocity, after, strict=True)]
+            )
+            for variant, after in zip(self.variants, [*following, zero], strict=True)
+        }
+
+    @property
+    def causes(self) -> tuple[str, ...]:
+        """Dominant cause of each contact's slip: the largest part; "no slip" below 1e-6 m/s."""
+        parts, speeds = self.parts, self.variants[0].speeds
+        names = list(parts)
+        largest = np.argmax(np.array(list(parts.values())).reshape(len(names), -1), axis=0)
+        return tuple(
+            names[i] if speed > MIN_EXPLAINED_SLIP else "no slip"
+            for i, speed in zip(largest, speeds, strict=True)
+        )
+
+    @property
+    def table(self) -> Table:
+        """Sliding speed of each contact in each variant [m/s], and the dominant cause."""
+        heads = ["contact", *(f"{v.name} [m/s]" for v in self.variants), "dominant cause"]
+        rows = []
+        for i, name in enumerate(self.contacts):
+            speeds = [_format_speed(v, i) for v in self.variants]
+            rows.append([name, *speeds, self.causes[i]])
+        return Table(heads, rows, words=frozenset({"contact", "dominant cause"}))
+
+    @property
+    def sentence(self) -> str:
+        """The contact with the largest slip and its cause in one sentence."""
+        if not self.contacts:
+            return "No contact was chosen."
+        i = int(np.argmax(self.variants[0].speeds))
+        speed, cause = self.variants[0].speeds[i], self.causes[i]
+        if cause == "no slip":
+            return f"No chosen contact slides faster than {MIN_EXPLAINED_SLIP:g} m/s."
+        part = self.parts[cause][i]
+        notes = "".join(f" ({v.name}: {v.note})" for v in self.variants if v.note)
+        return (
+            f"{self.contacts[i]} slides fastest, with {format_size(speed)} m/s; the largest part, "
+            f"{format_size(part)} m/s, is caused by: {cause}.{notes}"
+        )
+
+
+def explain_slip(
+    problem: Problem,
+    impulse: Any,
+    *,
+    contacts: Sequence[int] | Sequence[str] | str | None = None,
+    disk: Problem | None = None,
+    tol: float = 1e-9,
+) -> SlipExplanation:
+    """Divide the slip of contacts after a step into parts by their causes.
+
+    Parameters
+    ----------
+    problem : Problem
+        The engine's problem, in generalised coordinates or with bodies.
+    impulse : (m,) N s
+        The engine's answer.
+    contacts : block indices, names or a part of names, optional
+        Contacts to explain, of `disk` if it is given. Default: all contacts with tangents.
+    disk : Problem, optional
+        The same step with friction cones in place of pyramids, over the same velocities. It is needed if `problem` has
+        the edges of pyramids as rows, because these rows do not state what a contact is.
+    tol : float, default 1e-9
+        Relative residual to which each variant is solved.
+
+    Returns
+    -------
+    SlipExplanation
+
+    Raises
+    ------
+    InputError
+        No contact has tangents, a name fits none, the impulse has another shape, or the problems have different
+        velocities.
+    CapabilityError
+        The problem is a matrix: velocities after the step are not known.
+    """
+    check_problem(problem)
+    tol = check_float("tol", tol, above=0.0)
+    answer = as_array("impulse", impulse, (problem.m,), unit="N s")
+    measured = problem if disk is None else disk
+    check_problem(measured)
+    blocks = _choose_contacts(measured, contacts)
+    jacobian = measured.jacobian.tocsr()
+    free = measured.velocity(np.zeros(measured.m))
+    if len(problem.velocity(answer)) != len(free):
+        raise InputError(
+            f"disk has {len(free)} velocities, problem {len(problem.velocity(answer))}: equal ones are needed"
+        )
+
+    def slip(velocity: FloatArray) -> tuple[FloatArray, ...]:
+        return tuple(jacobian[rows] @ velocity for rows in rows_of_contacts)
+
+    cones = measured.cones
+    rows_of_contacts = [
+        np.arange(cones.ptr[k] + 1, cones.ptr[k] + 1 + min(2, int(cones.n_tangents[k]))) for k in blocks
+    ]
+    variants = [SlipVariant("engine", slip(problem.velocity(answer)), residual(problem, answer).relative)]
+
+    def add(name: str, changed: Problem, start: FloatArray | None, note: str = "") -> FloatArray:
+        if note:
+            last = variants[-1]
+            variants.append(replace(last, name=name, note=note, speed_range=None))
+            return np.zeros(0) if start is None else start
+        solution = solve(changed, impulse=start, tol=tol)
+        failed = "" if solution.residual.relative <= max(tol, solution.residual.roundoff_floor) else (
+            f"not solved: {solution.status.name}"
+        )  # fmt: skip
+        velocity = slip(changed.velocity(solution.impulse))
+        variants.append(SlipVariant(name, velocity, solution.residual.relative, failed))
+        return solution.impulse
+
+    start = add("solved", problem, answer)
+    own_disk = measured if disk is not None else _as_disk(problem)
+    is_same_shape = own_disk is problem
+    start = add(
+        "disk",
+        own_disk,
+        start if own_disk.m == problem.m else None,
+        "cones are round" if is_same_shape else "",
+    )
+    hard, has_soft_friction = _harden_friction(own_disk)
+    start = add("hard", hard, start, "" if has_soft_friction else "friction rows are hard")
+    law_note = "the law is Coulomb's" if hard.friction == "coulomb" else (
+        "Coulomb's law is not defined for its round cones" if hard.cones.has_round else ""
+    )  # fmt: skip
+    rigid = hard if law_note else hard.relaxed("coulomb")
+    start = add("coulomb", rigid, start, law_note)
+    variants[-1] = replace(variants[-1], speed_range=_speed_range(rigid, slip))
+    names = tuple(measured.block_name(k) for k in blocks)
+    return SlipExplanation(names, tuple(variants))
+
+
+def _choose_contacts(problem: Problem, contacts: Any) -> list[int]:
+    """Return the indices of the chosen contacts."""
+    sliding = np.flatnonzero(problem.cones.n_tangents > 0).tolist()
+    if not sliding:
+        raise InputError(
+            "the problem has no contact with tangents: nothing can slide (give disk= for pyramids)"
+        )
+    if contacts is None:
+        return sliding
+    chosen: list[int] = []
+    for entry in [contacts] if isinstance(contacts, str) else contacts:
+        if isinstance(entry, str):
+            fitting = [k for k in sliding if entry in problem.block_name(k)]
+            if not fitting:
+                known = ", ".join(problem.block_name(k) for k in sliding[:8])
+                raise InputError(f"no contact's name contains {entry!r}; contacts are {known}")
+            chosen += fitting
+        elif entry in sliding:
+            chosen.append(int(entry))
+        else:
+            raise InputError(f"block {entry!r} is not a contact with tangents; these are {sliding[:20]}")
+    return list(dict.fromkeys(chosen))
+
+
+def _as_disk(problem: Problem) -> Problem:
+    """Return the problem with disks in place of boxes, or the same object if it has no boxes."""
+    if not problem.cones.has_box:
+        return problem
+    return replace(problem, cones=problem.cones.shaped("disk"))
+
+
+def _harden_friction(problem: Problem) -> tuple[Problem, bool]:
+    """Return the problem with hard friction rows at target velocity 0, and whether a row changed."""
+    rows = problem.cones.friction_rows
+    free_slip = (problem.jacobian @ problem.velocity(np.zeros(problem.m)))[rows]
+    target = problem.b[rows] + free_slip
+    soft = np.zeros(problem.m) if problem.compliance is None else np.array(problem.compliance)
+    # b holds the difference of target and J v*: a target below its rounding counts as 0.
+    rounding = 8.0 * np.finfo(float).eps * (np.abs(problem.b[rows]) + np.abs(free_slip))
+    if not soft[rows].any() and not (np.abs(target) > rounding).any():
+        return problem, False
+    b = np.array(problem.b)
+    b[rows] = -free_slip
+    soft[rows] = 0.0
+    return replace(problem, b=b, compliance=soft), True
+
+
+def _speed_range(problem: Problem, slip: Any) -> FloatArray | None:
+    """Return the smallest and largest speed of each contact over the solutions that are found, or None for one."""
+    if problem.m > MAX_SEARCHED_ROWS:
+        return None
+    motions = find_solutions(problem).motions
+    if len(motions) < 2:
+        return None
+    speeds = np.array([[np.linalg.norm(v) for v in slip(problem.velocity(x.impulse))] for x in motions])
+    return np.array([speeds.min(axis=0), speeds.max(axis=0)])
+
+
+def _format_speed(variant: SlipVariant, i: int) -> str:
+    """Format a contact's speed, or its range over several solutions."""
+    if variant.note.startswith("not solved"):
+        return NONE
+    if variant.speed_range is not None and np.ptp(variant.speed_range[:, i]) > MIN_EXPLAINED_SLIP:
+        return " to ".join(map(format_size, variant.speed_range[:, i]))
+    return format_size(float(variant.speeds[i]))
+
+
+def explain_mujoco_slip(
+    model: Any, states: Any = None, *, contacts: Sequence[str] | str | None = None, steps: int = 1
+) -> list[SlipExplanation]:
+    """Explain the slip of contacts of a MuJoCo model at given states.
+
+    Parameters
+    ----------
+    model : mujoco.MjModel
+    states : path of an .npz, "keyframes", or arrays, optional
+        As for `lavender.audit`: `states.npz` of an audit or a recording. Default: the model's initial state.
+    contacts : names or a part of names, optional
+        Geoms of the contacts to explain; default: all.
+    steps : int, default 1
+        Steps that are simulated from each state, with its controls; the last one is explained.
+
+    Returns
+    -------
+    list of SlipExplanation
+        One for each state that has a contact with friction.
+    """
+    from lavender.io import mujoco as adapter
+    from lavender.io.states import read_states
+
+    mj = adapter.package()
+    data = mj.MjData(model)
+    vectors = [None] if states is None else list(read_states(mj, model, states).vectors)
+    round_model = None
+    if model.opt.cone == mj.mjtCone.mjCONE_PYRAMIDAL:
+        round_model = copy.deepcopy(model)
+        round_model.opt.cone = mj.mjtCone.mjCONE_ELLIPTIC
+    explanations = []
+    for vector in vectors:
+        mj.mj_resetData(model, data)
+        if vector is not None:
+            mj.mj_setState(model, data, vector, mj.mjtState.mjSTATE_INTEGRATION)
+        for _ in range(steps - 1):
+            mj.mj_step(model, data)
+        mj.mj_forward(model, data)
+        problem = adapter.from_mujoco(model, data)
+        disk = None
+        if round_model is not None:
+            other = mj.MjData(round_model)
+            state = np.empty(mj.mj_stateSize(model, mj.mjtState.mjSTATE_INTEGRATION))
+            mj.mj_getState(model, data, state, mj.mjtState.mjSTATE_INTEGRATION)
+            mj.mj_setState(round_model, other, state, mj.mjtState.mjSTATE_INTEGRATION)
+            mj.mj_forward(round_model, other)
+            disk = adapter.from_mujoco(round_model, other)
+        if (problem if disk is None else disk).cones.n_tangents.any():
+            explanations.append(
+                explain_slip(problem, adapter.impulse(model, data), contacts=contacts, disk=disk)
+            )
+    return explanations
+
+
+def summarize_slip(explanations: Iterable[SlipExplanation]) -> Table:
+    """Return the mean sliding speed of each contact [m/s] in each variant over several steps, and its main cause."""
+    speeds: dict[str, list[list[float]]] = {}
+    parts: dict[str, dict[str, float]] = {}
+    names: list[str] = []
+    for explanation in explanations:
+        names = names or [variant.name for variant in explanation.variants]
+        for i, contact in enumerate(explanation.contacts):
+            key = contact.partition(" (")[2].rstrip(")") or contact  # the geoms, without the contact's number
+            speeds.setdefault(key, []).append([float(v.speeds[i]) for v in explanation.variants])
+            sums = parts.setdefault(key, dict.fromkeys(CAUSES.values(), 0.0))
+            for cause, sizes in explanation.parts.items():
+                sums[cause] += float(sizes[i])
+    rows = []
+    for key, values in speeds.items():
+        mean = np.mean(values, axis=0)
+        cause = max(parts[key], key=lambda c: parts[key][c]) if mean[0] > MIN_EXPLAINED_SLIP else "no slip"
+        rows.append([key, str(len(values)), *map(format_size, mean.tolist()), cause])
+    heads = ["contact", "steps x points", *(f"{name} [m/s]" for name in names), "dominant cause"]
+    return Table(heads, rows, words=frozenset({"contact", "dominant cause"}))

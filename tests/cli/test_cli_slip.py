@@ -1,0 +1,28 @@
+"""`lavender slip`."""
+
+import pytest
+
+pytest.importorskip("mujoco", reason="needs MuJoCo: pip install 'lavender-contact[peers]'")
+
+SLOPE = """<mujoco><option timestep="0.002" gravity="5.5 0 -8.1" cone="elliptic"/><worldbody>
+  <geom name="slope" type="plane" size="9 9 .1" friction="0.5 0.005 0.0001"/>
+  <body pos="0 0 .05"><freejoint/><geom name="box" type="box" size=".2 .2 .05" friction="0.5 0.005 0.0001"/></body>
+  </worldbody></mujoco>"""
+
+
+def test_the_table_names_the_cause(lavender, tmp_path):
+    (tmp_path / "slope.xml").write_text(SLOPE)
+    code, output, error = lavender("slip", tmp_path / "slope.xml", "--steps", 15)
+    assert code == 0, error
+    assert "slope, box" in output and "load above the friction limit" in output
+    code, output, error = lavender("slip", tmp_path / "slope.xml", "--steps", 15, "--contact", "hand")
+    assert code == 2 and "hand" in error
+
+
+def test_no_contact_is_stated(lavender, tmp_path):
+    (tmp_path / "air.xml").write_text(
+        "<mujoco><worldbody><body><freejoint/><geom size='.1'/></body></worldbody></mujoco>"
+    )
+    code, output, _ = lavender("slip", tmp_path / "air.xml")
+    assert code == 1 and "no contact with friction" in output
+    assert lavender("slip", tmp_path / "air.xml", "--steps", 0)[0] == 2

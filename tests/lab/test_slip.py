@@ -1,0 +1,181 @@
+"""The cause of slip of scenes whose answer is known."""
+
+import numpy as np
+import pytest
+
+import lavender as lv
+from lavender.lab.slip import explain_mujoco_slip, explain_slip, summarize_slip
+
+mujoco = pytest.importorskip("mujoco", reason="needs MuJoCo: pip install 'lavender-contact[peers]'")
+
+GRAVITY = 9.81
+
+
+def block(angle, friction=0.5, option="", condim=3):
+    """A box on a slope of this angle [rad], as a plane under tilted gravity."""
+    return mujoco.MjModel.from_xml_string(f"""<mujoco>
+      <option timestep="0.002" gravity="{GRAVITY * np.sin(angle)} 0 {-GRAVITY * np.cos(angle)}" {option}/>
+      <default><geom friction="{friction} 0.005 0.0001" condim="{condim}"/></default>
+      <worldbody><geom name="slope" type="plane" size="50 50 .1"/>
+      <body pos="0 0 .05"><freejoint/><geom name="box" type="box" size=".2 .2 .05" mass="1"/></body>
+      </worldbody></mujoco>""")
+
+
+def dominant(explanation):
+    """Return the cause of the fastest contact."""
+    return explanation.causes[int(np.argmax(explanation.variants[0].speeds))]
+
+
+@pytest.mark.parametrize("cone", ["elliptic", "pyramidal"])
+def test_below_the_friction_angle_a_block_creeps_because_friction_is_soft(cone):
+    angle = 0.3  # tan 0.309 < 0.5
+    explanation = explain_mujoco_slip(block(angle, option=f'cone="{cone}"'), steps=600)[0]
+    assert set(explanation.causes) == {"softness of friction"}
+    hard = explanation.variants[3]
+    assert hard.name == "hard" and hard.speeds.max() < 1e-6
+    assert all(v.relative <= 1e-9 for v in explanation.variants[1:] if not v.note)
+
+
+def test_creep_has_the_speed_of_the_softened_row():
+    """A steady creep v of n equal contacts has b v + R f = 0 on tangent rows, aref = -b v, f = m g sin(angle) / n."""
+    angle = 0.2
+    model = block(angle, option='cone="elliptic"')
+    data = mujoco.MjData(model)
+    for _ in range(1500):
+        mujoco.mj_step(model, data)
+    mujoco.mj_forward(model, data)
+    tangent = int(data.contact.efc_address[0]) + 1
+    explanation = explain_mujoco_slip(model, steps=1501)[0]
+    force = GRAVITY * np.sin(angle) / data.ncon
+    damping = (
+        -data.efc_aref[tangent : tangent + 2]
+        @ np.ones(2)
+        / (data.efc_vel[tangent : tangent + 2] @ np.ones(2))
+    )
+    speed = data.efc_R[tangent] * force / damping
+    assert explanation.variants[0].speeds == pytest.approx(np.full(data.ncon, speed), rel=0.02)
+
+
+def test_above_the_friction_angle_the_load_is_too_large():
+    angle, friction = 0.6, 0.5  # tan 0.684 > 0.5
+    steps = 150
+    explanation = explain_mujoco_slip(block(angle, friction, 'cone="elliptic"'), steps=steps)[0]
+    assert set(explanation.causes) == {"load above the friction limit"}
+    expected = GRAVITY * (np.sin(angle) - friction * np.cos(angle)) * steps * 0.002
+    assert explanation.variants[-1].speeds == pytest.approx(
+        np.full(len(explanation.contacts), expected), rel=0.05
+    )
+
+
+def test_iterations_that_are_missing_are_the_cause():
+    model = block(0.3, option='cone="elliptic" solver="PGS" iterations="1" tolerance="0" impratio="1000"')
+    exact = block(0.3, option='cone="elliptic" impratio="1000"')
+    assert dominant(explain_mujoco_slip(exact, steps=40)[0]) != "unfinished solving"
+    data = mujoco.MjData(exact)
+    for _ in range(40):
+        mujoco.mj_step(exact, data)
+    state = np.empty(mujoco.mj_stateSize(exact, mujoco.mjtState.mjSTATE_INTEGRATION))
+    data.qacc_warmstart[:] = 0.0
+    mujoco.mj_getState(exact, data, state, mujoco.mjtState.mjSTATE_INTEGRATION)
+    assert dominant(explain_mujoco_slip(model, state[None])[0]) == "unfinished solving"
+
+
+def slide(velocity, cones, friction="coulomb", compliance=None):
+    """Build a step of a particle of 1 kg on the ground that falls with 1 m/s and slides with `velocity` (2,) [m/s]."""
+    jac = np.eye(3)[[2, 0, 1]]
+    free = [*velocity, -1.0]
+    return lv.Problem.from_jacobian(
+        jac,
+        np.eye(3),
+        free,
+        cones=cones,
+        friction=friction,
+        compliance=compliance,
+        names=["contact 0 (foot, ground)"],
+    )
+
+
+def test_the_convex_relaxation_is_a_cause():
+    # Coulomb: the normal impulse is 1 N s, friction 0.5: 2 - 0.5 = 1.5 m/s remain. The relaxation lifts the particle
+    # with v_n = mu v_t, and takes (2 - 0.5) / (1 + 0.25) = 1.2 m/s.
+    problem = slide([2.0, 0.0], lv.Cones.contacts(0.5), friction="cone")
+    explanation = explain_slip(problem, lv.solve(problem, tol=1e-9).impulse)
+    speeds = {v.name: v.speeds[0] for v in explanation.variants}
+    assert speeds["solved"] == pytest.approx(1.2) and speeds["coulomb"] == pytest.approx(1.5)
+    assert explanation.parts["convex relaxation"] == pytest.approx([0.3])
+    assert explanation.parts["load above the friction limit"] == pytest.approx([1.5])
+
+
+def test_the_shape_of_the_cone_is_a_cause():
+    # A box bounds each tangent by 0.5 N s, a disk their norm: along the diagonal 0.707 or 0.5 m/s are lost.
+    problem = slide([1.0, 1.0], lv.Cones.contacts(0.5).shaped("box"))
+    explanation = explain_slip(problem, lv.solve(problem, tol=1e-9).impulse)
+    speeds = {v.name: v.speeds[0] for v in explanation.variants}
+    assert speeds["solved"] == pytest.approx(np.sqrt(0.5)) and speeds["disk"] == pytest.approx(
+        np.sqrt(2.0) - 0.5
+    )
+    assert explanation.parts["shape of the cone"] == pytest.approx([np.sqrt(2.0) - 0.5 - np.sqrt(0.5)])
+
+
+@pytest.mark.parametrize(
+    ("grip", "cause"), [(30.0, "softness of friction"), (6.0, "load above the friction limit")]
+)
+def test_a_gripper_holds_a_box_or_drops_it(grip, cause):
+    # Two fingers press with `grip` [N] each: friction 2 * 0.5 * grip against a weight of 9.81 N.
+    model = mujoco.MjModel.from_xml_string(f"""<mujoco><option timestep="0.002" cone="elliptic"/>
+      <default><geom friction="0.5 0.005 0.0001"/></default><worldbody>
+      <body pos="-.07 0 1"><joint name="left" type="slide" axis="1 0 0"/>
+        <geom name="left" type="box" size=".02 .05 .05" mass=".1"/></body>
+      <body pos=".07 0 1"><joint name="right" type="slide" axis="-1 0 0"/>
+        <geom name="right" type="box" size=".02 .05 .05" mass=".1"/></body>
+      <body pos="0 0 1"><freejoint/><geom name="box" type="box" size=".05 .05 .05" mass="1"/></body></worldbody>
+      <actuator><motor joint="left" ctrllimited="false"/><motor joint="right" ctrllimited="false"/></actuator>
+      <keyframe><key ctrl="{grip} {grip}"/></keyframe></mujoco>""")
+    explanation = explain_mujoco_slip(model, "keyframes", contacts="box", steps=20)[0]
+    assert dominant(explanation) == cause
+
+
+def test_velocity_of_the_engines_impulses_is_the_engines_own():
+    model = block(0.3, option='cone="elliptic"')
+    data = mujoco.MjData(model)
+    for _ in range(100):
+        mujoco.mj_step(model, data)
+    mujoco.mj_forward(model, data)
+    problem = lv.io.from_mujoco(model, data)
+    after = problem.velocity(lv.io.mujoco.impulse(model, data))
+    mujoco.mj_step(model, data)
+    np.testing.assert_allclose(after, data.qvel, atol=1e-6)
+
+
+def test_several_solutions_give_a_range():
+    # A ball between two walls that touch it with opposite normals: any pair of equal normal impulses is a solution, and
+    # friction of a pair can be anything up to their sum.
+    jac = np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, 1.0]])
+    problem = lv.Problem.from_jacobian(
+        jac,
+        np.eye(2),
+        [0.0, -1.0],
+        cones=lv.Cones.contacts(0.5, tangents=1, count=2),
+        names=["left", "right"],
+    )
+    explanation = explain_slip(problem, np.zeros(4))
+    low, high = explanation.variants[-1].speed_range
+    assert low.max() < 1e-6 and high.min() > 0.9
+    assert " to " in str(explanation.table.rows[0][5])
+
+
+def test_chosen_contacts_and_summary():
+    explanations = explain_mujoco_slip(block(0.6, option='cone="elliptic"'), steps=100, contacts="box")
+    table = summarize_slip(explanations)
+    assert [str(row[0]) for row in table.rows] == ["slope, box"]
+    assert table.rows[0][-1] == "load above the friction limit"
+    with pytest.raises(lv.InputError, match="no contact's name contains 'hand'"):
+        explain_mujoco_slip(block(0.6, option='cone="elliptic"'), steps=100, contacts="hand")
+
+
+def test_problems_without_contacts_or_velocities_are_rejected():
+    with pytest.raises(lv.InputError, match="no contact with tangents"):
+        explain_slip(lv.Problem.lcp(np.eye(2), np.ones(2)), np.zeros(2))
+    matrix = lv.Problem.contact(np.eye(3), np.array([1.0, 1.0, 0.0]), mu=0.5)
+    with pytest.raises(lv.LavenderError):
+        explain_slip(matrix, np.zeros(3))
