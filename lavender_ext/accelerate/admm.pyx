@@ -30,10 +30,8 @@ from lavender_ext.accelerate.mixing cimport CONTROL, MAX_MEMORY, UNDONE, forget,
 from lavender_ext.core.block cimport clip, length, norm2, row_group, locate_in_round_cone, round_scale, projected_normal
 from lavender_ext.core.block_types cimport CONE, blocks_t, is_round, is_rows, get_friction_components, friction_components_t
 from lavender_ext.core.problem cimport Data
-from lavender_ext.factor.blocks cimport sparse_t
 from lavender_ext.factor.dense cimport dense_cholesky_solve
-from lavender_ext.factor.sparse cimport SparsePanels
-from lavender_ext.factor.supernodal cimport sparse_solve
+from lavender_ext.factor.sparse cimport SparsePanels, sparse_solve, sparse_t
 from lavender_ext.judge.reference cimport is_inactive_contact, is_inactive_row
 
 

@@ -2,7 +2,7 @@
 
 | method | over A | over bodies | over J and M |
 |---|---|---|---|
-| NEWTON | bounded rows, cones, Coulomb's law; dense | the same, of up to 1,500 bodies | the same, islands |
+| NEWTON | bounded rows, cones, Coulomb's law; dense | the same; sparse supernodes | the same, islands |
 """
 from libc.stdint cimport int32_t
 

@@ -24,7 +24,8 @@ from lavender_ext.engine.arrays cimport S_OUT, bind, engine_t
 from lavender_ext.engine.view cimport view
 from lavender_ext.judge.measure cimport find_reference, score_slack
 from lavender_ext.judge.score cimport new_score, score_t
-from lavender_ext.newton.solve cimport bodies_workspace_size, bodies_start, system_step
+from lavender_ext.factor.tiles cimport has_wide
+from lavender_ext.newton.solve cimport bodies_start, max_bodies_index_size, system_step
 from lavender_ext.newton.warm_start cimport (FACTORED, JUDGED, MOST_TRACED, UNDECIDED, band_width, judged, bind_warm_workspace,
                                       observe, room_of, start_errors, warm_solve, warm_t)
 
@@ -32,16 +33,14 @@ from lavender_ext.newton.warm_start cimport (FACTORED, JUDGED, MOST_TRACED, UNDE
 cdef enum:
     SCRATCH_HEADER = 4          # integers before the method's in scratch: [0] band width, [1] number of the method's integers
     INDEX_LIMIT = 2147483647
+    MAX_SUBSTEP_BODIES = 1500   # The integer scratch is allocated before the analysis, as if the factor were full: 27 MB here.
     MAX_SUBSTEP_FACTORISATIONS = 200    # of a substep, since a frame waits for them
 
 
 cdef inline workspace_t method_workspace_size(const blocks_t* p, const rows_t* r) noexcept nogil:
-    """Return the workspace of Newton's method, with n_index = 0 if it does not accept the problem."""
+    """Return the workspace of Newton's method, with n_index = 0 if it does not accept the problem, or above MAX_SUBSTEP_BODIES."""
     cdef view_t v = view_t(p[0], NULL, r, NULL)
-    cdef workspace_t workspace = workspace_t(0, 0, NULL, NULL, 0, 0, 0, 0.0)
-    if not bodies_workspace_size(&v, NULL, &workspace):
-        workspace.n_index = 0
-    return workspace
+    return workspace_t(max_bodies_index_size(&v) if r.n_bodies <= MAX_SUBSTEP_BODIES else 0, 0, NULL, NULL, 0, 0, 0, 0.0)
 
 
 cdef public int32_t lav_newton_index_workspace_size(const int32_t* size, double* real, int32_t* index, uint64_t* keys,
@@ -122,7 +121,7 @@ cdef inline int32_t newton_substep(const blocks_t* p, const rows_t* r, warm_t* s
     if not scratch[1]:
         return UNDECIDED
     problem = view_t(p[0], NULL, r, NULL)
-    o = options_t(0, MAX_SUBSTEP_FACTORISATIONS, 0, 0, 0, tol, e0, v0, 1.0 / 0.0, 0.0)
+    o = options_t(0, MAX_SUBSTEP_FACTORISATIONS, 0, 0, has_wide(), tol, e0, v0, 1.0 / 0.0, 0.0)
     # `lav_newton_plan` computed the pattern
     n = workspace_t(scratch[1], INDEX_LIMIT, scratch + SCRATCH_HEADER, workspace, 1, 0, 0, 0.0)
     return run_newton_stages(&problem, &o, &n, s, lam, v)

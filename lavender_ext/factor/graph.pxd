@@ -1,49 +1,50 @@
 """An elimination order of bodies, and the pattern of the matrix over them in that order.
 
-Bodies with a block in common are neighbours. Their order is that of least degree (minimum_degree.pxd), columns of one
-pattern put beside each other.
+Bodies with a common block are neighbours. They are ordered by minimum degree (`minimum_degree.pxd`), with columns of one
+pattern adjacent.
 """
 from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memcpy
 
-from lavender_ext.factor.minimum_degree cimport degree_order
-from lavender_ext.factor.symbolic cimport postordered
+from lavender_ext.factor.minimum_degree cimport minimum_degree_order
+from lavender_ext.factor.symbolic cimport apply_postorder
 
 
 cdef inline int64_t order_workspace_size(int64_t n, int64_t neighbours) noexcept nogil:
-    """Whole numbers of scratch that `order_graph` takes, from a multiple of 8 bytes on."""
+    """Return the number of int32 of scratch for `order_graph`, aligned to 8 bytes."""
     return 13 * n + 2 + neighbours + neighbours // 4
 
 
 cdef inline void order_graph(int32_t n, const int32_t* ptr, const int32_t* near, int32_t* scratch, int32_t* order,
                              int32_t* rank, int32_t* nptr, int32_t* nind, int32_t* parent) noexcept nogil:
-    """An order of elimination (n) of a graph's vertices, the place (n) of each, and the lower pattern in it.
+    """Compute an elimination order (n) of the vertices of a graph, the rank (n) of each, and the lower pattern in this order.
 
-    near[ptr[i]:ptr[i + 1]] are the neighbours of i, without i; scratch (`order_workspace_size`); nind (half of near and n).
+    near[ptr[i]:ptr[i + 1]] are the neighbours of i, without i. scratch has `order_workspace_size`, nind half as many entries as
+    near plus n.
     """
-    cdef int64_t* left = <int64_t*>scratch
-    cdef int32_t* whole = scratch + 2 * n               # 8 n + 1
-    cdef int32_t* head = whole + 8 * n + 1              # n + 1
+    cdef int64_t* outside = <int64_t*>scratch
+    cdef int32_t* integers = scratch + 2 * n            # 8 n + 1
+    cdef int32_t* head = integers + 8 * n + 1           # n + 1
     cdef int32_t* size = head + n + 1
     cdef int32_t* lists = size + n                      # the rest
     cdef int32_t i
     for i in range(n):
         size[i] = 1
-    memcpy(whole, ptr, (n + 1) * sizeof(int32_t))
-    if ptr[n]:                                          # of no neighbours there is no array
+    memcpy(integers, ptr, (n + 1) * sizeof(int32_t))
+    if ptr[n]:                                          # near may be NULL without neighbours
         memcpy(lists, near, ptr[n] * sizeof(int32_t))
-    degree_order(n, size, ptr[n] + ptr[n] // 4 + n, lists, whole, left, head, order)
-    postordered(n, ptr, near, order, rank, nptr, nind, parent, whole)
+    minimum_degree_order(n, size, ptr[n] + ptr[n] // 4 + n, lists, integers, outside, head, order)
+    apply_postorder(n, ptr, near, order, rank, nptr, nind, parent, integers)
 
 
 cdef inline int64_t pattern_workspace_size(int64_t n, int64_t k) noexcept nogil:
-    """Whole numbers of scratch that `eliminate_bodies` takes for n bodies and k blocks, from a multiple of 8 bytes on."""
+    """Return the number of int32 of scratch for `eliminate_bodies` of n bodies and k blocks, aligned to 8 bytes."""
     return order_workspace_size(n, 2 * k) + 3 * n + 1 + 2 * k
 
 
 cdef inline void find_neighbours(int32_t k, const int32_t* body, int32_t n, int32_t* mark, int32_t* ptr,
                                  int32_t* near) noexcept nogil:
-    """near[ptr[i]:ptr[i + 1]] are the neighbours of body i, each once; near (2 k), mark (n) is scratch."""
+    """List the neighbours of body i, each once, in near[ptr[i]:ptr[i + 1]]; near has 2 k entries, mark (n) is scratch."""
     cdef int32_t i, a, b, q, to = 0, first = 0
     for i in range(n + 1):
         ptr[i] = 0
@@ -78,11 +79,12 @@ cdef inline void find_neighbours(int32_t k, const int32_t* body, int32_t n, int3
 
 
 cdef inline void eliminate_bodies(int32_t k, const int32_t* body, int32_t n, int32_t* scratch, int32_t* parent,
-                                  int32_t* nptr, int32_t* nind, int32_t* node, int32_t* slot, int32_t* turned) noexcept nogil:
-    """Lower block rows in elimination order, and of each block its two places (larger first) and three slots.
+                                  int32_t* nptr, int32_t* nind, int32_t* node, int32_t* slot, int32_t* swapped) noexcept nogil:
+    """Order the bodies of blocks (k, 2), -1 if static, and list the lower block rows of the matrix over them in that order.
 
-    body (k, 2), -1 static; scratch (`pattern_workspace_size`); parent (n), nptr (n + 1), nind (n + k), node (k, 2), slot (k, 3),
-    turned (k).
+    node (k, 2) receives the ranks of each block's bodies, the larger first, slot (k, 3) its entries first-first, second-second
+    and first-second, swapped (k) whether its bodies are exchanged. parent is (n), nptr (n + 1), nind (n + k); scratch has
+    `pattern_workspace_size`.
     """
     cdef int32_t* order = scratch + order_workspace_size(n, 2 * k)
     cdef int32_t* rank = order + n
@@ -94,7 +96,7 @@ cdef inline void eliminate_bodies(int32_t k, const int32_t* body, int32_t n, int
     for i in range(k):
         a = rank[body[2 * i]] if body[2 * i] >= 0 else -1
         b = rank[body[2 * i + 1]] if body[2 * i + 1] >= 0 else -1
-        turned[i] = a < b
+        swapped[i] = a < b
         if a < b:
             r = a
             a = b

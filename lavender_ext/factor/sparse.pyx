@@ -1,13 +1,8 @@
-"""A sparse matrix of any pattern and its factor by dense panels: L L^T, or L U with rows exchanged inside a panel; a full
-one and its L L^T.
+"""Factorisation of a sparse matrix in compressed rows: L L^T, or L U with row exchanges inside supernodes; and of a full one.
 
-    A_JJ' = A_JJ - sum over K below J of L_K U_K,   P A_JJ' = L_JJ U_JJ                                    (1)
-    L_J = (A_J - sum L_K U_KJ) U_JJ^-1 below,   U_J = L_JJ^-1 P (A_J - sum L_JK U_K) beside                (2)
-
-Both on the pattern of the symmetric factor, in an order of least degree, rows of one pattern taken as one vertex. A
-panel is held column by column, its own columns' rows first, then the rows below; of L U what is beside it transposed,
-so that every update is C - A B^T (`tiles.pxd`). 1 / L_jj or 1 / U_jj stands on the diagonal. L U is of
-D^-1/2 A D^-1/2: what rows a panel exchanges are of one size, and how small a pivot is shows.
+The pattern must be symmetric. Rows are ordered by minimum degree (`symbolic.pyx`) and factored by supernodes
+(`supernodal.pxd`). L U is that of D^-1/2 A D^-1/2: rows that are exchanged have comparable entries, and small pivots are
+visible.
 """
 from libc.math cimport sqrt
 from libc.stdint cimport int32_t, int64_t
@@ -15,126 +10,70 @@ from libc.string cimport memset
 
 import numpy as np
 
-from lavender_ext.factor.symbolic import analysed
+from lavender_ext.factor.symbolic import analyse
 
 from lavender_ext.core.csr cimport transpose_csr, scan_entries
 from lavender_ext.core.view cimport csr_t
-from lavender_ext.factor.blocks cimport sparse_t
 from lavender_ext.factor.dense cimport cholesky_workspace_size, dense_cholesky, dense_cholesky_solve
-from lavender_ext.factor.supernodal cimport begin_panels, hand_on, place_rows, sparse_solve, take_panels
-from lavender_ext.factor.panels cimport LU_STRIP, cholesky_panel, lu_panel
-from lavender_ext.factor.tiles cimport axpy_subtract, gemm_subtract_nt, has_wide
+from lavender_ext.factor.sparse cimport sparse_solve, sparse_t
+from lavender_ext.factor.supernodal cimport (begin_supernodes, factor_supernode, panel_width, rows_below, set_local_rows,
+                                             supernodal_scratch_size, supernodal_t)
+from lavender_ext.factor.tiles cimport has_wide
 
 
-cdef inline int32_t lu_panel_with_rows(const sparse_t* f, int32_t width, int32_t rows, double* a, double* u, int32_t* swap,
-                                       double min_pivot) noexcept nogil:
-    """Factor columns a (rows, width) with L below, and u (rows - width, width), the transposed rows beside them, by (1) and (2).
-
-    Return the number of pivots that are too small.
-    """
-    cdef int32_t j, j0 = 0, t, n, i, below = rows - width
-    cdef int32_t lost = lu_panel(f.wide, width, rows, width, a, rows, swap, min_pivot, f.temp)
-    cdef double x
-    cdef double* y
-    cdef double* z
-    if below == 0:
-        return lost
-    # exchange the rows of U
-    for j in range(width):
-        if swap[j] != j:
-            y = u + <int64_t>j * below
-            z = u + <int64_t>swap[j] * below
-            for i in range(below):
-                x = y[i]
-                y[i] = z[i]
-                z[i] = x
-    # solve with L
-    while j0 < width:
-        n = LU_STRIP if j0 + LU_STRIP <= width else width - j0
-        gemm_subtract_nt(f.wide, below, n, j0, u, below, a + j0, rows, u + <int64_t>j0 * below, below)
-        for j in range(j0 + 1, j0 + n):
-            for t in range(j0, j):
-                axpy_subtract(below, a[j + <int64_t>t * rows], u + <int64_t>t * below, u + <int64_t>j * below)
-        j0 += n
-    return lost
-
-
-cdef inline void fill(const sparse_t* f, int32_t i, const int32_t* indptr, const int32_t* indices, const double* data,
-                      const int32_t* tptr, const int32_t* tind, const double* tdata, const double* d,
-                      double shift) noexcept nogil:
-    """Entries of A + shift D in the columns of panel i and, of L U, beside them."""
+cdef inline void fill_supernode(const sparse_t* s, int32_t i, const int32_t* indptr, const int32_t* indices,
+                                const double* data, const int32_t* tptr, const int32_t* tind, const double* tdata,
+                                const double* d, double shift) noexcept nogil:
+    """Copy the entries of A + shift D in the columns of supernode i to its panel, and for L U those of its rows."""
+    cdef const supernodal_t* f = &s.factor
     cdef int32_t base = f.first[i], after = f.first[i + 1], c, q, p, row
-    cdef int64_t own = after - base, beside = f.rptr[i + 1] - f.rptr[i], ld = own + beside
-    cdef double* v = f.val + f.at[i]
-    cdef double* u = f.up + f.beside[i]
-    cdef double s
+    cdef int64_t own = after - base, beside = rows_below(f, i), ld = own + beside
+    cdef double* v = f.values + f.value_offset[i]
+    cdef double* u
+    cdef double scale
     memset(v, 0, sizeof(double) * ld * own)
-    if not f.lu:
+    if not s.lu:
         for c in range(base, after):
             row = f.order[c]
             for q in range(indptr[row], indptr[row + 1]):
-                p = f.place[indices[q]]
+                p = f.position[indices[q]]
                 if p >= c:
-                    v[f.rel[p]] = data[q]
+                    v[f.local_row[p]] = data[q]
             v[c - base] += shift * d[row]
             v += ld
         return
+    u = f.upper + f.upper_offset[i]
     memset(u, 0, sizeof(double) * beside * own)
     for c in range(base, after):
         row = f.order[c]
-        s = f.scale[c]
+        scale = s.scale[c]
         for q in range(indptr[row], indptr[row + 1]):
-            p = f.place[indices[q]]
+            p = f.position[indices[q]]
             if p >= after:
-                u[f.rel[p] - own] = s * data[q] * f.scale[p]
+                u[f.local_row[p] - own] = scale * data[q] * s.scale[p]
         for q in range(tptr[row], tptr[row + 1]):
-            p = f.place[tind[q]]
+            p = f.position[tind[q]]
             if p >= base:
-                v[f.rel[p]] = f.scale[p] * tdata[q] * s
+                v[f.local_row[p]] = s.scale[p] * tdata[q] * scale
         v[c - base] += shift
         v += ld
         u += beside
 
 
-cdef public int32_t lav_sparse_factor(const sparse_t* f, const int32_t* indptr, const int32_t* indices,
+cdef public int32_t lav_sparse_factor(const sparse_t* s, const int32_t* indptr, const int32_t* indices,
                                       const double* data, const int32_t* tptr, const int32_t* tind, const double* tdata,
                                       const double* d, double shift, double tiny) noexcept nogil:
-    """Factor A + shift D, D = diag(d) > 0; of L U with A^T beside. How many pivots were at most tiny of d."""
-    cdef int32_t i, k, q, lost = 0
+    """Factor A + shift D, D = diag(d) > 0; L U also reads A^T. Return the number of pivots of at most tiny d."""
+    cdef const supernodal_t* f = &s.factor
+    cdef int32_t i, k, lost = 0
     for k in range(f.n):
-        f.scale[k] = 1.0 / sqrt(d[f.order[k]]) if f.lu else tiny * d[f.order[k]]
-    begin_panels(f)
-    for i in range(f.panels):
-        place_rows(f, i)
-        fill(f, i, indptr, indices, data, tptr, tind, tdata, d, shift)
-        take_panels(f, i, f.lu)
-        k = f.first[i + 1] - f.first[i]
-        q = k + f.rptr[i + 1] - f.rptr[i]
-        if f.lu:
-            lost += lu_panel_with_rows(f, k, q, f.val + f.at[i], f.up + f.beside[i], f.swap + f.first[i], tiny)
-        else:
-            lost += cholesky_panel(f.wide, k, q, f.val + f.at[i], f.scale + f.first[i])
-        hand_on(f, i, f.rptr[i])
+        s.scale[k] = 1.0 / sqrt(d[f.order[k]]) if s.lu else tiny * d[f.order[k]]
+    begin_supernodes(f)
+    for i in range(f.supernodes):
+        set_local_rows(f, i)
+        fill_supernode(s, i, indptr, indices, data, tptr, tind, tdata, d, shift)
+        lost += factor_supernode(f, i, s.lu, s.scale, tiny)
     return lost
-
-
-cdef inline int64_t panel_workspace_size(const sparse_t* f) noexcept nogil:
-    # for what one panel takes from another, for the rows below it, and of L U for the tops of a strip
-    cdef int32_t i, j, run
-    cdef int64_t most = 0, needed
-    for i in range(f.panels):
-        needed = <int64_t>(f.first[i + 1] - f.first[i]) * LU_STRIP if f.lu else 0
-        if f.rptr[i + 1] - f.rptr[i] > needed:
-            needed = f.rptr[i + 1] - f.rptr[i]
-        if needed > most:
-            most = needed
-        run = 0
-        for j in range(f.rptr[i], f.rptr[i + 1]):
-            run = run + 1 if j > f.rptr[i] and f.of[f.rows[j]] == f.of[f.rows[j - 1]] else 1
-            needed = <int64_t>run * (f.rptr[i + 1] - j + run - 1)
-            if needed > most:
-                most = needed
-    return most
 
 
 def bandwidth(const int32_t[::1] indptr, const int32_t[::1] indices):
@@ -174,7 +113,7 @@ def is_mirrored(const int32_t[::1] indptr, const int32_t[::1] indices):
         for q in range(indptr[i], indptr[i + 1]):
             j = indices[q]
             if cursor[j] == indptr[j + 1] or indices[cursor[j]] != i:
-                return False                            # rows are gone through in order: entry i of row j is next
+                return False                            # Rows are visited in order, so that entry i of row j is next.
             cursor[j] += 1
     return True
 
@@ -211,97 +150,79 @@ cdef class SparsePanels:
     ----------
     indptr, indices : (n + 1,), (nnz,) int32
     lu : bool
-        L U; else L L^T of a symmetric matrix, of which the entries at and after the diagonal in the order are read.
+        L U; otherwise L L^T of a symmetric matrix, of which the entries at and after the diagonal in the order are read.
     wide : bool
-        Four lanes where the machine has them: the same bits.
+        Use four lanes if the processor has them; the bits are the same.
     like : SparsePanels, optional
-        Of the same pattern, whose analysis serves again.
+        A factor of the same pattern, whose analysis is reused.
     """
 
     def __init__(self, indptr, indices, bint lu, bint wide=True, SparsePanels like=None):
-        cdef int32_t n = <int32_t>len(indptr) - 1
+        cdef int32_t n = <int32_t>len(indptr) - 1, k
+        cdef int32_t[::1] integers
+        cdef int64_t[::1] offsets
+        cdef supernodal_t* f = &self.f.factor
+        cdef int32_t* p
         if n < 1:
             raise ValueError("a matrix of one row or more")
         if like is None:
-            analysis = analysed(indptr, indices)
-        elif like.f.n == n and like.indices.shape[0] == len(indices):
-            analysis = like.keep[0].copy(), like.keep[1], like.half
+            self.analysis = analyse(indptr, indices)
+        elif like.f.factor.n == n and like.indices.shape[0] == len(indices):
+            self.analysis = like.analysis[0].copy(), *like.analysis[1:]
         else:
             raise ValueError("panels of another matrix")
         self.indptr, self.indices = indptr, indices
-        self._hold(analysis, n, lu, wide)
+        integers, offsets, self.cholesky_work = self.analysis
+        k = <int32_t>(offsets.shape[0] // 2 - 1)
+        p = &integers[0]                                # The layout is that of `analyse`.
+        f.order, f.position, f.supernode_of, f.swap, f.local_row = p, p + n, p + 2 * n, p + 3 * n, p + 4 * n
+        f.first, f.row_ptr = p + 5 * n, p + 5 * n + k + 1
+        f.head = p + 5 * n + 2 * (k + 1)
+        f.link, f.next_row, f.row_indices = f.head + k, f.head + 2 * k, f.head + 3 * k
+        f.value_offset, f.upper_offset = &offsets[0], &offsets[0] + k + 1
+        f.n, f.supernodes, f.wide, self.f.lu = n, k, wide and has_wide(), lu
+        self.work = 2.0 * self.cholesky_work if lu else self.cholesky_work
+        self.entries = f.value_offset[k] + (f.upper_offset[k] if lu else 0)
 
-    cdef _hold(self, analysis, int32_t n, bint lu, bint wide):
-        whole_array, places, self.half = analysis
-        cdef int32_t k = <int32_t>(len(places) // 2 - 1)
-        cdef int32_t[::1] whole = whole_array
-        cdef int64_t[::1] places_ = places
-        cdef int32_t* order = &whole[0]
-        cdef int32_t* place = order + n
-        cdef int32_t* of = place + n
-        cdef int32_t* swap = of + n
-        cdef int32_t* rel = swap + n
-        cdef int32_t* first = rel + n                   # k + 1
-        cdef int32_t* rptr = first + k + 1              # k + 1
-        cdef int32_t* head = rptr + k + 1
-        cdef int32_t* link = head + k
-        cdef int32_t* next_ = link + k
-        cdef int32_t* rows = next_ + k                  # the rest
-        cdef int64_t* at = &places_[0]
-        cdef int64_t* beside = at + k + 1
-        self.work = 2.0 * self.half if lu else self.half
-        self.entries = at[k] + (beside[k] if lu else 0)
-        self.keep, self.numbers = (whole_array, places), None
-        self.f = sparse_t(
-            n, k, wide and has_wide(), lu, order, place, first, of, rptr, rows, at, beside, NULL, NULL, NULL, NULL, NULL,
-            swap, rel, head, link, next_)
-
-    @staticmethod
-    cdef SparsePanels of_blocks(analysis, int32_t n, bint wide):
-        """With workspace for the values of n rows, by `symbolic.block_panels`."""
-        cdef SparsePanels made = SparsePanels.__new__(SparsePanels)
-        made._hold((analysis[0].copy(), *analysis[1:]), n, False, wide)
-        made._make_workspace()
-        return made
-
-    cdef _make_workspace(self):
-        # What is counted and never factored holds no numbers.
-        cdef int64_t most = panel_workspace_size(&self.f)
+    cdef _allocate(self):
+        # An analysis without a factor has no values.
+        cdef supernodal_t* f = &self.f.factor
+        cdef int64_t scratch = supernodal_scratch_size(f, self.f.lu)
         cdef double[::1] numbers
-        numbers = self.numbers = np.empty(self.entries + most + 2 * self.f.n + 1)
-        self.f.val = &numbers[0]
-        self.f.up = self.f.val + self.f.at[self.f.panels]
-        self.f.temp = self.f.val + self.entries
-        self.f.scale = self.f.temp + most
-        self.f.y = self.f.scale + self.f.n
+        numbers = self.numbers = np.empty(self.entries + scratch + 2 * f.n + 1)
+        f.values = &numbers[0]
+        f.upper = f.values + f.value_offset[f.supernodes]
+        f.scratch = f.values + self.entries
+        self.f.scale = f.scratch + scratch
+        self.f.y = self.f.scale + f.n
 
     def factor(self, const double[::1] data, const double[::1] d, double shift, double tiny):
-        """Factor the matrix of these entries with shift D, d (n,) > 0; how many pivots are not above tiny d."""
+        """Factor the matrix with these entries plus shift D, d (n,) > 0; return how many pivots do not exceed tiny d."""
         cdef const int32_t[::1] ptr = self.indptr, ind = self.indices
         cdef int32_t[::1] tptr, tind
         cdef double[::1] tdata
-        cdef int32_t lost
-        if data.shape[0] != ind.shape[0] or d.shape[0] != self.f.n:
+        cdef int32_t lost, n = self.f.factor.n
+        if data.shape[0] != ind.shape[0] or d.shape[0] != n:
             raise ValueError("entries of another matrix")
         if data.shape[0] == 0:
-            return self.f.n
+            return n
         if self.numbers is None:
-            self._make_workspace()
+            self._allocate()
         tptr, tind, tdata = np.empty(1, np.int32), np.empty(1, np.int32), np.empty(1)
         if self.f.lu:
-            tptr = np.empty(self.f.n + 2, np.int32)
+            tptr = np.empty(n + 2, np.int32)
             tind, tdata = np.empty(data.shape[0], np.int32), np.empty(data.shape[0])
         with nogil:
             if self.f.lu:
-                transpose_csr(self.f.n, self.f.n, &ptr[0], &ind[0], &data[0], &tptr[0], &tind[0], &tdata[0])
+                transpose_csr(n, n, &ptr[0], &ind[0], &data[0], &tptr[0], &tind[0], &tdata[0])
             lost = lav_sparse_factor(&self.f, &ptr[0], &ind[0], &data[0], &tptr[0], &tind[0], &tdata[0], &d[0], shift, tiny)
         return lost
 
     def solve(self, const double[::1] b):
-        """(n,) of the last factor; a new array."""
-        out = np.empty(self.f.n)
+        """Solve with the last factor; return a new array (n,)."""
+        out = np.empty(self.f.factor.n)
         cdef double[::1] x = out
-        if b.shape[0] != self.f.n or self.numbers is None:
+        if b.shape[0] != self.f.factor.n or self.numbers is None:
             raise ValueError("of another size, or before a factor")
         with nogil:
             sparse_solve(&self.f, &b[0], &x[0])
@@ -310,50 +231,51 @@ cdef class SparsePanels:
     @property
     def order(self):
         """(n,) row eliminated first, second, ..."""
-        return self.keep[0][:self.f.n]
+        return self.analysis[0][:self.f.factor.n]
 
     def lost_rows(self):
-        """Rows whose pivots the last factor did not take, in ascending order; their columns of L are 0."""
+        """Return the rows whose pivots the last factor rejected, ascending; their columns of L are 0."""
+        cdef const supernodal_t* f = &self.f.factor
         cdef int32_t i, k
-        cdef int64_t rows
+        cdef int64_t ld
         if self.numbers is None:
             raise ValueError("before a factor")
-        found = []
-        for i in range(self.f.panels):
-            rows = self.f.first[i + 1] - self.f.first[i] + self.f.rptr[i + 1] - self.f.rptr[i]
-            for k in range(self.f.first[i], self.f.first[i + 1]):
-                if self.f.val[self.f.at[i] + (k - self.f.first[i]) * (rows + 1)] == 0.0:
-                    found.append(self.f.order[k])
-        return np.sort(np.array(found, np.intp))
+        rows = []
+        for i in range(f.supernodes):
+            ld = panel_width(f, i) + rows_below(f, i)
+            for k in range(panel_width(f, i)):
+                if f.values[f.value_offset[i] + k * (ld + 1)] == 0.0:
+                    rows.append(f.order[f.first[i] + k])
+        return np.sort(np.array(rows, np.intp))
 
 
 cdef class FullCholesky:
-    """L L^T of a full symmetric matrix (`dense.pxd`).
+    """The factor L L^T of a full symmetric matrix (`dense.pxd`).
 
     Parameters
     ----------
     a : (n, n) float64
-        Of which the entries at and after the diagonal are read.
-    least : (n,) float64
-        What each pivot must be above.
+        The entries at and after the diagonal of each row are read.
+    min_pivot : (n,) float64
+        Each pivot must exceed this.
     wide : bool
-        Four lanes where the machine has them: the same bits.
+        Use four lanes if the processor has them; the bits are the same.
     """
 
     cdef double[::1] lower
     cdef int32_t n
-    cdef readonly int lost      # pivots that were not
+    cdef readonly int lost      # number of pivots that do not
 
-    def __init__(self, const double[:, ::1] a, const double[::1] least, bint wide=True):
+    def __init__(self, const double[:, ::1] a, const double[::1] min_pivot, bint wide=True):
         cdef int32_t n = <int32_t>a.shape[0]
-        if n < 1 or a.shape[1] != n or least.shape[0] != n:
+        if n < 1 or a.shape[1] != n or min_pivot.shape[0] != n:
             raise ValueError("a square matrix of one row or more, and what each of its pivots must be above")
         self.n, self.lower = n, np.empty(cholesky_workspace_size(n))
         with nogil:
-            self.lost = dense_cholesky(wide and has_wide(), n, &a[0, 0], &least[0], &self.lower[0])
+            self.lost = dense_cholesky(wide and has_wide(), n, &a[0, 0], &min_pivot[0], &self.lower[0])
 
     def solve(self, const double[::1] b):
-        """(n,); a new array."""
+        """Solve with the factor; return a new array (n,)."""
         out = np.array(b)
         cdef double[::1] x = out
         if b.shape[0] != self.n:

@@ -1,131 +1,244 @@
-"""Factors by supernodes: columns of one pattern side by side, as one dense panel.
+"""Sparse factorisation by supernodes: columns of L with one pattern, stored as a dense panel.
 
-    L_J = (N_J - sum over K below J of L_K L_K^T) L_JJ^-T                                               (1)
+    L_J = (N_J - sum over K before J of L_K L_K^T) L_JJ^-T                                              (1)
 
-Left-looking: what earlier panels K take from J is a dense product (`tiles.pxd`), spread over the rows of J. A panel
-is held column by column, its own columns' rows first, then the rows below; 1 / L_jj stands on the diagonal (Ng, Peyton
-1993; Davis 2006, chapter 4). `sparse.pyx` has it of any matrix, and L U; here is that of a matrix of blocks.
+    P N_JJ' = L_JJ U_JJ,   N_JJ' = N_JJ - sum over K before J of L_K U_K                                (2)
+    L_J = (N_J - sum L_K U_KJ) U_JJ^-1 below,   U_J = L_JJ^-1 P (N_J - sum L_JK U_K) beside             (3)
+
+The method is left-looking: the updates of a supernode J by its descendants K are dense products (`tiles.pxd`), which are added
+to the rows of J (Ng, Peyton 1993; Davis 2006, chapter 4). A panel (`panels.pxd`) is stored column by column, first the rows of
+its own columns, then the rows below. L U has the pattern of the symmetric factor, exchanges rows only within a panel, and
+stores the rows of U beside a panel transposed, so that every update is C - A B^T. `sparse.pyx` fills panels from a matrix in
+compressed rows, `blocks.pxd` from square blocks.
 """
 from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memset
 
-from lavender_ext.factor.blocks cimport factor_t, sparse_t
-from lavender_ext.factor.panels cimport cholesky_panel, gemm_subtract_lower
+from lavender_ext.factor.panels cimport LU_STRIP, cholesky_panel, gemm_subtract_lower, lu_panel
 from lavender_ext.factor.tiles cimport add_vector, axpy_subtract, gemm_subtract_nt
 
 
-cdef inline void spread(const sparse_t* f, int32_t from_, int32_t end, int32_t skip, int32_t n, const int32_t* columns,
-                        int32_t base, int64_t ld, double* to) noexcept nogil:
-    """temp (end - from, n) added to a panel's rows rel - skip and the columns at those places."""
-    cdef int32_t row = from_, high, j, m = end - from_
+cdef struct supernodal_t:
+    int32_t n                   # rows
+    int32_t supernodes
+    int32_t wide                # four lanes are one instruction
+    # pattern
+    const int32_t* order        # (n) row at each position, or NULL: as they stand
+    const int32_t* position     # (n) position of each row, or NULL
+    const int32_t* first        # (supernodes + 1) position of the first column
+    const int32_t* supernode_of     # (n) supernode of a position
+    const int32_t* row_ptr      # (supernodes + 1) rows below a supernode: positions, ascending
+    const int32_t* row_indices
+    const int64_t* value_offset     # (supernodes + 1) of a panel in `values`
+    const int64_t* upper_offset     # (supernodes + 1) of the rows of U beside a panel in `upper`
+    # factor
+    double* values
+    double* upper               # L U only
+    double* scratch             # (`supernodal_scratch_size`)
+    int32_t* swap               # (n) L U: index within the panel of the row that each pivot row was exchanged with
+    # state of a factorisation
+    int32_t* local_row          # (n) index of a position in the present panel
+    int32_t* head               # (supernodes) first descendant that updates a supernode next,
+    int32_t* link               # (supernodes) and the next one
+    int32_t* next_row           # (supernodes) first row of a supernode that has not updated its supernode
+
+
+cdef inline int32_t panel_width(const supernodal_t* f, int32_t i) noexcept nogil:
+    """Return the number of columns of supernode i."""
+    return f.first[i + 1] - f.first[i]
+
+
+cdef inline int32_t rows_below(const supernodal_t* f, int32_t i) noexcept nogil:
+    """Return the number of rows below supernode i."""
+    return f.row_ptr[i + 1] - f.row_ptr[i]
+
+
+cdef inline int64_t supernodal_scratch_size(const supernodal_t* f, bint lu) noexcept nogil:
+    """Return the number of doubles for the largest update, for the rows below a panel, and for a strip of `lu_panel`."""
+    cdef int32_t i, j, run
+    cdef int64_t largest = 0, needed
+    for i in range(f.supernodes):
+        needed = <int64_t>panel_width(f, i) * LU_STRIP if lu else 0
+        largest = max(largest, max(needed, <int64_t>rows_below(f, i)))
+        run = 0
+        for j in range(f.row_ptr[i], f.row_ptr[i + 1]):     # A run of rows of one supernode updates it together.
+            run = run + 1 if j > f.row_ptr[i] and f.supernode_of[f.row_indices[j]] == f.supernode_of[f.row_indices[j - 1]] else 1
+            needed = <int64_t>run * (f.row_ptr[i + 1] - j + run - 1)
+            largest = max(largest, needed)
+    return largest
+
+
+# -- updates of a supernode by its descendants -------------------------------------------------------------------
+
+
+cdef inline void add_scratch(const supernodal_t* f, int32_t begin, int32_t end, int32_t skipped, int32_t n, const int32_t* columns,
+                             int32_t base, int64_t ld, double* panel) noexcept nogil:
+    """Add scratch (end - begin, n) to a panel, at the rows of row_indices[begin:end] and these columns, minus `base`.
+
+    `skipped` is the number of the panel's first rows that `panel` leaves out.
+    """
+    cdef int32_t row = begin, run_end, j, m = end - begin
     while row < end:
-        high = row + 1
-        while high < end and f.rel[f.rows[high]] - f.rel[f.rows[row]] == high - row:
-            high += 1
+        run_end = row + 1
+        while run_end < end and f.local_row[f.row_indices[run_end]] - f.local_row[f.row_indices[row]] == run_end - row:
+            run_end += 1
         for j in range(n):
-            add_vector(high - row, f.temp + <int64_t>j * m + row - from_,
-                to + ld * (columns[j] - base) + f.rel[f.rows[row]] - skip)
-        row = high
+            add_vector(run_end - row, f.scratch + <int64_t>j * m + row - begin,
+                       panel + ld * (columns[j] - base) + f.local_row[f.row_indices[row]] - skipped)
+        row = run_end
 
 
-cdef inline void strip_by_strip(const sparse_t* f, int32_t m, int32_t n, int32_t k, const double* u, int32_t below,
-                                const double* a, int32_t rows, const int32_t* columns, int32_t base, double* v,
-                                int32_t beside) noexcept nogil:
-    # Rows in one run, columns not: each run of columns by itself.
-    cdef int32_t j = 0, high
+cdef inline void subtract_column_runs(const supernodal_t* f, int32_t m, int32_t n, int32_t k, const double* u, int32_t ldu,
+                                      const double* a, int32_t lda, const int32_t* columns, int32_t base, double* c,
+                                      int32_t ldc) noexcept nogil:
+    """Subtract U A^T from columns of C (m rows) in runs of consecutive columns."""
+    cdef int32_t j = 0, run_end
     while j < n:
-        high = j + 1
-        while high < n and columns[high] - columns[j] == high - j:
-            high += 1
-        gemm_subtract_nt(f.wide, m, high - j, k, u, below, a + j, rows, v + <int64_t>beside * (columns[j] - base), beside)
-        j = high
+        run_end = j + 1
+        while run_end < n and columns[run_end] - columns[j] == run_end - j:
+            run_end += 1
+        gemm_subtract_nt(f.wide, m, run_end - j, k, u, ldu, a + j, lda, c + <int64_t>ldc * (columns[j] - base), ldc)
+        j = run_end
 
 
-cdef inline void take_panel(const sparse_t* f, int32_t to, int32_t of, const int32_t lu) noexcept nogil:
-    """What the panel `to` is owed by an earlier one, from row `next` of that on."""
-    cdef int32_t q = f.next[of], end = f.rptr[of + 1], n = 0, base = f.first[to], after = f.first[to + 1]
-    cdef int32_t width = f.first[of + 1] - f.first[of], below = end - f.rptr[of], rows = width + below, m = end - q
-    cdef int32_t own = after - base, beside = f.rptr[to + 1] - f.rptr[to], low, r = q - f.rptr[of]
+cdef inline void subtract_descendant(const supernodal_t* f, int32_t i, int32_t k, const int32_t lu) noexcept nogil:
+    """Update supernode i by its descendant k, by the rows of k from `next_row` on; `next_row` moves past the columns of i."""
+    cdef int32_t q = f.next_row[k], end = f.row_ptr[k + 1], n = 0, base = f.first[i], after = f.first[i + 1]
+    cdef int32_t width = panel_width(f, k), below = rows_below(f, k), rows = width + below, m = end - q
+    cdef int32_t own = after - base, beside = rows_below(f, i), low, r = q - f.row_ptr[k]
     cdef int64_t ld = own + beside
-    cdef double* a = f.val + f.at[of] + width + r
+    cdef double* a = f.values + f.value_offset[k] + width + r
     cdef double* u
-    cdef double* v = f.val + f.at[to]
-    cdef const int32_t* columns = f.rows + q
-    cdef bint run
-    while q + n < end and f.rows[q + n] < after:
+    cdef double* panel = f.values + f.value_offset[i]
+    cdef const int32_t* columns = f.row_indices + q
+    cdef bint is_run
+    while q + n < end and f.row_indices[q + n] < after:
         n += 1
-    low = f.rel[f.rows[q]]
-    run = f.rel[f.rows[end - 1]] - low == m - 1         # into the panel as it stands
+    low = f.local_row[f.row_indices[q]]
+    is_run = f.local_row[f.row_indices[end - 1]] - low == m - 1         # The rows are consecutive in the panel.
+    f.next_row[k] = q + n
     if not lu:
-        if run:
-            gemm_subtract_lower(f.wide, m, n, width, a, rows, v + ld * low + low, ld)
+        if is_run:
+            gemm_subtract_lower(f.wide, m, n, width, a, rows, panel + ld * low + low, ld)
         else:
-            memset(f.temp, 0, sizeof(double) * m * n)
-            gemm_subtract_lower(f.wide, m, n, width, a, rows, f.temp, m)
-            spread(f, q, end, 0, n, columns, base, ld, v)
-        f.next[of] = q + n
+            memset(f.scratch, 0, sizeof(double) * m * n)
+            gemm_subtract_lower(f.wide, m, n, width, a, rows, f.scratch, m)
+            add_scratch(f, q, end, 0, n, columns, base, ld, panel)
         return
-    u = f.up + f.beside[of] + r
-    if run:
-        gemm_subtract_nt(f.wide, m, n, width, a, rows, u, below, v + ld * low + low, ld)
+    # columns of L U
+    u = f.upper + f.upper_offset[k] + r
+    if is_run:
+        gemm_subtract_nt(f.wide, m, n, width, a, rows, u, below, panel + ld * low + low, ld)
     else:
-        memset(f.temp, 0, sizeof(double) * m * n)
-        gemm_subtract_nt(f.wide, m, n, width, a, rows, u, below, f.temp, m)
-        spread(f, q, end, 0, n, columns, base, ld, v)
+        memset(f.scratch, 0, sizeof(double) * m * n)
+        gemm_subtract_nt(f.wide, m, n, width, a, rows, u, below, f.scratch, m)
+        add_scratch(f, q, end, 0, n, columns, base, ld, panel)
+    # rows of U
     if m > n:
-        v = f.up + f.beside[to]
-        low = f.rel[f.rows[q + n]]
-        if f.rel[f.rows[end - 1]] - low == m - n - 1:
-            strip_by_strip(f, m - n, n, width, u + n, below, a, rows, columns, base, v + low - own, beside)
+        panel = f.upper + f.upper_offset[i]
+        low = f.local_row[f.row_indices[q + n]]
+        if f.local_row[f.row_indices[end - 1]] - low == m - n - 1:
+            subtract_column_runs(f, m - n, n, width, u + n, below, a, rows, columns, base, panel + low - own, beside)
         else:
-            memset(f.temp, 0, sizeof(double) * (m - n) * n)
-            gemm_subtract_nt(f.wide, m - n, n, width, u + n, below, a, rows, f.temp, m - n)
-            spread(f, q + n, end, own, n, columns, base, beside, v)
-    f.next[of] = q + n
+            memset(f.scratch, 0, sizeof(double) * (m - n) * n)
+            gemm_subtract_nt(f.wide, m - n, n, width, u + n, below, a, rows, f.scratch, m - n)
+            add_scratch(f, q + n, end, own, n, columns, base, beside, panel)
 
 
-cdef inline void begin_panels(const sparse_t* f) noexcept nogil:
+cdef inline void begin_supernodes(const supernodal_t* f) noexcept nogil:
+    """Begin a factorisation: no supernode has updated another one."""
     cdef int32_t i
-    for i in range(f.panels):
+    for i in range(f.supernodes):
         f.head[i] = -1
-        f.next[i] = f.rptr[i]
+        f.next_row[i] = f.row_ptr[i]
 
 
-cdef inline void place_rows(const sparse_t* f, int32_t i) noexcept nogil:
-    # `rel` of panel i
+cdef inline void set_local_rows(const supernodal_t* f, int32_t i) noexcept nogil:
+    """Set `local_row` for the positions of supernode i."""
     cdef int32_t k, q
     for k in range(f.first[i], f.first[i + 1]):
-        f.rel[k] = k - f.first[i]
-    for q in range(f.rptr[i], f.rptr[i + 1]):
-        f.rel[f.rows[q]] = f.first[i + 1] - f.first[i] + q - f.rptr[i]
+        f.local_row[k] = k - f.first[i]
+    for q in range(f.row_ptr[i], f.row_ptr[i + 1]):
+        f.local_row[f.row_indices[q]] = panel_width(f, i) + q - f.row_ptr[i]
 
 
-cdef inline void hand_on(const sparse_t* f, int32_t i, int32_t q) noexcept nogil:
-    # panel i to the later one in which its row q is, if there is such a row
+cdef inline void link_descendant(const supernodal_t* f, int32_t i, int32_t q) noexcept nogil:
+    """Link supernode i to the later supernode of its row q, if it has such a row."""
     cdef int32_t k
-    if q < f.rptr[i + 1]:
-        k = f.of[f.rows[q]]
+    if q < f.row_ptr[i + 1]:
+        k = f.supernode_of[f.row_indices[q]]
         f.link[i] = f.head[k]
         f.head[k] = i
 
 
-cdef inline void take_panels(const sparse_t* f, int32_t i, const int32_t lu) noexcept nogil:
-    """All that panel i is owed by earlier ones, after `place_rows`."""
-    cdef int32_t j = f.head[i], after
-    while j >= 0:
-        after = f.link[j]
-        take_panel(f, i, j, lu)
-        hand_on(f, j, f.next[j])
-        j = after
+# -- factorisation -------------------------------------------------------------------------------------------------
 
 
-cdef inline void less_three(int32_t n, int32_t columns, const double* a, int64_t apart, const double* t,
-                            double* y) noexcept nogil:
-    """y <- y - A t (n) of up to three columns that are `apart` in memory, one after the other."""
+cdef inline void swap_columns(double* u, int32_t n, int32_t ld, const int32_t* swap) noexcept nogil:
+    """Exchange columns j and swap[j] of u for j = 0 ... n - 1."""
+    cdef int32_t i, j
+    cdef double x
+    cdef double* y
+    cdef double* z
+    for j in range(n):
+        if swap[j] != j:
+            y = u + <int64_t>j * ld
+            z = u + <int64_t>swap[j] * ld
+            for i in range(ld):
+                x = y[i]
+                y[i] = z[i]
+                z[i] = x
+
+
+cdef inline int32_t lu_supernode(const supernodal_t* f, int32_t width, int32_t below, double* a, double* u, int32_t* swap,
+                                 double min_pivot) noexcept nogil:
+    """Factor one panel a and its rows u of U, transposed, by (2) and (3); return the number of pivots that are too small."""
+    cdef int32_t j, j0 = 0, t, n, rows = width + below
+    cdef int32_t lost = lu_panel(f.wide, width, rows, width, a, rows, swap, min_pivot, f.scratch)
+    if below == 0:
+        return lost
+    swap_columns(u, width, below, swap)
+    while j0 < width:                                   # solve with L
+        n = LU_STRIP if j0 + LU_STRIP <= width else width - j0
+        gemm_subtract_nt(f.wide, below, n, j0, u, below, a + j0, rows, u + <int64_t>j0 * below, below)
+        for j in range(j0 + 1, j0 + n):
+            for t in range(j0, j):
+                axpy_subtract(below, a[j + <int64_t>t * rows], u + <int64_t>t * below, u + <int64_t>j * below)
+        j0 += n
+    return lost
+
+
+cdef inline int32_t factor_supernode(const supernodal_t* f, int32_t i, const int32_t lu, const double* min_pivot,
+                                     double min_lu_pivot) noexcept nogil:
+    """Factor supernode i, whose entries of N are filled in and whose `local_row` is set; return the number of lost pivots.
+
+    min_pivot (n), by position, is that of `cholesky_panel`, or NULL; min_lu_pivot that of `lu_panel`.
+    """
+    cdef int32_t k = f.head[i], after, lost, width = panel_width(f, i), below = rows_below(f, i)
+    cdef double* a = f.values + f.value_offset[i]
+    while k >= 0:
+        after = f.link[k]
+        subtract_descendant(f, i, k, lu)
+        link_descendant(f, k, f.next_row[k])
+        k = after
+    if lu:
+        lost = lu_supernode(f, width, below, a, f.upper + f.upper_offset[i], f.swap + f.first[i], min_lu_pivot)
+    else:
+        lost = cholesky_panel(f.wide, width, width + below, a, min_pivot + f.first[i] if min_pivot != NULL else NULL)
+    link_descendant(f, i, f.row_ptr[i])
+    return lost
+
+
+# -- solves --------------------------------------------------------------------------------------------------------
+
+
+cdef inline void subtract_three(int32_t n, int32_t columns, const double* a, int64_t lda, const double* t,
+                                double* y) noexcept nogil:
+    """Subtract A t from y (n), with up to three columns, one after the other."""
     cdef int32_t q
     cdef double t0 = t[0], t1, t2
-    cdef const double* b = a + apart
-    cdef const double* c = b + apart
+    cdef const double* b = a + lda
+    cdef const double* c = b + lda
     if columns == 3:
         t1, t2 = t[1], t[2]
         for q in range(n):
@@ -138,16 +251,16 @@ cdef inline void less_three(int32_t n, int32_t columns, const double* a, int64_t
         axpy_subtract(n, t0, a, y)
 
 
-cdef inline void less_products(int32_t n, int32_t columns, const double* a, int64_t apart, const double* x,
-                               double* y) noexcept nogil:
-    """y <- y - A^T x (columns) for columns of A (n) that are `apart` in memory: some at once, each sum in order."""
+cdef inline void gemv_subtract_t(int32_t n, int32_t columns, const double* a, int64_t lda, const double* x,
+                                 double* y) noexcept nogil:
+    """Subtract A^T x from y (columns), with columns of A (n); every sum runs in the order of the rows."""
     cdef int32_t j = 0, q
     cdef double s0, s1, s2, s3, t
     cdef const double* b
     cdef const double* c
     cdef const double* d
     while j + 4 <= columns:
-        b, c, d = a + apart, a + 2 * apart, a + 3 * apart
+        b, c, d = a + lda, a + 2 * lda, a + 3 * lda
         s0, s1, s2, s3 = y[j], y[j + 1], y[j + 2], y[j + 3]
         for q in range(n):
             t = x[q]
@@ -156,10 +269,10 @@ cdef inline void less_products(int32_t n, int32_t columns, const double* a, int6
             s2 -= c[q] * t
             s3 -= d[q] * t
         y[j], y[j + 1], y[j + 2], y[j + 3] = s0, s1, s2, s3
-        a += 4 * apart
+        a += 4 * lda
         j += 4
     if j + 3 == columns:
-        b, c = a + apart, a + 2 * apart
+        b, c = a + lda, a + 2 * lda
         s0, s1, s2 = y[j], y[j + 1], y[j + 2]
         for q in range(n):
             t = x[q]
@@ -173,22 +286,21 @@ cdef inline void less_products(int32_t n, int32_t columns, const double* a, int6
         for q in range(n):
             s0 -= a[q] * x[q]
         y[j] = s0
-        a += apart
+        a += lda
         j += 1
 
 
-cdef inline void panels_solve(const sparse_t* f, double* y, const int32_t lu) noexcept nogil:
-    """y (n) <- the solve in the order of the panels."""
+cdef inline void solve_lower(const supernodal_t* f, double* y, const int32_t lu) noexcept nogil:
+    """Overwrite y (n), in the order of positions, with L^-1 P y."""
     cdef int32_t i, j, q, n, width, below, rows, k
     cdef double t
     cdef double* own
     cdef const double* a
-    for i in range(f.panels):
-        width = f.first[i + 1] - f.first[i]
-        below = f.rptr[i + 1] - f.rptr[i]
+    for i in range(f.supernodes):
+        width, below = panel_width(f, i), rows_below(f, i)
         rows = width + below
         own = y + f.first[i]
-        a = f.val + f.at[i]
+        a = f.values + f.value_offset[i]
         if lu:
             for j in range(width):
                 k = f.swap[f.first[i] + j]
@@ -196,7 +308,7 @@ cdef inline void panels_solve(const sparse_t* f, double* y, const int32_t lu) no
                 own[k] = own[j]
                 own[j] = t
         for q in range(below):
-            f.temp[q] = 0.0
+            f.scratch[q] = 0.0
         j = 0
         while j < width:
             n = 3 if j + 3 <= width else width - j
@@ -207,24 +319,31 @@ cdef inline void panels_solve(const sparse_t* f, double* y, const int32_t lu) no
                     own[k] = t
                 for q in range(k + 1, j + n):
                     own[q] -= t * a[q + <int64_t>(k - j) * rows]
-            less_three(width - j - n, n, a + j + n, rows, own + j, own + j + n)
-            less_three(below, n, a + width, rows, own + j, f.temp)
+            subtract_three(width - j - n, n, a + j + n, rows, own + j, own + j + n)
+            subtract_three(below, n, a + width, rows, own + j, f.scratch)
             a += <int64_t>n * rows
             j += n
         for q in range(below):
-            y[f.rows[f.rptr[i] + q]] += f.temp[q]
-    for i in range(f.panels - 1, -1, -1):
-        width = f.first[i + 1] - f.first[i]
-        below = f.rptr[i + 1] - f.rptr[i]
+            y[f.row_indices[f.row_ptr[i] + q]] += f.scratch[q]
+
+
+cdef inline void solve_upper(const supernodal_t* f, double* y, const int32_t lu) noexcept nogil:
+    """Overwrite y (n), in the order of positions, with U^-1 y, or L^-T y."""
+    cdef int32_t i, j, q, width, below, rows
+    cdef double t
+    cdef double* own
+    cdef const double* a
+    for i in range(f.supernodes - 1, -1, -1):
+        width, below = panel_width(f, i), rows_below(f, i)
         rows = width + below
         own = y + f.first[i]
-        a = f.val + f.at[i]
+        a = f.values + f.value_offset[i]
         for q in range(below):
-            f.temp[q] = y[f.rows[f.rptr[i] + q]]
+            f.scratch[q] = y[f.row_indices[f.row_ptr[i] + q]]
         if lu:
-            less_products(below, width, f.up + f.beside[i], below, f.temp, own)
+            gemv_subtract_t(below, width, f.upper + f.upper_offset[i], below, f.scratch, own)
         else:
-            less_products(below, width, a + width, rows, f.temp, own)
+            gemv_subtract_t(below, width, a + width, rows, f.scratch, own)
         for j in range(width - 1, -1, -1):
             if lu:
                 t = own[j] * a[j + <int64_t>j * rows]
@@ -237,40 +356,19 @@ cdef inline void panels_solve(const sparse_t* f, double* y, const int32_t lu) no
                 own[j] = t * a[j + <int64_t>j * rows]
 
 
-cdef inline void sparse_solve(const sparse_t* f, const double* b, double* x) noexcept nogil:
-    """x <- (A + shift D)^-1 b after `lav_sparse_factor`; they may be one array."""
-    cdef int32_t k
-    for k in range(f.n):
-        f.y[k] = b[f.order[k]]
-        if f.lu:
-            f.y[k] *= f.scale[k]
-    panels_solve(f, f.y, f.lu)
-    for k in range(f.n):
-        x[f.order[k]] = f.y[k] * f.scale[k] if f.lu else f.y[k]
+cdef inline void solve_supernodes(const supernodal_t* f, double* y, const int32_t lu) noexcept nogil:
+    """Overwrite y (n), in the order of positions, with N^-1 y."""
+    solve_lower(f, y, lu)
+    solve_upper(f, y, lu)
 
 
-cdef inline int32_t super_cholesky(const factor_t* f) noexcept nogil:
-    """N = L L^T of the blocks in `nval`; returns the number of pivots lost to rounding."""
-    cdef const sparse_t* p = f.super
-    cdef int32_t k, q, r, c, i, s = f.s, lost = 0
-    cdef int64_t ld, b = s * s
-    cdef double* y
-    cdef const double* x
-    begin_panels(p)
-    memset(p.val, 0, sizeof(double) * p.at[p.panels])
-    for k in range(f.n):
-        for q in range(f.nptr[k], f.nptr[k + 1]):
-            i = p.of[s * f.nind[q]]
-            ld = p.first[i + 1] - p.first[i] + p.rptr[i + 1] - p.rptr[i]
-            y = p.val + f.spot[q]
-            x = f.nval + q * b
-            for c in range(s):
-                for r in range(s):
-                    y[r + c * ld] = x[r * s + c]
-    for i in range(p.panels):
-        place_rows(p, i)
-        take_panels(p, i, 0)
-        k = p.first[i + 1] - p.first[i]
-        lost += cholesky_panel(p.wide, k, k + p.rptr[i + 1] - p.rptr[i], p.val + p.at[i], NULL)
-        hand_on(p, i, p.rptr[i])
-    return lost
+cdef inline int32_t supernodal_lu_sign(const supernodal_t* f) noexcept nogil:
+    """Return the sign of det N after L U."""
+    cdef int32_t i, k, sign = 1
+    cdef int64_t rows
+    for i in range(f.supernodes):
+        rows = panel_width(f, i) + rows_below(f, i)
+        for k in range(panel_width(f, i)):
+            if (f.swap[f.first[i] + k] != k) != (f.values[f.value_offset[i] + k * (rows + 1)] < 0.0):
+                sign = -sign
+    return sign

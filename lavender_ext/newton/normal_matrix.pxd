@@ -1,7 +1,7 @@
 """The normal matrix N = I + K^T V K, block by block, a run of elements between the same two bodies at once."""
 from libc.stdint cimport int32_t, int64_t
 
-from lavender_ext.factor.blocks cimport factor_t
+from lavender_ext.factor.blocks cimport block_matrix_t
 from lavender_ext.newton.elements cimport elements_t
 
 
@@ -39,7 +39,8 @@ cdef inline void weigh(const double* v, const double* rows, double* t, int32_t n
             t[r * 2 * s + c] = row[c]
 
 
-cdef inline void add_elements(const elements_t* e, const double* v, const factor_t* f, int32_t lu, const int32_t s) noexcept nogil:
+cdef inline void add_elements(const elements_t* e, const double* v, const block_matrix_t* f, int32_t lu,
+                              const int32_t s) noexcept nogil:
     cdef int32_t h, i, j, r, c, nr, first, second, n_blocks = f.nptr[f.n], done
     cdef int64_t b = s * s, q
     cdef double t[216]                                  # V K of up to 18 rows between two bodies, (18, 2 s)
@@ -93,7 +94,7 @@ cdef inline void add_elements(const elements_t* e, const double* v, const factor
                     f.mval[q + c * s + r] = f.nval[q + r * s + c]
 
 
-cdef inline void normal_matrix(const elements_t* e, const double* v, const factor_t* f, int32_t lu) noexcept nogil:
+cdef inline void normal_matrix(const elements_t* e, const double* v, const block_matrix_t* f, int32_t lu) noexcept nogil:
     """N = I + K^T V K of (2) into the blocks of `f`; with `lu` the upper blocks too."""
     if f.s == 1:
         add_elements(e, v, f, lu, 1)

@@ -8,7 +8,7 @@ from libc.string cimport memcpy, memset
 
 from lavender_ext.core.block_types cimport blocks_t
 from lavender_ext.core.view cimport csr_t, generalized_t, rows_t, view_t
-from lavender_ext.factor.blocks cimport factor_t
+from lavender_ext.factor.blocks cimport block_matrix_t
 from lavender_ext.judge.best cimport best_workspace_size, best_t, bind_best, note_score, relative_of_best, see_impulse
 from lavender_ext.judge.measure cimport above_floor_of, floor_of, judge_view, relative_of
 from lavender_ext.judge.score cimport new_score, relative, score_t, smallest_reference
@@ -188,7 +188,7 @@ cdef struct path_t:             # through smoothed problems, in vectors of other
 cdef struct newton_t:           # may not move once it is furnished
     system_t s
     scaled_t sc
-    factor_t blocks             # of s over bodies
+    block_matrix_t blocks       # N of s over bodies, and its factor
     problem_t problem
     double tol
     int32_t budget              # factorisations

@@ -1,5 +1,5 @@
 """Newton's method over rows and bodies as workspace, start and step (`core/method.pxd`), compiled once, in `solve.pyx`."""
-from libc.stdint cimport int32_t
+from libc.stdint cimport int32_t, int64_t
 
 from lavender_ext.core.method cimport options_t, workspace_t, info_t
 from lavender_ext.core.view cimport view_t
@@ -9,6 +9,7 @@ from lavender_ext.newton.elements cimport elements_t
 cdef int32_t rows_workspace_size(const view_t* v, const options_t* o, workspace_t* r) noexcept nogil
 cdef int32_t rows_start(const view_t* v, const options_t* o, workspace_t* r, const double* lam) noexcept nogil
 cdef int32_t bodies_workspace_size(const view_t* v, const options_t* o, workspace_t* r) noexcept nogil
+cdef int64_t max_bodies_index_size(const view_t* v) noexcept nogil
 cdef int32_t bodies_start(const view_t* v, const options_t* o, workspace_t* r, const double* lam) noexcept nogil
 cdef int32_t system_step(const view_t* v, const options_t* o, const workspace_t* r, int32_t work, double* lam,
                          info_t* info) noexcept nogil

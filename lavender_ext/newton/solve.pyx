@@ -1,4 +1,4 @@
-"""Newton's method over the rows of A, dense, or over up to 1,500 bodies, as workspace, start and step (`core/method.pxd`).
+"""Newton's method over the rows of A, dense, or over bodies, as workspace, start and step (`core/method.pxd`).
 
 The unit of work is a factorisation; a step may do one or two more than it was asked for. After CERTIFICATE `options_t.proven`
 = 1 ends it; without, the next step goes on.
@@ -11,22 +11,18 @@ from libc.string cimport memcpy, memset
 
 import numpy as np
 
-from lavender_ext.factor.symbolic import block_panels
-
 from lavender_ext.core.arrays cimport address, zeros
-from lavender_ext.core.method cimport (CERTIFICATE, MORE, NEEDS_WORKSPACE, Method, require_workspace, method_t, options_t,
+from lavender_ext.core.method cimport (CERTIFICATE, MORE, NEEDS_WORKSPACE, UNFIT, Method, require_workspace, method_t, options_t,
                                        workspace_t, info_t)
 from lavender_ext.core.block_types cimport COULOMB
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.view cimport rows_t, view_t
-from lavender_ext.factor.blocks cimport sparse_t
-from lavender_ext.factor.sparse cimport SparsePanels
-from lavender_ext.factor.symbolic cimport block_pattern
+from lavender_ext.factor.blocks cimport (analyse_blocks, block_factor_index_size, block_factor_size, block_matrix_t,
+                                         block_pattern_index_size)
 from lavender_ext.factor.tiles cimport has_wide
-from lavender_ext.newton.bodies cimport (PARTS, body_workspace_size, factor_workspace_size,
-                                         bind_body_workspace, furnish_factor, index_workspace_size, bind_bodies,
-                                         bind_pattern_workspace, make_pattern, order_bodies, order_index, panel_of,
-                                         panel_of_velocities, pattern_t)
+from lavender_ext.newton.bodies cimport (bind_bodies, bind_body_workspace, furnish_factor, bind_pattern_workspace,
+                                         body_workspace_size, factor_index_size, index_workspace_size, max_index_size,
+                                         order_index, order_bodies, order_elements, panel_of, panel_of_velocities, pattern_t)
 from lavender_ext.newton.elements cimport elements_t
 from lavender_ext.newton.interior cimport ipm_scale
 from lavender_ext.newton.path cimport path_compliance, smooth
@@ -143,27 +139,42 @@ cdef int32_t rows_start(const view_t* v, const options_t* o, workspace_t* r, con
 
 
 cdef int32_t bodies_workspace_size(const view_t* v, const options_t* o, workspace_t* r) noexcept nogil:
-    """Whole numbers; the others are known when the pattern of the factor is."""
-    cdef int64_t most = index_workspace_size(&v.p, v.r)
-    r.n_index, r.n_real = head() + most, 0
-    return most > 0
+    """Write the integers of the elimination order; `start` computes the sizes for the factor."""
+    cdef int64_t size = index_workspace_size(&v.p, v.r)
+    r.n_index, r.n_real = head() + size, 0
+    return size > 0
+
+
+cdef int64_t max_bodies_index_size(const view_t* v) noexcept nogil:
+    """Return integers that always suffice, for a host that cannot enlarge them; 0 if the method does not apply."""
+    cdef int64_t size = max_index_size(&v.p, v.r)
+    return head() + size if size > 0 else 0
 
 
 cdef int32_t bodies_start(const view_t* v, const options_t* o, workspace_t* r, const double* lam) noexcept nogil:
     cdef newton_t* n = state_of(r)
     cdef pattern_t* a = &(<state_t*>r.index).a
+    cdef int64_t below, first = head() + index_workspace_size(&v.p, v.r), needed
+    cdef int32_t* index = r.index + first + first % 2       # a multiple of 8 bytes
     if not r.is_bound:
-        if not require_workspace(r, head() + index_workspace_size(&v.p, v.r), 0):
+        if not require_workspace(r, first, 0):
             return NEEDS_WORKSPACE
         memset(n, 0, sizeof(newton_t))
         bind_bodies(n, a, r.index + head(), &v.p, v.r)
         find_elements(&n.sc, v)
-        make_pattern(&n.sc, a, v.r)
+        below = order_elements(&n.sc, a, v.r)
+        if 6 * below > 2147483647:
+            return UNFIT
+        needed = first + 1 + factor_index_size(a.n, a.nptr[a.n], below)
+        if not require_workspace(r, needed, 0):
+            return NEEDS_WORKSPACE
+        r.work = analyse_blocks(&n.blocks, a.n, 6, a.nptr, a.nind, a.parent, a.lptr, index)
         r.is_bound = 1
-    if not require_workspace(r, r.n_index, judge_workspace_size(&v.p, v.r, NULL) + body_workspace_size(n, a, &v.p, v.r)):
+    if not require_workspace(r, r.n_index, judge_workspace_size(&v.p, v.r, NULL) + body_workspace_size(n, &v.p, v.r)):
         return NEEDS_WORKSPACE
     aim(n, &v.p, NULL, v.r, NULL)
-    bind_body_workspace(n, a, bind_judge_workspace(n, r.real), v)
+    index += block_pattern_index_size(a.n, 6, a.nptr[a.n], a.lptr[a.n])
+    bind_body_workspace(n, a, bind_judge_workspace(n, r.real), v, o.wide, index)
     return begin(n, o, lam)
 
 
@@ -202,46 +213,40 @@ cdef inline object part(object array, const void* at, Py_ssize_t n):
 
 
 cdef class Layout:
-    """An order of elimination of n bodies, s unknowns each, and the pattern of a factor; kept between problems.
+    """Elimination order of n bodies with s unknowns each, and the pattern of a factor; it may be reused between problems.
 
-    body (k, 2) are those of each element, -1 static. A factor of `least` multiply-adds stands in dense panels, by few and
-    share of `symbolic.block_panels`.
+    body (k, 2) are the bodies of each element, -1 static.
     """
     cdef pattern_t a
-    cdef object index, filled
-    cdef readonly object body, node, turned             # (k, 2) bodies, block columns, and (k,) which were changed over
+    cdef block_matrix_t blocks
+    cdef object index, pattern
+    cdef readonly object body, node                     # (k, 2) bodies and block columns of each element
+    cdef readonly object turned                        # (k,) whether an element's bodies are exchanged
     cdef readonly object nptr, lptr                     # (n + 1) blocks of N by rows, and of L by columns
-    cdef readonly object panels                         # of `symbolic.block_panels`, or None
-    cdef readonly int n, s
-    cdef readonly double work                           # multiply-adds of a factor
+    cdef readonly int n, s, supernodes
+    cdef readonly double work                           # multiply-adds of a factor, without stored zeros
 
-    def __init__(self, const int32_t[:, ::1] body, int n, int s, double least=float("inf"), int few=1, double share=0.0):
+    def __init__(self, const int32_t[:, ::1] body, int n, int s):
         cdef pattern_t* a = &self.a
         cdef int64_t k = body.shape[0], below
         cdef int32_t i
         self.index = np.empty(order_index(n, k) + 2, np.int32)
-        bind_pattern_workspace(a, <int32_t*>address(self.index), n, k, 0)
+        bind_pattern_workspace(a, <int32_t*>address(self.index), n, k)
         if k:
             memcpy(a.body, &body[0, 0], 2 * k * sizeof(int32_t))
         with nogil:
             below = order_bodies(a)
-        if below >= 2**31:
-            raise OverflowError("the factor has 2^31 blocks or more")
-        self.filled = np.empty(2 * below + 1, np.int32)
-        a.lind = <int32_t*>address(self.filled)
-        a.rind = a.lind + below
-        with nogil:
-            block_pattern(n, a.nptr, a.nind, a.parent, a.mark, a.lptr, a.rptr, a.scratch, a.lind, a.rind)
-        self.n, self.s = n, s
+        if s * below >= 2**31:
+            raise OverflowError("the factor has 2^31 rows of blocks or more")
+        self.pattern = np.empty(block_pattern_index_size(n, s, a.nptr[n], below), np.int32)
+        analyse_blocks(&self.blocks, n, s, a.nptr, a.nind, a.parent, a.lptr, <int32_t*>address(self.pattern))
+        self.n, self.s, self.supernodes = n, s, self.blocks.factor.supernodes
         for i in range(n):
             self.work += 0.5 * <double>(a.lptr[i + 1] - a.lptr[i]) * (a.lptr[i + 1] - a.lptr[i])
         self.work = s**3 * (self.work + below + n)
         self.body, self.node = part(self.index, a.body, 2 * k).reshape(k, 2), part(self.index, a.node, 2 * k).reshape(k, 2)
         self.turned = part(self.index, a.turned, k)
         self.nptr, self.lptr = part(self.index, a.nptr, n + 1), part(self.index, a.lptr, n + 1)
-        if self.work >= least:
-            nind = part(self.index, a.nind, a.nptr[n])
-            self.panels = block_panels(self.nptr, nind, self.lptr, self.filled[:below + 1], s, few, share)
 
     def serves(self, body, int n, int s):
         """Whether it is that of n bodies, s unknowns each, with these elements (k, 2)."""
@@ -359,30 +364,17 @@ cdef class Solve(Method):
         return panel, np.array(columns if len(columns) <= 3 else range(6), np.int32)
 
     def over_bodies(self, panel, const int32_t[::1] columns, Layout layout, bint lu, bint wide):
-        """K of `jacobian`, in place: of each body these columns; lu: L U may be asked for, which panels are not for."""
+        """Use K of `jacobian`, which is overwritten, with these columns of each body; lu: N may have to be factored as L U."""
+        cdef block_matrix_t* f = &self.n.blocks
         cdef pattern_t a = layout.a
-        cdef int32_t i, s = layout.s
-        cdef int64_t size[PARTS]
-        cdef double* x[PARTS]
-        cdef SparsePanels held
-        cdef const int64_t[::1] spot
-        cdef const sparse_t* super_ = NULL
-        cdef const int64_t* places = NULL
-        own = np.zeros(a.n * (s + 1) + len(self.ptr) + 1, np.int32)
-        a.pivot = <int32_t*>address(own)                # what a factor writes belongs to this one alone
-        a.next = a.pivot + a.n * s
-        a.group = a.next + a.n + 1
-        if layout.panels is not None and not lu:
-            spot = layout.panels[0]
-            held = SparsePanels.of_blocks(layout.panels[1:], a.n * s, wide)
-            super_, places = &held.f, &spot[0]
-            self.held.append(held)
-        factor_workspace_size(&a, s, lu, super_ != NULL, size)
-        values = [zeros(size[i]) for i in range(PARTS)]
-        for i in range(PARTS):
-            x[i] = <double*>address(values[i])
+        cdef int32_t factored = a.n * layout.s
+        f[0] = layout.blocks
+        own = np.empty(block_factor_index_size(a.n, layout.s) + len(self.ptr) + 1, np.int32)
+        a.group = <int32_t*>address(own) + block_factor_index_size(a.n, layout.s)
+        values = np.empty(factored + block_factor_size(f, lu) + 1)
         self.held += [panel, layout, own, values]
-        furnish_factor(self.n, &a, <double*>address(panel), &columns[0], s, super_, places, x)
+        furnish_factor(self.n, &a, <double*>address(panel), &columns[0], layout.s, lu, wide and has_wide(), <int32_t*>address(own),
+                    <double*>address(values), <double*>address(values) + factored)
 
     # -- turns -------------------------------------------------------------------------------------
 

@@ -17,11 +17,10 @@ from lavender_ext.core.validate cimport norm_inf
 from lavender_ext.core.dot cimport dot
 from lavender_ext.core.block_types cimport CONE
 from lavender_ext.core.view cimport csr_t
-from lavender_ext.factor.blocks cimport factor_t
-from lavender_ext.factor.cholesky cimport block_cholesky, block_solve
+from lavender_ext.factor.blocks cimport block_matrix_t, factor_blocks
 from lavender_ext.factor.dense cimport (cholesky_workspace_size, dense_cholesky, dense_cholesky_solve, dense_lu, dense_lu_sign,
                                         dense_lu_solve)
-from lavender_ext.factor.lu cimport block_lu, block_lu_solve
+from lavender_ext.factor.supernodal cimport solve_supernodes, supernodal_lu_sign
 from lavender_ext.newton.cones cimport is_high, is_low
 from lavender_ext.newton.elements cimport element_times, elements_t, is_row
 from lavender_ext.newton.natural_map cimport natural
@@ -64,7 +63,7 @@ cdef struct system_t:
     int32_t n_free              # of it: rows that are solved for, -1 for all
     int32_t law                 # of the last natural map
     const elements_t* e
-    const factor_t* f           # BODIES
+    const block_matrix_t* f           # BODIES
     const double* h             # (m, m) DENSE
     csr_t a                     # H, SPARSE
     const others_t* others      # or NULL
@@ -236,34 +235,24 @@ cdef inline int32_t system_factor(system_t* s, int32_t what, double eps) noexcep
     lu = what == OF_PAIR or (what == OF_NATURAL and s.law != CONE)
     normal_matrix(s.e, s.v, s.f, lu)
     s.by = BY_LU if lu else BY_CHOLESKY
-    return (block_lu(s.f) if lu else block_cholesky(s.f)) == 0
+    return factor_blocks(s.f, lu) == 0
 
 
 cdef inline int32_t system_sign(const system_t* s) noexcept nogil:
     """Sign of the determinant of the last (3); 0 where the caller factors, who does not tell it."""
-    cdef int32_t k, size, sign = 1
-    cdef double pivot
     if s.augmented or s.form == SPARSE:
         return 0
     if s.by != BY_LU:
         return s.by == BY_CHOLESKY
     if s.form == DENSE:
         return dense_lu_sign(s.e.m if s.n_free < 0 else s.n_free, s.whole, s.swap)
-    size = s.f.s
-    for k in range(s.f.n * size):
-        pivot = s.f.dval[<int64_t>(k // size) * size * size + (k % size) * (size + 1)]
-        if (s.f.pivot[k] != k % size) != (pivot < 0.0):
-            sign = -sign
-    return sign
+    return supernodal_lu_sign(&s.f.factor)
 
 
 cdef inline void over_bodies(system_t* s, const double* x, double* out) noexcept nogil:
     # K N^-1 K^T x
     to_bodies(s.e, s.f.n, x, s.y)
-    if s.by == BY_LU:
-        block_lu_solve(s.f, s.y)
-    else:
-        block_solve(s.f, s.y)
+    solve_supernodes(&s.f.factor, s.y, s.by == BY_LU)
     to_rows(s.e, s.y, out)
 
 

@@ -224,15 +224,6 @@ def test_a_solver_moved_to_the_memory_it_needs_takes_a_larger_problem(library, m
     assert grown
 
 
-def test_newton_rejects_more_bodies_than_its_factor_can_hold(library):
-    problem, options, workspace = library.problem(stack_of(1501)), library.options("newton"), ct.c_uint64()
-    assert ERRORS[library.c.lav_takes(ct.byref(problem), ct.byref(options))] == "LAV_ERROR_BODIES"
-    assert (
-        ERRORS[library.c.lav_workspace_size(ct.byref(problem), ct.byref(options), ct.byref(workspace))]
-        == "LAV_ERROR_BODIES"
-    )
-
-
 def test_a_solver_that_is_running_rejects_other_calls(library):
     # From within the clock, which stands for another thread: the solver is busy until the run returns.
     solver, problem = open_solver(library)

@@ -302,6 +302,35 @@ def test_methods_with_bits_of_their_own_meet_the_tolerance_where_the_package_doe
     assert met >= 7
 
 
+def row_of_boxes(n):
+    """n unit boxes on the ground in a row: each touches the next one, and the first is pushed against it."""
+    up, along = np.tile([0.0, 0.0, 1.0], (n, 1)), np.tile([1.0, 0.0, 0.0], (n - 1, 1))
+    normal = np.vstack([up, along])
+    body = np.vstack(
+        [
+            np.column_stack([np.full(n, -1), np.arange(n)]),
+            np.column_stack([np.arange(n - 1), np.arange(1, n)]),
+        ]
+    )
+    v_free = np.tile([0.0, 0.0, -0.1, 0.0, 0.0, 0.0], (n, 1))
+    v_free[0, 0] = 0.02
+    rows = lv.Rows(
+        np.ones(n), np.tile(6.0 * np.eye(3), (n, 1, 1)), v_free, normal=normal,
+        tangent=np.roll(normal, 1, axis=1), arm_a=0.5 * normal, arm_b=-0.5 * normal, contact_body=body,
+    )  # fmt: skip
+    return lv.Problem.from_rows(rows, mu=0.3, tangents=2)
+
+
+def test_newton_solves_more_bodies_than_a_full_factor_would_hold(library):
+    given = row_of_boxes(1600)
+    wanted, factorisations = run_driver(given, 1e-9, 400)
+    solver = library.open(library.problem(given), library.options("newton"))
+    result = solver.run(400, 1e-9)
+    assert result.outcome == 1 and result.verdict.relative <= 1e-9
+    assert (solver.impulse().tobytes(), result.iterations) == (wanted.tobytes(), factorisations)
+    assert np.abs(wanted).max() > 0.05
+
+
 def test_newton_that_a_budget_ends_is_no_worse_than_its_start_or_nothing(library):
     """At each of the first factorisations, from doing nothing, a solution of other numbers, and far off."""
     ran = 0

@@ -186,8 +186,6 @@ static int32_t takes_counts(const lav_problem *q, const lav_options *o) {
   if (!(row_of(o->method)->forms >> q->form & 1)) return LAV_ERROR_UNSUPPORTED;
 #ifdef LAV_SWEEPS_ONLY
   if (q->form == LAV_VELOCITIES) return LAV_ERROR_UNSUPPORTED;
-#else
-  if (o->method == LAV_NEWTON && q->form == LAV_BODIES && q->n_bodies > newton_bodies_MOST_BODIES) return LAV_ERROR_BODIES;
 #endif
   return LAV_OK;
 }

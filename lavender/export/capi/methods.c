@@ -179,6 +179,7 @@ static int32_t start_newton(lav_solver *s) {
     if (s->is_short) return LAV_ERROR_WORKSPACE;
     how = s->view.a ? core_method_MORE : begin_newton(s, s->newton_options.tol, s->newton_options.budget); /* Starting with the last options gives the workspace size. */
   }
+  if (how == core_method_UNFIT) return LAV_ERROR_FACTOR;
   s->driven = s->view.a == NULL;
   return LAV_OK;
 }

@@ -26,10 +26,6 @@ MAX_ALWAYS_DENSE_ROWS = 150  # Up to this many rows, a dense factor is faster th
 # the fraction s, and a multiply-add of a dense factor costs a quarter. It is smaller for bounded rows, of which dense
 # factors use only the free ones, and for Coulomb's law, whose asymmetric matrices lose pivots by panels.
 CONE_DENSE_FRACTION, OTHER_DENSE_FRACTION = 0.4, 0.25
-# Dense panels over bodies are used from this many multiply-adds of a factor; below, block rows are faster. A panel
-# stores zeros as numbers up to MAX_STORED_ZERO_FRACTION of its entries, or four times that up to NARROW_PANEL_COLUMNS
-# columns.
-MIN_PANELS_WORK, NARROW_PANEL_COLUMNS, MAX_STORED_ZERO_FRACTION = 2e6, 6, 0.1
 
 
 def is_dense_faster(nnz: float, m: int, cones: bool) -> bool:
@@ -109,9 +105,7 @@ class VelocitySystem(System):
         panel, columns = solve.jacobian(bodies.pair, bodies.column)
         structure = bodies.pair[solve.block], bodies.n, len(columns)
         reused = like.layout if isinstance(like, VelocitySystem) and like.layout.serves(*structure) else None
-        self.layout: Layout = reused or Layout(
-            *structure, MIN_PANELS_WORK, NARROW_PANEL_COLUMNS, MAX_STORED_ZERO_FRACTION
-        )
+        self.layout: Layout = reused or Layout(*structure)
         self.work = self.layout.work
         solve.over_bodies(
             panel, columns, self.layout, solve.has_friction and problem.law == "coulomb", USE_WIDE_LANES
