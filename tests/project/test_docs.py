@@ -17,6 +17,7 @@ from worked import python
 import benchmarks.__main__ as benchmarks
 import lavender as lv
 from lavender.cli import cli
+from lavender.sim.web.compile import MAX_MODULE_BYTES
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -251,6 +252,12 @@ def test_every_function_of_the_page_on_webassembly_is_exported():
     exported = set(re.findall(r"^cdef public [\w*]+ (lav_\w+)\(", "\n".join(sources), re.MULTILINE))
     named = set(re.findall(r"\blav_\w+", (ROOT / "docs" / "web.md").read_text(encoding="utf-8")))
     assert named <= exported, sorted(named - exported)
+
+
+def test_the_largest_module_of_the_page_is_that_of_its_build():
+    text = (ROOT / "docs" / "web.md").read_text(encoding="utf-8")
+    assert f"must be smaller than {MAX_MODULE_BYTES // 1000} kB (`MAX_MODULE_BYTES`" in text
+    assert MAX_MODULE_BYTES % 1000 == 0
 
 
 def test_every_test_that_a_page_names_exists():
