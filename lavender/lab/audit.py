@@ -44,7 +44,7 @@ from lavender.lab.bench.running.workers import check_workers, connect_backend, m
 from lavender.lab.report.figures import Curve, Figure
 from lavender.lab.report.summary_page import PageSection, SummaryPage
 from lavender.lab.report.table import Cell, Table
-from lavender.lab.report.text import NONE, format_count, format_percent, format_size
+from lavender.lab.report.text import format_count, format_percent, format_size
 from lavender.lab.simulated_worlds import (
     ENGINES,
     Divergence,
@@ -290,7 +290,7 @@ class Audit:
                 known = x[selected & np.isfinite(x)]
                 if len(known):
                     quantiles = np.quantile(known, QUANTILES, method="higher")
-                    rows.append([f"{name} [{unit}], {of}", *map(format_size, quantiles.tolist())])
+                    rows.append([f"{name} [{unit}], {of}", *map(Cell.size, quantiles.tolist())])
         return Table(heads, rows, words=frozenset({"error"}))
 
     @property
@@ -308,16 +308,16 @@ class Audit:
     def table_of_rows(self) -> Table:
         """The worst rows of steps that stopped before convergence, most frequent first."""
         ranked = sorted(self.where.items(), key=lambda entry: -entry[1][0])
-        rows = [[name, str(n), format_size(largest)] for name, (n, largest) in ranked]
+        rows: list[list[str | Cell]] = [[name, str(n), Cell.size(largest)] for name, (n, largest) in ranked]
         return Table(["worst row", UNCONVERGED, "at most [m/s]"], rows)
 
     @property
     def table_of_diverged(self) -> Table:
         """The step in which each world diverged."""
-        rows = []
+        rows: list[list[str | Cell]] = []
         for d in self.divergences:
             error = self.numbers[0, d.world, d.step]
-            known = format_size(error) if np.isfinite(error) else NONE
+            known = Cell.size(float(error))
             exact = "exact" if self.has_exact_solves(d) else "not exact"
             rows.append([d.cause, str(d.world), str(d.step), known, exact])
         heads = ["too large", "world", "step", "error [m/s]", "solves until then"]
@@ -326,8 +326,8 @@ class Audit:
     @property
     def table_of_worst(self) -> Table:
         """The worlds of the worst steps, which are written to files."""
-        rows = [
-            [f"worst_{i}.npz", str(w.world), str(w.step), format_size(w.velocity), w.where]
+        rows: list[list[str | Cell]] = [
+            [f"worst_{i}.npz", str(w.world), str(w.step), Cell.size(w.velocity), w.where]
             for i, w in enumerate(self.worst, 1)
         ]
         return Table(

@@ -44,7 +44,7 @@ from lavender.lab.bench import machine
 from lavender.lab.bench.running.runner import Event
 from lavender.lab.report.figures import Curve, Figure
 from lavender.lab.report.summary_page import PageSection, SummaryPage
-from lavender.lab.report.table import Table
+from lavender.lab.report.table import Cell, Table
 from lavender.lab.report.text import format_ratio, format_size
 from lavender.lab.simulated_worlds import Runs, StepSizes, can_touch, has_diverged, simulate_world
 from lavender.problem.derived import cached_property
@@ -459,10 +459,10 @@ class Tuning:
 
     def _table(self, settings: Iterable[Measured]) -> Table:
         """Build the table of some settings."""
-        rows = [
+        rows: list[list[str | Cell]] = [
             [
-                m.setting.line or "as it is", seconds(m.time), f"{m.time / self.now.time:.2f}", format_size(m.worst),
-                format_size(float(m.error.max())), format_size(m.worst_motion),
+                m.setting.line or "as it is", Cell.time(m.time), f"{m.time / self.now.time:.2f}", Cell.size(m.worst),
+                Cell.size(float(m.error.max())), Cell.size(m.worst_motion),
             ]
             for m in settings
         ]  # fmt: skip

@@ -421,30 +421,32 @@ def times_to(records: Records, tolerance: float) -> dict[str, dict[str, float]]:
 
 
 #: Counters of `work` of which each is a pass over the entries of A: a sweep over all blocks, or a product with A.
-PASS_COUNTERS = frozenset({"sweeps", "products", "matvecs"})
+MATRIX_PASS_COUNTERS = frozenset({"sweeps", "products", "matvecs"})
 #: Counters of work that cannot be expressed in passes; solvers with such work are not in a profile by work.
 OTHER_WORK_COUNTERS = frozenset({"factorisations", "solves", "pivots", "backend_calls"})
 
 
-def count_passes(record: Record) -> float:
+def count_matrix_passes(record: Record) -> float:
     """Return the passes over A of a run (sweeps and products); nan if it did other work, or counted none."""
     if any(record.work.get(name, 0) for name in OTHER_WORK_COUNTERS):
         return math.nan
-    passes = [n for name, n in record.work.items() if name in PASS_COUNTERS]
+    passes = [n for name, n in record.work.items() if name in MATRIX_PASS_COUNTERS]
     return float(sum(passes)) if passes else math.nan
 
 
-def passes_to(records: Records, tolerance: float) -> dict[str, dict[str, float]]:
+def matrix_passes_to(records: Records, tolerance: float) -> dict[str, dict[str, float]]:
     """Return the passes over A to a tolerance from a cold start by case and solver, inf if missed.
 
-    Only solvers whose runs do no other work are compared (`count_passes`); fewer than one pass counts as one.
+    Only solvers whose runs do no other work are compared (`count_matrix_passes`); fewer than one pass counts as one.
     """
     groups = {k[:2]: [r for r in group if r.usable] for k, group in pairs(records).items() if k[2] == "cold"}
-    excluded = {s for (_, s), group in groups.items() if any(math.isnan(count_passes(r)) for r in group)}
+    excluded = {
+        s for (_, s), group in groups.items() if any(math.isnan(count_matrix_passes(r)) for r in group)
+    }
     out: dict[str, dict[str, float]] = defaultdict(dict)
     for (case, solver), group in groups.items():
         if solver not in excluded:
-            reached = [max(1.0, count_passes(r)) for r in group if r.relative <= tolerance]
+            reached = [max(1.0, count_matrix_passes(r)) for r in group if r.relative <= tolerance]
             out[case][solver] = min(reached, default=math.inf)
     return out
 
@@ -558,13 +560,13 @@ def profiles(records: Records, measure: str = "time") -> list[Profile]:
     ----------
     records : Records
     measure : {"time", "work"}
-        "work": passes over A, of the solvers that do no other work (`passes_to`).
+        "work": passes over A, of the solvers that do no other work (`matrix_passes_to`).
     """
     check_choice("measure", measure, ("time", "work"))
     out = []
     for law, cases in _laws(records).items():
         for tolerance in get_tolerances(records):
-            times = (times_to if measure == "time" else passes_to)(records, tolerance)
+            times = (times_to if measure == "time" else matrix_passes_to)(records, tolerance)
             curves: dict[str, tuple[tuple[float, float], ...]] = {}
             for solver in sorted({s for c in cases for s in times.get(c, {})}):
                 ratios = []
@@ -653,6 +655,11 @@ class Pass:
     def target(self) -> str:
         """Budget or tolerance."""
         return describe_target(self.mode, self.tol, self.max_iter)
+
+    @property
+    def start(self) -> str:
+        """The start that a simulation uses: "carried" if the solver takes a start, else "cold"."""
+        return "carried" if "carried" in self.times else "cold"
 
     @property
     def time(self) -> dict[str, float]:

@@ -99,10 +99,20 @@ class MotionError:
     @property
     def body_name(self) -> str:
         """Name of the body (or generalised velocity) with the largest error, e.g. "body 3"; empty without one."""
+        return self._name_body(self.body)
+
+    @property
+    def _row_unit(self) -> str:
+        """Unit of `rows`: that of `row`, if bodies are known, otherwise that of a velocity or an angular velocity."""
+        if self._problem is None or self._problem.rows is None or self.row < 0:
+            return " m/s or rad/s"
+        row = self._problem.jacobian[[self.row]]
+        return " m/s" if row.data[row.indices % 6 < 3].any() else " rad/s"
+
+    def _name_body(self, body: int) -> str:
+        """Return the name of a body or generalised velocity; empty for -1."""
         return (
-            motion_cache(self._problem).operator.name(self.body)
-            if self._problem is not None and self.body >= 0
-            else ""
+            motion_cache(self._problem).operator.name(body) if self._problem is not None and body >= 0 else ""
         )
 
     @property
@@ -111,29 +121,31 @@ class MotionError:
         return self._problem.row_name(self.row) if self._problem is not None and self.row >= 0 else ""
 
     def __str__(self) -> str:
-        parts = []
-        if self.relative is not None:
-            parts.append(f"relative {self.relative:.2e}")
-        if self.kinetic is not None or self.energy is not None:
-            parts.append(f"{self.kinetic if self.kinetic is not None else self.energy:.2e} sqrt(J)")
-        if self.speed is not None:
-            spin = "" if self.spin is None else f", {self.spin:.2g} rad/s"
-            unit = " m/s" if self.spin is not None else ""  # a generalised velocity may be in m/s or rad/s
-            parts.append(f"{self.body_name or 'bodies'} {self.speed:.2g}{unit}{spin}")
-        if self.rows is not None:
-            parts.append(f"{self.row_name or 'rows'} {self.rows:.2g} m/s")
-        if self.bound is not None:
-            speed = "" if self.bound_speed is None else f" ({self.bound_speed:.2g} m/s)"
-            moved = "" if self.moved is None else f" with targets moved by {self.moved:.1e} m/s"
-            parts.append(f"at most {self.bound:.2e} sqrt(J){speed}{moved}")
+        is_generalized = self.spin is None  # A generalised velocity may be in m/s or rad/s.
+        numbers = (
+            ("relative", self.relative, "", ""),
+            ("kinetic", self.kinetic, " sqrt(J)", ""),
+            ("energy", self.energy if self.kinetic is None else None, " sqrt(J)", ""),
+            ("speed", self.speed, " m/s or rad/s" if is_generalized else " m/s", self.body_name),
+            ("spin", self.spin, " rad/s", self._name_body(self.spin_body)),
+            ("rows", self.rows, self._row_unit, self.row_name),
+            ("bound", self.bound, " sqrt(J)", ""),
+            ("bound_speed", self.bound_speed if self.bound is not None else None, " m/s", ""),
+        )
+        parts = [
+            f"{name} {x:.2g}{unit}{f' ({where})' if where else ''}"
+            for name, x, unit, where in numbers
+            if x is not None
+        ]
+        if self.bound is not None and self.moved is not None:
+            parts[-1] += f" with targets moved by {self.moved:.1e} m/s"
+        text = f"motion error: {', '.join(parts)}"
         if self.spread_speed is not None and self.count > 1:
-            parts.append(f"nearest of {self.count} motions {self.spread_speed:.2g} m/s apart")
+            text += f"; nearest of {self.count} motions {self.spread_speed:.2g} m/s apart"
         if self.unique:
-            parts.append(f"unique: {self.unique}")
-        parts.append(f"to {self.reference}")
-        if self.note:
-            parts.append(self.note)
-        return f"motion error: {', '.join(parts)}"
+            text += f"; unique: {self.unique}"
+        text += f"; compared with {self.reference}"
+        return f"{text}; {self.note}" if self.note else text
 
 
 def measure(problem: Problem, x: FloatArray, reference: Reference) -> MotionError:

@@ -193,23 +193,6 @@ def build_budget_figure(records: Records, case: str) -> Figure:
     return _build_case_figure("budget", "iterations (sweeps)", records, case, curves)
 
 
-def build_pass_figure(sequence: str, passes: list[statistics.Pass]) -> Figure:
-    """Plot each step of a sequence, carried and cold (thin): its residual at a budget, or its time to a tolerance."""
-    timed = passes[0].mode == "tol"
-    curves = []
-    for w in passes:
-        for start, residuals in sorted(w.residuals.items()):
-            values = w.times[start] if timed else residuals
-            cold = start == "cold" and len(w.residuals) > 1
-            label = f"{w.solver} (cold)" if cold else w.solver
-            curves.append(Curve.of(w.solver, label, enumerate(values), thin=cold))
-    target = passes[0].target
-    return Figure(
-        f"sequence {sequence} {target}", f"{sequence}: {target}", "step",
-        "time: set-up and solve [s]" if timed else "relative residual [-]", tuple(curves), x_log=False,
-    )  # fmt: skip
-
-
 MAX_CURVES = 5  # Curves of a profile: more cannot be distinguished, and mislead about the second place.
 MIN_COMPARED = 2  # At least this many other solvers are drawn with plug-ins.
 
@@ -225,6 +208,34 @@ def select_drawn(ranked: Sequence[str]) -> list[str]:
     plug_ins = [name for name in ranked if is_plug_in(name)]
     others = [name for name in ranked if name not in plug_ins]
     return [*plug_ins, *others[: max(MAX_CURVES - len(plug_ins), MIN_COMPARED)]]
+
+
+def build_pass_figure(sequence: str, passes: list[statistics.Pass]) -> Figure:
+    """Plot the steps of a sequence at one target, carried and cold (thin), for a few solvers.
+
+    With a budget: the residual of each step. To a tolerance: the time of all steps so far, because the times of single
+    steps are noise.
+    """
+    timed = passes[0].mode == "tol"
+
+    def rank(w: statistics.Pass) -> tuple[float, float, str]:
+        return -len(w.times[w.start]), w.time[w.start] if timed else w.middle(w.start), w.solver
+
+    ranked = [w.solver for w in sorted(passes, key=rank)]
+    drawn = set(select_drawn(ranked))
+    curves = []
+    for w in passes:
+        for start, residuals in sorted(w.residuals.items()) if w.solver in drawn else ():
+            values = np.cumsum(w.times[start]).tolist() if timed else residuals
+            cold = start == "cold" and len(w.residuals) > 1
+            label = f"{w.solver} (cold)" if cold else w.solver
+            curves.append(Curve.of(w.solver, label, enumerate(values), thin=cold))
+    target = passes[0].target
+    return Figure(
+        f"sequence {sequence} {target}", f"{sequence}: {target}", "step",
+        "time of all steps so far [s]" if timed else "relative residual [-]", tuple(curves), x_log=False,
+        y_log=not timed, left_out=tuple(sorted(set(ranked) - drawn)),
+    )  # fmt: skip
 
 
 def build_profile_figure(profile: statistics.Profile) -> Figure:
@@ -350,8 +361,9 @@ def _keep_drawn(*some: Figure) -> tuple[Figure, ...]:
 
 
 def _build_pass_figures(name: str, passes: list[statistics.Pass]) -> tuple[Figure, ...]:
-    # The middle budget, and the solvers without budgets.
+    # The middle budget, and the middle tolerance.
     budgets = sorted({w.max_iter for w in passes if w.mode == "budget"})
     middle = [w for w in passes if w.mode == "budget" and w.max_iter == budgets[len(budgets) // 2]]
-    to_tolerance = [w for w in passes if w.mode == "tol"]
+    tolerances = sorted({w.tol for w in passes if w.mode == "tol"}, reverse=True)
+    to_tolerance = [w for w in passes if w.mode == "tol" and w.tol == tolerances[len(tolerances) // 2]]
     return tuple(build_pass_figure(name, some) for some in (middle, to_tolerance) if some)

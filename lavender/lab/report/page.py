@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+import re
 from collections.abc import Sequence
 from typing import Any
 
@@ -42,7 +43,11 @@ def create_environment() -> Any:
         lstrip_blocks=True,
     )
     environment.filters.update(
-        seconds=seconds, residual=format_residual, tolerance=format_tolerance, anchor=file_name
+        seconds=seconds,
+        residual=format_residual,
+        tolerance=format_tolerance,
+        anchor=file_name,
+        numbers=keep_numbers_together,
     )
     environment.globals.update(
         table_specs=table_specs,
@@ -59,6 +64,20 @@ def create_environment() -> Any:
         flat_lines_note=FLAT_LINES_NOTE,
     )
     return environment
+
+
+#: A number with an exponent or a unit, or the name of an option, which are not broken across lines.
+NUMBER = re.compile(
+    r"(?<![\w.])\d[\d.]*(?:e-?\d+(?:\s(?:m/s|N\ss|√J))?|\s(?:µs|ms|s|m/s|rad/s|N\ss|√J|%|times|iterations?|sweeps?))"
+    r"(?!\w)|(?<!\S)--[a-z][a-z-]*"
+)
+
+
+def keep_numbers_together(text: str) -> Any:
+    """Return escaped HTML in which each number stays on one line with its exponent and unit."""
+    from jinja2.filters import do_forceescape, do_mark_safe
+
+    return do_mark_safe(NUMBER.sub(r'<span class="v">\g<0></span>', str(do_forceescape(text))))
 
 
 def render_page(report: Report, figures: Figures, saved: bool = True) -> str:

@@ -13,6 +13,7 @@ from __future__ import annotations
 import io
 import math
 import re
+import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
@@ -24,17 +25,19 @@ from xml.etree import ElementTree
 from lavender.io.stored import make_folder, write_figure
 from lavender.lab.bench.record import file_name, format_tolerance
 from lavender.lab.report.figures import Curve, Figure
+from lavender.lab.report.text import TIME_UNITS
 
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#8C6D31", "#7F7F7F")
 DASHES = ("-", "--", ":", "-.")  # Line styles of matplotlib.
 MARKERS = ("o", "s", "^", "D", "X", "*", "v")
 LEGEND_COLUMNS = 3  # Columns of a legend above the axes.
+MAX_PAGE_DOTS = 40  # A line with more points has no dots on a page; single points always have.
 MAX_MARKED_POINTS = 60  # A curve with more points has no marks: they would cover it.
 MAX_TITLE_LENGTH = 80  # [characters] Longer titles are cut.
 MAX_NAME_LENGTH = 24  # [characters] Longer names of solvers at the ends of curves are cut.
 MIN_DECADES = 1.0  # A logarithmic axis has at least this length.
 AXIS_MARGIN = 0.03  # This fraction of the data's range is added at each end of an axis.
-TIME_UNITS = ((1.0, "s"), (1e-3, "ms"), (1e-6, "µs"), (1e-9, "ns"))
+AXIS_TIME_UNITS = (*TIME_UNITS, (1e-9, "ns"))
 
 
 # -- axes ----------------------------------------------------------------------------------------------------
@@ -69,7 +72,9 @@ def label_axis(
     middle = math.sqrt(limits[0] * limits[1]) if log else 0.5 * (limits[0] + limits[1])
     is_time = "[s]" in title
     scale, unit = (
-        next((u for u in TIME_UNITS if middle >= u[0]), TIME_UNITS[-1]) if is_time else TIME_UNITS[0]
+        next((u for u in AXIS_TIME_UNITS if middle >= u[0]), AXIS_TIME_UNITS[-1])
+        if is_time
+        else AXIS_TIME_UNITS[0]
     )
     smallest = 9e-4 if is_time else 0.09  # Smaller numbers of a logarithmic axis are powers of ten.
 
@@ -271,6 +276,7 @@ def save_figures(figures: Iterable[Figure], folder: Path, solvers: Iterable[str]
 # -- within a page ---------------------------------------------------------------------------------------------
 
 WIDTH, HEIGHT = 1000, 640  # [units] Size of a drawing in a page, about two units per pixel of a phone.
+PAGE_WIDTH = 1900  # [units] Width of a drawing that is as wide as the page on a screen.
 LEFT, RIGHT, TOP, BOTTOM = (
     118,
     256,
@@ -278,14 +284,23 @@ LEFT, RIGHT, TOP, BOTTOM = (
     92,
 )  # [units] Margins for the labels of the axes and the names at the ends of curves.
 FONT_SIZE = 22  # [units] The page's style sheet has the same size.
+TITLE_CHARACTER_WIDTH = (
+    16  # [units] Mean width of a character of a title on a phone, which has the largest font.
+)
+TITLE_LINE_HEIGHT = 32  # [units]
+TITLE_MARGIN = 8  # [units] Between the title and the title of the vertical axis.
 MIN_NAME_DISTANCE = 30  # [units] Smallest distance between two names of leaders.
 SVG = "{http://www.w3.org/2000/svg}"
 
 
 def plot_for_page(
-    figure: Figure, number: Mapping[str, int], leaders: Sequence[str] = (), title: str | None = None
+    figure: Figure,
+    number: Mapping[str, int],
+    leaders: Sequence[str] = (),
+    title: str | None = None,
+    width: int = WIDTH,
 ) -> str:
-    """Draw a figure as SVG text for a page.
+    """Draw a figure as SVG text for a page. A title that is too long for one line has several.
 
     Parameters
     ----------
@@ -296,11 +311,13 @@ def plot_for_page(
         The page shows their names at the ends of their curves, at a distance from each other.
     title : str, optional
         Replaces the figure's heading, which may repeat a heading of the page.
+    width : int
+        Width of the drawing in its own units.
     """
-    canvas = _create_canvas((WIDTH / 72.0, HEIGHT / 72.0), dpi=72)  # One unit is one pixel.
-    right, bottom = WIDTH - RIGHT, HEIGHT - BOTTOM
+    canvas = _create_canvas((width / 72.0, HEIGHT / 72.0), dpi=72)  # One unit is one pixel.
+    right, bottom = width - RIGHT, HEIGHT - BOTTOM
     axes = canvas.add_axes(
-        (LEFT / WIDTH, BOTTOM / HEIGHT, (right - LEFT) / WIDTH, (bottom - TOP) / HEIGHT), frame_on=False
+        (LEFT / width, BOTTOM / HEIGHT, (right - LEFT) / width, (bottom - TOP) / HEIGHT), frame_on=False
     )
     axes.grid(True)
     axes.tick_params(length=0, pad=10, labelsize=FONT_SIZE)
@@ -311,7 +328,7 @@ def plot_for_page(
         i: [(x, HEIGHT - y) for x, y in to_units([p for p in points if not math.isnan(p[1])])]
         for i, (_, points, _, _) in enumerate(artists)
     }
-    names = _place_names([c for c, *_ in artists], places, leaders)
+    names = _place_names([c for c, *_ in artists], places, leaders, right)
     for i, (_, _, line, band) in enumerate(artists):
         line.set(gid=f"@{i} line", zorder=4 + i)
         if band is not None:
@@ -319,15 +336,22 @@ def plot_for_page(
         if i in names:
             x, y = names[i]
             axes.text(
-                x / WIDTH, 1.0 - y / HEIGHT, "x", transform=canvas.transFigure, gid=f"@{i} name", zorder=4 + i
+                x / width, 1.0 - y / HEIGHT, "x", transform=canvas.transFigure, gid=f"@{i} name", zorder=4 + i
             )
-    heading = _shorten(figure.heading if title is None else title)
+    heading = figure.heading if title is None else title
+    lines = textwrap.wrap(heading, (width - LEFT) // TITLE_CHARACTER_WIDTH) or [""]
+    above = TITLE_MARGIN + TITLE_LINE_HEIGHT * (len(lines) - 1)
+    text = "".join(
+        f'<text class="t" x="{LEFT}" y="{24 + TITLE_LINE_HEIGHT * i - above}">{escape(line)}</text>'
+        for i, line in enumerate(lines)
+    )
     is_time = "".join(str(int("[s]" in text)) for text in (figure.x_title, figure.y_title))
     head = (
-        f'<svg class="chart" viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{escape(figure.title)}"'
+        f'<svg class="chart" viewBox="0 {-above} {width} {HEIGHT + above}" role="img"'
+        f' aria-label="{escape(figure.title)}"'
         f' data-x="{_describe_axis(axes.get_xlim(), figure.x_log, LEFT, right)}"'
         f' data-y="{_describe_axis(axes.get_ylim(), figure.y_log, bottom, TOP)}" data-t="{is_time}">'
-        f'<text class="t" x="{LEFT}" y="24">{escape(heading)}</text>'
+        f"{text}"
     )
     return "".join([head, *_rewrite_svg(canvas, [c for c, *_ in artists], number), "</svg>"])
 
@@ -355,19 +379,24 @@ def _describe_axis(limits: tuple[float, float], log: bool, first: int, last: int
 
 
 def _place_names(
-    curves: Sequence[Curve], places: Mapping[int, Sequence[tuple[float, float]]], leaders: Sequence[str]
+    curves: Sequence[Curve],
+    places: Mapping[int, Sequence[tuple[float, float]]],
+    leaders: Sequence[str],
+    edge: float,
 ) -> dict[int, tuple[float, float]]:
-    """Return the positions of the names of curves: at their ends, with a distance between the names of leaders."""
+    """Return the positions of the names of curves: at their ends, with a distance between the names of leaders.
+
+    In a figure with single points the names are a list to the right of the axes, which end at `edge`: beside a point
+    they would cover others.
+    """
+    if any(c.points for c in curves):
+        return {i: (edge + 24.0, TOP + FONT_SIZE + MIN_NAME_DISTANCE * i) for i in range(len(curves))}
     ends = {}
     for i, c in enumerate(curves):
         if not c.thin:
             last = places[i][-1][1]
             # Next to the rightmost point at the height of the end.
-            right = (
-                WIDTH - RIGHT
-                if c.steps
-                else max(x for x, y in places[i] if abs(y - last) < MIN_NAME_DISTANCE)
-            )
+            right = edge if c.steps else max(x for x, y in places[i] if abs(y - last) < MIN_NAME_DISTANCE)
             ends[i] = (right + 12.0, last + 8.0)
     leading = sorted((i for i in ends if curves[i].solver in leaders), key=lambda i: ends[i][1])
     for above, i in pairwise(leading):
@@ -416,7 +445,7 @@ def _rewrite_svg(canvas: Any, curves: Sequence[Curve], number: Mapping[str, int]
             elif kind == "line":
                 if not c.points:
                     yield f'<path d="{data}"/>'
-                if not (c.steps or c.low):
+                if c.points or not (c.steps or c.low or len(c.x) > MAX_PAGE_DOTS):
                     dots = re.sub(r"[ML](\S+ \d+)", r"M\1h0", data)
                     yield f'<path class="d" d="{dots}"/>'
             yield from _rewrite_texts(group, "", _shorten(c.label, MAX_NAME_LENGTH))

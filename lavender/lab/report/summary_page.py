@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from lavender.io.stored import make_folder, write_text
 from lavender.lab.report.figures import Figure
 from lavender.lab.report.page import create_environment
-from lavender.lab.report.plotting import plot_for_page, save_figures
+from lavender.lab.report.plotting import PAGE_WIDTH, plot_for_page, save_figures
 from lavender.lab.report.table import Table
 from lavender.lab.report.terminal import print_table
 
@@ -73,7 +73,15 @@ class SummaryPage:
         number = {name: i for i, name in enumerate(names)}
         shown = [part for part in self.sections if part.is_shown]
         sections = [
-            (part, [plot_for_page(f, number, names) for f in part.figures if f.curves]) for part in shown
+            (
+                part,
+                [
+                    (plot_for_page(f, number, names, width=PAGE_WIDTH), plot_for_page(f, number, names))
+                    for f in part.figures
+                    if f.curves
+                ],
+            )
+            for part in shown
         ]
         template = create_environment().get_template("summary_page.html.j2")
         return str(template.render(page=self, sections=sections, number=number))

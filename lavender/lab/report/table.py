@@ -1,12 +1,17 @@
 """Define tables as data. Each output format has one writer of them.
 
-These are `terminal`, `markdown`, `latex_export`, and the template `table.html.j2` for pages.
+These are `terminal`, `markdown`, `latex_export`, and the template `table.html.j2` for pages. The times of a table have
+one unit, and the sizes of a column one format.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from lavender.lab.report.text import format_sizes, format_times
 
 #: Heads of columns of words; all other columns have numbers.
 WORDS = frozenset({
@@ -29,6 +34,7 @@ class Cell:
     link : id of the part of the page that the cell links to
     value : number by which the page sorts
     mark : key of `COLOURS`
+    quantity : "time" [s] or "size": the table writes `value`, in the format of its other times or of the column
     """
 
     text: str
@@ -39,9 +45,24 @@ class Cell:
     link: str = ""
     value: float | None = None
     mark: str = ""
+    quantity: str = ""
+
+    @classmethod
+    def time(cls, value: float, after: str = "", **more: Any) -> Cell:
+        """Create the cell of a time [s]."""
+        return cls("", after=after, value=value, quantity="time", **more)
+
+    @classmethod
+    def size(cls, value: float, **more: Any) -> Cell:
+        """Create the cell of a number without a usual size."""
+        return cls("", value=value, quantity="size", **more)
 
     def __str__(self) -> str:
         return f"{self.lead} {self.text}".strip() + self.after
+
+
+def _value_of(cell: Cell) -> float:
+    return math.nan if cell.value is None else cell.value
 
 
 @dataclass(frozen=True)
@@ -61,6 +82,23 @@ class Table:
     marks: Sequence[str] = ()
     folds: bool = False
     words: frozenset[str] = field(default=WORDS, repr=False)
+
+    def __post_init__(self) -> None:
+        """Write all times in one unit, which the heads name, and the sizes of each column in one format."""
+        heads, rows = list(self.heads), [list(row) for row in self.rows]
+        cells = [(row, i, c) for row in rows for i, c in enumerate(row) if isinstance(c, Cell) and c.quantity]
+        times = [entry for entry in cells if entry[2].quantity == "time"]
+        unit, texts = format_times([_value_of(cell) for _, _, cell in times])
+        for (row, i, cell), text in zip(times, texts, strict=True):
+            row[i] = replace(cell, text=text, quantity="")
+        for i in {i for _, i, _ in times}:
+            heads[i] = f"{heads[i]} [{unit}]"
+        for column in {i for _, i, cell in cells if cell.quantity == "size"}:
+            sizes = [(row, cell) for row, i, cell in cells if i == column]
+            for (row, cell), text in zip(sizes, format_sizes([_value_of(c) for _, c in sizes]), strict=True):
+                row[column] = replace(cell, text=text, quantity="")
+        object.__setattr__(self, "heads", heads)
+        object.__setattr__(self, "rows", rows)
 
     @classmethod
     def of(cls, rows: Sequence[Mapping[str, str | Cell]], marks: Sequence[str] = ()) -> Table:

@@ -155,18 +155,20 @@ def _tabulate_solvers(report: Report, tolerance: float) -> Table:
     rows: Rows = [
         [
             c.solver,
-            seconds(c.score) + format_share(c.solved, c.cases),
+            Cell.time(c.score, after=format_share(c.solved, c.cases)),
             f"{line.target}, {line.start}",
             INTERLEAVED if line.interleave_group else ALONE,
         ]
         for line, c in raced.values()
     ]
-    rows += [[c.solver, seconds(c.score) + format_share(c.solved, c.cases), c.how, ALONE] for c in alone]
+    rows += [
+        [c.solver, Cell.time(c.score, after=format_share(c.solved, c.cases)), c.how, ALONE] for c in alone
+    ]
     engine = rank_engine(report.engines, report.records, report.lines[0].cases, tolerance)
     if engine is not None and engine.solved:
         ranked = [*(choice for _, choice in raced.values()), *alone]
         before = sum(not ranks_before(engine, choice) for choice in ranked)
-        time = seconds(engine.score) + format_share(engine.solved, engine.cases)
+        time = Cell.time(engine.score, after=format_share(engine.solved, engine.cases))
         rows.insert(before, [f"engine's {engine.solver}", time, "own, warm", "inside the engine"])
     return Table(["solver", f"to {format_tolerance(tolerance)}", "target", "timed"], rows)
 
@@ -275,7 +277,7 @@ def tabulate_cases(
         rows.append(
             [
                 Cell(name, link=f"case-{file_name(name)}"), info.law, str(info.rows), str(info.contacts),
-                ", ".join(info.structure), "none" if best is None else best.solver, Cell(seconds(time), value=time),
+                ", ".join(info.structure), "none" if best is None else best.solver, Cell.time(time),
                 Cell(answer, value=info.stored),
             ]
         )  # fmt: skip
@@ -291,7 +293,7 @@ def tabulate_reaches(reaches: Sequence[statistics.Reach], tolerances: Sequence[f
         [
             r.case,
             name_run(r.solver, r.start),
-            *(seconds(r.times[x]) for x in tolerances),
+            *(Cell.time(r.times[x]) for x in tolerances),
             Cell(format_residual(r.best), after=" floor" if r.at_floor else ""),
             Cell(r.status, mark="good" if r.status in GOOD else "warn"),
             Cell(CLAIM_MARKS[r.claim_check], more=r.status_conflict),
@@ -339,7 +341,9 @@ def tabulate_motion_errors(report: Report) -> Table:
             f"{format_residual(x)}{unit}" if math.isfinite(x) else NONE
             for x, unit in ((m.best, " m/s"), (m.motion_error, ""), (m.bound, " √J"))
         ]
-        rows.append([m.case, name_run(m.solver, m.start), *(seconds(m.times[x]) for x in tolerances), *known])
+        rows.append(
+            [m.case, name_run(m.solver, m.start), *(Cell.time(m.times[x]) for x in tolerances), *known]
+        )
     heads = [f"to {format_speed(x)}" for x in tolerances]
     return Table(["case", "solver", *heads, "best", "relative", "bound"], rows)
 
@@ -388,7 +392,7 @@ def tabulate_changes(old: Records, new: Records) -> Table:
     rows: Rows = []
     for c in changes:
         factor = f" {c.new / c.old:.3g} times" if c.kind in ("faster", "slower") else ""
-        times_of = (format_tolerance(c.tolerance), seconds(c.old), seconds(c.new))
+        times_of = (format_tolerance(c.tolerance), Cell.time(c.old), Cell.time(c.new))
         rows.append([c.case, name_run(c.solver, c.start), *times_of, c.kind + factor])
     marks = ["bad" if c.kind in ("lost", "slower") else "good" for c in changes]
     return Table(["case", "solver", "tolerance", "before", "now", "change"], rows, marks)
@@ -448,10 +452,7 @@ def tabulate_means(by_tolerance: Mapping[float, Mapping[str, tuple[float, int, i
     rows: Rows = [
         [
             solver,
-            *(
-                Cell(seconds(t), after=f" {n}/{of}")
-                for t, n, of in (by_tolerance[x][solver] for x in tolerances)
-            ),
+            *(Cell.time(t, after=f" {n}/{of}") for t, n, of in (by_tolerance[x][solver] for x in tolerances)),
         ]
         for solver in by_tolerance[tolerances[0]]
     ]
@@ -464,7 +465,7 @@ def tabulate_backends(records: Records) -> Table:
         [
             b.solver,
             str(b.solved),
-            *map(seconds, (b.total_time, b.total_time - b.backend_time, b.backend_time)),
+            *map(Cell.time, (b.total_time, b.total_time - b.backend_time, b.backend_time)),
             str(b.wins),
         ]
         for b in statistics.backends(records)
@@ -494,12 +495,50 @@ def tabulate_passes(passes: Sequence[statistics.Pass]) -> Table:
                 Cell(w.sequence, after=format_left_out(w.left_out)), w.solver, w.target, str(w.steps),
                 f"{w.gain:.3g}" if math.isfinite(w.gain) and w.mode == "budget" else NONE,
                 *(format_residual(w.middle(s)) if s in w.residuals else NONE for s in starts),
-                *(seconds(w.time[s]) + format_share(len(w.times[s]), w.steps) if s in w.time else NONE for s in starts),
+                *(
+                    Cell.time(w.time[s], after=format_share(len(w.times[s]), w.steps)) if s in w.time else NONE
+                    for s in starts
+                ),
                 *(str(w.iterations.get(s, NONE)) for s in starts),
             ]
         )  # fmt: skip
     heads = [f"{what}, {start}" for what in ("median", "time", "iterations") for start in starts]
     return Table(["sequence", "solver", "target", "steps", "gain", *heads], rows)
+
+
+def tabulate_sequence(passes: Sequence[statistics.Pass]) -> Table:
+    """Tabulate one row for each solver on a sequence: time of all steps to each tolerance, median residual by budget.
+
+    The steps have carried impulses, or start cold if the solver takes no start. Solvers are ordered by the number of
+    steps to the middle tolerance, then by time.
+    """
+    tolerances = sorted({w.tol for w in passes if w.mode == "tol"}, reverse=True)
+    budgets = sorted({w.max_iter for w in passes if w.mode == "budget"})
+    by_target = {(w.solver, w.mode, w.tol if w.mode == "tol" else w.max_iter): w for w in passes}
+    middle = tolerances[len(tolerances) // 2] if tolerances else math.nan
+
+    def rank(solver: str) -> tuple[float, float, str]:
+        w = by_target.get((solver, "tol", middle))
+        return (0, math.inf, solver) if w is None else (-len(w.times[w.start]), w.time[w.start], solver)
+
+    rows: Rows = []
+    for solver in sorted({w.solver for w in passes}, key=rank):
+        timed = [by_target.get((solver, "tol", x)) for x in tolerances]
+        limited = [by_target.get((solver, "budget", n)) for n in budgets]
+        rows.append(
+            [
+                solver,
+                *(
+                    NONE
+                    if w is None
+                    else Cell.time(w.time[w.start], after=format_share(len(w.times[w.start]), w.steps))
+                    for w in timed
+                ),
+                *(NONE if w is None else format_residual(w.middle(w.start)) for w in limited),
+            ]
+        )
+    heads = [f"to {format_tolerance(x)}" for x in tolerances]
+    return Table(["solver", *heads, *(f"{n} iterations" for n in budgets)], rows)
 
 
 def tabulate_engines(report: Report) -> Table:

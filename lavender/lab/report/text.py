@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 from lavender.lab.bench.record import Skip
 from lavender.lab.bench.store import Records
 
+TIME_UNITS = ((1.0, "s"), (1e-3, "ms"), (1e-6, "µs"))
 NONE = "–"  # Shown in place of a missing number.
 
 
@@ -24,6 +25,29 @@ def format_residual(x: float) -> str:
 def format_size(x: float) -> str:
     """Return two digits, without an exponent for usual sizes: 24, 0.31, 3.4e-7."""
     return f"{x:.2g}" if 0.05 <= x < 99.5 else format_residual(x)
+
+
+def format_sizes(values: Sequence[float]) -> list[str]:
+    """Return two digits of each number: without exponents if no number needs one, else all with exponents."""
+    known = [x for x in values if math.isfinite(x) and x != 0.0]
+    write = format_size if all("e" not in format_size(x) for x in known) else format_residual
+    return [write(x) if math.isfinite(x) and x != 0.0 else "0" if x == 0.0 else NONE for x in values]
+
+
+def format_times(values: Sequence[float]) -> tuple[str, list[str]]:
+    """Return one unit for some times [s], and each time in this unit with three digits."""
+    known = [t for t in values if math.isfinite(t) and t > 0.0]
+    middle = math.exp(sum(map(math.log, known)) / len(known)) if known else 1.0
+    scale, unit = next((u for u in TIME_UNITS if middle >= 0.9995 * u[0]), TIME_UNITS[-1])
+    return unit, [format_digits(t / scale) if math.isfinite(t) else NONE for t in values]
+
+
+def format_digits(x: float, digits: int = 3) -> str:
+    """Return a number with so many significant digits and without an exponent: 0.0652, 16.0, 1020."""
+    if x == 0.0:
+        return "0"
+    rounded = float(f"{x:.{digits - 1}e}")
+    return f"{rounded:.{max(0, digits - 1 - math.floor(math.log10(abs(rounded))))}f}"
 
 
 def format_ratio(x: float) -> str:

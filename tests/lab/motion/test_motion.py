@@ -1,5 +1,6 @@
 """Motion errors: the bound against a truth in long double, distances that mean what they say, several motions."""
 
+import re
 import warnings
 from dataclasses import replace
 from importlib import import_module
@@ -524,3 +525,16 @@ def test_all_motions_are_all_at_every_size(size):
         warnings.simplefilter("error")
         found = lv.find_solutions(replace(p, b=p.b * size))
     assert (len(found), found.all) == (3, True)
+
+
+def test_the_line_of_a_motion_error_has_names_and_units():
+    bodies = random_contact_problem(3, contacts=6)
+    error = lv.solve(bodies, "pgs", tol=0.0, max_iter=3).motion_error()
+    text = str(error)
+    for name, unit in (("relative", ""), ("kinetic", r" sqrt\(J\)"), ("speed", r" m/s \(body \d+\)"),
+                       ("spin", r" rad/s \(body \d+\)"), ("rows", r" (m|rad)/s \(.+\)")):  # fmt: skip
+        assert re.search(rf"\b{name} [\d.e-]+{unit}", text), text
+    row = bodies.jacobian[[error.row]].toarray().reshape(-1, 6)
+    assert (f"rows {error.rows:.2g} rad/s" in text) == (not row[:, :3].any())
+    general = str(lv.solve(random_general(3), tol=1e-2).motion_error())
+    assert " m/s or rad/s (" in general and "compared with " in general
