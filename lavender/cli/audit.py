@@ -21,15 +21,17 @@ from lavender.cli.options import (
 )
 from lavender.io.stored import lock_output
 
+DEFAULT_CLAIM_WORLDS = 8  # Worlds of engines whose claims are compared: they step all worlds at once.
+
 
 @click.command()
-@click.argument("model", metavar="MODEL.xml", type=FILE)
+@click.argument("model", metavar="MODEL.xml|SCENE.py", type=FILE)
 @worlds_options(worlds=None, steps=200)
 @click.option(
     "--engine",
     default="mujoco",
     show_default=True,
-    metavar="mujoco|mjx|mujoco_warp",
+    metavar="mujoco|mjx|mujoco_warp|kamino|newton-mujoco|genesis",
     help="Engine that steps the worlds.",
 )
 @click.option("--max-velocity-error", type=float, metavar="M/S",
@@ -46,7 +48,11 @@ def audit(
 ) -> None:
     """Judge every step of many worlds of a MuJoCo model.
 
-    MODEL.xml is an MJCF file. Without --worlds the audit takes about a minute; the remaining time is shown. The page
+    MODEL.xml is an MJCF file. For kamino, newton-mujoco and genesis, SCENE.py is a Python file whose function build()
+    returns a newton.ModelBuilder, or build(worlds) a built genesis.Scene; or it is the name of a builder in
+    newton.tests.utils.basics. The page then compares what the engine claims about each solve with the verdict.
+
+    Without --worlds the audit takes about a minute; the remaining time is shown. The page
     shows how many steps were judged, how many of these stopped before convergence,
     their errors with time and body, and the numbers of rows and contacts. The worst worlds are problem files in
     OUT/worst; OUT/states.npz holds the states before them, from which --states starts again.
@@ -55,6 +61,7 @@ def audit(
     error above --max-velocity-error. Exit code 130: stopped by Ctrl-C; the page shows the completed steps.
     """
     from lavender.lab.audit import audit as run
+    from lavender.lab.engine_scenes import CLAIM_ENGINES
 
     if max_velocity_error is not None and not max_velocity_error >= 0.0:
         raise InputError(f"--max-velocity-error is {max_velocity_error}; a velocity error in m/s is needed")
@@ -62,6 +69,14 @@ def audit(
         for name in ("workers", "backend", "precision"):
             if was_given(context, name):
                 raise InputError(f"--{name} needs --engine mujoco: leave it out")
+    if options["engine"] in CLAIM_ENGINES:
+        for name in ("spread", "controls", "seed", "states"):
+            if was_given(context, name) or was_given(context, name.removesuffix("s")):
+                raise InputError(
+                    f"--{name} is for models of MuJoCo; the scene of {options['engine']} sets its own"
+                )
+        _audit_claims(context, model, out, max_velocity_error, options)
+        return
     context.with_resource(lock_output(out, folder=True))
     one_thread()
     with progress() as watch:
@@ -73,4 +88,29 @@ def audit(
         or result.unjudged
         or (max_velocity_error is not None and result.largest > max_velocity_error)
     ):
+        raise click.exceptions.Exit(EXIT_UNMET)
+
+
+def _audit_claims(
+    context: click.Context, scene: Path, out: Path, max_velocity_error: float | None, options: dict[str, Any]
+) -> None:
+    """Compare the claims of an engine with the verdicts, and write the page."""
+    from lavender.lab.claims import compare_claims
+    from lavender.lab.engine_scenes import step_scene
+
+    worlds, steps = options["worlds"] or DEFAULT_CLAIM_WORLDS, options["steps"]
+    stepped = step_scene(scene, options["engine"], worlds=worlds, steps=steps)
+    context.with_resource(lock_output(out, folder=True))
+    one_thread()
+    with progress() as watch:
+        result = compare_claims(
+            stepped,
+            engine=options["engine"],
+            threshold=options["threshold"],
+            folder=out,
+            total=steps,
+            watch=watch,
+        )
+    show_page(result.summary_page, out)
+    if result.is_any_lost or (max_velocity_error is not None and result.largest > max_velocity_error):
         raise click.exceptions.Exit(EXIT_UNMET)

@@ -8,8 +8,8 @@
 
 An error names everything that a format cannot hold. `docs/formats.md` lists every entry. Problems can also be built
 from the data of another engine: `from_mujoco`, `from_pinocchio`, `from_drake`; `from_mujoco_many`, `from_efc`,
-`from_kamino` and `from_genesis` for many worlds at once. `record` writes the steps of a MuJoCo simulation to a folder,
-`Recorder` those of any loop.
+`from_kamino`, `from_newton_mujoco` and `from_genesis` for many worlds at once. `record` writes the steps of a MuJoCo
+simulation to a folder, `Recorder` those of any loop.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ from lavender.io.engine_step import Claims, EngineStep
 from lavender.io.genesis import from_genesis
 from lavender.io.kamino import from_kamino
 from lavender.io.mujoco import from_mujoco
+from lavender.io.newton_mujoco import from_newton_mujoco
 from lavender.io.pinocchio import from_pinocchio
 from lavender.io.recorder import Recorder, StepVerdict, read_recorded_state
 from lavender.io.recording import Recording, record
@@ -48,6 +49,7 @@ __all__ = [
     "from_kamino",
     "from_mujoco",
     "from_mujoco_many",
+    "from_newton_mujoco",
     "from_pinocchio",
     "load",
     "load_solution",

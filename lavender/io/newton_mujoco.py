@@ -1,0 +1,105 @@
+"""Convert the last step of newton's `SolverMuJoCo` to a batch of problems, with the engine's impulses and its claims.
+
+    velocity = solver.mjw_data.qvel.numpy().copy()          # before the step
+    solver.step(state_in, state_out, control, contacts, dt)
+    step = lavender.io.from_newton_mujoco(solver, velocity)
+
+The solver runs MuJoCo Warp; its problem is the one of `lavender.io.efc`. The engine overwrites the velocity before the
+step, so it must be copied. A world with more rows than the engine has memory for is solved without the rest:
+`claims.residuals["dropped_rows"]` counts them, and the problem that is judged is the one that was solved.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from lavender.base.arrays import to_numpy
+from lavender.base.errors import CapabilityError, InputError
+from lavender.io.efc import from_efc
+from lavender.io.engine_step import Claims, EngineStep
+
+NEWTON_ADVICE = "newton 1.8 with mujoco-warp 3.17 to 4.0 is known"
+
+
+def from_newton_mujoco(solver: Any, velocity: Any) -> EngineStep:
+    """Return the problems that a `SolverMuJoCo` solved in its last step, its impulses and its claims.
+
+    Parameters
+    ----------
+    solver : newton.solvers.SolverMuJoCo
+        After `step`, with MuJoCo Warp (not use_mujoco_cpu).
+    velocity : (n, nv) m/s, rad/s
+        `solver.mjw_data.qvel` before the step, copied.
+
+    Returns
+    -------
+    EngineStep
+        In float32. `claims.converged` is False in worlds that used up the iterations; `claims.residuals` holds
+        "dropped_rows", the rows (n,) for which the engine had no memory.
+
+    Raises
+    ------
+    InputError
+        `solver` is not a SolverMuJoCo with MuJoCo Warp, or the velocity has another shape.
+    CapabilityError
+        The Jacobian is sparse, attributes of this version are missing, or M qacc_smooth is not the smooth force.
+    """
+    data, model = getattr(solver, "mjw_data", None), getattr(solver, "mj_model", None)
+    if data is None or model is None:
+        raise InputError(
+            f"solver is a {type(solver).__name__}; a newton.solvers.SolverMuJoCo that runs MuJoCo Warp is needed"
+        )
+    try:
+        return _convert(solver, data, model, to_numpy("velocity", velocity))
+    except AttributeError as error:
+        raise CapabilityError(f"an attribute of this solver is missing: {error}. {NEWTON_ADVICE}") from None
+
+
+def _convert(solver: Any, data: Any, model: Any, velocity: Any) -> EngineStep:
+    """Read the engine's arrays and build the batch."""
+    rows, contact, count = data.nefc.numpy().astype(np.int64), data.contact, int(data.nacon.numpy()[0])
+    capacity, nv = int(data.efc.D.shape[1]), int(model.nv)
+    jac = data.efc.J.numpy()
+    if jac.ndim != 3 or jac.shape[1] < capacity or jac.shape[2] < nv:
+        raise CapabilityError(
+            f"efc.J has shape {jac.shape} for {capacity} rows of {nv} velocities: the Jacobian is sparse; set "
+            "opt.jacobian to dense"
+        )
+    used = np.minimum(rows, capacity)
+    m = int(used.max(initial=0))
+    efc = {
+        name: getattr(data.efc, name).numpy()[:, :m]
+        for name in ("D", "aref", "type", "frictionloss", "force")
+    }
+    count = min(count, len(contact.dim))
+    world, address, dim, friction = (
+        getattr(contact, name).numpy()[:count] for name in ("worldid", "efc_address", "dim", "friction")
+    )
+    mass = data.M.numpy()
+    if mass.ndim == 2:  # lower triangles in compressed rows
+        mass = mass[:, : len(model.M_colind)], model.M_colind, np.append(model.M_rowadr, len(model.M_colind))
+    else:
+        mass = mass[:, :nv, :nv]
+    result = from_efc(
+        efc_J=jac[:, :m, :nv].copy(),
+        efc_D=efc["D"],
+        efc_aref=efc["aref"],
+        efc_type=efc["type"],
+        efc_frictionloss=efc["frictionloss"],
+        efc_force=efc["force"],
+        M=mass,
+        qvel=velocity.astype(jac.dtype),
+        qacc_smooth=data.qacc_smooth.numpy(),
+        qfrc_smooth=data.qfrc_smooth.numpy(),
+        timestep=solver.mjw_model.opt.timestep.numpy(),
+        nefc=used,
+        contacts=(world, address[:, 0], dim, friction),
+    )
+    if result.impulse is None:
+        raise AssertionError("from_efc returns impulses if it is given forces")
+    iterations = data.solver_niter.numpy().astype(np.int64)
+    limit = int(np.max(to_numpy("iterations", solver.mjw_model.opt.iterations)))
+    dropped = {"dropped_rows": (rows - used).astype(float)}
+    return EngineStep(result.batch, result.impulse, Claims(iterations < limit, iterations, dropped))
