@@ -39,21 +39,23 @@ OUTCOMES = (
     "claimed with numbers that are not finite",
     "not claimed, not finite",
 )
-RIGHT, WRONG = (0, 2), (1, 3)
+RIGHT_OUTCOMES, WRONG_OUTCOMES = (0, 2), (1, 3)
 N_KEPT_PROBLEMS = 8  # The worst answers are written to files.
-INDEX = re.compile(
+NUMBER_PATTERN = re.compile(
     r"\b\d+\b"
 )  # Numbers of contacts and limits differ between steps and are removed from row names.
 CLAIMS_NOTE = (
     "Right: no row has a velocity error above the threshold, or rounding explains it in the engine's precision. A "
     "wrong claim hides an error; a missing claim for a right answer costs iterations, or a needless warning."
 )
-ROWS_NOTE = "Rows with the largest error of wrong answers, without the numbers of contacts."
+WORST_ROWS_NOTE = "Rows with the largest error of wrong answers, without the numbers of contacts."
 MASS_NOTE = (
     "Effective mass 1 / A_ii [kg] of the row with the largest error: an absolute tolerance on impulses accepts large "
     "velocity errors of light bodies."
 )
-FILES_NOTE = "Problems with the engine's impulses and claims, in the folder worst: lavender check reads it."
+WORST_FILES_NOTE = (
+    "Problems with the engine's impulses and claims, in the folder worst: lavender check reads it."
+)
 
 
 @dataclass(eq=False)
@@ -96,12 +98,12 @@ class ClaimComparison:
     @property
     def is_any_lost(self) -> bool:
         """Whether a world had numbers that are not finite."""
-        return bool(np.any(self.outcome >= len(RIGHT) + len(WRONG)))
+        return bool(np.any(self.outcome >= len(RIGHT_OUTCOMES) + len(WRONG_OUTCOMES)))
 
     @property
     def largest(self) -> float:
         """Largest velocity error of a wrong answer [m/s]."""
-        return float(np.max(self.velocity[np.isin(self.outcome, WRONG)], initial=0.0))
+        return float(np.max(self.velocity[np.isin(self.outcome, WRONG_OUTCOMES)], initial=0.0))
 
     @property
     def head(self) -> str:
@@ -164,7 +166,7 @@ class ClaimComparison:
     @property
     def table_of_worlds(self) -> Table:
         """Worlds with the most wrong answers."""
-        wrong = np.isin(self.outcome, WRONG)
+        wrong = np.isin(self.outcome, WRONG_OUTCOMES)
         counts = wrong.sum(axis=0)
         order = np.argsort(-counts, kind="stable")[:N_KEPT_PROBLEMS]
         rows = []
@@ -180,9 +182,9 @@ class ClaimComparison:
         """Page with all tables."""
         sections = [
             PageSection("Claims and verdicts", [self.table_of_claims], note=CLAIMS_NOTE, short=len(OUTCOMES)),
-            PageSection("Worst rows", [self.table_of_rows], note=ROWS_NOTE, short=5),
+            PageSection("Worst rows", [self.table_of_rows], note=WORST_ROWS_NOTE, short=5),
             PageSection("Effective mass", [self.table_of_masses], note=MASS_NOTE),
-            PageSection("Worlds", [self.table_of_worlds], note=FILES_NOTE),
+            PageSection("Worlds", [self.table_of_worlds], note=WORST_FILES_NOTE),
         ]
         numbers = {"engine": self.engine, "threshold": self.threshold, **self.counts}
         return SummaryPage(f"Claims of {self.engine}", self.head, sections, numbers, stopped=self.stopped)
@@ -250,7 +252,7 @@ def compare_claims(
             if recorder is not None:
                 recorder.add(step)
             if watch is not None:
-                wrong = sum(int(np.isin(x, WRONG).sum()) for x in outcomes)
+                wrong = sum(int(np.isin(x, WRONG_OUTCOMES).sum()) for x in outcomes)
                 watch(Event(len(outcomes), total, f"steps judged, {wrong} wrong answers", ""))
     except KeyboardInterrupt:
         if not outcomes:
@@ -276,9 +278,9 @@ def _judge(step: EngineStep, result: ClaimComparison) -> tuple[Any, FloatArray]:
     lost[list(residuals.faults)] = True
     outcome[lost] = np.where(claimed[lost], 4, 5)
     velocity = np.where(lost, np.nan, velocity)
-    for i in np.flatnonzero(np.isin(outcome, WRONG)).tolist():
+    for i in np.flatnonzero(np.isin(outcome, WRONG_OUTCOMES)).tolist():
         residual, problem = residuals[i], step.batch[i]
-        name = INDEX.sub("", residual.worst_name).replace("  ", " ").strip()
+        name = NUMBER_PATTERN.sub("", residual.worst_name).replace("  ", " ").strip()
         count, largest = result.where.get(name, (0, 0.0))
         result.where[name] = count + 1, max(largest, float(velocity[i]))
         result.masses.append((float(1.0 / problem.d[residual.worst_row]), bool(claimed[i])))
