@@ -1,1 +1,1 @@
-"""Factorisations in the order of a structure: bands, dense panels, sparse matrices, components and orders of graphs."""
+"""Factorisations: dense, banded, sparse by supernodes; elimination orders, components of graphs."""

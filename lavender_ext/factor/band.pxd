@@ -1,26 +1,28 @@
-"""LDL^T of a symmetric matrix stored by diagonals, dense matrices included (width n).
+"""Banded factorisation L D L^T of a symmetric matrix; a dense matrix is a band of width n.
 
     c[i width + t] = A[i + t, i],  0 <= t < width                      lower half, column by column
     column i:  p_i = c[i, 0],  c[i + s, t - s] -= c[i, s] c[i, t] / p_i   for 1 <= s <= t              (1)
 
-After it c[i, 0] holds 1 / p_i and c[i, t] the column before its division, so that L[i + t, i] =
-c[i, t] c[i, 0]. Right-looking: between two pivots lie one division, one product and one difference.
+The factor contains 1 / p_i in c[i, 0], and the columns before their division in c[i, t], so that L[i + t, i] =
+c[i, t] c[i, 0]. The method is right-looking: one division, one product and one difference separate two pivots.
 """
 from libc.stdint cimport int32_t, int64_t
 
 
 cdef enum:
-    NEGATIVE_DIGITS = 100000000     # rounding leaves no zero pivot below -1e-8, others having been skipped
+    # A pivot below -size_i / NEGATIVE_PIVOT_RATIO is negative; rounding of a zero pivot stays above, because zeros are skipped.
+    NEGATIVE_PIVOT_RATIO = 100000000
 
 
 cdef struct pivots_t:
-    int32_t small               # pivots below tiny * size_i: skipped, their row and column drop out
-    int32_t negative            # pivots below -size_i / NEGATIVE_DIGITS: kept
+    int32_t small               # number of pivots of at most tiny size_i: their rows and columns are left out
+    int32_t negative            # number of negative pivots, which are used
     double least                # smallest p_i / size_i
-    int32_t first_small         # place of the first small pivot, -1
+    int32_t first_small         # index of the first small pivot, or -1
 
 
 cdef inline void no_pivots(pivots_t* out) noexcept nogil:
+    """Set the statistics of a factorisation without pivots."""
     out.small = 0
     out.negative = 0
     out.least = 1.0 / 0.0
@@ -28,11 +30,11 @@ cdef inline void no_pivots(pivots_t* out) noexcept nogil:
 
 
 cdef inline double inverse_pivot(double p, double size, int32_t i, double tiny, pivots_t* out) noexcept nogil:
-    # 1 / p, or 0 for a small pivot.
+    """Return 1 / p, or 0 for a small pivot, and count it."""
     if p < out.least * size:
         out.least = p / size
     if not p > tiny * size:
-        if p * NEGATIVE_DIGITS < -size:
+        if p * NEGATIVE_PIVOT_RATIO < -size:
             out.negative += 1
         else:
             out.small += 1
@@ -44,9 +46,11 @@ cdef inline double inverse_pivot(double p, double size, int32_t i, double tiny, 
 
 cdef inline void ldl_factor_2(int32_t n, double* c, const double* size, double tiny, double* x,
                               pivots_t* out) noexcept nogil:
-    # (1) for a tridiagonal matrix, from both ends to the middle row h (twisted factorisation): two chains of
-    # divisions that do not wait for each other. c[2 i] = 1 / p_i; the off-diagonals stay. Where x is not NULL the
-    # first half of ldl_solve_2 goes along while the divisions run.
+    """Factor a tridiagonal matrix by (1) from both ends to the middle row h (twisted factorisation).
+
+    The two chains of divisions are independent. c[2 i] becomes 1 / p_i, and the off-diagonals stay. If x is not NULL, the first
+    half of `ldl_solve_2` is applied to it while the divisions run.
+    """
     cdef int32_t i = 0, j = n - 1, h = n // 2
     cdef double p = c[0], r = c[2 * (n - 1)], off
     while i < h or j > h:
@@ -66,7 +70,7 @@ cdef inline void ldl_factor_2(int32_t n, double* c, const double* size, double t
                 x[j - 1] -= off * r * x[j]
             r = (c[2 * j - 2] if j - 1 > h else 0.0) - off * off * r
             j -= 1
-    # Both chains end with what they take from the diagonal of row h, itself still untouched.
+    # Both chains subtract from the diagonal of row h, which is unchanged until here.
     off = c[2 * h]
     if h > 0:
         off += p
@@ -76,7 +80,7 @@ cdef inline void ldl_factor_2(int32_t n, double* c, const double* size, double t
 
 
 cdef inline void ldl_back_2(int32_t n, const double* c, double* x) noexcept nogil:
-    # The second half, from the middle to both ends.
+    """Apply the second half of `ldl_solve_2` to x, from the middle to both ends."""
     cdef int32_t h = n // 2, i = h - 1, j = h + 1
     x[h] *= c[2 * h]
     while i >= 0 or j < n:
@@ -89,6 +93,7 @@ cdef inline void ldl_back_2(int32_t n, const double* c, double* x) noexcept nogi
 
 
 cdef inline void ldl_solve_2(int32_t n, const double* c, double* x) noexcept nogil:
+    """Overwrite x (n) with the solution of the tridiagonal system of `ldl_factor_2`."""
     cdef int32_t i = 0, j = n - 1, h = n // 2
     while i < h or j > h:
         if i < h:
@@ -100,10 +105,12 @@ cdef inline void ldl_solve_2(int32_t n, const double* c, double* x) noexcept nog
     ldl_back_2(n, c, x)
 
 
-cdef inline void ldl_columns(int32_t begin, int32_t end, int32_t width, int32_t reach, double* c, const double* size,
+cdef inline void ldl_columns(int32_t begin, int32_t end, int32_t width, int32_t height, double* c, const double* size,
                              double tiny, double* x, pivots_t* out) noexcept nogil:
-    # (1) for columns begin, ... end - 1 of height reach; 0: they end with row end - 1. Where x is not NULL,
-    # ldl_forward goes along.
+    """Apply (1) to columns begin ... end - 1, of `height` rows, or down to row end - 1 if that is 0.
+
+    If x is not NULL, `ldl_forward` is applied to it as well.
+    """
     cdef int32_t i, s, t, last
     cdef double inv, l
     cdef double* col
@@ -116,7 +123,7 @@ cdef inline void ldl_columns(int32_t begin, int32_t end, int32_t width, int32_t 
                 col[t] = 0.0
             continue
         col[0] = inv
-        last = reach if reach > 0 else end - i
+        last = height if height > 0 else end - i
         for s in range(1, last):
             l = col[s] * inv
             to = col + <int64_t>s * width
@@ -129,75 +136,79 @@ cdef inline void ldl_columns(int32_t begin, int32_t end, int32_t width, int32_t 
 
 
 cdef inline int32_t full_columns(int32_t n, int32_t width) noexcept nogil:
-    # Columns of full height come first; of no rows (width 0) there are none.
+    """Return the number of columns of full height, which come first; 0 without rows (width 0)."""
     return n - width + 1 if n >= width > 0 else 0
 
 
 cdef inline void ldl_factor(int32_t n, int32_t width, double* c, const double* size, double tiny, double* x,
                             pivots_t* out) noexcept nogil:
-    # (1); size (n) > 0 is what a pivot is compared with. Where x is not NULL it goes half way of ldl_solve, while
-    # one pivot waits for the other.
-    cdef int32_t whole = full_columns(n, width)
+    """Factor by (1); pivots are compared with size (n) > 0.
+
+    If x is not NULL, the first half of `ldl_solve` is applied to it, which is hidden by the latency of the divisions.
+    """
+    cdef int32_t full = full_columns(n, width)
     no_pivots(out)
     if width == 2:
         ldl_factor_2(n, c, size, tiny, x, out)
         return
-    if width == 6:                                      # joints of three rows in a chain: the width a constant
-        ldl_columns(0, whole, 6, 6, c, size, tiny, x, out)
+    if width == 6:                                      # chains of joints with three rows: constant loop bounds
+        ldl_columns(0, full, 6, 6, c, size, tiny, x, out)
     else:
-        ldl_columns(0, whole, width, width, c, size, tiny, x, out)
-    ldl_columns(whole, n, width, 0, c, size, tiny, x, out)
+        ldl_columns(0, full, width, width, c, size, tiny, x, out)
+    ldl_columns(full, n, width, 0, c, size, tiny, x, out)
 
 
-cdef inline void ldl_forward(int32_t begin, int32_t end, int32_t width, int32_t reach, const double* c,
+cdef inline void ldl_forward(int32_t begin, int32_t end, int32_t width, int32_t height, const double* c,
                              double* x) noexcept nogil:
+    """Solve with L for columns begin ... end - 1."""
     cdef int32_t i, t, last
     cdef double y
     cdef const double* col
     for i in range(begin, end):
         col = c + <int64_t>i * width
         y = x[i] * col[0]
-        last = reach if reach > 0 else end - i
+        last = height if height > 0 else end - i
         for t in range(1, last):
             x[i + t] -= col[t] * y
 
 
-cdef inline void ldl_back(int32_t begin, int32_t end, int32_t width, int32_t reach, const double* c,
+cdef inline void ldl_back(int32_t begin, int32_t end, int32_t width, int32_t height, const double* c,
                           double* x) noexcept nogil:
+    """Solve with D L^T for columns end - 1 ... begin."""
     cdef int32_t i, t, last
     cdef double y
     cdef const double* col
     for i in range(end - 1, begin - 1, -1):
         col = c + <int64_t>i * width
         y = x[i]
-        last = reach if reach > 0 else end - i
+        last = height if height > 0 else end - i
         for t in range(1, last):
             y -= col[t] * x[i + t]
         x[i] = y * col[0]
 
 
 cdef inline void ldl_back_all(int32_t n, int32_t width, const double* c, double* x) noexcept nogil:
-    # The second half of ldl_solve.
-    cdef int32_t whole = full_columns(n, width)
+    """Apply the second half of `ldl_solve` to x (n)."""
+    cdef int32_t full = full_columns(n, width)
     if width == 2:
         ldl_back_2(n, c, x)
         return
-    ldl_back(whole, n, width, 0, c, x)
+    ldl_back(full, n, width, 0, c, x)
     if width == 6:
-        ldl_back(0, whole, 6, 6, c, x)
+        ldl_back(0, full, 6, 6, c, x)
     else:
-        ldl_back(0, whole, width, width, c, x)
+        ldl_back(0, full, width, width, c, x)
 
 
 cdef inline void ldl_solve(int32_t n, int32_t width, const double* c, double* x) noexcept nogil:
-    # x <- (L D L^T)^-1 x; 0 on skipped places.
-    cdef int32_t whole = full_columns(n, width)
+    """Overwrite x (n) with (L D L^T)^-1 x; components of small pivots become 0."""
+    cdef int32_t full = full_columns(n, width)
     if width == 2:
         ldl_solve_2(n, c, x)
         return
     if width == 6:
-        ldl_forward(0, whole, 6, 6, c, x)
+        ldl_forward(0, full, 6, 6, c, x)
     else:
-        ldl_forward(0, whole, width, width, c, x)
-    ldl_forward(whole, n, width, 0, c, x)
+        ldl_forward(0, full, width, width, c, x)
+    ldl_forward(full, n, width, 0, c, x)
     ldl_back_all(n, width, c, x)

@@ -10,7 +10,7 @@ from lavender_ext.factor.graph cimport order_graph, order_workspace_size
 
 
 def least_degree(const int32_t[::1] ptr, const int32_t[::1] near):
-    """(n,) vertices in their order of elimination; near[ptr[i]:ptr[i + 1]] are the neighbours of i, without i."""
+    """Return the vertices (n,) in an elimination order; near[ptr[i]:ptr[i + 1]] are the neighbours of i, without i."""
     cdef int32_t n = <int32_t>ptr.shape[0] - 1, all_ = <int32_t>near.shape[0]
     cdef double[::1] scratch = np.empty(order_workspace_size(n, all_) // 2 + 1)
     order_array = np.empty(n, np.int32)
@@ -25,7 +25,7 @@ def least_degree(const int32_t[::1] ptr, const int32_t[::1] near):
 
 def matrix_components(const int32_t[::1] ptr, const int32_t[::1] block, const int32_t[::1] indptr,
                       const int32_t[::1] indices):
-    """(number of components, label (k,)) of the blocks of a matrix in compressed rows; block (m,) is the block of each row."""
+    """Return (number of components, label (k,)) of the blocks of a matrix in compressed rows; block (m,) has each row's block."""
     cdef int32_t i, j, q, k = <int32_t>ptr.shape[0] - 1, count = 0
     label_array = np.zeros(k, np.int32)
     cdef int32_t[::1] label = label_array, parent = np.arange(k + 1, dtype=np.int32)
@@ -40,7 +40,7 @@ def matrix_components(const int32_t[::1] ptr, const int32_t[::1] block, const in
 
 
 def tree_ends(Data p):
-    """(k, 2) the first and the last tree that rows of each block touch, -1 without one, in generalised coordinates."""
+    """Return the first and the last kinematic tree that each block's rows touch, (k, 2), or -1 if they touch none."""
     cdef const generalized_t* g = &p.general
     cdef int32_t i, j, q, t, k = p.blocks.n_blocks
     cdef int32_t[::1] tree = np.empty(g.n + 1, np.int32)
@@ -61,23 +61,34 @@ def tree_ends(Data p):
 
 
 cdef enum:
-    OF_BODY = 6                 # velocities at most
+    MAX_BODY_VELOCITIES = 6     # A body has at most six velocities.
 
 
 def bodies_in(Data p, order):
-    """(body (k, 2), n, column (nv,)): velocities of J and M as those of n bodies, of which each block touches two; or None.
+    """Group velocities of J and M to bodies of which each block touches at most two.
 
-    A body is a run of at most six velocities, in the order given, of which neighbours stand mostly in the same panels of Y.
-    column: 6 b + place of each velocity; body: -1 where a block touches fewer; `order` is that of `Generalized`.
+    A body is a run of at most six velocities, in the given order, of which neighbours are mostly in the same panels of Y.
+
+    Parameters
+    ----------
+    p : Data
+    order : (nv,) int32 or None
+        That of `Generalized`.
+
+    Returns
+    -------
+    body (k, 2), n, column (nv,), or None
+        Bodies of each block, -1 if it touches fewer; number of bodies; 6 times the body of each velocity plus its index in it.
+        None if a block touches more than two.
     """
     p.prepare()
     cdef const generalized_t* g = &p.general
     cdef int32_t i, b, c, q, t, last = -1, size = 0, n = 0, k = p.blocks.n_blocks
     cdef int32_t[::1] given = np.arange(g.n, dtype=np.int32) if order is None else np.argsort(order).astype(np.int32)
     cdef int32_t[:, ::1] marks = np.full((4, g.n + 1), -1, np.int32)
-    cdef int32_t* before = &marks[0, 0]                 # the velocity before each,
-    cdef int32_t* on = &marks[1, 0]                     # panels that have it,
-    cdef int32_t* both = &marks[2, 0]                   # and the one before too
+    cdef int32_t* before = &marks[0, 0]                 # the velocity before each
+    cdef int32_t* on = &marks[1, 0]                     # number of panels that contain it
+    cdef int32_t* both = &marks[2, 0]                   # number of panels that also contain the one before
     cdef int32_t* seen = &marks[3, 0]
     body_array, column_array = np.full((k, 2), -1, np.int32), np.empty(g.n, np.int32)
     cdef int32_t[:, ::1] body = body_array
@@ -95,15 +106,15 @@ def bodies_in(Data p, order):
             both[c] += before[c] >= 0 and seen[before[c]] == b
     for i in range(g.n):
         c = given[i]
-        if i > 0 and size < OF_BODY and 2 * both[c] >= max(on[c], on[before[c]]):
+        if i > 0 and size < MAX_BODY_VELOCITIES and 2 * both[c] >= max(on[c], on[before[c]]):
             size += 1
         else:
             n, size = n + 1, 1
-        column[c] = OF_BODY * (n - 1) + size - 1
+        column[c] = MAX_BODY_VELOCITIES * (n - 1) + size - 1
     for i in range(k):
         b = g.home[i]
         for q in range(g.pcol[b], g.pcol[b + 1]):
-            t = column[g.cols[q]] // OF_BODY
+            t = column[g.cols[q]] // MAX_BODY_VELOCITIES
             if body[i, 0] < 0:
                 body[i, 0] = t
             elif t != body[i, 0] and t != body[i, 1]:

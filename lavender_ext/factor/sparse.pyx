@@ -77,7 +77,7 @@ cdef public int32_t lav_sparse_factor(const sparse_t* s, const int32_t* indptr, 
 
 
 def bandwidth(const int32_t[::1] indptr, const int32_t[::1] indices):
-    """(lower, upper) bandwidth of a canonical CSR matrix, from the ends of its rows."""
+    """Return the (lower, upper) bandwidth of a canonical CSR matrix, from the ends of its rows."""
     cdef Py_ssize_t i, n = indptr.shape[0] - 1
     cdef int32_t lower = 0, upper = 0
     for i in range(n):
@@ -88,7 +88,7 @@ def bandwidth(const int32_t[::1] indptr, const int32_t[::1] indices):
 
 
 def scan(const int32_t[::1] indptr, const int32_t[::1] indices, const double[::1] data, const double[::1] d):
-    """(lower bandwidth, upper bandwidth, asymmetry) of a canonical CSR matrix with the metric d (n,)."""
+    """Return (lower bandwidth, upper bandwidth, asymmetry) of a canonical CSR matrix with the metric d (n,)."""
     cdef int32_t n = <int32_t>indptr.shape[0] - 1
     cdef int32_t band[2]
     cdef double asymmetry
@@ -106,7 +106,7 @@ def scan(const int32_t[::1] indptr, const int32_t[::1] indices, const double[::1
 
 
 def is_mirrored(const int32_t[::1] indptr, const int32_t[::1] indices):
-    """Whether the pattern of a canonical CSR matrix is symmetric."""
+    """Return whether the pattern of a canonical CSR matrix is symmetric."""
     cdef int32_t[::1] cursor = np.array(indptr)
     cdef int32_t i, j, q
     for i in range(indptr.shape[0] - 1):
@@ -120,7 +120,7 @@ def is_mirrored(const int32_t[::1] indptr, const int32_t[::1] indices):
 
 def free_part(const int32_t[::1] indptr, const int32_t[::1] indices, const double[::1] data,
               const int32_t[::1] place, int n_free):
-    """(indptr, indices, data) of the rows and columns with place >= 0, numbered in order of rows."""
+    """Return (indptr, indices, data) of the rows and columns with place >= 0, numbered in the order of the rows."""
     cdef int32_t i, q, k = 0, n = <int32_t>indptr.shape[0] - 1
     ptr_array = np.zeros(n_free + 1, np.int32)
     cdef int32_t[::1] ptr = ptr_array, idx
