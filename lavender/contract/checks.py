@@ -23,6 +23,7 @@ from lavender.contract.problems import (
     CONTACTS,
     FORMS,
     as_matrix,
+    change_numbers,
     random_contact_problem,
     random_general,
     touching,
@@ -31,11 +32,19 @@ from lavender.judge.certificates import check_certificate
 from lavender.judge.residuals import residual
 from lavender.judge.solution import Solution, Status
 from lavender.problem import LAWS, Problem
-from lavender.problem.cones import ROW, Cones
+from lavender.problem.cones import Cones
 from lavender.solvers.registry import SolverSpec
 from lavender.solving.solve import prepare, solve
 
-__all__ = ["CHECKS", "Check", "ContractError", "check_name", "list_checks", "well_posed_problems"]
+__all__ = [
+    "CHECKS",
+    "Check",
+    "ContractError",
+    "check_name",
+    "list_checks",
+    "problems_of_every_kind",
+    "well_posed_problems",
+]
 
 #: Backends of other packages that must solve every example. Any other backend may fail if its result reports it.
 REQUIRED_BACKENDS = frozenset({"osqp", "clarabel", "piqp", "daqp", "clarabel_cone"})
@@ -182,17 +191,6 @@ def _describe(problem: Problem, kind: str = "") -> str:
     form = "J and M" if problem.operator == "generalized" else problem.operator
     details = ", ".join(filter(None, (f"law {problem.law}", kind, f"given as {form}")))
     return f"a problem of {problem.m} row{'s' * (problem.m != 1)} ({details})"
-
-
-def _change_numbers(problem: Problem) -> Problem:
-    """Return a problem of the same structure with other numbers, bounds and coefficients."""
-    cones = problem.cones
-    fixed = (np.arange(problem.m) % 3 == 0) & (np.repeat(cones.kind, np.diff(cones.ptr)) == ROW)
-    mu = np.where(np.arange(problem.n_blocks) % 3 == 0, 0.0, cones.mu)
-    lower, upper = (np.where(fixed, 0.0, x) for x in (cones.lower, cones.upper))
-    other = replace(problem, b=problem.b * 1.25 + 0.01)
-    changed = replace(other, cones=replace(cones, lower=lower, upper=upper, mu=mu))
-    return changed if changed.law == problem.law and not cones.has_ellipse else other
 
 
 def _budget(spec: SolverSpec) -> int | None:
@@ -604,7 +602,7 @@ def require_update_equals_prepare(spec: SolverSpec) -> None:
     """Require that `update` to new numbers gives the bits of a new `prepare`."""
     options = _short_options(spec)
     for problem in well_posed_problems(spec):
-        changed = _change_numbers(problem)
+        changed = change_numbers(problem)
         if spec.refuses(changed) is not None:
             continue
         prepared = prepare(changed, spec.name)

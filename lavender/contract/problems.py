@@ -14,7 +14,7 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray
 from lavender.problem import Problem
-from lavender.problem.cones import CONTACT_BOX, CONTACT_ELLIPSE, Cones
+from lavender.problem.cones import CONTACT_BOX, CONTACT_ELLIPSE, ROW, Cones
 from lavender.problem.rows import Rows
 
 __all__ = [
@@ -22,6 +22,7 @@ __all__ = [
     "FORMS",
     "as_generalized",
     "as_matrix",
+    "change_numbers",
     "list_ancestors",
     "random_boxes",
     "random_contact_problem",
@@ -192,6 +193,17 @@ CONTACTS: dict[str, Callable[..., Problem]] = {
     "boxes": random_boxes,
     "ellipses": random_ellipses,
 }
+
+
+def change_numbers(problem: Problem) -> Problem:
+    """Return a problem of the same structure with other numbers, bounds and coefficients."""
+    cones = problem.cones
+    fixed = (np.arange(problem.m) % 3 == 0) & (np.repeat(cones.kind, np.diff(cones.ptr)) == ROW)
+    mu = np.where(np.arange(problem.n_blocks) % 3 == 0, 0.0, cones.mu)
+    lower, upper = (np.where(fixed, 0.0, x) for x in (cones.lower, cones.upper))
+    other = replace(problem, b=problem.b * 1.25 + 0.01)
+    changed = replace(other, cones=replace(cones, lower=lower, upper=upper, mu=mu))
+    return changed if changed.law == problem.law and not cones.has_ellipse else other
 
 
 def random_lcp(seed: int, m: int = 12, rank: int | None = None, boxed: bool = True) -> Problem:

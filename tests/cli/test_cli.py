@@ -47,6 +47,20 @@ def test_a_problem_that_none_of_the_solvers_takes_is_not_checked(lavender):
     assert lavender("check", "granularF(n=3)", "--solvers", "sor", "pgs")[0] == 0
 
 
+def test_contract_checks_a_solver_and_explains_what_it_does_not_meet(lavender, plug_in):
+    code, out, _ = lavender("contract", "sor")
+    assert code == 0 and "NOT MET" not in out
+    assert "orders_change_the_sweep" not in out  # sor has orders
+    plug_in(lambda problem, impulse: lv.Claim(lv.Status.CONVERGED, 1, {"sweeps": 1}), "liar", laws={"lcp"})
+    code, out, _ = lavender("contract", "liar")
+    assert code == cli.EXIT_UNMET
+    assert "NOT MET  The solver solves every law that it lists" in out
+    assert "is required, because the spec lists the law 'lcp'" in out
+    code, out, _ = lavender("contract", "liar", "--list")
+    assert code == 0 and "every_listed_law_is_solved, all solvers" in out and "met " not in out
+    assert lavender("contract", "no such solver")[0] == cli.EXIT_BAD_INPUT
+
+
 #: The words with which a command would run, where it has an option of a real number.
 RUNS = {
     "audit": ("m.xml", "--worlds", 1, "--steps", 1, "--workers", 1), "tune": ("m.xml", "--worlds", 2, "--steps", 2),

@@ -18,12 +18,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from calls import driven, facts
-from random_problems import CONTACTS, FORMS, as_matrix, random_contact_problem, touching
+from random_problems import as_matrix, touching
 
 import lavender as lv
 from benchmarks.core_problems import fresh, stacks
 from lavender import registry
+from lavender.contract.checks import problems_of_every_kind
 from lavender.contract.enumeration import random_bounds
+from lavender.contract.problems import change_numbers
 from lavender.judge.residuals import get_reference
 from lavender.solvers.auto import Tree, make_step
 from lavender.solvers.newton_systems import general
@@ -39,26 +41,8 @@ RESUMABLE = lv.available(external=False, resumable=True)
 @functools.cache
 def examples():
     """Problems of every law and kind of block, each in every form."""
-    free = random_contact_problem(21, contacts=0, joints=12, bodies=6)
-    ends = np.full(free.m, np.inf)
-    of_rows = [
-        replace(free, cones=replace(free.cones, lower=-ends, upper=ends)),
-        random_contact_problem(22, tangents=0, spin=False),
-        *(make_contacts(23, law) for law in ("coulomb", "cone") for make_contacts in CONTACTS.values()),
-    ]
-    soft = [replace(p, compliance=p.compliance + 0.3) for p in of_rows]
-    return [convert(p) for p in soft for convert in FORMS.values()]
-
-
-def changed(problem):
-    """The same structure with other numbers, a third of the bounded rows fixed, a third of the contacts smooth."""
-    cones = problem.cones
-    fixed = (np.arange(problem.m) % 3 == 0) & (np.repeat(cones.kind, np.diff(cones.ptr)) == lv.ROW)
-    mu = np.where(np.arange(problem.n_blocks) % 3 == 0, 0.0, cones.mu)
-    lower, upper = (np.where(fixed, 0.0, x) for x in (cones.lower, cones.upper))
-    other = replace(problem, b=problem.b * 1.25 + 0.01)
-    less = replace(other, cones=replace(cones, lower=lower, upper=upper, mu=mu))
-    return less if less.law == problem.law and not cones.has_ellipse else other
+    kinds = problems_of_every_kind().items()
+    return [p for (_, kind), (forms, _) in kinds if not kind.startswith("round") for p in forms]
 
 
 # -- a fresh solve, and the same problem solved in another way --------------------------------------
@@ -72,7 +56,7 @@ def prepare_and_solve(problem, name, **options):
 
 
 def prepare_other_numbers(problem, name, **options):
-    prepared = lv.prepare(changed(problem), name)
+    prepared = lv.prepare(change_numbers(problem), name)
     prepared.solve(**options)
     found = prepared.solve(problem, **options)
     assert facts(prepared.solve(**options)) == facts(found), "the problem given last is kept"
