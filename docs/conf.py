@@ -51,7 +51,7 @@ CONTENTS = {
         "diagnose examples generated/examples"
     ),
     "Use": (
-        "commands report campaigns formats generalized quadratic-programs mujoco worlds audit "
+        "commands report campaigns formats generalized quadratic-programs mujoco worlds engines audit "
         "tune derivatives proof c solvers generated/api"
     ),
     "LavenderSim": "engine engine-measurements scenes towers web phenomena",

@@ -90,6 +90,9 @@ def test_python_of_a_page_runs(page, files, capsys):
         pytest.importorskip("h5py", reason="the page reads HDF5 files")
     if "lv.prove(" in whole:
         pytest.importorskip("flint", reason="the page proves (extra: proof)")
+    for engine in ("newton", "genesis"):
+        if f"import {engine}\n" in whole or f"import {engine} as" in whole:
+            pytest.importorskip(engine, reason=f"the page steps {engine}")
     names = {"np": np, "lv": lv}
     for line, kind, text in blocks(page, "python", "pycon"):
         where = f"{page.name}:{line}"
