@@ -86,7 +86,7 @@ class Gradients(_LazySequence):
         inv_inertia: FloatArray
 
     def _make(self, i: int) -> Gradient:
-        return Gradient(self._of._get(i), self._numbers[self._of._linears.place(i)])
+        return Gradient(self._of._get(i), self._numbers[self._of._linears.result_slice(i)])
 
     if not TYPE_CHECKING:  # Type checkers report unknown names.
 
@@ -113,15 +113,15 @@ class Derivatives(_LazySequence):
         return derivatives, (self._problems, [each._impulse for each in self])
 
     def _make(self, i: int) -> Derivative:
-        return Derivative(self._problems[i], self._linears.one(i))
+        return Derivative(self._problems[i], self._linears.item(i))
 
     @cached_property
     def _rows(self) -> IntArray:
-        return self._linears.places(False)
+        return self._linears.result_indices(False)
 
     @cached_property
     def _velocities(self) -> IntArray:
-        return self._linears.places(True)
+        return self._linears.result_indices(True)
 
     def vjp(self, *, velocity: Any = None, impulse: Any = None, slack: Any = None) -> Gradients:
         """Compute the gradients of each problem.
@@ -190,7 +190,7 @@ def derivatives(problems: Iterable[Problem], solutions: Iterable[Any]) -> Deriva
         [_get_data(p) for p in problems], impulses.flat_impulses if is_batch else impulses, MAX_KERNEL_ROWS
     )
     separate = {}
-    for i in linears.leave(MAX_ACCEPTED_RESIDUAL):
+    for i in linears.skip_unsolvable(MAX_ACCEPTED_RESIDUAL):
         try:
             separate[i] = derivative(problems[i], impulses[i])
         except InputError as error:

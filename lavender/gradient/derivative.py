@@ -145,7 +145,7 @@ class Derivative:
     @cached_property
     def _system_rows(self) -> Any:
         """Rows in which G is not the identity."""
-        return np.flatnonzero(self._linear.place >= 0)
+        return np.flatnonzero(self._linear.system_row >= 0)
 
     def _velocity_shape(self) -> tuple[int, ...]:
         """Return the shape of the velocities; raise CapabilityError for a problem given as a matrix."""

@@ -76,8 +76,8 @@ class System:
     def _form_h(self) -> tuple[Any, Any, FloatArray]:
         """Form H on the rows of G, in compressed rows."""
         a, linear = self.problem.csr, self.linear
-        indptr, indices, data = free_part(a.indptr, a.indices, a.data, linear.place, self.n)
-        root = linear.root[linear.place >= 0]
+        indptr, indices, data = free_part(a.indptr, a.indices, a.data, linear.system_row, self.n)
+        root = linear.root[linear.system_row >= 0]
         return indptr, indices, data / (np.repeat(root, np.diff(indptr)) * root[indices])
 
     def _factor_symmetric(self, shift: float) -> Solve | None:
@@ -98,7 +98,7 @@ class System:
         ends = np.concatenate([[0], np.cumsum(np.where(is_row, 1, np.diff(c.ptr)[block]))])
         first = np.where(is_row, np.arange(c.n_rows), c.ptr[block])
         columns = np.arange(ends[-1]) + np.repeat(first - ends[:-1], np.diff(ends))
-        rows = np.flatnonzero(self.linear.place >= 0)
+        rows = np.flatnonzero(self.linear.system_row >= 0)
         p = sp.csr_array((self.linear.p, columns, ends), shape=(c.n_rows, c.n_rows))[rows][:, rows]
         return sp.csc_array(one - p + p @ (h + shift * one))
 

@@ -161,7 +161,7 @@ def linear_of(problem: Problem, impulse: FloatArray, max_rows: int = 0) -> Linea
     data = problem.disk.metric
     if data.reference_energy < 0.0:
         get_reference(problem.disk)
-    return Linears([data], [problem.on_disk(impulse)], max_rows).one(0)
+    return Linears([data], [problem.on_disk(impulse)], max_rows).item(0)
 
 
 def states_of(problem: Problem, impulse: FloatArray, linear: Linear | None = None) -> States:

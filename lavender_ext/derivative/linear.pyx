@@ -24,8 +24,9 @@ from lavender_ext.core.problem cimport Data, Workspace, allocate_workspace
 from lavender_ext.core.rows cimport rows_times
 from lavender_ext.core.velocity cimport rows_wrench, wrenches_to_velocity
 from lavender_ext.core.view cimport generalized_t, view_t
-from lavender_ext.derivative.natural cimport (CLOSED, FREE, HIGH, LOW, OPEN, SLIDES, STICKS, block_times, linear_t,
-                                              linearise_blocks, natural_t, place_rows, scaled_csr, scaled_general, system_rows)
+from lavender_ext.derivative.natural cimport (CLOSED, FREE, HIGH, LOW, OPEN, SLIDES, STICKS, form_scaled_csr,
+                                              form_scaled_generalized, form_system_rows, linear_t, linearise_blocks,
+                                              multiply_blocks, natural_t, number_system_rows)
 from lavender_ext.factor.dense cimport dense_lu, dense_lu_solve, dense_lu_solve_transposed
 from lavender_ext.factor.tiles cimport has_wide
 from lavender_ext.judge.measure cimport above_floor_of, floor_of, judge_view, relative_of, scratch_of
@@ -69,7 +70,7 @@ cdef void times_jac_minv(const linear_t* a, double* f, double* out) noexcept nog
             f[k] = z * g.root[k]
     for b in range(g.n_panels):
         for i in range(g.prow[b], g.prow[b + 1]):
-            if a.place[i] >= 0:
+            if a.system_row[i] >= 0:
                 out[i] = whitened_dot(g, b, i, f)
 
 
@@ -104,12 +105,12 @@ cdef public void lav_adjoint(const linear_t* a, const double* y, const double* c
             for i in range(m):
                 q[i] += soft[i] * x[i]
     for i in range(m):
-        if a.place[i] >= 0:
-            s[a.place[i]] = (q[i] + (c[i] if c != NULL else 0.0)) / a.x.root[i]
+        if a.system_row[i] >= 0:
+            s[a.system_row[i]] = (q[i] + (c[i] if c != NULL else 0.0)) / a.x.root[i]
     dense_lu_solve_transposed(a.rows, a.lu, a.swap, s)
     for i in range(m):
-        q[i] = s[a.place[i]] if a.place[i] >= 0 else 0.0
-    block_times(&a.x, &v.p, a.x.p, q, True, s)
+        q[i] = s[a.system_row[i]] if a.system_row[i] >= 0 else 0.0
+    multiply_blocks(&a.x, &v.p, a.x.p, q, True, s)
     for i in range(m):
         s[i] = s[i] / a.x.root[i] - (x[i] if x != NULL else 0.0)
     times_jac_transpose(v, s, f)
@@ -135,19 +136,19 @@ cdef bint get_array_data(array, Py_ssize_t n, Py_buffer* view, const double** to
     return True
 
 
-cdef void form(const linear_t* a, const view_t* v, double shift, double* g, double* h) noexcept nogil:
+cdef void form_system(const linear_t* a, const view_t* v, double shift, double* g, double* h) noexcept nogil:
     """Compute G of H + shift, for A of J and M or in compressed rows; h (rows, rows + n) is scratch."""
     cdef int32_t i, n = a.rows
     if v.g != NULL:
-        scaled_general(v.g, n, a.place, a.x.root, h + <ssize_t>n * n, h)
+        form_scaled_generalized(v.g, n, a.system_row, a.x.root, h + <ssize_t>n * n, h)
     else:
-        scaled_csr(v.a, a.v.p.n_rows, n, a.place, a.x.root, h)
+        form_scaled_csr(v.a, a.v.p.n_rows, n, a.system_row, a.x.root, h)
     for i in range(n):
         h[<ssize_t>i * n + i] += shift
-    system_rows(&a.x, &a.v.p, n, a.place, h, g)
+    form_system_rows(&a.x, &a.v.p, n, a.system_row, h, g)
 
 
-cdef ssize_t values_of(const blocks_t* b) noexcept nogil:
+cdef ssize_t count_values(const blocks_t* b) noexcept nogil:
     """Return the number of values of P."""
     cdef int32_t i, n
     cdef ssize_t size = 0
@@ -169,18 +170,18 @@ cdef void linearise(linear_t* a, const double* lam, double energy, double veloci
     """
     cdef const blocks_t* b = &a.v.p
     cdef int32_t m = b.n_rows
-    cdef ssize_t values = values_of(b)
+    cdef ssize_t values = count_values(b)
     cdef int32_t* ptr = <int32_t*>(at + 5 * m + 2 * values)
     cdef score_t s = new_score()
     if m == 0:
         a.regular = True
         return
-    a.lam, a.w, a.place = at, at + m, ptr + b.n_blocks + 1
-    a.x = natural_t(at + 2 * m, at + 3 * m, at + 4 * m, <int8_t*>(a.place + m), ptr, at + 5 * m, at + 5 * m + values)
+    a.lam, a.w, a.system_row = at, at + m, ptr + b.n_blocks + 1
+    a.x = natural_t(at + 2 * m, at + 3 * m, at + 4 * m, <int8_t*>(a.system_row + m), ptr, at + 5 * m, at + 5 * m + values)
     memcpy(a.lam, lam, m * sizeof(double))
     judge_view(&a.v, a.lam, a.w, scratch, scratch + m, True, &s)
     linearise_blocks(b, a.lam, a.w, ptr, &a.x)
-    a.rows = place_rows(b, &a.x, a.place)
+    a.rows = number_system_rows(b, &a.x, a.system_row)
     a.relative = relative_of(&s, a.w, m, energy, velocity)
     a.above_floor = above_floor_of(&s, a.relative, floor_of(&s, energy, velocity))
 
@@ -207,7 +208,7 @@ cdef bint factorise(linear_t* a, const view_t* v, double shift, double* at, doub
     if n == 0:
         return True
     a.lu, a.swap = at, <int32_t*>(at + <ssize_t>n * n)
-    form(a, v, shift, a.lu, scratch)
+    form_system(a, v, shift, a.lu, scratch)
     if dense_lu(has_wide(), n, a.lu, a.swap, 0.0) == 0:
         for i in range(n):
             x = 1.0 / fabs(a.lu[<ssize_t>i * n + i])    # The factor contains 1 / U_ii.
@@ -323,7 +324,7 @@ cdef class Linear:
         cdef int32_t i, j
         for i in range(self.at.v.p.n_blocks):
             for j in range(self.at.v.p.ptr[i], self.at.v.p.ptr[i + 1]):
-                if self.at.place[j] >= 0 and self.at.x.case_[j] == SLIDES:
+                if self.at.system_row[j] >= 0 and self.at.x.case_[j] == SLIDES:
                     return True
         return False
 
@@ -335,7 +336,7 @@ cdef class Linear:
         cdef Workspace work
         if self.at.rows:
             work = allocate_workspace(scratch_of_factor(self.at.rows, &v) * sizeof(double))
-            form(&self.at, &v, 0.0, &out[0, 0], <double*>work.at)
+            form_system(&self.at, &v, 0.0, &out[0, 0], <double*>work.at)
         return out_
 
     def solve(self, r, bint transpose=False):
@@ -354,7 +355,7 @@ cdef class Linear:
         out_ = np.empty(self.at.v.p.n_rows)
         cdef double[::1] out = out_
         if self.at.v.p.n_rows:
-            block_times(&self.at.x, &self.at.v.p, self.at.x.edge if edge else self.at.x.p, &v[0], transpose, &out[0])
+            multiply_blocks(&self.at.x, &self.at.v.p, self.at.x.edge if edge else self.at.x.p, &v[0], transpose, &out[0])
         return out_
 
     @property
@@ -385,7 +386,7 @@ cdef class Linear:
     @property
     def p(self):
         """Values of P, block by block: the diagonal for bounded rows, otherwise row by row."""
-        return copy_to_array(self.at.x.p, self.at.x.at[self.at.v.p.n_blocks] if self.at.v.p.n_rows else 0, F8)
+        return copy_to_array(self.at.x.p, self.at.x.value_ptr[self.at.v.p.n_blocks] if self.at.v.p.n_rows else 0, F8)
 
     @property
     def case(self):
@@ -393,24 +394,24 @@ cdef class Linear:
         return copy_to_array(self.at.x.case_, self.at.v.p.n_rows, I1)
 
     @property
-    def place(self):
+    def system_row(self):
         """Row of G of each row (m,), -1 if it has none."""
-        return copy_to_array(self.at.place, self.at.v.p.n_rows, I4)
+        return copy_to_array(self.at.system_row, self.at.v.p.n_rows, I4)
 
 
 cdef class Linears:
     """Judge and linearise several impulses (m,) [N s] at once.
 
-    The data must know the references of the zero impulse. impulses is a list, or the arrays (all impulses, first index of
-    each, number of rows of each). G is factored if A is given by J and M and G has at most `most` rows. An item is skipped,
-    and its `one` is None, if its data are None, its impulse is not an array of its rows, or d is outside the valid range.
+    The references of the zero impulse must be set in the data. impulses is a list, or the arrays (all impulses, first index of
+    each, number of rows of each). G is factored if A is given by J and M and G has at most `max_rows` rows. An item is skipped,
+    and `item` returns None for it, if its data are None, its impulse is not an array of its rows, or d is outside the valid range.
     """
     cdef Workspace table, workspace, factors
     cdef list data
     cdef linear_t* at
     cdef readonly Py_ssize_t n, size                    # number of impulses; length of the result of `adjoint`
 
-    def __init__(self, list data, impulses, int32_t most=0):
+    def __init__(self, list data, impulses, int32_t max_rows=0):
         cdef Py_ssize_t i, n = len(data), size = 0, scratch = 1, more = 0
         cdef Data p
         cdef linear_t* a
@@ -433,32 +434,32 @@ cdef class Linears:
             a = self.at + i
             if p is None or not is_prepared(p):
                 continue
-            a.known, a.v = True, p.view()
+            a.valid, a.v = True, p.view()
             a.n = a.v.g.n if a.v.g != NULL else 6 * a.v.r.n_bodies if a.v.r != NULL else 0
-            size += linear_workspace_size(&a.v.p, values_of(&a.v.p))
+            size += linear_workspace_size(&a.v.p, count_values(&a.v.p))
             scratch = max(scratch, a.v.p.n_rows + scratch_of(&a.v))
         self.workspace, spare = allocate_workspace(size * sizeof(double)), allocate_workspace(scratch * sizeof(double))
         to = <double*>self.workspace.at
         for i in range(n):
             a = self.at + i
-            if not a.known:
+            if not a.valid:
                 continue
             p = data[i]
             memset(&view, 0, sizeof(Py_buffer))
             try:
                 if each is None:
-                    a.known = sizes[i] == a.v.p.n_rows
+                    a.valid = sizes[i] == a.v.p.n_rows
                     lam = &flat[0] + first[i] if a.v.p.n_rows else NULL
                 else:
-                    a.known = each[i] is not None and get_array_data(each[i], a.v.p.n_rows, &view, &lam)
-                if not a.known:
+                    a.valid = each[i] is not None and get_array_data(each[i], a.v.p.n_rows, &view, &lam)
+                if not a.valid:
                     continue
                 with nogil:
                     linearise(a, lam, p.reference_energy, p.reference_velocity, to, <double*>spare.at)
             finally:
                 PyBuffer_Release(&view)
-            to += linear_workspace_size(&a.v.p, values_of(&a.v.p))
-            if a.v.g != NULL and a.rows <= most:
+            to += linear_workspace_size(&a.v.p, count_values(&a.v.p))
+            if a.v.g != NULL and a.rows <= max_rows:
                 more += factor_workspace_size(a.rows)
                 scratch = max(scratch, scratch_of_factor(a.rows, &a.v))
         self.factors, spare = allocate_workspace(more * sizeof(double)), allocate_workspace(scratch * sizeof(double))
@@ -466,31 +467,31 @@ cdef class Linears:
         with nogil:
             for i in range(n):
                 a = self.at + i
-                if a.known and a.v.g != NULL and a.rows <= most:
+                if a.valid and a.v.g != NULL and a.rows <= max_rows:
                     factorise(a, &a.v, 0.0, to, work)
                     to += factor_workspace_size(a.rows)
 
-    def one(self, Py_ssize_t i):
+    def item(self, Py_ssize_t i):
         """Return item i as a `Linear`, or None if it was skipped."""
         cdef Linear item
-        if not self.at[i].known:
+        if not self.at[i].valid:
             return None
         item = Linear.__new__(Linear)
         item.at, item.judge, item.data = self.at[i], self.data[i], self.data[i]
         item.workspace, item.factor = self.workspace, self.factors
         return item
 
-    def leave(self, double accepted):
-        """Skip items without a regular factor or with a residual above `accepted`; return the indices of all skipped items."""
+    def skip_unsolvable(self, double max_residual):
+        """Skip items without a regular factor or with a residual above max_residual; return the indices of all skipped items."""
         cdef Py_ssize_t i
         cdef linear_t* a
         cdef list skipped = []
         self.size = 0
         for i in range(self.n):
             a = self.at + i
-            a.known = a.known and a.tried and a.regular and a.relative <= accepted
+            a.valid = a.valid and a.tried and a.regular and a.relative <= max_residual
             a.first = self.size
-            if a.known:
+            if a.valid:
                 self.size += 3 * a.v.p.n_rows + a.n
             else:
                 skipped.append(i)
@@ -504,18 +505,18 @@ cdef class Linears:
         numbers = empty(self.size)
         PyObject_GetBuffer(numbers, &view, PyBUF_WRITABLE)
         for i in range(self.n):
-            if self.at[i].known and not adjoint_into(self.at + i, velocities[i], impulses[i], slacks[i],
+            if self.at[i].valid and not adjoint_into(self.at + i, velocities[i], impulses[i], slacks[i],
                                                      <double*>view.buf + self.at[i].first):
                 failed.append(i)
         PyBuffer_Release(&view)
         return numbers, failed
 
-    def place(self, Py_ssize_t i):
+    def result_slice(self, Py_ssize_t i):
         """Return the slice of item i in the result of `adjoint`."""
         cdef linear_t* a = self.at + i
         return slice(a.first, a.first + 3 * a.v.p.n_rows + a.n)
 
-    def places(self, bint velocities):
+    def result_indices(self, bint velocities):
         """Return the indices of every s (sum m,), or of every f (sum n,), in the result of `adjoint`."""
         cdef Py_ssize_t i, j, k = 0
         cdef int32_t m, n
@@ -523,7 +524,7 @@ cdef class Linears:
         cdef Py_ssize_t[::1] out = out_
         for i in range(self.n):
             m, n = self.at[i].v.p.n_rows, self.at[i].n
-            if self.at[i].known:
+            if self.at[i].valid:
                 for j in range(n if velocities else m):
                     out[k] = self.at[i].first + (2 * m if velocities else m) + j
                     k += 1

@@ -35,7 +35,7 @@ cdef struct natural_t:          # natural map of all blocks
     double* f                   # (m) F
     double* margin              # (m) N s
     int8_t* case_               # (m)
-    const int32_t* at           # (k + 1) first value of each block in p and edge: a diagonal for bounded rows, otherwise a square
+    const int32_t* value_ptr    # (k + 1) first value of each block in p and edge: a diagonal for bounded rows, otherwise a square
     double* p                   # P
     double* edge                # dPi/de, e_g the friction coefficient of component g, in the first column of g
 
@@ -45,16 +45,16 @@ cdef struct linear_t:           # a judged and linearised solution
     natural_t x
     int32_t n                   # number of velocities, 0 for a matrix
     int32_t rows                # order of G
-    bint known                  # the problem is supported and linearised
+    bint valid                  # the problem is supported and linearised
     bint tried                  # a factorisation was attempted
     bint regular                # G was factored and is regular
     double* lam                 # (m) N s
     double* w                   # (m) m/s
-    int32_t* place              # (m) row of G that each row is, -1 without one
+    int32_t* system_row         # (m) row of G of each row, -1 without one
     double* lu                  # (rows, rows) P G^T = L U
     int32_t* swap               # (rows)
     double relative, above_floor        # results of the judge
-    ssize_t first               # first index of its numbers in the results of several
+    ssize_t first               # first index of the item in the results of `Linears.adjoint`
 
 
 cdef inline void linearise_row(double lam, double w, double low, double high, double root, double* f, double* margin,
@@ -85,7 +85,7 @@ cdef inline void linearise_contact(const blocks_t* b, int32_t i, const double* l
     cdef int32_t j = b.ptr[i], n = b.ptr[i + 1] - j, k, g, first, size
     cdef double* root = out.root + j
     cdef double* margin = out.margin + j
-    cdef double* edge = out.edge + out.at[i]
+    cdef double* edge = out.edge + out.value_ptr[i]
     cdef double z[6]
     cdef double s[6]
     cdef double y[6]
@@ -104,7 +104,7 @@ cdef inline void linearise_contact(const blocks_t* b, int32_t i, const double* l
         s[k] = w[j + k] / root[k]
         y[k] = z[k] - s[k]
         margin[k] = INFINITY
-    evaluate_natural_map(b.law, &q, n, z, s, projected, out.f + j, out.p + out.at[i])
+    evaluate_natural_map(b.law, &q, n, z, s, projected, out.f + j, out.p + out.value_ptr[i])
     normal = projected[0]
     # dPi/de with a_g = e_g root_g / root_n
     differentiate_by_coefficients(b.law, &q, n, y, normal, edge)
@@ -127,38 +127,38 @@ cdef inline void linearise_contact(const blocks_t* b, int32_t i, const double* l
     margin[0] = (normal if normal > 0.0 else gap if b.law == CONE else -y[0]) / root[0]
 
 
-cdef inline void linearise_blocks(const blocks_t* b, const double* lam, const double* w, int32_t* at,
+cdef inline void linearise_blocks(const blocks_t* b, const double* lam, const double* w, int32_t* value_ptr,
                              const natural_t* out) noexcept nogil:
-    """Compute (1) and (2) of all blocks; `at` (k + 1) is the array of `out`."""
+    """Compute (1) and (2) of all blocks; `value_ptr` (k + 1) is the array of `out`."""
     cdef int32_t i, j, k, n
-    at[0] = 0
+    value_ptr[0] = 0
     for i in range(b.n_blocks):
         j = b.ptr[i]
         n = b.ptr[i + 1] - j
-        at[i + 1] = at[i] + (n if is_rows(b, i) else n * n)
+        value_ptr[i + 1] = value_ptr[i] + (n if is_rows(b, i) else n * n)
         if not is_rows(b, i):
             linearise_contact(b, i, lam, w, out)
             continue
         for k in range(n):
             out.root[j + k] = sqrt(b.d[j + k])
             linearise_row(lam[j + k], w[j + k], b.lower[j + k], b.upper[j + k], out.root[j + k], out.f + j + k,
-                          out.margin + j + k, out.case_ + j + k, out.p + at[i] + k)
-            out.edge[at[i] + k] = 0.0
+                          out.margin + j + k, out.case_ + j + k, out.p + value_ptr[i] + k)
+            out.edge[value_ptr[i] + k] = 0.0
 
 
-cdef inline int32_t place_rows(const blocks_t* b, const natural_t* x, int32_t* place) noexcept nogil:
+cdef inline int32_t number_system_rows(const blocks_t* b, const natural_t* x, int32_t* system_row) noexcept nogil:
     """Assign a row of G to each row that is not trivial in (3): closed contacts, rows between bounds. Return their number."""
     cdef int32_t i, j, n = 0
     for i in range(b.n_blocks):
         for j in range(b.ptr[i], b.ptr[i + 1]):
-            place[j] = -1
+            system_row[j] = -1
             if x.case_[b.ptr[i]] != OPEN and x.case_[j] != LOW and x.case_[j] != HIGH:
-                place[j] = n
+                system_row[j] = n
                 n += 1
     return n
 
 
-cdef inline void block_times(const natural_t* x, const blocks_t* b, const double* values, const double* v, bint transpose,
+cdef inline void multiply_blocks(const natural_t* x, const blocks_t* b, const double* values, const double* v, bint transpose,
                              double* out) noexcept nogil:
     """Compute out (m), the products of the blocks in `values`, or of their transposes, with v."""
     cdef int32_t i, j, k, l, n
@@ -167,7 +167,7 @@ cdef inline void block_times(const natural_t* x, const blocks_t* b, const double
     for i in range(b.n_blocks):
         j = b.ptr[i]
         n = b.ptr[i + 1] - j
-        a = values + x.at[i]
+        a = values + x.value_ptr[i]
         for k in range(n):
             if is_rows(b, i):
                 out[j + k] = a[k] * v[j + k]
@@ -181,24 +181,24 @@ cdef inline void block_times(const natural_t* x, const blocks_t* b, const double
             out[j + k] = s
 
 
-cdef inline void scaled_csr(const csr_t* a, int32_t m, int32_t count, const int32_t* place, const double* root,
+cdef inline void form_scaled_csr(const csr_t* a, int32_t m, int32_t count, const int32_t* system_row, const double* root,
                             double* h) noexcept nogil:
     """Compute H (count, count) of a matrix on the rows of G."""
     cdef int32_t i, q, c
     cdef double* row
     for i in range(m):
-        if place[i] < 0:
+        if system_row[i] < 0:
             continue
-        row = h + <ssize_t>place[i] * count
+        row = h + <ssize_t>system_row[i] * count
         for c in range(count):
             row[c] = 0.0
         for q in range(a.indptr[i], a.indptr[i + 1]):
-            c = place[a.indices[q]]
+            c = system_row[a.indices[q]]
             if c >= 0:
                 row[c] += a.data[q] / (root[i] * root[a.indices[q]])
 
 
-cdef inline void scaled_general(const generalized_t* g, int32_t count, const int32_t* place, const double* root,
+cdef inline void form_scaled_generalized(const generalized_t* g, int32_t count, const int32_t* system_row, const double* root,
                                 double* y, double* h) noexcept nogil:
     """Compute H (count, count) of J and M on the rows of G; y (count, nv) is scratch."""
     cdef int32_t i, k, c, b, nc, n = g.n
@@ -212,8 +212,8 @@ cdef inline void scaled_general(const generalized_t* g, int32_t count, const int
         nc = g.pcol[b + 1] - g.pcol[b]
         from_ = g.y + g.pval[b]
         for i in range(g.prow[b], g.prow[b + 1]):
-            if place[i] >= 0:
-                row = y + <ssize_t>place[i] * n
+            if system_row[i] >= 0:
+                row = y + <ssize_t>system_row[i] * n
                 for k in range(nc):
                     row[g.cols[g.pcol[b] + k]] = from_[k] / root[i]
             from_ += nc
@@ -223,13 +223,13 @@ cdef inline void scaled_general(const generalized_t* g, int32_t count, const int
             h[<ssize_t>i * count + c] = x
             h[<ssize_t>c * count + i] = x
     for i in range(g.m):
-        if place[i] >= 0:
-            h[<ssize_t>place[i] * count + place[i]] += g.compliance[i] / (root[i] * root[i])
+        if system_row[i] >= 0:
+            h[<ssize_t>system_row[i] * count + system_row[i]] += g.compliance[i] / (root[i] * root[i])
 
 
-cdef inline void system_rows(const natural_t* x, const blocks_t* b, int32_t count, const int32_t* place,
+cdef inline void form_system_rows(const natural_t* x, const blocks_t* b, int32_t count, const int32_t* system_row,
                              const double* h, double* g) noexcept nogil:
-    """Compute G (count, count) of (3) from H; place is the row of G of each row, or -1."""
+    """Compute G (count, count) of (3) from H; system_row is row of G of each row, or -1."""
     cdef int32_t i, j, k, l, n, c
     cdef const double* p
     cdef double* row
@@ -237,13 +237,13 @@ cdef inline void system_rows(const natural_t* x, const blocks_t* b, int32_t coun
     for i in range(b.n_blocks):
         j = b.ptr[i]
         n = b.ptr[i + 1] - j
-        p = x.p + x.at[i]
+        p = x.p + x.value_ptr[i]
         for k in range(n):
-            if place[j + k] < 0:
+            if system_row[j + k] < 0:
                 continue
-            row = g + <ssize_t>place[j + k] * count
+            row = g + <ssize_t>system_row[j + k] * count
             if is_rows(b, i):
-                from_ = h + <ssize_t>place[j + k] * count
+                from_ = h + <ssize_t>system_row[j + k] * count
                 for c in range(count):
                     row[c] = from_[c]
                 continue
@@ -251,9 +251,9 @@ cdef inline void system_rows(const natural_t* x, const blocks_t* b, int32_t coun
                 row[c] = 0.0
             for l in range(n):
                 if p[k * n + l] != 0.0:
-                    from_ = h + <ssize_t>place[j + l] * count
+                    from_ = h + <ssize_t>system_row[j + l] * count
                     for c in range(count):
                         row[c] += p[k * n + l] * from_[c]
             for l in range(n):
-                row[place[j + l]] -= p[k * n + l]
-            row[place[j + k]] += 1.0
+                row[system_row[j + l]] -= p[k * n + l]
+            row[system_row[j + k]] += 1.0

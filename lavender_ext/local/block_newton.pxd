@@ -40,7 +40,7 @@ cdef struct scaled_block_t:
     int32_t n                   # number of rows, at most MAX_ROWS
     bint bounded                # bounded rows, otherwise a contact
     const double* H             # (n, n)
-    friction_components_t part  # friction components of a contact, with the coefficients of z
+    friction_components_t components    # of a contact, with the coefficients of z
     double lower[MAX_ROWS]      # bounds of z
     double upper[MAX_ROWS]
     double z0[MAX_ROWS]
@@ -53,17 +53,17 @@ cdef struct scaled_block_t:
     double size                 # largest sum of absolute terms of a row, for the tolerance
 
 
-cdef inline void prepare_newton(int32_t n, const double* W, const double* d, const friction_components_t* part,
+cdef inline void prepare_newton(int32_t n, const double* W, const double* d, const friction_components_t* components,
                                 double* g) noexcept nogil:
-    """Compute the prepared numbers g (n n + 2 n) of a block; part.n is 0 for bounded rows."""
+    """Compute the prepared numbers g (n n + 2 n) of a block; components.n is 0 for bounded rows."""
     cdef double* root = g + n * n
     cdef double* inverse = root + n
     cdef int32_t i, j
     for i in range(n):
         root[i] = sqrt(d[i])
-    for j in range(part.n):
-        for i in range(part.first[j] + 1, part.first[j] + part.size[j]):
-            root[i] = root[part.first[j]]
+    for j in range(components.n):
+        for i in range(components.first[j] + 1, components.first[j] + components.size[j]):
+            root[i] = root[components.first[j]]
     for i in range(n):
         inverse[i] = 1.0 / root[i]
     for i in range(n):
@@ -71,7 +71,7 @@ cdef inline void prepare_newton(int32_t n, const double* W, const double* d, con
             g[n * i + j] = W[n * i + j] * (inverse[i] * inverse[j])
 
 
-cdef inline double evaluate(scaled_block_t* x, const int32_t n, double t) noexcept nogil:
+cdef inline double evaluate_residual(scaled_block_t* x, const int32_t n, double t) noexcept nogil:
     """Return |F| at z and compute Pi(y), F, P and `size`."""
     cdef double ts[MAX_ROWS]
     cdef double change[MAX_ROWS]
@@ -96,7 +96,7 @@ cdef inline double evaluate(scaled_block_t* x, const int32_t n, double t) noexce
             x.F[i] = ts[i] if side == 0 else x.z[i] - x.projected[i]
             x.P[(n + 1) * i] = 1.0 if side == 0 else 0.0
     else:
-        evaluate_natural_map(x.law, &x.part, n, x.z, ts, x.projected, x.F, x.P)
+        evaluate_natural_map(x.law, &x.components, n, x.z, ts, x.projected, x.F, x.P)
     for i in range(n):
         total += x.F[i] * x.F[i]
     return sqrt(total)
@@ -107,7 +107,7 @@ cdef inline bint iterate_newton(scaled_block_t* x, const int32_t n, double t) no
     cdef double A[MAX_ROWS * MAX_ROWS]
     cdef double f[MAX_ROWS]
     cdef double z[MAX_ROWS]
-    cdef double now = evaluate(x, n, t), next_, a, fraction
+    cdef double now = evaluate_residual(x, n, t), next_, a, fraction
     cdef int32_t i, j, k, _step, _halving, slow = 0
     for _step in range(MAX_NEWTON_STEPS):
         if not now > 1e-15 * x.size:
@@ -125,14 +125,14 @@ cdef inline bint iterate_newton(scaled_block_t* x, const int32_t n, double t) no
         for _halving in range(MAX_STEP_HALVINGS):
             for i in range(n):
                 x.z[i] = z[i] + fraction * f[i]
-            next_ = evaluate(x, n, t)
+            next_ = evaluate_residual(x, n, t)
             if next_ < now:
                 break
             fraction *= 0.5
         if not next_ < now and now <= 1e-13 * x.size:
             for i in range(n):
                 x.z[i] = z[i]
-            now = evaluate(x, n, t)
+            now = evaluate_residual(x, n, t)
             break
         slow += not next_ < 0.9 * now
         now = next_
@@ -179,7 +179,7 @@ cdef inline void take_projected_steps(scaled_block_t* x) noexcept nogil:
         x.z[i] = x.start[i]
         trace += fabs(x.H[(x.n + 1) * i])
     for _step in range(N_PROJECTED_STEPS if trace > 0.0 else 0):    # No eigenvalue of a symmetric H exceeds its trace.
-        evaluate(x, x.n, 1.0 / trace)
+        evaluate_residual(x, x.n, 1.0 / trace)
         for i in range(x.n):
             x.z[i] = x.start[i] = x.projected[i]
 
@@ -194,8 +194,8 @@ cdef inline bint is_open(const scaled_block_t* x) noexcept nogil:
             s[i] -= x.H[x.n * i + j] * x.z0[j]
         if x.law != CONE or s[0] < 0.0:
             return s[0] >= 0.0
-    for g in range(x.part.n):
-        s[0] -= x.part.friction_coefficient[g] * length(s + x.part.first[g], x.part.size[g])
+    for g in range(x.components.n):
+        s[0] -= x.components.friction_coefficient[g] * length(s + x.components.first[g], x.components.size[g])
     return s[0] >= 0.0
 
 
@@ -225,8 +225,8 @@ cdef inline int32_t solve_block_newton(scaled_block_t* x, const double* g, const
             x.lower[i] = root[i] * lower[i]
             x.upper[i] = root[i] * upper[i]
     else:
-        for i in range(x.part.n):
-            x.part.friction_coefficient[i] *= root[x.part.first[i]] * inverse[0]
+        for i in range(x.components.n):
+            x.components.friction_coefficient[i] *= root[x.components.first[i]] * inverse[0]
         if is_open(x):
             for i in range(x.n):
                 lam[i] = 0.0

@@ -13,7 +13,7 @@ from libc.stdint cimport int32_t
 
 from lavender_ext.core.block cimport norm2
 from lavender_ext.local.coulomb cimport opposes_friction
-from lavender_ext.local.small cimport FAILED, OPEN, SLIP, STICK, newton_or_bisect, slack_is_zero
+from lavender_ext.local.small cimport FAILED, OPEN, SLIP, STICK, newton_or_bisect, is_slack_zero
 
 
 cdef inline int32_t minimize_on_ray(const double* W, const double* q, double mu, double s0, double s1,
@@ -37,7 +37,7 @@ cdef inline int32_t minimize_on_ray(const double* W, const double* q, double mu,
     return SLIP
 
 
-cdef inline int32_t cone3(const double* W, const double* q, double mu, double* lam) noexcept nogil:
+cdef inline int32_t solve_cone_disk(const double* W, const double* q, double mu, double* lam) noexcept nogil:
     """Solve for lam (3); FAILED keeps lam."""
     cdef double m2 = mu * mu, d1, d2, beta, top, f, df, step, lo, hi, side, P, U, d0
     cdef double v0[3]
@@ -76,7 +76,7 @@ cdef inline int32_t cone3(const double* W, const double* q, double mu, double* l
     if d0 > 0.0 and v0[0] >= 0.0 and norm2(v0[1], v0[2]) <= mu * v0[0]:
         for k in range(3):
             v[k] = v0[k] / d0
-        if slack_is_zero(3, W, q, v):
+        if is_slack_zero(3, W, q, v):
             for k in range(3):
                 lam[k] = v[k]
             return STICK

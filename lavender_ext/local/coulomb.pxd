@@ -22,10 +22,10 @@ from lavender_ext.local.small cimport FAILED, OPEN, SLIP, STICK, newton_or_bisec
 
 cdef enum:
     PREPARED = 25               # number of doubles of a prepared 3x3 block
-    ONE_PATTERN = 15            # index of a flag in them, which `prepare3` sets to 0
+    ONE_PATTERN = 15            # index of a flag in them, which `prepare_disk` sets to 0
 
 
-cdef inline void prepare3(const double* W, double* g) noexcept nogil:
+cdef inline void prepare_disk(const double* W, double* g) noexcept nogil:
     """Compute g (25): W, 1 / W_nn (0 if not positive), S, det S (0 if singular), 0, and W^-1 if det S > 0; row by row."""
     cdef double h0, h1, k0, k1, inv, det, size, t00, t01, t10, t11
     cdef int32_t i
@@ -79,7 +79,7 @@ cdef inline int32_t opposes_friction(const double* W, const double* q, double x0
     return fabs(w0 * x1 - w1 * x0) <= size and w0 * x0 + w1 * x1 <= size
 
 
-cdef inline int32_t coulomb3(const double* g, const double* q, double mu, double beta, double* lam) noexcept nogil:
+cdef inline int32_t solve_coulomb_disk(const double* g, const double* q, double mu, double beta, double* lam) noexcept nogil:
     """Solve (1)-(4) for lam (3), with a guess `beta` for slip (0: none); FAILED keeps lam."""
     cdef double a, h0, h1, r0, r1, u0, u1, x0, x1, det, tr, hr, delta, n, P, U, U2, f, step, lo = 0.0, hi = -1.0
     cdef double hu, size
@@ -182,7 +182,7 @@ cdef inline int32_t coulomb3(const double* g, const double* q, double mu, double
     return SLIP
 
 
-cdef inline int32_t coulomb3_from(const double* g, const double* w, double mu, double* lam) noexcept nogil:
+cdef inline int32_t update_coulomb_disk(const double* g, const double* w, double mu, double* lam) noexcept nogil:
     """Solve for lam (3) from the slack w (3) of the present lam; open and sticking contacts need only products."""
     cdef double q[3]
     cdef double n, x, y, s, f
@@ -207,4 +207,4 @@ cdef inline int32_t coulomb3_from(const double* g, const double* w, double mu, d
     # guess: beta = |w_t| / |lam_t| of the present sliding
     s = lam[1] * lam[1] + lam[2] * lam[2]
     f = -(w[1] * lam[1] + w[2] * lam[2])
-    return coulomb3(g, q, mu, f / s if s > 0.0 and f > 0.0 else 0.0, lam)
+    return solve_coulomb_disk(g, q, mu, f / s if s > 0.0 and f > 0.0 else 0.0, lam)

@@ -5,7 +5,7 @@ The prepared numbers of block i begin at g[start[i]]:
     one row                      nothing: lam <- clip(lam - w / d)
     rows, 2 to 8, all free       1, then W^-1 (n, n); if W is singular, as bounded rows
     rows, 2 to 8, bounded        0, then `prepare_newton` of local/block_newton.pxd
-    normal, two tangents, disk   `prepare3` of local/coulomb.pxd, with 1 at ONE_PATTERN if its rows of A share one pattern
+    normal, two tangents, disk   `prepare_disk` of local/coulomb.pxd, with 1 at ONE_PATTERN if its rows of A share one pattern
     other contacts               1 if there are three rows and they share one pattern, then `prepare_newton`
 
 A sweep solves each block exactly with the others fixed: disks by local/coulomb.pxd and local/cone.pxd, all others, and disks
@@ -27,8 +27,8 @@ from lavender_ext.core.rows cimport (contact_jacobian, contact_velocity, cross, 
                                      minv_times, apply_impulse_to_bodies, relative_velocity, relax_joint, apply_contact_impulse)
 from lavender_ext.core.view cimport csr_t, generalized_t, rows_t, view_t
 from lavender_ext.local.block_newton cimport prepare_newton, scaled_block_t, solve_block_newton
-from lavender_ext.local.cone cimport cone3
-from lavender_ext.local.coulomb cimport ONE_PATTERN, PREPARED, coulomb3_from, prepare3
+from lavender_ext.local.cone cimport solve_cone_disk
+from lavender_ext.local.coulomb cimport ONE_PATTERN, PREPARED, update_coulomb_disk, prepare_disk
 from lavender_ext.local.small cimport FAILED, MAX_ROWS, eliminate
 
 
@@ -46,12 +46,12 @@ cdef inline void prepare_block(const blocks_t* p, int32_t i, double* W, int32_t 
     cdef double inf = 1.0 / 0.0
     cdef double a[MAX_ROWS * MAX_ROWS]
     cdef double x[MAX_ROWS]
-    cdef friction_components_t part
-    get_friction_components(p, i, &part)
+    cdef friction_components_t components
+    get_friction_components(p, i, &components)
     # contacts
     if not is_rows(p, i):
         if is_disk(p, i):
-            prepare3(W, g)
+            prepare_disk(W, g)
             g[ONE_PATTERN] = one_pattern
             if W[0] != p.d[j]:
                 g[9] = 0.0
@@ -59,7 +59,7 @@ cdef inline void prepare_block(const blocks_t* p, int32_t i, double* W, int32_t 
         if W[0] != p.d[j]:                              # d of the normal is a fallback value: W_nn is too small to divide by
             W[0] = 0.0
         g[0] = one_pattern and n == 3
-        prepare_newton(n, W, p.d + j, &part, g + 1)
+        prepare_newton(n, W, p.d + j, &components, g + 1)
         return
     # rows
     for q in range(j, p.ptr[i + 1]):
@@ -77,7 +77,7 @@ cdef inline void prepare_block(const blocks_t* p, int32_t i, double* W, int32_t 
             g[1 + n * q + k] = x[q]
     g[0] = free
     if not free:
-        prepare_newton(n, W, p.d + j, &part, g + 1)
+        prepare_newton(n, W, p.d + j, &components, g + 1)
 
 
 cdef int32_t solve_other_block(const blocks_t* p, int32_t i, const double* g, const double* w, double* lam) noexcept nogil:
@@ -85,16 +85,16 @@ cdef int32_t solve_other_block(const blocks_t* p, int32_t i, const double* g, co
     cdef int32_t j = p.ptr[i]
     cdef scaled_block_t x
     x.law, x.n, x.bounded = p.law, p.ptr[i + 1] - j, is_rows(p, i)
-    get_friction_components(p, i, &x.part)
+    get_friction_components(p, i, &x.components)
     return solve_block_newton(&x, g, w, p.lower + j, p.upper + j, lam) == FAILED
 
 
 cdef int32_t solve_rejected_disk(const blocks_t* p, int32_t i, const double* g, const double* w, double* lam) noexcept nogil:
-    """Solve disk i, which its closed form rejects, with prepared numbers of `prepare3`; return 1 if the fallback was used."""
+    """Solve disk i, which its closed form rejects, with prepared numbers of `prepare_disk`; return 1 if the fallback was used."""
     cdef double h[15]
-    cdef friction_components_t part
-    get_friction_components(p, i, &part)
-    prepare_newton(3, g, p.d + p.ptr[i], &part, h)
+    cdef friction_components_t components
+    get_friction_components(p, i, &components)
+    prepare_newton(3, g, p.d + p.ptr[i], &components, h)
     if not g[9] > 0.0:
         h[0] = 0.0
     return solve_other_block(p, i, h, w, lam)
@@ -125,13 +125,17 @@ cdef inline int32_t solve_block(const blocks_t* p, int32_t i, const double* g, c
         return solve_other_block(p, i, g + 1, w, lam)
     # a disk
     if p.law != CONE:
-        return coulomb3_from(g, w, p.mu[i], lam) == FAILED and solve_rejected_disk(p, i, g, w, lam)
-    for k in range(3):
-        s = w[k]
-        for t in range(3):
-            s -= g[3 * k + t] * lam[t]
-        x[k] = s
-    return (not (g[9] > 0.0 or x[0] >= 0.0) or cone3(g, x, p.mu[i], lam) == FAILED) and solve_rejected_disk(p, i, g, w, lam)
+        if update_coulomb_disk(g, w, p.mu[i], lam) != FAILED:
+            return 0
+    else:
+        for k in range(3):                              # q = w - W lam
+            s = w[k]
+            for t in range(3):
+                s -= g[3 * k + t] * lam[t]
+            x[k] = s
+        if (g[9] > 0.0 or x[0] >= 0.0) and solve_cone_disk(g, x, p.mu[i], lam) != FAILED:
+            return 0
+    return solve_rejected_disk(p, i, g, w, lam)
 
 
 cdef inline void csr_dot3(const csr_t* a, int32_t i, const double* x, double* out) noexcept nogil:
@@ -186,9 +190,9 @@ cdef inline int32_t solve_csr_block(const blocks_t* p, const csr_t* a, int32_t i
 cdef inline int32_t solve_general_block(const blocks_t* p, const generalized_t* o, int32_t i, const double* g, double* lam,
                                         double* u) noexcept nogil:
     """Update block i by (3), u (nv) = Y^T lam; return 1 if the fallback was used."""
-    cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, b = o.home[i], k, found
+    cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, b = o.home[i], k, fallbacks
     cdef double w[MAX_ROWS]
-    cdef double old[MAX_ROWS]
+    cdef double previous[MAX_ROWS]
     cdef double now
     if n > MAX_ROWS:                                    # bounded rows, one by one
         for k in range(j, j + n):
@@ -199,11 +203,11 @@ cdef inline int32_t solve_general_block(const blocks_t* p, const generalized_t* 
         return 1
     for k in range(n):
         w[k] = whitened_dot(o, b, j + k, u) + (o.compliance[j + k] * lam[j + k] - p.b[j + k])
-        old[k] = lam[j + k]
-    found = solve_block(p, i, g, w, lam + j)
+        previous[k] = lam[j + k]
+    fallbacks = solve_block(p, i, g, w, lam + j)
     for k in range(n):
-        add_scaled_whitened_row(o, b, j + k, lam[j + k] - old[k], u)
-    return found
+        add_scaled_whitened_row(o, b, j + k, lam[j + k] - previous[k], u)
+    return fallbacks
 
 
 cdef inline int32_t solve_sliding_contact(const blocks_t* p, const rows_t* r, int32_t i, const double* g, double* lam,
@@ -225,7 +229,7 @@ cdef inline int32_t solve_sliding_contact(const blocks_t* p, const rows_t* r, in
     w[1] = dot3(t1, u) + (r.compliance[j + 1] * x - p.b[j + 1])
     w[2] = dot3(t2, u) + (r.compliance[j + 2] * y - p.b[j + 2])
     k = 0
-    if coulomb3_from(g, w, p.mu[i], lam) == FAILED:
+    if update_coulomb_disk(g, w, p.mu[i], lam) == FAILED:
         k = solve_block(p, i, g, w, lam)
     n = lam[0] - n
     x = lam[1] - x
@@ -243,9 +247,9 @@ cdef inline int32_t solve_sliding_contact(const blocks_t* p, const rows_t* r, in
 cdef inline int32_t solve_rows_block(const blocks_t* p, const rows_t* r, int32_t i, const double* g, double* lam,
                                      double* v) noexcept nogil:
     """Update block i by (2); return 1 if the fallback was used."""
-    cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, c = i - r.n_joints, k, a, b, nt, n_angular, roll, found
+    cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, c = i - r.n_joints, k, a, b, nt, n_angular, roll, fallbacks
     cdef double w[MAX_ROWS]
-    cdef double old[MAX_ROWS]
+    cdef double previous[MAX_ROWS]
     cdef double t2[3]
     cdef double impulse[3]
     cdef double twist[3]
@@ -262,11 +266,11 @@ cdef inline int32_t solve_rows_block(const blocks_t* p, const rows_t* r, int32_t
         b = r.joint_body[2 * i + 1]
         for k in range(n):
             w[k] = joint_velocity(r.jac + 12 * (j + k), v, a, b) + r.compliance[j + k] * lam[j + k] - p.b[j + k]
-            old[k] = lam[j + k]
-        found = solve_block(p, i, g, w, lam + j)
+            previous[k] = lam[j + k]
+        fallbacks = solve_block(p, i, g, w, lam + j)
         for k in range(n):
-            apply_joint_impulse(r.minv_jac + 12 * (j + k), lam[j + k] - old[k], v, a, b)
-        return found
+            apply_joint_impulse(r.minv_jac + 12 * (j + k), lam[j + k] - previous[k], v, a, b)
+        return fallbacks
     a = r.contact_body[2 * c]
     b = r.contact_body[2 * c + 1]
     n_angular = n_angular_rows(p, i)
@@ -277,10 +281,10 @@ cdef inline int32_t solve_rows_block(const blocks_t* p, const rows_t* r, int32_t
     contact_velocity(r, c, nt, n_angular, v, w)
     for k in range(n):
         w[k] += r.compliance[j + k] * lam[j + k] - p.b[j + k]
-        old[k] = lam[j + k]
-    found = solve_block(p, i, g, w, lam + j)
+        previous[k] = lam[j + k]
+    fallbacks = solve_block(p, i, g, w, lam + j)
     for k in range(n):
-        w[k] = lam[j + k] - old[k]
+        w[k] = lam[j + k] - previous[k]
     for k in range(3):
         impulse[k] = w[0] * normal[k]
         twist[k] = 0.0
@@ -298,7 +302,7 @@ cdef inline int32_t solve_rows_block(const blocks_t* p, const rows_t* r, int32_t
         for k in range(3):
             twist[k] += w[roll] * t1[k] + w[roll + 1] * t2[k]
     apply_impulse_to_bodies(v, a, b, r.inv_mass, r.inv_inertia, r.arm_a + 3 * c, r.arm_b + 3 * c, impulse, twist)
-    return found
+    return fallbacks
 
 
 cdef double prepared_sizes(const blocks_t* p, int32_t* start) noexcept nogil:
@@ -311,7 +315,7 @@ cdef double prepared_sizes(const blocks_t* p, int32_t* start) noexcept nogil:
     return n
 
 
-cdef inline bint csr_diagonal_block(const blocks_t* p, const csr_t* a, int32_t i, double* W) noexcept nogil:
+cdef inline bint form_csr_diagonal_block(const blocks_t* p, const csr_t* a, int32_t i, double* W) noexcept nogil:
     """Extract the diagonal block W (n, n) of block i from A; return whether its rows share one pattern."""
     cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, k, q
     cdef bint one = True
@@ -328,7 +332,7 @@ cdef inline bint csr_diagonal_block(const blocks_t* p, const csr_t* a, int32_t i
     return one
 
 
-cdef inline void rows_diagonal_block(const blocks_t* p, const rows_t* r, int32_t i, double* W) noexcept nogil:
+cdef inline void form_rows_diagonal_block(const blocks_t* p, const rows_t* r, int32_t i, double* W) noexcept nogil:
     """Compute the diagonal block W (n, n) of block i from J and M^-1."""
     cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, k, q, c = i - r.n_joints
     cdef double jac[72]
@@ -351,7 +355,7 @@ cdef inline void rows_diagonal_block(const blocks_t* p, const rows_t* r, int32_t
         W[0] = p.d[j]                                   # W_nn has the bits of d, which is summed in another order.
 
 
-cdef inline void general_diagonal_block(const blocks_t* p, const generalized_t* o, int32_t i, double* W) noexcept nogil:
+cdef inline void form_generalized_diagonal_block(const blocks_t* p, const generalized_t* o, int32_t i, double* W) noexcept nogil:
     """Compute the diagonal block W (n, n) of block i from the rows of Y."""
     cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, k, q, b = o.home[i], nc = o.pcol[b + 1] - o.pcol[b]
     cdef const double* y = o.y + o.pval[b] + <ssize_t>(j - o.prow[b]) * nc
@@ -372,11 +376,11 @@ cdef void prepare_blocks(const view_t* v, const int32_t* start, double* g) noexc
             continue
         one = False
         if v.g != NULL:
-            general_diagonal_block(&v.p, v.g, i, W)
+            form_generalized_diagonal_block(&v.p, v.g, i, W)
         elif v.r != NULL:
-            rows_diagonal_block(&v.p, v.r, i, W)
+            form_rows_diagonal_block(&v.p, v.r, i, W)
         else:
-            one = csr_diagonal_block(&v.p, v.a, i, W)
+            one = form_csr_diagonal_block(&v.p, v.a, i, W)
         prepare_block(&v.p, i, W, one, g + start[i])
 
 

@@ -83,7 +83,7 @@ cdef inline int32_t eliminate(int32_t n, double* a, double* x) noexcept nogil:
     return rank
 
 
-cdef inline int32_t slack_is_zero(int32_t m, const double* W, const double* q, const double* lam) noexcept nogil:
+cdef inline int32_t is_slack_zero(int32_t m, const double* W, const double* q, const double* lam) noexcept nogil:
     """Return whether w = W lam + q is 0 within rounding."""
     cdef int32_t i, j
     cdef double w, size

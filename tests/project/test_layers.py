@@ -80,7 +80,7 @@ def test_every_room_of_the_kernels_says_what_it_is():
     ("file", "line", "sign"),
     [
         ("core/rows.pxd", "from lavender_ext.judge.measure cimport score_t", "core cimports lavender_ext.judge"),
-        ("judge/measure.pyx", "from lavender_ext.local.cone cimport (cone3,", "judge cimports lavender_ext.local"),
+        ("judge/measure.pyx", "from lavender_ext.local.cone cimport (eliminate,", "judge cimports lavender_ext.local"),
         ("core/order.pyx", "import lavender_ext.sweep.serial", "core cimports lavender_ext.sweep"),
         ("core/order.pyx", "from lavender_ext cimport rows", "name the room"),
         ("attic/old.pyx", "cimport numpy", "has no place"),
