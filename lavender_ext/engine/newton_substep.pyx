@@ -81,7 +81,10 @@ cdef public int32_t lav_newton_plan(const int32_t* size, double* real, int32_t* 
         v = view_t(p, NULL, &r, NULL)
         n.index = scratch + SCRATCH_HEADER
         bodies_start(&v, NULL, &n, NULL)                # computes the pattern and the remaining workspace size
-        workspace += n.n_real
+        if n.is_bound:
+            workspace += n.n_real
+        else:
+            scratch[1] = 0                              # The factor has too many entries: only the first phase runs.
     return <int32_t>workspace if workspace < INDEX_LIMIT else -1
 
 

@@ -6,6 +6,7 @@ import itertools
 import numpy as np
 import pytest
 from calls import newton_without
+from newton_steps import NewtonSteps
 from random_problems import good
 from worked import after
 
@@ -180,3 +181,13 @@ def test_the_best_point_is_kept_when_a_walk_apart_finds_nothing_better():
         lv.solve(problem, "newton", tol=1e-8, max_iter=n).residual.relative for n in (30, 60, 120, 240)
     ]
     assert all(later <= earlier for earlier, later in itertools.pairwise(budgets))
+
+
+@pytest.mark.parametrize(("scene", "parameters"), [("spinner", {}), ("stack", {"n": 1}), ("stack", {"n": 2})])
+def test_few_bodies_whose_factor_is_full_reach_the_tolerance(scene, parameters):
+    """The scratch of a substep is allocated before the analysis: it must hold the pattern of a full factor."""
+    run = NewtonSteps(scene, warm_start=False, **parameters)
+    for _ in range(40):
+        values = run.step()
+        assert np.isfinite(values).all()
+    assert all(run.ended)
