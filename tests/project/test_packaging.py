@@ -171,16 +171,21 @@ def test_every_import_is_declared():
         declared("cluster") | declared("peers") | declared("mujoco") | declared("torch") | declared("jax")
     )
     # If installed:
-    known |= declared("contract") | {
-        "lavendersim",
-        "mujoco_warp",
-        "newton",
-        "pinocchio",
-        "pydrake",
-        "qoco",
-        "siconos",
-        "warp",
-    }
+    known |= (
+        declared("contract")
+        | declared("newton")
+        | {
+            "lavendersim",
+            "mujoco_warp",
+            "pinocchio",
+            "pydrake",
+            "qoco",
+            "siconos",
+            "warp",
+        }
+    )
+    known |= {"genesis"}  # genesis-world, of the extra `genesis`
+    known |= {"pytest"}  # of the plug-in that pytest itself imports
     known |= {"flint"}  # python-flint, of the extra `proof`
     known |= {"typing_extensions"}  # for type checkers alone, which bring its stub
     known |= {"ray"}  # a cluster that campaigns can use where it is installed
