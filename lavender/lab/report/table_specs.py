@@ -97,7 +97,10 @@ def list_sections(report: Report) -> list[Section]:
             "first sentence"
         )
         every = "floor: rounding to float64 allows no better"
-        carried = "median residual, time of all steps; carried from step to step, or cold"
+        carried = (
+            "time of all steps, of a part if a limit ended the run; median residual by budget; carried from step to "
+            "step, or cold if the solver takes no start"
+        )
         cases = tabulate_reaches(statistics.reaches(records, tolerances), tolerances).without("form")
         sections = [
             Section("By structure", by_structure, tabulate_advice(report)),
@@ -107,7 +110,10 @@ def list_sections(report: Report) -> list[Section]:
             Section("Motion error of each case", moved, tabulate_motion_errors(report), grouped=True),
             Section("Cases", every, cases, grouped=True),
             Section("Difficulty", DIFFICULTY, tabulate_difficulties(statistics.difficulties(records))),
-            Section("Sequences", carried, tabulate_passes(statistics.passes(records)), grouped=True),
+            *(
+                Section(f"Sequence {printable(name)}", carried, tabulate_sequence(passes))
+                for name, passes in statistics.group_passes(records).items()
+            ),
         ]
     if report.earlier_run is not None:
         changed = tabulate_changes(report.earlier_run, records)

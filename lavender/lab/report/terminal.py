@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
@@ -17,24 +18,32 @@ from lavender.lab.report.text import format_count, format_residual, list_diagnos
 
 if TYPE_CHECKING:
     from rich.console import Console
+    from rich.table import Table as RichTable
 
 MAX_LINES = 25  # Lines of a short report, with those that the command adds.
 COMMAND_LINES = (
     5  # Lines that the command adds: a blank line, page, reused runs, paper, cases that did not load.
 )
+MIN_HEAD_WIDTH = 8  # [columns] Heads do not fold at a smaller width.
+MIN_WORD_WIDTH = 9  # [columns] A column of words does not become narrower: "CONVERGED".
 MAX_NOTES = 20  # Notes of a kind in a complete report.
 
 
 def print_table(console: Console, table: Table, grouped: bool = False, cut: bool = False) -> None:
     """Print a table within the width of the terminal. Its texts are not read as markup.
 
-    Cells of a table that is too wide fold. A table that `folds` then becomes one line for each cell below the first
-    cell of its row. With `cut`, a row is one line and its first cell is shortened instead. `grouped` shows the first
-    cell only if it differs from the row above, and separates such groups.
+    In a table that is too wide, heads and words fold and numbers stay whole. If that is not enough, or if the table
+    `folds`, each cell becomes a line below the first cell of its row. With `cut`, a row is one line and its first cell
+    is shortened instead. `grouped` shows the first cell only if it differs from the row above, and separates such
+    groups. Columns without any text are left out.
     """
     from rich.table import Table as RichTable
     from rich.text import Text
 
+    empty = [
+        head for i, head in enumerate(table.heads) if table.rows and not any(row[i] for row in table.texts)
+    ]
+    table = table.without(*empty)
     grid = RichTable(box=None, pad_edge=False, header_style="bold")
     for head in table.heads:
         grid.add_column(
@@ -54,17 +63,37 @@ def print_table(console: Console, table: Table, grouped: bool = False, cut: bool
         grid.add_row(*cells, style=COLOURS.get(table.marks[i], "") if table.marks else "")
         above = first
     is_wide = console.measure(grid, options=console.options.update(width=100_000)).maximum > console.width
-    if is_wide and table.folds and not cut:
-        width = max(map(len, table.heads[1:]))
-        for name, *texts in table.texts:
-            console.print(name, highlight=False, markup=False)
-            for head, text in zip(table.heads[1:], texts, strict=True):
-                console.print(f"  {head:<{width}}  {text}", highlight=False, markup=False)
+    if is_wide and not cut and (table.folds or _fold_words(grid, table) > console.width):
+        _print_lines(console, table)
         return
-    if is_wide and not cut:
-        for column in grid.columns:
-            column.no_wrap, column.overflow = False, "fold"
     console.print(grid, highlight=False)
+
+
+def _fold_words(grid: RichTable, table: Table) -> int:
+    """Let heads and columns of words fold, and return the smallest width at which numbers stay whole."""
+    from rich.text import Text
+
+    width = 2 * (len(table.heads) - 1)
+    for i, (column, head) in enumerate(zip(grid.columns, table.heads, strict=True)):
+        texts = [row[i] for row in table.texts]
+        if table.is_number(head):
+            lines = textwrap.wrap(head, max(map(len, ["x" * MIN_HEAD_WIDTH, *texts, *head.split()])))
+            smallest = max(map(len, [*texts, *lines]))
+            column.header = Text("\n".join(lines))
+        else:
+            smallest = min(MIN_WORD_WIDTH, max(len(word) for text in (head, *texts) for word in text.split()))
+            column.min_width, column.no_wrap, column.overflow = smallest, False, "fold"
+        width += smallest
+    return width
+
+
+def _print_lines(console: Console, table: Table) -> None:
+    """Print each row as the line of its first cell, and a line for each other cell."""
+    width = max(map(len, table.heads[1:]))
+    for name, *texts in table.texts:
+        console.print(name, highlight=False, markup=False)
+        for head, text in zip(table.heads[1:], texts, strict=True):
+            console.print(f"  {head:<{width}}  {text}", highlight=False, markup=False)
 
 
 def print_report(report: Report, console: Console, complete: bool = False) -> None:

@@ -1,16 +1,20 @@
 """Tables and pages are readable: one unit and format in a column, whole numbers on a line, whole titles."""
 
+import io
 import re
 from dataclasses import replace
 
 import pytest
+from rich.console import Console
 
 from lavender.lab.bench import statistics
 from lavender.lab.report import figures, table_specs
+from lavender.lab.report.findings import Report
 from lavender.lab.report.page import create_environment, keep_numbers_together
 from lavender.lab.report.plotting import LEFT, RIGHT, WIDTH, plot_for_page
 from lavender.lab.report.summary_page import PageSection, SummaryPage
 from lavender.lab.report.table import Cell, Table
+from lavender.lab.report.terminal import print_table
 from lavender.lab.report.text import NONE, format_digits, format_sizes, format_times
 from tests.lab.report.synthetic import info, record, records_of
 
@@ -151,3 +155,22 @@ def test_a_figure_of_a_sequence_has_one_tolerance_and_few_solvers(sequence):
     assert carried.y == pytest.approx([1e-3, 2e-3, 3e-3, 4e-3])  # the time of all steps so far
     drawn = figures.build_figures(sequence).sequences["s"]
     assert [f.title for f in drawn] == ["s: 8 iterations", "s: to 1e-9"]  # the middle of 1e-6 and 1e-9
+
+
+@pytest.mark.parametrize("width", [100, 60, 44, 30])
+def test_numbers_stay_whole_in_a_narrow_terminal(width):
+    heads = ["case", "solver", "to 1e-6", "best residual of all runs", "status", "claim"]
+    rows = [[f"box_stack(n=1{i})", "sequential_impulses", Cell.time(1.5e-3 * i), f"{i}.0e-16", "CONVERGED", ""]
+            for i in (1, 2)]  # fmt: skip
+    out = io.StringIO()
+    print_table(Console(file=out, width=width), Table(heads, rows))
+    text = out.getvalue()
+    assert all(number in text.split() for number in ("1.50", "3.00", "1.0e-16", "2.0e-16", "CONVERGED"))
+    assert max(map(len, text.splitlines())) <= width
+    assert "claim" not in text  # a column without any text
+    assert ("solver" in text.splitlines()[0]) == (width == 100)
+
+
+def test_a_sequence_has_a_section_in_the_terminal(sequence):
+    (section,) = (s for s in table_specs.list_sections(Report(sequence)) if s.title.startswith("Sequence"))
+    assert section.title == "Sequence s" and len(section.table.rows) == 7
