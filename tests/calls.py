@@ -181,7 +181,7 @@ def newton_without(*phases):
 
     def begin(self, problem, solve):
         given(self, problem, solve)
-        solve.without = sum(PHASES[name] for name in phases)
+        solve.disabled_phases = sum(PHASES[name] for name in phases)
 
     with mock.patch.object(systems.System, "__init__", begin):
         yield

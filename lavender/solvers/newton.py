@@ -1,16 +1,17 @@
-"""Second-order solver for every law: interior point, active-set polish, proximal Newton.
+"""Second-order solver for every law: active sets, interior points, proximal damped Newton.
 
     z = D^1/2 lambda,   H = D^-1/2 A D^-1/2,   s = H z - g complementary to z on every block
 
-0. A warm start over bodies is judged first. If at most 64 sweeps (counted in `work`), or one banded factorisation of
-   joints without other rows, can solve it to tol, these run (`warm_start.py`).
+0. A warm start over bodies is judged first. Up to 64 sweeps (counted in `work`), or one banded factorisation of joints
+   without other rows, then try to solve it to tol (`warm_start.py`).
 1. Bounded rows: active-set exchanges (Newton's method on the natural map) from the warm start and from the solution of
    H z = g.
-2. A cold-started Mehrotra interior point. As soon as the active rows are identified, the solution on them is computed
-   to the floor of float64.
-3. If rows are nearly dependent and 1 and 2 fail: both again, with the augmented system of the bodies.
-4. Coulomb friction: a proximal Newton method on the Alart-Curnier map, and interior points on De Saxce's form of the
-   law, whose convex problem changes with every step. If these stall, a path of smoothed problems (Chen, Mangasarian
+2. Bounded rows and cones: a cold-started Mehrotra interior point. When the active rows are identified, the solution on
+   them is computed to the round-off limit of float64.
+3. If rows are nearly dependent and 1 and 2 fail: an interior point on the augmented system of the bodies, then proximal
+   damped Newton.
+4. Coulomb friction: proximal damped Newton on the Alart-Curnier map, and interior points on De Saxce's form of the law,
+   in which the convex problem changes with every step. If these stall, a path of smoothed problems (Chen, Mangasarian
    1996) is followed, each step by the coordinate that changes fastest (Rheinboldt 1986), through folds at which
    contacts change from stick to slip.
 
@@ -20,9 +21,9 @@ forming A, unless a full A is estimated to cost less than a tenth of that (few r
 two of them (free bodies of an engine), 1 to 4 use these bodies; under Coulomb's law, and if many contacts are rigid,
 they do so from the start (`SmallCall.cost_limit`).
 
-1 to 4 are compiled (`lavender_ext/newton/plan.pxd`) and run one factorisation at a time; in between, Python checks the
-clock, Ctrl-C and certificates. `newton_systems/` builds their linear systems. Form "velocity" factors I + K^T V K over
-the bodies and does not square J; "impulse" factors over the rows.
+1 to 4 are compiled and run one factorisation at a time; `lavender_ext/newton/plan.pxd` has the table of their states.
+In between, Python checks the clock, Ctrl-C and certificates. `newton_systems/` builds their linear systems. Form
+"velocity" factors I + K^T V K over the bodies and does not square J; "impulse" factors over the rows.
 """
 
 from __future__ import annotations
@@ -317,7 +318,7 @@ class Newton(Solver):
         solve = system.solve
         factorisations = warm_factorisations + solve.done - before
         message = ", ".join(
-            counted(count, kind) for count, kind in zip(solve.ran, COUNTED, strict=True) if count
+            counted(count, kind) for count, kind in zip(solve.counts, COUNTED, strict=True) if count
         )
         work = {"factorisations": factorisations} | ({"sweeps": sweeps} if sweeps else {})
         return Claim(status, factorisations, work, message, form=system.form, certificate=certificate)

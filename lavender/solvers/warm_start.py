@@ -11,11 +11,11 @@ from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
 from lavender_ext.newton.warm_start import (
     JUDGED,
-    MOST_SWEEPS,
+    MAX_WARM_SWEEPS,
     SOLVED,
     SWEPT,
     UNDECIDED,
-    from_guess,
+    solve_from_guess,
 )
 
 UNDECIDED_RESULT = UNDECIDED, 0, 0
@@ -51,7 +51,7 @@ def warm_start(
     """
     if problem.rows is None or problem.friction != "coulomb" or tol <= 0.0 or budget < 1:
         return UNDECIDED_RESULT
-    if time_limit is not None and MOST_SWEEPS * 1e-9 * problem.data.work > time_limit:
+    if time_limit is not None and MAX_WARM_SWEEPS * 1e-9 * problem.data.work > time_limit:
         return UNDECIDED_RESULT
-    result: tuple[int, int, int] = from_guess(problem.data, impulse, tol)
+    result: tuple[int, int, int] = solve_from_guess(problem.data, impulse, tol)
     return result

@@ -47,7 +47,7 @@ cdef class Driver(Method):
     ----------
     data : Data
         The problem.
-    most : float
+    max_values : float
         Maximum number of values of the matrix N of an island over J and M. A larger island is not accepted.
     work : float
         Multiply-adds of a factorisation above which an island may be rejected without analysis.
@@ -59,9 +59,9 @@ cdef class Driver(Method):
     cdef Workspace index, real
     cdef readonly bint fits
 
-    def __init__(self, Data data, double most=INFINITY, double work=INFINITY):
+    def __init__(self, Data data, double max_values=INFINITY, double work=INFINITY):
         self.data, self.view = data, data.view()
-        self.options.method, self.options.wide, self.options.most = NEWTON, has_wide(), most
+        self.options.method, self.options.wide, self.options.most = NEWTON, has_wide(), max_values
         self.options.work = work
         self.own = row_of(&self.view)
         self.fits = lav_workspace_size(&self.view, &self.options, &self.space) and self.analyse() == NEEDS_WORKSPACE

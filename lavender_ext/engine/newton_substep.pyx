@@ -26,8 +26,9 @@ from lavender_ext.judge.measure cimport find_reference, score_slack
 from lavender_ext.judge.score cimport new_score, score_t
 from lavender_ext.factor.tiles cimport has_wide
 from lavender_ext.newton.solve cimport bodies_start, max_bodies_index_size, system_step
-from lavender_ext.newton.warm_start cimport (FACTORED, JUDGED, MOST_TRACED, UNDECIDED, band_width, judged, bind_warm_workspace,
-                                      observe, room_of, start_errors, warm_solve, warm_t)
+from lavender_ext.newton.warm_start cimport (FACTORED, JUDGED, MAX_TRACED_SCORES, UNDECIDED, band_width,
+                                             bind_warm_workspace, judge_impulse, measure_as_engine, warm_solve,
+                                             warm_t, warm_workspace_size, zero_impulse_errors)
 
 
 cdef enum:
@@ -76,7 +77,7 @@ cdef public int32_t lav_newton_plan(const int32_t* size, double* real, int32_t* 
     n = method_workspace_size(&p, &r)
     scratch[1] = <int32_t>n.n_index if all_stages else 0
     scratch[0] = band_width(&p, &r, scratch + SCRATCH_HEADER + scratch[1])
-    workspace = room_of(&p, scratch[0]) + p.n_rows + 2 * <int64_t>p.n_blocks
+    workspace = warm_workspace_size(&p, scratch[0]) + p.n_rows + 2 * <int64_t>p.n_blocks
     if scratch[1] > 0:
         v = view_t(p, NULL, &r, NULL)
         n.index = scratch + SCRATCH_HEADER
@@ -97,8 +98,8 @@ cdef inline int32_t run_newton_stages(const view_t* problem, const options_t* o,
         result = system_step(problem, o, workspace, 1, lam, &said)
         s.factorisations = said.factorisations
         if s.trace != NULL:
-            judged(&problem.p, problem.r, s, said.tried, v, o.e0, o.v0)
-    s.relative = judged(&problem.p, problem.r, s, lam, v, o.e0, o.v0)
+            judge_impulse(&problem.p, problem.r, s, said.tried, v, o.e0, o.v0)
+    s.relative = judge_impulse(&problem.p, problem.r, s, lam, v, o.e0, o.v0)
     return FACTORED if said.relative <= o.tol else UNDECIDED
 
 
@@ -113,11 +114,11 @@ cdef inline int32_t newton_substep(const blocks_t* p, const rows_t* r, warm_t* s
     if result != UNDECIDED or p.n_rows == 0 or not all_stages:
         return result
     s.relative = 1.0 / 0.0
-    if not start_errors(p, &e0, &v0):
+    if not zero_impulse_errors(p, &e0, &v0):
         if e0 == 0.0 and v0 == 0.0:                     # lam = 0 is the solution
             for j in range(p.n_rows):
                 lam[j] = 0.0
-            judged(p, r, s, lam, v, 1.0, 1.0)
+            judge_impulse(p, r, s, lam, v, 1.0, 1.0)
             s.relative = 0.0
             return JUDGED
         return UNDECIDED
@@ -144,13 +145,13 @@ cdef inline void bind_islands(blocks_t* p, const rows_t* r, warm_t* s, int32_t* 
         return
     for i in range(p.n_blocks):
         for j in range(p.ptr[i], p.ptr[i + 1]):
-            s.kept[j], s.slack[j] = 0.0, -p.b[j]
+            s.start[j], s.slack[j] = 0.0, -p.b[j]
             if is_rows(p, i) and not p.lower[j] <= 0.0 <= p.upper[j]:
                 return
-    score_slack(p, s.kept, s.slack, s.error, &score)
+    score_slack(p, s.start, s.slack, s.error, &score)
     islands.reference = reference
     p.islands = islands
-    find_reference(p, s.kept, s.slack, s.error, start)
+    find_reference(p, s.start, s.slack, s.error, start)
 
 
 cdef public int32_t lav_newton_substep(const int32_t* size, double* real, int32_t* index, uint64_t* keys, double tol,
@@ -178,18 +179,18 @@ cdef public int32_t lav_newton_substep(const int32_t* size, double* real, int32_
     s.width = scratch[0]
     s.trace = trace
     s.relative = 0.0
-    own = room_of(&p, s.width) + p.n_rows
+    own = warm_workspace_size(&p, s.width) + p.n_rows
     marks = SCRATCH_HEADER + scratch[1]
     bind_warm_workspace(&s, workspace + p.n_rows, scratch + marks, &p, &r)
     bind_islands(&p, &r, &s, scratch + marks + r.n_bodies + 2 * r.n_joints + 1, workspace + own, &islands)
     own += 2 * <int64_t>p.n_blocks
     result = newton_substep(&p, &r, &s, tol, all_stages, scratch, workspace + own, e.impulse, e.dv)
     if p.n_rows > 0 and (all_stages or result != UNDECIDED):
-        observe(&p, &r, &s, e.setting + S_OUT + 5, e.setting + S_OUT + 7)
+        measure_as_engine(&p, &r, &s, e.setting + S_OUT + 5, e.setting + S_OUT + 7)
     said[0] = s.sweeps
     said[1] = s.factorisations
     said[2] = s.relative
-    said[3] = s.traced
+    said[3] = s.n_traced
     return result
 
 
@@ -207,7 +208,7 @@ cdef class Substep:
     def __init__(self, const int32_t[::1] size, double[::1] real, int32_t[::1] index, uint64_t[::1] keys, bint all_stages):
         self.size, self.real, self.index, self.keys, self.all_stages = size, real, index, keys, all_stages
         self.scratch, self.workspace = np.empty(1), np.empty(1)
-        self.noted = np.zeros((MOST_TRACED if all_stages else 0, 3))
+        self.noted = np.zeros((MAX_TRACED_SCORES if all_stages else 0, 3))
 
     cdef int _make_scratch(self) except -1:
         """Allocate the scratch integers."""

@@ -9,14 +9,15 @@ from libc.string cimport memset
 
 from lavender_ext.core.block_types cimport COULOMB, blocks_t
 from lavender_ext.core.view cimport bodies_of, generalized_t, rows_t, view_t
-from lavender_ext.factor.blocks cimport (analyse_blocks, bind_block_factor, block_factor_index_size, block_factor_size,
-                                         block_matrix_t, block_pattern_index_size)
+from lavender_ext.factor.blocks cimport (bind_block_factor, block_factor_index_size, block_factor_size,
+                                         block_pattern_index_size)
 from lavender_ext.factor.graph cimport eliminate_bodies, pattern_workspace_size
 from lavender_ext.factor.symbolic cimport block_tree
 from lavender_ext.newton.elements cimport elements_t
-from lavender_ext.newton.panel cimport fill_panel, inertia_root
-from lavender_ext.newton.run cimport bind_real_workspace, bind_index_workspace, newton_t, own_index, own_workspace_size
-from lavender_ext.newton.scaling cimport find_elements, is_known, scaled_t
+from lavender_ext.newton.panel cimport compute_panel, factor_inertia
+from lavender_ext.newton.run cimport (bind_index_workspace, bind_real_workspace, method_index_size, method_real_size,
+                                      newton_t)
+from lavender_ext.newton.scaling cimport is_known, scaled_t
 from lavender_ext.newton.system cimport BODIES
 
 
@@ -25,7 +26,7 @@ cdef inline int64_t index_workspace_size(const blocks_t* p, const rows_t* r) noe
     cdef int64_t k = p.n_rows, n = r.n_bodies
     if n == 0 or k == 0 or not is_known(p):
         return 0
-    return order_index(n, k) + own_index(k) + 1
+    return order_index_size(n, k) + method_index_size(k) + 1
 
 
 cdef inline int64_t factor_index_size(int64_t n, int64_t blocks, int64_t below) noexcept nogil:
@@ -39,9 +40,9 @@ cdef inline int64_t max_index_size(const blocks_t* p, const rows_t* r) noexcept 
     return size + 1 + factor_index_size(n, n + min(pairs, <int64_t>p.n_rows), pairs) if size > 0 else 0
 
 
-cdef inline int64_t order_index(int64_t n, int64_t k) noexcept nogil:
+cdef inline int64_t order_index_size(int64_t n, int64_t k) noexcept nogil:
     """Return the part of it for the order of n bodies and k elements."""
-    # scratch of the order, four vectors of bodies, the pattern of N, elements
+    # Scratch of the order, four vectors of bodies, the pattern of N, elements.
     return pattern_workspace_size(n, k) + 4 * (n + 1) + (n + k + 1) + 9 * (k + 1)
 
 
@@ -58,7 +59,7 @@ cdef struct pattern_t:
     int32_t* body
     int32_t* node
     int32_t* slot
-    int32_t* turned
+    int32_t* swapped
 
 
 cdef inline int32_t* bind_pattern_workspace(pattern_t* a, int32_t* index, int64_t n, int64_t k) noexcept nogil:
@@ -74,8 +75,8 @@ cdef inline int32_t* bind_pattern_workspace(pattern_t* a, int32_t* index, int64_
     a.body = a.group + k + 1
     a.node = a.body + 2 * k
     a.slot = a.node + 2 * k
-    a.turned = a.slot + 3 * k
-    return index + order_index(n, k)
+    a.swapped = a.slot + 3 * k
+    return index + order_index_size(n, k)
 
 
 cdef inline void bind_bodies(newton_t* s, pattern_t* a, int32_t* index, const blocks_t* p, const rows_t* r) noexcept nogil:
@@ -84,10 +85,10 @@ cdef inline void bind_bodies(newton_t* s, pattern_t* a, int32_t* index, const bl
 
 
 cdef inline int64_t order_bodies(pattern_t* a) noexcept nogil:
-    """An elimination order of the bodies of a.body (k, 2), and the blocks of N; how many its factor has below."""
+    """Order the bodies of a.body (k, 2) for elimination, and list the blocks of N; return the off-diagonal blocks of L."""
     cdef int32_t i
     cdef int64_t below = 0
-    eliminate_bodies(a.k, a.body, a.n, a.scratch, a.parent, a.nptr, a.nind, a.node, a.slot, a.turned)
+    eliminate_bodies(a.k, a.body, a.n, a.scratch, a.parent, a.nptr, a.nind, a.node, a.slot, a.swapped)
     block_tree(a.n, a.nptr, a.nind, a.parent, a.mark, a.scratch, a.lptr + 1)
     a.lptr[0] = 0
     for i in range(a.n):
@@ -116,12 +117,12 @@ cdef inline bint needs_lu(const newton_t* s, const blocks_t* p) noexcept nogil:
 
 cdef inline int64_t body_workspace_size(const newton_t* s, const blocks_t* p, const rows_t* r) noexcept nogil:
     """Return the number of doubles that `bind_body_workspace` assigns, after `analyse_blocks`."""
-    return (12 * <int64_t>p.n_rows + 10 * <int64_t>r.n_bodies + own_workspace_size(p.n_rows, s.sc.small) + 6 * <int64_t>r.n_bodies
+    return (12 * <int64_t>p.n_rows + 10 * <int64_t>r.n_bodies + method_real_size(p.n_rows, s.sc.small) + 6 * <int64_t>r.n_bodies
             + block_factor_size(&s.blocks, needs_lu(s, p)))
 
 
 cdef inline int32_t find_groups(elements_t* e, int32_t* group) noexcept nogil:
-    """Runs of elements between the same bodies, in group (n + 1)."""
+    """List the runs of elements between the same bodies in group (n + 1); return their number."""
     cdef int32_t k, h = 0
     for k in range(e.n):
         if k == 0 or e.node[2 * k] != e.node[2 * k - 2] or e.node[2 * k + 1] != e.node[2 * k - 1]:
@@ -132,9 +133,12 @@ cdef inline int32_t find_groups(elements_t* e, int32_t* group) noexcept nogil:
     return h
 
 
-cdef inline void narrow_panel(const scaled_t* s, const int32_t* turned, const int32_t* column, int32_t size,
+cdef inline void narrow_panel(const scaled_t* s, const int32_t* swapped, const int32_t* column, int32_t size,
                               double* panel) noexcept nogil:
-    """Of a panel (rows, 12) the rows that move and `size` columns of each body, changed over where turned, in place."""
+    """Compress a panel (rows, 12) in place to the rows that are not fixed and `size` columns of each body.
+
+    The two bodies of an element are exchanged if `swapped`.
+    """
     cdef int32_t i, j, k
     cdef double x[12]
     cdef double* row
@@ -142,25 +146,25 @@ cdef inline void narrow_panel(const scaled_t* s, const int32_t* turned, const in
         for j in range(s.e.ptr[k], s.e.ptr[k + 1]):
             row = panel + 12 * <int64_t>s.keep[j]
             for i in range(size):
-                x[i] = row[column[i] + (6 if turned[k] else 0)]
-                x[size + i] = row[column[i] + (0 if turned[k] else 6)]
+                x[i] = row[column[i] + (6 if swapped[k] else 0)]
+                x[size + i] = row[column[i] + (0 if swapped[k] else 6)]
             row = panel + 2 * size * <int64_t>j
             for i in range(2 * size):
                 row[i] = x[i]
 
 
-cdef inline void panel_of(const blocks_t* p, const rows_t* r, double* root, double* panel) noexcept nogil:
-    """K (rows, 12); root (10 n_bodies) is scratch."""
+cdef inline void form_panel(const blocks_t* p, const rows_t* r, double* root, double* panel) noexcept nogil:
+    """Compute K (rows, 12) of bodies; root (10 n_bodies) is scratch."""
     cdef int32_t i, n = r.n_bodies
-    inertia_root(n, r.inv_inertia, root)
+    factor_inertia(n, r.inv_inertia, root)
     for i in range(n):
         root[9 * <int64_t>n + i] = sqrt(r.inv_mass[i])
-    fill_panel(p, r, root, root + 9 * <int64_t>n, panel)
+    compute_panel(p, r, root, root + 9 * <int64_t>n, panel)
 
 
-cdef inline void panel_of_velocities(const blocks_t* p, const generalized_t* g, const int32_t* body, const int32_t* column,
+cdef inline void form_velocity_panel(const blocks_t* p, const generalized_t* g, const int32_t* body, const int32_t* column,
                                      double* panel) noexcept nogil:
-    """K (rows, 12) where velocities are those of bodies: column (n), body (n_blocks, 2) of `graph.bodies_in`."""
+    """Compute K (rows, 12) from J and M whose velocities belong to bodies: column (n), body (n_blocks, 2) of `graph.bodies_in`."""
     cdef int32_t i, j, q, c, b, nc
     cdef const double* y
     cdef double* row
@@ -175,14 +179,14 @@ cdef inline void panel_of_velocities(const blocks_t* p, const generalized_t* g, 
                 row[c % 6 + (0 if c // 6 == body[2 * i] else 6)] = y[q] / sqrt(p.d[j])
 
 
-cdef inline void furnish_factor(newton_t* s, const pattern_t* a, double* panel, const int32_t* column, int32_t size,
+cdef inline void bind_factor(newton_t* s, const pattern_t* a, double* panel, const int32_t* column, int32_t size,
                              bint lu, bint wide, int32_t* index, double* y, double* real) noexcept nogil:
     """Bind the panel (rows, 12), with these columns of each body, and the factor after `analyse_blocks`.
 
     index has `block_factor_index_size`, y n size, real `block_factor_size`.
     """
     if s.sc.e.m:
-        narrow_panel(&s.sc, a.turned, column, size, panel)
+        narrow_panel(&s.sc, a.swapped, column, size, panel)
     s.s.form, s.s.symmetric, s.s.y = BODIES, 1, y
     s.sc.e.s, s.sc.e.panel, s.sc.e.node, s.sc.e.slot = size, panel, a.node, a.slot
     find_groups(&s.sc.e, a.group)
@@ -198,11 +202,11 @@ cdef inline void bind_body_workspace(newton_t* s, pattern_t* a, double* real, co
     cdef int32_t column[6]
     cdef double* panel
     cdef double* x
-    memset(real, 0, own_workspace_size(p.n_rows, s.sc.small) * sizeof(double))
+    memset(real, 0, method_real_size(p.n_rows, s.sc.small) * sizeof(double))
     panel = bind_real_workspace(s, v, real)
     x = panel + 12 * <int64_t>p.n_rows
     for i in range(6):
         column[i] = i
-    panel_of(p, r, x, panel)
+    form_panel(p, r, x, panel)
     x += 10 * <int64_t>r.n_bodies
-    furnish_factor(s, a, panel, column, 6, needs_lu(s, p), wide, index, x, x + 6 * <int64_t>r.n_bodies)
+    bind_factor(s, a, panel, column, 6, needs_lu(s, p), wide, index, x, x + 6 * <int64_t>r.n_bodies)

@@ -1,4 +1,8 @@
-"""Second-order cones of a contact in their own coordinates: scaling, steps to the boundary, divisions."""
+"""Second-order cones of a contact in their own coordinates: scaling, steps to the boundary, divisions.
+
+Component g of contact i has the cone |x_1..| <= x_0 of x = G z, with G = diag(1, 1/a) for a > 1 and diag(a, 1) else, on
+the normal and on the rows of the component. No entry of G is below 1, so that G does not magnify a proximal term.
+"""
 from libc.math cimport sqrt
 from libc.stdint cimport int32_t
 
@@ -6,27 +10,28 @@ from lavender_ext.core.block cimport length
 from lavender_ext.newton.elements cimport elements_t
 
 
-cdef enum:                      # what is kept of a cone, from w (n) on: T = eta [w_0 w_1'; w_1 I + w_1 w_1' / (1 + w_0)]
-    KEPT_ETA = 4
-    KEPT_SHRINK = 5             # 1 / eta
-    KEPT_TURN = 6               # 1 / (1 + w_0)
-    KEPT_V = 8                  # v (n)
-    KEPT_C = 12                 # v \\ c of the combined step (n)
-    KEPT = 16
+cdef enum:                      # stored for each cone after w (n), T = eta [w_0 w_1'; w_1 I + w_1 w_1' / (1 + w_0)]
+    SCALING_ETA = 4
+    SCALING_INV_ETA = 5         # 1 / eta
+    SCALING_INV_SUM = 6         # 1 / (1 + w_0)
+    SCALING_V = 8               # v (n)
+    SCALING_C = 12              # v \\ c of the combined step (n)
+    CONE_SCALING_SIZE = 16
 
 
 cdef inline double cone_gap(const double* x, int32_t n) noexcept nogil:
-    # x_0 - |x_1..|
+    """Return x_0 - |x_1..|."""
     return x[0] - length(x + 1, n - 1)
 
 
 cdef inline double cone_det(const double* x, int32_t n) noexcept nogil:
+    """Return x_0^2 - |x_1..|^2."""
     cdef double t = length(x + 1, n - 1)
     return (x[0] - t) * (x[0] + t)
 
 
-cdef inline double cone_step(const double* x, const double* dx, int32_t n) noexcept nogil:
-    # largest step to the boundary of the second-order cone; 1e30 where there is none
+cdef inline double distance_to_boundary(const double* x, const double* dx, int32_t n) noexcept nogil:
+    """Return the largest t with x + t dx in the second-order cone; 1e30 if there is no largest."""
     cdef double a = dx[0] * dx[0], b = x[0] * dx[0], c = cone_det(x, n), disc, q
     cdef int32_t i
     for i in range(1, n):
@@ -43,66 +48,72 @@ cdef inline double cone_step(const double* x, const double* dx, int32_t n) noexc
     return c / q
 
 
-# The cone of part g of element i in its own coordinates: x_0 = a z_n, then the rows of the part.
 cdef inline int32_t cone_size(const elements_t* e, int32_t g) noexcept nogil:
+    """Return the dimension of the cone of component g."""
     return 1 + e.size[g]
 
 
-cdef inline double* kept(const elements_t* e, int32_t g) noexcept nogil:
-    return e.scaling + KEPT * g
+cdef inline double* scaling_of(const elements_t* e, int32_t g) noexcept nogil:
+    """Return the stored scaling of component g."""
+    return e.scaling + CONE_SCALING_SIZE * g
 
 
-cdef inline double on_normal(double a) noexcept nogil:
+cdef inline double normal_factor(double a) noexcept nogil:
+    """Return the entry of G on the normal."""
     return a if a > 1.0 else 1.0
 
 
-cdef inline double on_tangent(double a) noexcept nogil:
+cdef inline double tangent_factor(double a) noexcept nogil:
+    """Return the entry of G on the rows of the component."""
     return 1.0 / a if a < 1.0 else 1.0
 
 
-cdef inline void gather(const elements_t* e, int32_t i, int32_t g, const double* z, double* x) noexcept nogil:
-    # x = G z, G = diag(1, 1/a) or diag(a, 1): no entry below 1, so that G never blows a proximal term up
+cdef inline void load_cone(const elements_t* e, int32_t i, int32_t g, const double* z, double* x) noexcept nogil:
+    """Compute x = G z."""
     cdef int32_t q = e.first[g] - 1, k
     cdef double a = e.reach[g]
-    x[0] = on_normal(a) * z[e.ptr[i]]
+    x[0] = normal_factor(a) * z[e.ptr[i]]
     for k in range(1, cone_size(e, g)):
-        x[k] = on_tangent(a) * z[q + k]
+        x[k] = tangent_factor(a) * z[q + k]
 
 
-cdef inline void scatter(const elements_t* e, int32_t i, int32_t g, const double* x, double* z) noexcept nogil:
-    # z += G^T x
+cdef inline void add_cone_transpose(const elements_t* e, int32_t i, int32_t g, const double* x, double* z) noexcept nogil:
+    """Compute z += G^T x."""
     cdef int32_t q = e.first[g] - 1, k
     cdef double a = e.reach[g]
-    z[e.ptr[i]] += on_normal(a) * x[0]
+    z[e.ptr[i]] += normal_factor(a) * x[0]
     for k in range(1, cone_size(e, g)):
-        z[q + k] += on_tangent(a) * x[k]
+        z[q + k] += tangent_factor(a) * x[k]
 
 
-# u1 (m): dual of the lower bound, or of the first part's cone. u2 (m): of the upper bound, or of the other cones, whose
-# first numbers are on the normal and on the row behind it, which the first part leaves free.
-cdef inline double* dual_head(const elements_t* e, int32_t i, int32_t g, double* u1, double* u2) noexcept nogil:
+# Storage of duals. u1 (m): of the lower bound, or of the first component's cone. u2 (m): of the upper bound, or of the
+# other cones; their first numbers use the places of the normal and of the row after it, which u2 leaves free.
+cdef inline double* dual_normal(const elements_t* e, int32_t i, int32_t g, double* u1, double* u2) noexcept nogil:
+    """Return the place of the first number of a cone's dual."""
     return u1 + e.ptr[i] if g == e.part[i] else u2 + e.ptr[i] + (g - e.part[i] - 1)
 
 
 cdef inline void load_dual(const elements_t* e, int32_t i, int32_t g, const double* u1, const double* u2,
                            double* x) noexcept nogil:
+    """Load the dual of a cone."""
     cdef const double* u = u1 if g == e.part[i] else u2
     cdef int32_t q = e.first[g] - 1, k
-    x[0] = dual_head(e, i, g, <double*>u1, <double*>u2)[0]
+    x[0] = dual_normal(e, i, g, <double*>u1, <double*>u2)[0]
     for k in range(1, cone_size(e, g)):
         x[k] = u[q + k]
 
 
 cdef inline void store_dual(const elements_t* e, int32_t i, int32_t g, const double* x, double* u1, double* u2) noexcept nogil:
+    """Store the dual of a cone."""
     cdef double* u = u1 if g == e.part[i] else u2
     cdef int32_t q = e.first[g] - 1, k
-    dual_head(e, i, g, u1, u2)[0] = x[0]
+    dual_normal(e, i, g, u1, u2)[0] = x[0]
     for k in range(1, cone_size(e, g)):
         u[q + k] = x[k]
 
 
-cdef inline void nt_scaling(const double* s, const double* u, int32_t n, double* w, double* eta) noexcept nogil:
-    # T = eta [w0 w1'; w1 I + w1 w1'/(1 + w0)], T u = T^-1 s
+cdef inline void compute_nt_scaling(const double* s, const double* u, int32_t n, double* w, double* eta) noexcept nogil:
+    """Compute the scaling T = eta [w_0 w_1'; w_1 I + w_1 w_1' / (1 + w_0)] with T u = T^-1 s (Nesterov, Todd 1997)."""
     cdef double ds = sqrt(cone_det(s, n)), du = sqrt(cone_det(u, n)), dot = 0.0, gamma
     cdef int32_t k
     for k in range(n):
@@ -114,36 +125,36 @@ cdef inline void nt_scaling(const double* s, const double* u, int32_t n, double*
     dot = 1.0
     for k in range(1, n):
         dot += w[k] * w[k]
-    w[0] = sqrt(dot)                                    # w0^2 - |w1|^2 = 1 again after rounding
+    w[0] = sqrt(dot)                                    # Restore w_0^2 - |w_1|^2 = 1 after rounding.
     eta[0] = sqrt(ds / du)
 
 
-cdef inline void scale_times(const double* w, int32_t n, const double* x, double* out) noexcept nogil:
-    # T x
+cdef inline void apply_scaling(const double* w, int32_t n, const double* x, double* out) noexcept nogil:
+    """Compute T x."""
     cdef double t = 0.0
     cdef int32_t k
     for k in range(1, n):
         t += w[k] * x[k]
-    out[0] = w[KEPT_ETA] * (w[0] * x[0] + t)
-    t = x[0] + t * w[KEPT_TURN]
+    out[0] = w[SCALING_ETA] * (w[0] * x[0] + t)
+    t = x[0] + t * w[SCALING_INV_SUM]
     for k in range(1, n):
-        out[k] = w[KEPT_ETA] * (x[k] + w[k] * t)
+        out[k] = w[SCALING_ETA] * (x[k] + w[k] * t)
 
 
-cdef inline void scale_back(const double* w, int32_t n, const double* x, double* out) noexcept nogil:
-    # T^-1 x
+cdef inline void apply_inv_scaling(const double* w, int32_t n, const double* x, double* out) noexcept nogil:
+    """Compute T^-1 x."""
     cdef double t = 0.0
     cdef int32_t k
     for k in range(1, n):
         t += w[k] * x[k]
-    out[0] = w[KEPT_SHRINK] * (w[0] * x[0] - t)
-    t = t * w[KEPT_TURN] - x[0]
+    out[0] = w[SCALING_INV_ETA] * (w[0] * x[0] - t)
+    t = t * w[SCALING_INV_SUM] - x[0]
     for k in range(1, n):
-        out[k] = w[KEPT_SHRINK] * (x[k] + w[k] * t)
+        out[k] = w[SCALING_INV_ETA] * (x[k] + w[k] * t)
 
 
-cdef inline void cone_divide(const double* v, const double* c, int32_t n, double* out) noexcept nogil:
-    # v o out = c
+cdef inline void divide_in_cone(const double* v, const double* c, int32_t n, double* out) noexcept nogil:
+    """Solve v o out = c in the Jordan algebra of the cone."""
     cdef double det = cone_det(v, n), dot = 0.0
     cdef int32_t k
     for k in range(1, n):
@@ -153,37 +164,47 @@ cdef inline void cone_divide(const double* v, const double* c, int32_t n, double
         out[k] = (c[k] - out[0] * v[k]) / v[0]
 
 
-cdef inline bint is_low(const elements_t* e, int32_t j) noexcept nogil:
+cdef inline bint has_lower_bound(const elements_t* e, int32_t j) noexcept nogil:
+    """Return whether row j has a lower bound."""
     return e.lower[j] > -1.0 / 0.0
 
 
-cdef inline bint is_high(const elements_t* e, int32_t j) noexcept nogil:
+cdef inline bint has_upper_bound(const elements_t* e, int32_t j) noexcept nogil:
+    """Return whether row j has an upper bound."""
     return e.upper[j] < 1.0 / 0.0
 
 
-cdef inline void slack_dual(const elements_t* e, int32_t i, int32_t g, const double* hz, double* c) noexcept nogil:
-    # u with G^T u = H z - g where the contact has one cone
+cdef inline void load_slack(const elements_t* e, int32_t i, int32_t g, const double* hz, double* c) noexcept nogil:
+    """Compute u with G^T u = H z - g on a contact with one cone."""
     cdef int32_t j = e.ptr[i], q = e.first[g] - 1, k
     cdef double a = e.reach[g]
-    c[0] = (hz[j] - e.g[j]) / on_normal(a)
+    c[0] = (hz[j] - e.g[j]) / normal_factor(a)
     for k in range(1, cone_size(e, g)):
-        c[k] = (hz[q + k] - e.g[q + k]) / on_tangent(a)
+        c[k] = (hz[q + k] - e.g[q + k]) / tangent_factor(a)
 
 
-cdef inline double cone_parts(const double* s, const double* u, int32_t n, double a, double delta, double* w,
-                              double* h, double* c, double* root) noexcept nogil:
-    # (T^-2 + delta)^-1 between G^-1 and G^-T as x [1 h][1 h]^T + [0 0; 0 c]: returns x, the normal's own entry.
-    # Through the eigenvalues of T^2, eta^2 (w0 +- |w1|)^2 along (1, +-w1/|w1|) and eta^2 across: as a matrix
-    # T^-2 would lose the small ones. c and its square root are (n - 1, n - 1).
-    # w (KEPT) keeps the scaling, and v.
+cdef struct cone_weight_t:      # (T^-2 + delta)^-1 between G^-1 and G^-T as x [1 h][1 h]^T + [0 0; 0 c]
+    double x                    # entry of the normal
+    double h[4]                 # (n - 1)
+    double c[4]                 # (n - 1, n - 1)
+    double root[4]              # square root of c
+
+
+cdef inline void scale_cone(const double* s, const double* u, int32_t n, double a, double delta, double* w,
+                            cone_weight_t* out) noexcept nogil:
+    """Compute the scaling of s and u into w (CONE_SCALING_SIZE), and the cone's weight.
+
+    The weight uses the eigenvalues of T^2, which are eta^2 (w_0 +- |w_1|)^2 along (1, +-w_1/|w_1|) and eta^2 across:
+    the matrix T^-2 itself would lose the small ones.
+    """
     cdef double d[4]
-    cdef double eta, size, grow, shrink, across, along, x, gn = on_normal(a), gt = on_tangent(a)
+    cdef double eta, size, grow, shrink, across, along, x, gn = normal_factor(a), gt = tangent_factor(a)
     cdef int32_t k, l, nt = n - 1
-    nt_scaling(s, u, n, w, &eta)
-    w[KEPT_ETA] = eta
-    w[KEPT_SHRINK] = 1.0 / eta
-    w[KEPT_TURN] = 1.0 / (1.0 + w[0])
-    scale_times(w, n, u, w + KEPT_V)
+    compute_nt_scaling(s, u, n, w, &eta)
+    w[SCALING_ETA] = eta
+    w[SCALING_INV_ETA] = 1.0 / eta
+    w[SCALING_INV_SUM] = 1.0 / (1.0 + w[0])
+    apply_scaling(w, n, u, w + SCALING_V)
     size = length(w + 1, nt)
     grow = eta * (w[0] + size)
     shrink = eta / (w[0] + size)
@@ -197,68 +218,69 @@ cdef inline double cone_parts(const double* s, const double* u, int32_t n, doubl
     across = across / (gt * gt)
     for k in range(nt):
         d[k] = w[1 + k] / size if size > 0.0 else (1.0 if k == 0 else 0.0)
-        h[k] = (grow - shrink) / (grow + shrink) * (gn / gt) * d[k]
+        out.h[k] = (grow - shrink) / (grow + shrink) * (gn / gt) * d[k]
     for k in range(nt):
         for l in range(nt):
             x = 1.0 if k == l else 0.0
-            c[k * nt + l] = across * x + (along - across) * d[k] * d[l]
-            root[k * nt + l] = sqrt(across) * x + (sqrt(along) - sqrt(across)) * d[k] * d[l]
-    return 0.5 * (grow + shrink) / (gn * gn)
+            out.c[k * nt + l] = across * x + (along - across) * d[k] * d[l]
+            out.root[k * nt + l] = sqrt(across) * x + (sqrt(along) - sqrt(across)) * d[k] * d[l]
+    out.x = 0.5 * (grow + shrink) / (gn * gn)
 
 
-cdef inline double row_limit(double x, double dx, double best) noexcept nogil:
+cdef inline double limit_step(double x, double dx, double best) noexcept nogil:
+    """Return the smaller of `best` and the step along dx at which x > 0 becomes 0."""
     if dx < 0.0 and -x / dx < best:
         return -x / dx
     return best
 
 
-# Steps of a cone are taken in the scaled coordinates, where T^-1 s = T u = v: with y = T^-1 G dz, T du = -v - y for
-# the affine step and -(v \\ c) - y for the combined one. T maps the cone onto itself, so lengths are the same.
-cdef inline void cone_affine(const elements_t* e, int32_t i, int32_t g, const double* da, const int32_t n,
+# Steps of a cone are computed in scaled coordinates, where T^-1 s = T u = v. With y = T^-1 G dz, T du is -v - y for the
+# affine step and -(v \\ c) - y for the combined step. T maps the cone onto itself, so step lengths do not change.
+cdef inline void step_affine(const elements_t* e, int32_t i, int32_t g, const double* da, const int32_t n,
                              double* y, double* back) noexcept nogil:
-    # y = T^-1 G dz_a, back = T du_a
-    cdef const double *w = kept(e, g)
+    """Compute y = T^-1 G dz_a and back = T du_a."""
+    cdef const double *w = scaling_of(e, g)
     cdef double x[4]
     cdef int32_t k
-    gather(e, i, g, da, x)
-    scale_back(w, n, x, y)
+    load_cone(e, i, g, da, x)
+    apply_inv_scaling(w, n, x, y)
     for k in range(n):
-        back[k] = -w[KEPT_V + k] - y[k]
+        back[k] = -w[SCALING_V + k] - y[k]
 
 
-cdef inline void cone_combined(const elements_t* e, int32_t i, int32_t g, const double* da, double sigma_mu,
+cdef inline void combine_steps(const elements_t* e, int32_t i, int32_t g, const double* da, double sigma_mu,
                                const int32_t n, double* rhs) noexcept nogil:
-    # v \\ c of (4) into the cone's store; rhs = T^-1 (v \\ c)
-    cdef double *w = kept(e, g)
-    cdef const double *v = w + KEPT_V
+    """Compute v \\\\ c of interior.pxd (4) into the cone's scaling, and rhs = T^-1 (v \\\\ c)."""
+    cdef double *w = scaling_of(e, g)
+    cdef const double *v = w + SCALING_V
     cdef double x[4]
     cdef double y[4]
     cdef double back[4]
     cdef int32_t k
-    cone_affine(e, i, g, da, n, y, back)
+    step_affine(e, i, g, da, n, y, back)
     x[0] = -sigma_mu
     for k in range(n):
         x[0] += v[k] * v[k] + y[k] * back[k]
     for k in range(1, n):
         x[k] = 2.0 * v[0] * v[k] + y[0] * back[k] + back[0] * y[k]
-    cone_divide(v, x, n, w + KEPT_C)
-    scale_back(w, n, w + KEPT_C, rhs)
+    divide_in_cone(v, x, n, w + SCALING_C)
+    apply_inv_scaling(w, n, w + SCALING_C, rhs)
 
 
-cdef inline double cone_length(const elements_t* e, int32_t i, int32_t g, const double* dz, double best,
+cdef inline double limit_cone_step(const elements_t* e, int32_t i, int32_t g, const double* dz, double best,
                                const int32_t n, double* du) noexcept nogil:
-    # the combined step's length, at most `best`; du
-    cdef const double *w = kept(e, g)
+    """Compute du of the combined step; return the smaller of `best` and the step to the boundary."""
+    cdef const double *w = scaling_of(e, g)
     cdef double x[4]
     cdef double y[4]
     cdef double a
     cdef int32_t k
-    gather(e, i, g, dz, x)
-    scale_back(w, n, x, y)
-    a = cone_step(w + KEPT_V, y, n)
+    load_cone(e, i, g, dz, x)
+    apply_inv_scaling(w, n, x, y)
+    a = distance_to_boundary(w + SCALING_V, y, n)
     best = a if a < best else best
     for k in range(n):
-        y[k] = -w[KEPT_C + k] - y[k]
-    a = cone_step(w + KEPT_V, y, n)
-    scale_back(w, n, y, du)
+        y[k] = -w[SCALING_C + k] - y[k]
+    a = distance_to_boundary(w + SCALING_V, y, n)
+    apply_inv_scaling(w, n, y, du)
     return a if a < best else best

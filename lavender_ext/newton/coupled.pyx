@@ -1,8 +1,8 @@
-"""H in compressed rows of whole elements, and the matrices of Newton's method on that one pattern.
+"""H in compressed rows with the pattern of elements, and the matrices of Newton's method in the same pattern.
 
-    M = L H R^T + o L + I         L, R one small matrix for each element, or nothing for the identity             (1)
+    M = L H R^T + o L + I         L, R have one small matrix for each element; R may be the identity              (1)
 
-Rows of an element share their columns, which are those of all elements that H couples it with, either way.
+The rows of an element share their columns: those of all elements that H couples it to, in either direction.
 """
 from libc.stdint cimport int32_t
 
@@ -14,7 +14,7 @@ from lavender_ext.newton.solve cimport elements_of
 
 cdef public void lav_coupled_rows(int32_t n, const int32_t* ptr, const int32_t* to, const int32_t* other,
                                   int32_t* indptr, int32_t* indices) noexcept nogil:
-    """Compressed rows of the graph (to, other) of n elements, each with itself, ascending; indices NULL: indptr alone."""
+    """Write the compressed rows of the graph (to, other) of n elements, columns ascending; with indices NULL indptr alone."""
     cdef int32_t i, j, q, r, width, at
     indptr[0] = 0
     for i in range(n):
@@ -33,7 +33,7 @@ cdef public void lav_coupled_rows(int32_t n, const int32_t* ptr, const int32_t* 
 
 cdef inline void coupled_block(const double* h, double* out, int32_t ld, const double* left, const double* right,
                                double own, bint diagonal, const int32_t ni, const int32_t nj) noexcept nogil:
-    # (1) of one pair of elements; rows of both are ld apart
+    """Compute (1) for one pair of elements; the rows of h and out have stride ld."""
     cdef int32_t k, l, t
     cdef double x
     cdef double half[36]
@@ -62,7 +62,7 @@ cdef inline void coupled_block(const double* h, double* out, int32_t ld, const d
 cdef public void lav_coupled(const elements_t* e, const int32_t* to, const int32_t* other, const int32_t* indptr,
                              const double* h, const double* left, const double* right, double own,
                              double* out) noexcept nogil:
-    """(1); right may be NULL."""
+    """Compute (1); right may be NULL (the identity)."""
     cdef int32_t i, j, q, ni, nj, at, ld
     cdef const double* r = NULL
     for i in range(e.n):
@@ -85,7 +85,7 @@ cdef public void lav_coupled(const elements_t* e, const int32_t* to, const int32
 
 def element_graph(const int32_t[::1] ptr, const int32_t[::1] element, const int32_t[::1] indptr,
                   const int32_t[::1] indices):
-    """(indptr, indices) of the graph of elements that A couples: which of them an element's rows of A reach."""
+    """Return (indptr, indices) of the graph of elements: the elements whose columns appear in an element's rows of A."""
     cdef int32_t n = <int32_t>ptr.shape[0] - 1, i, j, q, k, count = 0
     to_array, other_array = np.zeros(n + 1, np.int32), np.empty(indices.shape[0], np.int32)
     cdef int32_t[::1] mark = np.full(n, -1, np.int32), to = to_array, other = other_array
@@ -103,7 +103,7 @@ def element_graph(const int32_t[::1] ptr, const int32_t[::1] element, const int3
 
 
 def scaled_entries(const int32_t[::1] indptr, const int32_t[::1] indices, const double[::1] a, const double[::1] scale):
-    """Entries of diag(scale) A diag(scale)."""
+    """Return the entries of diag(scale) A diag(scale)."""
     out_array = np.empty(a.shape[0])
     cdef double[::1] out = out_array
     cdef int32_t i, q
@@ -115,7 +115,7 @@ def scaled_entries(const int32_t[::1] indptr, const int32_t[::1] indices, const 
 
 
 def coupled_rows(const int32_t[::1] ptr, const int32_t[::1] to, const int32_t[::1] other):
-    """(indptr, indices) of the rows of the graph of elements; n > 0."""
+    """Return (indptr, indices) of the rows of the graph of elements; n > 0."""
     cdef int32_t n = <int32_t>ptr.shape[0] - 1
     indptr_array = np.empty(ptr[n] + 1, np.int32)
     cdef int32_t[::1] indptr = indptr_array, indices
@@ -130,7 +130,7 @@ def coupled_rows(const int32_t[::1] ptr, const int32_t[::1] to, const int32_t[::
 
 def coupled_entries(const int32_t[::1] aptr, const int32_t[::1] aind, const double[::1] a, const int32_t[::1] indptr,
                     const int32_t[::1] indices):
-    """A, whose columns ascend, on the pattern of `coupled_rows`, which holds its own."""
+    """Return the entries of A, whose columns ascend, in the pattern of `coupled_rows`, which includes its own."""
     out_array = np.zeros(indices.shape[0])
     cdef double[::1] out = out_array
     cdef int32_t i, p, q
@@ -146,7 +146,7 @@ def coupled_entries(const int32_t[::1] aptr, const int32_t[::1] aind, const doub
 
 def coupled(s, const int32_t[::1] to, const int32_t[::1] other, const int32_t[::1] indptr,
             const double[::1] h, const double[::1] left, right, double own, double[::1] out):
-    """(1) for the elements of a `newton.solve.Solve`; right may be None."""
+    """Compute (1) for the elements of a `newton.solve.Solve`; right may be None (the identity)."""
     cdef const elements_t* e = elements_of(s)
     cdef const double[::1] r
     cdef const double* second = NULL

@@ -1,17 +1,16 @@
-"""The scaled problem and its elements: a bounded row or a contact each, with small square matrices, at most 6 x 6.
+"""The scaled problem and its elements, each a bounded row or a contact with small square matrices of at most 6 x 6.
 
 With d = diag(A): z = D^1/2 lambda [sqrt J], g = D^-1/2 b, s = H z - g,
 
     H = D^-1/2 A D^-1/2 = K K^T + diag(theta),   K = D^-1/2 J M^-1/2                              (1)
 
-An element is a bounded row, or a contact of a normal and parts g whose cones in z are |z_g| <= a_g z_n. Interior point
-and natural map both ask for (H + W) dz = r with one small W for each element; in the velocity form, with
-V = (theta + W)^-1 per element,
+A contact has a normal and friction components g with the cones |z_g| <= a_g z_n. The interior point and the natural map
+both solve (H + W) dz = r with one small W for each element. Over bodies, with V = (theta + W)^-1 for each element,
 
     N = I + K^T V K,   N dy = K^T V r,   dz = V (r - K dy)                                        (2)
 
-and N (normal_matrix.pxd), one block of `s` columns for each body, is factored by block Cholesky in a fixed order.
-Nothing here squares J twice, and rows that depend on each other cost nothing.
+and N (normal_matrix.pxd), with a block of `s` columns for each body, is factored by block Cholesky in a fixed order. The
+condition of N is that of J squared once, not twice, and linearly dependent rows do no harm.
 """
 from libc.math cimport fabs
 from libc.stdint cimport int32_t, int64_t
@@ -24,30 +23,30 @@ cdef struct elements_t:
     int32_t m                   # rows
     int32_t s                   # columns of a body in the panel
     const int32_t* ptr          # (n + 1) first row
-    const int32_t* part         # (n + 1) first part; an element without parts is a bounded row
+    const int32_t* part         # (n + 1) first friction component; an element without components is a bounded row
     const int32_t* wptr         # (n + 1) first entry of the element's small square matrices
-    const int32_t* node         # (n, 2) block columns, the first the larger, -1 where static
+    const int32_t* node         # (n, 2) block columns of the bodies, the larger first, -1: static
     const int32_t* slot         # (n, 3) blocks of N: first-first, second-second, first-second
-    int32_t n_groups            # runs of elements between the same bodies: one manifold each, usually
+    int32_t n_groups            # runs of elements between the same two bodies, usually one manifold each
     const int32_t* group        # (n_groups + 1) first element
     const double* panel         # (m, 2 s) K
     const double* theta         # (m)
     const double* g             # (m)
     const double* lower         # (m) scaled, read on bounded rows
     const double* upper         # (m)
-    const int32_t* first        # of each part its first row
-    const int32_t* size         # how many there are, 1 or 2
-    const double* reach         # a_g
-    double* scaling             # (parts, KEPT) of their cones, once ipm_scale has run
+    const int32_t* first        # first row of each friction component
+    const int32_t* size         # its rows, 1 or 2
+    const double* reach         # a_g, its friction coefficient in z
+    double* scaling             # (components, CONE_SCALING_SIZE) written by `compute_scaling`
 
 
 cdef inline bint is_row(const elements_t* e, int32_t i) noexcept nogil:
-    """A bounded row."""
+    """Return whether element i is a bounded row."""
     return e.part[i] == e.part[i + 1]
 
 
-cdef inline void element_parts(const elements_t* e, int32_t i, friction_components_t* q) noexcept nogil:
-    """The parts of element i, its reach in the metric of d."""
+cdef inline void load_components(const elements_t* e, int32_t i, friction_components_t* q) noexcept nogil:
+    """Load the friction components of element i, with coefficients in the scaled unknown."""
     cdef int32_t g, at = e.part[i]
     q.n = e.part[i + 1] - at
     for g in range(q.n):
@@ -55,7 +54,7 @@ cdef inline void element_parts(const elements_t* e, int32_t i, friction_componen
 
 
 cdef inline void invert_small(double* a, double* inv, int32_t n) noexcept nogil:
-    # Gauss-Jordan with row pivots; a is lost. A zero pivot leaves zeros in its column.
+    """Invert a by Gauss-Jordan elimination with row exchanges; a is lost. A zero pivot leaves zeros in its column."""
     cdef int32_t i, j, k, best
     cdef double x
     for i in range(n * n):
@@ -91,7 +90,7 @@ cdef inline void invert_small(double* a, double* inv, int32_t n) noexcept nogil:
 
 cdef inline void element_times(const elements_t* e, const double* w, const double* x, double* out,
                                const bint turned) noexcept nogil:
-    """out = W x, or W^T x, of one small matrix for each element."""
+    """Compute out = W x, or W^T x, with one small matrix for each element."""
     cdef int32_t i, j, r, c, nr
     cdef double t
     if e.n == e.m:

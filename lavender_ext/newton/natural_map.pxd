@@ -14,7 +14,7 @@ from libc.stdint cimport int32_t
 from lavender_ext.core.block cimport length
 from lavender_ext.core.block_projection cimport active_bound, evaluate_natural_map
 from lavender_ext.core.block_types cimport CONE, friction_components_t
-from lavender_ext.newton.elements cimport element_parts, elements_t, invert_small, is_row
+from lavender_ext.newton.elements cimport load_components, elements_t, invert_small, is_row
 
 
 cdef inline void natural_contact(const elements_t* e, int32_t i, int32_t law, const double* z, const double* s, double* f,
@@ -22,7 +22,7 @@ cdef inline void natural_contact(const elements_t* e, int32_t i, int32_t law, co
     """Compute F (nr) and P (nr, nr) of one contact, with Pi in the metric of d."""
     cdef double out[6]
     cdef friction_components_t q
-    element_parts(e, i, &q)
+    load_components(e, i, &q)
     evaluate_natural_map(law, &q, e.ptr[i + 1] - e.ptr[i], z, s, out, f, p)
 
 

@@ -1,4 +1,4 @@
-"""The normal matrix N = I + K^T V K, block by block, a run of elements between the same two bodies at once."""
+"""Form N = I + K^T V K block by block, for runs of elements between the same two bodies."""
 from libc.stdint cimport int32_t, int64_t
 
 from lavender_ext.factor.blocks cimport block_matrix_t
@@ -7,7 +7,7 @@ from lavender_ext.newton.elements cimport elements_t
 
 cdef inline void add_product(double* out, const double* left, const double* right, int32_t nr,
                              const int32_t s) noexcept nogil:
-    # out += left^T right, (nr, 2 s) rows of which s columns are read
+    """Add left^T right to out, of nr rows with stride 2 s, s columns each."""
     cdef int32_t i, j, r
     cdef double x
     cdef double row[6]
@@ -22,8 +22,8 @@ cdef inline void add_product(double* out, const double* left, const double* righ
             out[i * s + j] = row[j]
 
 
-cdef inline void weigh(const double* v, const double* rows, double* t, int32_t nr, const int32_t s) noexcept nogil:
-    # t = V rows, (nr, 2 s)
+cdef inline void multiply_small(const double* v, const double* rows, double* t, int32_t nr, const int32_t s) noexcept nogil:
+    """Compute t = V rows (nr, 2 s)."""
     cdef int32_t r, k, c
     cdef double x
     cdef double row[12]
@@ -41,9 +41,10 @@ cdef inline void weigh(const double* v, const double* rows, double* t, int32_t n
 
 cdef inline void add_elements(const elements_t* e, const double* v, const block_matrix_t* f, int32_t lu,
                               const int32_t s) noexcept nogil:
-    cdef int32_t h, i, j, r, c, nr, first, second, n_blocks = f.nptr[f.n], done
+    """Form N for a constant number of columns s."""
+    cdef int32_t h, i, j, r, c, nr, first, second, n_blocks = f.nptr[f.n], n_done
     cdef int64_t b = s * s, q
-    cdef double t[216]                                  # V K of up to 18 rows between two bodies, (18, 2 s)
+    cdef double t[216]                                  # V K of up to 18 rows between two bodies (18, 2 s)
     cdef const double *pr
     cdef const int32_t *slot
     for q in range(n_blocks * b):
@@ -67,26 +68,26 @@ cdef inline void add_elements(const elements_t* e, const double* v, const block_
         while i < e.group[h + 1]:
             j = e.ptr[i]
             pr = e.panel + <int64_t>j * 2 * s
-            done = 0
-            while i < e.group[h + 1] and done <= 12:
+            n_done = 0
+            while i < e.group[h + 1] and n_done <= 12:
                 nr = e.ptr[i + 1] - e.ptr[i]
                 if nr == 1:
-                    weigh(v + e.wptr[i], pr + done * 2 * s, t + done * 2 * s, 1, s)
+                    multiply_small(v + e.wptr[i], pr + n_done * 2 * s, t + n_done * 2 * s, 1, s)
                 elif nr == 3:
-                    weigh(v + e.wptr[i], pr + done * 2 * s, t + done * 2 * s, 3, s)
+                    multiply_small(v + e.wptr[i], pr + n_done * 2 * s, t + n_done * 2 * s, 3, s)
                 else:
-                    weigh(v + e.wptr[i], pr + done * 2 * s, t + done * 2 * s, nr, s)
-                done += nr
+                    multiply_small(v + e.wptr[i], pr + n_done * 2 * s, t + n_done * 2 * s, nr, s)
+                n_done += nr
                 i += 1
-            add_product(f.nval + slot[0] * b, pr, t, done, s)
+            add_product(f.nval + slot[0] * b, pr, t, n_done, s)
             if second >= 0:
-                add_product(f.nval + slot[1] * b, pr + s, t + s, done, s)
-                add_product(f.nval + slot[2] * b, pr, t + s, done, s)
+                add_product(f.nval + slot[1] * b, pr + s, t + s, n_done, s)
+                add_product(f.nval + slot[2] * b, pr, t + s, n_done, s)
                 if lu:
-                    # block (second, first) of K^T V K, transposed: (V K_first)^T K_second
-                    add_product(f.mval + slot[2] * b, t, pr + s, done, s)
+                    # Block (second, first) of K^T V K, transposed: (V K_first)^T K_second.
+                    add_product(f.mval + slot[2] * b, t, pr + s, n_done, s)
     if lu:
-        # The mirror of a diagonal block is its transpose; only off-diagonal blocks are read there.
+        # The upper copy of a diagonal block is its transpose.
         for i in range(f.n):
             q = (f.nptr[i + 1] - 1) * b
             for r in range(s):
@@ -94,8 +95,8 @@ cdef inline void add_elements(const elements_t* e, const double* v, const block_
                     f.mval[q + c * s + r] = f.nval[q + r * s + c]
 
 
-cdef inline void normal_matrix(const elements_t* e, const double* v, const block_matrix_t* f, int32_t lu) noexcept nogil:
-    """N = I + K^T V K of (2) into the blocks of `f`; with `lu` the upper blocks too."""
+cdef inline void form_normal_matrix(const elements_t* e, const double* v, const block_matrix_t* f, int32_t lu) noexcept nogil:
+    """Form N of elements.pxd (2) in the blocks of `f`; with `lu` also its upper blocks."""
     if f.s == 1:
         add_elements(e, v, f, lu, 1)
     elif f.s == 3:

@@ -1,8 +1,8 @@
-"""K = D^-1/2 J M^-1/2 of a factored problem, and products with it: from rows to bodies and back."""
+"""The panel K = D^-1/2 J M^-1/2 of a factored problem over bodies, and products with K and K^T."""
 from libc.math cimport sqrt
 from libc.stdint cimport int32_t, int64_t
 
-from lavender_ext.core.block_types cimport blocks_t, n_tangents, n_angular_rows
+from lavender_ext.core.block_types cimport blocks_t, n_angular_rows, n_tangents
 from lavender_ext.core.rows cimport contact_jacobian
 from lavender_ext.core.view cimport bodies_of, rows_t
 from lavender_ext.newton.elements cimport elements_t
@@ -16,11 +16,11 @@ cdef extern from *:
     #define LAVENDER_FOR_EACH_SIZE void
     #endif
     """
-    # Return type of a function that is inlined for each constant size, however much the module has grown by inlining.
+    # Return type of a function that is inlined for each constant size, whatever the size of the module.
     ctypedef void for_each_size "LAVENDER_FOR_EACH_SIZE"
 
 
-cdef inline for_each_size to_bodies_of_size(const elements_t* e, int32_t n, const double* x, double* y,
+cdef inline for_each_size multiply_panel_transpose_of_size(const elements_t* e, int32_t n, const double* x, double* y,
                                             const int32_t s) noexcept nogil:
     cdef int32_t h, i, j, c, first, second
     cdef const double *p
@@ -48,7 +48,7 @@ cdef inline for_each_size to_bodies_of_size(const elements_t* e, int32_t n, cons
                 y[second * s + c] += sum[s + c]
 
 
-cdef inline for_each_size to_rows_of_size(const elements_t* e, const double* y, double* x, const int32_t s) noexcept nogil:
+cdef inline for_each_size multiply_panel_of_size(const elements_t* e, const double* y, double* x, const int32_t s) noexcept nogil:
     cdef int32_t h, i, j, c, first, second
     cdef const double *p
     cdef double t, u
@@ -69,32 +69,32 @@ cdef inline for_each_size to_rows_of_size(const elements_t* e, const double* y, 
             x[j] = t + u
 
 
-cdef inline void to_bodies(const elements_t* e, int32_t n, const double* x, double* y) noexcept nogil:
-    """y = K^T x, (n, s)."""
+cdef inline void multiply_panel_transpose(const elements_t* e, int32_t n, const double* x, double* y) noexcept nogil:
+    """Compute y = K^T x (n, s)."""
     if e.s == 1:
-        to_bodies_of_size(e, n, x, y, 1)
+        multiply_panel_transpose_of_size(e, n, x, y, 1)
     elif e.s == 3:
-        to_bodies_of_size(e, n, x, y, 3)
+        multiply_panel_transpose_of_size(e, n, x, y, 3)
     elif e.s == 6:
-        to_bodies_of_size(e, n, x, y, 6)
+        multiply_panel_transpose_of_size(e, n, x, y, 6)
     else:
-        to_bodies_of_size(e, n, x, y, e.s)
+        multiply_panel_transpose_of_size(e, n, x, y, e.s)
 
 
-cdef inline void to_rows(const elements_t* e, const double* y, double* x) noexcept nogil:
-    """x = K y, (m)."""
+cdef inline void multiply_panel(const elements_t* e, const double* y, double* x) noexcept nogil:
+    """Compute x = K y (m)."""
     if e.s == 1:
-        to_rows_of_size(e, y, x, 1)
+        multiply_panel_of_size(e, y, x, 1)
     elif e.s == 3:
-        to_rows_of_size(e, y, x, 3)
+        multiply_panel_of_size(e, y, x, 3)
     elif e.s == 6:
-        to_rows_of_size(e, y, x, 6)
+        multiply_panel_of_size(e, y, x, 6)
     else:
-        to_rows_of_size(e, y, x, e.s)
+        multiply_panel_of_size(e, y, x, e.s)
 
 
-cdef inline void inertia_root(int32_t n, const double* inv_inertia, double* root) noexcept nogil:
-    """Lower L with L L^T = I^-1 for each body, (n, 9); a pivot at rounding is a pinned axis, zero."""
+cdef inline void factor_inertia(int32_t n, const double* inv_inertia, double* root) noexcept nogil:
+    """Factor the inverse inertia of each body as L L^T (n, 9); a pivot within rounding of 0 is a fixed axis and set to 0."""
     cdef int32_t i, c, r, t
     cdef double x, top
     cdef const double *a
@@ -119,9 +119,9 @@ cdef inline void inertia_root(int32_t n, const double* inv_inertia, double* root
                 l[3 * r + c] = top / x
 
 
-cdef inline void fill_panel(const blocks_t* p, const rows_t* r, const double* root, const double* root_mass,
+cdef inline void compute_panel(const blocks_t* p, const rows_t* r, const double* root, const double* root_mass,
                             double* panel) noexcept nogil:
-    """K (m, 12): D^-1/2 J M^-1/2, columns of body a then b."""
+    """Compute K (m, 12), with the columns of body a before those of body b."""
     cdef int32_t i, j, q, c, k, h, body
     cdef double jac[72]
     cdef double x

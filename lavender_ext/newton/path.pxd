@@ -1,29 +1,40 @@
-"""Coulomb's law along a path of smoothed problems, through its folds.
+"""A path of smoothed problems to a solution of Coulomb's law, through its folds.
 
 With p(x) = (x + sqrt(x^2 + 4 tau^2)) / 2 for max(0, x), y = z - s, s = (H + eps) z - g, each contact's map is smooth:
 
     n = p(y_n),   r = a n,   m = r + p(|y_t| - r),   F_n = z_n - n,   F_t = z_t - (r / m) y_t                  (1)
 
-(Chen, Mangasarian 1996; of a frictionless contact it is the central path z s = tau^2), with c tau for tau in m. Its
-solutions from a large tau to tau = 0 are a curve in (z, log tau), on which tau may rise for a while: where contacts that
-carry load pass from stick to slip, the curve turns back, and what only lowers tau loses it. How far a contact is from
-its next piece is told by coordinates of its own,
+(Chen, Mangasarian 1996; without friction it is the central path z s = tau^2), with c tau in place of tau in m. The
+solutions from a large tau to tau = 0 are a curve in (z, log tau), along which tau may rise for a while. If loaded
+contacts pass from stick to slip, the curve turns back, and a method that only lowers tau loses it. The distance of a
+contact from another state is measured by coordinates:
 
     asinh(y_n / 2 tau)   and   asinh((r - |y_t|) / 2 c tau).                                               (2)
 
-Whichever changes fastest along the tangent (b, 1), F_z b = -F_tau, be it log tau itself, is the parameter of the next
-step (local parameterisation: Rheinboldt 1986): a contact that slips runs through its own coordinate while the curve turns
-sharply in z and tau. A step follows the tangent and half its change, as far as the fastest coordinate may go; Newton's
-method then leaves the parameter x as it is,
+The coordinate, or log tau, that changes fastest along the tangent (b, 1), F_z b = -F_tau, is the parameter of the next
+step (local parameterisation: Rheinboldt 1986). A contact that slips follows its own coordinate while the curve turns
+sharply in z and tau. A step follows the tangent as far as the fastest coordinate may change. Newton's method then keeps
+the parameter x,
 
     F_z dz + F_tau dl = -F,   x'(dz, dl) = 0     dz = a + b dl,   F_z a = -F,   dl = -x'(a, 0) / x'(b, 1)         (3)
 
-and is measured by what it changes of (2) and of the direction of y_t. Of one factor, simplified Newton steps follow, which
-must contract (Deuflhard 2011). On the curve the sign of dl is that of -det F_z (Allgower, Georg 2003): at a large tau,
-where tau falls, det F_z > 0. So its direction is known at every point, even at one that a step has come to by chance.
+and its progress is the change of (2) and of the direction of y_t. On the curve the sign of dl is that of -det F_z
+(Allgower, Georg 2003): at a large tau, where tau falls, det F_z > 0. So the direction is known at every point, even at
+one that a step has reached by chance.
 
-Which c leads to a solution soon nobody knows before: some are tried in turn, each from the start. eps is a compliance:
-without it, redundant contacts share their load as tau^2 / z says, which no factor sees.
+The ratio c that leads to a solution soon is not known in advance: several are tried in turn, each from the start. The
+compliance eps prevents that redundant contacts share their load as tau^2 / z determines, which no factor can resolve.
+
+    stage        step                                            event                  next stage
+    STARTING     Newton's method at the first tau                on the curve           STEPPING
+                                                                 does not converge      STARTING at ten times tau
+    STEPPING     follow the tangent by h                                                CORRECTING
+    CORRECTING   Newton step (3)                                 on the curve           STEPPING, or TRYING
+                                                                 diverges, first time   STEPPING with h / 2
+                                                                 diverges, second time  REPEATING
+    REPEATING    Newton steps on the last point                  exact                  STEPPING
+                                                                 diverges               STEPPING from a saved point
+    TRYING       damped Newton from a point with a low residual  not solved             STEPPING
 """
 from libc.math cimport fabs, floor, sqrt
 from libc.stdint cimport int32_t
@@ -31,15 +42,16 @@ from libc.string cimport memset
 
 from lavender_ext.core.validate cimport all_finite
 from lavender_ext.core.block_types cimport COULOMB
-from lavender_ext.newton.cones cimport is_high, is_low
+from lavender_ext.newton.cones cimport has_lower_bound, has_upper_bound
 from lavender_ext.newton.elements cimport elements_t, invert_small, is_row
-from lavender_ext.newton.phases cimport begin_rounds, enter_rounds
-from lavender_ext.newton.run cimport (N_PATH, PATH, done, enter, leave, newton_t, path_t, score, take, with_products)
-from lavender_ext.newton.system cimport OF_NATURAL, solve_natural, system_factor, system_sign, system_times
+from lavender_ext.newton.phases cimport begin_damped_newton, push_damped_newton
+from lavender_ext.newton.run cimport (N_PATH, PATH, compute_slack, copy_vector, is_finished, newton_t, path_t,
+                                      pop_phase, push_phase, score_point)
+from lavender_ext.newton.system cimport NATURAL, solve_natural, system_factor, system_sign, system_times
 
 
 cdef inline double exponential(double x) noexcept nogil:
-    """e^x to 1e-15 by a sum, with the same bits on every machine: those of the C library differ."""
+    """Return e^x to 1e-15 by a sum with the same bits on every machine, unlike the C library."""
     cdef double k, r, term = 1.0, total = 1.0
     cdef int i, _i, n
     if x < -700.0:
@@ -47,7 +59,7 @@ cdef inline double exponential(double x) noexcept nogil:
     x = x if x < 700.0 else 700.0
     k = floor(x * 1.4426950408889634 + 0.5)
     n = <int>k
-    r = x - k * 0.6931471803691238 - k * 1.9082149292705877e-10  # ln 2 in two parts
+    r = x - k * 0.6931471803691238 - k * 1.9082149292705877e-10  # ln 2 in two parts.
     for i in range(1, 16):
         term *= r / i
         total += term
@@ -59,7 +71,7 @@ cdef inline double exponential(double x) noexcept nogil:
 
 
 cdef inline double logarithm(double x) noexcept nogil:
-    """ln x to 1e-15, the same: 2 artanh((m - 1) / (m + 1)) of x = m 2^k, |m| near 1; x > 0."""
+    """Return ln x to 1e-15 likewise: 2 artanh((m - 1) / (m + 1)) of x = m 2^k with m near 1; x > 0."""
     cdef double k = 0.0, y, square, term, total = 0.0
     cdef int i, _i
     for _i in range(1100):
@@ -79,89 +91,106 @@ cdef inline double logarithm(double x) noexcept nogil:
     return 2.0 * total + k * 0.6931471805599453
 
 
-cdef enum:                      # where a path stands
-    STARTING = 0                # on its first tau
+cdef enum:                      # stages of a path
+    STARTING = 0
     STEPPING = 1
     CORRECTING = 2
-    REPEATING = 3               # the last point, more exactly
-    TRYING = 4                  # whether Newton's method ends it
+    REPEATING = 3
+    TRYING = 4
+
+cdef enum:                      # outcomes of a correction
+    DIVERGING = 0
+    CONVERGING = 1
+    ON_CURVE = 2
 
 cdef enum:
-    PATHS = 3                   # with a c of their own
-    STEPS = 600                 # factorisations of one at most
-    FIRST_STEPS = 15            # on the first tau,
-    RAISES = 3                  # which is so often raised where they do not end
-    CORRECTIONS = 4             # factors of one point
-    SIMPLIFIED = 3              # steps with one factor
-    REPEATED = 4                # factors that make a point exact
-    SHORTER = 2                 # times that a step is halved before that
-    CLEAN = 6                   # steps after which points may be as inexact as before a return
-    ENDING = 4                  # Newton steps of a trial
+    N_PATHS = 3                 # ratios c that are tried
+    MAX_PATH_FACTORISATIONS = 600   # Budget of one path; most end within 300.
+    MAX_START_STEPS = 15        # Newton steps at one first tau.
+    MAX_TAU_RAISES = 3          # The first tau is raised at most so often: towers carry up to some hundred times g.
+    MAX_CORRECTIONS = 4         # Newton steps of one point; with more the step is halved instead.
+    MAX_REPEATED_CORRECTIONS = 4    # Newton steps that correct the last point further.
+    HALVINGS_TO_REPEAT = 2      # Halvings of a step before the last point is corrected further.
+    STEPS_TO_FULL_TOLERANCE = 6     # Steps after a return with the smaller tolerance.
+    TRIAL_FACTORISATIONS = 4    # Budget of damped Newton from a point of the path.
 
-cdef enum:                      # coordinates: 4 i + FIRST of element i (a contact's normal, a row's lower bound), then its cones
-    LOG_TAU = 0                 # (a row's upper bound)
-    FIRST = 1
-    OF_ONE = 4
-
-
-cdef inline double wide_of(int32_t k) noexcept nogil:
-    """c of the k-th path."""
-    return 3.0 if k < 1 else 1.0 if k < 2 else 10.0     # not ==, of which compilers make a table
+cdef enum:                      # coordinates: 4 i + FIRST_COORDINATE of element i (normal, or a row's lower bound), then its
+    LOG_TAU = 0                 # components (or the row's upper bound)
+    FIRST_COORDINATE = 1
+    COORDINATES_PER_ELEMENT = 4
 
 
-cdef inline double exact_of() noexcept nogil:
-    """Change of (2) by what is left of a correction, below which a point counts as one of the curve."""
+cdef inline double friction_ratio_of(int32_t k) noexcept nogil:
+    """Return c of the k-th path."""
+    return 3.0 if k < 1 else 1.0 if k < 2 else 10.0     # Not ==, of which compilers make a table.
+
+
+cdef inline double curve_tolerance() noexcept nogil:
+    """Change of (2) by a correction below which a point counts as on the curve."""
     return 0.2
 
 
+cdef inline double first_step_length() noexcept nogil:
+    """First h, the change of the fastest coordinate in one step."""
+    return 0.3
+
+
 cdef inline double path_compliance() noexcept nogil:
-    """eps, where z is of the size of g."""
+    """First eps, relative to d."""
     return 1e-9
 
 
-cdef inline double plus(double x, double tau) noexcept nogil:
-    """p(x), exact for x < 0 as well."""
+cdef inline double smooth_max(double x, double tau) noexcept nogil:
+    """Return p(x) without cancellation for x < 0."""
     cdef double root = sqrt(x * x + 4.0 * tau * tau)
     return 0.5 * (x + root) if x > 0.0 else 2.0 * tau * tau / (root - x)
 
 
-cdef inline double slope(double x, double tau) noexcept nogil:
-    """p'(x); p'(-x) = 1 - p'(x)."""
-    return plus(x, tau) / sqrt(x * x + 4.0 * tau * tau)
+cdef inline double smooth_max_slope(double x, double tau) noexcept nogil:
+    """Return p'(x); p'(-x) = 1 - p'(x)."""
+    return smooth_max(x, tau) / sqrt(x * x + 4.0 * tau * tau)
 
 
-cdef inline double rise(double x, double tau) noexcept nogil:
-    """dp / d log tau"""
+cdef inline double smooth_max_rise(double x, double tau) noexcept nogil:
+    """Return dp / d log tau."""
     return 2.0 * tau * tau / sqrt(x * x + 4.0 * tau * tau)
 
 
-cdef inline double smooth_row(const elements_t* e, int32_t j, double z, double s, double tau, double* p, double* rest,
-                              double* ft) noexcept nogil:
-    """F, P, 1 - P and dF / d log tau of a bounded row."""
-    cdef double y = z - s, f = s, x
-    p[0], rest[0], ft[0] = 1.0, 0.0, 0.0
-    if is_low(e, j):
+cdef struct smooth_t:           # the smoothed map of one element of n rows
+    double f[6]                 # F
+    double p[36]                # (n, n) P
+    double rest[36]             # (n, n) I - P
+    double ft[6]                # dF / d log tau
+
+
+cdef inline void smooth_row(const elements_t* e, int32_t j, double z, double s, double tau, smooth_t* out) noexcept nogil:
+    """Compute the smoothed map of a bounded row."""
+    cdef double y = z - s, x
+    out.f[0], out.p[0], out.rest[0], out.ft[0] = s, 1.0, 0.0, 0.0
+    if has_lower_bound(e, j):
         x = y - e.lower[j]
-        f = s - plus(-x, tau) if x > 0.0 else z - e.lower[j] - plus(x, tau)
-        p[0], rest[0], ft[0] = slope(x, tau), slope(-x, tau), -rise(x, tau)
-    if is_high(e, j):
+        out.f[0] = s - smooth_max(-x, tau) if x > 0.0 else z - e.lower[j] - smooth_max(x, tau)
+        out.p[0], out.rest[0], out.ft[0] = smooth_max_slope(x, tau), smooth_max_slope(-x, tau), -smooth_max_rise(x, tau)
+    if has_upper_bound(e, j):
         x = e.upper[j] - y
-        f = f + plus(-x, tau) if x > 0.0 else f - x + plus(x, tau)
-        p[0] -= slope(-x, tau)
-        rest[0] += slope(-x, tau)
-        ft[0] += rise(x, tau)
-    return f
+        out.f[0] = out.f[0] + smooth_max(-x, tau) if x > 0.0 else out.f[0] - x + smooth_max(x, tau)
+        out.p[0] -= smooth_max_slope(-x, tau)
+        out.rest[0] += smooth_max_slope(-x, tau)
+        out.ft[0] += smooth_max_rise(x, tau)
 
 
 cdef inline void smooth_contact(const elements_t* e, int32_t i, const double* z, const double* s, double tau, double wide,
-                                double* f, double* p, double* rest, double* ft) noexcept nogil:
-    """(1) of one contact, P (nr, nr), I - P without cancellation, and dF / d log tau."""
+                                smooth_t* out) noexcept nogil:
+    """Compute (1) of one contact and its derivatives, I - P without cancellation; `wide` is c tau."""
     cdef int32_t nr = e.ptr[i + 1] - e.ptr[i], first, n, k, l, g
-    cdef double y = z[0] - s[0], normal = plus(y, tau), dn = slope(y, tau), a, r, q, d, root, more, m, fr, across, along, x, own
-    memset(p, 0, nr * nr * sizeof(double))
-    memset(rest, 0, nr * nr * sizeof(double))
-    f[0] = s[0] - plus(-y, tau) if y > 0.0 else z[0] - normal
-    p[0], rest[0], ft[0] = dn, slope(-y, tau), -rise(y, tau)
+    cdef double y = z[0] - s[0], normal = smooth_max(y, tau), dn = smooth_max_slope(y, tau)
+    cdef double a, r, q, d, root, more, m, fr, across, along, x, own
+    memset(out.p, 0, nr * nr * sizeof(double))
+    memset(out.rest, 0, nr * nr * sizeof(double))
+    # Normal.
+    out.f[0] = s[0] - smooth_max(-y, tau) if y > 0.0 else z[0] - normal
+    out.p[0], out.rest[0], out.ft[0] = dn, smooth_max_slope(-y, tau), -smooth_max_rise(y, tau)
+    # Friction components.
     for g in range(e.part[i], e.part[i + 1]):
         n = e.size[g]
         first = e.first[g] - e.ptr[i]
@@ -172,73 +201,74 @@ cdef inline void smooth_contact(const elements_t* e, int32_t i, const double* z,
         q = sqrt(q)
         d = r - q
         root = sqrt(d * d + 4.0 * wide * wide)
-        more = plus(-d, wide)                            # m - r
+        more = smooth_max(-d, wide)                     # m - r
         m = r + more
         fr = (more + r * (more / root)) / (m * m)       # d(r / m) / dr
         across = more / m
         along = (m * more + r * q * (more / root)) / (m * m)
         for k in range(first, first + n):
             x = z[k] - s[k]
-            f[k] = s[k] + across * x if d > 0.0 else z[k] - r / m * x
-            p[k * nr] = x * fr * a * dn
-            rest[k * nr] = -p[k * nr]
-            ft[k] = -x * (fr * a * rise(y, tau) - r * rise(d, wide) / (m * m))
+            out.f[k] = s[k] + across * x if d > 0.0 else z[k] - r / m * x
+            out.p[k * nr] = x * fr * a * dn
+            out.rest[k * nr] = -out.p[k * nr]
+            out.ft[k] = -x * (fr * a * smooth_max_rise(y, tau) - r * smooth_max_rise(d, wide) / (m * m))
             for l in range(first, first + n):
                 own = x * (z[l] - s[l]) / (q * q) if q > 0.0 else 0.0
-                rest[k * nr + l] = (across if k == l else 0.0) + (along - across) * own
-                p[k * nr + l] = (1.0 if k == l else 0.0) - rest[k * nr + l]
+                out.rest[k * nr + l] = (across if k == l else 0.0) + (along - across) * own
+                out.p[k * nr + l] = (1.0 if k == l else 0.0) - out.rest[k * nr + l]
 
 
-cdef inline void smooth(newton_t* n, const double* z, double tau, bint derived) noexcept nogil:
-    """F of z into n.f and y into n.t1, with a compliance eps; with `derived` small matrices and dF / d log tau (n.c)."""
+cdef inline void smooth_map(newton_t* n, const double* z, double tau, bint derived) noexcept nogil:
+    """Compute F of z into n.f and y into n.t1; with `derived` also the small matrices and dF / d log tau (n.c)."""
     cdef const elements_t* e = n.s.e
     cdef double eps = n.path.eps
     cdef int32_t i, j, k, l, t, q, nr
     cdef double x
-    cdef double p[36]
-    cdef double rest[36]
-    cdef double ft[6]
-    with_products(n, z, n.rest)
+    cdef smooth_t own
+    compute_slack(n, z, n.slack)
     for j in range(e.m):
-        n.rest[j] += eps * z[j]
-        n.t1[j] = z[j] - n.rest[j]
+        n.slack[j] += eps * z[j]
+        n.t1[j] = z[j] - n.slack[j]
     for i in range(e.n):
         j = e.ptr[i]
         nr = e.ptr[i + 1] - j
         q = e.wptr[i]
         if is_row(e, i):
-            n.f[j] = smooth_row(e, j, z[j], n.rest[j], tau, p, rest, ft)
+            smooth_row(e, j, z[j], n.slack[j], tau, &own)
         else:
-            smooth_contact(e, i, z + j, n.rest + j, tau, n.path.wide * tau, n.f + j, p, rest, ft)
+            smooth_contact(e, i, z + j, n.slack + j, tau, n.path.friction_ratio * tau, &own)
+        for k in range(nr):
+            n.f[j + k] = own.f[k]
         if not derived:
             continue
         for k in range(nr):
-            n.c[j + k] = ft[k]
+            n.c[j + k] = own.ft[k]
             for l in range(nr):
-                n.s.p[q + k * nr + l] = p[k * nr + l]
-                rest[k * nr + l] += p[k * nr + l] * (e.theta[j + l] + eps)
-        invert_small(rest, n.s.einv + q, nr)
+                n.s.p[q + k * nr + l] = own.p[k * nr + l]
+                own.rest[k * nr + l] += own.p[k * nr + l] * (e.theta[j + l] + eps)
+        invert_small(own.rest, n.s.einv + q, nr)
         for k in range(nr):
             for l in range(nr):
                 x = 0.0
                 for t in range(nr):
-                    x += n.s.einv[q + k * nr + t] * p[t * nr + l]
+                    x += n.s.einv[q + k * nr + t] * own.p[t * nr + l]
                 n.s.v[q + k * nr + l] = x
 
 
-cdef inline void change_of_y(newton_t* n, const double* dz, double* dy) noexcept nogil:
-    """dy = dz - (H + eps) dz."""
+cdef inline void compute_change_of_y(newton_t* n, const double* dz, double* dy) noexcept nogil:
+    """Compute dy = dz - (H + eps) dz."""
     cdef int32_t j
     system_times(&n.s, dz, dy)
     for j in range(n.s.e.m):
         dy[j] = dz[j] - dy[j] - n.path.eps * dz[j]
 
 
-cdef inline double rate_of(const newton_t* n, int32_t which, const double* dy, double dl, double tau,
+cdef inline double compute_rate(const newton_t* n, int32_t which, const double* dy, double dl, double tau,
                            double* turned) noexcept nogil:
-    """What (dy, dl) changes of a coordinate at the y of the last `smooth`, and of the direction of y_t beside it."""
+    """Return the rate of a coordinate along (dy, dl) at the y of the last `smooth_map`; write that of the direction of y_t."""
     cdef const elements_t* e = n.s.e
-    cdef int32_t i = (which - FIRST) // OF_ONE, part = (which - FIRST) % OF_ONE, j, k, first, size
+    cdef int32_t i = (which - FIRST_COORDINATE) // COORDINATES_PER_ELEMENT
+    cdef int32_t part = (which - FIRST_COORDINATE) % COORDINATES_PER_ELEMENT, j, k, first, size
     cdef double x, dx, y, normal, root, r, q, along, square, a, wide = tau
     turned[0] = 0.0
     if which == LOG_TAU:
@@ -251,10 +281,10 @@ cdef inline double rate_of(const newton_t* n, int32_t which, const double* dy, d
         x, dx = n.t1[j], dy[j]
     else:
         y = n.t1[j]
-        normal, root = plus(y, tau), sqrt(y * y + 4.0 * tau * tau)
+        normal, root = smooth_max(y, tau), sqrt(y * y + 4.0 * tau * tau)
         part += e.part[i] - 1
         size, first, a = e.size[part], e.first[part], e.reach[part]
-        wide = n.path.wide * tau
+        wide = n.path.friction_ratio * tau
         r, q = a * normal, 0.0
         along = square = 0.0
         for k in range(first, first + size):
@@ -270,33 +300,33 @@ cdef inline double rate_of(const newton_t* n, int32_t which, const double* dy, d
     return (dx - x * dl) / sqrt(x * x + 4.0 * wide * wide)
 
 
-cdef inline double fastest(const newton_t* n, const double* dy, double dl, double tau, int32_t* which,
+cdef inline double find_fastest(const newton_t* n, const double* dy, double dl, double tau, int32_t* which,
                            double* turned) noexcept nogil:
-    """The largest rate of a coordinate, and which it is; the largest of a direction."""
+    """Return the largest rate of a coordinate; write the coordinate, and the largest rate of a direction."""
     cdef const elements_t* e = n.s.e
     cdef int32_t i, part
     cdef double worst = fabs(dl), x, turn
     which[0] = LOG_TAU
     turned[0] = 0.0
     for i in range(e.n):
-        for part in range(OF_ONE):
+        for part in range(COORDINATES_PER_ELEMENT):
             if is_row(e, i):
-                if not (part == 0 and is_low(e, e.ptr[i]) or part == 1 and is_high(e, e.ptr[i])):
+                if not (part == 0 and has_lower_bound(e, e.ptr[i]) or part == 1 and has_upper_bound(e, e.ptr[i])):
                     continue
             elif part > e.part[i + 1] - e.part[i]:
                 continue
-            x = fabs(rate_of(n, OF_ONE * i + FIRST + part, dy, dl, tau, &turn))
+            x = fabs(compute_rate(n, COORDINATES_PER_ELEMENT * i + FIRST_COORDINATE + part, dy, dl, tau, &turn))
             turned[0] = turned[0] if turn <= turned[0] else turn
             if not x <= worst:
                 worst = x
-                which[0] = OF_ONE * i + FIRST + part
+                which[0] = COORDINATES_PER_ELEMENT * i + FIRST_COORDINATE + part
     return worst
 
 
-cdef inline double change(const newton_t* n, const double* dy, double dl, double tau) noexcept nogil:
-    """Largest change of a coordinate or direction by (dy, dl)."""
+cdef inline double largest_change(const newton_t* n, const double* dy, double dl, double tau) noexcept nogil:
+    """Return the largest change of a coordinate or direction by (dy, dl)."""
     cdef int32_t which
-    cdef double turned, worst = fastest(n, dy, dl, tau, &which, &turned)
+    cdef double turned, worst = find_fastest(n, dy, dl, tau, &which, &turned)
     return worst if not worst < turned else turned
 
 
@@ -304,271 +334,256 @@ cdef inline double change(const newton_t* n, const double* dy, double dl, double
 
 
 cdef inline void begin_path(newton_t* n) noexcept nogil:
-    """The next, from z = 0, in vectors that interior points and exchanges have left."""
+    """Begin the next path from z = 0; its vectors are those of interior points and exchanges, which have ended."""
     cdef path_t* x = &n.path
     cdef int32_t j, m = n.s.e.m
-    x.z, x.t, x.old, x.b = n.ip.z, n.ip.u1, n.ip.u2, n.ip.hz
-    x.mark[0], x.mark_t[0], x.mark[1], x.mark_t[1] = n.exchange.z, n.exchange.hz, n.exchange.kept, n.ip.everything
+    x.z, x.t, x.b = n.ip.z, n.ip.u1, n.ip.hz
+    x.saved_z[0], x.saved_t[0], x.saved_z[1], x.saved_t[1] = n.active.z, n.active.hz, n.active.best_z, n.ip.unbounded_z
     memset(x.z, 0, m * sizeof(double))
     x.size = 0.0
     for j in range(m):
         x.size += n.s.e.g[j] * n.s.e.g[j]
     x.size = sqrt(x.size / m)
     x.start = x.l = logarithm(0.3 * x.size)
-    x.exact = exact_of()
+    x.tolerance = curve_tolerance()
     x.eps = path_compliance()
-    x.near = 1e-2
-    x.h = 0.3
-    x.last = n.s.factorisations + STEPS
-    x.wide = wide_of(x.paths)
+    x.trial_residual = 1e-2
+    x.h = first_step_length()
+    x.last = n.s.factorisations + MAX_PATH_FACTORISATIONS
+    x.friction_ratio = friction_ratio_of(x.paths)
     x.paths += 1
-    x.at = x.used = x.raised = x.marks = x.clean = x.bends = x.shorter = 0
+    x.stage = x.factors = x.raises = x.n_saved = x.steps_since_return = x.halvings = 0
     if 0.0 < x.size < 1.0 / 0.0:
-        enter(n, PATH)
+        push_phase(n, PATH)
 
 
-cdef inline bint path_factor(newton_t* n, const double* z, double tau) noexcept nogil:
-    """a of (3) into n.dz and b into x.b, what they change of y into n.t2 and n.psi; False where they are not finite."""
+cdef inline bint factor_path(newton_t* n, const double* z, double tau) noexcept nogil:
+    """Compute a of (3) into n.dz and b into x.b, and their changes of y into n.t2 and n.psi; return whether they are finite."""
     cdef int32_t j, m = n.s.e.m
-    smooth(n, z, tau, True)
+    smooth_map(n, z, tau, True)
     n.counts[N_PATH] += 1
     n.s.law = COULOMB
-    system_factor(&n.s, OF_NATURAL, n.path.eps)
+    system_factor(&n.s, NATURAL, n.path.eps)
     n.path.sign = system_sign(&n.s)
     solve_natural(&n.s, n.f, n.dz)
     solve_natural(&n.s, n.c, n.path.b)
     for j in range(m):
         n.dz[j] = -n.dz[j]
         n.path.b[j] = -n.path.b[j]
-    change_of_y(n, n.dz, n.t2)
-    change_of_y(n, n.path.b, n.psi)
+    compute_change_of_y(n, n.dz, n.t2)
+    compute_change_of_y(n, n.path.b, n.psi)
     return all_finite(n.dz, m) and all_finite(n.path.b, m)
 
 
-cdef inline double along_curve(newton_t* n, double tau, double* found) noexcept nogil:
-    """dl of (3), with dz = a + b dl in place of a; how much that changes."""
+cdef inline double project_on_parameter(newton_t* n, double tau, double* change) noexcept nogil:
+    """Return dl of (3) and replace a in n.dz by dz = a + b dl; write the largest change of a coordinate."""
     cdef path_t* x = &n.path
     cdef int32_t j
     cdef double turned, dl = 0.0
-    if x.which != LOG_TAU:
-        dl = -rate_of(n, x.which, n.t2, 0.0, tau, &turned) / rate_of(n, x.which, n.psi, 1.0, tau, &turned)
+    if x.parameter != LOG_TAU:
+        dl = -compute_rate(n, x.parameter, n.t2, 0.0, tau, &turned) / compute_rate(n, x.parameter, n.psi, 1.0, tau, &turned)
     for j in range(n.s.e.m):
         n.dz[j] += x.b[j] * dl
         n.t2[j] += n.psi[j] * dl
-    found[0] = change(n, n.t2, dl, tau)
+    change[0] = largest_change(n, n.t2, dl, tau)
     return dl
 
 
-cdef inline void advance(newton_t* n, double* z, double* l, double dl) noexcept nogil:
+cdef inline void add_step(newton_t* n, double* z, double* l, double dl) noexcept nogil:
+    """Add n.dz and dl to a point."""
     cdef int32_t j
     for j in range(n.s.e.m):
         z[j] += n.dz[j]
     l[0] += dl
 
 
-cdef inline void new_tangent(newton_t* n, double tau) noexcept nogil:
-    """The direction of the last b: by the sign of the determinant, or, where that is unknown, on through the parameter."""
+cdef inline void compute_tangent(newton_t* n, double tau) noexcept nogil:
+    """Compute the tangent from the last b; its direction follows from the sign of the determinant.
+
+    If the sign is unknown, the parameter continues in its direction.
+    """
     cdef path_t* x = &n.path
     cdef int32_t j
     cdef double turned
     x.tl = -1.0 if x.sign > 0 else 1.0
     if x.sign == 0:
-        x.tl = 1.0 if rate_of(n, x.which, n.psi, 1.0, tau, &turned) * x.speed > 0.0 else -1.0
+        x.tl = 1.0 if compute_rate(n, x.parameter, n.psi, 1.0, tau, &turned) * x.speed > 0.0 else -1.0
     for j in range(n.s.e.m):
         x.t[j] = x.tl * x.b[j]
 
 
-cdef inline void mark(newton_t* n) noexcept nogil:
-    """The last point, to which steps that fail may return."""
+cdef inline void save_point(newton_t* n) noexcept nogil:
+    """Save the last point, to which the path returns if steps fail; the older of two saved points is dropped."""
     cdef path_t* x = &n.path
-    cdef double* place = x.mark[0]
-    cdef double* tangent = x.mark_t[0]
-    x.mark[0], x.mark_t[0], x.mark[1], x.mark_t[1] = x.mark[1], x.mark_t[1], place, tangent
-    x.mark_l[0], x.mark_tl[0], x.mark_h[0] = x.mark_l[1], x.mark_tl[1], x.mark_h[1]
-    take(n, x.mark[1], x.z)
-    take(n, x.mark_t[1], x.t)
-    x.mark_l[1], x.mark_tl[1], x.mark_h[1] = x.l, x.tl, x.h
-    x.marks = 2 if x.marks else 1
+    cdef double* z = x.saved_z[0]
+    cdef double* tangent = x.saved_t[0]
+    x.saved_z[0], x.saved_t[0], x.saved_z[1], x.saved_t[1] = x.saved_z[1], x.saved_t[1], z, tangent
+    x.saved_l[0], x.saved_tl[0], x.saved_h[0] = x.saved_l[1], x.saved_tl[1], x.saved_h[1]
+    copy_vector(n, x.saved_z[1], x.z)
+    copy_vector(n, x.saved_t[1], x.t)
+    x.saved_l[1], x.saved_tl[1], x.saved_h[1] = x.l, x.tl, x.h
+    x.n_saved = 2 if x.n_saved else 1
 
 
-cdef inline bint go_back(newton_t* n) noexcept nogil:
-    """To the point before, with a shorter step and more exactly; False where there is none."""
+cdef inline bint return_to_saved_point(newton_t* n) noexcept nogil:
+    """Return to the saved point with half the step and a smaller tolerance; False if there is none."""
     cdef path_t* x = &n.path
-    cdef double* place = x.mark[0]
-    cdef double* tangent = x.mark_t[0]
-    if x.marks == 0:
+    cdef double* z = x.saved_z[0]
+    cdef double* tangent = x.saved_t[0]
+    if x.n_saved == 0:
         return False
-    take(n, x.z, x.mark[1])
-    take(n, x.t, x.mark_t[1])
-    x.l, x.tl, x.h = x.mark_l[1], x.mark_tl[1], 0.5 * x.mark_h[1]
-    x.mark[0], x.mark_t[0], x.mark[1], x.mark_t[1] = x.mark[1], x.mark_t[1], place, tangent
-    x.mark_l[1], x.mark_tl[1], x.mark_h[1] = x.mark_l[0], x.mark_tl[0], x.mark_h[0]
-    x.marks -= 1
-    x.exact = 0.1 * x.exact if 0.1 * x.exact > 1e-3 else 1e-3
-    x.bends = x.clean = x.shorter = 0
+    copy_vector(n, x.z, x.saved_z[1])
+    copy_vector(n, x.t, x.saved_t[1])
+    x.l, x.tl, x.h = x.saved_l[1], x.saved_tl[1], 0.5 * x.saved_h[1]
+    x.saved_z[0], x.saved_t[0], x.saved_z[1], x.saved_t[1] = x.saved_z[1], x.saved_t[1], z, tangent
+    x.saved_l[1], x.saved_tl[1], x.saved_h[1] = x.saved_l[0], x.saved_tl[0], x.saved_h[0]
+    x.n_saved -= 1
+    x.tolerance = 0.1 * x.tolerance if 0.1 * x.tolerance > 1e-3 else 1e-3
+    x.steps_since_return = x.halvings = 0
     return True
 
 
-cdef inline void predict(newton_t* n) noexcept nogil:
-    """The tangent by its fastest coordinate, then z and l along tangent and curvature, into n.u and x.next."""
+cdef inline void predict_point(newton_t* n) noexcept nogil:
+    """Scale the tangent by its fastest coordinate and follow it by h, into n.u and x.next."""
     cdef path_t* x = &n.path
     cdef int32_t j
-    cdef double c, fast, turned, tau = exponential(x.l)
-    smooth(n, x.z, tau, False)
-    change_of_y(n, x.t, n.t2)
-    fast = fastest(n, n.t2, x.tl, tau, &x.which, &turned)
-    x.speed = rate_of(n, x.which, n.t2, x.tl, tau, &c)
+    cdef double fast, turned, ignored, tau = exponential(x.l)
+    smooth_map(n, x.z, tau, False)
+    compute_change_of_y(n, x.t, n.t2)
+    fast = find_fastest(n, n.t2, x.tl, tau, &x.parameter, &turned)
+    x.speed = compute_rate(n, x.parameter, n.t2, x.tl, tau, &ignored)
     fast = fast if not fast < turned else turned
-    c = 0.5 * x.h * x.h / x.before if x.bends else 0.0
     for j in range(n.s.e.m):
         x.t[j] /= fast
-        n.u[j] = x.z[j] + x.h * x.t[j] + (c * (x.t[j] - x.old[j]) if x.bends else 0.0)
+        n.u[j] = x.z[j] + x.h * x.t[j]
     x.tl /= fast
-    x.next = x.l + x.h * x.tl + (c * (x.tl - x.old_l) if x.bends else 0.0)
-    x.used = 0
-    x.found = x.previous = 1.0 / 0.0
-    x.at = CORRECTING
+    x.next = x.l + x.h * x.tl
+    x.factors = 0
+    x.change = 1.0 / 0.0
+    x.stage = CORRECTING
 
 
-cdef inline bint corrected(newton_t* n) noexcept nogil:
-    """One factor, and what follows with it; whether n.u is on the curve. Otherwise x.previous < 0: it leads nowhere."""
+cdef inline int32_t correct_point(newton_t* n) noexcept nogil:
+    """Take a Newton step (3) on n.u; return ON_CURVE, CONVERGING, or DIVERGING if the step from the last point fails."""
     cdef path_t* x = &n.path
-    cdef int32_t j, k, m = n.s.e.m
-    cdef double tau = exponential(x.next), dl, found, other, contraction = 0.5
-    if not path_factor(n, n.u, tau):
-        x.previous = -1.0
-        return False
-    dl = along_curve(n, tau, &found)
-    if x.used == 0:
-        x.found = found
-    x.used += 1
-    if not found < (0.5 * x.previous if x.previous < 2.0 else 1.0):
-        x.previous = -1.0
-        return False
-    for k in range(SIMPLIFIED + 1):
-        advance(n, n.u, &x.next, dl)
-        if found * contraction < x.exact * (1.0 - contraction):
-            return True
-        if k == SIMPLIFIED:
-            break
-        tau = exponential(x.next)
-        smooth(n, n.u, tau, False)
-        solve_natural(&n.s, n.f, n.dz)
-        for j in range(m):
-            n.dz[j] = -n.dz[j]
-        change_of_y(n, n.dz, n.t2)
-        dl = along_curve(n, tau, &other)
-        contraction = other / found
-        if not contraction < 0.5:
-            break
-        found = other
-    x.previous = found if x.used < CORRECTIONS else -1.0
-    return False
+    cdef double tau = exponential(x.next), dl, change
+    if not factor_path(n, n.u, tau):
+        return DIVERGING
+    dl = project_on_parameter(n, tau, &change)
+    if x.factors == 0:
+        x.first_change = change
+    x.factors += 1
+    if not change < (0.5 * x.change if x.change < 2.0 else 1.0):
+        return DIVERGING
+    add_step(n, n.u, &x.next, dl)
+    if change < x.tolerance:
+        return ON_CURVE
+    x.change = change
+    return CONVERGING if x.factors < MAX_CORRECTIONS else DIVERGING
 
 
-cdef inline void accept(newton_t* n) noexcept nogil:
-    """n.u is the next point."""
+cdef inline void accept_point(newton_t* n) noexcept nogil:
+    """Make n.u the last point, choose the next step length, and try to end the path by damped Newton."""
     cdef path_t* x = &n.path
-    cdef double found = x.tl
-    mark(n)
-    take(n, x.old, x.t)
-    x.old_l, x.before = x.tl, x.h
-    take(n, x.z, n.u)
+    cdef double factor, residual
+    save_point(n)
+    copy_vector(n, x.z, n.u)
     x.l = x.next
-    new_tangent(n, exponential(x.l))
-    x.bends = found * x.tl > 0.0                        # not around a fold
-    x.shorter = 0
-    x.clean += 1
-    if x.clean > CLEAN:
-        x.exact = exact_of()
-    found = exponential(logarithm(0.12 / (x.found if x.found > 1e-9 else 1e-9)) / 3.0)
-    x.h *= 2.0 if found > 2.0 else 0.5 if found < 0.5 else found
+    compute_tangent(n, exponential(x.l))
+    x.halvings = 0
+    x.steps_since_return += 1
+    if x.steps_since_return > STEPS_TO_FULL_TOLERANCE:
+        x.tolerance = curve_tolerance()
+    # The first correction should change the coordinates by 0.12; it grows with the third power of h.
+    factor = exponential(logarithm(0.12 / (x.first_change if x.first_change > 1e-9 else 1e-9)) / 3.0)
+    x.h *= 2.0 if factor > 2.0 else 0.5 if factor < 0.5 else factor
     x.h = x.h if x.h < 1.5 else 1.5
-    x.at = STEPPING
-    found = score(n, x.z)
-    if found < x.near and not done(n):
-        x.near = 0.1 * found
-        x.at = TRYING
-        begin_rounds(n, 1, x.z, COULOMB, 1e-7, ENDING)
-        enter_rounds(n, 1, ENDING)
+    x.stage = STEPPING
+    residual = score_point(n, x.z)
+    if residual < x.trial_residual and not is_finished(n):
+        x.trial_residual = 0.1 * residual
+        x.stage = TRYING
+        begin_damped_newton(n, x.z, COULOMB, 1e-7, TRIAL_FACTORISATIONS)
+        push_damped_newton(n, TRIAL_FACTORISATIONS)
 
 
-cdef inline bint repeated(newton_t* n) noexcept nogil:
-    """A Newton step on the last point, in n.u; False where it leads nowhere."""
+cdef inline bint repeat_correction(newton_t* n) noexcept nogil:
+    """Correct the last point further, in n.u; return False if that fails."""
     cdef path_t* x = &n.path
-    cdef double tau = exponential(x.next), dl, found
-    x.used += 1
-    if not path_factor(n, n.u, tau):
+    cdef double tau = exponential(x.next), dl, change
+    x.factors += 1
+    if not factor_path(n, n.u, tau):
         return False
-    dl = along_curve(n, tau, &found)
-    if not (found < x.previous and found <= 1.0):
+    dl = project_on_parameter(n, tau, &change)
+    if not (change < x.change and change <= 1.0):
         return False
-    advance(n, n.u, &x.next, dl)
-    x.previous = found
-    if found < 0.02:
-        take(n, x.z, n.u)
+    add_step(n, n.u, &x.next, dl)
+    x.change = change
+    if change < 0.02:
+        copy_vector(n, x.z, n.u)
         x.l = x.next
-        new_tangent(n, exponential(x.l))
-        x.at = STEPPING
-    return x.at == STEPPING or x.used < REPEATED
+        compute_tangent(n, exponential(x.l))
+        x.stage = STEPPING
+    return x.stage == STEPPING or x.factors < MAX_REPEATED_CORRECTIONS
 
 
-cdef inline void start(newton_t* n) noexcept nogil:
-    """A Newton step on the first tau."""
+cdef inline void start_path(newton_t* n) noexcept nogil:
+    """Take a Newton step at the first tau; if it does not converge, raise tau and begin anew."""
     cdef path_t* x = &n.path
-    cdef double tau = exponential(x.l), found
-    x.used += 1
-    x.which = LOG_TAU
+    cdef double tau = exponential(x.l), change
+    x.factors += 1
+    x.parameter = LOG_TAU
     x.speed = -1.0
-    if x.used > FIRST_STEPS or not path_factor(n, x.z, tau):
-        x.raised += 1
-        if x.raised > RAISES:
-            leave(n)
-        x.l += logarithm(10.0)                          # stacks carry more than their g says,
-        x.eps *= 0.1                                    # and feel a compliance as much more
-        x.start, x.used = x.l, 0
+    if x.factors > MAX_START_STEPS or not factor_path(n, x.z, tau):
+        x.raises += 1
+        if x.raises > MAX_TAU_RAISES:
+            pop_phase(n)
+        # The lowest contacts of a stack carry a multiple of the load that g suggests, and feel a compliance as much more.
+        x.l += logarithm(10.0)
+        x.eps *= 0.1
+        x.start, x.factors = x.l, 0
         memset(x.z, 0, n.s.e.m * sizeof(double))
         return
-    along_curve(n, tau, &found)
-    advance(n, x.z, &x.l, 0.0)
-    if found < x.exact:
-        new_tangent(n, tau)
-        x.at = STEPPING
+    project_on_parameter(n, tau, &change)
+    add_step(n, x.z, &x.l, 0.0)
+    if change < x.tolerance:
+        compute_tangent(n, tau)
+        x.stage = STEPPING
 
 
-cdef inline void go_path(newton_t* n) noexcept nogil:
-    """A factorisation; until the judge is content, the path is lost, or it returns."""
+cdef inline void step_path(newton_t* n) noexcept nogil:
+    """Do one factorisation of the path, until the judge accepts a point or no step succeeds."""
     cdef path_t* x = &n.path
-    if x.at == TRYING:
-        x.at = STEPPING
-    if done(n) or n.s.factorisations >= x.last or x.l > x.start + 1.0 or x.l < logarithm(1e-13 * x.size):
-        leave(n)
+    cdef int32_t outcome
+    if x.stage == TRYING:
+        x.stage = STEPPING
+    if is_finished(n) or n.s.factorisations >= x.last or x.l > x.start + 1.0 or x.l < logarithm(1e-13 * x.size):
+        pop_phase(n)
         return
-    if x.at == STARTING:
-        start(n)
+    if x.stage == STARTING:
+        start_path(n)
         return
-    if x.at == REPEATING:
-        if repeated(n):
+    if x.stage == REPEATING:
+        if repeat_correction(n):
             return
-        if not go_back(n):
-            leave(n)
+        if not return_to_saved_point(n):
+            pop_phase(n)
             return
-        x.at = STEPPING
-    if x.at == STEPPING:
-        predict(n)
-    if corrected(n):
-        accept(n)
+        x.stage = STEPPING
+    if x.stage == STEPPING:
+        predict_point(n)
+    outcome = correct_point(n)
+    if outcome == ON_CURVE:
+        accept_point(n)
+    if outcome != DIVERGING:
         return
-    if x.previous > 0.0:
-        return
+    # The step fails: halve it; after every second failure correct the last point further.
     x.h *= 0.5
-    x.shorter += 1
-    x.at = STEPPING
-    if x.shorter >= 2:
-        x.bends = 0
-    if x.shorter % SHORTER == 0:
-        take(n, n.u, x.z)
-        x.next, x.used, x.previous = x.l, 0, 1.0 / 0.0
-        x.at = REPEATING
+    x.halvings += 1
+    x.stage = STEPPING
+    if x.halvings % HALVINGS_TO_REPEAT == 0:
+        copy_vector(n, n.u, x.z)
+        x.next, x.factors, x.change = x.l, 0, 1.0 / 0.0
+        x.stage = REPEATING
     elif x.h < 1e-6:
-        leave(n)
+        pop_phase(n)

@@ -1,18 +1,18 @@
-"""What Newton's method consists of, one factorisation at a time: exchanges, interior points, proximal rounds.
+"""The phases of Newton's method, one factorisation at a time: active-set exchanges, interior points, damped Newton.
 
-    exchanges   F(z) = z - Pi(z - (H z - g)) = 0,   (I - P + P H) dz = -F                                 (1)
-    rounds      F_c(z) = z - Pi(z - (H z - g) - alpha (z - c)),   c = z of the last round                (2)
+    active set      F(z) = z - Pi(z - (H z - g)) = 0,   (I - P + P H) dz = -F                                 (1)
+    damped Newton   F_c(z) = z - Pi(z - (H z - g) - alpha (z - c)),   c = z of the last proximal iteration    (2)
 
-Exchanges solve the rows inside their bounds, rows with the wrong sign change sides, and so on: the primal-dual active
-set method (Qi, Sun 1993; Hintermueller, Ito, Kunisch 2002). Where rows depend on each other it may go round in circles:
-it is given up where the contraction of the number of rows c_k that change their side promises more steps than an
-interior point takes, or c_k stands still,
+An exchange solves the rows inside their bounds; rows with the wrong sign then change their active bound. This is the
+primal-dual active set method (Qi, Sun 1993; Hintermueller, Ito, Kunisch 2002). If rows depend on each other it may
+cycle. It ends if the contraction of the number of rows c_k that change their bound predicts more steps than an interior
+point takes, or if c_k does not fall:
 
-    k log(c_k) / log(c_0 / c_k)         exchanges left after the k-th                                   (3)
+    k log(c_k) / log(c_0 / c_k)         exchanges left after the k-th                                         (3)
 
-Rounds are the proximal point method (Rockafellar 1976): the inner problem is strongly monotone where H is monotone, and
-steps pass a non-monotone line search on |F_c| (Grippo, Lampariello, Lucidi 1986). alpha falls the faster the shorter
-the rounds are, and rises where one fails.
+Damped Newton is the proximal point method (Rockafellar 1976): the inner problem is strongly monotone if H is monotone,
+and its Newton steps pass a non-monotone line search on |F_c| (Grippo, Lampariello, Lucidi 1986). alpha falls faster the
+fewer steps an inner problem takes, and rises if one fails.
 """
 from libc.math cimport fabs
 from libc.stdint cimport int32_t
@@ -22,86 +22,117 @@ from lavender_ext.core.block_projection cimport active_bound
 from lavender_ext.core.validate cimport all_finite, norm_inf
 from lavender_ext.core.block_types cimport CONE
 from lavender_ext.judge.score cimport relative
-from lavender_ext.newton.cones cimport cone_gap, cone_size, gather, is_high, is_low
+from lavender_ext.newton.cones cimport cone_gap, cone_size, has_lower_bound, has_upper_bound, load_cone
 from lavender_ext.newton.elements cimport elements_t, is_row
-from lavender_ext.newton.run cimport (APPROACH, EXCHANGES, INNER, INTERIOR, N_AUGMENTED, N_AUGMENTED_DE_SAXCE,
-                                      N_AUGMENTED_INTERIOR, N_DE_SAXCE, N_EXCHANGES, N_INTERIOR, N_ROUNDS, POLISH,
-                                      PROXIMAL, PURSUIT, SECOND, at_floor, begin_apart, done, end_apart, enter, exchange_t,
-                                      leave, progress_t, newton_t, polish_t, proximal_t, pursuit_t, relative_at, score,
-                                      spent, take, with_products)
+from lavender_ext.newton.run cimport (ACTIVE_SET, AUGMENTED_NEWTON, DAMPED_NEWTON, DAMPED_STRETCHES, INTERIOR_POINT,
+                                      INTERIOR_WITH_NEWTON, MAX_INNER_STEPS, N_ACTIVE_SET, N_AUGMENTED_DE_SAXCE,
+                                      N_AUGMENTED_INTERIOR, N_AUGMENTED_NEWTON, N_DE_SAXCE, N_INTERIOR, N_PROXIMAL,
+                                      active_set_t, augmented_newton_t, begin_separate_best, compute_slack,
+                                      convex_residual, copy_vector, damped_newton_t, end_separate_best, is_at_roundoff,
+                                      is_budget_spent, is_finished, newton_t, pop_phase, progress_t, push_phase,
+                                      score_point, stretches_t)
 from lavender_ext.newton.steps cimport interior_step
-from lavender_ext.newton.system cimport (OF_BARRIER, OF_NATURAL, solve_natural, solve_refined, system_factor, system_natural,
+from lavender_ext.newton.system cimport (BARRIER, NATURAL, solve_natural, solve_refined, system_factor, system_natural,
                                          system_solve, system_t, system_times)
 
 
-cdef enum:
-    EXCHANGE_STEPS = 12         # factorisations of an interior point, as it usually takes
-    STILL = 4                   # exchanges in a row after which no fewer rows change than before
-    INTERIOR_STEPS = 1000       # of one interior point at most, whatever the budget
-    INTERIOR_PATIENCE = 15      # steps that halve neither residual nor gap
-    CLOSE_STILL = 3             # steps that do not halve the residual where rounding holds it up
-    END = 12                    # factorisations of the rounds that end an interior point of cones
-    MEMORY = 6                  # steps that the non-monotone line search looks back
-    HALVINGS = 7                # of one step
-    REFINED = 3                 # solves of (4) with one factor
-    RESTS = 4                   # factors of (4) at most, each with fewer elements
-    FREE = 20                   # rounds in a row that cost no factorisation, and so change nothing but the weight
-    FIRST = 8                   # factorisations of the first stretch from the start
-    STRETCH = 12                # factorisations between two checks of what rounds gain
-    STRETCHES = 1000            # of one pursuit at most, whatever its budget
-    TRIAL = 2                   # Newton steps of rounds that try to end an interior point of De Saxce's
-    APPROACH_STEPS = 60         # of one interior point of De Saxce's or of the augmented system at most
-    SHORT_STEPS = 4             # steps in a row that get nowhere before that is given up
-    APPROACH_IDLE = 15          # steps in a row that do not halve the residual, likewise
-    LIMITLESS = 2147483647
+cdef enum:                      # active set
+    TYPICAL_INTERIOR_STEPS = 12     # Exchanges end if (3) predicts more steps than an interior point usually takes.
+    MAX_STALLED_EXCHANGES = 4       # They end if this many in a row do not lower the number of changes.
+
+cdef enum:                      # interior points
+    MAX_INTERIOR_STEPS = 1000       # Limit of one convex interior point, whatever the budget.
+    MAX_IDLE_INTERIOR_STEPS = 15    # It ends if this many steps halve neither residual nor gap.
+    MAX_STALLED_INTERIOR_STEPS = 3  # Below `roundoff_residual` it ends if this many steps do not halve the residual.
+    CERTIFICATE_REFINEMENTS = 3     # Solves of (4) with one factor.
+    MAX_CERTIFICATE_FACTORS = 4     # Factors of (4), each with fewer elements.
+    CONE_END_FACTORISATIONS = 12    # Budget of the damped Newton phase that ends an interior point of cones.
+    MAX_HYBRID_STEPS = 60           # Limit of an interior point with Newton trials; more steps rarely help.
+    MAX_SHORT_STEPS = 4             # It ends after this many short steps in a row: the path has turned back.
+    TRIAL_INNER_STEPS = 2           # Newton steps of a trial to end De Saxce's interior point.
+    AUGMENTED_TRIAL_STEPS = 4       # Augmented Newton steps of a trial.
+    MAX_FAILED_AUGMENTED_STEPS = 2  # A trial ends if this many in a row do not halve the residual.
+
+cdef enum:                      # damped Newton
+    LINE_SEARCH_MEMORY = 6      # Steps that the non-monotone line search looks back.
+    MAX_STEP_HALVINGS = 7       # Halvings of one step; the best length is then taken.
+    MAX_FREE_ITERATIONS = 20    # The phase is stuck after this many iterations in a row without a factorisation.
+    STRETCH_FACTORISATIONS = 12     # Factorisations between two checks of the gain of a phase.
+    MAX_STRETCHES = 1000        # Limit of one phase, whatever the budget.
+    UNLIMITED = 2147483647
 
 
-cdef inline double close_to() noexcept nogil:
-    """Relative residual from which rounding is what holds an interior point up."""
+cdef inline double roundoff_residual() noexcept nogil:
+    """Relative residual below which rounding may stall an interior point."""
     return 1e-6
 
 
-cdef inline double shift_of() noexcept nogil:
-    """Of d, on rows of the augmented system: squared singular values below it count as zero."""
+cdef inline double short_step() noexcept nogil:
+    """Step length of an interior point below which a step counts as short."""
+    return 0.05
+
+
+cdef inline double smallest_gap_ratio() noexcept nogil:
+    """Gap as a fraction of its maximum below which an interior point ends: rounding dominates its scaling."""
+    return 1e-24
+
+
+cdef inline double exchange_weight() noexcept nogil:
+    """Weight eps in the matrix of an exchange, which keeps dependent rows solvable; refinement removes its effect."""
+    return 1e-9
+
+
+cdef inline double augmented_shift() noexcept nogil:
+    """Shift of the augmented system's rows, relative to d: squared singular values below it count as zero."""
     return 1e-14
 
 
-# -- (1) -------------------------------------------------------------------------------------------------------
+cdef inline double smallest_alpha() noexcept nogil:
+    """Proximal weight below which a factorisation does not see it any more."""
+    return 1e-12
 
 
-cdef inline int32_t sides(const elements_t* e, const double* z, const double* hz, int32_t* side, bint counted) noexcept nogil:
-    """The bound that every row rests on by its natural map; how many have changed since, where `counted`."""
-    cdef int32_t j, now, changed = 0
+# -- (1) active set ----------------------------------------------------------------------------------------------------
+
+
+cdef inline void store_active_bounds(const elements_t* e, const double* z, const double* hz, int32_t* bound) noexcept nogil:
+    """Store the bound that is active on each row: -1, 0 or 1."""
+    cdef int32_t j
     for j in range(e.m):
-        now = active_bound(z[j] - hz[j] + e.g[j], e.lower[j], e.upper[j])
-        if counted:
-            changed += now != side[j]
-        else:
-            side[j] = now
+        bound[j] = active_bound(z[j] - hz[j] + e.g[j], e.lower[j], e.upper[j])
+
+
+cdef inline int32_t count_active_bound_changes(const elements_t* e, const double* z, const double* hz,
+                                               const int32_t* bound) noexcept nogil:
+    """Return the number of rows whose active bound differs from the stored one."""
+    cdef int32_t j, changed = 0
+    for j in range(e.m):
+        changed += active_bound(z[j] - hz[j] + e.g[j], e.lower[j], e.upper[j]) != bound[j]
     return changed
 
 
-cdef inline void begin_exchanges(newton_t* n, const double* z) noexcept nogil:
-    cdef exchange_t* x = &n.exchange
-    take(n, x.z, z)
-    take(n, x.kept, z)
+cdef inline void begin_active_set(newton_t* n, const double* z) noexcept nogil:
+    """Begin exchanges from z."""
+    cdef active_set_t* x = &n.active
+    copy_vector(n, x.z, z)
+    copy_vector(n, x.best_z, z)
     system_times(&n.s, x.z, x.hz)
-    x.best = relative_at(n, x.z, x.hz)
-    x.judged = x.first = x.done = x.still = 0
-    x.fewest = LIMITLESS
-    enter(n, EXCHANGES)
+    x.best = convex_residual(n, x.z, x.hz)
+    x.is_scored = x.first_changes = x.exchanges = x.stalled = 0
+    x.fewest_changes = UNLIMITED
+    push_phase(n, ACTIVE_SET)
 
 
-cdef inline bint exchange_once(newton_t* n) noexcept nogil:
-    """One exchange with a weight of 1e-9, which refinement takes away again; False where it is not finite."""
-    cdef exchange_t* x = &n.exchange
+cdef inline bint exchange_rows(newton_t* n) noexcept nogil:
+    """Make one exchange; return False if it is not finite."""
+    cdef active_set_t* x = &n.active
     cdef int32_t j
     cdef bint finite
     for j in range(n.s.e.m):
-        n.rest[j] = x.hz[j] - n.s.e.g[j]
-    sides(n.s.e, x.z, x.hz, x.side, False)
-    system_natural(&n.s, x.z, n.rest, CONE, 1e-9, n.f)
-    system_factor(&n.s, OF_NATURAL, 1e-9)
+        n.slack[j] = x.hz[j] - n.s.e.g[j]
+    store_active_bounds(n.s.e, x.z, x.hz, x.bound)
+    system_natural(&n.s, x.z, n.slack, CONE, exchange_weight(), n.f)
+    system_factor(&n.s, NATURAL, exchange_weight())
     for j in range(n.s.e.m):
         n.f[j] = -n.f[j]
     solve_refined(&n.s, n.f, n.dz, n.r, n.da)
@@ -113,85 +144,104 @@ cdef inline bint exchange_once(newton_t* n) noexcept nogil:
     return finite
 
 
-cdef inline bint too_many(int32_t first, int32_t now, int32_t done_) noexcept nogil:
-    """Does (3) promise more than an interior point takes?"""
+cdef inline bint predicts_too_many(int32_t first, int32_t now, int32_t exchanges) noexcept nogil:
+    """Return whether (3) predicts more exchanges than an interior point takes steps."""
     cdef double a = 1.0, b = 1.0
     cdef int32_t _
-    if done_ == 0 or now <= 1:
+    if exchanges == 0 or now <= 1:
         return False
     if now >= first:
         return True
-    for _ in range(done_):
+    for _ in range(exchanges):
         a *= now
-    for _ in range(EXCHANGE_STEPS):
+    for _ in range(TYPICAL_INTERIOR_STEPS):
         b *= <double>first / now
     return a > b
 
 
-cdef inline void end_exchanges(newton_t* n) noexcept nogil:
-    if not n.exchange.judged:
-        score(n, n.exchange.kept)
-    leave(n)
+cdef inline void end_active_set(newton_t* n) noexcept nogil:
+    """Score the best z and end the phase."""
+    if not n.active.is_scored:
+        score_point(n, n.active.best_z)
+    pop_phase(n)
 
 
-cdef inline void go_exchange(newton_t* n) noexcept nogil:
-    """One exchange of bounded rows, until the judge is content, nothing changes, or (3) promises too little."""
-    cdef exchange_t* x = &n.exchange
-    cdef double found
+cdef inline void step_active_set(newton_t* n) noexcept nogil:
+    """Make one exchange, until the judge accepts, no row changes, or (3) predicts too many."""
+    cdef active_set_t* x = &n.active
+    cdef double residual
     cdef int32_t changed
     cdef bint gains
-    if x.best <= n.tol and not x.judged:
-        x.judged = 1
-        if score(n, x.kept) <= n.tol:
-            leave(n)
+    if x.best <= n.tol and not x.is_scored:
+        x.is_scored = 1
+        if score_point(n, x.best_z) <= n.tol:
+            pop_phase(n)
             return
-    if done(n):
-        end_exchanges(n)
+    if is_finished(n):
+        end_active_set(n)
         return
-    n.counts[N_EXCHANGES] += 1
-    if not exchange_once(n):
-        end_exchanges(n)
+    n.counts[N_ACTIVE_SET] += 1
+    if not exchange_rows(n):
+        end_active_set(n)
         return
-    found = relative_at(n, x.z, x.hz)
-    gains = found < 0.5 * x.best
-    if found < x.best:
-        x.best, x.judged = found, 0
-        take(n, x.kept, x.z)
-    changed = sides(n.s.e, x.z, x.hz, x.side, True)
-    x.still = 0 if changed < x.fewest else x.still + 1
-    x.fewest = changed if changed < x.fewest else x.fewest
-    # The same rows again: what is left of their weight is refined away, as long as that gains.
-    if x.best > n.tol and (not gains if changed == 0 else x.still >= STILL or too_many(x.first, changed, x.done)):
-        end_exchanges(n)
+    residual = convex_residual(n, x.z, x.hz)
+    gains = residual < 0.5 * x.best
+    if residual < x.best:
+        x.best, x.is_scored = residual, 0
+        copy_vector(n, x.best_z, x.z)
+    changed = count_active_bound_changes(n.s.e, x.z, x.hz, x.bound)
+    x.stalled = 0 if changed < x.fewest_changes else x.stalled + 1
+    x.fewest_changes = changed if changed < x.fewest_changes else x.fewest_changes
+    # With the same active rows, further exchanges only refine away the weight; they go on while that gains.
+    if x.best > n.tol and (not gains if changed == 0 else x.stalled >= MAX_STALLED_EXCHANGES
+                           or predicts_too_many(x.first_changes, changed, x.exchanges)):
+        end_active_set(n)
         return
     if not gains and n.tol < x.best < 1e-5:
-        x.judged = 1
-        score(n, x.kept)
-        if at_floor(n):
-            leave(n)
+        x.is_scored = 1
+        score_point(n, x.best_z)
+        if is_at_roundoff(n):
+            pop_phase(n)
             return
-    x.first = x.first if x.first else changed
-    x.done += 1
+    x.first_changes = x.first_changes if x.first_changes else changed
+    x.exchanges += 1
 
 
-# -- interior points of the convex law ---------------------------------------------------------------------------
+# -- interior points of the convex law -----------------------------------------------------------------------------------
 
 
-cdef inline bint ends(const elements_t* e, int32_t i, const double* y) noexcept nogil:
-    """Whether y cannot go on for ever on element i."""
+cdef inline void begin_progress(newton_t* n, double trial_residual) noexcept nogil:
+    """Reset the progress of an interior point."""
+    cdef progress_t* k = &n.progress
+    k.lowest = 1.0 / 0.0
+    k.trial_residual = trial_residual
+    k.idle = k.stalled = k.steps = k.trial_runs = k.augmented = 0
+    copy_vector(n, k.best_z, n.ip.z)
+
+
+cdef inline void begin_interior_steps(newton_t* n, bint bounded_rows) noexcept nogil:
+    """Begin interior point steps from `begin_interior_point`."""
+    begin_progress(n, 1e-2)
+    n.progress.bounded_rows = bounded_rows
+    push_phase(n, INTERIOR_POINT)
+
+
+cdef inline bint leaves_bounds(const elements_t* e, int32_t i, const double* y) noexcept nogil:
+    """Return whether the ray along y leaves the bounds or a cone of element i."""
     cdef int32_t g
     cdef double x[4]
     if is_row(e, i):
-        return (y[e.ptr[i]] < 0.0 and is_low(e, e.ptr[i])) or (y[e.ptr[i]] > 0.0 and is_high(e, e.ptr[i]))
+        return ((y[e.ptr[i]] < 0.0 and has_lower_bound(e, e.ptr[i]))
+                or (y[e.ptr[i]] > 0.0 and has_upper_bound(e, e.ptr[i])))
     for g in range(e.part[i], e.part[i + 1]):
-        gather(e, i, g, y, x)
+        load_cone(e, i, g, y, x)
         if cone_gap(x, cone_size(e, g)) < 0.0:
             return True
     return False
 
 
-cdef inline void rest_on(newton_t* n, int32_t i) noexcept nogil:
-    """`direction` changes nothing on element i."""
+cdef inline void fix_direction(newton_t* n, int32_t i) noexcept nogil:
+    """Set `direction` and the weights of element i to 0."""
     cdef int32_t k
     memset(n.direction + n.s.e.ptr[i], 0, (n.s.e.ptr[i + 1] - n.s.e.ptr[i]) * sizeof(double))
     for k in range(n.s.e.wptr[i], n.s.e.wptr[i + 1]):
@@ -200,165 +250,159 @@ cdef inline void rest_on(newton_t* n, int32_t i) noexcept nogil:
             n.s.bt[k] = 0.0
 
 
-cdef inline void ask_interior(newton_t* n) noexcept nogil:
-    """Without a solution an interior point walks off inside the cones along what H does not see. A proof, if the caller
-    finds it one, is the y with H y = 0 next to its z in the metric of the cones,
+cdef inline void find_interior_certificate(newton_t* n) noexcept nogil:
+    """Compute a direction from a diverging interior point and request a check of it.
+
+    If there is no solution, the interior point diverges along the null space of H. A certificate is the y with H y = 0
+    that is nearest to z in the metric of the cones,
 
         y <- y - (H + W)^-1 H y,   W z = u                                                                (4)
 
-    with W of its last step, on elements whose z outgrows its dual u; those that y would lead out of their bounds rest.
+    with W of the last step. Elements whose z does not exceed its dual u are fixed, and so are those whose bounds y leaves.
     """
     cdef system_t* s = &n.s
     cdef const elements_t* e = s.e
-    cdef int32_t i, j, _, resting = 1, left = RESTS
+    cdef int32_t i, j, _, n_fixed = 1, factors_left = MAX_CERTIFICATE_FACTORS
     if not norm_inf(n.ip.hz, e.m) < 1e-3 * norm_inf(n.ip.z, e.m):
         return
-    take(n, n.direction, n.ip.z)
+    copy_vector(n, n.direction, n.ip.z)
     for i in range(e.n):
         j = e.ptr[i]
         if (not fabs(n.ip.z[j]) > fabs(n.ip.u1[j]) or s.v[e.wptr[i]] * 0.0 != 0.0
-                or (is_row(e, i) and is_low(e, j) and is_high(e, j))):
-            rest_on(n, i)
-    while resting and left and not spent(n):
-        left -= 1
-        system_factor(s, OF_BARRIER, 0.0)
-        for _ in range(REFINED):
-            system_times(s, n.direction, n.rest)
-            system_solve(s, OF_BARRIER, n.rest, n.trial)
+                or (is_row(e, i) and has_lower_bound(e, j) and has_upper_bound(e, j))):
+            fix_direction(n, i)
+    while n_fixed and factors_left and not is_budget_spent(n):
+        factors_left -= 1
+        system_factor(s, BARRIER, 0.0)
+        for _ in range(CERTIFICATE_REFINEMENTS):
+            system_times(s, n.direction, n.slack)
+            system_solve(s, BARRIER, n.slack, n.trial)
             for j in range(e.m):
                 n.direction[j] -= n.trial[j]
-        resting = 0
+        n_fixed = 0
         for i in range(e.n):
-            if ends(e, i, n.direction):
-                rest_on(n, i)
-                resting += 1
-    n.asked = resting == 0
+            if leaves_bounds(e, i, n.direction):
+                fix_direction(n, i)
+                n_fixed += 1
+    n.needs_check = n_fixed == 0
 
 
-cdef inline void begin_progress(newton_t* n, double near) noexcept nogil:
+cdef inline void end_interior_steps(newton_t* n, bint may_continue) noexcept nogil:
+    """Score the best z and end the phase.
+
+    On cones, damped Newton follows close to the solution, and else the search for a certificate.
+    """
     cdef progress_t* k = &n.progress
-    k.lowest = 1.0 / 0.0
-    k.near = near
-    k.idle = k.still = k.steps = k.at = k.augmented = 0
-    take(n, k.kept, n.ip.z)
-
-
-cdef inline void begin_steps(newton_t* n, bint rows) noexcept nogil:
-    """Steps from where the interior point stands."""
-    begin_progress(n, 1e-2)
-    n.progress.rows = rows
-    enter(n, INTERIOR)
-
-
-cdef inline void end_steps(newton_t* n, bint rounds) noexcept nogil:
-    """Its best point is judged; cones close to their end are ended by rounds."""
-    cdef progress_t* k = &n.progress
-    leave(n)
+    pop_phase(n)
     if k.lowest < n.best:
-        score(n, k.kept)
-    if rounds and not k.rows and k.lowest < close_to() and not done(n) and not at_floor(n):
-        begin_rounds(n, 1, k.kept, CONE, 1e-4 if k.lowest > 1e-4 else k.lowest, INNER)
-        enter_rounds(n, 1, END)
-    elif not k.rows and k.lowest >= close_to() and not done(n):
-        ask_interior(n)
+        score_point(n, k.best_z)
+    if may_continue and not k.bounded_rows and k.lowest < roundoff_residual() and not is_finished(n) and not is_at_roundoff(n):
+        begin_damped_newton(n, k.best_z, CONE, k.lowest, MAX_INNER_STEPS)
+        push_damped_newton(n, CONE_END_FACTORISATIONS)
+    elif not k.bounded_rows and k.lowest >= roundoff_residual() and not is_finished(n):
+        find_interior_certificate(n)
 
 
-cdef inline void go_interior(newton_t* n) noexcept nogil:
-    """A step; bounded rows are exchanged at each new decade."""
+cdef inline void step_interior_point(newton_t* n) noexcept nogil:
+    """Take a step; bounded rows are exchanged each time the residual falls by a factor of ten."""
     cdef progress_t* k = &n.progress
-    cdef double found
+    cdef double residual
     cdef bint gains
-    if k.at == 0:
-        if k.steps == INTERIOR_STEPS or done(n) or not interior_step(n):
-            end_steps(n, True)
+    if not k.trial_runs:
+        if k.steps == MAX_INTERIOR_STEPS or is_finished(n) or not interior_step(n):
+            end_interior_steps(n, True)
             return
         k.steps += 1
         n.counts[N_INTERIOR] += 1
-        found = relative(n.ip.energy, n.ip.velocity, n.problem.e0, n.problem.v0)
-        gains = found < 0.5 * k.lowest
-        k.idle = 0 if gains or n.ip.gap < 0.5 * n.ip.lowest_gap else k.idle + 1
-        k.still = 0 if gains else k.still + 1
-        if found < k.lowest:
-            k.lowest = found
-            take(n, k.kept, n.ip.z)
-        if found <= n.tol and score(n, n.ip.z) <= n.tol:
-            end_steps(n, False)
+        residual = relative(n.ip.energy, n.ip.velocity, n.problem.e0, n.problem.v0)
+        gains = residual < 0.5 * k.lowest
+        k.idle = 0 if gains or n.ip.gap < 0.5 * n.ip.min_gap else k.idle + 1
+        k.stalled = 0 if gains else k.stalled + 1
+        if residual < k.lowest:
+            k.lowest = residual
+            copy_vector(n, k.best_z, n.ip.z)
+        if residual <= n.tol and score_point(n, n.ip.z) <= n.tol:
+            end_interior_steps(n, False)
             return
-        if k.rows and found < k.near:
-            k.near = 0.1 * found
-            k.at = 1
-            begin_exchanges(n, n.ip.z)
+        if k.bounded_rows and residual < k.trial_residual:
+            k.trial_residual = 0.1 * residual
+            k.trial_runs = 1
+            begin_active_set(n, n.ip.z)
             return
     else:
-        k.at = 0
-        if n.best < 1e-6 and 0.1 * n.best < k.near:
-            k.near = 0.1 * n.best
-        if done(n) or at_floor(n):
-            end_steps(n, False)
+        k.trial_runs = 0
+        if n.best < roundoff_residual() and 0.1 * n.best < k.trial_residual:
+            k.trial_residual = 0.1 * n.best
+        if is_finished(n) or is_at_roundoff(n):
+            end_interior_steps(n, False)
             return
-    if (k.idle > INTERIOR_PATIENCE or (k.still >= CLOSE_STILL and k.lowest < close_to()) or n.ip.length < 1e-6
-            or n.ip.gap < 1e-24 * n.ip.first_gap):
-        end_steps(n, True)
+    if (k.idle > MAX_IDLE_INTERIOR_STEPS or (k.stalled >= MAX_STALLED_INTERIOR_STEPS and k.lowest < roundoff_residual())
+            or n.ip.length < 1e-6 or n.ip.gap < smallest_gap_ratio() * n.ip.max_gap):
+        end_interior_steps(n, True)
 
 
-# -- (2) -------------------------------------------------------------------------------------------------------
+# -- (2) damped Newton -----------------------------------------------------------------------------------------------------
 
 
-cdef inline void begin_rounds(newton_t* n, int32_t which, const double* z, int32_t law, double alpha,
-                              int32_t inner) noexcept nogil:
-    cdef proximal_t* x = &n.rounds[which]
-    take(n, x.z, z)
-    x.law, x.alpha, x.inner = law, alpha, inner
-    x.slowest = 0.1
-    x.failures = x.idle = x.stuck = x.free = 0
+cdef inline void begin_damped_newton(newton_t* n, const double* z, int32_t law, double alpha,
+                                     int32_t max_inner_steps) noexcept nogil:
+    """Set the start and the proximal weight of a damped Newton phase."""
+    cdef damped_newton_t* x = &n.damped
+    copy_vector(n, x.z, z)
+    x.law, x.alpha, x.max_inner_steps = law, alpha, max_inner_steps
+    x.min_factor = 0.1
+    x.failures = x.idle = x.is_stuck = x.free_iterations = 0
 
 
-cdef inline void enter_rounds(newton_t* n, int32_t which, int32_t limit) noexcept nogil:
-    """On from where they stand, for `limit` factorisations."""
-    cdef proximal_t* x = &n.rounds[which]
-    x.last = n.s.factorisations + limit if limit < LIMITLESS - n.s.factorisations else LIMITLESS
-    x.free = x.at = 0
-    score(n, x.z)
-    enter(n, PROXIMAL + SECOND * which)
+cdef inline void push_damped_newton(newton_t* n, int32_t limit) noexcept nogil:
+    """Start or continue the phase for `limit` factorisations."""
+    cdef damped_newton_t* x = &n.damped
+    x.last = n.s.factorisations + limit if limit < UNLIMITED - n.s.factorisations else UNLIMITED
+    x.free_iterations = x.stage = 0
+    score_point(n, x.z)
+    push_phase(n, DAMPED_NEWTON)
 
 
-cdef inline double size_at(newton_t* n, const proximal_t* x, double t) noexcept nogil:
-    """|F_c| at trial = z + t dz."""
+cdef inline double compute_trial_norm(newton_t* n, const damped_newton_t* x, double t) noexcept nogil:
+    """Return |F_c| at z + t dz, which is written to `trial`."""
     cdef int32_t j
     for j in range(n.s.e.m):
         n.trial[j] = n.u[j] + t * n.dz[j]
-        n.rest[j] = n.hz[j] + t * n.hdz[j] - n.s.e.g[j] + x.alpha * (n.trial[j] - n.c[j])
-    return system_natural(&n.s, n.trial, n.rest, x.law, 0.0, n.f)
+        n.slack[j] = n.hz[j] + t * n.hdz[j] - n.s.e.g[j] + x.alpha * (n.trial[j] - n.c[j])
+    return system_natural(&n.s, n.trial, n.slack, x.law, 0.0, n.f)
 
 
-cdef inline bint inner_step(newton_t* n, proximal_t* x) noexcept nogil:
-    """One Newton step of a round from z in n.u; False where it ends."""
+cdef inline bint take_inner_step(newton_t* n, damped_newton_t* x) noexcept nogil:
+    """Take a Newton step of the inner problem from z in n.u; return False if the inner problem ends."""
     cdef system_t* s = &n.s
     cdef int32_t j, k, _, m = s.e.m
     cdef double size, bound = 0.0, value, best = 1.0 / 0.0, at = 1.0, t = 1.0
-    if x.n == x.inner:
+    if x.inner_steps == x.max_inner_steps:
         return False
+    # Value and derivative of F_c.
     for j in range(m):
-        n.rest[j] = n.hz[j] - s.e.g[j] + x.alpha * (n.u[j] - n.c[j])
-    size = system_natural(s, n.u, n.rest, x.law, x.alpha, n.f)
-    x.history[x.n] = size
-    x.n += 1
-    if (size <= 0.1 * x.history[0] and x.n > 1) or size == 0.0:
-        x.solved = 1
+        n.slack[j] = n.hz[j] - s.e.g[j] + x.alpha * (n.u[j] - n.c[j])
+    size = system_natural(s, n.u, n.slack, x.law, x.alpha, n.f)
+    x.history[x.inner_steps] = size
+    x.inner_steps += 1
+    if (size <= 0.1 * x.history[0] and x.inner_steps > 1) or size == 0.0:
+        x.is_solved = 1
         return False
-    if spent(n):
+    if is_budget_spent(n):
         return False
-    system_factor(s, OF_NATURAL, x.alpha)
+    # Newton direction.
+    system_factor(s, NATURAL, x.alpha)
     for j in range(m):
         n.f[j] = -n.f[j]
     solve_natural(s, n.f, n.dz)
     if not all_finite(n.dz, m):
         return False
     system_times(s, n.dz, n.hdz)
-    for k in range(x.n - MEMORY if x.n > MEMORY else 0, x.n):
+    # Non-monotone line search.
+    for k in range(x.inner_steps - LINE_SEARCH_MEMORY if x.inner_steps > LINE_SEARCH_MEMORY else 0, x.inner_steps):
         bound = x.history[k] if x.history[k] > bound else bound
-    for _ in range(HALVINGS):
-        value = size_at(n, x, t)
+    for _ in range(MAX_STEP_HALVINGS):
+        value = compute_trial_norm(n, x, t)
         if value < best:
             best, at = value, t
         if value <= (1.0 - 1e-4 * t) * bound:
@@ -367,29 +411,37 @@ cdef inline bint inner_step(newton_t* n, proximal_t* x) noexcept nogil:
     for j in range(m):
         n.u[j] += at * n.dz[j]
         n.hz[j] += at * n.hdz[j]
-    return score(n, n.u) > n.tol
+    return score_point(n, n.u) > n.tol
 
 
-cdef inline void adapt(proximal_t* x, int32_t used, bint idle) noexcept nogil:
-    cdef double fall
-    if x.solved:
+cdef inline void adapt_alpha(damped_newton_t* x, int32_t factorisations, bint idle) noexcept nogil:
+    """Lower the proximal weight after a solved inner problem, or raise it after a failure.
+
+    The factors are larger for inner problems with few factorisations. After a single step the active pieces are known,
+    and alpha falls at once to its minimum.
+    """
+    cdef double factor
+    if x.is_solved:
         x.failures = 0
-        fall = 0.05 if used <= 2 else 0.15 if used <= 4 else 0.4 if used <= 8 else 1.0
-        fall = x.slowest if x.slowest > fall else fall
-        if used <= 1 and x.slowest <= 0.1:
-            fall = 2e-3                 # a single step: the pieces are found, and only alpha is in the way
-        x.alpha = x.alpha * fall if x.alpha * fall > 1e-12 else 1e-12       # below, a factorisation sees none
-        x.slowest = 0.5 * x.slowest if x.slowest > 0.1 else 0.05
-        x.idle = x.idle + 1 if x.alpha == 1e-12 and idle else 0
+        factor = 0.05 if factorisations <= 2 else 0.15 if factorisations <= 4 else 0.4 if factorisations <= 8 else 1.0
+        factor = x.min_factor if x.min_factor > factor else factor
+        if factorisations <= 1 and x.min_factor <= 0.1:
+            factor = 2e-3
+        x.alpha = x.alpha * factor if x.alpha * factor > smallest_alpha() else smallest_alpha()
+        x.min_factor = 0.5 * x.min_factor if x.min_factor > 0.1 else 0.05
+        x.idle = x.idle + 1 if x.alpha == smallest_alpha() and idle else 0
     else:
         x.failures += 1
-        x.slowest = 0.2 if x.slowest < 0.2 else 2.0 * x.slowest if x.slowest < 0.35 else 0.7
+        x.min_factor = 0.2 if x.min_factor < 0.2 else 2.0 * x.min_factor if x.min_factor < 0.35 else 0.7
         x.alpha *= 5.0
-    x.stuck = x.idle > 3 or x.failures > 6 or x.alpha > 10.0
+    x.is_stuck = x.idle > 3 or x.failures > 6 or x.alpha > 10.0
 
 
-cdef inline bint ask(newton_t* n, const proximal_t* x) noexcept nogil:
-    """Without a solution rounds walk off along a direction that H does not see: a proof, if the caller finds it one."""
+cdef inline bint request_certificate_check(newton_t* n, const damped_newton_t* x) noexcept nogil:
+    """Write the change of z to `direction` and request a check; return False if it is 0 or not finite.
+
+    If there is no solution, proximal iterations diverge along a direction y with H y = 0, which proves it.
+    """
     cdef int32_t j
     cdef double big
     for j in range(n.s.e.m):
@@ -397,153 +449,159 @@ cdef inline bint ask(newton_t* n, const proximal_t* x) noexcept nogil:
     big = norm_inf(n.direction, n.s.e.m)
     if not 0.0 < big < 1.0 / 0.0:
         return False
-    for j in range(n.s.e.m):            # rounding leaves rows that do not take part slightly on the wrong side
+    for j in range(n.s.e.m):            # Rounding leaves rows that take no part slightly beyond their bounds.
         n.direction[j] = n.direction[j] / big if fabs(n.direction[j]) > 1e-11 * big else 0.0
-    n.asked = 1
+    n.needs_check = 1
     return True
 
 
-cdef inline void go_rounds(newton_t* n, int32_t which) noexcept nogil:
-    """A Newton step of a round, until the judge is content, its factorisations are spent, or nothing moves."""
-    cdef proximal_t* x = &n.rounds[which]
-    cdef int32_t used
+cdef inline void step_damped_newton(newton_t* n) noexcept nogil:
+    """Take a Newton step of a proximal iteration, until the judge accepts, the limit is reached, or it is stuck."""
+    cdef damped_newton_t* x = &n.damped
+    cdef int32_t factorisations
     cdef bint idle
-    if x.at == 0:
-        if done(n) or x.stuck or n.s.factorisations >= x.last:
-            leave(n)
+    # Begin a proximal iteration.
+    if x.stage == 0:
+        if is_finished(n) or x.is_stuck or n.s.factorisations >= x.last:
+            pop_phase(n)
             return
-        x.before, x.begun = n.best, n.s.factorisations
-        x.n = x.solved = 0
-        x.at = 1
-        take(n, n.c, x.z)
-        take(n, n.u, x.z)
+        x.earlier_best, x.first = n.best, n.s.factorisations
+        x.inner_steps = x.is_solved = 0
+        x.stage = 1
+        copy_vector(n, n.c, x.z)
+        copy_vector(n, n.u, x.z)
         system_times(&n.s, n.u, n.hz)
-    if x.at == 1:
-        if inner_step(n, x):
+    # Take a step of its inner problem.
+    if x.stage == 1:
+        if take_inner_step(n, x):
             return
-        if x.solved or x.history[x.n - 1] <= x.history[0]:
-            take(n, x.z, n.u)
-        x.at = 2
-        if x.law == CONE and x.solved and n.best > 0.5 * x.before and n.best > 1e-8 and ask(n, x):
+        if x.is_solved or x.history[x.inner_steps - 1] <= x.history[0]:
+            copy_vector(n, x.z, n.u)
+        x.stage = 2
+        if (x.law == CONE and x.is_solved and n.best > 0.5 * x.earlier_best and n.best > 1e-8
+                and request_certificate_check(n, x)):
             return
-    x.at = 0
+    # End the iteration; the caller has checked a direction.
+    x.stage = 0
     if n.proven:
-        leave(n)
+        pop_phase(n)
         return
-    used = n.s.factorisations - x.begun
-    idle = n.best > 0.5 * x.before or n.best == 1.0 / 0.0
-    n.counts[N_ROUNDS] += 1
-    if n.best > 0.5 * x.before and at_floor(n):
-        leave(n)
+    factorisations = n.s.factorisations - x.first
+    idle = n.best > 0.5 * x.earlier_best or n.best == 1.0 / 0.0
+    n.counts[N_PROXIMAL] += 1
+    if n.best > 0.5 * x.earlier_best and is_at_roundoff(n):
+        pop_phase(n)
         return
-    adapt(x, used, idle)
-    x.free = x.free + 1 if used == 0 else 0
-    x.stuck = x.stuck or x.free > FREE
+    adapt_alpha(x, factorisations, idle)
+    x.free_iterations = x.free_iterations + 1 if factorisations == 0 else 0
+    x.is_stuck = x.is_stuck or x.free_iterations > MAX_FREE_ITERATIONS
 
 
-cdef inline void pursue(newton_t* n, int32_t which, int32_t length, double last) noexcept nogil:
-    """Rounds, first for `length` factorisations, after which half of `last` is to be reached."""
-    n.pursuit.last, n.pursuit.length = last, length
-    n.pursuit.which = which
-    n.pursuit.at = n.pursuit.stretches = 0
-    enter(n, PURSUIT)
+cdef inline void begin_stretches(newton_t* n, int32_t length, double residual) noexcept nogil:
+    """Begin a damped Newton phase that must reach half of `residual` in `length` factorisations."""
+    n.stretches.residual, n.stretches.length = residual, length
+    n.stretches.is_running = n.stretches.stretches = 0
+    push_phase(n, DAMPED_STRETCHES)
 
 
-cdef inline void go_pursuit(newton_t* n) noexcept nogil:
-    """Rounds as long as each stretch halves its residual."""
-    cdef pursuit_t* x = &n.pursuit
+cdef inline void step_stretches(newton_t* n) noexcept nogil:
+    """Continue the damped Newton phase as long as each stretch halves its residual."""
+    cdef stretches_t* x = &n.stretches
     cdef double best
-    if x.at == 0:
-        if done(n) or n.rounds[x.which].stuck or x.stretches == STRETCHES:
-            leave(n)
+    if not x.is_running:
+        if is_finished(n) or n.damped.is_stuck or x.stretches == MAX_STRETCHES:
+            pop_phase(n)
             return
-        x.at = 1
+        x.is_running = 1
         x.stretches += 1
-        begin_apart(n)
-        enter_rounds(n, x.which, x.length)
+        begin_separate_best(n)
+        push_damped_newton(n, x.length)
         return
-    x.at = 0
-    best = end_apart(n, NULL)
-    if best > 0.5 * x.last or best == 1.0 / 0.0 or at_floor(n):
-        leave(n)
+    x.is_running = 0
+    best = end_separate_best(n, NULL)
+    if best > 0.5 * x.residual or best == 1.0 / 0.0 or is_at_roundoff(n):
+        pop_phase(n)
         return
-    x.last, x.length = best, STRETCH
-    n.rounds[x.which].inner = INNER
+    x.residual, x.length = best, STRETCH_FACTORISATIONS
+    n.damped.max_inner_steps = MAX_INNER_STEPS
 
 
-# -- interior points that Newton steps end -------------------------------------------------------------------------
+# -- interior points with Newton trials ------------------------------------------------------------------------------------
 
 
-cdef inline void begin_approach(newton_t* n, int32_t law, int32_t augmented) noexcept nogil:
+cdef inline void begin_interior_with_newton(newton_t* n, int32_t law, int32_t augmented) noexcept nogil:
+    """Begin steps of De Saxce's interior point, or of an augmented one, with trials by Newton steps of `law`."""
     begin_progress(n, 1e-5 if augmented else 1e-3)
     n.progress.law, n.progress.augmented = law, augmented
-    enter(n, APPROACH)
+    push_phase(n, INTERIOR_WITH_NEWTON)
 
 
-cdef inline void go_approach(newton_t* n) noexcept nogil:
-    """A step, and Newton steps of `law`, until the judge is content or they get nowhere."""
+cdef inline void step_interior_with_newton(newton_t* n) noexcept nogil:
+    """Take a step, and try Newton steps each time the residual falls by a factor of ten."""
     cdef progress_t* k = &n.progress
-    cdef double found
-    cdef bint went
-    if k.at == 0:
+    cdef double residual
+    cdef bint succeeded
+    if not k.trial_runs:
         n.s.augmented = k.augmented
-        went = k.steps < APPROACH_STEPS and not done(n) and interior_step(n)
+        succeeded = k.steps < MAX_HYBRID_STEPS and not is_finished(n) and interior_step(n)
         n.s.augmented = 0
-        if not went:
-            leave(n)
+        if not succeeded:
+            pop_phase(n)
             return
         k.steps += 1
         if k.law == CONE:
             n.counts[N_AUGMENTED_INTERIOR] += 1
         else:
             n.counts[N_AUGMENTED_DE_SAXCE if k.augmented else N_DE_SAXCE] += 1
-        found = score(n, n.ip.z)
-        k.idle = 0 if found < 0.5 * k.lowest else k.idle + 1
-        if found < k.lowest:
-            k.lowest = found
-            take(n, k.kept, n.ip.z)
-        if found < k.near and not done(n):
-            k.near = 0.1 * found
-            k.at = 1
+        residual = score_point(n, n.ip.z)
+        k.idle = 0 if residual < 0.5 * k.lowest else k.idle + 1
+        if residual < k.lowest:
+            k.lowest = residual
+            copy_vector(n, k.best_z, n.ip.z)
+        if residual < k.trial_residual and not is_finished(n):
+            k.trial_residual = 0.1 * residual
+            k.trial_runs = 1
             if k.augmented:
-                begin_polish(n, n.ip.z, 2, 4)
+                begin_augmented_newton(n, n.ip.z)
             else:
-                begin_rounds(n, 1, n.ip.z, k.law, found, TRIAL)
-                enter_rounds(n, 1, 1)
+                begin_damped_newton(n, n.ip.z, k.law, residual, TRIAL_INNER_STEPS)
+                push_damped_newton(n, 1)
             return
-    if k.at == 1:
-        k.at = 0
-        if at_floor(n):
-            leave(n)
+    else:
+        k.trial_runs = 0
+        if is_at_roundoff(n):
+            pop_phase(n)
             return
-    k.still = k.still + 1 if n.ip.length < 0.05 else 0
-    if k.still >= SHORT_STEPS or (k.idle > APPROACH_IDLE and k.lowest < 1e-5) or n.ip.gap < 1e-24 * n.ip.first_gap:
-        leave(n)
+    k.stalled = k.stalled + 1 if n.ip.length < short_step() else 0
+    if (k.stalled >= MAX_SHORT_STEPS or (k.idle > MAX_IDLE_INTERIOR_STEPS and k.lowest < 1e-5)
+            or n.ip.gap < smallest_gap_ratio() * n.ip.max_gap):
+        pop_phase(n)
 
 
-cdef inline void begin_polish(newton_t* n, const double* z, int32_t patience, int32_t limit) noexcept nogil:
-    cdef polish_t* x = &n.polish
-    take(n, x.z, z)
-    x.best = score(n, z)
-    x.worse = 0
-    x.patience, x.left = patience, limit
-    enter(n, POLISH)
+cdef inline void begin_augmented_newton(newton_t* n, const double* z) noexcept nogil:
+    """Begin Newton steps on the augmented system from z."""
+    cdef augmented_newton_t* x = &n.augmented
+    copy_vector(n, x.z, z)
+    x.best = score_point(n, z)
+    x.failed = 0
+    x.steps_left = AUGMENTED_TRIAL_STEPS
+    push_phase(n, AUGMENTED_NEWTON)
 
 
-cdef inline void go_polish(newton_t* n) noexcept nogil:
-    """A Newton step through the augmented system, until the judge is content or `patience` of them gain nothing."""
-    cdef polish_t* x = &n.polish
+cdef inline void step_augmented_newton(newton_t* n) noexcept nogil:
+    """Take a Newton step on the augmented system, until the judge accepts or steps do not gain."""
+    cdef augmented_newton_t* x = &n.augmented
     cdef int32_t j
-    cdef double found
-    if x.left == 0 or done(n):
-        leave(n)
+    cdef double residual
+    if x.steps_left == 0 or is_finished(n):
+        pop_phase(n)
         return
-    x.left -= 1
+    x.steps_left -= 1
     n.s.augmented = 1
-    with_products(n, x.z, n.rest)
-    system_natural(&n.s, x.z, n.rest, n.progress.law, shift_of(), n.f)
-    system_factor(&n.s, OF_NATURAL, shift_of())
-    n.counts[N_AUGMENTED] += 1
+    compute_slack(n, x.z, n.slack)
+    system_natural(&n.s, x.z, n.slack, n.progress.law, augmented_shift(), n.f)
+    system_factor(&n.s, NATURAL, augmented_shift())
+    n.counts[N_AUGMENTED_NEWTON] += 1
     for j in range(n.s.e.m):
         n.f[j] = -n.f[j]
     solve_refined(&n.s, n.f, n.dz, n.r, n.da)
@@ -551,10 +609,10 @@ cdef inline void go_polish(newton_t* n) noexcept nogil:
     for j in range(n.s.e.m):
         x.z[j] += n.dz[j]
     if not all_finite(x.z, n.s.e.m):
-        leave(n)
+        pop_phase(n)
         return
-    found = score(n, x.z)
-    x.worse = 0 if found < 0.5 * x.best else x.worse + 1
-    x.best = found if found < x.best else x.best
-    if x.worse >= x.patience or (x.worse and at_floor(n)):
-        leave(n)
+    residual = score_point(n, x.z)
+    x.failed = 0 if residual < 0.5 * x.best else x.failed + 1
+    x.best = residual if residual < x.best else x.best
+    if x.failed >= MAX_FAILED_AUGMENTED_STEPS or (x.failed and is_at_roundoff(n)):
+        pop_phase(n)

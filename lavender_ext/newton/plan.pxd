@@ -1,363 +1,385 @@
-"""What Newton's method tries when.
+"""The plan of Newton's method: which phase follows which.
 
-Bounded rows: exchanges from the warm start and from the solution of H z = g; of bodies and sparse matrices proximal rounds,
-as long as they get anywhere, which pass rows that depend on each other; an interior point, exchanges at each of its decades.
-Cones: interior points with two weights. What these leave: the augmented system of bodies, proximal rounds.
+    law             state                     phase                                               next state if unsolved
+    bounded rows    START_ACTIVE_SET          exchanges from a given start                        UNBOUNDED_ACTIVE_SET
+                    UNBOUNDED_ACTIVE_SET      refinement and exchanges from H z = g               ROWS_DAMPED_NEWTON
+                    ROWS_DAMPED_NEWTON        proximal damped Newton while it gains, over bodies  ROWS_INTERIOR_POINT
+                                              and for a sparse A without symmetry
+                    ROWS_INTERIOR_POINT       interior point, exchanges at each decade            AUGMENTED_INTERIOR_POINT
+    cones           FIRST_CONE_WEIGHT         interior point, proximal weight 1e-8                SECOND_CONE_WEIGHT
+                    SECOND_CONE_WEIGHT        interior point, proximal weight 1e-10               AUGMENTED_INTERIOR_POINT
+    both            AUGMENTED_INTERIOR_POINT  interior point on the augmented system of bodies    CONVEX_DAMPED_NEWTON
+                    CONVEX_DAMPED_NEWTON      proximal damped Newton; its direction may prove     CONVEX_END
+                                              that there is no solution
+    Coulomb's       START_DAMPED_NEWTON       proximal damped Newton from the start               FIRST_DE_SAXCE
+                    FIRST_DE_SAXCE            De Saxce's interior point, 0.95 of phi's derivative FIRST_PATH
+                    FIRST_PATH                path of smoothed problems, unless joints are rigid  SECOND_DE_SAXCE
+                    SECOND_DE_SAXCE           De Saxce's interior point with 0.7 of it            AUGMENTED_DE_SAXCE
+                    AUGMENTED_DE_SAXCE        the same on the augmented system, if joints are     MORE_PATHS
+                                              rigid
+                    MORE_PATHS                paths with other ratios of smoothing                COULOMB_DAMPED_NEWTON
+                    COULOMB_DAMPED_NEWTON     proximal damped Newton from the best point          COULOMB_END
 
-Coulomb friction: proximal rounds on the Alart-Curnier map from the start, as long as they get anywhere; De Saxce's
-interior point, ended by rounds; a path of smoothed problems, but for closed loops of joints; De Saxce's with less of phi's
-derivative; closed loops through the augmented system; rounds from the answer of the convex relaxation, then from nothing;
-more paths; and the first rounds again for what is left of the budget.
+Every state ends the solve as soon as the best point is within tol or at the round-off limit, a certificate is proven,
+or the budget is spent. De Saxce's interior point has states of its own:
+
+    DE_SAXCE_INTERIOR    interior point                              far from a solution: end;  else DE_SAXCE_FIRST_END
+                         on the augmented system                     the same with 0.95 of phi's derivative, then end
+    DE_SAXCE_FIRST_END   damped Newton from its best point           DE_SAXCE_SECOND_END
+    DE_SAXCE_SECOND_END  the same with a smaller proximal weight     end
 """
 from libc.math cimport sqrt
 from libc.stdint cimport int32_t
-from libc.string cimport memset
 
-from lavender_ext.core.method cimport CERTIFICATE, ROUNDOFF_LIMIT, MORE, REACHED, SPENT, STUCK
+from lavender_ext.core.method cimport CERTIFICATE, MORE, REACHED, ROUNDOFF_LIMIT, SPENT, STUCK
 from lavender_ext.core.block_types cimport CONE, COULOMB
 from lavender_ext.core.start cimport is_zero_impulse
 from lavender_ext.judge.score cimport relative
-from lavender_ext.newton.cones cimport is_high, is_low
-from lavender_ext.newton.phases cimport (FIRST, LIMITLESS, STRETCH, begin_approach, begin_exchanges, begin_rounds, begin_steps,
-                                         enter_rounds, go_approach, go_exchange, go_interior, go_polish, go_pursuit,
-                                         go_rounds, pursue, shift_of)
-from lavender_ext.newton.path cimport PATHS, begin_path, go_path
-from lavender_ext.newton.run cimport (APPROACH, DE_SAXCE, EXCHANGES, INNER, INTERIOR, N_COUNTED, N_REFINED, N_RELAXED, PATH,
-                                      PLAN_CONVEX, PLAN_COULOMB, POLISH, PROXIMAL, PURSUIT, RELAXED, SECOND, at_floor,
-                                      begin_apart, done, end_apart, enter, leave, newton_t, put_aside, score, spent, take,
-                                      take_back, tries_t, unknown_of, with_products)
-from lavender_ext.newton.steps cimport begin_interior, delta_of, has_free_rows, interior_step
-from lavender_ext.newton.system cimport BODIES, DENSE, OF_BARRIER, system_factor, system_natural, system_solve, system_times
+from lavender_ext.newton.cones cimport has_lower_bound, has_upper_bound
+from lavender_ext.newton.path cimport N_PATHS, begin_path, step_path
+from lavender_ext.newton.phases cimport (STRETCH_FACTORISATIONS, UNLIMITED, augmented_shift, begin_active_set,
+                                         begin_damped_newton, begin_interior_steps, begin_interior_with_newton,
+                                         begin_stretches, push_damped_newton, step_active_set, step_augmented_newton,
+                                         step_damped_newton, step_interior_point, step_interior_with_newton,
+                                         step_stretches)
+from lavender_ext.newton.run cimport (ACTIVE_SET, AUGMENTED_NEWTON, DAMPED_NEWTON, DAMPED_STRETCHES, DE_SAXCE,
+                                      INTERIOR_POINT, INTERIOR_WITH_NEWTON, MAX_INNER_STEPS, N_COUNTED, N_REFINEMENTS,
+                                      PLAN_CONVEX, PLAN_COULOMB, begin_separate_best, compute_slack, copy_vector,
+                                      de_saxce_t, end_separate_best, is_at_roundoff, is_budget_spent, is_finished,
+                                      is_over, newton_t, pop_phase, push_phase, restore_best_of_all,
+                                      restore_earlier_best, score_point, store_earlier_best, write_unknown)
+from lavender_ext.newton.steps cimport begin_interior_point, has_free_rows, proximal_weight
+from lavender_ext.newton.system cimport BARRIER, BODIES, SPARSE, system_factor, system_solve
 
+
+cdef enum:                      # states of PLAN_CONVEX
+    START_ACTIVE_SET = 0
+    UNBOUNDED_ACTIVE_SET = 1
+    ROWS_DAMPED_NEWTON = 2
+    ROWS_INTERIOR_POINT = 3
+    FIRST_CONE_WEIGHT = 4
+    SECOND_CONE_WEIGHT = 5
+    AUGMENTED_INTERIOR_POINT = 6
+    CONVEX_DAMPED_NEWTON = 7
+    CONVEX_END = 8
+
+cdef enum:                      # states of PLAN_COULOMB
+    START_DAMPED_NEWTON = 0
+    FIRST_DE_SAXCE = 1
+    FIRST_PATH = 2
+    SECOND_DE_SAXCE = 3
+    AUGMENTED_DE_SAXCE = 4
+    MORE_PATHS = 5
+    COULOMB_DAMPED_NEWTON = 6
+    COULOMB_END = 7
+
+cdef enum:                      # states of DE_SAXCE
+    DE_SAXCE_INTERIOR = 0
+    DE_SAXCE_FIRST_END = 1
+    DE_SAXCE_SECOND_END = 2
+    DE_SAXCE_ENDED = 3
 
 cdef enum:
-    REFINEMENTS = 3             # of a first point,
-    MORE_REFINEMENTS = 20       # and with another factor of rows that all hold
-    RELAXED_STEPS = 30          # of the convex problem that rounds start from, at most
-    LARGEST_AUGMENTED = 10000   # rows, up to which one factorisation stays well below 0.2 s
+    POINT_REFINEMENTS = 3       # Refinements of the first point with the factor of its weighted system.
+    EXACT_POINT_REFINEMENTS = 20    # Refinements of linear rows with a factor of nearly no weight, which is less exact.
+    START_FACTORISATIONS = 8    # First stretch of damped Newton; a start near a solution gains within it.
+    FIRST_END_INNER_STEPS = 10
+    FIRST_END_FACTORISATIONS = 15   # Budget of the first damped Newton phase after De Saxce's interior point.
+    SECOND_END_FACTORISATIONS = 12  # Budget and inner steps of the second one.
+    MAX_AUGMENTED_ROWS = 10000  # Above this, one factorisation of the augmented system may exceed 0.2 s.
 
 
-cdef inline double share_of(const tries_t* x) noexcept nogil:
-    """Of phi's derivative: the nearer to 1, the faster an interior point ends; further below it passes more folds.
-
-    Closed loops begin below: no rounds follow their augmented system.
-    """
-    return 0.95 if x.augmented == x.second else 0.7
+cdef inline double first_derivative_fraction() noexcept nogil:
+    """Fraction of phi's derivative in the first De Saxce interior point: near 1 it ends faster, but passes fewer folds."""
+    return 0.95
 
 
-cdef inline double first_gain() noexcept nogil:
-    """Residual over that of the start after FIRST factorisations, above which rounds give way to an interior point."""
+cdef inline double second_derivative_fraction() noexcept nogil:
+    """The same after a failure, and first on the augmented system, which has no damped Newton phase to end it."""
+    return 0.7
+
+
+cdef inline double far_from_end() noexcept nogil:
+    """Residual of De Saxce's interior point above which damped Newton does not end it."""
+    return 1e-2
+
+
+cdef inline double max_start_gain() noexcept nogil:
+    """Residual, relative to the start, above which damped Newton gives way to an interior point after its first stretch."""
     return 0.9
 
 
-cdef inline double cone_delta() noexcept nogil:
-    """Proximal weight on cones: their scaling spans more than that of rows, and what N loses to rounding is 2^-53 over
-    it (measured on a redundant pyramid: 3e-8 is the end at 1e-10, 4e-10 at 1e-8, and 1e-6 costs a step more)."""
+cdef inline double start_alpha() noexcept nogil:
+    """First proximal weight of damped Newton from the start; 1e-4 to 1e-7 take 2,030 to 2,530 factors of 68."""
+    return 1e-5
+
+
+cdef inline double first_cone_weight() noexcept nogil:
+    """Proximal weight on cones, whose scaling spans more than that of rows; N loses 2^-53 / weight to rounding.
+
+    On a redundant pyramid 1e-10 ends at 3e-8 and 1e-8 at 4e-10; 1e-6 takes a step more.
+    """
     return 1e-8
 
 
-cdef inline bint over(newton_t* n) noexcept nogil:
-    return done(n) or at_floor(n)
+# -- first points of bounded rows --------------------------------------------------------------------------------------
 
 
-# -- bounded rows and cones --------------------------------------------------------------------------------------
-
-
-cdef inline void refine(newton_t* n, double* z, int32_t most, double contraction) noexcept nogil:
-    """z + (H + W)^-1 (g - H z) with the last factor, while that contracts what is left."""
+cdef inline void refine_point(newton_t* n, double* z, int32_t max_refinements, double contraction) noexcept nogil:
+    """Refine z <- z + (H + W)^-1 (g - H z) with the last factor while |g - H z| contracts; score it if it is within tol."""
     cdef int32_t j, _, m = n.s.e.m
-    cdef double size = 0.0, before, found = 1.0 / 0.0, fast, x
-    with_products(n, z, n.r)
+    cdef double size = 0.0, before, residual = 1.0 / 0.0, velocity, x
+    compute_slack(n, z, n.r)
     for j in range(m):
         size += n.r[j] * n.r[j]
     size = sqrt(size)
-    for _ in range(most):
-        system_solve(&n.s, OF_BARRIER, n.r, n.dz)
+    for _ in range(max_refinements):
+        system_solve(&n.s, BARRIER, n.r, n.dz)
         for j in range(m):
             z[j] -= n.dz[j]
-        n.counts[N_REFINED] += 1
-        with_products(n, z, n.r)
+        n.counts[N_REFINEMENTS] += 1
+        compute_slack(n, z, n.r)
         before = size
-        size = fast = 0.0
+        size = velocity = 0.0
         for j in range(m):
             size += n.r[j] * n.r[j]
             x = n.sc.speed[j] * (n.r[j] if n.r[j] > 0.0 else -n.r[j])
-            fast = x if x > fast else fast
-        size = sqrt(size)                               # |F| where every row still holds
-        found = relative(size, fast, n.problem.e0, n.problem.v0)
-        if not size < contraction * before or found <= 1e-3 * n.tol:
+            velocity = x if x > velocity else velocity
+        size = sqrt(size)                               # |F| if all rows stay inside their bounds.
+        residual = relative(size, velocity, n.problem.e0, n.problem.v0)
+        if not size < contraction * before or residual <= 1e-3 * n.tol:
             break
-    if found <= n.tol:
-        score(n, z)
+    if residual <= n.tol:
+        score_point(n, z)
 
 
-cdef inline bint all_hold(newton_t* n, const double* z, bint free) noexcept nogil:
-    """No row has a bound (`free`), or all are inside theirs."""
+cdef inline bint is_inside_bounds(newton_t* n, const double* z, bint require_free) noexcept nogil:
+    """Return whether z is inside all bounds, and with `require_free` whether there are none."""
     cdef int32_t j
     for j in range(n.s.e.m):
-        if free and (is_low(n.s.e, j) or is_high(n.s.e, j)):
+        if require_free and (has_lower_bound(n.s.e, j) or has_upper_bound(n.s.e, j)):
             return False
         if not n.s.e.lower[j] <= z[j] <= n.s.e.upper[j]:
             return False
     return True
 
 
-cdef inline void begin_rows(newton_t* n) noexcept nogil:
-    """The first point of an interior point; H z = g on every row is refined where all of them hold."""
+cdef inline void begin_unbounded_point(newton_t* n) noexcept nogil:
+    """Compute the first point of an interior point; refine the solution of H z = g if it is inside all bounds."""
     cdef int32_t j
-    cdef double* z = n.ip.everything
-    cdef bint linear
-    begin_interior(n, delta_of(), 0.0)
-    linear = all_hold(n, z, True)
-    if not linear and (n.s.form == BODIES or not all_hold(n, z, False)):
+    cdef double* z = n.ip.unbounded_z
+    cdef bint is_linear
+    begin_interior_point(n, proximal_weight(), 0.0)
+    is_linear = is_inside_bounds(n, z, True)
+    if not is_linear and (n.s.form == BODIES or not is_inside_bounds(n, z, False)):
         return
-    # The weight of the first point goes away with the factor that is there; another costs more.
-    take(n, n.trial, z)
-    refine(n, n.trial, REFINEMENTS, 0.1)
-    if linear and not done(n):
-        # Rows that nearly depend on each other feel that weight: with next to none a factor is less exact, and
-        # refinement mends that.
+    # The weight of the first point is refined away with the existing factor.
+    copy_vector(n, n.trial, z)
+    refine_point(n, n.trial, POINT_REFINEMENTS, 0.1)
+    if is_linear and not is_finished(n):
+        # Nearly dependent rows feel that weight. A factor with nearly none is less exact; refinement corrects that.
         for j in range(n.s.e.m):
             n.s.v[j] = 1.0 / (n.s.e.theta[j] + 1e-12)
-        system_factor(&n.s, OF_BARRIER, 0.0)
-        system_solve(&n.s, OF_BARRIER, n.s.e.g, n.trial)
-        refine(n, n.trial, MORE_REFINEMENTS, 1.0)
+        system_factor(&n.s, BARRIER, 0.0)
+        system_solve(&n.s, BARRIER, n.s.e.g, n.trial)
+        refine_point(n, n.trial, EXACT_POINT_REFINEMENTS, 1.0)
 
 
-cdef inline void exchanges_apart(newton_t* n, const double* z) noexcept nogil:
-    """What these leave unfinished is no start for what follows."""
-    n.before = n.best
-    take(n, n.before_z, n.best_z)
-    begin_exchanges(n, z)
+cdef inline void begin_separate_active_set(newton_t* n, const double* z) noexcept nogil:
+    """Begin exchanges from z; an unfinished result of them is no start for the next phase."""
+    store_earlier_best(n)
+    begin_active_set(n, z)
 
 
-cdef inline void go_ends(newton_t* n) noexcept nogil:
-    """Where bounded rows and cones stop short, from `at` 10 on."""
-    if n.at == 10:
-        n.at = 12
-        if n.best < 1e-3 and n.loops:                   # near-dependent rows may be what is in the way
-            n.at = 11
+# -- bounded rows and cones --------------------------------------------------------------------------------------------
+
+
+cdef inline void plan_convex(newton_t* n) noexcept nogil:
+    """Enter the next state of the convex laws."""
+    cdef int32_t state = n.stage
+    n.stage = state + 1
+    if state == UNBOUNDED_ACTIVE_SET and not n.is_cold or state == ROWS_DAMPED_NEWTON:
+        if not is_finished(n):
+            restore_earlier_best(n)
+    if state != START_ACTIVE_SET and state != FIRST_CONE_WEIGHT and is_over(n):
+        state = CONVEX_END
+    if state == START_ACTIVE_SET:
+        if not n.is_cold:
+            begin_separate_active_set(n, n.best_z)
+    elif state == UNBOUNDED_ACTIVE_SET:
+        begin_unbounded_point(n)
+        if not is_finished(n):
+            begin_separate_active_set(n, n.ip.unbounded_z)
+    elif state == ROWS_DAMPED_NEWTON:
+        if n.s.form == BODIES or (n.s.form == SPARSE and not n.s.symmetric):
+            begin_damped_newton(n, n.best_z, CONE, 1e-3, MAX_INNER_STEPS)
+            begin_stretches(n, STRETCH_FACTORISATIONS, 1.0 / 0.0)
+    elif state == ROWS_INTERIOR_POINT:
+        begin_interior_steps(n, True)
+        n.stage = AUGMENTED_INTERIOR_POINT
+    elif state == FIRST_CONE_WEIGHT:
+        begin_interior_point(n, first_cone_weight(), 0.0)
+        begin_interior_steps(n, False)
+    elif state == SECOND_CONE_WEIGHT:
+        begin_interior_point(n, proximal_weight(), 0.0)
+        begin_interior_steps(n, False)
+    elif state == AUGMENTED_INTERIOR_POINT:
+        restore_best_of_all(n)
+        if n.best < 1e-3 and n.has_augmented:           # Nearly dependent rows may prevent the rest.
             n.s.augmented = 1
-            begin_interior(n, shift_of(), 0.0)
+            begin_interior_point(n, augmented_shift(), 0.0)
             n.s.augmented = 0
-            begin_approach(n, CONE, 1)
-        return
-    if n.at == 11:
-        n.at = 12
-        if at_floor(n):
-            n.at = 13
-            return
-    if n.at == 12 and not done(n):
-        n.at = 13
-        begin_rounds(n, 1, n.best_z, CONE, 1e-3, INNER)
-        enter_rounds(n, 1, LIMITLESS)
-        return
-    take_back(n)
-    leave(n)
-
-
-cdef inline void go_convex(newton_t* n) noexcept nogil:
-    cdef int32_t at = n.at
-    if at >= 10:
-        go_ends(n)
-        return
-    n.at += 1
-    if n.s.e.n < n.s.e.m:                               # cones: two weights, where the first itself is in the way
-        if at > 0 and over(n):
-            n.at = 13
-        elif at == 2:
-            n.at = 10
-        else:
-            begin_interior(n, cone_delta() if at == 0 else delta_of(), 0.0)
-            begin_steps(n, False)
-    elif at == 0:
-        if not n.cold:
-            exchanges_apart(n, n.best_z)
-    elif at == 1:
-        if not n.cold and not done(n):
-            put_aside(n, n.before, n.before_z)
-        if over(n):
-            n.at = 13
-        else:
-            begin_rows(n)
-            if not done(n):
-                exchanges_apart(n, n.ip.everything)
-    elif at == 2:
-        if done(n):
-            n.at = 13
-        else:
-            put_aside(n, n.before, n.before_z)
-            if n.s.form != DENSE:
-                begin_rounds(n, 1, n.best_z, CONE, 1e-3, INNER)
-                pursue(n, 1, STRETCH, 1.0 / 0.0)
-    elif at == 3 and not over(n):
-        begin_steps(n, True)
+            begin_interior_with_newton(n, CONE, 1)
+    elif state == CONVEX_DAMPED_NEWTON:
+        begin_damped_newton(n, n.best_z, CONE, 1e-3, MAX_INNER_STEPS)
+        push_damped_newton(n, UNLIMITED)
     else:
-        n.at = 13 if over(n) else 10
-        if n.at == 10:
-            take_back(n)
+        restore_best_of_all(n)
+        pop_phase(n)
 
 
-# -- Coulomb friction --------------------------------------------------------------------------------------------
+# -- Coulomb's law -----------------------------------------------------------------------------------------------------
 
 
-cdef inline void begin_de_saxce(newton_t* n, int32_t augmented, int32_t second) noexcept nogil:
-    n.tries.at = 0
-    n.tries.augmented, n.tries.second = augmented, second
-    enter(n, DE_SAXCE)
+cdef inline void begin_de_saxce(newton_t* n, double derivative_fraction, double max_residual) noexcept nogil:
+    """Begin De Saxce's interior point; damped Newton ends it if its residual is at most `max_residual`."""
+    n.de_saxce = de_saxce_t(derivative_fraction, 0.0, max_residual, DE_SAXCE_INTERIOR, False)
+    push_phase(n, DE_SAXCE)
 
 
-cdef inline void go_de_saxce(newton_t* n) noexcept nogil:
-    """An interior point, ended by Newton's method on the Alart-Curnier map."""
-    cdef tries_t* x = &n.tries
+cdef inline void begin_augmented_de_saxce(newton_t* n) noexcept nogil:
+    """Begin De Saxce's interior point on the augmented system, with two fractions of phi's derivative in turn."""
+    n.de_saxce = de_saxce_t(second_derivative_fraction(), first_derivative_fraction(), 0.0, DE_SAXCE_INTERIOR, True)
+    push_phase(n, DE_SAXCE)
+
+
+cdef inline void begin_de_saxce_end(newton_t* n, double alpha, int32_t max_inner_steps, int32_t limit) noexcept nogil:
+    """Begin damped Newton from the best point of De Saxce's interior point."""
+    begin_damped_newton(n, n.progress.best_z, COULOMB, alpha, max_inner_steps)
+    begin_separate_best(n)
+    push_damped_newton(n, limit)
+
+
+cdef inline void step_de_saxce(newton_t* n) noexcept nogil:
+    """Enter the next state of De Saxce's interior point."""
+    cdef de_saxce_t* x = &n.de_saxce
+    cdef int32_t state = x.stage
     cdef double best
-    if x.at == 0:
-        x.at = 1
+    x.stage = state + 1
+    if state == DE_SAXCE_INTERIOR:
         n.s.augmented = x.augmented
-        begin_interior(n, shift_of() if x.augmented else delta_of(), share_of(x))
+        begin_interior_point(n, augmented_shift() if x.augmented else proximal_weight(), x.derivative_fraction)
         n.s.augmented = 0
-        begin_approach(n, COULOMB, x.augmented)
+        begin_interior_with_newton(n, COULOMB, x.augmented)
         return
-    best = n.progress.lowest if x.at == 1 else end_apart(n, n.progress.kept)
-    if over(n):
-        leave(n)
-        return
-    if x.augmented or x.at == 3 or (not x.second and x.at == 1 and best > 1e-2):    # far from an end: no rounds
-        if x.second or not x.augmented:
-            leave(n)
-        x.at = 0
-        x.second = 1
-        return
-    begin_rounds(n, 1, n.progress.kept, COULOMB, best if best < (1e-3 if x.at == 1 else 1e-7) else
-                 (1e-3 if x.at == 1 else 1e-7), 10 if x.at == 1 else 12)
-    begin_apart(n)
-    enter_rounds(n, 1, 15 if x.at == 1 else 12)
-    x.at += 1
-
-
-cdef inline void begin_relaxed(newton_t* n) noexcept nogil:
-    begin_interior(n, delta_of(), 0.0)
-    memset(n.trial, 0, n.s.e.m * sizeof(double))
-    with_products(n, n.trial, n.rest)
-    n.relaxed = 1e-4 * system_natural(&n.s, n.trial, n.rest, CONE, 0.0, n.f)
-    n.relaxed_at = 0
-    enter(n, RELAXED)
-
-
-cdef inline void go_relaxed(newton_t* n) noexcept nogil:
-    """A step of the convex problem; from its answer, rounds."""
-    if n.relaxed_at < RELAXED_STEPS and not done(n) and interior_step(n):
-        n.relaxed_at += 1
-        n.counts[N_RELAXED] += 1
-        score(n, n.ip.z)
-        if n.ip.energy > n.relaxed:
-            return
-    leave(n)
-    if not done(n):
-        begin_rounds(n, 1, n.ip.z, COULOMB, 1e-3, INNER)
-        pursue(n, 1, STRETCH, 1.0 / 0.0)
-
-
-cdef inline void go_coulomb(newton_t* n) noexcept nogil:
-    cdef int32_t at = n.at
-    # Loops of joints, whose rows nearly depend on each other; known without what solves their augmented system.
-    cdef bint closed = n.s.form == BODIES and n.s.e.m <= LARGEST_AUGMENTED and has_free_rows(n)
-    n.at += 1
-    if at > 0 and over(n):
-        at = 9
-    if at == 0:
-        take(n, n.aside_z, n.best_z)
-        begin_rounds(n, 0, n.best_z, COULOMB, 1e-5, FIRST)     # (1e-4 to 1e-7: 2,030 to 2,530 factors of 68)
-        pursue(n, 0, FIRST, 2.0 * first_gain() * n.best)
-    elif at == 1:
-        begin_de_saxce(n, 0, 0)
-    elif at == 2:                                       # stick and slip that fold the way to a solution
-        if not closed:
-            begin_path(n)
-    elif at == 3:
-        begin_de_saxce(n, 0, 1)
-    elif at == 4:
-        if n.loops and closed:
-            begin_de_saxce(n, 1, 0)
-    elif at == 5:
-        begin_relaxed(n)
-    elif at == 6:                                       # a start that is near no solution may be worse than none
-        if not n.cold:
-            memset(n.trial, 0, n.s.e.m * sizeof(double))
-            begin_rounds(n, 0, n.trial, COULOMB, 1e-5, FIRST)
-            pursue(n, 0, FIRST, 2.0 * first_gain())
-    elif at == 7:
-        if n.path.paths < PATHS:
-            n.at = at
-            begin_path(n)
-    elif at == 8:
-        begin_rounds(n, 0, n.aside_z, COULOMB, 1e-5, INNER)     # they were cut short: anew, from the start
-        enter_rounds(n, 0, LIMITLESS)
+    best = n.progress.lowest if state == DE_SAXCE_FIRST_END else end_separate_best(n, n.progress.best_z)
+    if is_over(n) or state == DE_SAXCE_ENDED:
+        pop_phase(n)
+    elif x.next_fraction > 0.0:
+        x.derivative_fraction, x.next_fraction = x.next_fraction, 0.0
+        x.stage = DE_SAXCE_INTERIOR
+    elif state == DE_SAXCE_FIRST_END and best > x.max_residual:
+        pop_phase(n)
+    elif state == DE_SAXCE_FIRST_END:
+        begin_de_saxce_end(n, min(best, 1e-3), FIRST_END_INNER_STEPS, FIRST_END_FACTORISATIONS)
     else:
-        leave(n)
+        begin_de_saxce_end(n, min(best, 1e-7), SECOND_END_FACTORISATIONS, SECOND_END_FACTORISATIONS)
 
 
-# -- turns -------------------------------------------------------------------------------------------------------
+cdef inline void plan_coulomb(newton_t* n) noexcept nogil:
+    """Enter the next state of Coulomb's law."""
+    cdef int32_t state = n.stage
+    # Loops of rigid joints have nearly dependent rows; the answer must not depend on whether a host can factor their
+    # augmented system.
+    cdef bint has_rigid_joints = n.s.form == BODIES and n.s.e.m <= MAX_AUGMENTED_ROWS and has_free_rows(n)
+    n.stage = state + 1
+    if state != START_DAMPED_NEWTON and is_over(n):
+        state = COULOMB_END
+    if state == START_DAMPED_NEWTON:
+        begin_damped_newton(n, n.best_z, COULOMB, start_alpha(), START_FACTORISATIONS)
+        begin_stretches(n, START_FACTORISATIONS, 2.0 * max_start_gain() * n.best)
+    elif state == FIRST_DE_SAXCE:
+        begin_de_saxce(n, first_derivative_fraction(), far_from_end())
+    elif state == FIRST_PATH:
+        if not has_rigid_joints:
+            begin_path(n)
+    elif state == SECOND_DE_SAXCE:
+        begin_de_saxce(n, second_derivative_fraction(), 1.0 / 0.0)
+    elif state == AUGMENTED_DE_SAXCE:
+        if n.has_augmented and has_rigid_joints:
+            begin_augmented_de_saxce(n)
+    elif state == MORE_PATHS:
+        if n.path.paths < N_PATHS:
+            n.stage = MORE_PATHS
+            begin_path(n)
+    elif state == COULOMB_DAMPED_NEWTON:
+        begin_damped_newton(n, n.best_z, COULOMB, start_alpha(), MAX_INNER_STEPS)
+        push_damped_newton(n, UNLIMITED)
+    else:
+        pop_phase(n)
 
 
-cdef inline void go(newton_t* n) noexcept nogil:
-    """One factorisation of the phase on top, or its end."""
+# -- start and step ----------------------------------------------------------------------------------------------------
+
+
+cdef inline void step_phase(newton_t* n) noexcept nogil:
+    """Do at most one factorisation of the phase on top of the stack, or end it."""
     cdef int32_t phase = n.stack[n.depth - 1]
     if phase == PLAN_CONVEX:
-        go_convex(n)
+        plan_convex(n)
     elif phase == PLAN_COULOMB:
-        go_coulomb(n)
-    elif phase == EXCHANGES:
-        go_exchange(n)
-    elif phase == INTERIOR:
-        go_interior(n)
-    elif phase == PURSUIT:
-        go_pursuit(n)
-    elif phase == APPROACH:
-        go_approach(n)
-    elif phase == POLISH:
-        go_polish(n)
+        plan_coulomb(n)
     elif phase == DE_SAXCE:
-        go_de_saxce(n)
-    elif phase == RELAXED:
-        go_relaxed(n)
-    elif phase == PATH:
-        go_path(n)
+        step_de_saxce(n)
+    elif phase == ACTIVE_SET:
+        step_active_set(n)
+    elif phase == INTERIOR_POINT:
+        step_interior_point(n)
+    elif phase == INTERIOR_WITH_NEWTON:
+        step_interior_with_newton(n)
+    elif phase == AUGMENTED_NEWTON:
+        step_augmented_newton(n)
+    elif phase == DAMPED_NEWTON:
+        step_damped_newton(n)
+    elif phase == DAMPED_STRETCHES:
+        step_stretches(n)
     else:
-        go_rounds(n, phase // SECOND)
+        step_path(n)
 
 
 cdef inline void newton_start(newton_t* n, const double* lam) noexcept nogil:
-    """From lam (rows), with problem, system, tol and budget given."""
+    """Start from lam (rows); problem, system, tol and budget are set."""
     cdef int32_t i
-    n.stop = n.asked = n.proven = n.at = n.set_aside = n.depth = n.path.paths = 0
+    cdef bint has_cones = n.s.e.n < n.s.e.m
+    n.stop = n.needs_check = n.proven = n.has_saved_best = n.depth = n.path.paths = 0
     n.s.augmented = n.s.factorisations = 0
     for i in range(N_COUNTED):
         n.counts[i] = 0
     n.best = 1.0 / 0.0
     n.above_floor = 1.0 / 0.0
-    n.kept.seen = 0
-    n.loops = n.s.form == BODIES and n.s.others != NULL and n.s.e.m <= LARGEST_AUGMENTED
-    n.cold = is_zero_impulse(&n.problem.p, lam)
-    unknown_of(n, lam, n.trial)
-    take(n, n.best_z, n.trial)
-    score(n, n.trial)
-    if not done(n):
-        enter(n, PLAN_COULOMB if n.problem.p.law == COULOMB and n.s.e.n < n.s.e.m else PLAN_CONVEX)
+    n.island_best.seen = 0
+    n.has_augmented = n.s.form == BODIES and n.s.others != NULL and n.s.e.m <= MAX_AUGMENTED_ROWS
+    n.is_cold = is_zero_impulse(&n.problem.p, lam)
+    n.stage = FIRST_CONE_WEIGHT if has_cones and n.problem.p.law != COULOMB else 0
+    write_unknown(n, lam, n.trial)
+    copy_vector(n, n.best_z, n.trial)
+    score_point(n, n.trial)
+    if not is_finished(n):
+        push_phase(n, PLAN_COULOMB if n.problem.p.law == COULOMB and has_cones else PLAN_CONVEX)
 
 
 cdef inline int32_t newton_step(newton_t* n, int32_t work) noexcept nogil:
-    """`work` factorisations more at least, where there is as much to do; how it stands."""
+    """Do at least `work` factorisations, unless the solve ends before; return the outcome so far."""
     cdef int32_t last = n.s.factorisations + work
-    n.asked = 0
-    while n.depth > 0 and not n.asked and (n.stop or n.s.factorisations < last):
-        go(n)
-    if n.asked:
+    n.needs_check = 0
+    while n.depth > 0 and not n.needs_check and (n.stop or n.s.factorisations < last):
+        step_phase(n)
+    if n.needs_check:
         return CERTIFICATE
     if n.depth > 0:
         return MORE
     if n.best <= n.tol:
         return REACHED
-    if at_floor(n):
+    if is_at_roundoff(n):
         return ROUNDOFF_LIMIT
-    return SPENT if spent(n) else STUCK
+    return SPENT if is_budget_spent(n) else STUCK

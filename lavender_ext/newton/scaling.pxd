@@ -1,36 +1,36 @@
-"""The rows of a problem that move, in the scaled unknown of Newton's method, from the problem's own arrays.
+"""Build the scaled problem of Newton's method, without its fixed rows, from the problem's own arrays.
 
     z = D^1/2 lambda,   H = D^-1/2 A D^-1/2,   g = D^-1/2 (b - A fixed)
 
-An element is a bounded row, or a contact with the parts that move. Rows of equal bounds,
-parts without friction and empty rows of A stay where they are. Whole numbers come first (`find_elements`), since the
-workspace of a factor over bodies depends on them, then the numbers (`scale_elements`).
+An element is a bounded row, or a contact with its free friction components. Rows with equal bounds, components without
+friction and empty rows of A are fixed and left out. The integers come first (`find_elements`), since the workspace of a
+factor over bodies depends on them, then the values (`scale_elements`).
 """
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memset
 
-from lavender_ext.core.block_types cimport blocks_t, is_round, is_rows, get_friction_components, friction_components_t
+from lavender_ext.core.block_types cimport blocks_t, friction_components_t, get_friction_components, is_round, is_rows
 from lavender_ext.core.velocity cimport rows_velocity
 from lavender_ext.core.view cimport csr_t, rows_t, view_t
 from lavender_ext.judge.slack cimport general_slack, rows_slack
-from lavender_ext.newton.cones cimport KEPT
+from lavender_ext.newton.cones cimport CONE_SCALING_SIZE
 from lavender_ext.newton.elements cimport elements_t
 
 
 cdef struct scaled_t:
     elements_t e
-    int32_t* keep               # (m) rows that move
-    int32_t* block              # (n) of each element
-    double* fixed               # (rows) impulse of the others
+    int32_t* keep               # (m) rows of the problem that are not fixed
+    int32_t* block              # (n) block of each element
+    double* fixed               # (rows) impulse of the fixed rows
     double* scale               # (m) D^-1/2
     double* speed               # (m) velocity error per unit of the natural map
-    int32_t small               # entries of small matrices
-    int32_t whole               # every row moves
+    int32_t small               # entries of the elements' small matrices
+    int32_t whole               # no row is fixed
 
 
 cdef inline bint is_known(const blocks_t* p) noexcept nogil:
-    """No round cones of more than two tangents."""
+    """Return whether the problem has no round cones of more than two tangents."""
     cdef int32_t i
     for i in range(p.n_blocks):
         if is_round(p, i):
@@ -39,19 +39,22 @@ cdef inline bint is_known(const blocks_t* p) noexcept nogil:
 
 
 cdef inline bint is_row(const blocks_t* p, int32_t i) noexcept nogil:
+    """Return whether block i has bounded rows, or is a contact of a normal alone."""
     return is_rows(p, i) or p.ptr[i + 1] - p.ptr[i] == 1
 
 
-cdef inline double low_of(const blocks_t* p, int32_t i, int32_t j) noexcept nogil:
+cdef inline double lower_bound(const blocks_t* p, int32_t i, int32_t j) noexcept nogil:
+    """Return the lower bound of row j of block i; 0 for rows of a contact."""
     return p.lower[j] if is_rows(p, i) else 0.0
 
 
-cdef inline double high_of(const blocks_t* p, int32_t i, int32_t j) noexcept nogil:
+cdef inline double upper_bound(const blocks_t* p, int32_t i, int32_t j) noexcept nogil:
+    """Return the upper bound of row j of block i; infinity for rows of a contact."""
     return p.upper[j] if is_rows(p, i) else 1.0 / 0.0
 
 
-cdef inline double reach_of(const blocks_t* p, int32_t i, int32_t j) noexcept nogil:
-    """Largest impulse of row j of contact i, behind its normal, over lam_n."""
+cdef inline double component_coefficient(const blocks_t* p, int32_t i, int32_t j) noexcept nogil:
+    """Return the friction coefficient of the component of row j (not the normal) of contact i."""
     cdef friction_components_t q
     cdef int32_t g = 0
     get_friction_components(p, i, &q)
@@ -60,16 +63,16 @@ cdef inline double reach_of(const blocks_t* p, int32_t i, int32_t j) noexcept no
     return q.friction_coefficient[g]
 
 
-cdef inline double compliance_of(const view_t* v, int32_t j) noexcept nogil:
-    """Of row j; that of a given A stands on its diagonal."""
+cdef inline double row_compliance(const view_t* v, int32_t j) noexcept nogil:
+    """Return the compliance of row j; 0 for a given A, whose diagonal includes it."""
     return v.r.compliance[j] if v.r != NULL else v.g.compliance[j] if v.g != NULL else 0.0
 
 
-cdef inline bint is_empty(const view_t* v, int32_t i, int32_t j) noexcept nogil:
-    """Nothing stands in row j of A, of block i."""
+cdef inline bint is_empty_row(const view_t* v, int32_t i, int32_t j) noexcept nogil:
+    """Return whether row j of A, of block i, has no non-zero entry."""
     cdef const rows_t* r = v.r
     cdef int32_t q, b
-    cdef double x = fabs(compliance_of(v, j))
+    cdef double x = fabs(row_compliance(v, j))
     if v.a != NULL:
         for q in range(v.a.indptr[j], v.a.indptr[j + 1]):
             x += fabs(v.a.data[q])
@@ -89,18 +92,18 @@ cdef inline bint is_empty(const view_t* v, int32_t i, int32_t j) noexcept nogil:
     return x == 0.0
 
 
-cdef inline bint stays(const view_t* v, int32_t i, int32_t j, double* at) noexcept nogil:
-    """Row j of block i cannot move; its impulse into `at`."""
+cdef inline bint is_fixed(const view_t* v, int32_t i, int32_t j, double* at) noexcept nogil:
+    """Return whether row j of block i is fixed, and write its impulse to `at`."""
     cdef const blocks_t* p = &v.p
     cdef double x, low, high
     at[0] = 0.0
     if not is_row(p, i):
-        return j > p.ptr[i] and reach_of(p, i, j) == 0.0
-    low, high = low_of(p, i, j), high_of(p, i, j)
+        return j > p.ptr[i] and component_coefficient(p, i, j) == 0.0
+    low, high = lower_bound(p, i, j), upper_bound(p, i, j)
     if low == high:
         at[0] = low
         return True
-    if not is_empty(v, i, j):
+    if not is_empty_row(v, i, j):
         return False
     x = high if p.b[j] > 0.0 else low if p.b[j] < 0.0 else 0.0
     x = x if fabs(x) < 1.0 / 0.0 else 0.0
@@ -108,16 +111,16 @@ cdef inline bint stays(const view_t* v, int32_t i, int32_t j, double* at) noexce
     return True
 
 
-cdef inline int64_t scaled_index(int64_t m) noexcept nogil:
+cdef inline int64_t scaled_index_size(int64_t m) noexcept nogil:
     return 7 * m + 3
 
 
-cdef inline int64_t scaled_real(int64_t m) noexcept nogil:
-    return (8 + KEPT) * m
+cdef inline int64_t scaled_real_size(int64_t m) noexcept nogil:
+    return (8 + CONE_SCALING_SIZE) * m
 
 
 cdef inline void bind_element_workspace(scaled_t* s, int64_t m, int32_t* index) noexcept nogil:
-    """Places in index (`scaled_index`), of at most m rows."""
+    """Assign places in index (`scaled_index_size`) for at most m rows."""
     s.keep = index
     s.block = index + m
     s.e.ptr = index + 2 * m
@@ -125,14 +128,14 @@ cdef inline void bind_element_workspace(scaled_t* s, int64_t m, int32_t* index) 
     s.e.part = index + 4 * m + 2
     s.e.first = index + 5 * m + 3
     s.e.size = index + 6 * m + 3
-    s.e.node = s.e.slot = s.e.group = NULL              # of bodies
+    s.e.node = s.e.slot = s.e.group = NULL              # Only over bodies.
     s.e.n_groups = 0
     s.e.panel = NULL
     s.e.s = 1
 
 
 cdef inline void bind_scaling_workspace(scaled_t* s, int64_t m, double* real) noexcept nogil:
-    """Places in real (`scaled_real`)."""
+    """Assign places in real (`scaled_real_size`)."""
     s.fixed, s.scale, s.speed = real, real + m, real + 2 * m
     s.e.theta, s.e.g, s.e.lower, s.e.upper = real + 3 * m, real + 4 * m, real + 5 * m, real + 6 * m
     s.e.reach = real + 7 * m
@@ -140,7 +143,7 @@ cdef inline void bind_scaling_workspace(scaled_t* s, int64_t m, double* real) no
 
 
 cdef inline void find_elements(scaled_t* s, const view_t* v) noexcept nogil:
-    """Which rows move, and how they stand together; in the places of `bind_element_workspace`."""
+    """Find the rows that are not fixed and their elements; the arrays are bound by `bind_element_workspace`."""
     cdef const blocks_t* p = &v.p
     cdef int32_t i, j, g, q, n = 0, m = 0, parts = 0, normal
     cdef int32_t* ptr = <int32_t*>s.e.ptr
@@ -154,7 +157,7 @@ cdef inline void find_elements(scaled_t* s, const view_t* v) noexcept nogil:
     for i in range(p.n_blocks):
         normal = m
         for j in range(p.ptr[i], p.ptr[i + 1]):
-            if stays(v, i, j, &x):
+            if is_fixed(v, i, j, &x):
                 continue
             s.keep[m] = j
             m += 1
@@ -183,59 +186,59 @@ cdef inline void find_elements(scaled_t* s, const view_t* v) noexcept nogil:
     s.whole = m == p.n_rows
 
 
-cdef inline double opening(const scaled_t* s, const blocks_t* p, int32_t i, int32_t at) noexcept nogil:
-    """Of the cone of element i at its row `at`, in the metric of d."""
-    return reach_of(p, s.block[i], s.keep[at]) * (1.0 / s.scale[at]) / (1.0 / s.scale[s.e.ptr[i]])
+cdef inline double cone_coefficient(const scaled_t* s, const blocks_t* p, int32_t i, int32_t at) noexcept nogil:
+    """Return the friction coefficient of element i at its row `at` in the scaled unknown."""
+    return component_coefficient(p, s.block[i], s.keep[at]) * (1.0 / s.scale[at]) / (1.0 / s.scale[s.e.ptr[i]])
 
 
-cdef inline bint hold(scaled_t* s, const view_t* v) noexcept nogil:
-    """Impulses of the rows that stay; is any of them other than 0?"""
+cdef inline bint write_fixed_impulses(scaled_t* s, const view_t* v) noexcept nogil:
+    """Write the impulses of the fixed rows; return whether any of them is not 0."""
     cdef const blocks_t* p = &v.p
     cdef int32_t i, j
     cdef double x
-    cdef bint pushed = False
+    cdef bint any_fixed_impulse = False
     memset(s.fixed, 0, p.n_rows * sizeof(double))
     for i in range(0 if s.whole else p.n_blocks):
         for j in range(p.ptr[i], p.ptr[i + 1]):
-            if stays(v, i, j, &x):
+            if is_fixed(v, i, j, &x):
                 s.fixed[j] = x
-                pushed = pushed or x != 0.0
-    return pushed
+                any_fixed_impulse = any_fixed_impulse or x != 0.0
+    return any_fixed_impulse
 
 
 cdef inline void scale_elements(scaled_t* s, const view_t* v, double* w, double* scratch) noexcept nogil:
-    """Their numbers, in the places of `bind_scaling_workspace`; w (rows) and scratch (velocities) are lost."""
+    """Compute the values of the elements, bound by `bind_scaling_workspace`; w (rows) and scratch (velocities) are lost."""
     cdef const blocks_t* p = &v.p
     cdef int32_t i, j, q, h, g
     cdef double x
-    cdef bint pushed = hold(s, v)
-    if pushed and v.r != NULL:
+    cdef bint any_fixed_impulse = write_fixed_impulses(s, v)
+    if any_fixed_impulse and v.r != NULL:
         rows_velocity(p, v.r, s.fixed, scratch)
         rows_slack(p, v.r, s.fixed, scratch, w)
-    elif pushed and v.g != NULL:
+    elif any_fixed_impulse and v.g != NULL:
         general_slack(p, v.g, s.fixed, scratch, w)
     for i in range(s.e.n):
         for q in range(s.e.ptr[i], s.e.ptr[i + 1]):
             j = s.keep[q]
             s.scale[q] = 1.0 / sqrt(p.d[j])
             s.speed[q] = sqrt(p.nu[j]) * sqrt(p.d[j]) * s.scale[q]
-            (<double*>s.e.lower)[q] = low_of(p, s.block[i], j) / s.scale[q]
-            (<double*>s.e.upper)[q] = high_of(p, s.block[i], j) / s.scale[q]
-            (<double*>s.e.theta)[q] = compliance_of(v, j) * s.scale[q] * s.scale[q]
+            (<double*>s.e.lower)[q] = lower_bound(p, s.block[i], j) / s.scale[q]
+            (<double*>s.e.upper)[q] = upper_bound(p, s.block[i], j) / s.scale[q]
+            (<double*>s.e.theta)[q] = row_compliance(v, j) * s.scale[q] * s.scale[q]
             x = 0.0                                     # (A fixed)_j
-            if pushed and v.a == NULL:
+            if any_fixed_impulse and v.a == NULL:
                 x = w[j] + p.b[j]
-            elif pushed:
+            elif any_fixed_impulse:
                 for h in range(v.a.indptr[j], v.a.indptr[j + 1]):
                     x += v.a.data[h] * s.fixed[v.a.indices[h]]
             (<double*>s.e.g)[q] = (p.b[j] - x) * s.scale[q]
     for i in range(s.e.n):
         for g in range(s.e.part[i], s.e.part[i + 1]):
-            (<double*>s.e.reach)[g] = opening(s, p, i, s.e.first[g])
+            (<double*>s.e.reach)[g] = cone_coefficient(s, p, i, s.e.first[g])
 
 
-cdef inline bint dense_matrix(const scaled_t* s, const csr_t* a, int32_t rows, int32_t* place, double* h) noexcept nogil:
-    """H (m, m) of the rows that move; place (rows) is scratch. Whether it is symmetric."""
+cdef inline bint form_scaled_matrix(const scaled_t* s, const csr_t* a, int32_t rows, int32_t* place, double* h) noexcept nogil:
+    """Form H (m, m) and return whether it is symmetric; place (rows) is scratch."""
     cdef int32_t i, j, q, m = s.e.m
     cdef double x
     cdef bint same = True

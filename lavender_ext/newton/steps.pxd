@@ -1,103 +1,122 @@
-"""Interior points of the convex law (Mehrotra 1992) and of Coulomb's, by De Saxce's change of variable, over any system.
+"""Steps of an interior point of the convex law (Mehrotra 1992) or of Coulomb's law, by De Saxce's change of variable.
 
-    s = H z - g,   u = s + phi(s_t) e_n,   phi = sum over parts of a_p |s_p|          (De Saxce, Feng 1998)   (1)
+    s = H z - g,   u = s + phi(s_t) e_n,   phi = sum over components g of a_g |s_g|   (De Saxce, Feng 1998)   (1)
     z in K,  u in K*,  z . u = 0     on every contact                                                   (2)
 
-With phi frozen, (1) and (2) are the convex problem of the "cone" law with its normals lowered by phi, and
-phi <- phi(s_t) is Cadoux's fixed point (Cadoux 2009; Acary, Cadoux, Lemarechal, Malick 2011): dozens of
-convex problems. Here phi moves with every step of one interior point, and so does its derivative: with
-psi = phi'(s_t) behind the normal, 0 on it, C = I - e_n psi^T and B = C^-1 = I + e_n psi^T,
+With phi fixed, (1) and (2) are the convex problem of the "cone" law with its normals lowered by phi, and
+phi <- phi(s_t) is Cadoux's fixed point iteration (Cadoux 2009; Acary, Cadoux, Lemarechal, Malick 2011), which takes
+dozens of convex problems. Here phi and its derivative follow every step of one interior point. With psi = phi'(s_t) on
+the rows after the normal and 0 on it, C = I - e_n psi^T and B = C^-1 = I + e_n psi^T,
 
     du = -q - W dz,    C du = H dz - r_d,    r_d = u - s - phi e_n,                                      (3)
     (H + C W) dz = r_d - C q = r_d - q + (psi . q) e_n,                                                  (4)
 
-q and W = G^T T^-2 G as in the convex method (interior.pxd), whose kernels take every step; phi and psi are read off u,
-which shares its tangents with s. W^-1 = L L^T gives (C W)^-1 = L P, P = L^T B, so
+with q and W = G^T T^-2 G of the convex method (interior.pxd), whose functions take every step. phi and psi are computed
+from u, which has the tangents of s. W^-1 = L L^T gives (C W)^-1 = L P, P = L^T B, so that
 
     bodies     N = I + K^T L P K,   N dy = K^T L P r,   dz = L P (r - K dy)                              (5)
     rows       (I + P H L) y = P r,   dz = L y                                                           (6)
 
-Both matrices lack symmetry and are factored by LU. The central path of a problem that is not monotone may
-turn back: steps then shrink to nothing. With `share` psi for psi in B, share a little below 1, the method is
-between Newton's and the fixed point and passes such folds, at a linear rate, after which Newton's method on
-the Alart-Curnier map ends it.
+Both matrices are not symmetric and are factored by LU. The central path of a problem that is not monotone may turn
+back, and steps then become arbitrarily short. With a fraction of psi in B (`derivative_fraction`, a little below 1) the
+method is between Newton's method and the fixed point iteration. It passes such folds at a linear rate, and Newton's
+method on the Alart-Curnier map then ends it.
 """
-from libc.math cimport fabs, sqrt
+from libc.math cimport fabs
 from libc.stdint cimport int32_t
 from libc.string cimport memset
 
 from lavender_ext.core.block cimport length
 from lavender_ext.core.validate cimport all_finite
-from lavender_ext.newton.cones cimport is_high, is_low, load_dual, scatter
+from lavender_ext.newton.cones cimport add_cone_transpose, has_lower_bound, has_upper_bound, load_dual
 from lavender_ext.newton.elements cimport elements_t, is_row
-from lavender_ext.newton.interior cimport ipm_affine, ipm_rhs, ipm_scale, ipm_start, ipm_update
+from lavender_ext.newton.interior cimport (compute_scaling, form_combined_rhs, interior_t, limit_affine_step,
+                                           place_inside_cones, take_combined_step)
 from lavender_ext.newton.natural_map cimport convex_error
-from lavender_ext.newton.run cimport newton_t, interior_t, take
-from lavender_ext.newton.system cimport (OF_BARRIER, OF_PAIR, first_weights, system_factor, system_solve,
-                                         system_t, system_times)
+from lavender_ext.newton.run cimport copy_vector, newton_t
+from lavender_ext.newton.system cimport (BARRIER, PAIR, set_first_weights, system_factor, system_solve, system_t,
+                                         system_times)
 
 
-cdef inline double delta_of() noexcept nogil:
-    """Weight of the proximal term: far below any step that matters, far above the rounding of a pivot."""
+cdef inline double proximal_weight() noexcept nogil:
+    """Proximal weight of an interior point, as a fraction of d.
+
+    A larger weight changes the steps; a smaller one is lost in the rounding of a pivot (2^-53).
+    """
     return 1e-10
 
 
-cdef inline double out_of_reach() noexcept nogil:
-    """Share of |z|^2 that H z takes to (1e-4 to 0.1 measured: the same steps)."""
+cdef inline double unreachable_fraction() noexcept nogil:
+    """Fraction of |z|^2 below which g counts as unreachable by H.
+
+    The first point is then the least-squares solution. Fractions of 1e-4 to 0.1 take the same steps.
+    """
     return 0.01
 
 
-cdef inline bint all_free(const elements_t* e) noexcept nogil:
+cdef inline double first_dual_fraction() noexcept nogil:
+    """First duals as a fraction of the first impulses; fractions of 0.001 to 1 take about the same steps."""
+    return 0.01
+
+
+cdef inline double step_damping() noexcept nogil:
+    """Fraction of the step to the boundary that an interior point takes (Mehrotra 1992: just below 1)."""
+    return 0.995
+
+
+cdef inline bint has_only_free_rows(const elements_t* e) noexcept nogil:
+    """Return whether every element is a row without bounds."""
     cdef int32_t i
     for i in range(e.n):
-        if not is_row(e, i) or is_low(e, e.ptr[i]) or is_high(e, e.ptr[i]):
+        if not is_row(e, i) or has_lower_bound(e, e.ptr[i]) or has_upper_bound(e, e.ptr[i]):
             return False
     return True
 
 
 cdef inline bint has_free_rows(const newton_t* n) noexcept nogil:
+    """Return whether any row has no bounds, as the rows of joints."""
     cdef int32_t i
     for i in range(n.s.e.n):
-        if is_row(n.s.e, i) and not is_low(n.s.e, n.s.e.ptr[i]) and not is_high(n.s.e, n.s.e.ptr[i]):
+        if is_row(n.s.e, i) and not has_lower_bound(n.s.e, n.s.e.ptr[i]) and not has_upper_bound(n.s.e, n.s.e.ptr[i]):
             return True
     return False
 
 
-cdef inline void begin_interior(newton_t* n, double delta, double share) noexcept nogil:
-    """A first point near H z = g, all boundaries left by what the worst of them needs; one factor.
+cdef inline void begin_interior_point(newton_t* n, double delta, double derivative_fraction) noexcept nogil:
+    """Compute a first point near H z = g and shift it inside all boundaries; one factorisation.
 
-    Of a g that H does not reach, as where contacts part or rows outnumber velocities, a small weight makes nearly the
-    whole of z: z then meets H z = g as far as it can.
+    If H does not reach g (contacts separate, or rows outnumber velocities), the weight of the first system determines
+    nearly all of z. The least-squares solution of H z = g is then used instead.
     """
     cdef system_t* s = &n.s
     cdef interior_t* p = &n.ip
     cdef int32_t j, m = s.e.m
-    cdef double reached = 0.0, whole = 0.0
-    p.delta, p.share = delta, share
-    p.gap = p.lowest_gap = 1.0 / 0.0
-    p.first_gap = 0.0
+    cdef double reached = 0.0, size = 0.0
+    p.delta, p.derivative_fraction = delta, derivative_fraction
+    p.gap = p.min_gap = 1.0 / 0.0
+    p.max_gap = 0.0
     p.length = 1.0
     memset(p.u1, 0, m * sizeof(double))
     memset(p.u2, 0, m * sizeof(double))
-    first_weights(s, 1e-6, delta_of())
-    system_factor(s, OF_BARRIER, 0.0)
-    system_solve(s, OF_BARRIER, s.e.g, p.z)
-    take(n, p.everything, p.z)                          # where all rows hold, the answer
+    set_first_weights(s, 1e-6, proximal_weight())
+    system_factor(s, BARRIER, 0.0)
+    system_solve(s, BARRIER, s.e.g, p.z)
+    copy_vector(n, p.unbounded_z, p.z)
     system_times(s, p.z, p.hz)
-    if not all_free(s.e):
-        system_solve(s, OF_BARRIER, p.hz, n.trial)
+    if not has_only_free_rows(s.e):
+        system_solve(s, BARRIER, p.hz, n.trial)
         for j in range(m):
-            whole += p.z[j] * p.z[j]
+            size += p.z[j] * p.z[j]
             reached += n.trial[j] * n.trial[j]
-        if reached < out_of_reach() * whole:
-            take(n, p.z, n.trial)
+        if reached < unreachable_fraction() * size:
+            copy_vector(n, p.z, n.trial)
             system_times(s, p.z, p.hz)
-    p.degree = ipm_start(s.e, p.hz, 0.01, p.z, p.u1, p.u2)      # of the first impulses (measured: 0.001 to 1)
+    p.degree = place_inside_cones(s.e, p, first_dual_fraction())
     system_times(s, p.z, p.hz)
 
 
-cdef inline void duals(const elements_t* e, const interior_t* p, double* u) noexcept nogil:
-    """G^T u on every row."""
+cdef inline void multiply_duals(const elements_t* e, const interior_t* p, double* u) noexcept nogil:
+    """Compute G^T u on every row."""
     cdef int32_t i, j, g
     cdef double x[4]
     for i in range(e.n):
@@ -108,11 +127,11 @@ cdef inline void duals(const elements_t* e, const interior_t* p, double* u) noex
         memset(u + j, 0, (e.ptr[i + 1] - j) * sizeof(double))
         for g in range(e.part[i], e.part[i + 1]):
             load_dual(e, i, g, p.u1, p.u2, x)
-            scatter(e, i, g, x, u)
+            add_cone_transpose(e, i, g, x, u)
 
 
-cdef inline double slip(const elements_t* e, int32_t i, const double* s, double share, double* psi) noexcept nogil:
-    """phi of one contact's s; share of its derivative into psi."""
+cdef inline double contact_shift(const elements_t* e, int32_t i, const double* s, double fraction, double* psi) noexcept nogil:
+    """Return phi of one contact's s; write `fraction` times its derivative to psi."""
     cdef int32_t k, g, first, n
     cdef double t, a, phi = 0.0
     psi[0] = 0.0
@@ -122,17 +141,17 @@ cdef inline double slip(const elements_t* e, int32_t i, const double* s, double 
         a = e.reach[g]
         if n == 1:
             phi += a * fabs(s[first])
-            psi[first] = share * a * (1.0 if s[first] > 0.0 else -1.0 if s[first] < 0.0 else 0.0)
+            psi[first] = fraction * a * (1.0 if s[first] > 0.0 else -1.0 if s[first] < 0.0 else 0.0)
             continue
         t = length(s + first, n)
         for k in range(first, first + n):
-            psi[k] = share * (a * s[k] / t) if t > 0.0 else 0.0
+            psi[k] = fraction * (a * s[k] / t) if t > 0.0 else 0.0
         phi += a * t
     return phi
 
 
-cdef inline void slips(const elements_t* e, const double* u, double share, double* phi, double* psi) noexcept nogil:
-    """phi (m) on the normals of contacts, nothing elsewhere, and psi (m)."""
+cdef inline void normal_shifts(const elements_t* e, const double* u, double fraction, double* phi, double* psi) noexcept nogil:
+    """Compute phi (m), which is 0 except on the normals of contacts, and psi (m)."""
     cdef int32_t i, j
     memset(phi, 0, e.m * sizeof(double))
     for i in range(e.n):
@@ -140,11 +159,11 @@ cdef inline void slips(const elements_t* e, const double* u, double share, doubl
         if is_row(e, i):
             psi[j] = 0.0
         else:
-            phi[j] = slip(e, i, u + j, share, psi + j)
+            phi[j] = contact_shift(e, i, u + j, fraction, psi + j)
 
 
-cdef inline void add_along(const elements_t* e, const double* psi, const double* x, double* r) noexcept nogil:
-    """r_n += psi . x"""
+cdef inline void add_normal_products(const elements_t* e, const double* psi, const double* x, double* r) noexcept nogil:
+    """Compute r_n += psi . x on every contact."""
     cdef int32_t i, j
     cdef double t
     for i in range(e.n):
@@ -154,10 +173,10 @@ cdef inline void add_along(const elements_t* e, const double* psi, const double*
         r[e.ptr[i]] += t
 
 
-cdef inline void turn(system_t* s, const double* psi) noexcept nogil:
-    """(theta + C W)^-1 = V (I + e_n c^T) = L P into `v` and P into `pair`, V = (W + theta)^-1 = L L^T,
+cdef inline void combine_pair(system_t* s, const double* psi) noexcept nogil:
+    """Compute (theta + C W)^-1 = V (I + e_n c^T) = L P into `v` and P into `pair`, from V = (W + theta)^-1 = L L^T,
 
-        c = (psi - t) / (1 + t_n),   t = V theta psi                 (c = psi without a compliance)
+        c = (psi - t) / (1 + t_n),   t = V theta psi                 (c = psi without compliance)
     """
     cdef int32_t i, j, k, l, q, nr
     cdef double x
@@ -184,45 +203,49 @@ cdef inline void turn(system_t* s, const double* psi) noexcept nogil:
 
 
 cdef inline bint interior_step(newton_t* n) noexcept nogil:
-    """One predictor-corrector step, |F| and velocity error after it; False where the factorisation or the step fails."""
+    """Take one predictor-corrector step and compute its errors; return False if the factorisation or the step fails."""
     cdef system_t* s = &n.s
     cdef interior_t* p = &n.ip
     cdef const elements_t* e = s.e
-    cdef int32_t j, what = OF_PAIR if p.share > 0.0 else OF_BARRIER
+    cdef int32_t j, what = PAIR if p.derivative_fraction > 0.0 else BARRIER
     cdef double gap, after, sigma = 0.0, mu
-    ipm_scale(e, p.z, p.u1, p.u2, p.delta, s.v, s.bt, &gap)
-    if what == OF_PAIR:
-        duals(e, p, n.u)
-        slips(e, n.u, p.share, n.c, n.psi)
-        turn(s, n.psi)
+    # Scaling and matrix.
+    compute_scaling(e, p, s.v, s.bt, &gap)
+    if what == PAIR:
+        multiply_duals(e, p, n.u)
+        normal_shifts(e, n.u, p.derivative_fraction, n.c, n.psi)
+        combine_pair(s, n.psi)
     if not system_factor(s, what, 0.0) and not gap - gap == 0.0:
         return False
+    # Predictor; its q is u itself.
     for j in range(e.m):
         n.r[j] = e.g[j] - p.hz[j]
-        if what == OF_PAIR:
+        if what == PAIR:
             n.r[j] -= n.c[j]
-    if what == OF_PAIR:                                 # the predictor's q is u itself
-        add_along(e, n.psi, n.u, n.r)
+    if what == PAIR:
+        add_normal_products(e, n.psi, n.u, n.r)
     system_solve(s, what, n.r, n.da)
     if p.degree > 0.0 and gap > 0.0:
-        ipm_affine(e, p.z, p.u1, p.u2, n.da, &after)
+        limit_affine_step(e, p, n.da, &after)
         sigma = after / gap
         sigma = 1.0 if sigma > 1.0 else sigma if sigma > 0.0 else 0.0
         sigma = sigma * sigma * sigma
+    # Corrector. Its right-hand side is r_d - q with r_d = u - s; q follows by difference.
     mu = gap / (p.degree if p.degree > 1.0 else 1.0)
-    ipm_rhs(e, p.z, p.u1, p.u2, p.hz, n.da, sigma * mu, n.r)
-    if what == OF_PAIR:                                 # that is r_d - q for u - s alone; q comes back by difference
+    form_combined_rhs(e, p, n.da, sigma * mu, n.r)
+    if what == PAIR:
         for j in range(e.m):
             n.u[j] -= p.hz[j] - e.g[j] + n.r[j]
             n.r[j] -= n.c[j]
-        add_along(e, n.psi, n.u, n.r)
+        add_normal_products(e, n.psi, n.u, n.r)
     system_solve(s, what, n.r, n.dz)
     if not all_finite(n.dz, e.m):
         return False
-    p.length = ipm_update(e, p.z, p.u1, p.u2, n.dz, n.da, sigma * mu, 0.995, n.t1, n.t2)
-    p.lowest_gap = p.gap if p.gap < p.lowest_gap else p.lowest_gap
+    # Step and errors.
+    p.length = take_combined_step(e, p, n.dz, n.da, sigma * mu, step_damping(), n.t1, n.t2)
+    p.min_gap = p.gap if p.gap < p.min_gap else p.min_gap
     p.gap = mu
-    p.first_gap = mu if mu > p.first_gap else p.first_gap
+    p.max_gap = mu if mu > p.max_gap else p.max_gap
     system_times(s, p.z, p.hz)
     convex_error(e, p.z, p.hz, n.sc.speed, &p.energy, &p.velocity)
     return p.length > 0.0

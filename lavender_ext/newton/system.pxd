@@ -1,12 +1,12 @@
-"""The Newton systems of a scaled problem, for whichever of its forms: over bodies, or over rows of A.
+"""The linear systems of Newton's method in each form of the scaled problem: over bodies, or over the rows of A.
 
     barrier   (H + W) dz = r               V = (W + theta)^-1 in `v`, B^T with V = B B^T in `bt`          (1)
     pair      the same for W^-1 = R^T L    of De Saxce's interior points, not symmetric; L in `pair`      (2)
-    natural   (I - P + P (H + eps)) dz = r P in the derivative of the natural map                         (3)
+    natural   (I - P + P (H + eps)) dz = r P is the derivative of the projection in the natural map       (3)
 
-Bodies factor I + K^T V K (elements.pxd). Rows factor M = L H R^T + o L + I, for bounded rows H + W: dense ones here
-(factor/dense.pxd), in (3) the rows alone where P is not 0; sparse ones by whom the caller names. The augmented system of the
-bodies, [I -R K^T; L K I], is the caller's too: without one these stages are left out.
+Over bodies the matrix is I + K^T V K (elements.pxd). Over rows it is M = L H R^T + o L + I, or H + W for bounded rows
+alone. Dense matrices are factored here (factor/dense.pxd), in (3) on the rows with P != 0 only. Sparse matrices and the
+augmented system of the bodies, [I -R K^T; L K I], are factored by the caller (`external_t`).
 """
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t, int64_t
@@ -18,14 +18,14 @@ from lavender_ext.core.dot cimport dot
 from lavender_ext.core.block_types cimport CONE
 from lavender_ext.core.view cimport csr_t
 from lavender_ext.factor.blocks cimport block_matrix_t, factor_blocks
-from lavender_ext.factor.dense cimport (cholesky_workspace_size, dense_cholesky, dense_cholesky_solve, dense_lu, dense_lu_sign,
-                                        dense_lu_solve)
+from lavender_ext.factor.dense cimport (cholesky_workspace_size, dense_cholesky, dense_cholesky_solve, dense_lu,
+                                        dense_lu_sign, dense_lu_solve)
 from lavender_ext.factor.supernodal cimport solve_supernodes, supernodal_lu_sign
-from lavender_ext.newton.cones cimport is_high, is_low
+from lavender_ext.newton.cones cimport has_lower_bound, has_upper_bound
 from lavender_ext.newton.elements cimport element_times, elements_t, is_row
 from lavender_ext.newton.natural_map cimport natural
-from lavender_ext.newton.normal_matrix cimport normal_matrix
-from lavender_ext.newton.panel cimport to_bodies, to_rows
+from lavender_ext.newton.normal_matrix cimport form_normal_matrix
+from lavender_ext.newton.panel cimport multiply_panel, multiply_panel_transpose
 
 
 cdef enum:                      # forms
@@ -33,45 +33,45 @@ cdef enum:                      # forms
     DENSE = 1
     SPARSE = 2
 
-cdef enum:                      # what is factored: (1), (2), (3)
-    OF_BARRIER = 0
-    OF_PAIR = 1
-    OF_NATURAL = 2
+cdef enum:                      # systems (1), (2), (3)
+    BARRIER = 0
+    PAIR = 1
+    NATURAL = 2
 
-cdef enum:                      # by what
-    BY_NONE = 0
-    BY_CHOLESKY = 1
-    BY_LU = 2
+cdef enum:                      # factorisations
+    FACTOR_NONE = 0
+    FACTOR_CHOLESKY = 1
+    FACTOR_LU = 2
 
 cdef enum:
-    ROUNDS = 2                  # of refinement
+    REFINEMENT_STEPS = 2        # Refinements of (3), which remove eps; the next Newton step does the rest.
 
 
-cdef struct others_t:           # factors that the caller makes
+cdef struct external_t:         # factorisations by the caller
     void* at
     int32_t (*factor)(void* at, int32_t augmented, int32_t what, double eps) noexcept nogil
-    void (*solve)(void* at, int32_t augmented, double* x) noexcept nogil       # (m), in place
+    void (*solve)(void* at, int32_t augmented, double* x) noexcept nogil       # x (m), in place
 
 
 cdef struct system_t:
     int32_t form
-    int32_t symmetric           # A is
-    int32_t augmented           # now: factors are those of the augmented system
-    int32_t wide                # four lanes are one instruction
+    int32_t symmetric           # A is symmetric
+    int32_t augmented           # the augmented system is factored and solved at present
+    int32_t wide                # four doubles fit one instruction
     int32_t factorisations
-    int32_t by                  # the last dense factor
-    int32_t n_free              # of it: rows that are solved for, -1 for all
+    int32_t by                  # factorisation of the last matrix
+    int32_t n_free              # rows of the last dense matrix, -1: all
     int32_t law                 # of the last natural map
     const elements_t* e
     const block_matrix_t* f           # BODIES
     const double* h             # (m, m) DENSE
     csr_t a                     # H, SPARSE
-    const others_t* others      # or NULL
+    const external_t* others    # or NULL
     double* whole               # (m, m) DENSE: the matrix, or L U
     double* lower               # (`dense_workspace_size`) L L^T, or scratch
-    int32_t* swap               # (m)
-    int32_t* free               # (m)
-    double* v                   # small matrices
+    int32_t* swap               # (m) row exchanges
+    int32_t* free               # (m) rows of the last dense matrix
+    double* v                   # small matrices of the elements
     double* einv
     double* p
     double* pair
@@ -82,16 +82,16 @@ cdef struct system_t:
 
 
 cdef inline int64_t dense_workspace_size(int64_t m, int32_t cones) noexcept nogil:
-    """Values of `lower`; with cones it holds L H as well."""
+    """Return the number of doubles of `lower`; with cones it holds L H instead."""
     return m * m if cones else cholesky_workspace_size(<int32_t>m)
 
 
 cdef inline void system_times(system_t* s, const double* x, double* out) noexcept nogil:
-    """H x; x is not out."""
+    """Compute out = H x; out must not be x."""
     cdef int32_t j, m = s.e.m
     if s.form == BODIES:
-        to_bodies(s.e, s.f.n, x, s.y)
-        to_rows(s.e, s.y, out)
+        multiply_panel_transpose(s.e, s.f.n, x, s.y)
+        multiply_panel(s.e, s.y, out)
         for j in range(m):
             out[j] += s.e.theta[j] * x[j]
     elif s.form == DENSE:
@@ -105,8 +105,8 @@ cdef inline void system_times(system_t* s, const double* x, double* out) noexcep
 # -- dense rows ------------------------------------------------------------------------------------------------
 
 
-cdef inline void times_left(const elements_t* e, const double* w, const double* h, double* out) noexcept nogil:
-    """out = W H, both (m, m) row-major."""
+cdef inline void multiply_left(const elements_t* e, const double* w, const double* h, double* out) noexcept nogil:
+    """Compute out = W H with one small matrix W for each element; both are (m, m), row-major."""
     cdef int32_t i, j, k, r, c, nr, m = e.m
     cdef double x
     cdef double *y
@@ -126,8 +126,8 @@ cdef inline void times_left(const elements_t* e, const double* w, const double* 
                     y[k] += x * a[k]
 
 
-cdef inline void form_natural(system_t* s, double eps) noexcept nogil:
-    """M of (3) on the rows of elements that move: where P = 0 a row is that of I, and its dz = r."""
+cdef inline void form_natural_matrix(system_t* s, double eps) noexcept nogil:
+    """Form M of (3) on the elements with P != 0; the other rows of M are those of I, so that dz = r there."""
     cdef int32_t i, j, k, r, c, nr, n = 0
     cdef const elements_t* e = s.e
     cdef double x
@@ -171,37 +171,40 @@ cdef inline void form_natural(system_t* s, double eps) noexcept nogil:
         n += nr
 
 
-cdef inline void form_dense(system_t* s, int32_t what, double eps) noexcept nogil:
+cdef inline void form_dense_matrix(system_t* s, int32_t what, double eps) noexcept nogil:
+    """Form the dense matrix of a system."""
     cdef int32_t j, m = s.e.m
     cdef const elements_t* e = s.e
     s.n_free = -1
-    if what == OF_NATURAL:
-        form_natural(s, eps)
+    if what == NATURAL:
+        form_natural_matrix(s, eps)
     elif s.bt == NULL:
         memcpy(s.whole, s.h, <int64_t>m * m * sizeof(double))
         for j in range(m):
-            s.whole[<int64_t>j * (m + 1)] += 1.0 / s.v[j]       # inf for a row that no longer moves: the step fails
+            s.whole[<int64_t>j * (m + 1)] += 1.0 / s.v[j]       # Infinite for a row at its bound: the step then fails.
     else:
-        times_left(e, s.bt if what == OF_BARRIER else s.pair, s.h, s.lower)
+        multiply_left(e, s.bt if what == BARRIER else s.pair, s.h, s.lower)
         for j in range(m):
             element_times(e, s.bt, s.lower + <int64_t>j * m, s.whole + <int64_t>j * m, False)
             s.whole[<int64_t>j * (m + 1)] += 1.0
 
 
 cdef inline int32_t factor_dense(system_t* s, int32_t what, double eps) noexcept nogil:
-    cdef int32_t n = s.e.m, symmetric = s.symmetric and what != OF_PAIR and (s.bt == NULL or what == OF_BARRIER)
-    form_dense(s, what, eps)
+    """Form and factor the dense matrix of a system; return 0 if a pivot fails."""
+    cdef int32_t n = s.e.m, symmetric = s.symmetric and what != PAIR and (s.bt == NULL or what == BARRIER)
+    form_dense_matrix(s, what, eps)
     if s.n_free >= 0:
         n = s.n_free
-    s.by = BY_NONE
+    s.by = FACTOR_NONE
     if symmetric and dense_cholesky(s.wide, n, s.whole, NULL, s.lower) == 0:
-        s.by = BY_CHOLESKY
+        s.by = FACTOR_CHOLESKY
     elif dense_lu(s.wide, n, s.whole, s.swap, 0.0) == 0:
-        s.by = BY_LU
-    return s.by != BY_NONE
+        s.by = FACTOR_LU
+    return s.by != FACTOR_NONE
 
 
 cdef inline void solve_dense(system_t* s, double* x) noexcept nogil:
+    """Solve with the last dense factor, in place."""
     cdef int32_t j, n = s.e.m
     cdef double* y = x
     if s.n_free >= 0:
@@ -209,13 +212,13 @@ cdef inline void solve_dense(system_t* s, double* x) noexcept nogil:
         y = s.q
         for j in range(n):
             y[j] = x[s.free[j]]
-    if s.by == BY_CHOLESKY:
+    if s.by == FACTOR_CHOLESKY:
         dense_cholesky_solve(n, s.lower, y)
-    elif s.by == BY_LU:
+    elif s.by == FACTOR_LU:
         dense_lu_solve(n, s.whole, s.swap, y)
     else:
         for j in range(n):
-            y[j] = 1.0 / 0.0                          # of a singular matrix: no number
+            y[j] = 1.0 / 0.0                            # The matrix is singular: the caller rejects the step.
     if s.n_free >= 0:
         for j in range(n):
             x[s.free[j]] = y[j]
@@ -225,38 +228,39 @@ cdef inline void solve_dense(system_t* s, double* x) noexcept nogil:
 
 
 cdef inline int32_t system_factor(system_t* s, int32_t what, double eps) noexcept nogil:
-    """Factor (1), (2), or (3) of the last `system_natural`; 0 where a pivot was lost."""
+    """Factor (1), (2), or (3) with the last `system_natural`; return 0 if a pivot fails."""
     cdef int32_t lu
     s.factorisations += 1
     if s.augmented or s.form == SPARSE:
         return s.others.factor(s.others.at, s.augmented, what, eps)
     if s.form == DENSE:
         return factor_dense(s, what, eps)
-    lu = what == OF_PAIR or (what == OF_NATURAL and s.law != CONE)
-    normal_matrix(s.e, s.v, s.f, lu)
-    s.by = BY_LU if lu else BY_CHOLESKY
+    lu = what == PAIR or (what == NATURAL and s.law != CONE)
+    form_normal_matrix(s.e, s.v, s.f, lu)
+    s.by = FACTOR_LU if lu else FACTOR_CHOLESKY
     return factor_blocks(s.f, lu) == 0
 
 
 cdef inline int32_t system_sign(const system_t* s) noexcept nogil:
-    """Sign of the determinant of the last (3); 0 where the caller factors, who does not tell it."""
+    """Return the sign of the determinant of the last (3); 0 if the caller factored it."""
     if s.augmented or s.form == SPARSE:
         return 0
-    if s.by != BY_LU:
-        return s.by == BY_CHOLESKY
+    if s.by != FACTOR_LU:
+        return s.by == FACTOR_CHOLESKY
     if s.form == DENSE:
         return dense_lu_sign(s.e.m if s.n_free < 0 else s.n_free, s.whole, s.swap)
     return supernodal_lu_sign(&s.f.factor)
 
 
-cdef inline void over_bodies(system_t* s, const double* x, double* out) noexcept nogil:
-    # K N^-1 K^T x
-    to_bodies(s.e, s.f.n, x, s.y)
-    solve_supernodes(&s.f.factor, s.y, s.by == BY_LU)
-    to_rows(s.e, s.y, out)
+cdef inline void apply_body_inverse(system_t* s, const double* x, double* out) noexcept nogil:
+    """Compute out = K N^-1 K^T x."""
+    multiply_panel_transpose(s.e, s.f.n, x, s.y)
+    solve_supernodes(&s.f.factor, s.y, s.by == FACTOR_LU)
+    multiply_panel(s.e, s.y, out)
 
 
-cdef inline void over_rows(system_t* s, double* x) noexcept nogil:
+cdef inline void solve_rows(system_t* s, double* x) noexcept nogil:
+    """Solve over the rows of A with the last factor, in place."""
     if s.augmented or s.form == SPARSE:
         s.others.solve(s.others.at, s.augmented, x)
     else:
@@ -264,45 +268,45 @@ cdef inline void over_rows(system_t* s, double* x) noexcept nogil:
 
 
 cdef inline void system_solve(system_t* s, int32_t what, const double* r, double* out) noexcept nogil:
-    """dz of (1) or (2); r is not out."""
+    """Solve (1) or (2) for dz in `out`, which must not be r."""
     cdef int32_t j, m = s.e.m
-    cdef const double* left = s.pair if what == OF_PAIR else s.bt
+    cdef const double* left = s.pair if what == PAIR else s.bt
     if s.form == BODIES and not s.augmented:
         element_times(s.e, s.v, r, s.t, False)
-        over_bodies(s, s.t, s.q)
+        apply_body_inverse(s, s.t, s.q)
         for j in range(m):
             s.q[j] = r[j] - s.q[j]
         if s.bt == NULL:
             element_times(s.e, s.v, s.q, out, False)
         else:
-            # B (B^T ...): V itself has lost the small end of its scaling to the large one.
+            # Apply B and B^T one after the other: in V the small entries of the scaling are lost in the large ones.
             element_times(s.e, left, s.q, s.t, False)
             element_times(s.e, s.bt, s.t, out, True)
     elif s.bt != NULL:
         element_times(s.e, left, r, s.t, False)
-        over_rows(s, s.t)
+        solve_rows(s, s.t)
         element_times(s.e, s.bt, s.t, out, True)
     elif s.augmented:
         element_times(s.e, s.v, r, out, False)
-        over_rows(s, out)
+        solve_rows(s, out)
     else:
         memcpy(out, r, m * sizeof(double))
-        over_rows(s, out)
+        solve_rows(s, out)
 
 
-cdef inline double system_natural(system_t* s, const double* z, const double* rest, int32_t law, double eps,
+cdef inline double system_natural(system_t* s, const double* z, const double* slack, int32_t law, double eps,
                                   double* f) noexcept nogil:
-    """F of the map `law` into f, and the small matrices of its derivative; |F|."""
+    """Compute F of the natural map of `law` into f, and the small matrices of its derivative; return |F|."""
     s.law = law
-    return natural(s.e, z, rest, law, eps, f, s.p, s.einv, s.v)
+    return natural(s.e, z, slack, law, eps, f, s.p, s.einv, s.v)
 
 
 cdef inline void solve_natural(system_t* s, const double* r, double* out) noexcept nogil:
-    """dz of (3); r is not out."""
+    """Solve (3) for dz in `out`, which must not be r."""
     cdef int32_t j, m = s.e.m
     if s.form == BODIES and not s.augmented:
         element_times(s.e, s.einv, r, s.t, False)
-        over_bodies(s, s.t, s.q)
+        apply_body_inverse(s, s.t, s.q)
         element_times(s.e, s.p, s.q, s.t, False)
         for j in range(m):
             s.t[j] = r[j] - s.t[j]
@@ -310,7 +314,7 @@ cdef inline void solve_natural(system_t* s, const double* r, double* out) noexce
         return
     if s.augmented or (s.form == SPARSE and s.bt != NULL):
         memcpy(out, r, m * sizeof(double))
-    else:                                               # M_FF dz_F = r_F - P H_FN r_N, dz_N = r_N where P = 0
+    else:                                               # M_FF dz_F = r_F - P H_FN r_N, and dz_N = r_N for P = 0.
         memcpy(s.t, r, m * sizeof(double))
         if s.form == DENSE:
             for j in range(s.n_free):
@@ -322,11 +326,11 @@ cdef inline void solve_natural(system_t* s, const double* r, double* out) noexce
         element_times(s.e, s.p, s.q, s.t, False)
         for j in range(m):
             out[j] = r[j] - s.t[j]
-    over_rows(s, out)
+    solve_rows(s, out)
 
 
 cdef inline void natural_times(system_t* s, const double* dz, double* out) noexcept nogil:
-    """(I - P) dz + P H dz"""
+    """Compute (I - P) dz + P H dz."""
     cdef int32_t j
     system_times(s, dz, s.q)
     for j in range(s.e.m):
@@ -337,11 +341,11 @@ cdef inline void natural_times(system_t* s, const double* dz, double* out) noexc
 
 
 cdef inline void solve_refined(system_t* s, const double* rhs, double* x, double* r, double* dx) noexcept nogil:
-    """(3) with its eps mostly refined away; the next Newton step does the rest. r, dx (m) are scratch."""
+    """Solve (3) and refine its eps away; r, dx (m) are scratch."""
     cdef int32_t j, _, m = s.e.m
     cdef double left, last = 1.0 / 0.0, size = norm_inf(rhs, m)
     solve_natural(s, rhs, x)
-    for _ in range(ROUNDS):
+    for _ in range(REFINEMENT_STEPS):
         natural_times(s, x, r)
         for j in range(m):
             r[j] = rhs[j] - r[j]
@@ -354,8 +358,8 @@ cdef inline void solve_refined(system_t* s, const double* rhs, double* x, double
             x[j] += dx[j]
 
 
-cdef inline void first_weights(system_t* s, double weight, double free_weight) noexcept nogil:
-    """V of (1) for W = weight on rows that have a bound, `free_weight` on others."""
+cdef inline void set_first_weights(system_t* s, double weight, double free_weight) noexcept nogil:
+    """Set V of (1) with W = weight on rows with a bound, and `free_weight` on the others."""
     cdef int32_t i, j, k, q, nr
     cdef double x
     cdef const elements_t* e = s.e
@@ -367,7 +371,7 @@ cdef inline void first_weights(system_t* s, double weight, double free_weight) n
             s.v[q + k] = 0.0
             if s.bt != NULL:
                 s.bt[q + k] = 0.0
-        x = free_weight if is_row(e, i) and not is_low(e, j) and not is_high(e, j) else weight
+        x = free_weight if is_row(e, i) and not has_lower_bound(e, j) and not has_upper_bound(e, j) else weight
         for k in range(nr):
             s.v[q + k * nr + k] = 1.0 / (e.theta[j + k] + x)
             if s.bt != NULL:

@@ -1,4 +1,4 @@
-"""The first phase of Newton's method from a warm start: equations in `warm_start.pxd`, whose functions are compiled here."""
+"""First phase of Newton's method from a warm start; `warm_start.pxd` has the equations."""
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t, int64_t
 
@@ -16,20 +16,21 @@ from lavender_ext.judge.measure cimport score_slack
 from lavender_ext.judge.score cimport new_score, relative, score_t
 from lavender_ext.judge.slack cimport rows_slack
 from lavender_ext.judge.tally cimport empty_tally, tally_row, tally_t
-from lavender_ext.newton.warm_start cimport (FIRST_SWEEPS, JUDGED, MOST_ROWS, MOST_BAND, MOST_SWEEPS, MOST_TRACED, PATIENT_SWEEPS,
-                                             SOLVED, SWEPT, UNDECIDED, bind_warm_workspace, room_of, warm_t)
+from lavender_ext.newton.warm_start cimport (FIRST_SWEEP_CHECK, JUDGED, MAX_BAND_WIDTH, MAX_TRACED_SCORES,
+                                             MAX_WARM_ROWS, MAX_WARM_SWEEPS, MIN_SWEEPS_TO_GIVE_UP, SOLVED, SWEPT,
+                                             UNDECIDED, bind_warm_workspace, warm_t, warm_workspace_size)
 
 
-cdef int32_t start_errors(const blocks_t* p, double* energy, double* velocity) noexcept nogil:
-    """E0, V0 of lam = 0, w = -b; 0 where they are not plainly the judge's."""
+cdef int32_t zero_impulse_errors(const blocks_t* p, double* energy, double* velocity) noexcept nogil:
+    """Compute E0, V0 of lam = 0, w = -b; return 0 if the judge may use another reference."""
     cdef int32_t i, j
-    cdef double e, rhs = 0.0, least = 1.0 / 0.0, inf = 1.0 / 0.0
+    cdef double e, rhs = 0.0, min_diagonal = 1.0 / 0.0, inf = 1.0 / 0.0
     cdef tally_t s = empty_tally()
     for i in range(p.n_blocks):
         for j in range(p.ptr[i], p.ptr[i + 1]):
             if not 0.0 < p.d[j] < inf:
                 return 0
-            least = p.d[j] if p.d[j] < least else least
+            min_diagonal = p.d[j] if p.d[j] < min_diagonal else min_diagonal
             rhs += p.b[j] * p.b[j]
             if is_rows(p, i):
                 if not p.lower[j] <= 0.0 <= p.upper[j]:
@@ -38,17 +39,17 @@ cdef int32_t start_errors(const blocks_t* p, double* energy, double* velocity) n
             elif j == p.ptr[i]:
                 e = row_error(0.0, -p.b[j], p.d[j], 0.0, inf)
             else:
-                continue                                # a disk of radius 0 holds it: e = 0
+                continue                                # The disk of lam_n = 0 has radius 0: e = 0.
             tally_row(p, j, e, &s)
     energy[0] = sqrt(s.energy)
     velocity[0] = sqrt(s.fast)
-    # below 2^-48 of the norm of b the judge measures by that
-    return s.energy < inf and s.energy * least > 1.3e-29 * rhs
+    # Below 2^-48 of the norm of b the judge uses another reference.
+    return s.energy < inf and s.energy * min_diagonal > 1.3e-29 * rhs
 
 
-cdef void observe(const blocks_t* p, const rows_t* r, const warm_t* s, double* residual,
+cdef void measure_as_engine(const blocks_t* p, const rows_t* r, const warm_t* s, double* residual,
                          double* violation) noexcept nogil:
-    # as the engine measures its own sweeps: max |e_n| [N s] and max(0, -w_n) [m/s] over the contacts
+    """Compute max |e_n| [N s] and max(0, -w_n) [m/s] over the contacts, as the engine does for its own sweeps."""
     cdef int32_t i, j
     cdef double x, big = 0.0, low = 0.0
     for i in range(r.n_joints, p.n_blocks):
@@ -60,40 +61,40 @@ cdef void observe(const blocks_t* p, const rows_t* r, const warm_t* s, double* r
     violation[0] = low
 
 
-cdef inline void note_score(const blocks_t* p, const rows_t* r, warm_t* s, double energy) noexcept nogil:
-    # the last score of as much work counts
+cdef inline void store_score(const blocks_t* p, const rows_t* r, warm_t* s, double energy) noexcept nogil:
+    """Store the work, energy and max |e_n| of a score; it replaces an earlier score after the same work."""
     cdef int32_t i
     cdef double x, big = 0.0, work = s.sweeps + s.factorisations
     cdef double* out
-    if s.traced > 0 and s.trace[3 * s.traced - 3] == work:
-        s.traced -= 1
-    if s.traced == MOST_TRACED:
+    if s.n_traced > 0 and s.trace[3 * s.n_traced - 3] == work:
+        s.n_traced -= 1
+    if s.n_traced == MAX_TRACED_SCORES:
         return
     for i in range(r.n_joints, p.n_blocks):
         x = fabs(s.error[p.ptr[i]])
         big = x if x > big else big
-    out = s.trace + 3 * s.traced
+    out = s.trace + 3 * s.n_traced
     out[0] = work
     out[1] = energy
     out[2] = big
-    s.traced += 1
+    s.n_traced += 1
 
 
-cdef inline double scored(const blocks_t* p, const rows_t* r, warm_t* s, const double* lam, const double* v, double e0,
+cdef inline double score_impulse(const blocks_t* p, const rows_t* r, warm_t* s, const double* lam, const double* v, double e0,
                           double v0) noexcept nogil:
-    """Relative residual of lam as the judge has it, v = M^-1 J^T lam; infinite where it is not finite."""
+    """Return the judge's relative residual of lam, given v = M^-1 J^T lam; infinite if it is not finite."""
     cdef score_t x = new_score()
     rows_slack(p, r, lam, v, s.slack)
     score_slack(p, lam, s.slack, s.error, &x)
     if s.trace != NULL:
-        note_score(p, r, s, x.energy)
-    if x.relative >= 0.0:                               # of the worst island
+        store_score(p, r, s, x.energy)
+    if x.relative >= 0.0:                               # The residual of the worst island.
         return x.relative
     return relative(x.energy, x.velocity, e0, v0) if x.finite else 1.0 / 0.0
 
 
 cdef int32_t band_width(const blocks_t* p, const rows_t* r, int32_t* last) noexcept nogil:
-    """Width of the band of A in the given order, joints alone and all free; 0 where there are others."""
+    """Return the width of the band of A in the given order; 0 unless all rows are joints without bounds."""
     cdef int32_t i, j, h, b, width = 1
     if r.n_contacts > 0 or r.n_joints == 0:
         return 0
@@ -113,14 +114,14 @@ cdef int32_t band_width(const blocks_t* p, const rows_t* r, int32_t* last) noexc
                 last[b] = p.ptr[i]
             elif p.ptr[i + 1] - last[b] > width:
                 width = p.ptr[i + 1] - last[b]
-    return width if width <= MOST_BAND else 0
+    return width if width <= MAX_BAND_WIDTH else 0
 
 
 cdef inline void fill_band(const blocks_t* p, const rows_t* r, warm_t* s) noexcept nogil:
-    # band[i width + t] = A[i + t, i], over the joints of each body
+    """Compute band[i width + t] = A[i + t, i] from the joints of each body."""
     cdef int32_t i, k, q, j, h, g, b, at
     for b in range(r.n_bodies):
-        s.last[b] = -1
+        s.last_joint[b] = -1
     for i in range(p.n_rows * s.width):
         s.band[i] = 0.0
     for i in range(r.n_joints):
@@ -128,9 +129,9 @@ cdef inline void fill_band(const blocks_t* p, const rows_t* r, warm_t* s) noexce
             b = r.joint_body[2 * i + h]
             if b < 0:
                 continue
-            s.before[2 * i + h] = s.last[b]
-            s.last[b] = 2 * i + h
-            at = s.last[b]
+            s.previous_joint[2 * i + h] = s.last_joint[b]
+            s.last_joint[b] = 2 * i + h
+            at = s.last_joint[b]
             while at >= 0:
                 k = at >> 1
                 g = at & 1
@@ -139,23 +140,23 @@ cdef inline void fill_band(const blocks_t* p, const rows_t* r, warm_t* s) noexce
                         if q <= j:
                             s.band[<int64_t>q * s.width + (j - q)] += dot6(r.jac + 12 * j + 6 * h,
                                                                            r.minv_jac + 12 * q + 6 * g)
-                at = s.before[at]
+                at = s.previous_joint[at]
     for j in range(p.n_rows):
         s.band[<int64_t>j * s.width] += r.compliance[j]
 
 
-cdef double judged(const blocks_t* p, const rows_t* r, warm_t* s, const double* lam, double* v, double e0,
+cdef double judge_impulse(const blocks_t* p, const rows_t* r, warm_t* s, const double* lam, double* v, double e0,
                           double v0) noexcept nogil:
-    # with v formed anew, as the judge does
+    """Return the judge's relative residual of lam, with v computed from lam."""
     rows_velocity(p, r, lam, v)
-    return scored(p, r, s, lam, v, e0, v0)
+    return score_impulse(p, r, s, lam, v, e0, v0)
 
 
 cdef inline int32_t solve_joints(const blocks_t* p, const rows_t* r, warm_t* s, double tol, double e0, double v0,
                                  double* lam, double* v) noexcept nogil:
-    """(3)"""
+    """Solve the joints by (3)."""
     cdef pivots_t pivot
-    cdef int32_t j, turn
+    cdef int32_t j, attempt
     fill_band(p, r, s)
     s.factorisations = 1
     ldl_factor(p.n_rows, s.width, s.band, p.d, 1e-13, NULL, &pivot)
@@ -164,11 +165,11 @@ cdef inline int32_t solve_joints(const blocks_t* p, const rows_t* r, warm_t* s, 
     for j in range(p.n_rows):
         lam[j] = p.b[j]
     ldl_solve(p.n_rows, s.width, s.band, lam)
-    for turn in range(2):
-        s.relative = judged(p, r, s, lam, v, e0, v0)
+    for attempt in range(2):
+        s.relative = judge_impulse(p, r, s, lam, v, e0, v0)
         if s.relative <= tol:
             return SOLVED
-        if turn == 0:                                   # lam <- lam - A^-1 w
+        if attempt == 0:                                   # Refine: lam <- lam - A^-1 w.
             ldl_solve(p.n_rows, s.width, s.band, s.slack)
             for j in range(p.n_rows):
                 lam[j] -= s.slack[j]
@@ -177,28 +178,28 @@ cdef inline int32_t solve_joints(const blocks_t* p, const rows_t* r, warm_t* s, 
 
 cdef inline int32_t sweep_contacts(const blocks_t* p, const rows_t* r, warm_t* s, double tol, double e0, double v0,
                                    double* lam, double* v) noexcept nogil:
-    """(2)"""
-    cdef int32_t i, n = 0, last = 0, next_ = FIRST_SWEEPS
-    cdef double before, now = s.relative, ahead
-    while n < MOST_SWEEPS:
+    """Sweep the contacts as in (2)."""
+    cdef int32_t i, n = 0, last = 0, next_ = FIRST_SWEEP_CHECK
+    cdef double before, now = s.relative, predicted
+    while n < MAX_WARM_SWEEPS:
         while n < next_:
             for i in range(p.n_blocks):
                 relax_rows_block(p, r, i, lam, v)
             n += 1
         s.sweeps = n
         before = now
-        now = scored(p, r, s, lam, v, e0, v0)
+        now = score_impulse(p, r, s, lam, v, e0, v0)
         if now <= tol:
-            s.relative = judged(p, r, s, lam, v, e0, v0)
+            s.relative = judge_impulse(p, r, s, lam, v, e0, v0)
             if s.relative <= tol:
                 return SWEPT
-        if n >= PATIENT_SWEEPS:
-            ahead = now
+        if n >= MIN_SWEEPS_TO_GIVE_UP:
+            predicted = now
             i = n
-            while i < MOST_SWEEPS:
-                ahead = ahead * (now / before)
+            while i < MAX_WARM_SWEEPS:
+                predicted = predicted * (now / before)
                 i += n - last
-            if not ahead <= tol:
+            if not predicted <= tol:
                 return UNDECIDED
         last = n
         next_ = 2 * n
@@ -207,44 +208,44 @@ cdef inline int32_t sweep_contacts(const blocks_t* p, const rows_t* r, warm_t* s
 
 cdef int32_t warm_solve(const blocks_t* p, const rows_t* r, warm_t* s, double tol, double* lam, double* v,
                                int32_t has_velocity) noexcept nogil:
-    """lam (m), not all zero, to tol; v (n_bodies, 6) is left M^-1 J^T lam, given so with `has_velocity`."""
+    """Solve from lam (m), not zero, to tol in place; v (n_bodies, 6) becomes M^-1 J^T lam, and is so before with `has_velocity`."""
     cdef double e0, v0
-    cdef int32_t j, found
+    cdef int32_t j, result
     s.sweeps = 0
     s.factorisations = 0
-    s.traced = 0
-    if is_zero_impulse(p, lam) or p.n_rows > MOST_ROWS or p.law != COULOMB or not start_errors(p, &e0, &v0):
+    s.n_traced = 0
+    if is_zero_impulse(p, lam) or p.n_rows > MAX_WARM_ROWS or p.law != COULOMB or not zero_impulse_errors(p, &e0, &v0):
         return UNDECIDED
     if not has_velocity:
         rows_velocity(p, r, lam, v)
-    s.relative = scored(p, r, s, lam, v, e0, v0)
+    s.relative = score_impulse(p, r, s, lam, v, e0, v0)
     if s.relative <= tol:
         return JUDGED
     for j in range(p.n_rows):
-        s.kept[j] = lam[j]
-    found = UNDECIDED
+        s.start[j] = lam[j]
+    result = UNDECIDED
     if r.n_contacts > 0:
-        found = sweep_contacts(p, r, s, tol, e0, v0, lam, v)
+        result = sweep_contacts(p, r, s, tol, e0, v0, lam, v)
     elif s.width > 0:
-        found = solve_joints(p, r, s, tol, e0, v0, lam, v)
-    if found == UNDECIDED:
+        result = solve_joints(p, r, s, tol, e0, v0, lam, v)
+    if result == UNDECIDED:
         for j in range(p.n_rows):
-            lam[j] = s.kept[j]
+            lam[j] = s.start[j]
         rows_velocity(p, r, lam, v)
-    return found
+    return result
 
 
-def from_guess(Data data, double[::1] impulse, double tol):
-    """impulse (m,) of a factored problem to tol: (how it ended, sweeps, factorisations); as it came where 0."""
-    cdef int32_t m = data.blocks.n_rows, how
+def solve_from_guess(Data data, double[::1] impulse, double tol):
+    """Solve impulse (m,) of a factored problem to tol in place; return (result, sweeps, factorisations). 0: it is unchanged."""
+    cdef int32_t m = data.blocks.n_rows, result
     cdef warm_t s
     if m == 0 or not data.factored:
         return 0, 0, 0
     cdef int32_t[::1] index = np.empty(data.rows.n_bodies + 2 * data.rows.n_joints + 1, np.int32)
     s.width = band_width(&data.blocks, &data.rows, &index[0])
-    cdef double[::1] real = np.empty(6 * data.rows.n_bodies + room_of(&data.blocks, s.width))
+    cdef double[::1] real = np.empty(6 * data.rows.n_bodies + warm_workspace_size(&data.blocks, s.width))
     s.trace = NULL
     bind_warm_workspace(&s, &real[6 * data.rows.n_bodies], &index[0], &data.blocks, &data.rows)
     with nogil:
-        how = warm_solve(&data.blocks, &data.rows, &s, tol, &impulse[0], &real[0], 0)
-    return how, s.sweeps, s.factorisations
+        result = warm_solve(&data.blocks, &data.rows, &s, tol, &impulse[0], &real[0], 0)
+    return result, s.sweeps, s.factorisations

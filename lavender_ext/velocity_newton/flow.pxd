@@ -16,8 +16,8 @@ from libc.string cimport memcpy, memset
 
 from lavender_ext.core.block_projection cimport active_bound, project_contact
 from lavender_ext.core.block cimport block_error, row_error
-from lavender_ext.core.generalized cimport panel_transpose_add, panel_times
-from lavender_ext.core.block_types cimport blocks_t, is_rows, get_friction_components, friction_components_t
+from lavender_ext.core.generalized cimport panel_times, panel_transpose_add
+from lavender_ext.core.block_types cimport blocks_t, friction_components_t, get_friction_components, is_rows
 from lavender_ext.core.view cimport generalized_t
 from lavender_ext.factor.tiles cimport combine_rows
 from lavender_ext.judge.tally cimport empty_tally, tally_block, tally_row, tally_t

@@ -24,7 +24,7 @@ from lavender.base.deadline import NEVER, Deadline, Stopwatch, TooLate
 from lavender.base.lazy_import import sparse as sp
 from lavender.base.lu import sparse_lu
 from lavender.solvers.setup_times import SCIPY_CALLS_TIME, SPARSE_FACTOR_WORK_TIME, loading_time, sparse_work
-from lavender_ext.newton.solve import WHATS, Layout, Solve
+from lavender_ext.newton.solve import SYSTEMS, Layout, Solve
 
 
 class Augmented:
@@ -66,12 +66,12 @@ class Augmented:
     def _factor_kind(self, what: int, eps: float) -> bool:
         """Build the blocks of (1) or (2) for the kind `what` and factor them."""
         s = self.kernel
-        if what == WHATS["natural"]:
+        if what == SYSTEMS["natural"]:
             p = self._block_matrix(s.p)
             own = sp.eye_array(s.m) - p + p @ sp.diags_array(s.theta + eps)
             return self._factor(p, None, own)
         right = None if s.bt is None else self._block_matrix(s.bt)
-        left_factor = s.v if s.bt is None else s.bt if what == WHATS["barrier"] else s.pair
+        left_factor = s.v if s.bt is None else s.bt if what == SYSTEMS["barrier"] else s.pair
         return self._factor(self._block_matrix(left_factor), right, sp.eye_array(s.m))
 
     def solve(self, _augmented: int, r: FloatArray) -> FloatArray:

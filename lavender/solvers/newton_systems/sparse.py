@@ -21,7 +21,7 @@ from lavender.base.lu import sparse_lu
 from lavender.solvers.factors import PIVOT_TOLERANCE, Panels
 from lavender_ext.factor.sparse import is_mirrored
 from lavender_ext.newton.coupled import coupled, coupled_entries, coupled_rows, element_graph
-from lavender_ext.newton.solve import WHATS, Solve
+from lavender_ext.newton.solve import SYSTEMS, Solve
 
 BACKWARD_TOLERANCE = 1e-12  # Largest accepted backward error (1): thousands of roundings.
 
@@ -53,12 +53,12 @@ class SparseRows:
     def factor(self, _augmented: int, what: int, eps: float) -> bool:
         """Factor the matrix of the kind `what`; return whether that succeeded."""
         s, bounded = self.kernel, self.kernel.bt is None
-        self.lu = not self.symmetric or what == WHATS["pair"]
-        if what == WHATS["natural"]:
+        self.lu = not self.symmetric or what == SYSTEMS["pair"]
+        if what == SYSTEMS["natural"]:
             self.lu = self.lu or not bounded
             self.rows.data = self._coupled(s.p, s.p if bounded else None, eps - 1.0)
         elif not bounded:
-            self.rows.data = self._coupled(s.bt if what == WHATS["barrier"] else s.pair, s.bt, 0.0)
+            self.rows.data = self._coupled(s.bt if what == SYSTEMS["barrier"] else s.pair, s.bt, 0.0)
         else:
             self.rows.data = self.h.copy()
             with np.errstate(divide="ignore", over="ignore"):

@@ -111,7 +111,7 @@ class VelocitySystem(System):
             panel, columns, self.layout, solve.has_friction and problem.law == "coulomb", USE_WIDE_LANES
         )
         self.augmented = Augmented(solve, self.layout, bodies)
-        solve.ask(self.augmented)
+        solve.set_external(self.augmented)
 
     def set_deadline(self, deadline: Deadline) -> None:
         self.augmented.deadline = deadline
@@ -145,7 +145,7 @@ class MatrixSystem(System):
             self.h = sp.csr_array((values, a.indices, a.indptr), shape=(m, m))
             solve.over_entries(a.indptr, a.indices, values, self.symmetric)
             self.sparse = SparseRows(solve, self.h, self.symmetric)
-            solve.ask(self.sparse)
+            solve.set_external(self.sparse)
             self.work = (1.0 if self.symmetric else 2.0) * self.sparse.panels.work()
 
 

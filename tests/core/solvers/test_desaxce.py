@@ -26,7 +26,7 @@ def test_slip_is_de_saxces_term_and_psi_its_derivative(seed):
     sc = solve = system.solve
     rng = np.random.default_rng(seed)
     s, ds = rng.normal(size=sc.m), rng.normal(size=sc.m)
-    phi, psi = solve.slip(s)
+    phi, psi = solve.normal_shift(s)
     for i in range(len(sc.ptr) - 1):
         j, end = sc.ptr[i], sc.ptr[i + 1]
         reach = sc.reach[sc.part[i] : sc.part[i + 1]]
@@ -37,7 +37,7 @@ def test_slip_is_de_saxces_term_and_psi_its_derivative(seed):
         assert phi[j] == pytest.approx(expected, rel=1e-14, abs=1e-300)
         assert psi[j] == 0.0
     step = 1e-6
-    difference = (solve.slip(s + step * ds)[0] - solve.slip(s - step * ds)[0]) / (2.0 * step)
+    difference = (solve.normal_shift(s + step * ds)[0] - solve.normal_shift(s - step * ds)[0]) / (2.0 * step)
     # The third derivative of |s_t| grows like 1/|s_t|^2, and spin has a kink: only where nothing is near 0.
     smooth = [
         i
@@ -58,16 +58,16 @@ def test_the_system_of_a_step_is_solved(form, compliant, seed):
     sc = solve = system.solve
     h = dense_h(problem)[np.ix_(sc.keep, sc.keep)]
     first = np.repeat(sc.ptr[:-1], np.diff(sc.ptr))
-    solve.begin(1e-10, 0.9)
+    solve.begin_interior(1e-10, 0.9)
     for _ in range(3):
-        solve.weigh(1e-10)
+        solve.scale_interior(1e-10)
         w = np.linalg.inv(block_diagonal(system, solve.v)) - np.diag(sc.theta)
         c = np.eye(sc.m)
-        np.subtract.at(c, (first, np.arange(sc.m)), solve.turn(0.9))
+        np.subtract.at(c, (first, np.arange(sc.m)), solve.combine_pair(0.9))
         assert solve.factor("pair", augmented=form == "augmented")
         r = np.random.default_rng(seed).normal(size=sc.m)
         x = solve.solve("pair", r)
         expected = np.linalg.solve(h + c @ w, r)
         # W holds entries up to 1e10 of delta's reciprocal beside 1: what the dense inverse keeps of 16 digits.
         np.testing.assert_allclose(x, expected, rtol=0, atol=2e-5 * np.abs(expected).max())
-        assert solve.advance()[0]
+        assert solve.step_interior()[0]

@@ -99,7 +99,9 @@ def test_a_path_begins_where_a_tower_carries_more_than_its_right_hand_side_says(
     """z is some hundred times g there: paths that only began at the size of g gave up, and 120 factors were in vain."""
     problem = bricks(8, noise)
     system = make_system(problem, "velocity")
-    system.solve.without = sum(bit for name, bit in PHASES.items() if name not in ("path", "rounds"))
+    system.solve.disabled_phases = sum(
+        bit for name, bit in PHASES.items() if name not in ("path", "damped Newton")
+    )
     impulse = problem.start().copy()
     claim = Newton().run(NewtonState(problem, system), impulse, 250, 1e-6)
     assert claim.status is Status.CONVERGED, str(claim)
@@ -152,11 +154,11 @@ def test_interior_point_system_is_solved_and_its_steps_stay_inside_and_know_the_
     problem = random_contact_problem(seed, friction="cone", bodies=6, contacts=10)
     system = system_in(problem, form)
     solve = sc = system.solve
-    solve.begin(1e-10)
+    solve.begin_interior(1e-10)
     # V holds theta, the compliance, where H is K K^T + theta.
     h = dense_h(problem)[np.ix_(sc.keep, sc.keep)] - np.diag(sc.theta)
     for _ in range(4):
-        solve.weigh(1e-6)
+        solve.scale_interior(1e-6)
         solve.factor("barrier")
         r = np.random.default_rng(seed).normal(size=sc.m)
         x = solve.solve("barrier", r)
@@ -164,7 +166,7 @@ def test_interior_point_system_is_solved_and_its_steps_stay_inside_and_know_the_
         expected = np.linalg.solve(np.eye(sc.m) + v @ h, v @ r)
         # With delta = 1e-6 V is at most 1e6: ten digits are lost at most.
         np.testing.assert_allclose(x, expected, rtol=0, atol=1e-6 * np.abs(expected).max())
-        went, _, _, energy, velocity = solve.advance()
+        went, _, _, energy, velocity = solve.step_interior()
         assert went
         row = np.diff(sc.part) == 0
         whole = solve.point[0]
@@ -228,7 +230,7 @@ def on_bodies(k, layout, lu, wide=True):
     problem = lv.Problem.lcp(np.eye(m), np.ones(m))
     solve = Solve(problem.metric, problem.csr_data)
     panel = np.zeros((m, 2, 6))
-    panel[:, :, :s] = np.where(layout.turned[:, None, None] > 0, k[:, ::-1], k)
+    panel[:, :, :s] = np.where(layout.swapped[:, None, None] > 0, k[:, ::-1], k)
     solve.over_bodies(panel.reshape(m, 12), np.arange(s, dtype=np.int32), layout, lu, wide)
     return solve
 
@@ -256,7 +258,7 @@ def test_factors_of_a_graph_of_bodies_solve_what_a_dense_matrix_solves(s, n, m):
     layout = Layout(body, n, s)
     assert (layout.node[:, 0] > layout.node[:, 1]).all()
     if n > 3:
-        assert layout.supernodes < n and 0 < layout.turned.sum() < len(body)
+        assert layout.supernodes < n and 0 < layout.swapped.sum() < len(body)
     k, whole = random_columns(rng, layout.node, n, s)
     v, r = rng.uniform(0.1, 10.0, m), rng.normal(size=m)
     expected = np.linalg.solve(np.diag(1.0 / v) + whole @ whole.T, r)

@@ -97,7 +97,7 @@ def test_an_exchange_is_newtons_step_on_the_natural_map(seed):
     rows = np.where(free[:, None], h, np.eye(problem.m))
     expected = np.linalg.solve(rows, np.where(free, g, 0.0))
     for form in ("velocity", "impulse", "sparse"):
-        finite, found, relative, changed = system_in(problem, form).solve.exchange(z)
+        finite, found, relative, changed = system_in(problem, form).solve.exchange_rows(z)
         assert finite
         # Nine bodies: H has a condition number of some hundreds, the normal matrix 1e9 times that before refinement.
         np.testing.assert_allclose(found, expected, rtol=0, atol=1e-7 * np.abs(expected).max() + 1e-14)

@@ -99,14 +99,14 @@ def test_what_the_first_phase_does_not_reach_is_left_as_it_came():
     sim.step()
     problem = sim.constraint_problem()
     lam = problem.guess.copy()
-    how, _, factorisations = warm_start.from_guess(problem.data, lam, 1e-6)
+    how, _, factorisations = warm_start.solve_from_guess(problem.data, lam, 1e-6)
     assert (how, factorisations) == (0, 1)
     np.testing.assert_array_equal(lam, problem.guess)
     # nothing reaches a millionth of what float64 can hold
     problem = lv.Simulation(lv.Scene("stack", n=10)).constraint_problem()
     lam = 0.2 * lv.solve(problem, "newton", tol=1e-10).impulse
     before = lam.copy()
-    how, sweeps, factorisations = warm_start.from_guess(problem.data, lam, 1e-22)
+    how, sweeps, factorisations = warm_start.solve_from_guess(problem.data, lam, 1e-22)
     assert how == 0 and sweeps > 0
     np.testing.assert_array_equal(lam, before)
     found = lv.solve(problem, "newton", impulse=before, tol=1e-22)
@@ -154,7 +154,7 @@ def problem_in(scene, step, **parameters):
 def test_redundant_contacts_at_rest(scene, step, parameters, walks):
     problem = problem_in(scene, step, **parameters)
     assert problem.law == "coulomb"
-    with newton_without(*["pursuit"] * (not walks)):
+    with newton_without(*["damped Newton stretches"] * (not walks)):
         solution = lv.solve(problem, "newton", tol=1e-8)
     assert good(solution, 1e-8), str(solution)
     assert walks or "De Saxce steps" in solution.message
