@@ -14,7 +14,7 @@ from lavender.lab.bench.record import file_name, format_tolerance
 from lavender.lab.bench.statistics import RESIDUAL_NOISE_FACTOR, TIME_NOISE_FACTOR
 from lavender.lab.bench.store import Records
 from lavender.lab.report import table_specs
-from lavender.lab.report.figures import FLAT_LINES_NOTE, Figures
+from lavender.lab.report.figures import FLAT_LINES_NOTE, Figures, is_plug_in
 from lavender.lab.report.findings import Report
 from lavender.lab.report.plotting import plot_for_page
 from lavender.lab.report.text import (
@@ -26,6 +26,7 @@ from lavender.lab.report.text import (
 )
 from lavender.lab.report.verdict import Verdict
 
+MAX_NAMED = 7  # Solvers that are drawn in colour at first: the style sheet has so many colours.
 MAX_FAILURES = 500  # Failures on a page, so that a page of 200 problems has less than 3 MB.
 MAX_SPREADS = 100  # Spreads of sweep orders on a page: the widest ones.
 
@@ -99,15 +100,17 @@ def _render_drawings(records: Records, figures: Figures, verdict: Verdict) -> di
     """Return the drawings by name, and for each section of the page the names of its drawings."""
     names = sorted({r.solver for r in records} | {c.solver for f in figures for c in f.curves})
     number = {name: i for i, name in enumerate(names)}
+    named = [*verdict.leaders, *(name for name in names if is_plug_in(name) and name not in verdict.leaders)]
     # The drawings of a case have no title: the heading above them is the name of the case.
     own = [f.name for some in figures.cases.values() for f in some]
     titles = {name: "" for plain in own for name in (plain, f"motion {plain}")}
     return {
         "drawings": {  # their texts are escaped
-            file_name(figure.name): plot_for_page(figure, number, verdict.leaders, titles.get(figure.name))
+            file_name(figure.name): plot_for_page(figure, number, named, titles.get(figure.name))
             for figure in figures
         },
         "solvers": names,
+        "named": named[:MAX_NAMED],
         "number": number,
         "by_motion": figures.moved is not None,
         "drawn": _list_keys(figures),

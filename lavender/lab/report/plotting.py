@@ -284,9 +284,7 @@ LEFT, RIGHT, TOP, BOTTOM = (
     92,
 )  # [units] Margins for the labels of the axes and the names at the ends of curves.
 FONT_SIZE = 22  # [units] The page's style sheet has the same size.
-TITLE_CHARACTER_WIDTH = (
-    16  # [units] Mean width of a character of a title on a phone, which has the largest font.
-)
+TITLE_CHARACTER_WIDTH = 15  # [units] Mean width of a character of a title with the largest font, on a phone.
 TITLE_LINE_HEIGHT = 32  # [units]
 TITLE_MARGIN = 8  # [units] Between the title and the title of the vertical axis.
 MIN_NAME_DISTANCE = 30  # [units] Smallest distance between two names of leaders.

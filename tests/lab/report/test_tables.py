@@ -10,7 +10,7 @@ from rich.console import Console
 from lavender.lab.bench import statistics
 from lavender.lab.report import figures, table_specs
 from lavender.lab.report.findings import Report
-from lavender.lab.report.page import create_environment, keep_numbers_together
+from lavender.lab.report.page import create_environment, keep_numbers_together, render_page
 from lavender.lab.report.plotting import LEFT, RIGHT, WIDTH, plot_for_page
 from lavender.lab.report.summary_page import PageSection, SummaryPage
 from lavender.lab.report.table import Cell, Table
@@ -174,3 +174,13 @@ def test_numbers_stay_whole_in_a_narrow_terminal(width):
 def test_a_sequence_has_a_section_in_the_terminal(sequence):
     (section,) = (s for s in table_specs.list_sections(Report(sequence)) if s.title.startswith("Sequence"))
     assert section.title == "Sequence s" and len(section.table.rows) == 7
+
+
+def test_plug_ins_are_in_colour_on_the_page():
+    names = ("anderson", "direct", "jacobi", "newton", "nncg", "pgs", "my_solver")
+    made = [record(case, name, 1e-3 * (1 + i), 1e-7) for case in "ab" for i, name in enumerate(names)]
+    report = Report(records_of(*made))
+    page = render_page(report, figures.build_figures(report.records))
+    number = sorted(names).index("my_solver")
+    assert re.search(rf'value="{number}" checked', page) and f".s{number} {{ --c:" in page
+    assert len(re.findall(r'type="checkbox" value="\d+" checked', page)) < len(names)
