@@ -40,14 +40,13 @@ from lavender.solvers.registry import Solver, SolverSpec
 from lavender.solvers.setup_times import first_solve_time, matrix_setup_time
 from lavender.solvers.small import DIRECT
 from lavender_ext.judge import measure
-from lavender_ext.pivot.direct import CIRCLES, PASSED, SPENT
-from lavender_ext.pivot.principal import INDEFINITE, SMALL, SOLVED, STUCK
+from lavender_ext.pivot.direct import CYCLING, PASS_ENDED, PASSES_USED
+from lavender_ext.pivot.principal import INDEFINITE, SMALL_PIVOT, SOLVED, STUCK
 
 REFINEMENT_RESIDUAL = (
     1e-13  # Refinement ends at this relative residual, or at the round-off floor if that is larger.
 )
 ROUNDS_PER_CHECK = 32  # Rounds of exchanges between two checks of the clock and the residual.
-FINAL_CODES = (SOLVED, INDEFINITE, SPENT, CIRCLES)  # Codes of the kernel after which no round follows.
 
 
 @dataclass
@@ -322,12 +321,12 @@ class _Run:
             max_rounds = 0 if late else min(ROUNDS_PER_CHECK, self.max_iter - self.iterations)
             code, self.late = pivot.advance(self.deadline, max_rounds)
             self.iterations = rows.n_rounds - before
-            if code == SMALL and rows.passes == 0:
+            if code == SMALL_PIVOT and rows.passes == 0:
                 self.note_singular(pivot, self.patient or pivot.symmetric)
-            proof = self.certificate(rows.changed) if code in (PASSED, SPENT) else None
+            proof = self.certificate(rows.changed) if code in (PASS_ENDED, PASSES_USED) else None
             if proof is not None:
                 return proof
-            if code in FINAL_CODES or self.must_give_up(code, rows.passes > 0 or not pivot.symmetric):
+            if rows.is_over or self.must_give_up(code, rows.passes > 0 or not pivot.symmetric):
                 self.offer(rows.best)
                 return self.end(pivot, code)
             if self.iterations >= self.max_iter or self.out_of_time:
@@ -336,16 +335,16 @@ class _Run:
 
     def must_give_up(self, code: int, is_shifted: bool) -> bool:
         """Return whether the solver stops because it is not patient and pivoting makes no progress."""
-        return not self.patient and (code == STUCK or (code == SMALL and is_shifted))
+        return not self.patient and (code == STUCK or (code == SMALL_PIVOT and is_shifted))
 
     def end(self, pivot: PivotState, code: int) -> Claim:
         """Return the claim after the final code of the kernel."""
-        if code == CIRCLES:
+        if code == CYCLING:
             return self.end_in_cycle()
         if self.problem.law != "linear":
             return self.indefinite(pivot.symmetric) if code == INDEFINITE else self.verdict()
         met = self.best <= self.tol or self.is_at_floor() or self.out_of_time
-        if code == SOLVED or (code == SPENT and pivot.symmetric and met):
+        if code == SOLVED or (code == PASSES_USED and pivot.symmetric and met):
             return self.verdict()
         return self.general("A is indefinite" if pivot.symmetric else "A is not symmetric")
 

@@ -1,16 +1,26 @@
-"""Bounded rows to rounding: principal pivoting, refined and judged, and what follows where it does not end there.
+"""Bounded rows and linear systems solved to rounding: exchanges, refinement, shifted passes, descent; each result is judged.
 
-    rounds     of principal.pyx; what they end at is refined, x_F <- x_F - A_FF^-1 w_F, while that halves the residual
-    passes     rounds on A + s D around the last answer c, where A is singular on the free rows: a fixed point
-               solves A itself                                                                            (1)
-    descent    where rounds are stuck, instead of them, along falling s:
+    exchanges  principal pivoting (principal.pyx); then refinement x_F <- x_F - A_FF^-1 w_F while it halves the residual
+    pass       exchanges on A + s D around the last result c, if A is singular on the free rows: a fixed point solves A   (1)
+    descent    if exchanges are stuck, instead of them in a pass, for a sequence of smaller s:
 
         phi(x) = 1/2 x.A x - b.x + s/2 |x - c|_D^2,  grad phi = w                                         (2)
-        x <- P(x - t A_FF^-1 w_F),  F: rows off their bounds, or whose w pushes them off                  (3)
-        t = 1, 1/2, ... until phi falls by 1e-4 of what w promises                                        (4)
+        x <- P(x - t A_FF^-1 w_F),  F: rows off their bounds, or pushed off them by w                     (3)
+        t = 1, 1/2, ... until phi decreases by 1e-4 of the decrease that w promises                       (4)
 
-Bertsekas 1982. (3) is monotone, so no set comes back: what pivoting lacks on a nearly singular A. `direct_turn` leads
-from one to the other: a call does at most as many rounds as it is asked for, and the host looks at its clock in between.
+(Bertsekas 1982.) (3) is monotone, so no set of free rows returns, which pivoting cannot guarantee on a nearly singular A.
+
+`step_direct` does at most a number of rounds of one state, so that hosts can check their clock between steps. States, and the
+results that change them; ROUNDS_USED keeps the state:
+
+    GUESS     sweeps guess the free rows, or all rows are free; then as EXCHANGE
+    EXCHANGE  -> over      SOLVED; INDEFINITE; of an A that is not symmetric also CYCLING, and PASSES_USED of a linear system
+              -> PASS      SMALL_PIVOT: A is singular; or STUCK: refinement has ended above rounding
+              -> DESCENT   STUCK: the number of infeasible rows no longer falls
+    PASS      -> PASS      PASS_HALVED or PASS_ENDED: another pass; SMALL_PIVOT: another pass with a larger shift
+              -> DESCENT   STUCK, from the largest shift
+              -> over      SOLVED; INDEFINITE under the largest shift; PASSES_USED; CYCLING
+    DESCENT   as PASS, with descent in place of exchanges
 """
 from libc.math cimport INFINITY
 from libc.stdint cimport int32_t, int64_t
@@ -19,83 +29,82 @@ from libc.string cimport memcpy
 import numpy as np
 
 from lavender_ext.core.block cimport clip
-from lavender_ext.core.block_types cimport blocks_t
 from lavender_ext.core.problem cimport Data
-from lavender_ext.core.view cimport csr_t, view_t
+from lavender_ext.core.view cimport view_t
 from lavender_ext.judge.measure cimport above_floor_of, floor_of, judge_view, judged_from, relative_of, scratch_of
 from lavender_ext.judge.score cimport is_at_floor, new_score, score_t
-from lavender_ext.pivot.direct cimport CIRCLES, HALVED, PASSED, SPENT, direct_t
-from lavender_ext.pivot.principal cimport (INDEFINITE, ROUNDS, SMALL, SOLVED, STUCK, factor_free, pivots_solve,
-                                           pivoting_t, pivots_correct, pivots_exchange, pivots_factor_all, pivots_on,
-                                           pivots_renew, pivots_restart, pivots_rounds, pivots_slack, pivots_solve_free,
-                                           pivots_start)
+from lavender_ext.pivot.direct cimport (CYCLING, DESCENT, EXCHANGE, GUESS, PASS, PASS_ENDED, PASS_HALVED, PASSES_USED,
+                                        direct_t)
+from lavender_ext.pivot.principal cimport (INDEFINITE, ROUNDS_USED, SMALL_PIVOT, SOLVED, STUCK, bind_pivoting_workspace,
+                                           compute_slack, correct_free_rows, exchange_infeasible_rows, factor_all_rows,
+                                           factor_free_rows, guess_free_rows, pivoting_t, reset_patience, reset_pivoting,
+                                           run_rounds, set_shift, solve_all_rows)
 
 
 cdef enum:
-    CORRECTIONS = 100           # refinements at a time at most; each halves the residual
-    PASSES = 100
-    WAIT = 6                    # of these without halving the best residual
-    SHIFTS = 5                  # of the path
-    HALVINGS = 41               # step lengths tried in a line search: 1, 1/2, ... 2^-40
-
-cdef enum:                      # stages
-    BEGIN = 0
-    EXCHANGING = 1
-    PASSING = 2
+    MAX_CORRECTIONS = 100       # corrections of one refinement; each halves the residual
+    MAX_PASSES = 100
+    MAX_WAITED_PASSES = 6       # passes without halving the best residual, after which no other follows
+    N_SHIFTS = 5                # shifts of a descent
+    MAX_STEP_LENGTHS = 41       # step lengths of a line search: 1, 1/2, ... 2^-40
 
 
-cdef int64_t direct_real(const view_t* v, int64_t band) noexcept nogil:
-    """Numbers that `direct_lay` hands out, a factor of half bandwidth `band` among them, -1: none."""
+# -- workspace and begin -----------------------------------------------------------------------------------------
+
+cdef int64_t direct_workspace_doubles(const view_t* v, int64_t band) noexcept nogil:
+    """Return the number of doubles that `bind_direct_workspace` needs; half bandwidth -1: without a compiled factor."""
     cdef int64_t m = v.p.n_rows
     return 16 * m + m * (band + 1) + 1 + scratch_of(v)
 
 
-cdef int64_t direct_index(const view_t* v) noexcept nogil:
+cdef int64_t direct_workspace_integers(const view_t* v) noexcept nogil:
+    """Return the number of integers that `bind_direct_workspace` needs."""
     return 4 * <int64_t>v.p.n_rows + 1
 
 
-cdef void direct_lay(direct_t* t, const view_t* v, const csr_t* a, const blocks_t* p, int32_t band, const int32_t* order,
-                     double tiny, double* real, int32_t* index) noexcept nogil:
-    """All arrays; what is judged is v, what is pivoted on a, with d of p. e0, v0, least, sweeps, linear are the caller's."""
-    cdef int64_t m = p.n_rows
-    t.v = v[0]
+cdef void bind_direct_workspace(direct_t* t, double* real, int32_t* index) noexcept nogil:
+    """Bind the arrays of t, whose fields that direct.pxd names are set."""
+    cdef int64_t m = t.v.p.n_rows
     t.x, t.best = real, real + 3 * m
-    t.start, t.origin, t.slope, t.turn = real + 6 * m, real + 7 * m, real + 8 * m, real + 9 * m
+    t.start, t.origin, t.slope, t.step = real + 6 * m, real + 7 * m, real + 8 * m, real + 9 * m
     t.scratch = real + 10 * m
     t.side = index + 3 * m
-    pivots_on(&t.s, a, p, band, order, tiny, t.scratch + scratch_of(v), index)
+    bind_pivoting_workspace(&t.s, t.scratch + scratch_of(&t.v), index)
     if not t.symmetric:
         t.s.swap = index + 2 * m
-    direct_renew(t)
+    reset_direct(t)
 
 
-cdef inline void direct_renew(direct_t* t) noexcept nogil:
-    pivots_renew(&t.s)
+cdef inline void reset_direct(direct_t* t) noexcept nogil:
+    reset_pivoting(&t.s)
     t.relative = INFINITY
     t.floor = 0.0
-    t.rank = t.solved = t.swept = t.refined = t.shifts = t.searches = t.passes = 0
-    t.stage = BEGIN
+    t.rank = t.solved = t.swept = t.refined = t.shifts = t.searches = t.passes = t.is_over = 0
+    t.state = GUESS
 
 
-cdef void direct_begin(direct_t* t, const double* start) noexcept nogil:
-    """As if nothing had been solved, from start (m)."""
-    direct_renew(t)
+cdef void begin_direct(direct_t* t, const double* start) noexcept nogil:
+    """Begin a solve at start (m) [N s]."""
+    reset_direct(t)
     memcpy(t.start, start, t.s.n * sizeof(double))
 
 
 cdef void begin_exchanges(direct_t* t) noexcept nogil:
-    """Begin with exchanges from the bounds in s.at."""
-    pivots_start(&t.s, 0.0)
-    t.stage = EXCHANGING
+    """Begin with exchanges from the bounds in s.at; the best impulse is kept."""
+    set_shift(&t.s, 0.0)
+    t.passes = t.is_over = 0
+    t.state = EXCHANGE
 
+
+# -- judging and refinement --------------------------------------------------------------------------------------
 
 cdef inline int32_t is_good(const direct_t* t) noexcept nogil:
-    """To rounding, or to the floor where it excuses that."""
+    """Return whether the best residual is at most `least`, or at a floor that excuses it."""
     return t.relative <= t.least or (t.relative <= t.floor and is_at_floor(t.relative, t.floor))
 
 
-cdef int32_t is_end(const direct_t* t) noexcept nogil:
-    """The same; where every row is free, rounding is all that can be left."""
+cdef int32_t is_solved(const direct_t* t) noexcept nogil:
+    """Return `is_good`, or for a linear system whether only rounding is left."""
     return is_good(t) or (t.linear and is_at_floor(t.relative, t.floor))
 
 
@@ -105,236 +114,214 @@ cdef inline void clip_rows(const direct_t* t, const double* x, double* out) noex
         out[i] = clip(x[i], t.s.p.lower[i], t.s.p.upper[i])
 
 
-cdef void judge_now(direct_t* t) noexcept nogil:
-    """x within its bounds, judged; the best is kept."""
-    cdef score_t found = new_score()
+cdef void judge_iterate(direct_t* t) noexcept nogil:
+    """Judge s.x, clipped to its bounds, and keep it if it is the best."""
+    cdef score_t score = new_score()
     cdef double* x = t.x
     cdef double* w = x + t.s.n
     clip_rows(t, t.s.x, x)
-    judge_view(&t.v, x, w, w + t.s.n, t.scratch, True, &found)
-    t.now = relative_of(&found, w, t.s.n, t.e0, t.v0)
+    judge_view(&t.v, x, w, w + t.s.n, t.scratch, True, &score)
+    t.now = relative_of(&score, w, t.s.n, t.e0, t.v0)
     if t.now < t.relative:
         t.relative = t.now
-        t.floor = floor_of(&found, t.e0, t.v0)
-        t.score = found
+        t.floor = floor_of(&score, t.e0, t.v0)
+        t.score = score
         t.x, t.best = t.best, x
 
 
 cdef inline int32_t refine(direct_t* t) noexcept nogil:
-    # Corrections while they halve the residual; ROUNDS where one changes a sign.
+    """Correct the free rows while that halves the residual; return ROUNDS_USED if a row was exchanged, else SOLVED."""
     cdef double previous = INFINITY
     cdef int32_t _
-    for _ in range(CORRECTIONS):
+    for _ in range(MAX_CORRECTIONS):
         if is_good(t) or not t.now < 0.5 * previous:
             break
         previous = t.now
-        pivots_correct(&t.s)
-        pivots_slack(&t.s)
+        correct_free_rows(&t.s)
+        compute_slack(&t.s)
         t.refined += 1
-        if pivots_exchange(&t.s):
-            return ROUNDS
-        judge_now(t)
+        if exchange_infeasible_rows(&t.s):
+            return ROUNDS_USED
+        judge_iterate(t)
     return SOLVED
 
 
-cdef int32_t after_rounds(direct_t* t, int32_t code) noexcept nogil:
-    """Judge what rounds left, and refine it; `code` of theirs, or ROUNDS where that changed a sign."""
-    if code == SMALL or code == INDEFINITE:
+cdef inline int32_t judge_rounds(direct_t* t, int32_t code) noexcept nogil:
+    """Judge and refine the result of rounds that ended with `code`; return `code`, or ROUNDS_USED if a row was exchanged.
+
+    Rows whose signs differ by rounding may be exchanged without end; the judge then finds that only rounding is left.
+    """
+    if code == SMALL_PIVOT or code == INDEFINITE:
         return code
-    judge_now(t)
-    if code != SOLVED:
+    judge_iterate(t)
+    if code != SOLVED or t.s.shift != 0.0:
         return code
-    if t.s.shift != 0.0:
-        return SOLVED
     t.solved = 1
     if is_good(t):
         return SOLVED
-    pivots_slack(&t.s)
+    compute_slack(&t.s)
     return refine(t)
 
 
-cdef int32_t direct_factor(direct_t* t) noexcept nogil:
-    """A with all rows free: SOLVED, or SMALL or INDEFINITE after its pivots."""
+# -- linear systems and exchanges --------------------------------------------------------------------------------
+
+cdef inline int32_t factor_linear(direct_t* t) noexcept nogil:
+    """Factor A with all rows free: SOLVED, SMALL_PIVOT or INDEFINITE."""
     if not t.s.is_factored:
-        pivots_factor_all(&t.s)
-    if t.s.found.negative > 0:
+        factor_all_rows(&t.s)
+    if t.s.pivots.negative > 0:
         return INDEFINITE
-    if t.s.found.small == 0:
+    if t.s.pivots.small == 0:
         return SOLVED
-    t.rank = t.s.n - t.s.found.small
-    return SMALL
+    t.rank = t.s.n - t.s.pivots.small
+    return SMALL_PIVOT
 
 
-cdef int32_t direct_linear(direct_t* t) noexcept nogil:
-    """All rows free, after a factor that is SOLVED."""
+cdef inline int32_t step_linear(direct_t* t) noexcept nogil:
+    """Factor and solve with all rows free."""
+    cdef int32_t code = factor_linear(t)
+    if code != SOLVED:
+        return code
     t.s.n_rounds += 1
-    pivots_solve_free(&t.s)
-    return after_rounds(t, SOLVED)
+    solve_all_rows(&t.s)
+    return judge_rounds(t, SOLVED)
 
 
-cdef int32_t direct_first(direct_t* t, int32_t sweeps, int32_t n) noexcept nogil:
-    """A guess of the free rows by `sweeps` symmetric sweeps, or all of a narrow band, then `direct_rounds`."""
-    return after_rounds(t, pivots_solve(&t.s, t.start, sweeps, n, &t.swept))
+cdef inline int32_t step_guess(direct_t* t, int32_t max_rounds) noexcept nogil:
+    """Guess the free rows, then do at most `max_rounds` rounds."""
+    t.swept = not guess_free_rows(&t.s, t.start, t.sweeps, max_rounds)
+    return judge_rounds(t, run_rounds(&t.s, max_rounds) if t.swept else SOLVED)
 
 
-cdef int32_t direct_rounds(direct_t* t, int32_t n) noexcept nogil:
-    """At most n rounds, judged and refined.
-
-    Signs that differ by rounding alone exchange for ever: after ROUNDS the judge may see that nothing is wrong.
-    """
-    return after_rounds(t, pivots_rounds(&t.s, n))
+cdef inline int32_t step_exchanges(direct_t* t, int32_t max_rounds) noexcept nogil:
+    """Do at most `max_rounds` rounds."""
+    return judge_rounds(t, run_rounds(&t.s, max_rounds))
 
 
-cdef void direct_begin_passes(direct_t* t, int32_t stuck) noexcept nogil:
-    """Passes from the best impulse so far, along the path of shifts where rounds are stuck."""
-    cdef bint known = t.relative < INFINITY and t.floor <= 1e-6
-    memcpy(t.s.x, t.best if known else t.start, t.s.n * sizeof(double))
-    t.stuck = stuck
-    t.at = 0 if stuck else SHIFTS - 1
-    t.next = 0.0
+# -- passes with a shift -----------------------------------------------------------------------------------------
+
+cdef inline double path_shift(int32_t i) noexcept nogil:
+    """Return the i-th shift s. The last one is far above the rounding of a factor and far below a mass ratio of 1e8."""
+    return 1e-2 if i == 0 else 1e-4 if i == 1 else 1e-6 if i == 2 else 1e-8 if i == 3 else 1e-10
+
+
+cdef inline void begin_passes(direct_t* t, int32_t state) noexcept nogil:
+    """Prepare passes from the best impulse, with every shift for DESCENT and with the smallest for PASS."""
+    cdef bint has_best = t.relative < INFINITY and t.floor <= 1e-6
+    memcpy(t.s.x, t.best if has_best else t.start, t.s.n * sizeof(double))
+    t.state = state
+    t.next_shift = 0 if state == DESCENT else N_SHIFTS - 1
+    t.larger_shift = 0.0
     t.passes = t.waited = 0
-    t.fresh = 1
-    t.reference = INFINITY
-
-
-cdef inline double shift_of(int32_t at) noexcept nogil:
-    # -, of d: the last is far above the rounding of a factorisation and below what a mass ratio of 1e8 leaves.
-    return 1e-2 if at == 0 else 1e-4 if at == 1 else 1e-6 if at == 2 else 1e-8 if at == 3 else 1e-10
+    t.is_pass_over = 1
+    t.halved_from = INFINITY
 
 
 cdef inline void recenter(direct_t* t) noexcept nogil:
     memcpy(t.s.center, t.s.x, t.s.n * sizeof(double))
 
 
-cdef inline void open_pass(direct_t* t) noexcept nogil:
-    t.fresh = 0
+cdef inline void begin_pass(direct_t* t) noexcept nogil:
+    t.is_pass_over = 0
     t.passes += 1
     recenter(t)
-    if t.next > 0.0 or t.at < SHIFTS:
-        pivots_start(&t.s, t.next if t.next > 0.0 else shift_of(t.at))
-        t.at += t.next == 0.0
-        t.next = 0.0
+    if t.larger_shift > 0.0 or t.next_shift < N_SHIFTS:
+        set_shift(&t.s, t.larger_shift if t.larger_shift > 0.0 else path_shift(t.next_shift))
+        t.next_shift += t.larger_shift == 0.0
+        t.larger_shift = 0.0
         t.shifts += 1
-    pivots_restart(&t.s)
+    reset_patience(&t.s)
 
 
-cdef inline void settle(direct_t* t) noexcept nogil:
-    # More passes with the same factor, on the rows found, whatever signs rounding gives.
+cdef inline void repeat_pass(direct_t* t) noexcept nogil:
+    """Repeat the pass on its free rows with its factor while that halves the residual, whatever the signs are."""
     cdef double previous = INFINITY
     cdef int32_t _
-    for _ in range(CORRECTIONS):
+    for _ in range(MAX_CORRECTIONS):
         if is_good(t) or not t.now < 0.5 * previous:
             break
         previous = t.now
         recenter(t)
-        pivots_slack(&t.s)
-        pivots_correct(&t.s)
-        pivots_slack(&t.s)
+        compute_slack(&t.s)
+        correct_free_rows(&t.s)
+        compute_slack(&t.s)
         t.refined += 1
-        judge_now(t)
+        judge_iterate(t)
         if not t.now < previous:
             memcpy(t.s.x, t.s.center, t.s.n * sizeof(double))
 
 
-cdef int32_t direct_pass(direct_t* t, int32_t n) noexcept nogil:
-    """At most n rounds of a pass.
-
-    SOLVED: `is_end`. ROUNDS: the pass goes on with the next call. HALVED, PASSED: it came to its end. STUCK, SMALL: the
-    next one descends, or has a larger shift. INDEFINITE: there is none larger.
-    """
+cdef inline int32_t step_pass(direct_t* t, int32_t max_rounds) noexcept nogil:
+    """Do at most `max_rounds` rounds of a pass; the header has its results."""
     cdef int32_t code, i
-    if t.fresh and t.passes == PASSES:
-        return SPENT
-    if t.fresh:
-        open_pass(t)
-    code = descend(t, n) if t.stuck else direct_rounds(t, n)
-    if is_end(t):
+    if t.is_pass_over and t.passes == MAX_PASSES:
+        return PASSES_USED
+    if t.is_pass_over:
+        begin_pass(t)
+    code = descend(t, max_rounds) if t.state == DESCENT else step_exchanges(t, max_rounds)
+    if is_solved(t):
         return SOLVED
-    if code == ROUNDS:
-        return ROUNDS
-    t.fresh = 1
+    if code == ROUNDS_USED:
+        return ROUNDS_USED
+    t.is_pass_over = 1
     if code == STUCK:
-        t.stuck = 1
-        t.at = 0
+        if not t.symmetric:
+            return CYCLING
+        t.state = DESCENT
+        t.next_shift = 0
         clip_rows(t, t.s.center, t.s.x)
         return STUCK
     if code != SOLVED:
-        if t.s.shift >= shift_of(0):
+        if t.s.shift >= path_shift(0):
             return INDEFINITE
-        t.next = 100.0 * t.s.shift
-        t.at = SHIFTS
+        t.larger_shift = 100.0 * t.s.shift
+        t.next_shift = N_SHIFTS
         memcpy(t.s.x, t.s.center, t.s.n * sizeof(double))
-        return SMALL
+        return SMALL_PIVOT
     for i in range(t.s.n):
-        t.turn[i] = t.s.x[i] - t.s.center[i]
-    settle(t)
-    if is_end(t):
+        t.step[i] = t.s.x[i] - t.s.center[i]
+    repeat_pass(t)
+    if is_solved(t):
         return SOLVED
-    if t.at < SHIFTS or t.relative <= 0.5 * t.reference:
-        t.reference = t.relative
+    if t.next_shift < N_SHIFTS or t.relative <= 0.5 * t.halved_from:
+        t.halved_from = t.relative
         t.waited = 0
-        return HALVED
+        return PASS_HALVED
     t.waited += 1
-    return PASSED
+    return PASSES_USED if t.waited >= MAX_WAITED_PASSES else PASS_ENDED
 
 
-cdef int32_t direct_turn(direct_t* t, int32_t n) noexcept nogil:
-    """What comes next, of at most n rounds.
+# -- descent -----------------------------------------------------------------------------------------------------
 
-    ROUNDS, HALVED, PASSED, and SMALL and STUCK, which passes follow: another turn goes on. Else it is over: SOLVED
-    `is_end`, INDEFINITE, CIRCLES or SPENT. After PASSED and SPENT, what the pass changed may be a certificate.
-    """
-    cdef int32_t code
-    if t.stage == PASSING:
-        code = direct_pass(t, n)
-        if code == STUCK and not t.symmetric:
-            return CIRCLES
-        return SPENT if code == PASSED and t.waited >= WAIT else code
-    if t.linear:
-        code = direct_factor(t)
-        if code == SOLVED:
-            code = direct_linear(t)
-    else:
-        code = direct_first(t, t.sweeps, n) if t.stage == BEGIN else direct_rounds(t, n)
-    t.stage = EXCHANGING
-    if is_end(t):
-        return SOLVED
-    if code == ROUNDS or code == INDEFINITE:
-        return code
-    if not t.symmetric and (t.linear or code == STUCK):
-        return CIRCLES if code == STUCK else INDEFINITE if code == SMALL else SPENT
-    t.stage = PASSING
-    direct_begin_passes(t, code == STUCK)
-    return SMALL if code == SMALL else STUCK
-
-
-cdef inline bint take_sides(direct_t* t) noexcept nogil:
-    # F of (3) at `origin`; is the factor of those rows at hand?
+cdef inline bint choose_free_rows(direct_t* t) noexcept nogil:
+    """Choose F of (3) at the origin; return whether the factor of these rows is known."""
     cdef pivoting_t* s = &t.s
     cdef int32_t i, changed = 0
-    cdef double low, high, slop
+    cdef double low, high, tolerance
     for i in range(s.n):
-        low, high, slop = s.p.lower[i], s.p.upper[i], 8.0 * s.f[i]
-        if low == high or (t.origin[i] <= low and t.slope[i] >= -slop):
+        low, high, tolerance = s.p.lower[i], s.p.upper[i], 8.0 * s.f[i]
+        if low == high or (t.origin[i] <= low and t.slope[i] >= -tolerance):
             t.side[i] = -1
         else:
-            t.side[i] = t.origin[i] >= high and t.slope[i] <= slop
+            t.side[i] = t.origin[i] >= high and t.slope[i] <= tolerance
         changed += t.side[i] != s.at[i]
     s.exchanged += changed
     memcpy(s.at, t.side, s.n * sizeof(int32_t))
     return s.is_factored and changed == 0
 
 
-cdef inline double search(direct_t* t) noexcept nogil:
-    # (4): x and its w at the end of the step `turn` from `origin`; t.  No cancellation:
-    # phi(y) - phi(x) = 1/2 (w(x) + w(y)).(y - x)
+cdef inline double search_line(direct_t* t) noexcept nogil:
+    """Find the step length (4), and compute x and w at its end.
+
+    phi(y) - phi(x) = 1/2 (w(x) + w(y)).(y - x) has no cancellation.
+    """
     cdef pivoting_t* s = &t.s
     cdef int32_t i, _
     cdef double length = 1.0, gained, promised, move
-    for _ in range(HALVINGS):
+    for _ in range(MAX_STEP_LENGTHS):
         for i in range(s.n):
-            s.x[i] = clip(t.origin[i] + length * t.turn[i], s.p.lower[i], s.p.upper[i])
-        pivots_slack(s)
+            s.x[i] = clip(t.origin[i] + length * t.step[i], s.p.lower[i], s.p.upper[i])
+        compute_slack(s)
         t.searches += 1
         gained = promised = 0.0
         for i in range(s.n):
@@ -347,53 +334,93 @@ cdef inline double search(direct_t* t) noexcept nogil:
     return length
 
 
-cdef inline bint stays(const direct_t* t) noexcept nogil:
-    # Was the whole step within the bounds, and does no w push a row off its own?
+cdef inline bint is_minimum(const direct_t* t) noexcept nogil:
+    """Return whether the complete step was within the bounds, and no w pushes a row off its bound."""
     cdef const pivoting_t* s = &t.s
     cdef int32_t i
-    cdef double low, high, slop, y
+    cdef double low, high, tolerance, y
     for i in range(s.n):
-        low, high, slop = s.p.lower[i], s.p.upper[i], 8.0 * s.f[i]
-        y = t.origin[i] + t.turn[i]
-        if not low - slop / s.p.d[i] <= y <= high + slop / s.p.d[i]:
+        low, high, tolerance = s.p.lower[i], s.p.upper[i], 8.0 * s.f[i]
+        y = t.origin[i] + t.step[i]
+        if not low - tolerance / s.p.d[i] <= y <= high + tolerance / s.p.d[i]:
             return False
-        if (s.at[i] < 0 and low != high and s.w[i] < -slop) or (s.at[i] > 0 and s.w[i] > slop):
+        if (s.at[i] < 0 and low != high and s.w[i] < -tolerance) or (s.at[i] > 0 and s.w[i] > tolerance):
             return False
     return True
 
 
-cdef inline int32_t descend(direct_t* t, int32_t n) noexcept nogil:
-    """At most n steps of (3), judged."""
+cdef inline int32_t descend(direct_t* t, int32_t max_steps) noexcept nogil:
+    """Do at most `max_steps` steps (3) and judge the result: SOLVED, ROUNDS_USED, SMALL_PIVOT or INDEFINITE."""
     cdef pivoting_t* s = &t.s
-    cdef int32_t i, _, code = ROUNDS
+    cdef int32_t i, _, code = ROUNDS_USED
     cdef double length
     clip_rows(t, s.x, s.x)
-    pivots_slack(s)
-    for _ in range(n):
+    compute_slack(s)
+    for _ in range(max_steps):
         memcpy(t.origin, s.x, s.n * sizeof(double))
         memcpy(t.slope, s.w, s.n * sizeof(double))
-        if not take_sides(t):
-            factor_free(s, NULL)
+        if not choose_free_rows(t):
+            factor_free_rows(s, NULL)
             if s.late:
                 break
-            if s.found.negative > 0 or s.found.small > 0:
+            if s.pivots.negative > 0 or s.pivots.small > 0:
                 s.n_rounds += 1
-                return INDEFINITE if s.found.negative > 0 else SMALL
+                return INDEFINITE if s.pivots.negative > 0 else SMALL_PIVOT
         s.n_rounds += 1
-        pivots_correct(s)
+        correct_free_rows(s)
         for i in range(s.n):
-            t.turn[i] = s.x[i] - t.origin[i]
-        length = search(t)
-        if length == 1.0 and stays(t):
+            t.step[i] = s.x[i] - t.origin[i]
+        length = search_line(t)
+        if length == 1.0 and is_minimum(t):
             code = SOLVED
             break
-    judge_now(t)
+    judge_iterate(t)
     return code
 
 
-cdef int32_t factor_outside(void* of, const int32_t* _place, int32_t n_free, double shift) noexcept with gil:
-    # By Python; -1 where it was not begun, or broke off.
-    cdef Pivoting rows = <Pivoting>of
+# -- the driver --------------------------------------------------------------------------------------------------
+
+cdef inline bint is_final(const direct_t* t, int32_t code) noexcept nogil:
+    return code == SOLVED or code == INDEFINITE or code == PASSES_USED or code == CYCLING
+
+
+cdef inline int32_t leave_exchanges(direct_t* t, int32_t code) noexcept nogil:
+    """Choose what follows exchanges or a linear solve that ended with `code`; return the result of the step."""
+    if is_solved(t):
+        return SOLVED
+    if code == ROUNDS_USED or code == INDEFINITE:
+        return code
+    if not t.symmetric and code == STUCK:
+        return CYCLING
+    if not t.symmetric and t.linear:
+        return INDEFINITE if code == SMALL_PIVOT else PASSES_USED
+    begin_passes(t, DESCENT if code == STUCK else PASS)
+    return SMALL_PIVOT if code == SMALL_PIVOT else STUCK
+
+
+cdef int32_t step_direct(direct_t* t, int32_t max_rounds) noexcept nogil:
+    """Do at most `max_rounds` rounds of the present state; the header has states and results."""
+    cdef int32_t code
+    if t.state == GUESS or t.state == EXCHANGE:
+        if t.linear:
+            code = step_linear(t)
+        elif t.state == GUESS:
+            code = step_guess(t, max_rounds)
+        else:
+            code = step_exchanges(t, max_rounds)
+        t.state = EXCHANGE
+        code = leave_exchanges(t, code)
+    else:
+        code = step_pass(t, max_rounds)
+    t.is_over = is_final(t, code)
+    return code
+
+
+# -- for Python --------------------------------------------------------------------------------------------------
+
+cdef int32_t factor_outside(void* owner, const int32_t* _place, int32_t n_free, double shift) noexcept with gil:
+    """Call the factor of Python; return -1 if it was not started or has raised."""
+    cdef Pivoting rows = <Pivoting>owner
     cdef Py_ssize_t m = rows.t.s.n
     if rows.error is not None:
         return -1
@@ -404,14 +431,15 @@ cdef int32_t factor_outside(void* of, const int32_t* _place, int32_t n_free, dou
         return -1
 
 
-cdef void solve_outside(void* of, int32_t n_free, double* y) noexcept with gil:
-    cdef Pivoting rows = <Pivoting>of
-    cdef const double[::1] found
+cdef void solve_outside(void* owner, int32_t n_free, double* y) noexcept with gil:
+    """Solve with the factor of Python."""
+    cdef Pivoting rows = <Pivoting>owner
+    cdef const double[::1] solution
     if rows.error is not None or n_free == 0:
         return
     try:
-        found = rows.outside.solve(np.asarray(<double[:n_free]>y).copy())
-        memcpy(y, &found[0], n_free * sizeof(double))
+        solution = rows.outside.solve(np.asarray(<double[:n_free]>y).copy())
+        memcpy(y, &solution[0], n_free * sizeof(double))
     except BaseException as error:
         rows.error = error
 
@@ -422,106 +450,111 @@ cdef class Pivoting:
     Parameters
     ----------
     p : Data
-        Of A in compressed rows.
+        Problem with A in compressed rows.
     band : int
-        Half bandwidth of A in order of elimination, at most m - 1; -1: the factor is `outside`.
+        Half bandwidth of A in the order of elimination, at most m - 1; -1 if the factor is `outside`.
     order : (m,) int32 or None
-        Row eliminated first, second, ...; None: as they stand.
+        Row that is eliminated first, second, ...; None: 0, 1, ...
     tiny : float
         Pivots below tiny d are small.
     judged : Data, optional
-        What the judge reads, its error of doing nothing known; default p.
+        The problem as the judge reads it, with known errors of the zero impulse; default p.
     outside : object, optional
-        `factor(place, n_free, shift)` of the rows with place >= 0, numbered as they stand: how many pivots are small, -1
-        where it was not begun; `solve(rhs)` (n_free,).
+        Factor by Python. `factor(place, n_free, shift)` factors the rows with place >= 0, numbered as in A, and returns the
+        number of small pivots, or -1 if it was not started; `solve(rhs)` returns the solution (n_free,).
     linear, symmetric : bool
-        Every row is free; A is symmetric. Without `outside`: else LU, in workspace for a band of m - 1, as rows stand.
+        Every row is free; A is symmetric. An A that is not symmetric is factored by LU, unless `outside` is given: `band` is
+        then m - 1 and `order` is None.
     """
 
     def __init__(self, Data p, int band, order, double tiny, Data judged=None, outside=None, bint linear=False,
                  bint symmetric=True):
         cdef int32_t m = p.blocks.n_rows
-        cdef const int32_t[::1] given
+        cdef const int32_t[::1] row_order
         cdef double[::1] reals
         cdef int32_t[::1] ints
-        cdef const int32_t* first = NULL
-        cdef view_t v
         if p.factored or p.is_general:
             raise ValueError("Pivoting reads A in compressed rows")
         if outside is None and not symmetric and (band != m - 1 or order is not None):
-            raise ValueError("LU has workspace where the band is whole, and takes rows as they stand")
+            raise ValueError("LU needs a band of m - 1 and rows in their own order")
         self.p, self.judged, self.order, self.outside = p, p if judged is None else judged, order, outside
-        if order is not None:
-            given = order
-            if given.shape[0] != m:
-                raise ValueError("order must name every row once")
-            if m:
-                first = &given[0]
-        v = self.judged.view()
-        # One block for the vectors and the factor: two allocations in all.
-        self.reals = np.zeros(direct_real(&v, band))
-        self.ints = np.zeros(direct_index(&v), np.int32)
-        reals, ints = self.reals, self.ints
+        self.t.v = self.judged.view()
         self.t.e0, self.t.v0 = self.judged.reference_energy, self.judged.reference_velocity
         self.t.least = 1e-13
         self.t.linear, self.t.symmetric = linear, symmetric
-        direct_lay(&self.t, &v, &p.csr, &p.blocks, band, first, tiny, &reals[0], &ints[0])
+        self.t.s.a, self.t.s.p, self.t.s.band, self.t.s.order, self.t.s.tiny = &p.csr, &p.blocks, band, NULL, tiny
+        if order is not None:
+            row_order = order
+            if row_order.shape[0] != m:
+                raise ValueError("order must name every row once")
+            if m:
+                self.t.s.order = &row_order[0]
+        # One array for the vectors and the factor: two allocations in all.
+        self.reals = np.zeros(direct_workspace_doubles(&self.t.v, band))
+        self.ints = np.zeros(direct_workspace_integers(&self.t.v), np.int32)
+        reals, ints = self.reals, self.ints
+        bind_direct_workspace(&self.t, &reals[0], &ints[0])
         if outside is not None:
             self.t.s.swap = NULL
             self.t.s.outside = <void*>self
-            self.t.s.refactor = factor_outside
-            self.t.s.resolve = solve_outside
+            self.t.s.factor_outside = factor_outside
+            self.t.s.solve_outside = solve_outside
 
-    cdef int told(self, int32_t code) except -1:
-        # What broke off outside comes up here.
+    cdef int raise_error(self, int32_t code) except -1:
+        """Raise the error of the factor of Python, if any; else return `code`."""
         error, self.error = self.error, None
         if error is not None:
             raise error
         return code
 
     def factor_all(self):
-        """Factor A, all rows free: SOLVED, SMALL or INDEFINITE."""
+        """Factor A with all rows free: SOLVED, SMALL_PIVOT or INDEFINITE."""
         cdef int32_t code
         with nogil:
-            code = direct_factor(&self.t)
-        return self.told(code)
+            code = factor_linear(&self.t)
+        return self.raise_error(code)
 
     def begin(self, const double[::1] start, double least, int sweeps):
-        """From start (m,) [N s], with `sweeps` symmetric ones; `least`: the relative residual good whatever the floor."""
+        """Begin at start (m,) [N s] with `sweeps` symmetric sweeps; a relative residual up to `least` is not refined."""
         self.t.least, self.t.sweeps = least, sweeps
         memcpy(self.t.start, &start[0], self.t.s.n * sizeof(double))
 
-    def advance(self, int n):
-        """At most n rounds, refined and judged, as `direct_turn` says."""
+    def advance(self, int max_rounds):
+        """Do at most `max_rounds` rounds, refined and judged; return the result of the step (states in direct.pyx)."""
         cdef int32_t code
         with nogil:
-            code = direct_turn(&self.t, n)
-        return self.told(code)
+            code = step_direct(&self.t, max_rounds)
+        return self.raise_error(code)
+
+    @property
+    def is_over(self):
+        """Whether the last step had a final result."""
+        return bool(self.t.is_over)
 
     @property
     def relative(self):
-        """Relative residual of the best impulse, inf before any."""
+        """Relative residual of the best impulse, inf before the first."""
         return self.t.relative
 
     @property
     def floor(self):
-        """What rounding alone costs it, relative."""
+        """Relative round-off floor of the best impulse."""
         return self.t.floor
 
     @property
     def above_floor(self):
-        """What of the relative residual of the best impulse rounding does not explain, inf before any."""
+        """Part of the best relative residual that rounding does not explain, inf before the first impulse."""
         return above_floor_of(&self.t.score, self.t.relative, self.t.floor) if self.t.relative < INFINITY else INFINITY
 
     @property
     def changed(self):
-        """(m,) N s, what the last pass changed; a new array."""
+        """Change (m,) [N s] of the impulse in the last pass, a new array."""
         cdef Py_ssize_t at = 9 * <Py_ssize_t>self.t.s.n
         return self.reals[at:at + self.t.s.n].copy()
 
     @property
     def late(self):
-        """A factor was not begun."""
+        """Whether a factor was not started."""
         return bool(self.t.s.late)
 
     @property
@@ -530,34 +563,34 @@ cdef class Pivoting:
 
     @property
     def passes(self):
-        """So many have begun."""
+        """Number of passes that have begun."""
         return self.t.passes
 
     @property
     def rank(self):
-        """Of A where `factor_all` was SMALL, by pivots above tiny d."""
+        """Rank of A if `factor_all` returned SMALL_PIVOT: the number of pivots above tiny d."""
         return self.t.rank
 
     @property
     def work(self):
-        """What was done, but what was not."""
+        """Counts of work that are not 0."""
         counts = (("sweeps", 2 * self.t.sweeps * self.t.swept), ("shifts", self.t.shifts), ("refinements", self.t.refined),
                   ("factorisations", self.t.s.factorisations), ("pivots", self.t.s.exchanged),
                   ("line_searches", self.t.searches))
-        return {what: count for what, count in counts if count}
+        return {kind: count for kind, count in counts if count}
 
     @property
     def best(self):
-        """What the judge found of the best impulse; None before any."""
+        """The best impulse with its residual as a `Judged`, None before the first."""
         cdef Py_ssize_t m = self.t.s.n, at
         if not self.t.relative < INFINITY:
             return None
-        at = 0 if self.t.best < self.t.x else 3 * m     # the two change places
-        found = self.reals[at:at + 3 * m].copy()
-        return judged_from(self.judged, found[:m], found[m:], &self.t.score, self.t.relative, self.t.floor)
+        at = 0 if self.t.best < self.t.x else 3 * m     # The two arrays change places.
+        numbers = self.reals[at:at + 3 * m].copy()
+        return judged_from(self.judged, numbers[:m], numbers[m:], &self.t.score, self.t.relative, self.t.floor)
 
     def skipped(self):
-        """Rows whose pivots were small in the last factorisation, in order of elimination."""
+        """Return the rows whose pivots were small in the last factorisation, in order of elimination."""
         cdef pivoting_t* s = &self.t.s
         rows = self.order if self.order is not None else range(s.n)
         return [i for i in rows if s.place[i] >= 0 and s.c[<int64_t>s.place[i] * s.width] == 0.0]

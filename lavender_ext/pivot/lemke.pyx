@@ -43,10 +43,10 @@ import numpy as np
 from lavender_ext.core.validate cimport norm_inf
 from lavender_ext.core.order cimport next_random
 from lavender_ext.core.block_types cimport blocks_t
-from lavender_ext.pivot.direct cimport (CIRCLES, Pivoting, SPENT, begin_exchanges, direct_begin, direct_t, direct_turn, is_end,
-                                        judge_now)
+from lavender_ext.pivot.direct cimport (Pivoting, begin_direct, begin_exchanges, direct_t, is_solved, judge_iterate,
+                                        step_direct)
 from lavender_ext.pivot.lemke cimport DONE, LATE, PIVOTS, RAY, dictionary_t, lemke_t
-from lavender_ext.pivot.principal cimport AT_LOWER, AT_UPPER, FREE, INDEFINITE, SOLVED
+from lavender_ext.pivot.principal cimport AT_LOWER, AT_UPPER, FREE
 
 
 cdef enum:                      # states
@@ -67,7 +67,7 @@ cdef enum:
     MAX_PATHS = 8               # covering vectors
     PIVOTS_PER_PAIR = 20        # A path is given up after PIVOTS_PER_PAIR n + EXTRA_PIVOTS pivots.
     EXTRA_PIVOTS = 200
-    FINISH_ROUNDS = 32          # rounds of exchanges in one call of `direct_turn` at the end of a path
+    FINISH_ROUNDS = 32          # rounds of exchanges in one step at the end of a path
 
 
 # -- the dictionary ----------------------------------------------------------------------------------------------
@@ -434,7 +434,7 @@ cdef inline void judge_path(lemke_t* l) noexcept nogil:
     for k in range(l.n_bounded, first_free_pair(l)):
         if row_of(d, d.n_pairs + k) >= 0:               # The multiplier of the cap is positive.
             at[l.row[l.row[k]]] = AT_UPPER
-    judge_now(l.t)
+    judge_iterate(l.t)
 
 
 cdef void get_ray(const lemke_t* l, double* y) noexcept nogil:
@@ -449,15 +449,6 @@ cdef void get_ray(const lemke_t* l, double* y) noexcept nogil:
     for i in range(p.n_rows):
         if p.lower[i] > -INFINITY and p.upper[i] < INFINITY:
             y[i] = 0.0
-
-
-cdef inline int32_t finish_path(lemke_t* l) noexcept nogil:
-    """Exchange from the bounds of the path's end; return the final code of `direct_turn`, or that of a late factor."""
-    cdef int32_t code
-    while True:
-        code = direct_turn(l.t, FINISH_ROUNDS)
-        if l.t.s.late or code == SOLVED or code == INDEFINITE or code == SPENT or code == CIRCLES:
-            return code
 
 
 # -- calls -------------------------------------------------------------------------------------------------------
@@ -488,7 +479,7 @@ cdef void begin_paths(lemke_t* l) noexcept nogil:
     l.n_pivots = l.n_paths = 0
     l.random = 0
     memcpy(l.t.s.x, l.t.start, l.t.s.n * sizeof(double))
-    judge_now(l.t)
+    judge_iterate(l.t)
 
 
 cdef int32_t follow_paths(lemke_t* l, int32_t pivots) noexcept nogil:
@@ -509,13 +500,14 @@ cdef int32_t follow_paths(lemke_t* l, int32_t pivots) noexcept nogil:
             judge_path(l)
             begin_exchanges(l.t)
             l.state = FINISH
-            if code == RAY and not is_end(l.t):
+            if code == RAY and not is_solved(l.t):
                 return RAY
         if l.state == FINISH:
-            code = finish_path(l)
-            if l.t.s.late:
-                return LATE
-            l.state = OVER if code == SOLVED or l.n_paths == MAX_PATHS else START
+            while not l.t.is_over:
+                code = step_direct(l.t, FINISH_ROUNDS)
+                if l.t.s.late:
+                    return LATE
+            l.state = OVER if is_solved(l.t) or l.n_paths == MAX_PATHS else START
     return DONE
 
 
@@ -547,7 +539,7 @@ cdef class Lemke:
 
     def begin(self, const double[::1] start):
         """Begin a solve at start (m,) [N s]."""
-        direct_begin(&self.rows.t, &start[0])
+        begin_direct(&self.rows.t, &start[0])
         begin_paths(&self.l)
 
     def run(self, int pivots):
@@ -555,7 +547,7 @@ cdef class Lemke:
         cdef int32_t code
         with nogil:
             code = follow_paths(&self.l, pivots)
-        return self.rows.told(code)
+        return self.rows.raise_error(code)
 
     def judge(self):
         """Judge the present impulse of a path that is not continued."""

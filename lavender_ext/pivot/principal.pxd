@@ -1,4 +1,4 @@
-"""Principal pivoting for other compiled loops: its state, its outcomes, and its steps by name."""
+"""Principal pivoting for other kernels: its state, results and operations."""
 from libc.stdint cimport int32_t
 
 from lavender_ext.core.block_types cimport blocks_t
@@ -6,69 +6,68 @@ from lavender_ext.core.view cimport csr_t
 from lavender_ext.factor.band cimport pivots_t
 
 
-cpdef enum:                     # outcomes
-    SOLVED = 0
-    ROUNDS = 1                  # all rounds used
-    SMALL = 2                   # a pivot too small for s = 0
-    INDEFINITE = 3              # a negative pivot
-    STUCK = 4                   # patience used up
+cpdef enum:                     # results of rounds
+    SOLVED = 0                  # no row is infeasible
+    ROUNDS_USED = 1             # the rounds of the call are used up
+    SMALL_PIVOT = 2             # a pivot is too small for s = 0
+    INDEFINITE = 3              # a pivot is negative
+    STUCK = 4                   # the number of infeasible rows no longer falls
 
 
-cdef enum:                      # sides of a row
+cdef enum:                      # where a row is
     FREE = 0
     AT_LOWER = -1
     AT_UPPER = 1
 
 
-ctypedef int32_t (*refactor_t)(void* outside, const int32_t* place, int32_t n_free, double shift) noexcept nogil
-ctypedef void (*resolve_t)(void* outside, int32_t n_free, double* y) noexcept nogil
+ctypedef int32_t (*outside_factor_t)(void* outside, const int32_t* place, int32_t n_free, double shift) noexcept nogil
+ctypedef void (*outside_solve_t)(void* outside, int32_t n_free, double* y) noexcept nogil
 
 
 cdef struct pivoting_t:
-    const csr_t* a
+    const csr_t* a              # The caller sets the first five fields before `bind_pivoting_workspace`.
     const blocks_t* p           # b, d, lower, upper
+    int32_t band                # half bandwidth in the order of elimination; -1: no compiled factor
+    const int32_t* order        # (n) row that is eliminated first, second, ...; NULL: 0, 1, ...
+    double tiny                 # Pivots below tiny d are small.
     int32_t n
-    int32_t band                # half bandwidth in order of elimination
-    const int32_t* order        # (n) row eliminated first, second, ...; not read where natural
-    int32_t natural             # order is 0, 1, ...
-    int32_t* swap               # (n) rows exchanged by LU; NULL: LDL^T, of a symmetric A
+    int32_t natural             # The order is 0, 1, ...
+    int32_t* swap               # (n) row exchanges of LU; NULL: LDL^T, for a symmetric A
     int32_t* at                 # (n) FREE | AT_LOWER | AT_UPPER
-    int32_t* place              # (n) place among the free rows, -1
+    int32_t* place              # (n) place among the free rows, or -1
     double* x                   # (n) N s
     double* w                   # (n) m/s, (2)
     double* f                   # (n) m/s, 2^-53 (|A| |x| + |b|): rounding of w
     double* center              # (n) N s
     double* y                   # (n) scratch
-    double* size                # (n) d of the free rows, by place; of LU d^-1/2
-    double* c                   # (n (band + 1)) factor; of LU (n_free, n_free)
+    double* size                # (n) d of the free rows, by place; for LU d^-1/2
+    double* c                   # (n (band + 1)) factor; for LU (n_free, n_free)
     double shift                # s
-    double tiny                 # pivots below tiny d are small
     int32_t n_free
     int32_t width
-    int32_t is_factored         # of the present set and shift
-    int32_t is_half_solved      # x holds what the factorisation made of b on its way
-    pivots_t found
-    int32_t best                # least number of infeasible rows so far
-    int32_t patience
-    int32_t exchanged           # rows that changed sides so far
+    int32_t is_factored         # The factor belongs to the present free rows and shift.
+    int32_t is_half_solved      # x holds the result of the forward substitution of b, which the factorisation did.
+    pivots_t pivots             # of the last factor
+    int32_t min_infeasible      # smallest number of infeasible rows so far
+    int32_t patience            # exchanges left without a smaller number
+    int32_t exchanged           # rows that changed between free and a bound so far
     int32_t factorisations
     int32_t n_rounds
-    int32_t late                # a factor was not begun
-    void* outside               # whose factor it is, of the rows with a place, numbered as they stand, or NULL:
-    refactor_t refactor         # how many of its pivots are small, -1: not begun
-    resolve_t resolve           # y (n_free) <- the solve
+    int32_t late                # An outside factor was not started.
+    void* outside               # owner of an outside factor of the rows with a place, numbered as in A; or NULL
+    outside_factor_t factor_outside     # returns the number of small pivots, -1: not started
+    outside_solve_t solve_outside       # y (n_free) <- solution
 
 
-cdef void pivots_on(pivoting_t* s, const csr_t* a, const blocks_t* p, int32_t band, const int32_t* order, double tiny,
-                    double* real, int32_t* whole) noexcept nogil
-cdef void pivots_renew(pivoting_t* s) noexcept nogil
-cdef void factor_free(pivoting_t* s, double* x) noexcept nogil
-cdef void pivots_factor_all(pivoting_t* s) noexcept nogil
-cdef void pivots_solve_free(pivoting_t* s) noexcept nogil
-cdef int32_t pivots_solve(pivoting_t* s, const double* start, int32_t sweeps, int32_t n, int32_t* swept) noexcept nogil
-cdef int32_t pivots_rounds(pivoting_t* s, int32_t n) noexcept nogil
-cdef void pivots_start(pivoting_t* s, double shift) noexcept nogil
-cdef void pivots_restart(pivoting_t* s) noexcept nogil
-cdef void pivots_slack(pivoting_t* s) noexcept nogil
-cdef void pivots_correct(pivoting_t* s) noexcept nogil
-cdef int32_t pivots_exchange(pivoting_t* s) noexcept nogil
+cdef void bind_pivoting_workspace(pivoting_t* s, double* real, int32_t* index) noexcept nogil
+cdef void reset_pivoting(pivoting_t* s) noexcept nogil
+cdef void set_shift(pivoting_t* s, double shift) noexcept nogil
+cdef void reset_patience(pivoting_t* s) noexcept nogil
+cdef void factor_free_rows(pivoting_t* s, double* x) noexcept nogil
+cdef void factor_all_rows(pivoting_t* s) noexcept nogil
+cdef void solve_all_rows(pivoting_t* s) noexcept nogil
+cdef int32_t guess_free_rows(pivoting_t* s, const double* start, int32_t sweeps, int32_t max_rounds) noexcept nogil
+cdef int32_t run_rounds(pivoting_t* s, int32_t max_rounds) noexcept nogil
+cdef void compute_slack(pivoting_t* s) noexcept nogil
+cdef void correct_free_rows(pivoting_t* s) noexcept nogil
+cdef int32_t exchange_infeasible_rows(pivoting_t* s) noexcept nogil

@@ -1,38 +1,38 @@
-"""Principal pivoting on a boxed LCP, and the factorisations under it: LDL^T, or LU of few rows where A is not symmetric.
+"""Principal pivoting on a boxed LCP, with its factorisations: LDL^T, or LU of few rows if A is not symmetric.
 
     free rows F: (A_FF + s D_FF) x_F = b_F - A_FB x_B + s D_FF center_F,  bound rows B: x = its bound    (1)
     w = A x - b + s D (x - center),   D = diag(d)                                                       (2)
     infeasible: x_i outside its bounds on F, w_i < 0 at a lower, w_i > 0 at an upper bound              (3)
-    exchange all infeasible rows, while their number falls within `patience` tries                      (4)
+    exchange all infeasible rows, unless their number has not fallen for MAX_MAX_PATIENCE exchanges         (4)
 
-Judice, Pires 1994 (block principal pivoting; when (4) is stuck the caller descends on the energy instead).
-s > 0 is the proximal shift of a singular matrix. Free rows are numbered compactly in a fixed order of
-elimination, so the bandwidth of A never grows; a dense matrix is a band of full width. A linear system is
-the case of all rows free. LU is of D^-1/2 (A_FF + s D_FF) D^-1/2, dense, with rows exchanged for the largest pivot.
+Judice, Pires 1994 (block principal pivoting; if (4) is stuck, the caller descends on the energy instead).
+s > 0 is the proximal shift of a singular matrix. Free rows are numbered compactly in a fixed order of elimination, so the
+bandwidth of A never grows; a dense matrix is a band of full width. A linear system is the case in which all rows are free. LU
+factors D^-1/2 (A_FF + s D_FF) D^-1/2, dense, with row exchanges for the largest pivot.
 """
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t, int64_t
 
 from lavender_ext.core.block cimport relax_row
 from lavender_ext.core.csr cimport csr_dot
-from lavender_ext.core.block_types cimport blocks_t
 from lavender_ext.core.view cimport csr_t
 from lavender_ext.factor.band cimport ldl_back_all, ldl_factor, ldl_factor_2, ldl_solve, no_pivots
 from lavender_ext.factor.dense cimport dense_lu, dense_lu_solve
 from lavender_ext.factor.tiles cimport has_wide
 from lavender_ext.judge.score cimport unit_roundoff
-from lavender_ext.pivot.principal cimport AT_LOWER, AT_UPPER, FREE, INDEFINITE, ROUNDS, SMALL, SOLVED, STUCK, pivoting_t
+from lavender_ext.pivot.principal cimport AT_LOWER, AT_UPPER, FREE, INDEFINITE, ROUNDS_USED, SMALL_PIVOT, SOLVED, STUCK, pivoting_t
 
 
 cdef enum:
-    PATIENCE = 8                # exchanges without a new least number of infeasible rows
+    MAX_PATIENCE = 8            # exchanges without a smaller number of infeasible rows, after which rounds are stuck
 
 
 cdef inline void factor_lu(pivoting_t* s) noexcept nogil:
+    """Factor the scaled matrix of the free rows by LU."""
     cdef int32_t i, j, k = s.n_free, q, at, to
     cdef const csr_t* a = s.a
     cdef double* row
-    no_pivots(&s.found)
+    no_pivots(&s.pivots)
     for j in range(k):
         s.size[j] = 1.0 / sqrt(s.size[j])
     for i in range(s.n):
@@ -47,24 +47,25 @@ cdef inline void factor_lu(pivoting_t* s) noexcept nogil:
             if to >= 0:
                 row[to] = s.size[at] * a.data[q] * s.size[to]
         row[at] += s.shift
-    s.found.small = dense_lu(has_wide(), k, s.c, s.swap, s.tiny)
+    s.pivots.small = dense_lu(has_wide(), k, s.c, s.swap, s.tiny)
     s.factorisations += 1
     s.is_factored = 1
 
 
-cdef inline void factor_elsewhere(pivoting_t* s) noexcept nogil:
-    cdef int32_t small = s.refactor(s.outside, s.place, s.n_free, s.shift)
+cdef inline void factor_by_owner(pivoting_t* s) noexcept nogil:
+    """Call the outside factor."""
+    cdef int32_t small = s.factor_outside(s.outside, s.place, s.n_free, s.shift)
     s.late = small < 0
     if s.late:
         return
-    no_pivots(&s.found)
-    s.found.small = small
+    no_pivots(&s.pivots)
+    s.pivots.small = small
     s.factorisations += 1
     s.is_factored = 1
 
 
-cdef void factor_free(pivoting_t* s, double* x) noexcept nogil:
-    """A_FF + s D_FF of (1); x: what ldl_factor takes along, or NULL."""
+cdef void factor_free_rows(pivoting_t* s, double* x) noexcept nogil:
+    """Factor A_FF + s D_FF of (1). Forward substitution of x (n_free) is done on the way, unless x is NULL."""
     cdef int32_t i, j, k = 0, q, r, at, to, in_place
     cdef const csr_t* a = s.a
     cdef double* col
@@ -77,8 +78,8 @@ cdef void factor_free(pivoting_t* s, double* x) noexcept nogil:
             s.size[k] = s.p.d[i]
             k += 1
     s.n_free = k
-    if s.refactor != NULL:
-        factor_elsewhere(s)
+    if s.factor_outside != NULL:
+        factor_by_owner(s)
         return
     if s.swap != NULL:
         factor_lu(s)
@@ -95,7 +96,7 @@ cdef void factor_free(pivoting_t* s, double* x) noexcept nogil:
         col -= at
         q = a.indptr[i]
         if in_place:
-            q = a.indptr[i + 1]                         # places are rows: the upper half, from the right
+            q = a.indptr[i + 1]                         # Places are rows: copy the upper half, from the right.
             while q > a.indptr[i] and a.indices[q - 1] >= i:
                 q -= 1
                 col[a.indices[q]] = a.data[q]
@@ -105,16 +106,16 @@ cdef void factor_free(pivoting_t* s, double* x) noexcept nogil:
                 if to >= at:
                     col[to] = a.data[q]
         col[at] += s.shift * s.p.d[i]
-    ldl_factor(k, s.width, s.c, s.size, s.tiny, x, &s.found)
+    ldl_factor(k, s.width, s.c, s.size, s.tiny, x, &s.pivots)
     s.factorisations += 1
     s.is_factored = 1
 
 
 cdef inline void solve_factored(const pivoting_t* s, double* y) noexcept nogil:
-    # y (n_free) <- (A_FF + s D_FF)^-1 y
+    """Compute y (n_free) <- (A_FF + s D_FF)^-1 y."""
     cdef int32_t j
-    if s.resolve != NULL:
-        s.resolve(s.outside, s.n_free, y)
+    if s.solve_outside != NULL:
+        s.solve_outside(s.outside, s.n_free, y)
         return
     if s.swap == NULL:
         ldl_solve(s.n_free, s.width, s.c, y)
@@ -126,16 +127,16 @@ cdef inline void solve_factored(const pivoting_t* s, double* y) noexcept nogil:
         y[j] *= s.size[j]
 
 
-cdef void pivots_factor_all(pivoting_t* s) noexcept nogil:
-    """A factor of A, all rows free and no shift; of LDL^T with the first half of x = A^-1 b on the way."""
+cdef void factor_all_rows(pivoting_t* s) noexcept nogil:
+    """Factor A with all rows free and no shift; LDL^T in natural order also does the forward substitution of x = A^-1 b."""
     cdef int32_t i, q, end, half
     cdef const csr_t* a = s.a
     if s.swap != NULL or not (s.natural and s.band == 1 and s.n > 1):
         for i in range(s.n):
             s.at[i] = FREE
             s.x[i] = s.p.b[i]
-        half = s.natural and s.swap == NULL and s.refactor == NULL
-        factor_free(s, s.x if half else NULL)
+        half = s.natural and s.swap == NULL and s.factor_outside == NULL
+        factor_free_rows(s, s.x if half else NULL)
         s.is_half_solved = half
         return
     s.is_half_solved = 1
@@ -150,18 +151,18 @@ cdef void pivots_factor_all(pivoting_t* s) noexcept nogil:
         s.c[2 * i + 1] = 0.0
         end = a.indptr[i + 1]
         q = end - 2 if end - 2 > a.indptr[i] else a.indptr[i]
-        while q < end:                                  # the last two entries hold the upper half
+        while q < end:                                  # The last two entries contain the upper half.
             if a.indices[q] >= i:
                 s.c[i + a.indices[q]] = a.data[q]
             q += 1
-    no_pivots(&s.found)
-    ldl_factor_2(s.n, s.c, s.size, s.tiny, s.x, &s.found)
+    no_pivots(&s.pivots)
+    ldl_factor_2(s.n, s.c, s.size, s.tiny, s.x, &s.pivots)
     s.factorisations += 1
     s.is_factored = 1
 
 
-cdef void pivots_correct(pivoting_t* s) noexcept nogil:
-    """x_F <- x_F - (A_FF + s D_FF)^-1 w_F."""
+cdef void correct_free_rows(pivoting_t* s) noexcept nogil:
+    """Compute x_F <- x_F - (A_FF + s D_FF)^-1 w_F."""
     cdef int32_t i
     for i in range(s.n):
         if s.place[i] >= 0:
@@ -172,8 +173,8 @@ cdef void pivots_correct(pivoting_t* s) noexcept nogil:
             s.x[i] -= s.y[s.place[i]]
 
 
-cdef void pivots_slack(pivoting_t* s) noexcept nogil:
-    """w of (2) and its rounding f."""
+cdef void compute_slack(pivoting_t* s) noexcept nogil:
+    """Compute w (2) and its rounding f."""
     cdef int32_t i, q, end
     cdef const int32_t* idx = s.a.indices
     cdef const double* val = s.a.data
@@ -203,8 +204,8 @@ cdef void pivots_slack(pivoting_t* s) noexcept nogil:
             s.w[i] += s.shift * s.p.d[i] * (s.x[i] - s.center[i])
 
 
-cdef inline int32_t wanted(const pivoting_t* s, int32_t i) noexcept nogil:
-    # Side of row i after (3). 8 f: a few roundings of w, and of x through d.
+cdef inline int32_t exchanged_side(const pivoting_t* s, int32_t i) noexcept nogil:
+    """Return where row i is after an exchange (3). The tolerance 8 f is a few roundings of w, or of x = w / d."""
     cdef double lower = s.p.lower[i], upper = s.p.upper[i], slop = 8.0 * s.f[i]
     if lower == upper:
         return AT_LOWER
@@ -220,29 +221,29 @@ cdef inline int32_t wanted(const pivoting_t* s, int32_t i) noexcept nogil:
     return FREE
 
 
-cdef int32_t pivots_exchange(pivoting_t* s) noexcept nogil:
-    """(3), (4); the number of infeasible rows before, as a negative number where patience was used up."""
-    cdef int32_t i, bad = 0
+cdef int32_t exchange_infeasible_rows(pivoting_t* s) noexcept nogil:
+    """Exchange (4); return the number of infeasible rows (3) before it, negated if patience is used up and none is exchanged."""
+    cdef int32_t i, n_infeasible = 0
     for i in range(s.n):
-        bad += wanted(s, i) != s.at[i]
-    if bad == 0:
+        n_infeasible += exchanged_side(s, i) != s.at[i]
+    if n_infeasible == 0:
         return 0
-    if bad < s.best:
-        s.best = bad
-        s.patience = PATIENCE
+    if n_infeasible < s.min_infeasible:
+        s.min_infeasible = n_infeasible
+        s.patience = MAX_PATIENCE
     elif s.patience > 0:
         s.patience -= 1
     else:
-        return -bad
+        return -n_infeasible
     s.is_factored = 0
     for i in range(s.n):
-        s.at[i] = wanted(s, i)
-    s.exchanged += bad
-    return bad
+        s.at[i] = exchanged_side(s, i)
+    s.exchanged += n_infeasible
+    return n_infeasible
 
 
-cdef inline void pivots_place(pivoting_t* s) noexcept nogil:
-    """x of bound rows."""
+cdef inline void place_bound_rows(pivoting_t* s) noexcept nogil:
+    """Set x of bound rows to their bounds."""
     cdef int32_t i
     for i in range(s.n):
         if s.at[i] == AT_LOWER:
@@ -251,8 +252,8 @@ cdef inline void pivots_place(pivoting_t* s) noexcept nogil:
             s.x[i] = s.p.upper[i]
 
 
-cdef inline void pivots_predict(pivoting_t* s) noexcept nogil:
-    """Sides from x and w: where x - w / d falls; w of this x."""
+cdef inline void predict_bounds(pivoting_t* s) noexcept nogil:
+    """Decide from x - w / d which rows are free and which are at a bound; w belongs to this x."""
     cdef int32_t i
     cdef double y
     for i in range(s.n):
@@ -266,11 +267,11 @@ cdef inline void pivots_predict(pivoting_t* s) noexcept nogil:
     s.is_factored = 0
 
 
-cdef inline void pivots_sweep(pivoting_t* s, int32_t n) noexcept nogil:
-    """n times: all rows upwards, then downwards, x_i <- clip(x_i - omega w_i / d_i), omega = 1.7, then 1.
+cdef inline void sweep_rows(pivoting_t* s, int32_t n) noexcept nogil:
+    """Do n symmetric sweeps x_i <- clip(x_i - omega w_i / d_i), with omega = 1.7 in the first and 1 in the others.
 
-    Along a stack each contact gets 0.85 of what the one before got: over-relaxed, the news travels 4000
-    contacts before it underflows; at 0.5 it would be 1000.
+    Along a stack, each contact gets 0.85 of the change of the previous one with omega = 1.7, so that a change passes through
+    4000 contacts before it underflows; with omega = 1 each gets 0.5, which is enough for 1000.
     """
     cdef int32_t i, k
     cdef double* x = s.x
@@ -285,8 +286,8 @@ cdef inline void pivots_sweep(pivoting_t* s, int32_t n) noexcept nogil:
             x[i] = relax_row(x[i], w, omega * s.p.step[i], s.p.lower[i], s.p.upper[i])
 
 
-cdef void pivots_solve_free(pivoting_t* s) noexcept nogil:
-    """x = A^-1 b, all rows free and factored; w is left alone."""
+cdef void solve_all_rows(pivoting_t* s) noexcept nogil:
+    """Compute x = A^-1 b with all rows free and factored; w is unchanged."""
     cdef int32_t i
     cdef double* y = s.x if s.natural else s.y
     if s.is_half_solved:
@@ -301,117 +302,105 @@ cdef void pivots_solve_free(pivoting_t* s) noexcept nogil:
             s.x[i] = y[s.place[i]]
 
 
-cdef inline int32_t pivots_all_free(pivoting_t* s) noexcept nogil:
-    """Are all rows free at the solution? 1, with x, where A is positive definite and x within its bounds."""
+cdef inline bint try_all_free(pivoting_t* s) noexcept nogil:
+    """Solve with all rows free; return whether A is positive definite and x is within its bounds, so that x is the solution."""
     cdef int32_t i
     for i in range(s.n):
         if s.p.lower[i] == s.p.upper[i]:
-            return 0
-    pivots_factor_all(s)
-    if s.found.negative > 0 or s.found.small > 0:
+            return False
+    factor_all_rows(s)
+    if s.pivots.negative > 0 or s.pivots.small > 0:
         s.is_factored = 0
-        return 0
-    pivots_solve_free(s)
+        return False
+    solve_all_rows(s)
     for i in range(s.n):
         if not s.p.lower[i] <= s.x[i] <= s.p.upper[i]:
             s.is_factored = 0
-            return 0
-    return 1
+            return False
+    return True
 
 
-cdef int32_t pivots_rounds(pivoting_t* s, int32_t rounds) noexcept nogil:
-    """At most `rounds` rounds of: factor, solve, exchange; until no row is infeasible, or a factor is not begun."""
-    cdef int32_t _r, bad
-    for _r in range(rounds):
+cdef int32_t run_rounds(pivoting_t* s, int32_t max_rounds) noexcept nogil:
+    """Factor, solve and exchange, at most `max_rounds` times, until no row is infeasible or an outside factor is not started."""
+    cdef int32_t _, n_infeasible
+    for _ in range(max_rounds):
         s.n_rounds += 1
-        pivots_place(s)
-        pivots_slack(s)
+        place_bound_rows(s)
+        compute_slack(s)
         if not s.is_factored:
-            factor_free(s, NULL)
+            factor_free_rows(s, NULL)
         if s.late:
             s.n_rounds -= 1
-            return ROUNDS
-        if s.found.negative > 0:
+            return ROUNDS_USED
+        if s.pivots.negative > 0:
             return INDEFINITE
-        if s.found.small > 0 and (s.shift == 0.0 or s.swap != NULL or s.refactor != NULL):
-            return SMALL
-        pivots_correct(s)
-        pivots_slack(s)
-        bad = pivots_exchange(s)
-        if bad == 0:
+        if s.pivots.small > 0 and (s.shift == 0.0 or s.swap != NULL or s.factor_outside != NULL):
+            return SMALL_PIVOT
+        correct_free_rows(s)
+        compute_slack(s)
+        n_infeasible = exchange_infeasible_rows(s)
+        if n_infeasible == 0:
             return SOLVED
-        if bad < 0:
+        if n_infeasible < 0:
             return STUCK
-    return ROUNDS
+    return ROUNDS_USED
 
 
-cdef int32_t pivots_solve(pivoting_t* s, const double* start, int32_t sweeps, int32_t n, int32_t* swept) noexcept nogil:
-    """A boxed problem: where that costs less than the sweeps all rows free first, which may be the end of it.
+cdef int32_t guess_free_rows(pivoting_t* s, const double* start, int32_t sweeps, int32_t max_rounds) noexcept nogil:
+    """Return 1 if all rows are free at the solution x; else guess the free rows by `sweeps` symmetric sweeps from start (m).
 
-    Else `sweeps` symmetric sweeps from `start` (m), the rows free that they leave free, and at most n rounds.
+    All rows free are tried only if their factor costs less than the sweeps, and `max_rounds` allows a round.
     """
     cdef int32_t i
-    # Multiply-adds: (band + 1)^2 / 2 a row against two for each nonzero and sweep.
-    cdef bint cheap = s.band >= 0 and n > 0 and s.n > 0 and (
+    # Multiply-adds: (band + 1)^2 / 2 per row of the factor, two per nonzero of a sweep.
+    cdef bint is_cheap = s.band >= 0 and max_rounds > 0 and s.n > 0 and (
         (s.band + 1.0) * (s.band + 1) * s.n <= 4.0 * sweeps * s.a.indptr[s.n])
-    swept[0] = not (cheap and pivots_all_free(s))
-    if not swept[0]:
+    if is_cheap and try_all_free(s):
         s.n_rounds += 1
-        return SOLVED
+        return 1
     for i in range(s.n):
         s.x[i] = start[i]
-    pivots_sweep(s, sweeps)
-    pivots_slack(s)
-    pivots_predict(s)
-    return pivots_rounds(s, n)
+    sweep_rows(s, sweeps)
+    compute_slack(s)
+    predict_bounds(s)
+    return 0
 
 
-cdef void pivots_restart(pivoting_t* s) noexcept nogil:
-    s.best = s.n + 1
-    s.patience = PATIENCE
+cdef void reset_patience(pivoting_t* s) noexcept nogil:
+    """Allow exchanges to begin anew."""
+    s.min_infeasible = s.n + 1
+    s.patience = MAX_PATIENCE
 
 
-cdef void pivots_start(pivoting_t* s, double shift) noexcept nogil:
+cdef void set_shift(pivoting_t* s, double shift) noexcept nogil:
+    """Set the shift, which makes the factor invalid and exchanges begin anew."""
     s.shift = shift
     s.is_factored = 0
-    pivots_restart(s)
+    reset_patience(s)
 
 
-cdef void pivots_renew(pivoting_t* s) noexcept nogil:
-    """As if made anew: no row at a bound, nothing factored, nothing counted."""
+cdef void reset_pivoting(pivoting_t* s) noexcept nogil:
+    """Reset the state: no row at a bound, no factor, all counts 0."""
     cdef int32_t i
     for i in range(s.n):
         s.at[i] = FREE
     s.is_half_solved = s.exchanged = s.factorisations = s.n_rounds = s.late = 0
-    no_pivots(&s.found)
-    pivots_start(s, 0.0)
+    no_pivots(&s.pivots)
+    set_shift(s, 0.0)
 
 
-cdef void pivots_on(pivoting_t* s, const csr_t* a, const blocks_t* p, int32_t band, const int32_t* order, double tiny,
-                    double* real, int32_t* whole) noexcept nogil:
-    """Arrays in real, 6 m numbers and the factor's, and whole, 2 m; order: NULL as rows stand."""
-    cdef int32_t i, m = p.n_rows
-    s.a = a
-    s.p = p
-    s.n = m
-    s.band = band
-    s.tiny = tiny
-    s.order = order
-    s.natural = 1
-    if order != NULL:
-        for i in range(m):
-            s.natural &= order[i] == i
-    s.x = real
-    s.w = real + m
-    s.f = real + 2 * m
-    s.center = real + 3 * m
-    s.y = real + 4 * m
-    s.size = real + 5 * m
-    s.c = real + 6 * m
-    s.at = whole
-    s.place = whole + m
+cdef void bind_pivoting_workspace(pivoting_t* s, double* real, int32_t* index) noexcept nogil:
+    """Bind 6 n doubles and those of the factor, and 2 n integers, for the matrix that s contains; the factor is LDL^T."""
+    cdef int32_t i, n = s.p.n_rows
+    s.n, s.natural = n, 1
+    if s.order != NULL:
+        for i in range(n):
+            s.natural &= s.order[i] == i
+    s.x, s.w, s.f, s.center = real, real + n, real + 2 * n, real + 3 * n
+    s.y, s.size, s.c = real + 4 * n, real + 5 * n, real + 6 * n
+    s.at, s.place = index, index + n
     s.swap = NULL
     s.outside = NULL
-    s.refactor = NULL
-    s.resolve = NULL
-    pivots_renew(s)
+    s.factor_outside = NULL
+    s.solve_outside = NULL
+    reset_pivoting(s)

@@ -32,11 +32,11 @@ from lavender_ext.small.workspace cimport has_workspace_size, free_workspace
 from lavender_ext.judge.measure cimport set_zero_impulse, floor_of, judge_view, judged_from, relative_of, scratch_of
 from lavender_ext.judge.score cimport new_score
 from lavender_ext.local.gauss_seidel cimport prepare_blocks, prepared_sizes
-from lavender_ext.pivot.direct cimport (HALVED, direct_begin, direct_begin_passes, direct_factor, direct_first,
-                                        direct_index, direct_lay, direct_linear, direct_pass, direct_real, direct_t, is_end)
+from lavender_ext.pivot.direct cimport (PASS, PASS_HALVED, begin_direct, bind_direct_workspace, direct_t,
+                                        direct_workspace_doubles, direct_workspace_integers, is_solved, step_direct)
 from lavender_ext.pivot.lemke cimport (RAY, begin_paths, bind_lemke_workspace, follow_paths, lemke_t, lemke_workspace_doubles,
                                        lemke_workspace_integers)
-from lavender_ext.pivot.principal cimport INDEFINITE, SMALL, SOLVED
+from lavender_ext.pivot.principal cimport SMALL_PIVOT
 
 cdef object new = np.empty
 
@@ -132,7 +132,13 @@ cdef inline bint is_converged(const direct_t* t, double tol, bint tol_suffices) 
 
     With `tol_suffices`, solved bounded rows need not be refined to rounding.
     """
-    return t.relative <= tol and (is_end(t) or (tol_suffices and t.solved and not t.linear))
+    return t.relative <= tol and (is_solved(t) or (tol_suffices and t.solved and not t.linear))
+
+
+cdef inline int32_t remaining_rounds(const direct_t* t, double max_rounds) noexcept nogil:
+    """Return the rounds of the next step: at most MAX_PASS_EXCHANGES, and `max_rounds` in total."""
+    cdef double remaining = max_rounds - t.s.n_rounds
+    return MAX_PASS_EXCHANGES if remaining > MAX_PASS_EXCHANGES else <int32_t>max(remaining, 0.0)
 
 
 cdef inline bint run_exchanges(direct_t* t, const double* start, double tol, bint tol_suffices, double max_rounds) noexcept nogil:
@@ -141,25 +147,13 @@ cdef inline bint run_exchanges(direct_t* t, const double* start, double tol, bin
     Passes with a shifted matrix end if one does not halve the residual or is stuck, or after `max_rounds` rounds in total.
     """
     cdef int32_t code
-    cdef double remaining
-    # one factorisation, or exchanges
-    direct_begin(t, start)
-    if t.linear:
-        code = direct_factor(t)
-        if code == INDEFINITE:
-            return False
-        if code == SOLVED:
-            code = direct_linear(t)
-    else:
-        code = direct_first(t, ACTIVE_SET_SWEEPS,
-                            MAX_PASS_EXCHANGES if max_rounds > MAX_PASS_EXCHANGES else <int32_t>max(max_rounds, 0.0))
+    begin_direct(t, start)
+    code = step_direct(t, remaining_rounds(t, max_rounds))
     # singular: passes with a shift
-    if t.symmetric and (code == SMALL or (t.linear and not is_end(t))):
-        direct_begin_passes(t, 0)
-        code = HALVED
-        while code == HALVED and t.s.n_rounds < max_rounds:
-            remaining = max_rounds - t.s.n_rounds
-            code = direct_pass(t, MAX_PASS_EXCHANGES if remaining > MAX_PASS_EXCHANGES else <int32_t>remaining)
+    if t.symmetric and t.state == PASS and (code == SMALL_PIVOT or t.linear):
+        code = PASS_HALVED
+        while code == PASS_HALVED and t.s.n_rounds < max_rounds:
+            code = step_direct(t, remaining_rounds(t, max_rounds))
             if not t.relative < INFINITY:
                 return False
     return is_converged(t, tol, tol_suffices)
@@ -197,11 +191,12 @@ cdef bint pivot_small(const small_problem_t* s, double* own, double tol, bint fo
     cdef int32_t path = 0, m = s.v.p.n_rows
     cdef double each = EXCHANGE_NS_PER_ROW * m + 0.1 * m * (s.band + 1.0) ** 2
     cdef bint ended
-    if not has_workspace_size(&workspaces.work, direct_index(&s.v), direct_real(&s.v, s.band)):
+    if not has_workspace_size(&workspaces.work, direct_workspace_integers(&s.v), direct_workspace_doubles(&s.v, s.band)):
         return False
-    t.e0, t.v0, t.least = s.zero_residual[0], s.zero_residual[1], 1e-13
-    t.linear, t.symmetric = s.linear, s.symmetric
-    direct_lay(&t, &s.v, s.over.a, &s.over.p, s.band, NULL, 1e-13, workspaces.work.real, workspaces.work.index)
+    t.v, t.e0, t.v0, t.least = s.v, s.zero_residual[0], s.zero_residual[1], 1e-13
+    t.linear, t.symmetric, t.sweeps = s.linear, s.symmetric, ACTIVE_SET_SWEEPS
+    t.s.a, t.s.p, t.s.band, t.s.order, t.s.tiny = s.over.a, &s.over.p, s.band, NULL, 1e-13
+    bind_direct_workspace(&t, workspaces.work.real, workspaces.work.index)
     # exchanges, then Lemke's paths
     ended = run_exchanges(&t, own, tol, follows, remaining_cost[0] / each)
     remaining_cost[0] -= t.s.n_rounds * each

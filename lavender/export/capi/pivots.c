@@ -19,8 +19,8 @@ static int32_t start_pivots(lav_solver *s) {
     if (s->p.lower[i] != -INFINITY || s->p.upper[i] != INFINITY) t->linear = 0;
   for (i = 0; i < s->p.n_blocks; i++)
     if (s->p.kind[i] != LAV_ROW) t->linear = 0;
-  real = TAKE(s, double, pivot_direct_direct_real(&s->read, band));
-  index = TAKE(s, int32_t, pivot_direct_direct_index(&s->read));
+  real = TAKE(s, double, pivot_direct_direct_workspace_doubles(&s->read, band));
+  index = TAKE(s, int32_t, pivot_direct_direct_workspace_integers(&s->read));
   if (s->options.method == LAV_LEMKE) {
     s->table = TAKE(s, double, pivot_lemke_lemke_workspace_doubles(&s->p));
     whole = TAKE(s, int32_t, pivot_lemke_lemke_workspace_integers(&s->p));
@@ -30,7 +30,13 @@ static int32_t start_pivots(lav_solver *s) {
   t->v0 = s->start[1];
   t->least = 1e-13;
   t->sweeps = GUESS_SWEEPS;
-  pivot_direct_direct_lay(t, &s->read, &s->a, &s->q, band, NULL, TINY_PIVOT, real, index);
+  t->v = s->read;
+  t->s.a = &s->a;
+  t->s.p = &s->q;
+  t->s.band = band;
+  t->s.order = NULL;
+  t->s.tiny = TINY_PIVOT;
+  pivot_direct_bind_direct_workspace(t, real, index);
   if (whole) pivot_lemke_bind_lemke_workspace(&s->lemke, t, s->table, whole);
   return LAV_OK;
 }
@@ -44,10 +50,10 @@ static int32_t rounds_left(const lav_solver *s, const lav_budget *budget) {
 static int32_t pivot_all(lav_solver *s, const lav_budget *budget) {
   int32_t code;
   do {
-    code = pivot_direct_direct_turn(&s->direct, rounds_left(s, budget));
+    code = pivot_direct_step_direct(&s->direct, rounds_left(s, budget));
     if (code == pivot_principal_SOLVED) return LAV_CONVERGED;
     if (code == pivot_principal_INDEFINITE) return LAV_FAILED; /* The package continues with LAPACK. */
-    if (code == pivot_direct_SPENT || code == pivot_direct_CIRCLES) return LAV_STALLED;
+    if (s->direct.is_over) return LAV_STALLED;
   } while (rounds_left(s, budget) > 0 && !is_late(s, budget));
   return rounds_left(s, budget) <= 0 ? LAV_MAX_ITERATIONS : LAV_TIME_LIMIT;
 }
@@ -67,11 +73,11 @@ static int32_t follow_paths(lav_solver *s, const lav_budget *budget) {
 
 static void run_pivots(lav_solver *s, const lav_budget *budget, lav_result *out) {
   struct pivot_direct_direct_t *t = &s->direct;
-  pivot_direct_direct_begin(t, s->impulse);
+  pivot_direct_begin_direct(t, s->impulse);
   out->outcome = s->options.method == LAV_LEMKE ? follow_paths(s, budget) : pivot_all(s, budget);
   if (t->relative < INFINITY) COPY(s->impulse, t->best, s->p.n_rows);
   if (out->outcome == LAV_CONVERGED || out->outcome == LAV_STALLED)
-    out->outcome = t->relative <= budget->tol || (budget->tol == 0.0 && pivot_direct_is_end(t)) ? LAV_CONVERGED
+    out->outcome = t->relative <= budget->tol || (budget->tol == 0.0 && pivot_direct_is_solved(t)) ? LAV_CONVERGED
                    : judge_score_is_at_floor(t->relative, t->floor)                            ? LAV_ROUNDOFF_LIMIT
                                                                                                 : LAV_STALLED;
   out->iterations = s->options.method == LAV_LEMKE ? s->lemke.n_pivots : t->s.n_rounds;

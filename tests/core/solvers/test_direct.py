@@ -16,7 +16,7 @@ from lavender.solvers import pivoting
 from lavender.solvers.direct import Direct
 from lavender.solvers.pivoting import DenseFactor, PivotState
 from lavender_ext.pivot import direct, principal
-from lavender_ext.pivot.principal import SMALL
+from lavender_ext.pivot.principal import SMALL_PIVOT
 
 
 def spd(rng, m, spread=2.0):
@@ -259,7 +259,7 @@ def test_a_shifted_matrix_that_is_singular_is_found_to_be(m):
     a[2:4, 2:4] = 1.0  # and without one
     state = PivotState(lv.Problem.lcp(a, np.ones(m), -np.inf, 1e9))
     state.rows.begin(np.zeros(m), 1e-13, 0)
-    assert [state.rows.advance(4) for _ in range(2)] == [SMALL, SMALL]
+    assert [state.rows.advance(4) for _ in range(2)] == [SMALL_PIVOT, SMALL_PIVOT]
     assert (state.rows.n_rounds, state.rows.passes) == (2, 1)
 
 
