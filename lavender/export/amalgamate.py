@@ -17,6 +17,8 @@ ExtractionError: type[Exception] = EXTRACT_C["ExtractionError"]
 #: Modules of lavender_ext whose functions the library uses.
 MODULES = (
     "core.assemble",
+    "core.blocks",
+    "core.checks",
     "core.generalized",
     "core.order",
     "core.problem",

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, NoReturn
 
 import numpy as np
 import numpy.typing as npt
@@ -51,7 +51,7 @@ from lavender.problem.friction import (
     convert_ellipse_coefficients,
 )
 from lavender_ext.core import blocks as kernels
-from lavender_ext.core.checks import MAX_MAGNITUDE, MIN_MAGNITUDE
+from lavender_ext.core.checks import FAULT_NAMES, MAX_MAGNITUDE, MIN_MAGNITUDE, counts_up
 
 __all__ = [
     "CONTACT",
@@ -147,8 +147,11 @@ class Cones:
         blocks = kernels.copy_to_blocks(
             self.ptr, self.kind, self.lower, self.upper, self.mu, self.patch_radius, self.rolling
         )
-        if blocks is None:
-            blocks = self._convert_fields()
+        if blocks is None or blocks.fault:
+            fields = self._convert_fields()
+            blocks = kernels.copy_to_blocks(*fields)
+            if blocks.fault:
+                _raise_fault(FAULT_NAMES[blocks.fault], int(blocks.index), fields)
         self._set_blocks(blocks)
 
     def _set_blocks(self, blocks: kernels.Blocks) -> None:
@@ -178,10 +181,10 @@ class Cones:
             raise InputError("together these have more rows than 32-bit numbers count")
         return cls._from_blocks(blocks)
 
-    def _convert_fields(self) -> kernels.Blocks:
-        """Convert and check fields that the fast path rejected; raise InputError for invalid ones."""
+    def _convert_fields(self) -> tuple[np.ndarray, ...]:
+        """Convert the fields to arrays of the required types and shapes; raise InputError for invalid ones."""
         ptr = as_array("cones.ptr", self.ptr, (None,), dtype=np.int32)
-        if len(ptr) == 0 or ptr[0] != 0 or np.any(np.diff(ptr) <= 0):
+        if not counts_up(ptr):
             raise InputError(
                 "cones.ptr must start with 0 and increase: the first row of each block, then the number of "
                 "rows"
@@ -194,41 +197,15 @@ class Cones:
                 f"CONTACT_BOX={CONTACT_BOX}, CONTACT_ROLLING={CONTACT_ROLLING}, CONTACT_ELLIPSE={CONTACT_ELLIPSE} are "
                 "known"
             )
-        size = np.diff(ptr)
-        kind = _check_kinds(kind, size)
+        kind = _check_kinds(kind, np.diff(ptr))
         lower = as_array("lower", self.lower, (m,), finite=False, unit="N s")
         upper = as_array("upper", self.upper, (m,), finite=False, unit="N s")
         check_not_nan("lower", lower)
         check_not_nan("upper", upper)
-        contact_rows = np.repeat(kind != ROW, size)
-        for name, bound in (("lower", lower), ("upper", upper)):
-            check_inside(name, np.where(contact_rows | np.isinf(bound), 0.0, bound), "N s")
-        bad = np.flatnonzero(~contact_rows & ~((lower <= upper) & (lower < np.inf) & (upper > -np.inf)))
-        if len(bad):
-            i = bad[0]
-            raise InputError(
-                f"row {i}: lower = {lower[i]}, upper = {upper[i]}; lower <= upper is needed, "
-                "and a number between them"
-            )
-        if contact_rows.any():
-            # Give rows whose bounds are not read fixed values, so that equal problems compare equal.
-            lower, upper = lower.copy(), upper.copy()
-            lower[contact_rows], upper[contact_rows] = -np.inf, np.inf
-            normal = ptr[:-1][kind != ROW]
-            lower[normal] = 0.0
-            lower.flags.writeable = upper.flags.writeable = False
-        mu = check_coefficients("mu", self.mu, k)
-        radius = check_coefficients("patch_radius", self.patch_radius, k, "m")
-        out_of_range = ~((radius >= MIN_COEFFICIENT_RATIO) & (radius <= 1.0 / MIN_COEFFICIENT_RATIO))
-        bad = np.flatnonzero((kind == CONTACT_ELLIPSE) & out_of_range)
-        if len(bad):
-            raise InputError(
-                f"block {bad[0]} is an ellipse with mu_2 / mu_1 = {radius[bad[0]]:g} in the place of the patch radius; "
-                "1e-18 to 1e18 is needed"
-            )
-        check_sizes(SPIN_COEFFICIENT_LABEL, np.where(kind == ROW, 0.0, mu * radius), "m")
-        rolling = check_coefficients("rolling", self.rolling, k, "m")
-        return kernels.Blocks(ptr, kind, lower, upper, mu, radius, rolling)
+        mu = as_array("mu", self.mu, (k,), unit="-")
+        radius = as_array("patch_radius", self.patch_radius, (k,), unit="m")
+        rolling = as_array("rolling", self.rolling, (k,), unit="m")
+        return ptr, kind, lower, upper, mu, radius, rolling
 
     @classmethod
     def bounded(cls, lower: ArrayLike, upper: ArrayLike) -> Cones:
@@ -608,6 +585,31 @@ def kinds_of(
     kind = np.where(np.asarray(spin), CONTACT_SPIN, np.where(np.asarray(tangents) > 2, ROUND, CONTACT))
     kind = np.where(box, CONTACT_BOX, np.where(rolling, CONTACT_ROLLING, kind))
     return np.where(is_contact, kind, ROW).astype(np.int32)
+
+
+def _raise_fault(fault: str, index: int, fields: tuple[np.ndarray, ...]) -> NoReturn:
+    """Raise the InputError of a fault (`lavender_ext/core/faults.pxd`) of a block or row."""
+    _, kind, lower, upper, mu, radius, rolling = fields
+    if fault == "bounds":
+        raise InputError(
+            f"row {index}: lower = {lower[index]}, upper = {upper[index]}; lower <= upper is needed, "
+            "and a number between them"
+        )
+    if fault == "ratio":
+        raise InputError(
+            f"block {index} is an ellipse with mu_2 / mu_1 = {radius[index]:g} in the place of the patch radius; "
+            "1e-18 to 1e18 is needed"
+        )
+    if fault in ("lower", "upper"):
+        bound = lower if fault == "lower" else upper
+        check_inside(
+            fault, np.where(np.isinf(bound) | np.repeat(kind != ROW, np.diff(fields[0])), 0.0, bound), "N s"
+        )
+    check_sizes("mu", mu, "-")
+    check_sizes("patch_radius", radius, "m")
+    check_sizes(SPIN_COEFFICIENT_LABEL, np.where(kind == ROW, 0.0, mu * radius), "m")
+    check_sizes("rolling", rolling, "m")
+    raise InputError(f"block {index} is invalid: {fault}")
 
 
 def _check_kinds(kind: IntArray, size: IntArray) -> IntArray:

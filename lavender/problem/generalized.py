@@ -41,9 +41,6 @@ MAX_ASYMMETRY_FLOAT32 = 2.0**-16  # The same if M has dtype float32; its lower t
 MIN_TREE_ORDERING_VELOCITIES = (
     400  # With fewer velocities, a factorisation costs less than the search of an order.
 )
-EXPECTED_FACTORIZATIONS = (
-    20  # Factorisations of the pattern of M by the solves of a problem, to weigh the search.
-)
 MAX_FACTOR_ENTRIES = (
     50_000_000  # If the factor of M in the original order has more entries, another order is used.
 )
@@ -208,7 +205,7 @@ class Generalized:
             operator = kernels.Operator(*jac, *mass, like, MAX_FACTOR_ENTRIES)
         except MemoryError:
             operator = None
-        if operator is None or (operator.fill > 0 and _is_worth_ordering(operator.work, len(mass[1]), n)):
+        if operator is None or operator.is_worth_ordering:
             order = _order_velocities(mass, n)
             reordered = kernels.Operator(*_permute_columns(jac, order), *_permute_lower(mass, order))
             if operator is None or reordered.fill < operator.fill:
@@ -457,27 +454,6 @@ def _permute_columns(jac: Compressed, order: IntArray) -> Compressed:
     indptr, indices, data = jac
     rows = np.repeat(np.arange(len(indptr) - 1), np.diff(indptr))
     return _compress(rows, np.argsort(order)[indices], data, len(indptr) - 1)
-
-
-def _is_worth_ordering(work: float, entries: int, n: int) -> bool:
-    """Return whether factorisations of M cost more time than the search of a better order.
-
-    Parameters
-    ----------
-    work : float
-        Multiply-adds of one factorisation.
-    entries : int
-        Entries of the lower triangle of M.
-    n : int
-        Number of velocities.
-
-    A factorisation without fill-in needs at least the work of evenly distributed entries, so a matrix that is nearly
-    full is not ordered. Times [ns] were measured on trees of 9 to 800 velocities in the wrong order: the search and the
-    factorisation in the new order take 0.2 ms and 0.13 us for each entry; a multiply-add takes 2 ns. (For example, a
-    robot of 9 velocities whose root slides in two directions has a fill-in of one entry.)
-    """
-    min_work = 0.5 * (entries - n) * ((entries - n) / n + 1.0)
-    return work > 2.0 * min_work and 2.0 * EXPECTED_FACTORIZATIONS * work > 4e5 + 130.0 * entries
 
 
 def _order_velocities(mass: Compressed, n: int) -> IntArray:

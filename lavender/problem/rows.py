@@ -158,27 +158,39 @@ class Rows:
         for name, shape in (("joint_body", (len(ptr) - 1, 2)), ("contact_body", (c, 2))):
             body = as_array(name, getattr(self, name), shape, dtype=np.int32, copy=self.copy)
             object.__setattr__(self, name, body)
-            if checks.are_pairs(body, len(self.inv_mass), name == "contact_body"):
-                continue
-            if body.size and (body.min() < -1 or body.max() >= len(self.inv_mass)):
-                invalid = body.max() if body.max() >= len(self.inv_mass) else body.min()
-                raise InputError(
-                    f"{name} names body {invalid}; there are {len(self.inv_mass)} bodies, and -1 is static"
-                )
-            same = np.flatnonzero((body[:, 0] == body[:, 1]) & (body[:, 0] >= 0))
-            if len(same):
-                raise InputError(f"{name}[{same[0]}] joins body {body[same[0], 0]} to itself")
-            static = np.flatnonzero((body < 0).all(axis=1))
+        fault, index = checks.find_body_fault(
+            self.inv_mass,
+            self.inv_inertia,
+            self.joint_body,
+            self.contact_body,
+            self.normal,
+            self.tangent,
+            self.copy,
+        )
+        if fault:
+            self._resolve_fault(fault, index)
+        object.__setattr__(self, "copy", True)  # `copy` applies to this call only
+
+    def _resolve_fault(self, fault: str, index: int) -> None:
+        """Correct inertias and frames that float32 has rounded; raise InputError for other faults."""
+        name, _, kind = fault.rpartition("_")
+        if kind == "body":
+            name, n = fault, len(self.inv_mass)
+            body = getattr(self, name).reshape(-1)[index]
+            raise InputError(f"{name} names body {body}; there are {n} bodies, and -1 is static")
+        if kind == "pair":
+            body = getattr(self, f"{name}_body")[index, 0]
+            if body >= 0:
+                raise InputError(f"{name}_body[{index}] joins body {body} to itself")
             raise InputError(
-                f"{name}[{static[0]}] = [-1, -1]: both are static, and no impulse moves them; leave it out"
+                f"{name}_body[{index}] = [-1, -1]: both are static, and no impulse moves them; leave it out"
             )
         check_sizes("inv_mass", self.inv_mass, UNITS["inv_mass"])
         check_sizes("largest entry of inv_inertia", tensor_size(self.inv_inertia), UNITS["inv_inertia"])
         if self.copy:
             object.__setattr__(self, "inv_inertia", check_inertia("inv_inertia", self.inv_inertia))
-        if not checks.are_frames(self.normal, self.tangent):
+        if self.n_contacts:
             self._correct_frames()
-        object.__setattr__(self, "copy", True)  # `copy` applies to this call only
 
     def _correct_frames(self) -> None:
         """Orthonormalise normals and tangents that float32 has rounded; raise InputError for larger errors."""
@@ -301,8 +313,6 @@ def check_inertia(name: str, tensors: FloatArray) -> FloatArray:
     InputError
         A tensor differs by more than `MAX_CORRECTED_ERROR` of its largest entry.
     """
-    if checks.are_definite(tensors):
-        return tensors
     size = np.abs(tensors).max(axis=(1, 2))
     skew = np.abs(tensors - tensors.transpose(0, 2, 1)).max(axis=(1, 2))
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -4,20 +4,20 @@ The results are the same numbers as those of `Generalized` from the same arrays:
 rows without zeros, M = L^T D L in the given order, b = target - J v*. A world that `Generalized` would reorder is deferred
 to the caller.
 """
-from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memcmp, memcpy, memset
 
-from lavender_ext.core.validate cimport (are_pairs, first_invalid_magnitude, has_invalid, is_definite, is_frame,
-                                         is_valid_magnitude, norm_inf, min_magnitude)
+from lavender_ext.core.faults cimport NO_FAULT, body_tolerances_t, find_body_fault, find_friction_fault, is_valid_rhs
+from lavender_ext.core.validate cimport first_invalid_magnitude, has_invalid
 from lavender_ext.core.generalized cimport jac_row
-from lavender_ext.core.tree cimport tree_factor, tree_pattern
+from lavender_ext.core.mass cimport THIN_PADDING, compress_lower_triangle, compress_rows, factor_mass, is_worth_ordering
+from lavender_ext.core.tree cimport tree_pattern
 from lavender_ext.core.method cimport workspace_t
-from lavender_ext.core.block_types cimport blocks_t, from_block, is_rows
+from lavender_ext.core.block_types cimport blocks_t, from_block
 from lavender_ext.core.rows cimport rows_times
 from lavender_ext.judge.rounding cimport mass_t
 from lavender_ext.small.workspace cimport has_workspace_size
-from lavender_ext.batch.thin cimport thin
+from lavender_ext.core.thin cimport thin
 from lavender_ext.core.view cimport generalized_t, rows_t
 
 
@@ -49,7 +49,6 @@ cdef enum:                      # arrays that may be in float32
     N_ARRAYS = 6
 
 cdef enum:
-    THIN_PADDING = 8                  # entries that `thin` may write beyond the end
     MIN_REORDERED_VELOCITIES = 400                  # `Generalized` considers another order from this many velocities on
 
 
@@ -124,59 +123,6 @@ cdef inline const double* read_matrix(const worlds_t* w, int32_t which, int64_t 
         read_numbers(w, which, first + i * row[0], n, out + <int64_t>i * n)
     row[0] = n
     return out
-
-
-cdef inline int32_t compress_rows(const double* a, int64_t row, int32_t m, int32_t n, int32_t* ptr, int32_t* idx,
-                            double* val) noexcept nogil:
-    """Write a dense matrix in compressed rows and return the number of entries."""
-    cdef int32_t i, q = 0
-    ptr[0] = 0
-    for i in range(m):
-        q += thin(n, a, NULL, idx + q, val + q)
-        a += row
-        ptr[i + 1] = q
-    return q
-
-
-cdef inline bint is_symmetric(const double* a, int64_t row, int32_t n) noexcept nogil:
-    """Return whether a is exactly symmetric, up to the sign of 0; branch-free."""
-    cdef int32_t i, j, odd = 0
-    for i in range(n):
-        for j in range(i):
-            odd |= a[i * row + j] != a[j * row + i]
-    return not odd
-
-
-cdef inline int32_t compress_lower_triangle(const double* a, int64_t row, double allowed, int32_t n, int32_t* ptr, int32_t* idx,
-                                double* val) noexcept nogil:
-    """Write M's lower triangle with diagonal in compressed rows; return the number of entries, -1 if M is not symmetric."""
-    cdef bint symmetric = is_symmetric(a, row, n)
-    cdef const double* own = a
-    cdef const double* other
-    cdef int32_t i, j, q = 0
-    cdef double gap, s
-    ptr[0] = 0
-    for i in range(n):
-        other = a + i
-        if symmetric:
-            q += thin(i, own, NULL, idx + q, val + q)
-        for j in range(0 if symmetric else i):
-            if own[j] != 0.0 or other[0] != 0.0:
-                idx[q] = j
-                val[q] = own[j]
-                q += 1
-                if own[j] != other[0]:
-                    gap = fabs(own[j] - other[0])
-                    s = own[i] * a[j * (row + 1)]
-                    if not (gap / sqrt(s) if s > 0.0 else gap) <= allowed:
-                        return -1
-            other += row
-        idx[q] = i
-        val[q] = own[i]
-        q += 1
-        ptr[i + 1] = q
-        own += row
-    return q
 
 
 cdef inline int32_t drop_zeros(const int32_t* row_ptr, const int32_t* col, const double* x, int32_t n, int32_t* ptr,
@@ -284,18 +230,6 @@ cdef inline void pattern_without(const worlds_t* w, int32_t n, const int64_t* ou
         ptr[i + 1] = q
 
 
-cdef inline bint would_reorder(const generalized_t* g, int32_t entries) noexcept nogil:
-    """Return whether `Generalized` would search for an order with less fill, like its `_worth_ordering`."""
-    cdef int32_t i, c
-    cdef double work = 0.0
-    if g.lptr[g.n] <= entries - g.n:
-        return False
-    for i in range(g.n):
-        c = g.lptr[i + 1] - g.lptr[i]
-        work += 0.5 * c * (c + 1.0)
-    return 40.0 * work > 4e5 + 130.0 * entries
-
-
 cdef inline int32_t lay_world(const worlds_t* w, int64_t i, worker_scratch_t* d, blocks_t* p, generalized_t* g) noexcept nogil:
     """Convert world i of J and M in the worker's scratch; return READY, BAD or LEFT."""
     cdef const int64_t* at = w.at + i * PLACES
@@ -343,16 +277,13 @@ cdef inline int32_t lay_world(const worlds_t* w, int64_t i, worker_scratch_t* d,
         shared = False
     if not shared and not find_factor_pattern(d, n, ptr, idx, g):
         return LEFT
-    if would_reorder(g, entries):
+    if is_worth_ordering(g, entries):
         return LEFT
     # M = L^T D L
     x += half
-    g.lval, g.inv_pivot, g.root = x, x + half, x + half + n
-    if tree_factor(n, d.mass.ptr, d.mass.idx, d.mass.val, g.lptr, g.lidx, x, <double*>g.root, <double*>g.inv_pivot) >= 0:
-        return BAD
-    for j in range(n):
-        (<double*>g.root)[j] = sqrt(g.inv_pivot[j])
     g.mptr, g.midx, g.mval, g.condition = d.mass.ptr, d.mass.idx, d.mass.val, 0.0
+    if factor_mass(g, x, x + half, x + half + n) >= 0:
+        return BAD
     # b = target - J v*
     x += half + 2 * n
     d.free, b, g.compliance = x, x + n, x + n + m
@@ -361,9 +292,7 @@ cdef inline int32_t lay_world(const worlds_t* w, int64_t i, worker_scratch_t* d,
     read_numbers(w, 4, at[SOFT], m, <double*>g.compliance)
     for j in range(m):
         b[j] -= jac_row(g, j, d.free)
-    if first_invalid_magnitude(g.compliance, m) >= 0 or has_invalid(d.free, n) or has_invalid(b, m):
-        return BAD
-    if 0.0 < norm_inf(b, m) < min_magnitude():
+    if first_invalid_magnitude(g.compliance, m) >= 0 or has_invalid(d.free, n) or not is_valid_rhs(b, m):
         return BAD
     return lay_blocks(w, at, p, b, idx + half, x + n + 2 * m)
 
@@ -382,7 +311,7 @@ cdef inline int32_t lay_matrix(const worlds_t* w, int64_t i, worker_scratch_t* d
         if has_invalid(a[0] + j * row[0], m):
             return BAD
     read_numbers(w, 3, at[TARGET], m, b)
-    if has_invalid(b, m) or 0.0 < norm_inf(b, m) < min_magnitude():
+    if not is_valid_rhs(b, m):
         return BAD
     return lay_blocks(w, at, p, b, d.workspace.index, b + m)
 
@@ -394,6 +323,8 @@ cdef inline int32_t lay_bodies(const worlds_t* w, int64_t i, worker_scratch_t* d
     cdef const double* x[FIELDS]
     cdef int32_t m = <int32_t>at[ROWS], kj = o.joints, c = o.contacts, k
     cdef int32_t size[FIELDS]
+    cdef body_tolerances_t tolerances = body_tolerances_t(5e-10, 5e-10, 0.0, 1e-6)      # as `find_body_fault` of core/checks.pyx
+    cdef int64_t index
     cdef double* b
     cdef double* mu
     size[:] = [o.n, 9 * o.n, 6 * o.n, 12 * w.blocks.ptr[kj], 3 * c, 3 * c, 3 * c, 3 * c, m, m, c]
@@ -407,16 +338,8 @@ cdef inline int32_t lay_bodies(const worlds_t* w, int64_t i, worker_scratch_t* d
     r.joint_body, r.contact_body = o.pair[0] + i * o.pair_step[0], o.pair[1] + i * o.pair_step[1]
     r.inv_mass, r.inv_inertia, r.jac, r.compliance = x[INV_MASS], x[INV_INERTIA], x[JOINT_JAC], x[BODY_COMPLIANCE]
     r.normal, r.tangent, r.arm_a, r.arm_b = x[NORMAL], x[TANGENT], x[ARM_A], x[ARM_B]
-    if not are_pairs(r.joint_body, kj, o.n, False) or not are_pairs(r.contact_body, c, o.n, True):
+    if find_body_fault(r, &tolerances, &index) != NO_FAULT or first_invalid_magnitude(r.compliance, m) >= 0:
         return LEFT
-    if first_invalid_magnitude(r.inv_mass, o.n) >= 0 or first_invalid_magnitude(r.compliance, m) >= 0:
-        return LEFT
-    for k in range(o.n):
-        if not is_valid_magnitude(norm_inf(r.inv_inertia + 9 * k, 9)) or not is_definite(r.inv_inertia + 9 * k, 5e-10, 0.0, 1e-6):
-            return LEFT
-    for k in range(c):
-        if not is_frame(r.normal + 3 * k, r.tangent + 3 * k, 5e-10):
-            return LEFT
     b, mu = d.workspace.real, d.workspace.real + m
     memset(mu, 0, kj * sizeof(double))
     memcpy(mu + kj, x[CONTACT_MU], c * sizeof(double))
@@ -426,7 +349,7 @@ cdef inline int32_t lay_bodies(const worlds_t* w, int64_t i, worker_scratch_t* d
     rows_times(p, r, d.free, b)
     for k in range(m):
         b[k] = x[BODY_TARGET][k] - b[k]
-    return LEFT if has_invalid(b, m) or 0.0 < norm_inf(b, m) < min_magnitude() else READY
+    return READY if is_valid_rhs(b, m) else LEFT
 
 
 cdef inline int32_t lay_blocks(const worlds_t* w, const int64_t* at, blocks_t* p, const double* b, int32_t* ptr,
@@ -446,6 +369,6 @@ cdef inline int32_t lay_blocks(const worlds_t* w, const int64_t* at, blocks_t* p
         read_numbers(w, 5, at[MU], p.n_blocks, mu)
         p.mu = mu
     for k in range(p.n_blocks):
-        if not is_valid_magnitude(p.mu[k]) or (not is_rows(p, k) and not is_valid_magnitude(p.mu[k] * p.patch_radius[k])):
+        if find_friction_fault(p, p.kind[k], k) != NO_FAULT:
             return BAD
     return READY

@@ -10,7 +10,9 @@ from libc.stdint cimport INT32_MAX, int32_t, int64_t
 import numpy as np
 
 from lavender_ext.core.csr cimport transpose_csr
-from lavender_ext.core.validate cimport is_number
+from lavender_ext.core.faults cimport NO_FAULT, find_matrix_fault
+from lavender_ext.core.mass cimport THIN_PADDING, compress_rows
+from lavender_ext.core.validate cimport has_invalid
 from lavender_ext.core.block_types cimport blocks_t, n_tangents, n_angular_rows
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.rows cimport contact_jacobian, dot6, minv_times
@@ -236,25 +238,20 @@ def delassus(Data p, Py_ssize_t max_entries, int32_t[::1] start, int32_t[::1] bl
 
 def dense_to_csr(const double[:, ::1] a, double sign=1.0):
     """Return the nonzeros of a dense matrix times `sign` as (indptr, indices, data), int32; nnz must be below 2^31."""
-    cdef Py_ssize_t i, j, n = a.shape[0], m = a.shape[1], nnz = 0, q = 0
+    cdef Py_ssize_t i, j, n = a.shape[0], m = a.shape[1], nnz = 0, q
     for i in range(n):
         for j in range(m):
             nnz += a[i, j] != 0.0
-    all_indices, values = np.empty(n + 1 + nnz, np.int32), np.empty(nnz)
-    cdef int32_t[::1] indptr = all_indices
+    all_indices, values = np.empty(n + 1 + nnz + THIN_PADDING, np.int32), np.empty(nnz + THIN_PADDING)
+    cdef int32_t[::1] indices = all_indices
     cdef double[::1] data = values
-    cdef int32_t* indices = &indptr[0] + n + 1
-    indptr[0] = 0
-    for i in range(n):
-        for j in range(m):
-            if a[i, j] != 0.0:
-                indices[q] = <int32_t>j
-                data[q] = sign * a[i, j]
-                q += 1
-        indptr[i + 1] = <int32_t>q
+    compress_rows(&a[0, 0] if n and m else NULL, m, <int32_t>n, <int32_t>m, &indices[0], &indices[n + 1], &data[0])
+    if sign != 1.0:
+        for q in range(nnz):
+            data[q] *= sign
     all_indices.setflags(False)
     values.setflags(False)
-    return all_indices[:n + 1], all_indices[n + 1:], values
+    return all_indices[:n + 1], all_indices[n + 1:n + 1 + nnz], values[:nnz]
 
 
 def transposed(const int32_t[::1] indptr, const int32_t[::1] indices, const double[::1] data, int n):
@@ -291,26 +288,6 @@ def mirrored(const int32_t[::1] indptr, const int32_t[::1] indices, const double
     return ptr_array, index_array, value_array
 
 
-cdef int32_t count_row_entries(Py_ssize_t lines, Py_ssize_t n_across, const int32_t* ptr, const int32_t* idx, const double* val,
-                        bint columns, int32_t* count) noexcept nogil:
-    """Add the nonzeros of each row to `count`; return False if the matrix is not canonical or has an invalid entry.
-
-    Canonical: indices ascend within each line and lie in [0, n_across). Valid: (1) of core/validate.pxd.
-    """
-    cdef Py_ssize_t i
-    cdef int32_t p
-    for i in range(lines):
-        if ptr[i + 1] < ptr[i]:
-            return False
-        for p in range(ptr[i], ptr[i + 1]):
-            if not 0 <= idx[p] < n_across or p > ptr[i] and idx[p] <= idx[p - 1]:
-                return False
-            if not is_number(val[p]):
-                return False
-            count[idx[p] if columns else i] += val[p] != 0.0
-    return True
-
-
 def stacked(int32_t n, matrices):
     """Stack several matrices of n columns vertically; return (indptr, indices, data) without zero entries, or None.
 
@@ -322,6 +299,7 @@ def stacked(int32_t n, matrices):
     cdef const double[::1] val
     cdef double sign
     cdef bint columns
+    cdef int64_t fault_at
     cdef int32_t m = 0, rows, first, i, p, nnz
     for matrix in matrices:
         m += matrix[5]
@@ -335,9 +313,13 @@ def stacked(int32_t n, matrices):
         if ptr.shape[0] != (n if columns else rows) + 1 or ptr[0] != 0 or ptr[ptr.shape[0] - 1] > idx.shape[0] \
                 or idx.shape[0] != val.shape[0]:
             return None
-        if idx.shape[0] and not count_row_entries(ptr.shape[0] - 1, rows if columns else n, &ptr[0], &idx[0], &val[0],
-                                                  columns, &start[2] + first if rows else NULL):
+        nnz = ptr[ptr.shape[0] - 1]
+        if idx.shape[0] and (find_matrix_fault(&ptr[0], &idx[0], <int32_t>ptr.shape[0] - 1, rows if columns else n, nnz, False,
+                                               &fault_at) != NO_FAULT or has_invalid(&val[0], nnz)):
             return None
+        for i in range(<int32_t>ptr.shape[0] - 1):
+            for p in range(ptr[i], ptr[i + 1]):
+                start[2 + first + (idx[p] if columns else i)] += val[p] != 0.0
         first += rows
     for i in range(m):
         start[i + 2] += start[i + 1]

@@ -1,5 +1,5 @@
 """Blocks of a problem: pointers into arrays that the object keeps alive."""
-from libc.stdint cimport int32_t
+from libc.stdint cimport int32_t, int64_t
 
 from lavender_ext.core.block_types cimport blocks_t
 
@@ -8,6 +8,8 @@ cdef class Blocks:
     cdef blocks_t at                                    # without law, b, d, nu and step
     cdef readonly object ints, numbers                  # arrays that `at` points into, with optional extra memory at the end
     cdef tuple _arrays
+    cdef readonly int32_t fault                         # first fault of core/faults.pxd, or NO_FAULT
+    cdef readonly int64_t index                         # its block or row
     cdef readonly bint is_free                          # every row is unbounded
     cdef readonly bint is_bounded_rows                  # every row has constant bounds
     cdef readonly bint has_round                        # some contact has more than two tangents

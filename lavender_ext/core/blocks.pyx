@@ -1,35 +1,26 @@
 """Creation, concatenation and checks of blocks, in one pass over a few small arrays.
 
-The same work in ten NumPy calls takes longer than a solve of eight rows. These functions report no reasons: if they return
-None, `lavender.problem.cones` validates in detail and raises.
+The same work in ten NumPy calls takes longer than a solve of eight rows. If a function returns None, the arrays need
+conversion, or have a fault of core/faults.pxd: `lavender.problem.cones` converts them and raises.
 """
 from libc.stdint cimport int32_t
 
 import numpy as np
 
-from lavender_ext.core.arrays cimport freeze, ndarray
-from lavender_ext.core.validate cimport is_number, is_valid_magnitude
-from lavender_ext.core.block_types cimport (CONTACT, CONTACT_BOX, CONTACT_ROLLING, CONTACT_SPIN, ROUND, ROW, contact_kind, fits,
-                                      bind_friction_arrays, spell_bounds)
-
-cdef enum:
-    CONTACT_ELLIPSE = 7                                 # Kernels never get this kind: `Problem.disk` is solved and judged.
+from lavender_ext.core.arrays cimport DOUBLE, INT, freeze, is_of, ndarray
+from lavender_ext.core.faults cimport CONTACT_ELLIPSE, NO_FAULT, find_block_fault
+from lavender_ext.core.block_types cimport (CONTACT, CONTACT_BOX, CONTACT_ROLLING, CONTACT_SPIN, ROUND, ROW, bind_friction_arrays,
+                                            blocks_t, contact_kind, spell_bounds)
 
 #: Kernel numbers of the kinds of blocks.
 KINDS = (ROW, CONTACT, CONTACT_SPIN, ROUND, CONTACT_BOX, CONTACT_ROLLING, CONTACT_ELLIPSE)
 
 cdef double INF = 1.0 / 0.0
-cdef double MAX_ELLIPSE_RATIO = 2.0 ** 60               # upper bound of mu_2 / mu_1 and mu_1 / mu_2 of an ellipse
 cdef object new = np.empty, F8 = np.dtype(np.float64), I4 = np.dtype(np.int32)
 
 
 cdef class Blocks:
-    """Pointers to the arrays of a problem's blocks, which are kept alive. Raises ValueError if the arrays are invalid."""
-
-    def __init__(self, ptr, kind, lower, upper, mu, patch_radius, rolling):
-        if not self.point(ptr, kind, lower, upper, mu, patch_radius, rolling) or not self.check():
-            raise ValueError("arrays that do not fit each other, or hold what no block can have")
-        self._arrays = (ptr, kind, lower, upper, mu, patch_radius, rolling)
+    """Pointers to the arrays of a problem's blocks, which are kept alive."""
 
     @property
     def arrays(self):
@@ -70,41 +61,28 @@ cdef class Blocks:
         return m > 0 or k == 0
 
     cdef bint check(self) noexcept:
-        """Set the flags of the blocks; return False if a block is invalid."""
+        """Set the first fault, or the flags of the blocks; return whether there is no fault."""
         cdef blocks_t* p = &self.at
         cdef int32_t i, j, size, kind
+        self.fault = find_block_fault(p, &self.index)
+        if self.fault != NO_FAULT:
+            return False
         self.is_free = self.is_bounded_rows = self.single_rows = True
         self.has_round = self.has_rolling = self.has_ellipse = False
         for i in range(p.n_blocks):
             size = p.ptr[i + 1] - p.ptr[i]
             kind = p.kind[i]
-            if not is_valid_magnitude(p.mu[i]) or not is_valid_magnitude(p.patch_radius[i]) or not is_valid_magnitude(p.rolling[i]):
-                return False
-            if kind != ROW and not is_valid_magnitude(p.mu[i] * p.patch_radius[i]):
-                return False
             self.has_round |= kind == ROUND
             self.has_rolling |= kind == CONTACT_ROLLING
-            if kind == CONTACT_ELLIPSE:
-                self.has_ellipse, kind = True, CONTACT_BOX
-                if not 1.0 / MAX_ELLIPSE_RATIO <= p.patch_radius[i] <= MAX_ELLIPSE_RATIO:
-                    return False
-            if not fits(kind, size):
-                return False
+            self.has_ellipse |= kind == CONTACT_ELLIPSE
             if kind != ROW or size > 1:
                 self.single_rows = False
             if kind != ROW:
                 self.is_free = False
                 if size > 1:
                     self.is_bounded_rows = False
-        for i in range(p.n_blocks):
-            for j in range(p.ptr[i], p.ptr[i + 1]):
-                if p.kind[i] != ROW:
-                    if p.lower[j] != p.lower[j] or p.upper[j] != p.upper[j]:
-                        return False
-                elif not (p.lower[j] <= p.upper[j] and (p.lower[j] == -INF or is_number(p.lower[j]))
-                          and (p.upper[j] == INF or is_number(p.upper[j]))):
-                    return False
-                elif p.lower[j] != -INF or p.upper[j] != INF:
+            for j in range(p.ptr[i], p.ptr[i + 1] if self.is_free else p.ptr[i]):
+                if p.lower[j] != -INF or p.upper[j] != INF:
                     self.is_free = False
         return True
 
@@ -182,22 +160,22 @@ def are_joints_then_contacts(Blocks blocks, const int32_t[::1] joint_ptr):
 
 
 def copy_to_blocks(ptr, kind, lower, upper, mu, patch_radius, rolling):
-    """Return blocks over a copy of these arrays, or None if they need conversion or detailed validation."""
+    """Return blocks over a copy of these arrays, whose `fault` is set; None if the arrays need conversion or have NaN bounds."""
     cdef Blocks source = Blocks.__new__(Blocks), blocks
-    for x, dtype in ((ptr, I4), (kind, I4), (lower, F8), (upper, F8), (mu, F8), (patch_radius, F8),
-                     (rolling, F8)):
-        if type(x) is not ndarray or x.dtype is not dtype or x.ndim != 1 or not x.flags.c_contiguous:
+    cdef Py_ssize_t j
+    for x, type_number in ((ptr, INT), (kind, INT), (lower, DOUBLE), (upper, DOUBLE), (mu, DOUBLE), (patch_radius, DOUBLE),
+                           (rolling, DOUBLE)):
+        if type(x) is not ndarray or not is_of(x, type_number) or x.ndim != 1 or not x.flags.c_contiguous:
             return None
-    try:
-        if not source.point(ptr, kind, lower, upper, mu, patch_radius, rolling):
-            return None
-    except ValueError:                                  # An array is not aligned.
+    if not source.point(ptr, kind, lower, upper, mu, patch_radius, rolling):
         return None
+    for j in range(source.at.n_rows):
+        if source.at.lower[j] != source.at.lower[j] or source.at.upper[j] != source.at.upper[j]:
+            return None
     blocks = allocate_blocks(source.at.n_blocks, source.at.n_rows)
     copy_blocks(blocks, 0, 0, &source.at)
-    if not blocks.check():
-        return None
-    spell_bounds(&blocks.at)
+    if blocks.check():
+        spell_bounds(&blocks.at)
     return blocks
 
 

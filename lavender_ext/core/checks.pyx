@@ -2,13 +2,19 @@
 
 These functions report no reasons. If a check fails, the caller validates again in detail, decides, and writes the message.
 """
-from libc.stdint cimport int32_t
+from libc.stdint cimport int32_t, int64_t
 
 from lavender_ext.core cimport validate
-from lavender_ext.core.arrays cimport DOUBLE, C_CONTIGUOUS, doubles, is_of, ndarray
-from lavender_ext.core.validate cimport (first_invalid_magnitude, has_invalid, is_definite, is_frame, is_valid_magnitude,
-                                         min_magnitude, max_magnitude)
+from lavender_ext.core.arrays cimport DOUBLE, C_CONTIGUOUS, doubles, ints, is_of, ndarray
+from lavender_ext.core.faults cimport body_tolerances_t, find_body_fault as find_body_fault_of
+from lavender_ext.core.validate cimport first_invalid_magnitude, has_invalid, max_magnitude, min_magnitude
+from lavender_ext.core.view cimport rows_t
 
+#: Names of the faults of core/faults.pxd, by number.
+FAULT_NAMES = (
+    "", "pointers", "kind", "mu", "patch_radius", "spin", "rolling", "bounds", "lower", "upper", "mass", "inertia_size",
+    "inertia", "joint_body", "joint_pair", "contact_body", "contact_pair", "frame", "column", "diagonal", "ratio",
+)
 #: The largest and the smallest nonzero magnitude of a number of a problem.
 MAX_MAGNITUDE, MIN_MAGNITUDE = max_magnitude(), min_magnitude()
 
@@ -73,24 +79,19 @@ def counts_up(const int32_t[::1] ptr):
     return True
 
 
-def are_pairs(const int32_t[:, ::1] pair, int32_t n, bint moves):
-    """Return `are_pairs` of core/validate.pxd for body pairs (k, 2)."""
-    return pair.shape[0] == 0 or validate.are_pairs(&pair[0, 0], pair.shape[0], n, moves)
+def find_body_fault(inv_mass, inv_inertia, joint_body, contact_body, normal, tangent, bint checks_inertia):
+    """Return (name, index) of the first fault of bodies, pairs and frames (core/faults.pxd), ("", -1) if there is none.
 
-
-def are_frames(const double[:, ::1] normal, const double[:, ::1] tangent):
-    """Return whether normals and tangents (c, 3) are orthogonal unit vectors, within half of the accepted tolerance."""
-    cdef Py_ssize_t i
-    for i in range(normal.shape[0]):
-        if not is_frame(&normal[i, 0], &tangent[i, 0], 5e-10):
-            return False
-    return True
-
-
-def are_definite(const double[:, :, ::1] tensor):
-    """Return whether every tensor (n, 3, 3) is zero, or clearly positive definite and symmetric within half the tolerance."""
-    cdef Py_ssize_t i
-    for i in range(tensor.shape[0]):
-        if not (is_valid_magnitude(validate.norm_inf(&tensor[i, 0, 0], 9)) and is_definite(&tensor[i, 0, 0], 5e-10, 0.0, 1e-6)):
-            return False
-    return True
+    The arrays have valid numbers and shapes. Tolerances are half of those of `Rows`, so that arrays without a fault need no
+    correction; without `checks_inertia`, inertias need not be symmetric or definite.
+    """
+    cdef rows_t r
+    cdef int64_t index = -1
+    cdef double loose = 0.0 if checks_inertia else 1.0 / 0.0
+    cdef body_tolerances_t tolerances = body_tolerances_t(5e-10, 5e-10 + loose, loose, 1e-6)
+    r.n_bodies, r.n_joints, r.n_contacts = <int32_t>len(inv_mass), <int32_t>len(joint_body), <int32_t>len(contact_body)
+    r.inv_mass, r.inv_inertia = doubles(inv_mass, r.n_bodies), doubles(inv_inertia, 9 * r.n_bodies)
+    r.joint_body, r.contact_body = ints(joint_body, 2 * r.n_joints), ints(contact_body, 2 * r.n_contacts)
+    r.normal, r.tangent = doubles(normal, 3 * r.n_contacts), doubles(tangent, 3 * r.n_contacts)
+    cdef int32_t fault = find_body_fault_of(&r, &tolerances, &index)
+    return FAULT_NAMES[fault], index if fault else -1

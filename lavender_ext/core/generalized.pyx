@@ -8,7 +8,9 @@ import numpy as np
 from lavender_ext.core.arrays cimport doubles, ints
 from lavender_ext.core.validate cimport is_beyond
 from lavender_ext.core.generalized cimport estimate_condition, jac_transpose_times, jac_row, tree_solve
-from lavender_ext.core.tree cimport tree_factor, tree_pattern
+from lavender_ext.core.mass cimport (THIN_PADDING, asymmetry, compress_lower_triangle, factor_mass, factor_work,
+                                     is_symmetric, is_worth_ordering)
+from lavender_ext.core.tree cimport tree_pattern
 
 cdef object new = np.empty, I4 = np.dtype(np.int32)
 
@@ -81,20 +83,13 @@ cdef class Operator:
 
     def factor(self):
         """Compute L and D, and estimate the condition of M."""
-        cdef int32_t n = self.g.n, i
+        cdef int32_t n = self.g.n
         cdef int64_t used = 2 * <int64_t>n + self.g.lptr[n] + 1, size = used + 2 * <int64_t>n
         cdef double* numbers
         factor = new(size)
         numbers = doubles(factor, size)
         self.keep.append(factor)
-        self.g.lval = numbers + 2 * n
-        self.g.inv_pivot = numbers
-        self.g.root = numbers + n                       # holds the pivots until the factorisation ends
-        if n:
-            self.failed = tree_factor(n, self.g.mptr, self.g.midx, self.g.mval, self.g.lptr, self.g.lidx, numbers + 2 * n,
-                                      numbers + n, numbers)
-        for i in range(n):
-            numbers[n + i] = sqrt(numbers[i])
+        self.failed = factor_mass(&self.g, numbers + 2 * n, numbers, numbers + n)
         if self.failed < 0:
             self.g.condition = estimate_condition(&self.g, numbers + used)
 
@@ -147,13 +142,13 @@ cdef class Operator:
 
     @property
     def work(self):
-        """Multiply-adds of the factorisation: c (c + 1) / 2 for a row with c entries left of the diagonal."""
-        cdef int32_t i, c
-        cdef double out = 0.0
-        for i in range(self.g.n):
-            c = self.g.lptr[i + 1] - self.g.lptr[i]
-            out += 0.5 * c * (c + 1.0)
-        return out
+        """Multiply-adds of the factorisation."""
+        return factor_work(&self.g)
+
+    @property
+    def is_worth_ordering(self):
+        """Whether the search of an order with less fill-in takes less time than it saves (core/mass.pxd)."""
+        return is_worth_ordering(&self.g, self.g.mptr[self.g.n])
 
     @property
     def parents(self):
@@ -225,39 +220,26 @@ cdef class Operator:
 def lower_of_dense(const double[:, ::1] a):
     """Return (indptr, indices, data) of the lower triangle with diagonal, and the largest asymmetry.
 
-    The asymmetry is (i, j, |a_ij - a_ji| / sqrt(a_ii a_jj)) of the pair with the largest ratio. The denominator is 1 if
-    a_ii a_jj is not positive.
+    The asymmetry is (i, j, `asymmetry` of core/mass.pxd) of the pair with the largest value.
     """
-    cdef int32_t n = <int32_t>a.shape[0], i, j, nnz = 0, at_i = 0, at_j = 0
-    cdef double worst = 0.0, x, s
+    cdef int32_t n = <int32_t>a.shape[0], i, j, nnz = n, at_i = 0, at_j = 0
+    cdef double worst = 0.0, x
+    cdef const double* entries = &a[0, 0] if n else NULL
     for i in range(n):
         for j in range(i):
             nnz += a[i, j] != 0.0 or a[j, i] != 0.0
-    whole = new(n + 1 + nnz + n, I4)
-    values = new(nnz + n)
+    whole = new(n + 1 + nnz + THIN_PADDING, I4)
+    values = new(nnz + THIN_PADDING)
     cdef int32_t[::1] k = whole
     cdef double[::1] v = values
-    nnz = 0
-    k[0] = 0
-    for i in range(n):
-        for j in range(i):
-            if a[i, j] != 0.0 or a[j, i] != 0.0:
-                k[n + 1 + nnz] = j
-                v[nnz] = a[i, j]
-                nnz += 1
-                x = fabs(a[i, j] - a[j, i])
-                if x > 0.0:
-                    s = a[i, i] * a[j, j]
-                    x = x / sqrt(s) if s > 0.0 else x
-                    if x > worst:
-                        worst = x
-                        at_i = i
-                        at_j = j
-        k[n + 1 + nnz] = i
-        v[nnz] = a[i, i]
-        nnz += 1
-        k[i + 1] = nnz
-    return (whole[:n + 1], whole[n + 1:], values), (at_i, at_j, worst)
+    compress_lower_triangle(entries, n, 1.0 / 0.0, n, &k[0], &k[n + 1], &v[0])
+    if n and not is_symmetric(entries, n, n):
+        for i in range(n):
+            for j in range(i):
+                x = asymmetry(entries, n, i, j)
+                if x > worst:
+                    worst, at_i, at_j = x, i, j
+    return (whole[:n + 1], whole[n + 1:n + 1 + nnz], values[:nnz]), (at_i, at_j, worst)
 
 
 def lower_of_rows(const int32_t[::1] ptr, const int32_t[::1] idx, const double[::1] val):

@@ -143,7 +143,6 @@ static int32_t are_finite(const double *x, int64_t n) {
   return sum == 0.0;
 }
 
-static int32_t is_bound(double x) { return isinf(x) || core_validate_is_number(x); }
 
 static int32_t check_counts(const lav_problem *q) {
   const int64_t m = q->n_rows, n = q->n_velocities;
@@ -219,61 +218,41 @@ static int32_t refuse(where_t *at, int32_t code, const char *array, int64_t inde
 }
 
 static int32_t check_blocks(const lav_problem *q, where_t *at) {
-  int32_t i, j;
+  const blocks_t p = {.n_blocks = q->n_blocks, .n_rows = q->n_rows, .ptr = q->block_ptr, .kind = q->kind, .lower = q->lower,
+                      .upper = q->upper, .mu = q->mu, .patch_radius = q->patch_radius, .rolling = q->rolling};
+  int64_t index = 0;
+  int32_t i;
   if (q->n_rows > 0 && !q->block_ptr && q->n_blocks != q->n_rows) return refuse(at, LAV_ERROR_BLOCKS, "n_blocks", 0);
-  if (q->block_ptr) {
-    if (q->block_ptr[0] != 0) return refuse(at, LAV_ERROR_BLOCKS, "block_ptr", 0);
-    for (i = 0; i < q->n_blocks; i++)
-      if (q->block_ptr[i + 1] <= q->block_ptr[i] || q->block_ptr[i + 1] > q->n_rows)
-        return refuse(at, LAV_ERROR_BLOCKS, "block_ptr", i + 1);
-    if (q->block_ptr[i] != q->n_rows) return refuse(at, LAV_ERROR_BLOCKS, "block_ptr", i);
+  for (i = 0; q->kind && i < q->n_blocks; i++)
+    if (q->kind[i] < LAV_ROW || q->kind[i] > LAV_CONTACT_ROLLING) return refuse(at, LAV_ERROR_BLOCKS, "kind", i);
+  switch (core_faults_find_block_fault(&p, &index)) {
+    case core_faults_FAULT_POINTERS: return refuse(at, LAV_ERROR_BLOCKS, "block_ptr", index);
+    case core_faults_FAULT_KIND: return refuse(at, LAV_ERROR_BLOCKS, "block_ptr", index + 1);
+    case core_faults_FAULT_MU: return refuse(at, LAV_ERROR_FRICTION, "mu", index);
+    case core_faults_FAULT_PATCH_RADIUS:
+    case core_faults_FAULT_SPIN: return refuse(at, LAV_ERROR_FRICTION, "patch_radius", index);
+    case core_faults_FAULT_ROLLING: return refuse(at, LAV_ERROR_FRICTION, "rolling", index);
+    case core_faults_FAULT_BOUNDS: return refuse(at, LAV_ERROR_BOUNDS, "lower", index);
+    case core_faults_FAULT_LOWER: return refuse(at, LAV_ERROR_NUMBER, "lower", index);
+    case core_faults_FAULT_UPPER: return refuse(at, LAV_ERROR_NUMBER, "upper", index);
   }
-  for (i = 0; i < q->n_blocks; i++) {
-    const int32_t first = q->block_ptr ? q->block_ptr[i] : i, end = q->block_ptr ? q->block_ptr[i + 1] : i + 1;
-    const int32_t kind = q->kind ? q->kind[i] : LAV_ROW;
-    const double mu = q->mu ? q->mu[i] : 0.0, radius = q->patch_radius ? q->patch_radius[i] : 0.0;
-    const double rolling = q->rolling ? q->rolling[i] : 0.0;
-    if (kind < LAV_ROW || kind > LAV_CONTACT_ROLLING) return refuse(at, LAV_ERROR_BLOCKS, "kind", i);
-    if (!core_block_types_fits(kind, end - first)) return refuse(at, LAV_ERROR_BLOCKS, "block_ptr", i + 1);
-    if (q->form == LAV_BODIES && (kind == LAV_ROW) != (i < q->n_joints)) return refuse(at, LAV_ERROR_BLOCKS, "kind", i);
-    if (!core_validate_is_valid_magnitude(mu)) return refuse(at, LAV_ERROR_FRICTION, "mu", i);
-    if (!core_validate_is_valid_magnitude(radius) || (kind != LAV_ROW && !core_validate_is_valid_magnitude(mu * radius))) return refuse(at, LAV_ERROR_FRICTION, "patch_radius", i);
-    if (!core_validate_is_valid_magnitude(rolling)) return refuse(at, LAV_ERROR_FRICTION, "rolling", i);
-    if (kind == LAV_CONTACT && end - first == 1 && mu > 0.0 && q->form == LAV_BODIES)
-      return refuse(at, LAV_ERROR_FRICTION, "mu", i);
-    for (j = first; kind == LAV_ROW && j < end; j++) {
-      const double low = q->lower ? q->lower[j] : -INFINITY, high = q->upper ? q->upper[j] : INFINITY;
-      if (!(low <= high && low < INFINITY && high > -INFINITY)) return refuse(at, LAV_ERROR_BOUNDS, "lower", j);
-      if (!is_bound(low) || !is_bound(high)) return refuse(at, LAV_ERROR_NUMBER, is_bound(low) ? "upper" : "lower", j);
-    }
+  for (i = 0; q->form == LAV_BODIES && i < q->n_blocks; i++) {
+    const int32_t kind = q->kind ? q->kind[i] : LAV_ROW, rows = q->block_ptr ? q->block_ptr[i + 1] - q->block_ptr[i] : 1;
+    if ((kind == LAV_ROW) != (i < q->n_joints)) return refuse(at, LAV_ERROR_BLOCKS, "kind", i);
+    if (kind == LAV_CONTACT && rows == 1 && q->mu && q->mu[i] > 0.0) return refuse(at, LAV_ERROR_FRICTION, "mu", i);
   }
   return LAV_OK;
 }
 
 static int32_t check_columns(const int32_t *ptr, const int32_t *index, int32_t rows, int32_t columns, int32_t entries,
                              int32_t is_lower, const char *name, where_t *at) {
-  int32_t i, k;
+  int64_t i = 0;
   if (!ptr || (entries > 0 && !index)) return refuse(at, LAV_ERROR_NULL, name, 0);
-  for (i = 0; i <= rows; i++)
-    if (ptr[i] < (i > 0 ? ptr[i - 1] : 0) || ptr[i] > (i > 0 ? entries : 0)) return refuse(at, LAV_ERROR_COUNT, name, i);
-  if (ptr[rows] != entries) return refuse(at, LAV_ERROR_COUNT, name, rows);
-  for (i = 0; i < rows; i++) {
-    for (k = ptr[i]; k < ptr[i + 1]; k++)
-      if (index[k] < 0 || index[k] >= columns || (k > ptr[i] && index[k] <= index[k - 1]))
-        return refuse(at, LAV_ERROR_INDEX, is_lower ? "mass_index" : "index", k);
-    if (is_lower && (ptr[i] == ptr[i + 1] || index[ptr[i + 1] - 1] != i)) return refuse(at, LAV_ERROR_INDEX, name, i);
+  switch (core_faults_find_matrix_fault(ptr, index, rows, columns, entries, is_lower, &i)) {
+    case core_faults_FAULT_POINTERS: return refuse(at, LAV_ERROR_COUNT, name, i);
+    case core_faults_FAULT_COLUMN: return refuse(at, LAV_ERROR_INDEX, is_lower ? "mass_index" : "index", i);
+    case core_faults_FAULT_DIAGONAL: return refuse(at, LAV_ERROR_INDEX, name, i);
   }
-  return LAV_OK;
-}
-
-/* Check the pairs of bodies of joints or contacts: no body with itself; a contact needs at least one body. */
-static int32_t check_pairs(const int32_t *body, int32_t n, int32_t n_bodies, int32_t moves, const char *name, where_t *at) {
-  int32_t i;
-  if (n > 0 && !body) return refuse(at, LAV_ERROR_NULL, name, 0);
-  for (i = 0; i < 2 * n; i++)
-    if (body[i] < -1 || body[i] >= n_bodies) return refuse(at, LAV_ERROR_INDEX, name, i);
-  for (i = 0; i < n; i++)
-    if (body[2 * i] == body[2 * i + 1] && (moves || body[2 * i] >= 0)) return refuse(at, LAV_ERROR_PAIR, name, 2 * (int64_t)i);
   return LAV_OK;
 }
 
@@ -287,19 +266,14 @@ static int32_t check_numbers(const double *x, int64_t n, int32_t is_needed, cons
 #define OPTIONAL(name, n) GIVE_BACK(check_numbers(q->name, (n), 0, #name, at))
 #define NEEDED(name, n) GIVE_BACK(check_numbers(q->name, (n), 1, #name, at))
 
-/* Return the largest deviation of a contact's normal and tangent from orthogonal unit vectors. */
-static double off_frame(const double *n, const double *t) {
-  double nn = core_rows_dot3(n, n), tt = core_rows_dot3(t, t), most;
-  const double nt = fabs(core_rows_dot3(n, t));
-  if (core_validate_is_frame(n, t, EXACT)) return 0.0; /* The usual case, which needs no square root. */
-  nn = fabs(sqrt(nn) - 1.0), tt = fabs(sqrt(tt) - 1.0);
-  most = nn > tt ? nn : tt;
-  return most > nt ? most : nt;
-}
-
 static int32_t check_bodies(const lav_problem *q, where_t *at) {
   const int64_t n = q->n_bodies, c = q->n_blocks - q->n_joints, mj = q->block_ptr ? q->block_ptr[q->n_joints] : q->n_joints;
-  int64_t i;
+  const rows_t r = {.n_bodies = q->n_bodies, .n_joints = q->n_joints, .n_contacts = (int32_t)c, .inv_mass = q->inv_mass,
+                    .inv_inertia = q->inv_inertia, .normal = q->normal, .tangent = q->tangent, .joint_body = q->joint_body,
+                    .contact_body = q->contact_body};
+  const struct core_faults_body_tolerances_t tolerances = {ROUNDED, ROUNDED, ROUNDED, 0.0};
+  double length;
+  int64_t i = 0;
   NEEDED(inv_mass, n);
   NEEDED(inv_inertia, 9 * n);
   OPTIONAL(velocity, 6 * n);
@@ -308,19 +282,20 @@ static int32_t check_bodies(const lav_problem *q, where_t *at) {
   NEEDED(tangent, 3 * c);
   NEEDED(arm_a, 3 * c);
   NEEDED(arm_b, 3 * c);
-  for (i = 0; i < n; i++) {
-    if (q->inv_mass[i] < 0.0) return refuse(at, LAV_ERROR_MASS, "inv_mass", i);
-    if (!core_validate_is_valid_magnitude(q->inv_mass[i])) return refuse(at, LAV_ERROR_NUMBER, "inv_mass", i);
-    if (!core_validate_is_valid_magnitude(core_validate_norm_inf(q->inv_inertia + 9 * i, 9))) return refuse(at, LAV_ERROR_NUMBER, "inv_inertia", 9 * i);
-    if (!core_validate_is_definite(q->inv_inertia + 9 * i, ROUNDED, ROUNDED, 0.0)) return refuse(at, LAV_ERROR_MASS, "inv_inertia", 9 * i);
-  }
-  GIVE_BACK(check_pairs(q->joint_body, q->n_joints, q->n_bodies, 0, "joint_body", at));
-  GIVE_BACK(check_pairs(q->contact_body, (int32_t)c, q->n_bodies, 1, "contact_body", at));
-  for (i = 0; i < c; i++)
-    if (!(off_frame(q->normal + 3 * i, q->tangent + 3 * i) <= ROUNDED)) {
-      const double length = core_rows_dot3(q->normal + 3 * i, q->normal + 3 * i);
+  if (q->n_joints > 0 && !q->joint_body) return refuse(at, LAV_ERROR_NULL, "joint_body", 0);
+  if (c > 0 && !q->contact_body) return refuse(at, LAV_ERROR_NULL, "contact_body", 0);
+  switch (core_faults_find_body_fault(&r, &tolerances, &i)) {
+    case core_faults_FAULT_MASS: return refuse(at, q->inv_mass[i] < 0.0 ? LAV_ERROR_MASS : LAV_ERROR_NUMBER, "inv_mass", i);
+    case core_faults_FAULT_INERTIA_SIZE: return refuse(at, LAV_ERROR_NUMBER, "inv_inertia", 9 * i);
+    case core_faults_FAULT_INERTIA: return refuse(at, LAV_ERROR_MASS, "inv_inertia", 9 * i);
+    case core_faults_FAULT_JOINT_BODY: return refuse(at, LAV_ERROR_INDEX, "joint_body", i);
+    case core_faults_FAULT_JOINT_PAIR: return refuse(at, LAV_ERROR_PAIR, "joint_body", 2 * i);
+    case core_faults_FAULT_CONTACT_BODY: return refuse(at, LAV_ERROR_INDEX, "contact_body", i);
+    case core_faults_FAULT_CONTACT_PAIR: return refuse(at, LAV_ERROR_PAIR, "contact_body", 2 * i);
+    case core_faults_FAULT_FRAME:
+      length = core_rows_dot3(q->normal + 3 * i, q->normal + 3 * i);
       return refuse(at, LAV_ERROR_FRAME, fabs(sqrt(length) - 1.0) <= ROUNDED ? "tangent" : "normal", 3 * i);
-    }
+  }
   return LAV_OK;
 }
 

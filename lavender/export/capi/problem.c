@@ -191,7 +191,7 @@ static void fill_frames(lav_solver *s, const lav_problem *q) {
   COPY(normal, q->normal, 3 * (int64_t)s->r.n_contacts);
   COPY(tangent, q->tangent, 3 * (int64_t)s->r.n_contacts);
   for (i = 0; i < s->r.n_contacts; i++, normal += 3, tangent += 3) {
-    if (off_frame(normal, tangent) <= EXACT) continue;
+    if (core_faults_measure_frame_error(normal, tangent) <= EXACT) continue;
     size = sqrt(core_rows_dot3(normal, normal));
     for (k = 0; k < 3; k++) normal[k] /= size;
     along = core_rows_dot3(normal, tangent);
@@ -230,8 +230,8 @@ static void fill_bodies(lav_solver *s, const lav_problem *q) {
 static int32_t factor_mass(lav_solver *s, const lav_problem *q) {
   const int32_t n = q->n_velocities;
   const int64_t most = (int64_t)n * n / 2 + 1;
-  int32_t *mptr = TAKE(s, int32_t, n + 1), *midx = TAKE(s, int32_t, q->n_mass_entries), *columns = NULL, *lidx, count, i;
-  double *mval = TAKE(s, double, q->n_mass_entries), *pivot = (double *)(uintptr_t)s->g.root, *values, *lval;
+  int32_t *mptr = TAKE(s, int32_t, n + 1), *midx = TAKE(s, int32_t, q->n_mass_entries), *columns = NULL, *lidx, count;
+  double *mval = TAKE(s, double, q->n_mass_entries), *values, *lval;
   const uint64_t from = s->used;
   int64_t workspace = (int64_t)q->n_mass_entries + 1;
   if (s->is_short) return LAV_ERROR_WORKSPACE;
@@ -247,11 +247,9 @@ static int32_t factor_mass(lav_solver *s, const lav_problem *q) {
   }
   values = TAKE(s, double, count);
   if (s->is_short) return LAV_ERROR_WORKSPACE;
-  if (core_tree_tree_factor(n, mptr, midx, mval, s->g.lptr, columns, values, pivot,
-                                   (double *)(uintptr_t)s->g.inv_pivot) >= 0)
+  s->g.mptr = mptr, s->g.midx = midx, s->g.mval = mval, s->g.lidx = columns;
+  if (core_mass_factor_mass(&s->g, values, (double *)(uintptr_t)s->g.inv_pivot, (double *)(uintptr_t)s->g.root) >= 0)
     return LAV_ERROR_MASS;
-  for (i = 0; i < n; i++) pivot[i] = sqrt(s->g.inv_pivot[i]);
-  s->g.mptr = mptr, s->g.midx = midx, s->g.mval = mval;
   s->used = from; /* Move L directly behind M, with its final size. */
   s->g.lidx = lidx = TAKE(s, int32_t, count);
   s->g.lval = lval = TAKE(s, double, count);

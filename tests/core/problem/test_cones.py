@@ -1,5 +1,7 @@
 """Cones: what blocks may be, bounds, and the NumPy projection against its conditions."""
 
+import re
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -129,3 +131,33 @@ def test_projection_is_feasible_keeps_what_is_and_is_a_projection(seed, size):
             assert t @ given_t >= 0.0
         if cones.kind[i] == lv.CONTACT_SPIN:
             assert abs(y[end - 1]) <= cones.mu[i] * cones.patch_radius[i] * y[j]  # the reach first
+
+
+@pytest.mark.parametrize(
+    ("name", "at", "value", "words"),
+    [
+        ("lower", 0, 3.0, "row 0: lower = 3.0, upper = 2.0"),
+        ("upper", 0, -np.inf, "row 0: lower = -inf, upper = -inf"),
+        ("lower", 0, -1e61, "lower must be at most 1e[+]60"),
+        ("mu", 1, -0.5, "mu must not be negative"),
+        ("mu", 1, 1e-70, "mu must be 0 or at least 1e-60"),
+        ("patch_radius", 1, -1.0, "patch_radius"),
+        ("rolling", 0, -1.0, "rolling"),
+        ("kind", 1, 4, "block 1 is a box"),
+        ("ptr", 1, 0, "cones.ptr must start with 0 and increase"),
+    ],
+)
+def test_faults_of_blocks_have_one_message_for_arrays_and_lists(name, at, value, words):
+    cones = lv.Cones.bounded([-np.inf], [2.0]) + lv.Cones.contacts(0.5, 2, 0.1)
+    fields = {
+        n: np.array(getattr(cones, n))
+        for n in ("ptr", "kind", "lower", "upper", "mu", "patch_radius", "rolling")
+    }
+    fields[name][at] = value
+    messages = []
+    for convert in (lambda x: x, lambda x: x.tolist()):
+        with pytest.raises(lv.InputError) as raised:
+            lv.Cones(**{n: convert(x) for n, x in fields.items()})
+        messages.append(str(raised.value))
+    assert messages[0] == messages[1]
+    assert re.search(words, messages[0]), messages[0]
