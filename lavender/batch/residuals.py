@@ -88,6 +88,11 @@ class Many:
         return self._numbers("speed")
 
     @property
+    def velocity_at_zero(self) -> FloatArray:
+        """Velocity error of the zero impulse (n,) [m/s], the reference of `relative`."""
+        return self._numbers("reference_speed")
+
+    @property
     def impulse_error(self) -> FloatArray:
         """Impulse error of the worst row (n,) [N s]."""
         return self._numbers("push")

@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Any, cast, overload
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray, check_int, read_only
+from lavender.base.arrays import FloatArray, check_float, check_int, read_only
 from lavender.base.deadline import NEVER, Deadline
 from lavender.base.errors import InputError, LavenderError
 from lavender.batch.data import Batch
-from lavender.batch.residuals import Many, check_impulses, check_problems
-from lavender.judge.residuals import judge_impulse, reading_time
+from lavender.batch.residuals import Many, check_impulses, check_problems, residual_many
+from lavender.judge.residuals import judge_impulse, reading_time, residual
 from lavender.judge.solution import CONTRADICTED, Solution, Status, uninterrupted
 from lavender.problem import Problem
 from lavender.problem.derived import cached_property
@@ -34,6 +34,7 @@ from lavender.solving.solve import (
     solve,
     solve_prepared,
 )
+from lavender.solving.velocity import MAX_VELOCITY_TOLERANCE, accept_velocity
 from lavender_ext.batch.many import CODE, NUMBER, PLACE, Worker
 from lavender_ext.judge.measure import all_finite
 
@@ -77,9 +78,13 @@ class Solutions(Many, Sequence[Solution]):
         Numbers of the judge [-, sqrt J, m/s, N s, -]; the errors are those of the worst row.
     worst_row, iterations : (n,) int
     tol : float, -
+    velocity_tol : float or None, m/s
+        Requested velocity error, if the worlds were to be solved to one.
     faults : dict of int to LavenderError
         Errors of worlds with the status INVALID_PROBLEM, by their indices.
     """
+
+    velocity_tol: float | None = None
 
     def __init__(
         self,
@@ -145,7 +150,9 @@ class Solutions(Many, Sequence[Solution]):
 
     @property
     def success(self) -> np.ndarray:
-        """Whether the judge's relative residual of each world (n,) is at most `tol`."""
+        """Whether each world (n,) has a relative residual up to `tol`, or a velocity error up to `velocity_tol`."""
+        if self.velocity_tol is not None:
+            return self.velocity_error <= self.velocity_tol
         return self.relative <= self.tol
 
     @property
@@ -236,6 +243,8 @@ class Solutions(Many, Sequence[Solution]):
         if i not in self._solutions:
             make = self._make_late_solution if i in self._late_worlds else self._make_solution
             self._solutions[i] = make(i)
+        if self.velocity_tol is not None and self._solutions[i].velocity_tol is None:
+            self._solutions[i] = accept_velocity(self._solutions[i], self.velocity_tol)
         return self._solutions[i]
 
     def _make_late_solution(self, i: int) -> Solution:
@@ -298,6 +307,7 @@ def solve_many(
     impulses: Sequence[Any] | None = None,
     threads: int = 1,
     tol: float = 1e-6,
+    velocity_tol: float | None = None,
     max_iter: int | None = None,
     time_limit: float | None = None,
     errors: str = "raise",
@@ -317,6 +327,9 @@ def solve_many(
         Number of worlds that are solved at the same time. Each thread starts the next world that no thread has started.
     tol, max_iter, **options
         As for `solve`.
+    velocity_tol : float, optional, m/s
+        Velocity error to reach on every row, in place of `tol`. All worlds are solved to the relative residual that
+        guarantees it in the world with the largest velocity error of the zero impulse.
     time_limit : float, optional, s
         Limit of the wall-clock time of the whole call. Worlds are solved in order, each with all of the remaining time.
         Worlds that are not started in time keep their start and have the status TIME_LIMIT. In a batch, their data may
@@ -342,12 +355,14 @@ def solve_many(
     worlds = check_problems(problems, errors)
     threads = check_int("threads", threads, 1, None)
     spec, limit = get(solver), check_time_limit(time_limit)
+    if velocity_tol is not None:
+        tol = _tolerance_for_velocity(worlds, velocity_tol)
     deadline = NEVER if limit == np.inf else Deadline(limit)
     check_budget(spec, tol, max_iter)
     starts, invalid_starts = _check_starts(worlds, impulse, impulses, errors)
     named = cast("dict[str, Any]", options)
     solutions = Solutions(worlds, starts, starts is None, tol, spec, named, errors)
-    solutions._invalid_starts = invalid_starts
+    solutions._invalid_starts, solutions.velocity_tol = invalid_starts, velocity_tol
     if deadline.is_set:
         deadline.reserve(solutions._time_to_judge_starts())
     more: dict[str, Any] = {"tol": tol, "max_iter": max_iter, **named}
@@ -404,6 +419,18 @@ def solve_many(
     if not isinstance(worlds, Batch):
         solutions._worlds.remember(solutions._data)
     return solutions
+
+
+def _tolerance_for_velocity(worlds: Any, velocity_tol: float) -> float:
+    """Return the relative residual that guarantees a velocity error [m/s] in every valid world."""
+    velocity_tol = check_float("velocity_tol", velocity_tol, above=0.0)
+    if isinstance(worlds, Batch):
+        # The references do not depend on the judged impulse.
+        references = residual_many(worlds, np.zeros(worlds.shape), errors="status").velocity_at_zero
+    else:
+        references = np.array([residual(p, p.start()).velocity_at_zero for p in worlds if p.m], float)
+    largest = float(np.max(references[np.isfinite(references)], initial=0.0))
+    return min(velocity_tol / largest, MAX_VELOCITY_TOLERANCE) if largest > 0.0 else MAX_VELOCITY_TOLERANCE
 
 
 def _check_starts(

@@ -27,6 +27,8 @@ SAVED_RESIDUAL_FIELDS = ("error", "relative", "energy", "velocity", "roundoff_fl
     show_default=True,
     help="Relative residual to reach; 0 runs exactly --max-iter iterations.",
 )
+@click.option("--velocity-tol", type=float, metavar="M/S",
+              help="Velocity error of every row to reach [m/s], in place of --tol.")  # fmt: skip
 @click.option("--max-iter", type=int, help="Largest number of iterations; default: the solver's.")
 @click.option("--time-limit", type=float, metavar="S", help="Limit of the solve time.")
 @click.option("--order", help="Sweep order, for solvers that take one.")
@@ -36,6 +38,7 @@ def solve(
     file: str,
     solver: str,
     tol: float,
+    velocity_tol: float | None,
     max_iter: int | None,
     time_limit: float | None,
     order: str | None,
@@ -44,9 +47,9 @@ def solve(
 ) -> None:
     """Solve one problem and print the judged result.
 
-    FILE is a file or a case of the suite. Exit code 0: the judge accepts the result (within tol, or at the floor of
-    float64; with --tol 0 always). 1: the judge rejects it. 3: the problem is infeasible, with a certificate that the
-    judge confirms.
+    FILE is a file or a case of the suite. Exit code 0: the judge accepts the result (within --tol or --velocity-tol, or
+    at the floor of float64; with --tol 0 always). 1: the judge rejects it. 3: the problem is infeasible, with a
+    certificate that the judge confirms.
     """
     from lavender.judge.residuals import WRONG
     from lavender.lab import bench
@@ -60,7 +63,8 @@ def solve(
         raise InputError(f"{file} holds {len(more) + 1} problems; give one file")
     if output is not None and output.exists() and Path(item.source).exists() and output.samefile(item.source):
         raise InputError(f"--output {output} would overwrite the problem: give another file")
-    options: dict[str, Any] = {k: v for k, v in (("order", order), ("seed", seed)) if v is not None}
+    given = ("order", order), ("seed", seed), ("velocity_tol", velocity_tol)
+    options: dict[str, Any] = {name: value for name, value in given if value is not None}
     with Worker() as worker:
         solution = solve_isolated(
             worker, item.problem, solver, tol=tol, max_iter=max_iter, time_limit=time_limit, **options

@@ -216,6 +216,8 @@ class Solution:
         Sweeps in which the residual fell tenfold at the last checks; NaN if it did not fall or was not checked.
     stages : tuple of SolverStage
         Stages of `auto` in the order in which they ran; empty for other solvers.
+    velocity_tol : float or None, m/s
+        Requested velocity error, if the solve was to stop at one.
 
     Examples
     --------
@@ -246,6 +248,7 @@ class Solution:
     status_conflict: str
     sweeps_per_decade: float
     stages: tuple[SolverStage, ...]
+    velocity_tol: float | None = None
 
     @classmethod
     def of(cls, values: dict[str, Any]) -> Solution:
@@ -326,7 +329,9 @@ class Solution:
 
     @property
     def success(self) -> bool:
-        """Whether the judge's relative residual is at most `tol`."""
+        """Whether the judge's relative residual is at most `tol`, or its velocity error at most `velocity_tol`."""
+        if self.velocity_tol is not None:
+            return self.residual.velocity <= self.velocity_tol
         return self.residual.relative <= self.tol
 
     def unstretched(self, problem: Problem) -> Solution:

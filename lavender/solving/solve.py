@@ -66,6 +66,7 @@ from lavender.solvers.setup_times import (
 )
 from lavender.solvers.small import time_fraction
 from lavender.solving.outcome import decide_empty_rows, finish, name_lost_row
+from lavender.solving.velocity import accept_velocity, relative_tolerance
 from lavender_ext.judge.measure import all_finite, by_island
 from lavender_ext.judge.stopping_test import StoppingTest
 
@@ -85,7 +86,7 @@ JUDGE_LATE_MESSAGE = "what the judge reads takes longer than the time limit: the
 WITHOUT_SCIPY_MESSAGE = (
     "without SciPy, which this process has not loaded: import scipy.linalg.lapack, scipy.sparse before"
 )
-SOLVE_ARGUMENTS = ("impulse", "tol", "max_iter", "time_limit", "history", "callback")
+SOLVE_ARGUMENTS = ("impulse", "tol", "velocity_tol", "max_iter", "time_limit", "history", "callback")
 
 
 def solve(
@@ -94,6 +95,7 @@ def solve(
     *surplus: NoReturn,
     impulse: ArrayLike | None = None,
     tol: float = 1e-6,
+    velocity_tol: float | None = None,
     max_iter: int | None = None,
     time_limit: float | None = None,
     history: bool = False,
@@ -112,6 +114,9 @@ def solve(
     tol : float, default 1e-6
         Relative residual to reach: 0 is a solution, 1 is zero impulses (see `judge.residuals`). `tol=0` runs exactly
         `max_iter` iterations; `auto` and solvers that factor end earlier where nothing is left to gain.
+    velocity_tol : float, optional, m/s (rad/s on angular rows)
+        Velocity error to reach on every row, whatever the relative residual; `tol` is not used. Solvers run to the
+        relative residual that guarantees it (`lavender.solving.velocity`), and `success` refers to it.
     max_iter : int, optional
         Largest number of iterations, in the solver's own unit (sweeps, steps, pivots). Default: that of the solver's
         spec.
@@ -143,7 +148,7 @@ def solve(
     CapabilityError
         The solver does not accept this problem or option; the message says why.
     InputError
-        `impulse`, `tol`, `max_iter` or `time_limit` is not valid.
+        `impulse`, `tol`, `velocity_tol`, `max_iter` or `time_limit` is not valid.
     """
     begun = 0.0 if time_limit is None else perf_counter()
     check_problem(problem)  # This comes first, because a frequent error is to pass A and b.
@@ -154,6 +159,13 @@ def solve(
         )
     spec = get(solver)
     limit = math.inf if time_limit is None else check_time_limit(time_limit)
+    if velocity_tol is not None:
+        tol = relative_tolerance(problem, velocity_tol)
+        judged = solve_prepared(
+            problem, spec, cast("dict[str, Any]", options), impulse, tol, max_iter, _deadline(spec, limit, begun),
+            history, callback,
+        )  # fmt: skip
+        return accept_velocity(judged, velocity_tol)
     failed_call = None
     if max_iter is None and callback is None and history is False and not options:
         solution, failed_call = solve_small(problem, spec, impulse, tol, limit)
@@ -291,6 +303,7 @@ class Prepared:
         *,
         impulse: ArrayLike | None = None,
         tol: float = 1e-6,
+        velocity_tol: float | None = None,
         max_iter: int | None = None,
         time_limit: float | None = None,
         history: bool = False,
@@ -310,7 +323,12 @@ class Prepared:
             successor = suggest_argument(name, SOLVE_ARGUMENTS)
             raise UnknownName("argument of Prepared.solve", name, SOLVE_ARGUMENTS, successor)
         deadline = _deadline(self.spec, check_time_limit(time_limit))
-        return self._solve(problem, impulse, tol, max_iter, deadline, history, callback)
+        if velocity_tol is None:
+            return self._solve(problem, impulse, tol, max_iter, deadline, history, callback)
+        check_problem(self._original if problem is None else problem)
+        tol = relative_tolerance(self._original if problem is None else problem, velocity_tol)
+        solution = self._solve(problem, impulse, tol, max_iter, deadline, history, callback)
+        return accept_velocity(solution, velocity_tol)
 
     def _solve(
         self,

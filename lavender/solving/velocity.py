@@ -1,0 +1,54 @@
+"""Stop at a velocity error in m/s: the tolerance that guarantees it, and the acceptance of answers that meet it.
+
+The relative residual is the largest max(E / E0, V / V0) of an island, with the velocity error V and the references E0,
+V0 of the zero impulse. With V0 the largest reference of an island,
+
+    relative <= velocity_tol / V0   =>   V <= velocity_tol on every row                                        (1)
+
+Solvers run to the tolerance (1). An answer that they return with a larger relative residual is accepted nevertheless if
+the judge measures V <= velocity_tol: the bound on E was then stricter than needed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import fields
+
+from lavender.base.arrays import check_float
+from lavender.judge.residuals import residual
+from lavender.judge.solution import Solution, Status
+from lavender.problem import Problem
+
+MAX_VELOCITY_TOLERANCE = (
+    1.0  # [-] Relative residual of the zero impulse: it is accepted if its own error is small enough.
+)
+UNFINISHED = (Status.MAX_ITERATIONS, Status.STALLED, Status.TIME_LIMIT)
+
+
+def relative_tolerance(problem: Problem, velocity_tol: float) -> float:
+    """Return the relative residual (1) that guarantees a velocity error.
+
+    Parameters
+    ----------
+    problem : Problem
+    velocity_tol : float, m/s
+        Largest accepted velocity error of a row (rad/s on angular rows).
+
+    Raises
+    ------
+    InputError
+        `velocity_tol` is not above 0.
+    """
+    velocity_tol = check_float("velocity_tol", velocity_tol, above=0.0)
+    reference = residual(problem, problem.start()).velocity_at_zero if problem.m else 0.0
+    return (
+        min(velocity_tol / reference, MAX_VELOCITY_TOLERANCE) if reference > 0.0 else MAX_VELOCITY_TOLERANCE
+    )
+
+
+def accept_velocity(solution: Solution, velocity_tol: float) -> Solution:
+    """Return the solution with the requested velocity error, as CONVERGED if the judge measures no larger one."""
+    values = {f.name: getattr(solution, f.name) for f in fields(solution)} | {"velocity_tol": velocity_tol}
+    if solution.status in UNFINISHED and solution.residual.velocity <= velocity_tol:
+        values["status"] = Status.CONVERGED
+        values["message"] = f"the velocity error of every row is at most {velocity_tol:g} m/s"
+    return Solution.of(values)
