@@ -1,41 +1,27 @@
-"""Select and combine other solvers: the following decision tree, with two estimated costs (`costs.py`).
+"""Select and combine other solvers by their estimated costs (`costs.py`).
 
-    the start is a solution     nothing runs
-    a program with a singular P `PROGRAM_BACKENDS`, one after the other; a linear program searches for a certificate if
-                                none finds a solution
-    a small problem             one compiled call (`small.py`), for at most 64 rows, for small islands with friction,
-                                and for J and M if Newton's method costs less than 100 sweeps and few contacts are
-                                between bodies; if it fails, the problem is treated as any other
-    a matrix                    `direct`: linear systems without a limit; bounded rows of a narrow band with up to
-                                DIRECT_BUDGET_RATIO times the factorisations expected for `newton`; bounded rows of an
-                                asymmetric matrix with the same budget, but after sweeps
-    sweeps (`anderson`)         EXPECTED_SWEEPS before an analysis gives Newton's cost, then up to that cost, or until
-                                the predicted cost of the remaining sweeps exceeds it. Linear problems, and bounded rows
-                                and cones that are not given as a matrix, are swept only if MIN_SWEEPS_PER_NEWTON
-                                sweeps cost less than Newton's method. Contacts of a matrix are solved exactly
-    a loose pile                at least MIN_PILE_ROWS contact rows under Coulomb's law, nearly all between different
-                                pairs: for the same cost again, conjugate gradients over sweeps (`nncg`), first under
-                                the cone law unless there is rolling or torsional friction
-    Newton's method (`newton`)  up to NEWTON_BUDGET_RATIO times its cost: over bodies or rows; for J and M over
-                                velocities and over rows of A, the cheaper one first. If it stalls from the impulse of
-                                another solver, it starts again from zero
-    a certificate               for J and M with a rigid row, from the smallest violation, after RELIABLE_BUDGET_RATIO
-                                times Newton's cost over velocities (NEWTON_BUDGET_RATIO if another form is cheaper);
-                                for other problems under Coulomb's law by a linear program, if the residual is above
-                                NEAR_SOLUTION_RESIDUAL
-    alternation                 with doubled work in each round, until no solver improves the residual in two stages:
-                                `newton` (for J and M also over rows, within NEWTON_BUDGET_RATIO times the cost or
-                                MIN_ROW_FORM_BUDGET; earlier if the compiled call failed, or before the end), `admm`
-                                (for J and M once a factor of A costs no more), `nncg`, and sweeps while they improve;
-                                in total TOTAL_BUDGET_RATIO times Newton's cost and at most MAX_ALTERNATION_COST
-    the end                     a linear program searches for a certificate if none was tried (`certify.py`)
+    start            if the start is a solution, nothing runs
+    compiled call    one call for small problems, for small islands with friction, and for J and M if Newton's method is
+                     estimated to cost no more than the first sweeps (`small.py`); attempted once
+    sweeps           (`anderson`, unless the problem is linear) `first_sweeps`, then as many as cost as much as the
+                     cheapest factorising solver, unless more are predicted to remain
+    loose pile       under Coulomb's law, for the same cost again, conjugate gradients over sweeps (`nncg`), first under
+                     the cone law unless there is rolling or torsional friction
+    factorisations   `newton` over velocities, bodies or rows of A, and for bounded rows of a matrix `direct`, the
+                     cheapest first, each up to `budget_ratio` times its estimated cost
+    certificate      that there is no solution: for J and M from the smallest violation, for others under Coulomb's law
+                     by a linear program
+    alternation      the factorising solvers, `admm`, `nncg` and sweeps, each continued, with doubled work in each
+                     round, until no solver improves the residual in two rounds or `total_ratio` is used up
+    end              a linear program searches for a certificate if none was tried (`certify.py`)
 
-Each solver continues where it stopped, and the result is the best impulse of all. Costs are estimated, never measured,
-so the same problem is solved in the same way on every machine. With a time limit, the tree is the same with these
-exceptions: a factorising solver starts only if its result is expected in time; sweeps come first in every case if
-RELIABLE_BUDGET_RATIO times Newton's cost does not fit; sweeps before Newton's method use at most half of the remaining
-time; sweeps use the rest if Newton's method has no time. `Solution.stages` lists the stages that ran,
-`lavender.explain` the stages that would run.
+Linear problems given by a matrix start with `direct`. A program with a singular P is solved by `PROGRAM_BACKENDS`, one
+after the other. The result is the best impulse of all stages. Costs are estimated, never measured, so the same problem
+is solved in the same way on every machine. Under a time limit, a factorising solver starts only if its estimated
+cost fits in the remaining time; sweeps before it use at most the fraction `time_share` of the time, or all of it if no
+factorising solver fits. `Solution.stages` lists the stages that ran, `lavender.explain` the stages that
+would run. These numbers decide (`decisions.py`):
+
 """
 
 from __future__ import annotations
@@ -61,8 +47,9 @@ from lavender.solvers.certify import (
     certify_infeasibility,
     linear_programs,
 )
+from lavender.solvers.decisions import DECISIONS, describe_numbers
 from lavender.solvers.islands import count_pairs
-from lavender.solvers.newton import WARM_START_MAX_RESIDUAL, NewtonState
+from lavender.solvers.newton import NewtonState
 from lavender.solvers.registry import Solver, SolverSpec, get, specs
 from lavender.solvers.setup_times import (
     first_factor_time,
@@ -73,11 +60,9 @@ from lavender.solvers.setup_times import (
     tight_limit,
 )
 from lavender.solvers.small import AUTO, NO_TIME_MESSAGE, time_fraction
-from lavender.solvers.solve_log import MIN_GAIN_RATIO, SolveLog
+from lavender.solvers.solve_log import SolveLog
 from lavender.solvers.steps import (
     METHODS,
-    NEAR_SOLUTION_RESIDUAL,
-    SWEEPS_TIME_FRACTION,
     Iterations,
     Newton,
     Step,
@@ -85,28 +70,10 @@ from lavender.solvers.steps import (
     setup_time,
 )
 
-# Newton's method may use this multiple of its estimated cost before solvers alternate.
-NEWTON_BUDGET_RATIO = 10.0
-# `direct` may use this multiple of the factorisations that Newton's method is expected to need.
-DIRECT_BUDGET_RATIO = 4.0
-MAX_ALTERNATIONS = 6  # Largest number of rounds of alternation, each with twice the work of the round before.
-TOTAL_BUDGET_RATIO = 200.0  # All solvers together may use this multiple of Newton's estimated cost.
-# Largest estimated cost [ns] of the alternation, and of Newton's method unless RELIABLE_BUDGET_RATIO times its cost is
-# more.
-MAX_ALTERNATION_COST = 6e10
-# If Newton's method converges reliably, sweeps precede it only if this many cost less than it.
-MIN_SWEEPS_PER_NEWTON = 200.0
-# Sweeps before the first factor of a sparse matrix, which may fill, and the largest fraction of nonzeros of such a one.
-SWEEPS_BEFORE_SPARSE_FACTOR, SPARSE_FRACTION = 32.0, 0.05
-# Newton's method over rows may use at least this estimated cost [ns], however much cheaper another form is.
-MIN_ROW_FORM_BUDGET = 5e6
-# Below this many contact rows, Newton's method is faster than conjugate-gradient sweeps and then Newton's method.
-MIN_PILE_ROWS = 390
-# `direct` runs first up to this half bandwidth, if that is at most a quarter of the rows.
-MAX_DIRECT_BAND = 100
-RELIABLE_BUDGET_RATIO = 4.0  # Within this multiple of the estimated cost, nine of ten problems converge.
-# Fraction of the estimated cost after which an interior point has an impulse that improves on sweeps.
-EARLY_RESULT_FRACTION = 0.25
+assert __doc__ is not None
+__doc__ += describe_numbers() + "\n"
+
+MAX_ALTERNATIONS = 12  # Largest number of rounds of alternation; the total cost ends most of them earlier.
 # A quadratic program with a singular P is solved by the first of these that is installed and solves it; osqp is always
 # installed.
 PROGRAM_BACKENDS = ("piqp", "clarabel", "osqp")
@@ -145,7 +112,6 @@ class Tree:
     The caller sets `best`, the relative residual so far, and adds the cost of stages that it skips to `remaining_cost`.
     """
 
-    cost_before_newton = 0.0  # Cost [ns] of the sweeps before Newton's method.
     remaining_cost = 0.0  # Cost [ns] that remains for the alternation.
     compiled_call_failed = False  # The compiled call over velocities of J and M has failed.
     sweeps_failed = False  # Sweeps did not improve the residual in the alternation.
@@ -166,7 +132,7 @@ class Tree:
 
     @cached_property
     def states(self) -> dict[str, NewtonState]:
-        """States of Newton's method after its analysis, the cheaper form first; empty if it is refused or too late."""
+        """States of Newton's method after its analysis; empty if it is refused or too late."""
         is_possible = get("newton").refuses(self.problem) is None and not self.is_late
         return self.prepare_newton("newton") if is_possible else {}
 
@@ -188,24 +154,30 @@ class Tree:
     def add_row_form(self, max_cost: float) -> bool:
         """Analyse A of J and M, too, if its Newton's method costs less than `max_cost` [ns] and has time.
 
-        A form that has failed in the compiled call becomes the last one. Return whether a form was added.
+        Return whether a form was added.
         """
         p, states = self.problem, self.states
         if "newton over rows" in states or self.row_form_cost >= max_cost or self.is_late:
             return False
         if self.deadline.is_set and self.deadline.passed(matrix_setup_time(p) + 3.0 * forming_time(p)):
             return False
-        both = states | self.prepare_newton("newton over rows")
-        failed = self.compiled_call_failed
-        self.states = dict(
-            sorted(both.items(), key=lambda item: (failed and item[1].general is not None, item[1].cost))
-        )
-        return len(both) > len(states)
+        self.states = states | self.prepare_newton("newton over rows")
+        return len(self.states) > len(states)
+
+    @property
+    def solver_costs(self) -> dict[str, float]:
+        """Estimated costs [ns] of the factorising solvers, the cheapest first; a failed form comes last."""
+        p = self.problem
+        found = {name: state.cost for name, state in self.states.items()}
+        if p.matrix is not None and self.law == "lcp":
+            found["direct"] = costs.direct_cost(p)
+        failed = "newton" if self.compiled_call_failed and self.states.get("newton", None) else ""
+        return dict(sorted(found.items(), key=lambda item: (item[0] == failed, item[1])))
 
     @property
     def newton(self) -> float:
-        """Cost of Newton's method [ns] in its cheapest form; inf if it is not possible."""
-        return min((state.cost for state in self.states.values()), default=inf)
+        """Cost of the cheapest factorising solver [ns]; inf if none is possible."""
+        return min(self.solver_costs.values(), default=inf)
 
     @property
     def is_late(self) -> bool:
@@ -213,31 +185,29 @@ class Tree:
         return not self.has_time("newton", self.min_newton_cost)
 
     def has_time(self, name: str, cost: float, before: float = 0.0) -> bool:
-        """Return whether a factorising solver of this cost [ns] has a result in time if it starts after `before` [ns].
-
-        An interior point has a result after each factorisation; under Coulomb's law, and in `direct`, only at the end.
-        """
+        """Return whether a factorising solver of this cost [ns] ends in time if it starts after `before` [ns]."""
         if not self.deadline.is_set:
             return True
-        needed = 1e-9 * (
-            before + (1.0 if name == "direct" or self.law == "coulomb" else EARLY_RESULT_FRACTION) * cost
-        )
+        needed = 1e-9 * (before + cost)
         if name == "newton" and "states" in vars(self):
             return not self.deadline.passed(needed)
         if not self.deadline.passed(tight_limit(self.problem) + needed):
             return True
         return not self.deadline.passed(setup_time(name, self.problem) + needed)
 
-    @property
-    def pivots(self) -> str:
-        """Reason to use `direct` for bounded rows of a matrix, "a narrow band" or "not symmetric", else empty."""
-        p, band = self.problem, min(MAX_DIRECT_BAND, self.problem.m // 4)
-        if p.matrix is None or self.law != "lcp":
-            return ""
-        entries = len(p._compressed[1])
-        if p.is_symmetric:
-            return "a narrow band" if entries <= (2 * band + 1) * p.m and max(p.bandwidth) <= band else ""
-        return "not symmetric" if entries > SPARSE_FRACTION * p.m**2 else ""
+    @cached_property
+    def factorises_first(self) -> bool:
+        """Whether a factorising solver costs less than the first sweeps, or sweeps do not accept the problem.
+
+        Fill determines the cost of a factor of a matrix, and only an analysis gives it. Before the first sweeps, only
+        the cost of `direct` and the cost over bodies or velocities are known.
+        """
+        p, first = self.problem, DECISIONS.first_sweeps * self.sweep
+        if self.law == "linear" or p.cones.has_round:
+            return True
+        if p.matrix is not None:
+            return self.law == "lcp" and costs.direct_cost(p) < first
+        return self.min_newton_cost < first and self.newton < first
 
     @cached_property
     def is_loose(self) -> bool:
@@ -246,49 +216,42 @@ class Tree:
         Sweeps then determine quickly which contacts stick.
         """
         p = self.problem
-        if self.law != "coulomb" or np.count_nonzero(p.cones.contact_rows) < MIN_PILE_ROWS:
-            return False
-        return 4 * count_pairs(p) > 3 * p.n_blocks
+        return self.law == "coulomb" and count_pairs(p) > DECISIONS.loose_fraction * p.n_blocks
 
     def __iter__(self) -> Iterator[Stage]:
         """Yield the stages in order; each is only needed if the stages before it did not solve the problem."""
-        if self.problem.matrix is not None and self.law == "linear":
-            p = self.problem
-            if len(p._compressed[1]) < SPARSE_FRACTION * p.m**2 and max(p.bandwidth) > MAX_DIRECT_BAND:
-                yield Stage(
-                    "anderson",
-                    SWEEPS_BEFORE_SPARSE_FACTOR,
-                    SWEEPS_BEFORE_SPARSE_FACTOR * self.sweep,
-                    "a sparse matrix whose factor may fill",
-                    SWEEPS_BEFORE_SPARSE_FACTOR,
-                )
+        p, ratio = self.problem, DECISIONS.budget_ratio
+        if p.matrix is not None and self.law == "linear":
             yield Stage("direct", inf, self.min_newton_cost, "linear, a matrix")
-        pivots, max_factorisations = self.pivots, DIRECT_BUDGET_RATIO * costs.factorisations(self.law)
-        if pivots == "a narrow band":
-            yield Stage("direct", max_factorisations, self.min_newton_cost, f"bounded rows, {pivots}")
-        # Fill determines the cost of a factor, and only an analysis gives it: before it, the usual number of sweeps.
-        yield from self.sweeps_first(max(self.min_newton_cost, costs.EXPECTED_SWEEPS * self.sweep))
-        yield from self.sweeps_first(min(self.newton, self.row_form_cost))
-        row_form_budget = max(NEWTON_BUDGET_RATIO * self.newton, MIN_ROW_FORM_BUDGET)
-        self.add_row_form(row_form_budget if self.compiled_call_failed else self.newton)
-        yield from self.sweeps_first(self.newton)
-        if pivots == "not symmetric":
-            yield Stage("direct", max_factorisations, self.newton, f"bounded rows, {pivots}")
-        if self.problem.generalized is not None and not np.all(self.problem.compliance):
-            velocity_state = self.states.get("newton")  # The smallest violation is found over velocities.
-            cost = self.newton if velocity_state is None else velocity_state.cost
-            is_cheap = cost <= max(NEWTON_BUDGET_RATIO * self.newton, MIN_ROW_FORM_BUDGET)
-            budget_ratio = RELIABLE_BUDGET_RATIO if is_cheap else NEWTON_BUDGET_RATIO
-            yield from islice(self.factorisations(budget_ratio), 1)
+        first = DECISIONS.first_sweeps * self.sweep
+        if self.factorises_first and p.matrix is not None and self.law == "lcp":
+            cost = ratio * costs.direct_cost(p)
+            yield Stage(
+                "direct", ratio * DECISIONS.pivot_factorisations, cost, "a narrow band: before any analysis"
+            )
+        elif not self.factorises_first:
+            yield self.sweeps(first, "the first sweeps, before any analysis")
+        self.add_row_form(ratio * self.newton if self.compiled_call_failed else self.newton)
+        if not self.factorises_first and first < self.newton < inf:
+            why = f"up to {seconds(1e-9 * self.newton)}, as much as {next(iter(self.solver_costs))} costs"
+            yield self.sweeps(self.newton - first, why, self.newton)
+            if self.is_loose:
+                name = "nncg" if p.cones.has_more_parts else "nncg from the cone law"
+                yield self.iterations(name, self.newton, f"a loose pile, {why}")
+        if p.generalized is not None and not np.all(p.compliance):
+            yield from islice(self.factorisations(0.25 * ratio), 1)
+            state = self.states.get("newton")  # The smallest violation is found over velocities.
+            cost = self.newton if state is None else state.cost
             yield Stage("certificate", 1.0, cost, "whether the least violation proves that there is none")
-        yield from self.factorisations(NEWTON_BUDGET_RATIO)
-        self.add_row_form(max(NEWTON_BUDGET_RATIO * self.newton, MIN_ROW_FORM_BUDGET))
-        if self.law == "coulomb" and self.problem.generalized is None and self.best > NEAR_SOLUTION_RESIDUAL:
+        yield from self.factorisations(ratio)
+        self.add_row_form(ratio * self.newton)
+        if self.law == "coulomb" and p.generalized is None and ratio * self.unit >= MIN_LINEAR_PROGRAM_COST:
             yield Stage("certificate", 1.0, MIN_LINEAR_PROGRAM_COST, "whether a linear program proves it")
-        unit = max((state.cost for state in self.states.values()), default=costs.EXPECTED_SWEEPS * self.sweep)
-        unit = min(unit, max(self.newton, MIN_ROW_FORM_BUDGET))
-        total = min((TOTAL_BUDGET_RATIO - NEWTON_BUDGET_RATIO) * unit, MAX_ALTERNATION_COST)
-        self.remaining_cost = total - self.cost_before_newton
+        yield from self.alternation()
+
+    def alternation(self) -> Iterator[Stage]:
+        """Yield all solvers in rounds with doubled work, until no solver improves the residual in two rounds."""
+        self.remaining_cost = DECISIONS.total_ratio * self.unit
         for k in range(MAX_ALTERNATIONS):
             before = self.best
             for stage in self.alternate(2.0**k):
@@ -297,36 +260,27 @@ class Tree:
                 fraction = min(1.0, self.remaining_cost / stage.cost)
                 self.remaining_cost -= fraction * stage.cost
                 yield replace(stage, iterations=fraction * stage.iterations, cost=fraction * stage.cost)
-            # Near a solution, the row form needs only a few of its factorisations.
-            ratio = NEWTON_BUDGET_RATIO if self.best <= WARM_START_MAX_RESIDUAL else 1.0
-            no_gain = k > 0 and self.best > MIN_GAIN_RATIO * before
-            if no_gain and not self.add_row_form(ratio * self.remaining_cost):
+            no_gain = k > 0 and self.best >= before
+            if no_gain and not self.add_row_form(DECISIONS.total_ratio * self.unit):
                 return
 
+    @property
+    def unit(self) -> float:
+        """Cost [ns] of the cheapest factorising solver, or of the first sweeps if there is none."""
+        return self.newton if self.newton < inf else DECISIONS.first_sweeps * self.sweep
+
     def factorisations(self, times: float) -> Iterator[Stage]:
-        """Yield stages of Newton's method, in all its forms, with this multiple of their estimated costs."""
-        for name, state in self.states.items():
-            ratio = min(times, max(RELIABLE_BUDGET_RATIO, MAX_ALTERNATION_COST / state.cost))
-            why = f"{ratio:.3g} times its counted cost of {seconds(1e-9 * state.cost)}"
-            yield Stage(name, ratio * state.steps, ratio * state.cost, why)
+        """Yield stages of the factorising solvers, whose costs are at most this multiple of the cheapest one's."""
+        budget = times * self.newton
+        for name, cost in self.solver_costs.items():
+            if cost <= budget:
+                why = f"{times:.3g} times its estimated cost of {seconds(1e-9 * cost)}"
+                yield self.factorisation(name, times * cost, why)
 
-    def sweeps_first(self, newton: float) -> Iterator[Stage]:
-        """Yield sweeps up to Newton's cost `newton` [ns], of which earlier sweeps are subtracted.
-
-        The callers first pass a lower bound of the cost, then the cost after the analysis, then that with the row form.
-        """
-        cost = newton - self.cost_before_newton
-        # Newton's method then converges within its estimated cost, if that fits the time limit.
-        is_reliable = self.law == "linear" or (self.law != "coulomb" and self.problem.matrix is None)
-        is_reliable = is_reliable and not self.deadline.passed(1e-9 * RELIABLE_BUDGET_RATIO * newton)
-        sweeps_pay = not is_reliable or MIN_SWEEPS_PER_NEWTON * self.sweep <= newton
-        if sweeps_pay and 0.0 < cost < inf and not self.problem.cones.has_round:
-            self.cost_before_newton += cost
-            why = f"{seconds(1e-9 * cost)} of what newton costs"
-            yield self.sweeps(cost, why, newton)
-            if self.is_loose:
-                has_rolling = self.problem.cones.has_more_parts
-                yield self.iterations("nncg" if has_rolling else "nncg from the cone law", cost, why)
+    def factorisation(self, name: str, cost: float, why: str) -> Stage:
+        """Return a stage of this cost [ns] of a factorising solver."""
+        steps = self.states[name].steps if name in self.states else DECISIONS.pivot_factorisations
+        return Stage(name, cost / self.solver_costs[name] * steps, cost, why)
 
     def sweeps(self, cost: float, why: str, max_remaining: float = inf) -> Stage:
         """Return a stage of sweeps of this cost [ns]; it stops if it predicts more than `max_remaining` [ns]."""
@@ -337,14 +291,11 @@ class Tree:
         return Stage(name, 0.5 * cost / self.sweep, cost, why)
 
     def alternate(self, times: float) -> Iterator[Stage]:
-        """Yield one round of all solvers, with this multiple of the cost of Newton's method before."""
-        cost = (
-            times
-            * NEWTON_BUDGET_RATIO
-            * (self.newton if self.newton < inf else costs.EXPECTED_SWEEPS * self.sweep)
-        )
-        why = f"in turn, {times * NEWTON_BUDGET_RATIO:g} times newton's cost"
-        yield from self.factorisations(times * NEWTON_BUDGET_RATIO)
+        """Yield one round, in which each solver costs this multiple of the factorising solvers' first budget."""
+        times *= DECISIONS.budget_ratio
+        cost = times * self.unit
+        why = f"in turn, {times:g} times the cheapest factorising solver's cost"
+        yield from (self.factorisation(name, cost, why) for name in self.solver_costs)
         p = self.problem
         # Time to form A of J and M if no stage did, and its first factor; it does not depend on cached data.
         time_to_form = (
@@ -359,7 +310,7 @@ class Tree:
         if not self.sweeps_failed and not self.problem.cones.has_round:
             before = self.best
             yield self.sweeps(cost, why)
-            self.sweeps_failed = self.best > MIN_GAIN_RATIO * before
+            self.sweeps_failed = self.best >= before
 
 
 @dataclass
@@ -504,16 +455,18 @@ def solve(log: SolveLog, tree: Tree) -> None:
         if log.deadline.is_set and not step.over:
             if isinstance(step, Sweeps):
                 if not tree_goes_on(
-                    tree, steps, min(stage.cost, SWEEPS_TIME_FRACTION * log.deadline.nanoseconds())
+                    tree, steps, min(stage.cost, DECISIONS.time_share * log.deadline.nanoseconds())
                 ):
                     step.finish()
                     return
             elif step.name == "direct" or isinstance(step, Newton):
-                cost = step.state.cost if isinstance(step, Newton) else stage.cost
-                step.over = step.late = not tree.has_time(METHODS[stage.solver][0], cost)
+                step.over = step.late = not tree.has_time(
+                    METHODS[stage.solver][0], tree.solver_costs.get(stage.solver, stage.cost)
+                )
             elif step.state is None:
-                step.over = log.deadline.passed(RELIABLE_BUDGET_RATIO * setup_time(stage.solver, log.problem))
-        if step.over:
+                step.over = log.deadline.passed(setup_time(stage.solver, log.problem) / DECISIONS.time_share)
+        is_hopeless = isinstance(step, Sweeps) and step.predicted > stage.least
+        if step.over or is_hopeless:
             tree.remaining_cost += stage.cost
         else:
             step.least = stage.least

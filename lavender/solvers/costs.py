@@ -3,13 +3,15 @@
     Newton   start + n (row m + entry e + work w)                                                             (1)
     sweep    sweep_row m + entry e, under the cone law over J sweep_cone e                                    (2)
 
+    direct   n (row m + work w)                                                                               (3)
+
 m is the number of rows; e the multiply-adds of a sweep, or the entries of A that one step reads; w the multiply-adds of
-one factorisation and its solves, from the solver's own analysis (`NewtonState.count`); n the number of factorisations,
-which depends on the law. Over generalised velocities everything is compiled: start and row are 0, and n is the number
-for bounded rows under every law, multiplied by RIGID_STEP_RATIO if a row has no compliance and not all rows are
-bounded, and by SOFT_STEP_RATIO if every row has enough compliance and not all rows are free. No clock is read: the same
-problem has the same counts on every machine. The twelve rates of `rates.json` were fitted to measured times of random
-problems (docs/method.md, "Figures without a command").
+one factorisation and its solves, from the solver's own analysis (`NewtonState.count`) or from the band of A. n is the
+number of factorisations: 1 for linear problems, otherwise `DECISIONS.factorisations`, and
+`DECISIONS.pivot_factorisations` for `direct`. Over generalised velocities everything is compiled: start and row are 0.
+No clock is read: the same problem has the same counts on every machine.
+The rates of `rates.json` are fitted to measured times of random problems
+(docs/method.md, "Figures without a command").
 """
 
 from __future__ import annotations
@@ -21,12 +23,13 @@ from typing import Any
 
 from lavender.problem import Problem
 from lavender.solvers._accelerated import sweep_work
+from lavender.solvers.decisions import DECISIONS
 from lavender.solvers.setup_times import dense_work, formation_time
 
 __all__ = [
-    "EXPECTED_SWEEPS",
     "RATES",
     "Count",
+    "direct_cost",
     "factorisations",
     "formed_count",
     "min_count",
@@ -37,11 +40,6 @@ __all__ = [
 # os.path is used because pathlib would take 4 % of the time of `import lavender`.
 with open(os.path.join(os.path.dirname(__file__), "rates.json"), encoding="utf-8") as _file:
     RATES: dict[str, Any] = json.load(_file)
-# Steps over generalised velocities per factorisation of the other forms, if no row is rigid and if a row is rigid.
-SOFT_STEP_RATIO = 0.5
-RIGID_STEP_RATIO = 4.0
-# Assumed number of sweeps to a solution: `auto` starts with Newton's method if it is estimated to cost less.
-EXPECTED_SWEEPS = 100.0
 
 
 @dataclass(frozen=True)
@@ -60,8 +58,6 @@ class Count:
         Number of rows; 0 over generalised velocities.
     set_up : float, ns
         Cost of forming A of J and M.
-    steps : float
-        Steps per factorisation that the law is expected to need.
     """
 
     form: str
@@ -69,17 +65,11 @@ class Count:
     entries: float
     rows: float
     set_up: float = 0.0
-    steps: float = 1.0
 
 
-def factorisations(law: str, form: str = "") -> float:
-    """Return the expected number of factorisations of Newton's method.
-
-    It is 1 for linear problems. Over velocities, all other laws have the number of bounded rows.
-    """
-    if law == "linear":
-        return 1.0
-    return float(RATES["count"]["rows" if law == "lcp" or form == "velocities" else law])
+def factorisations(law: str) -> float:
+    """Return the expected number of factorisations of Newton's method: 1 for linear problems."""
+    return 1.0 if law == "linear" else DECISIONS.factorisations
 
 
 def newton_cost(count: Count, law: str) -> float:
@@ -87,7 +77,14 @@ def newton_cost(count: Count, law: str) -> float:
     r = RATES
     step_cost = r["row"] * count.rows + r["entry"] * count.entries + r["work"][count.form] * count.work
     start = r["start"] if count.rows else 0.0
-    return float(start + count.set_up + count.steps * factorisations(law, count.form) * step_cost)
+    return float(start + count.set_up + factorisations(law) * step_cost)
+
+
+def direct_cost(problem: Problem) -> float:
+    """Return the estimated cost of `direct` on bounded rows of a matrix [ns], (3)."""
+    m = float(problem.m)
+    work = m * (1.0 + max(problem.bandwidth)) ** 2 if problem.is_symmetric else 2.0 * dense_work(problem.m)
+    return DECISIONS.pivot_factorisations * (RATES["pivot row"] * m + RATES["pivot work"] * work)
 
 
 def min_count(problem: Problem) -> Count:

@@ -41,7 +41,7 @@ from lavender.judge.certificates import check_certificate
 from lavender.judge.residuals import compute_relative
 from lavender.judge.solution import Claim, Status, counted, summed
 from lavender.problem import OPERATORS, Problem
-from lavender.solvers.costs import RIGID_STEP_RATIO, SOFT_STEP_RATIO, Count, factorisations, newton_cost
+from lavender.solvers.costs import Count, factorisations, newton_cost
 from lavender.solvers.newton_systems import general
 from lavender.solvers.newton_systems.systems import System, find_bodies, make_system, use_dense_matrix
 from lavender.solvers.registry import Solver, SolverSpec
@@ -62,7 +62,7 @@ FORMS = ("auto", "velocity", "impulse")
 # The row form is used if the velocity form is estimated to cost more than this multiple of it.
 VELOCITY_MAX_COST_RATIO = 10.0
 # Smallest count of one multiply-add over velocities.
-VELOCITY_UNIT_COUNT = Count("velocities", 1.0, 0.0, 0.0, steps=SOFT_STEP_RATIO)
+VELOCITY_UNIT_COUNT = Count("velocities", 1.0, 0.0, 0.0)
 MAX_FORMED_ROWS = (
     3000  # If the velocity form fails, A is formed and the row form continues up to this many rows.
 )
@@ -103,12 +103,7 @@ class NewtonState:
         problem, system = self.problem, self.system
         read = float(problem.metric.work)
         if self.general is not None:
-            is_soft, law = self.general.soft, problem.law
-            if is_soft and law != "linear":
-                steps = SOFT_STEP_RATIO
-            else:
-                steps = 1.0 if is_soft or law == "lcp" else RIGID_STEP_RATIO
-            return Count("velocities", self.general.work, read, 0.0, steps=steps)
+            return Count("velocities", self.general.work, read, 0.0)
         if system is None:
             return Count("dense", 0.0, 0.0, float(problem.m))
         if system.form == "velocity":
@@ -126,7 +121,7 @@ class NewtonState:
     def steps(self) -> float:
         """Expected number of iterations; over velocities, an iteration is a step of one island."""
         islands = 1 if self.general is None else max(1, self.general.islands)
-        return factorisations(self.problem.law, self.count.form) * self.count.steps * islands
+        return factorisations(self.problem.law) * islands
 
     @property
     def cost(self) -> float:

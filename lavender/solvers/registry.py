@@ -22,12 +22,13 @@ from lavender.base.renamed import SOLVER_HINTS
 from lavender.judge.solution import Claim, Status
 from lavender.problem import LAWS, OPERATORS, Problem, check_problem
 from lavender.problem.derived import cached_property
+from lavender.solvers.decisions import DECISIONS
 
 __all__ = ["Solver", "SolverOptions", "SolverSpec", "State", "available", "get", "known", "register"]
 
 
 # Up to this many rows, the overhead of Python dominates a solve: the compiled call `SolverSpec.small` is tried first.
-SMALL_ROWS = 64
+SMALL_ROWS = int(DECISIONS.small_rows)
 # Modules whose SPECS are registered first. They are named by strings because they import this module.
 TABLES = ("lavender.solvers", "lavender.external")
 

@@ -20,14 +20,8 @@ from lavender.base.arrays import FloatArray
 from lavender.judge.residuals import get_reference, judge_impulse, reading_time
 from lavender.judge.solution import Claim, SolverStage, Status, counted, summed
 from lavender.problem import Problem
-from lavender.solvers.costs import (
-    EXPECTED_SWEEPS,
-    RATES,
-    RIGID_STEP_RATIO,
-    SOFT_STEP_RATIO,
-    factorisations,
-    sweep_cost,
-)
+from lavender.solvers.costs import RATES, factorisations, sweep_cost
+from lavender.solvers.decisions import DECISIONS
 from lavender.solvers.islands import islands
 from lavender.solvers.newton_systems import general
 from lavender.solvers.newton_systems.systems import MAX_ALWAYS_DENSE_ROWS
@@ -46,24 +40,18 @@ NO_WORK_MESSAGES = {
 }
 NO_TIME_MESSAGE = "the time limit left no time for a solver"
 WARM_START_MAX_RESIDUAL = 1e-3  # Newton's method starts from an iterate up to this relative residual.
-# Largest number of rows of an island. Up to it, dense factors cost less than sweeps and factors of all islands.
-MAX_ISLAND_ROWS = 150
 MAX_SWEEPS_BEFORE_FACTOR = 32  # Largest number of sweeps of an island before its first factorisation.
-# A call of more than SMALL_ROWS rows may fail, so it may only use this fraction of the remaining time.
-CALL_TIME_FRACTION = 0.5
 ISLANDS_ROW_COST = 200.0  # Cost [ns] per row to separate the islands.
 TREE_OVERHEAD_COST = 2e5  # Cost [ns] of Python in two stages of the tree, which the compiled call avoids.
 # From this many rows per velocity, the matrix N is full, and small compared with the data from which it is formed.
 DENSE_ROWS_PER_VELOCITY = 10.0
 VELOCITIES_OF_TWO_BODIES = 12.0
-# Largest estimated cost [ns] of Newton's method over generalised velocities in one call that does not read the clock.
-MAX_UNCLOCKED_COST = 1e7
 # Largest numbers of steps of all islands of velocities, within the default limits of each solver.
 NEWTON_MAX_STEPS, AUTO_MAX_STEPS = 1500.0, 1e6
 
 
 def make_limits(
-    sweeps: float, max_cost: float = MAX_UNCLOCKED_COST, steps: float = NEWTON_MAX_STEPS
+    sweeps: float, max_cost: float = DECISIONS.call_cost, steps: float = NEWTON_MAX_STEPS
 ) -> Limits:
     """Return the limits of compiled calls over generalised velocities.
 
@@ -83,8 +71,6 @@ def make_limits(
         np.array(
             [
                 *step,
-                RIGID_STEP_RATIO,
-                SOFT_STEP_RATIO,
                 *sweep,
                 general.MAX_MATRIX_ENTRIES,
                 max_cost,
@@ -98,15 +84,15 @@ def make_limits(
 def time_fraction(problem: Problem, seconds: float) -> float:
     """Return the fraction of a time limit of `seconds` that the compiled call may use; 0 if it is not made.
 
-    With at most SMALL_ROWS rows, it may use all of the time. Otherwise, its set-up must fit in CALL_TIME_FRACTION of
-    the time; after that the kernel stops at the estimated cost that it is given.
+    With at most SMALL_ROWS rows, it may use all of the time. Otherwise the call may fail, so it may use a fraction of
+    the time, in which its set-up must fit; after that the kernel stops at the estimated cost that it is given.
     """
     if seconds == inf or len(problem.b) <= SMALL_ROWS:
         return 1.0
     if problem.generalized is None and problem.law in ("linear", "lcp"):
         return 0.0
     if seconds > tight_limit(problem):
-        return CALL_TIME_FRACTION
+        return DECISIONS.time_share
     if problem.generalized is not None:
         set_up = 1e9 * reading_time(problem)
     else:
@@ -115,7 +101,7 @@ def time_fraction(problem: Problem, seconds: float) -> float:
             + 1e9 * forming_time(problem)
             + MAX_SWEEPS_BEFORE_FACTOR * sweep_cost(problem)
         )
-    return CALL_TIME_FRACTION if 1e-9 * set_up <= CALL_TIME_FRACTION * seconds else 0.0
+    return DECISIONS.time_share if 1e-9 * set_up <= DECISIONS.time_share * seconds else 0.0
 
 
 def prepare_call(problem: Problem) -> Any:
@@ -135,7 +121,7 @@ def _make_call(problem: Problem) -> Small | None:
         if bounded:
             return None
         count, label = islands(problem)
-        if count == 1 or np.bincount(label, np.diff(cones.ptr)).max() > MAX_ISLAND_ROWS:
+        if count == 1 or np.bincount(label, np.diff(cones.ptr)).max() > DECISIONS.island_rows:
             return None
     get_reference(problem)
     data = problem.metric
@@ -348,7 +334,7 @@ def describe_work(name: str, work: Mapping[str, int]) -> str:
     return name
 
 
-AUTO = SmallCall("auto", make_limits(EXPECTED_SWEEPS, steps=AUTO_MAX_STEPS), True, True)
+AUTO = SmallCall("auto", make_limits(DECISIONS.first_sweeps, steps=AUTO_MAX_STEPS), True, True)
 DIRECT = SmallCall("direct", None, True)
 NEWTON = SmallCall("newton", make_limits(inf), False)
 

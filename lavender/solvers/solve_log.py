@@ -21,14 +21,11 @@ from lavender.judge.solution import Claim, SolverStage, Status, summed
 from lavender.problem import Problem
 from lavender.solvers.small import NO_TIME_MESSAGE, NO_WORK_MESSAGES, describe_stages
 
-__all__ = ["MIN_GAIN_RATIO", "SolveLog"]
+__all__ = ["SolveLog"]
 
 # Sweeps start from the given impulse up to this relative residual, even if the zero impulse has a smaller one, because
 # the given impulse shows which rows are free.
 MAX_START_RESIDUAL = 1e3
-MIN_GAIN_RATIO = (
-    0.99  # A stage has failed if the residual after it is more than this fraction of the one before.
-)
 
 
 class SolveLog:
@@ -109,8 +106,8 @@ class SolveLog:
 
     @property
     def last_stage_failed(self) -> bool:
-        """Whether the last stage did not reduce the residual by at least 1 %."""
-        return bool(self.stages) and self.best > MIN_GAIN_RATIO * self.stages[-1].before
+        """Whether the last stage did not reduce the residual."""
+        return bool(self.stages) and self.best >= self.stages[-1].before
 
     def done(self) -> bool:
         """Return whether the problem is solved or proved infeasible, or no time or iterations remain."""

@@ -14,7 +14,8 @@ from lavender.base.errors import BREAKDOWN, format_error
 from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
 from lavender.solvers._accelerated import state_as_given
-from lavender.solvers.costs import EXPECTED_SWEEPS, sweep_cost
+from lavender.solvers.costs import sweep_cost
+from lavender.solvers.decisions import DECISIONS
 from lavender.solvers.direct import SufficientDirect
 from lavender.solvers.loop import Loop
 from lavender.solvers.registry import get
@@ -33,15 +34,11 @@ METHODS: dict[str, tuple[str, dict[str, Any]]] = {
     "direct": ("direct", {}),
     "nncg": ("nncg", NNCG_OPTIONS),
     # For a loose pile: the convex relaxation is unique, and equals Coulomb's solution if contacts stick.
-    "nncg from the cone law": ("nncg", NNCG_OPTIONS | {"convex": int(EXPECTED_SWEEPS)}),
+    "nncg from the cone law": ("nncg", NNCG_OPTIONS | {"convex": int(DECISIONS.first_sweeps)}),
     "admm": ("admm", {}),
 }
-SWEEPS_BEFORE_PREDICTION = 32  # Sweeps before the first prediction of the remaining ones.
 MAX_CALL_ITERATIONS = 2**30  # Largest number of iterations of one call.
 MIN_PREDICTED_RESIDUAL = 1e-16  # Predictions use at least this relative residual as tol.
-# Newton's method starts from the impulse of another solver up to this relative residual, otherwise from zero.
-NEAR_SOLUTION_RESIDUAL = 0.02
-SWEEPS_TIME_FRACTION = 0.5  # Sweeps before a factorising solver may use this fraction of the remaining time.
 # Upper bound of the time [s] of an iteration per estimated cost [ns].
 ITERATION_TIME_PER_COST = 4e-9
 # Sweeps use a formed A only if this multiple of the time to form it remains.
@@ -111,7 +108,7 @@ class Step:
 class Newton(Step):
     """Newton's method with the state that the tree has analysed.
 
-    It starts from zero if the residual is large. If it stalls from another impulse, it starts once more from zero.
+    It starts from the best impulse. If it stalls from an impulse that is not zero, it starts once more from zero.
     """
 
     started_from_zero = has_stalled = False
@@ -128,8 +125,7 @@ class Newton(Step):
         """Run about n iterations; choose the start at the first call."""
         log = self.log
         if not self.state.begun:
-            is_far = log.best > NEAR_SOLUTION_RESIDUAL
-            self.impulse = log.problem.start() if self.started_from_zero or is_far else log.impulse.copy()
+            self.impulse = log.problem.start() if self.started_from_zero else log.impulse.copy()
             self.started_from_zero = not (self.impulse - log.problem.start()).any()
         claim = self.solver.advance(self.state, self.impulse, n, log.tol, log.time_left, log.left)
         self.has_stalled = claim.status is Status.STALLED
@@ -172,10 +168,21 @@ class Iterations(Step):
 class Sweeps(Iterations):
     """Sweeps that stop if more than `least` remaining sweeps are predicted.
 
-    With a time limit, they use half of the remaining time, or all of it in `finish`.
+    With a time limit, they use a part of the remaining time, or all of it in `finish`.
     """
 
-    time_fraction = SWEEPS_TIME_FRACTION
+    time_fraction = DECISIONS.time_share
+    predicted = 0.0  # Number of remaining sweeps that the last ones predict.
+
+    def advance(self, n: int) -> Claim:
+        """Run at most n sweeps, offer the result to the log, and predict how many remain."""
+        before = self.log.best
+        claim = super().advance(n)
+        now, tol = self.log.best, max(self.log.tol, MIN_PREDICTED_RESIDUAL)
+        if now > tol:
+            gain = log(before / now) if now < before else 0.0
+            self.predicted = claim.iterations * log(now / tol) / gain if gain > 0.0 else np.inf
+        return claim
 
     def begin(self) -> None:
         """Prepare the sweeps; start from the best impulse, or from a given start that is worse than zero."""
@@ -185,19 +192,18 @@ class Sweeps(Iterations):
         self.impulse = self.log.impulse.copy() if self.log.bad_start is None else self.log.bad_start
 
     def iterate(self, loop: Loop, n: int) -> Claim:
-        """Run at most n sweeps; predict how many remain after `SWEEPS_BEFORE_PREDICTION` and after each 50 % more."""
+        """Run at most n sweeps; predict how many remain after `first_sweeps` and after each 50 % more."""
+        first = int(DECISIONS.first_sweeps)
         done, due, tol = self.state.watch.total, 0, max(self.log.tol, MIN_PREDICTED_RESIDUAL)
         if self.time_fraction == 1.0:  # Checks would cost as much as the first sweeps.
             loop.tol = 0.0
-            claim = loop.run_chunks(min(n, SWEEPS_BEFORE_PREDICTION))
+            claim = loop.run_chunks(min(n, first))
             if claim.status is not Status.MAX_ITERATIONS:
                 return claim
             loop.tol = self.log.tol
         while True:
             step = (
-                min(n - due, max((done + due) // 2, SWEEPS_BEFORE_PREDICTION))
-                if self.least < np.inf
-                else n - due
+                min(n - due, max((done + due) // 2, 1 if done else first)) if self.least < np.inf else n - due
             )
             due += step
             claim = loop.run_chunks(due)

@@ -111,7 +111,7 @@ cdef void store_zero_residual(task_t* j, Data p):
 
 
 cdef class Limits:
-    """Cost limits, from the fields of a `limits_t` as an array (16,)."""
+    """Cost limits, from the fields of a `limits_t` as an array (14,)."""
     cdef limits_t at
 
     def __init__(self, const double[::1] numbers):
@@ -120,7 +120,7 @@ cdef class Limits:
     def cost(self, Data p, double work, int islands):
         """Return the estimated and permitted cost [ns] of Newton's method; `work`: multiply-adds to factorise every island."""
         cdef bint soft = is_soft(&p.blocks, &p.general)
-        return (cost_of(&p.blocks, &p.general, &self.at, work, soft),
+        return (cost_of(&p.blocks, &p.general, &self.at, work),
                 allowed(&p.blocks, &p.general, &self.at, islands, soft))
 
 

@@ -199,9 +199,9 @@ cdef inline void solve_task(task_t* j, workspace_t* workspace, workspace_t* isla
             return
         r.index = workspace.index
         code = lav_start(&v, &o, &r, j.lam)
-    if code != NEEDS_WORKSPACE or cost_of(&j.p, &j.g, limits, r.work, soft) > allowed(&j.p, &j.g, limits, r.islands, soft):
+    if code != NEEDS_WORKSPACE or cost_of(&j.p, &j.g, limits, r.work) > allowed(&j.p, &j.g, limits, r.islands, soft):
         return
-    if m > limits.coulomb_rows and cost_of(&j.p, &j.g, limits, r.work, soft) > j.cost_limit:
+    if m > limits.coulomb_rows and cost_of(&j.p, &j.g, limits, r.work) > j.cost_limit:
         return                                          # sweeps use a short time limit better
     if not has_workspace_size(workspace, 0, r.n_real):
         return

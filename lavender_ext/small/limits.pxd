@@ -16,8 +16,6 @@ cdef struct limits_t:           # as in lavender/solvers/costs.py
     double entry                # ns per multiply-add of a sweep
     double work                 # ns per multiply-add of a factorisation
     double count                # factorisations, if some row is not free
-    double rigid                # factor of count with a rigid row, except with bounded rows only
-    double soft                 # factor of count without a rigid row, except if all rows are free
     double start                # ns, minimum time of a solve outside of this call
     double sweep_row            # ns per row of a sweep outside of this call
     double sweep_cone           # ns per multiply-add of such a sweep under the cone law
@@ -46,15 +44,9 @@ cdef inline bint is_linear(const blocks_t* p) noexcept nogil:
     return True
 
 
-cdef inline double cost_of(const blocks_t* p, const generalized_t* g, const limits_t* l, double work, bint soft) noexcept nogil:
-    """Return the estimated cost [ns] of Newton's method, (1); soft: as `is_soft`."""
-    cdef bint linear = is_linear(p)
-    cdef double count = 1.0 if linear else l.count
-    if soft and not linear:
-        count *= l.soft
-    elif not soft and (linear or has_friction(p)):
-        count *= l.rigid
-    return count * step_cost(p, g, l, work)
+cdef inline double cost_of(const blocks_t* p, const generalized_t* g, const limits_t* l, double work) noexcept nogil:
+    """Return the estimated cost [ns] of Newton's method, (1)."""
+    return (1.0 if is_linear(p) else l.count) * step_cost(p, g, l, work)
 
 
 cdef inline bint are_short(const generalized_t* g, double columns) noexcept nogil:
@@ -80,5 +72,5 @@ cdef inline double allowed(const blocks_t* p, const generalized_t* g, const limi
 
 cdef inline double work_within(const blocks_t* p, const generalized_t* g, const limits_t* l, bint soft) noexcept nogil:
     """Return the maximum multiply-adds of factorising every island, for any number of islands."""
-    cdef double fixed = cost_of(p, g, l, 0.0, soft)
-    return (allowed(p, g, l, p.n_rows, soft) - fixed) / (cost_of(p, g, l, 1.0, soft) - fixed)
+    cdef double fixed = cost_of(p, g, l, 0.0)
+    return (allowed(p, g, l, p.n_rows, soft) - fixed) / (cost_of(p, g, l, 1.0) - fixed)

@@ -1,0 +1,96 @@
+"""Numbers that decide in `auto`: its decision table, the first compiled call, and the estimated costs.
+
+`python -m benchmarks decisions` counts the work on fixed problems with each number halved and doubled. Costs in
+nanoseconds are measured separately (`rates.json`).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+__all__ = ["DECISIONS", "NUMBERS", "Number", "describe_numbers"]
+
+
+class Number(NamedTuple):
+    """A number that decides in `auto`.
+
+    Parameters
+    ----------
+    name : str
+        Attribute of `DECISIONS`.
+    value : float
+    unit : str
+    meaning : str
+        What happens below and above the value.
+    fit : str
+        How the value was found.
+    """
+
+    name: str
+    value: float
+    unit: str
+    meaning: str
+    fit: str
+
+
+REPLAY = "least mean regret in replays of recorded solvers on problems drawn at random"
+NUMBERS = (
+    Number("small_rows", 64.0, "rows",
+           "Up to this size, the compiled call solves matrices and bodies without a cost limit.",
+           "Above it, Python takes less than a tenth of a solve."),
+    Number("island_rows", 150.0, "rows",
+           "The compiled call solves islands with friction one by one if none is larger.",
+           "Dense factors of larger islands cost more than sweeps over all of them."),
+    Number("call_cost", 1e7, "ns",
+           "The compiled call over J and M runs up to this estimated cost, because it does not check for Ctrl-C.",
+           "A delay of 10 ms is not noticed."),
+    Number("first_sweeps", 80.0, "sweeps",
+           "Sweeps before a factorising solver, unless it costs less; they predict how many remain.",
+           REPLAY + "; values from 64 to 128 lose less than 5 %"),
+    Number("factorisations", 18.0, "factorisations",
+           "Newton's method is expected to need this many unless the problem is linear.",
+           REPLAY + "; values from 12 to 25 lose less than 4 %"),
+    Number("pivot_factorisations", 4.0, "factorisations",
+           "`direct` is expected to need this many for bounded rows of a matrix.",
+           REPLAY + "; values of 2 and 8 lose 3 %"),
+    Number("budget_ratio", 16.0, "",
+           "A factorising solver may use this multiple of its estimated cost before solvers alternate.",
+           REPLAY + "; values from 8 to 32 lose less than 2 %"),
+    Number("loose_fraction", 0.75, "",
+           "Contacts are a loose pile if more than this fraction of them are between different pairs of bodies.",
+           "Values from 0.5 to 0.9 select the same problems."),
+    Number("total_ratio", 200.0, "",
+           "All solvers together may use this multiple of Newton's estimated cost.",
+           "No problem drawn at random was solved later."),
+    Number("time_share", 0.5, "",
+           "Under a time limit, a stage that another one follows may use this fraction of the remaining time.",
+           "The two stages then lose at most a factor of two each."),
+)  # fmt: skip
+
+
+class Decisions:
+    """The values of `NUMBERS` as attributes."""
+
+    small_rows: float
+    island_rows: float
+    call_cost: float
+    first_sweeps: float
+    factorisations: float
+    pivot_factorisations: float
+    budget_ratio: float
+    loose_fraction: float
+    total_ratio: float
+    time_share: float
+
+    def __init__(self) -> None:
+        for number in NUMBERS:
+            setattr(self, number.name, number.value)
+
+
+DECISIONS = Decisions()
+
+
+def describe_numbers() -> str:
+    """Return the numbers as lines of name, value, unit and meaning."""
+    width = max(len(number.name) for number in NUMBERS)
+    return "\n".join(f"    {n.name:{width}} {n.value:6g} {n.unit:15} {n.meaning}" for n in NUMBERS)
