@@ -59,7 +59,6 @@ COLD = (
     "engine/arrays",
     "core/blocks",
     "core/checks",
-    "core/order",
     "factor/graph",
 )
 

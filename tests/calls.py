@@ -84,7 +84,7 @@ def prepare_sweeps(problem, name="sequential_impulses", packs=True, **options):
     """A solver by sweeps that may pack blocks, or never does."""
     prepared = lv.prepare(problem, name, **options)
     if not packs:
-        prepared.state.sweeps.alone()
+        prepared.state.sweeps.disable_packing()
     return prepared
 
 
@@ -99,7 +99,7 @@ def sweep_in_parts(problem, counts, name="sequential_impulses", *, start=None, p
     for n in counts:
         prepared.solver.run(prepared.state, lam, n, 0.0)
     sweeps = prepared.state.sweeps
-    return lam, sweeps.velocity[: problem.rows.n_bodies], sweeps.pairs
+    return lam, sweeps.velocity[: problem.rows.n_bodies], sweeps.records
 
 
 def sweep_packed(problem, counts, name="sequential_impulses", **options):

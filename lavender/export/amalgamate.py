@@ -24,6 +24,7 @@ MODULES = (
     "core.problem",
     "judge.measure",
     "judge.stopping_test",
+    "sweep.packed",
     "sweep.pgs",
     "sweep.serial",
     "local.gauss_seidel",

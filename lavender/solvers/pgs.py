@@ -4,8 +4,8 @@
     contact   lambda_n <- max(0, lambda_n - w_n / d_n), then the tangents together with one scalar step
               1 / lambda_max(A_tt) projected radially on mu lambda_n, then spin
 
-It converges linearly for symmetric positive semidefinite A. A sweep over A calls `relax_csr_block` of
-`lavender_ext/sweep/pgs.pxd` for one block after the other. In generalised coordinates it keeps u = Y^T lambda instead,
+It converges linearly for symmetric positive semidefinite A. A sweep calls `relax_rows_block` of
+`lavender_ext/sweep/pgs.pyx` for one block after the other. In generalised coordinates it keeps u = Y^T lambda instead,
 with J M^-1 J^T = Y Y^T and w = Y u - b, if that costs less than forming A.
 """
 

@@ -5,7 +5,7 @@
 
 with v = M^-1 J^T lambda, the change of velocity. In the same order, each sweep equals one of `pgs` up to rounding,
 but the cost of a contact does not depend on the number of its neighbours. In a fixed order, contacts and joints are
-swept in pairs, with the same bits (`lavender_ext/sweep/packed.pxd`).
+swept in pairs, with the same bits (`lavender_ext/sweep/packed.pyx`).
 """
 
 from __future__ import annotations

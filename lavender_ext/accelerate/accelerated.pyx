@@ -17,14 +17,14 @@ which has the same solution as Coulomb's law if all contacts stick.
 from libc.math cimport sqrt
 from libc.stdint cimport int32_t, int64_t, uint64_t
 
-from lavender_ext.accelerate.accelerated cimport accelerate, accelerated_workspace_size, sweep_data_t
-from lavender_ext.accelerate.mixing cimport CONTROL, UNDONE, forget, mix, mixing_t, store_evaluation
+from lavender_ext.accelerate.accelerated cimport acceleration_t
+from lavender_ext.accelerate.mixing cimport CONTROL, MAX_MEMORY, UNDONE, forget, mix, mixing_t, store_evaluation
 from lavender_ext.core.block cimport clip, length
 from lavender_ext.core.order cimport SYMMETRIC
-from lavender_ext.core.block_types cimport blocks_t, is_rows, get_friction_components, friction_components_t
+from lavender_ext.core.block_types cimport CONE, blocks_t, is_rows, get_friction_components, friction_components_t
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.view cimport view_t
-from lavender_ext.sweep.serial cimport Sweeps, form_velocity, sweep, velocities_of
+from lavender_ext.sweep.serial cimport Sweeps, form_velocity, sweep, sweep_context_t, sweep_run_t, velocities_of
 
 cdef enum:
     # Number of nncg iterations after which v is recomputed, because rounding errors accumulate in it.
@@ -35,12 +35,12 @@ cdef enum:                      # indices in `control` of nncg
     RESTARTS = 1                # number of dropped directions p
 
 
-cdef inline void iterate(sweep_data_t* c, double* lam, int32_t first) noexcept nogil:
+cdef inline void iterate(acceleration_t* c, double* lam, int32_t first) noexcept nogil:
     """Sweep once, or with the symmetric order forwards and backwards."""
     cdef const blocks_t* p = c.sweeps.blocks
     cdef bint exact = c.sweeps.exact
     cdef int32_t k
-    if c.turn < c.convex:
+    if c.iterations < c.convex:
         p = &c.cone
         exact = True
     for k in range(2 if c.sweeps.mode == SYMMETRIC else 1):
@@ -118,7 +118,7 @@ cdef inline void extrapolate(double* y, double* x, double* p, double beta, int32
 
 cdef public void lav_nncg(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:
     """Run n iterations of (1)."""
-    cdef sweep_data_t* c = <sweep_data_t*>context
+    cdef acceleration_t* c = <acceleration_t*>context
     cdef int32_t m = c.sweeps.blocks.n_rows, n_v = c.sweeps.n_v, i, s
     cdef double* x = c.work                             # x, then g: the part of lam is followed by that of v
     cdef double* q = c.work + m + n_v                   # beta p, added before the next sweep
@@ -128,7 +128,7 @@ cdef public void lav_nncg(void* context, double* lam, int32_t first_sweep, int32
     cdef const double* d = c.sweeps.blocks.d
     cdef double norm, beta = 0.0
     for s in range(n):
-        if c.turn > 0 and c.turn % VELOCITY_REFRESH_INTERVAL == 0:
+        if c.iterations > 0 and c.iterations % VELOCITY_REFRESH_INTERVAL == 0:
             form_velocity(c.sweeps, lam)
         if s > 0:
             extrapolate(lam, x, p, beta, m)
@@ -152,8 +152,8 @@ cdef public void lav_nncg(void* context, double* lam, int32_t first_sweep, int32
                 beta = 0.0
                 control[RESTARTS] += 1.0
         control[NORM] = norm
-        c.turn += 1
-        if c.turn == c.convex:
+        c.iterations += 1
+        if c.iterations == c.convex:
             control[NORM] = 0.0                         # the law changes: restart
     if n > 0:
         for i in range(m + n_v):
@@ -163,7 +163,7 @@ cdef public void lav_nncg(void* context, double* lam, int32_t first_sweep, int32
 
 cdef public void lav_anderson(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:
     """Run n iterations of (2)."""
-    cdef sweep_data_t* c = <sweep_data_t*>context
+    cdef acceleration_t* c = <acceleration_t*>context
     cdef const blocks_t* p = c.sweeps.blocks
     cdef int32_t m = p.n_rows, i, s, mixed
     cdef double* x = c.work                             # x, later f
@@ -178,7 +178,7 @@ cdef public void lav_anderson(void* context, double* lam, int32_t first_sweep, i
     mixing.dv = mixing.g + m
     mixing.dg = mixing.dv + c.memory * m
     root = mixing.dg + c.memory * m
-    if c.turn == 0:
+    if c.iterations == 0:
         for i in range(m):
             root[i] = sqrt(p.d[i])
     for s in range(n):
@@ -194,14 +194,14 @@ cdef public void lav_anderson(void* context, double* lam, int32_t first_sweep, i
             x[i] = root[i] * (lam[i] - x[i])
         if not store_evaluation(&mixing, mixed, lam, x):
             form_velocity(c.sweeps, lam)
-        c.turn += 1
-        if c.turn == c.convex:
+        c.iterations += 1
+        if c.iterations == c.convex:
             forget(&mixing)                             # the law changes
 
 
 cdef void forget_all(void* context, const double* lam) noexcept nogil:
     """Restart from lam (m) without memory; the counts are kept."""
-    cdef sweep_data_t* c = <sweep_data_t*>context
+    cdef acceleration_t* c = <acceleration_t*>context
     cdef int32_t i, n = c.sweeps.blocks.n_rows + c.sweeps.n_v
     if c.memory == 0:
         c.control[NORM] = 0.0
@@ -214,7 +214,28 @@ cdef void forget_all(void* context, const double* lam) noexcept nogil:
     form_velocity(c.sweeps, lam)
 
 
-cdef double undone_of(const sweep_data_t* c) noexcept nogil:
+cdef int64_t accelerated_workspace_size(int64_t m, int64_t n_v, int64_t memory) noexcept nogil:
+    """Return the number of doubles of workspace of a run."""
+    return 3 * (m + n_v) + (1 + 2 * memory) * m + CONTROL + MAX_MEMORY * MAX_MEMORY
+
+
+cdef void accelerate(sweep_run_t* x, acceleration_t* c, int32_t memory, int32_t convex, int32_t keeps,
+                     double* workspace) noexcept nogil:
+    """Turn a started run of sweeps x into an accelerated one, before its first iteration.
+
+    memory = 0 is nncg. workspace (`accelerated_workspace_size`) must be zero-initialised.
+    """
+    cdef sweep_context_t* sweeps = &x.context
+    x.step, x.step_context, x.forget = lav_nncg if memory == 0 else lav_anderson, c, forget_all
+    c.sweeps, c.cone = sweeps, sweeps.blocks[0]
+    c.cone.law = CONE
+    c.memory, c.convex, c.keeps, c.iterations = memory, convex, keeps, 0
+    c.work = workspace
+    c.gram = workspace + 3 * (sweeps.blocks.n_rows + sweeps.n_v) + (1 + 2 * <int64_t>memory) * sweeps.blocks.n_rows
+    c.control = c.gram + MAX_MEMORY * MAX_MEMORY
+
+
+cdef double undone_of(const acceleration_t* c) noexcept nogil:
     """Return the number of dropped directions or undone mixed steps."""
     return c.control[RESTARTS if c.memory == 0 else UNDONE]
 
@@ -237,9 +258,9 @@ cdef class AcceleratedSweeps(Sweeps):
         cdef view_t v = p.view()
         cdef int64_t n = accelerated_workspace_size(v.p.n_rows, velocities_of(&v), memory)
         self.x.packing.single = True
-        accelerate(&self.x, &self.fast, memory, convex, keeps,
-                   self.lay(p, order, split, mode, rng, exact, exact or convex > 0, n))
+        accelerate(&self.x, &self.acceleration, memory, convex, keeps,
+                   self.allocate(p, order, split, mode, rng, exact, exact or convex > 0, n))
 
     cdef double undone(self) noexcept:
         """Return the number of restarts."""
-        return undone_of(&self.fast)
+        return undone_of(&self.acceleration)

@@ -1,9 +1,151 @@
-"""Orders and colours of blocks for Python: wrappers of core/order.pxd, and colours of the blocks of a matrix."""
+"""Orders and colours of blocks: the functions of core/order.pxd, colours of the blocks of a matrix, and wrappers for Python."""
 from libc.stdint cimport int32_t, uint64_t
 
 import numpy as np
 
-from lavender_ext.core.order cimport block_levels, body_levels, color_by_bodies
+from lavender_ext.core.order cimport RANDOM, SYMMETRIC, next_random
+
+
+cdef void shuffle(int32_t* order, int32_t first, int32_t end, uint64_t* rng) noexcept nogil:
+    """Shuffle order[first:end] (Fisher-Yates); an index below n is (32 random bits) * n / 2^32."""
+    cdef int32_t i = end - 1, j, t
+    while i > first:
+        j = first + <int32_t>(((next_random(rng) >> 32) * <uint64_t>(i - first + 1)) >> 32)
+        t = order[i]
+        order[i] = order[j]
+        order[j] = t
+        i -= 1
+
+
+cdef void reverse(int32_t* order, int32_t first, int32_t end) noexcept nogil:
+    """Reverse order[first:end]."""
+    cdef int32_t i = first, j = end - 1, t
+    while i < j:
+        t = order[i]
+        order[i] = order[j]
+        order[j] = t
+        i += 1
+        j -= 1
+
+
+cdef void advance_order(int32_t mode, int32_t first_sweep, int32_t* order, int32_t first, int32_t end,
+                        uint64_t* rng) noexcept nogil:
+    """Update order[first:end] in place for the next sweep."""
+    if mode == RANDOM:
+        shuffle(order, first, end, rng)
+    elif mode == SYMMETRIC and not first_sweep:
+        reverse(order, first, end)
+
+
+cdef int32_t body_levels(int32_t n_blocks, const int32_t* body, int32_t n_bodies, int32_t* level) noexcept nogil:
+    """Compute the breadth-first level of each body from the static ones (body -1); return the number of levels.
+
+    Bodies without a path to a static body get the last level + 1. `body` is (n_blocks, 2). Edges are relaxed forwards and
+    backwards until no level changes. This is linear for scenes whose bodies are numbered from the ground up.
+    """
+    cdef int32_t i, a, b, la, lb, changed, top = 0, far = 2147483647, _pass
+    for i in range(n_bodies):
+        level[i] = far
+    for _pass in range(n_bodies + 1):                   # The last pass changes nothing.
+        changed = 0
+        for i in range(2 * n_blocks):
+            a = body[2 * i] if i < n_blocks else body[2 * (2 * n_blocks - 1 - i)]
+            b = body[2 * i + 1] if i < n_blocks else body[2 * (2 * n_blocks - 1 - i) + 1]
+            la = -1 if a < 0 else level[a]
+            lb = -1 if b < 0 else level[b]
+            if a >= 0 and lb != far and lb + 1 < la:
+                level[a] = lb + 1
+                changed = 1
+            if b >= 0 and la != far and la + 1 < lb:
+                level[b] = la + 1
+                changed = 1
+        if not changed:
+            break
+    for i in range(n_bodies):
+        if level[i] != far and level[i] > top:
+            top = level[i]
+    for i in range(n_bodies):
+        if level[i] == far:
+            level[i] = top + 1
+    return top + 1
+
+
+cdef void block_levels(int32_t n_blocks, const int32_t* body, const int32_t* level, int32_t* out) noexcept nogil:
+    """Compute the level of each block: the lower level of its two bodies plus 1, 0 for a block on the ground."""
+    cdef int32_t i, la, lb
+    for i in range(n_blocks):
+        la = 0 if body[2 * i] < 0 else level[body[2 * i]] + 1
+        lb = 0 if body[2 * i + 1] < 0 else level[body[2 * i + 1]] + 1
+        out[i] = la if la < lb else lb
+
+
+cdef void sort_by_level(int32_t n_blocks, const int32_t* level, int32_t n_levels, int32_t* start,
+                        int32_t* order) noexcept nogil:
+    """Sort blocks by level (stable counting sort); blocks of level -1 are omitted.
+
+    start (n_levels + 1) receives the first index of each level in `order`.
+    """
+    cdef int32_t i, s, t
+    for i in range(n_levels + 1):
+        start[i] = 0
+    for i in range(n_blocks):
+        if level[i] >= 0:
+            start[level[i]] += 1
+    s = 0
+    for i in range(n_levels + 1):
+        t = start[i]
+        start[i] = s
+        s += t
+    for i in range(n_blocks):
+        if level[i] >= 0:
+            order[start[level[i]]] = i
+            start[level[i]] += 1
+    i = n_levels
+    while i > 0:
+        start[i] = start[i - 1]
+        i -= 1
+    start[0] = 0
+
+
+cdef int32_t color_by_bodies(int32_t n_blocks, const int32_t* body, int32_t n_bodies, uint64_t* used,
+                             int32_t* color) noexcept nogil:
+    """Colour blocks greedily so that no two blocks of one colour share a moving body; return the number of colours.
+
+    `used` (n_bodies) holds one bit per colour of the current group of 63 colours. Blocks without a free bit are coloured in
+    the next group.
+    """
+    cdef int32_t i, a, b, c, base = 0, uncoloured = n_blocks, top = 0
+    cdef uint64_t occupied
+    for i in range(n_blocks):
+        color[i] = -1
+    while uncoloured > 0:
+        for i in range(n_bodies):
+            used[i] = 0
+        for i in range(n_blocks):
+            if color[i] >= 0:
+                continue
+            a = body[2 * i]
+            b = body[2 * i + 1]
+            occupied = 0
+            if a >= 0:
+                occupied |= used[a]
+            if b >= 0:
+                occupied |= used[b]
+            c = 0
+            while c < 63 and (occupied >> c) & 1:
+                c += 1
+            if c == 63:
+                continue
+            if a >= 0:
+                used[a] |= (<uint64_t>1) << c
+            if b >= 0:
+                used[b] |= (<uint64_t>1) << c
+            color[i] = base + c
+            if base + c + 1 > top:
+                top = base + c + 1
+            uncoloured -= 1
+        base += 63
+    return top
 
 
 cdef public int32_t lav_graph_colors(int32_t n_blocks, const int32_t* block_ptr, const int32_t* block_of,

@@ -22,7 +22,6 @@ from lavender_ext.core.validate cimport all_finite
 from lavender_ext.core.order cimport (RANDOM, SYMMETRIC, advance_order, block_levels, body_levels,
                                       color_by_bodies, reverse, sort_by_level)
 from lavender_ext.core.block_types cimport blocks_t
-from lavender_ext.core.rows cimport relax_contact_block, relax_joint
 from lavender_ext.core.velocity cimport rows_velocity
 from lavender_ext.core.view cimport rows_t
 from lavender_ext.engine.arrays cimport (AT_RANDOM, AVBD, BOTTOM_UP, CAP_CONTACT, CAP_PAIR, COLORED, H_CONTACTS,
@@ -43,7 +42,8 @@ from lavender_ext.engine.xpbd cimport correct_all
 from lavender_ext.judge.measure cimport score_slack
 from lavender_ext.judge.score cimport new_score, score_t
 from lavender_ext.judge.slack cimport rows_slack
-from lavender_ext.sweep.packed cimport MOST, allocate_workspace, sweep_packed
+from lavender_ext.sweep.packed cimport MAX_PACKED_BLOCKS, packed_workspace_size, sweep_packed
+from lavender_ext.sweep.pgs cimport relax_bodies
 
 
 cdef enum:
@@ -146,18 +146,15 @@ cdef inline void record_sweep_error(const engine_t* e, const blocks_t* p, const 
 cdef void sweep_all(engine_t* e, const blocks_t* p, const rows_t* r, int32_t sweeps, double* curve,
                     double* scratch) noexcept nogil:
     """Run the sweeps, joints, then contacts; curve (sweeps + 1, 2) or NULL receives the error after each."""
-    cdef int32_t s, i, kj = r.n_joints, k = p.n_blocks, mode
+    cdef int32_t s, mode
     cdef uint64_t rng
     mode = SYMMETRIC if e.head[H_ORDER] == SYMMETRICALLY else (RANDOM if e.head[H_ORDER] == AT_RANDOM else 0)
     # every substep has its own random stream, a function of seed and substep alone
     rng = ((<uint64_t>(<int64_t>e.head[H_SEED])) << 32) ^ (<uint64_t>(<int64_t>e.head[H_STEP]))
     for s in range(sweeps):
-        advance_order(mode, s == 0, e.order, 0, kj, &rng)
-        advance_order(mode, s == 0, e.order, kj, k, &rng)
-        for i in range(kj):
-            relax_joint(p, r, e.order[i], e.impulse, e.dv)
-        for i in range(kj, k):
-            relax_contact_block(p, r, e.order[i], e.impulse, e.dv)
+        advance_order(mode, s == 0, e.order, 0, r.n_joints, &rng)
+        advance_order(mode, s == 0, e.order, r.n_joints, p.n_blocks, &rng)
+        relax_bodies(p, r, e.order, p.n_blocks, e.impulse, e.dv)
         if curve != NULL:
             record_sweep_error(e, p, r, curve + 2 * (s + 1), scratch)
 
@@ -308,7 +305,7 @@ cdef public int32_t lav_engine_finish(const int32_t* size, double* real, int32_t
 cdef inline int32_t substeps(engine_t* e, int32_t n, double* workspace, int32_t* done) noexcept nogil:
     """Run up to n substeps; `done` receives the number completed.
 
-    workspace: for packed blocks, of the size that `allocate_workspace` returns for the capacities, or NULL: slower, same bits.
+    workspace: for packed blocks, of the size that `packed_workspace_size` returns for the capacities, or NULL: slower, same bits.
     """
     cdef int32_t status
     done[0] = 0
@@ -352,9 +349,9 @@ cdef class Buffers:
         self.keys = keys
         cdef int64_t used[3]
         bind(&size[0], &real[0], &index[0], &keys[0], &self.e, used)
-        cdef int64_t contacts = min(<int64_t>size[CAP_CONTACT], MOST), joints = size[N_JOINT]
-        self.workspace = np.empty(allocate_workspace(joints, size[N_JOINT_ROW], contacts, contacts * size[ROWS_PER_CONTACT],
-                                      size[N_DYNAMIC]) if joints <= MOST else 1)
+        cdef int64_t contacts = min(<int64_t>size[CAP_CONTACT], MAX_PACKED_BLOCKS), joints = size[N_JOINT]
+        self.workspace = np.empty(packed_workspace_size(joints, size[N_JOINT_ROW], contacts, contacts * size[ROWS_PER_CONTACT],
+                                      size[N_DYNAMIC]) if joints <= MAX_PACKED_BLOCKS else 1)
 
     def pairs(self):
         """Run the broad phase alone, for the kernel benchmark, and return the number of pairs needed."""

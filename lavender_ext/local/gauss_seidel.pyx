@@ -18,13 +18,14 @@ that these reject, by local/block_newton.pxd:
 from libc.stdint cimport int32_t
 
 from lavender_ext.core.block cimport relax_normal, relax_row
-from lavender_ext.core.csr cimport csr_dot
 from lavender_ext.core.dot cimport dot
-from lavender_ext.core.generalized cimport whitened_dot, add_scaled_whitened_row
 from lavender_ext.core.block_types cimport (CONE, blocks_t, is_disk, is_rows, n_tangents, n_angular_rows,
                                       friction_components_t, get_friction_components)
-from lavender_ext.core.rows cimport (contact_jacobian, contact_velocity, cross, dot12, dot3, apply_joint_impulse, joint_velocity,
-                                     minv_times, apply_impulse_to_bodies, relative_velocity, relax_joint, apply_contact_impulse)
+from lavender_ext.core.joint cimport relax_joint_block
+from lavender_ext.core.numbers cimport apply_contact_changes
+from lavender_ext.core.row_forms cimport panel_of, row_form_t, row_slack, set_impulse
+from lavender_ext.core.rows cimport (apply_impulse_to_bodies, apply_joint_impulse, contact_jacobian, contact_velocity, cross, dot12,
+                                     dot3, joint_velocity, minv_times, relative_velocity)
 from lavender_ext.core.view cimport csr_t, generalized_t, rows_t, view_t
 from lavender_ext.local.block_newton cimport prepare_newton, scaled_block_t, solve_block_newton
 from lavender_ext.local.cone cimport solve_cone_disk
@@ -167,54 +168,47 @@ cdef inline void csr_dot3(const csr_t* a, int32_t i, const double* x, double* ou
     out[2] = s2 + t2
 
 
-cdef inline int32_t solve_csr_block(const blocks_t* p, const csr_t* a, int32_t i, const double* g,
-                                    double* lam) noexcept nogil:
-    """Update block i by (1); return 1 if the fallback was used."""
-    cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, k
-    cdef double w[MAX_ROWS]
-    if n > MAX_ROWS:                                    # bounded rows, one by one
-        for k in range(j, j + n):
-            lam[k] = relax_row(lam[k], csr_dot(a, k, lam) - p.b[k], p.step[k], p.lower[k], p.upper[k])
-        return 1
-    if n == 3 and not is_rows(p, i) and g[ONE_PATTERN if is_disk(p, i) else 0] != 0.0:
-        csr_dot3(a, j, lam, w)
-        w[0] -= p.b[j]
-        w[1] -= p.b[j + 1]
-        w[2] -= p.b[j + 2]
-    else:
-        for k in range(n):
-            w[k] = csr_dot(a, j + k, lam) - p.b[j + k]
-    return solve_block(p, i, g, w, lam + j)
+cdef inline void block_slack(const blocks_t* p, const row_form_t* form, int32_t i, const double* g, const double* lam,
+                             const double* v, double* w) noexcept nogil:
+    """Compute the slacks w (n) of block i."""
+    cdef int32_t j = p.ptr[i], panel = panel_of(form, i), k
+    if row_form_t is csr_t:
+        if p.ptr[i + 1] - j == 3 and not is_rows(p, i) and g[ONE_PATTERN if is_disk(p, i) else 0] != 0.0:
+            csr_dot3(form, j, lam, w)
+            w[0] -= p.b[j]
+            w[1] -= p.b[j + 1]
+            w[2] -= p.b[j + 2]
+            return
+    for k in range(p.ptr[i + 1] - j):
+        w[k] = row_slack(form, p, panel, j + k, lam, v)
 
 
-cdef inline int32_t solve_general_block(const blocks_t* p, const generalized_t* o, int32_t i, const double* g, double* lam,
-                                        double* u) noexcept nogil:
-    """Update block i by (3), u (nv) = Y^T lam; return 1 if the fallback was used."""
-    cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, b = o.home[i], k, fallbacks
+cdef inline int32_t solve_rows_block(const blocks_t* p, const row_form_t* form, int32_t i, const double* g, double* lam,
+                                     double* v) noexcept nogil:
+    """Update block i over A by (1), or over J and M by (3) with v = Y^T lam; return 1 if the fallback was used."""
+    cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, panel = panel_of(form, i), k, fallback
     cdef double w[MAX_ROWS]
-    cdef double previous[MAX_ROWS]
-    cdef double now
+    cdef double impulse[MAX_ROWS]
     if n > MAX_ROWS:                                    # bounded rows, one by one
         for k in range(j, j + n):
-            now = relax_row(lam[k], whitened_dot(o, b, k, u) + (o.compliance[k] * lam[k] - p.b[k]), p.step[k],
-                            p.lower[k], p.upper[k])
-            add_scaled_whitened_row(o, b, k, now - lam[k], u)
-            lam[k] = now
+            w[0] = row_slack(form, p, panel, k, lam, v)
+            set_impulse(form, panel, k, relax_row(lam[k], w[0], p.step[k], p.lower[k], p.upper[k]), lam, v)
         return 1
+    block_slack(p, form, i, g, lam, v, w)
     for k in range(n):
-        w[k] = whitened_dot(o, b, j + k, u) + (o.compliance[j + k] * lam[j + k] - p.b[j + k])
-        previous[k] = lam[j + k]
-    fallbacks = solve_block(p, i, g, w, lam + j)
+        impulse[k] = lam[j + k]
+    fallback = solve_block(p, i, g, w, impulse)
     for k in range(n):
-        add_scaled_whitened_row(o, b, j + k, lam[j + k] - previous[k], u)
-    return fallbacks
+        set_impulse(form, panel, j + k, impulse[k], lam, v)
+    return fallback
 
 
 cdef inline int32_t solve_sliding_contact(const blocks_t* p, const rows_t* r, int32_t i, const double* g, double* lam,
                                           double* v) noexcept nogil:
     """Update a disk under Coulomb's law by (2); lam points at its normal."""
-    cdef int32_t j = p.ptr[i], c = i - r.n_joints, a = r.contact_body[2 * c], b = r.contact_body[2 * c + 1], k
+    cdef int32_t j = p.ptr[i], c = i - r.n_joints, a = r.contact_body[2 * c], b = r.contact_body[2 * c + 1], k, axis
     cdef double w[3]
+    cdef double change[4]
     cdef double u[3]
     cdef double omega[3]
     cdef double t2[3]
@@ -231,20 +225,19 @@ cdef inline int32_t solve_sliding_contact(const blocks_t* p, const rows_t* r, in
     k = 0
     if update_coulomb_disk(g, w, p.mu[i], lam) == FAILED:
         k = solve_block(p, i, g, w, lam)
-    n = lam[0] - n
-    x = lam[1] - x
-    y = lam[2] - y
-    impulse[0] = n * normal[0] + x * t1[0] + y * t2[0]
-    impulse[1] = n * normal[1] + x * t1[1] + y * t2[1]
-    impulse[2] = n * normal[2] + x * t1[2] + y * t2[2]
+    change[0] = lam[0] - n
+    change[1] = lam[1] - x
+    change[2] = lam[2] - y
+    for axis in range(3):
+        impulse[axis] = change[0] * normal[axis] + change[1] * t1[axis] + change[2] * t2[axis]
     if a >= 0:
-        apply_contact_impulse(v + 6 * a, r.inv_mass[a], inv_inertia_arm, impulse, n, x, y, 0.0, 2, 0, -1.0)
+        apply_contact_changes(v + 6 * a, r.inv_mass + a, inv_inertia_arm, impulse, change, 2, False, -1)
     if b >= 0:
-        apply_contact_impulse(v + 6 * b, r.inv_mass[b], inv_inertia_arm + 3, impulse, n, x, y, 0.0, 2, 0, 1.0)
+        apply_contact_changes(v + 6 * b, r.inv_mass + b, inv_inertia_arm + 3, impulse, change, 2, False, 1)
     return k
 
 
-cdef inline int32_t solve_rows_block(const blocks_t* p, const rows_t* r, int32_t i, const double* g, double* lam,
+cdef inline int32_t solve_bodies_block(const blocks_t* p, const rows_t* r, int32_t i, const double* g, double* lam,
                                      double* v) noexcept nogil:
     """Update block i by (2); return 1 if the fallback was used."""
     cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, c = i - r.n_joints, k, a, b, nt, n_angular, roll, fallbacks
@@ -260,7 +253,7 @@ cdef inline int32_t solve_rows_block(const blocks_t* p, const rows_t* r, int32_t
         return solve_sliding_contact(p, r, i, g, lam + j, v)
     if c < 0:
         if n > MAX_ROWS:
-            relax_joint(p, r, i, lam, v)
+            relax_joint_block(p, r, i, lam, v)
             return 1
         a = r.joint_body[2 * i]
         b = r.joint_body[2 * i + 1]
@@ -384,20 +377,30 @@ cdef void prepare_blocks(const view_t* v, const int32_t* start, double* g) noexc
         prepare_block(&v.p, i, W, one, g + start[i])
 
 
+ctypedef fused exact_form_t:
+    csr_t
+    generalized_t
+    rows_t
+
+
+cdef inline int32_t solve_in_order(const blocks_t* p, const exact_form_t* form, const int32_t* start, const double* g,
+                                   const int32_t* order, double* lam, double* v) noexcept nogil:
+    """Sweep once over one form of A; return the number of fallbacks."""
+    cdef int32_t k, i, fallbacks = 0
+    for k in range(p.n_blocks):
+        i = order[k]
+        if exact_form_t is rows_t:
+            fallbacks += solve_bodies_block(p, form, i, g + start[i], lam, v)
+        else:
+            fallbacks += solve_rows_block(p, form, i, g + start[i], lam, v)
+    return fallbacks
+
+
 cdef int32_t solve_blocks(const blocks_t* p, const csr_t* a, const rows_t* r, const generalized_t* o, const int32_t* start,
                           const double* g, const int32_t* order, double* lam, double* v) noexcept nogil:
     """Sweep once over A (`a`), J and M (`o`) or bodies (`r`), with velocities v; return the number of fallbacks."""
-    cdef int32_t q, i, fallbacks = 0
     if o != NULL:
-        for q in range(p.n_blocks):
-            i = order[q]
-            fallbacks += solve_general_block(p, o, i, g + start[i], lam, v)
-    elif a != NULL:
-        for q in range(p.n_blocks):
-            i = order[q]
-            fallbacks += solve_csr_block(p, a, i, g + start[i], lam)
-    else:
-        for q in range(p.n_blocks):
-            i = order[q]
-            fallbacks += solve_rows_block(p, r, i, g + start[i], lam, v)
-    return fallbacks
+        return solve_in_order(p, o, start, g, order, lam, v)
+    if a != NULL:
+        return solve_in_order(p, a, start, g, order, lam, v)
+    return solve_in_order(p, r, start, g, order, lam, v)

@@ -7,7 +7,7 @@ import numpy as np
 from lavender_ext.core.block cimport row_error
 from lavender_ext.core.block_types cimport COULOMB, blocks_t, is_rows
 from lavender_ext.core.problem cimport Data
-from lavender_ext.core.rows cimport dot6, relax_rows_block
+from lavender_ext.core.rows cimport dot6
 from lavender_ext.core.start cimport is_zero_impulse
 from lavender_ext.core.velocity cimport rows_velocity
 from lavender_ext.core.view cimport rows_t
@@ -19,6 +19,7 @@ from lavender_ext.judge.tally cimport empty_tally, tally_row, tally_t
 from lavender_ext.newton.warm_start cimport (FIRST_SWEEP_CHECK, JUDGED, MAX_BAND_WIDTH, MAX_TRACED_SCORES,
                                              MAX_WARM_ROWS, MAX_WARM_SWEEPS, MIN_SWEEPS_TO_GIVE_UP, SOLVED, SWEPT,
                                              UNDECIDED, bind_warm_workspace, warm_t, warm_workspace_size)
+from lavender_ext.sweep.pgs cimport relax_bodies_in_sequence
 
 
 cdef int32_t zero_impulse_errors(const blocks_t* p, double* energy, double* velocity) noexcept nogil:
@@ -183,8 +184,7 @@ cdef inline int32_t sweep_contacts(const blocks_t* p, const rows_t* r, warm_t* s
     cdef double before, now = s.relative, predicted
     while n < MAX_WARM_SWEEPS:
         while n < next_:
-            for i in range(p.n_blocks):
-                relax_rows_block(p, r, i, lam, v)
+            relax_bodies_in_sequence(p, r, lam, v)
             n += 1
         s.sweeps = n
         before = now

@@ -6,7 +6,7 @@ their own last iterates.
 from libc.stdint cimport int32_t, int64_t, uint64_t
 from libc.string cimport memcmp, memcpy, memset
 
-from lavender_ext.accelerate.accelerated cimport lav_anderson, sweep_data_t
+from lavender_ext.accelerate.accelerated cimport acceleration_t, lav_anderson
 from lavender_ext.accelerate.mixing cimport CONTROL, MAX_MEMORY, UNDONE
 from lavender_ext.core.method cimport CERTIFICATE, MORE, NEEDS_WORKSPACE, options_t, workspace_t, info_t
 from lavender_ext.core.block_types cimport CONE, blocks_t
@@ -15,7 +15,7 @@ from lavender_ext.driver.driver cimport NEWTON, lav_workspace_size, lav_start, l
 from lavender_ext.small.workspace cimport has_workspace_size
 from lavender_ext.judge.measure cimport set_zero_impulse, find_reference, judge_view, relative_of
 from lavender_ext.judge.score cimport new_score, score_t
-from lavender_ext.sweep.serial cimport context_t, form_velocity
+from lavender_ext.sweep.serial cimport form_velocity, sweep_context_t
 
 
 cdef enum:
@@ -67,8 +67,8 @@ cdef struct alternation_t:      # state of one subproblem
     double* w                   # (m)
     double* error               # (m)
     double* scratch             # (12 n_bodies)
-    context_t sweeps
-    sweep_data_t c
+    sweep_context_t sweeps
+    acceleration_t c
     options_t options
     workspace_t workspace
     info_t info
@@ -100,12 +100,12 @@ cdef inline void lay_turns(alternation_t* t, double* work, int32_t* order, uint6
     t.c.sweeps, t.c.memory = &t.sweeps, MIXING_MEMORY
     t.sweeps.blocks, t.sweeps.csr, t.sweeps.rows, t.sweeps.n_v = &v.p, v.a, v.r, <int32_t>(6 * n)
     t.sweeps.order, t.sweeps.rng, t.sweeps.split = order, rng, t.s.split
-    t.sweeps.exact, t.sweeps.start, t.sweeps.g = t.s.at != NULL, t.s.at, t.s.prepared
+    t.sweeps.exact, t.sweeps.start, t.sweeps.prepared = t.s.at != NULL, t.s.at, t.s.prepared
 
 
 cdef inline double cost_so_far(const alternation_t* t) noexcept nogil:
     """Return the estimated cost [ns] of this subproblem so far."""
-    return t.c.turn * t.sweep + t.info.factorisations * t.factor
+    return t.c.iterations * t.sweep + t.info.factorisations * t.factor
 
 
 cdef inline double relative_residual_of(alternation_t* t, const double* lam) noexcept nogil:
@@ -134,12 +134,12 @@ cdef inline double continue_sweeps(alternation_t* t, double now, int32_t max_swe
     """
     cdef double before, tol = t.o.tol
     cdef int32_t step = MIN_CHECK_INTERVAL
-    while now > tol and t.c.turn < max_sweeps and cost_so_far(t) < t.o.remaining_cost:
+    while now > tol and t.c.iterations < max_sweeps and cost_so_far(t) < t.o.remaining_cost:
         before = now
-        lav_anderson(&t.c, t.swept, t.c.turn == 0, step)
+        lav_anderson(&t.c, t.swept, t.c.iterations == 0, step)
         now = relative_residual_of(t, t.swept)
-        step = t.c.turn // 2 if t.c.turn // 2 > MIN_CHECK_INTERVAL else MIN_CHECK_INTERVAL
-        if extrapolate and not converges_within(before, now, tol, EXTRAPOLATION_FACTOR * (max_sweeps - t.c.turn) // step):
+        step = t.c.iterations // 2 if t.c.iterations // 2 > MIN_CHECK_INTERVAL else MIN_CHECK_INTERVAL
+        if extrapolate and not converges_within(before, now, tol, EXTRAPOLATION_FACTOR * (max_sweeps - t.c.iterations) // step):
             break
     return now
 
@@ -222,12 +222,12 @@ cdef inline bint solve_subproblem(subproblem_t* s, friction_run_t* o, workspace_
         t.options = options_t(NEWTON, MAX_SUBPROBLEM_FACTORISATIONS, 0, 0, o.wide, o.tol, t.e0, t.v0, 1.0 / 0.0)
         now = alternate_methods(&t)
     # counters
-    o.swept += t.c.turn
+    o.swept += t.c.iterations
     o.undone += <int64_t>t.c.control[UNDONE]
     o.factorisations += t.info.factorisations
     o.factored += t.info.factorisations * (<double>p.n_rows * p.n_rows * p.n_rows)
-    if t.c.turn + t.info.factorisations > o.longest:
-        o.longest = t.c.turn + t.info.factorisations
+    if t.c.iterations + t.info.factorisations > o.longest:
+        o.longest = t.c.iterations + t.info.factorisations
     o.remaining_cost -= cost_so_far(&t)
     # at the cost limit the better of both iterates is the result
     if now > o.tol and not o.remaining_cost > 0.0 and not relative_residual_of(&t, s.answer) <= relative_residual_of(&t, t.swept):

@@ -1,38 +1,124 @@
-"""One sweep over the blocks (n_blocks) of an order, each loop with the update of a block inlined whole.
+"""One sweep of projected Gauss-Seidel over the blocks of an order, in each form of A.
 
-A module of their own, since that is what a compiler has workspace for: beside other loops it would call the updates.
+    w_q   = sum_j A_qj lam_j - b_q                                   with the current lam                    (1)
+    lam_q <- clip(lam_q - w_q / d_q, lower_q, upper_q)               a row; a normal has the bounds 0, inf   (2)
+    lam_g <- projection of lam_g - w_g / step on |.| <= a_g lam_n    each friction component g of a contact  (3)
+
+The slack w of a row is read from A, from J and M, or from an array (core/row_forms.pxd); blocks between bodies have an update of
+their own (core/contact.pxd). This module contains nothing else, because gcc then inlines the update of a block into its loop.
 """
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block cimport relax_row
+from lavender_ext.core.block cimport clip, relax_normal, relax_row, relax_tangents
+from lavender_ext.core.block_types cimport blocks_t, friction_components_t, get_friction_components, is_rows
+from lavender_ext.core.contact cimport relax_bodies_block
 from lavender_ext.core.csr cimport csr_dot
-from lavender_ext.core.block_types cimport blocks_t
-from lavender_ext.core.rows cimport relax_rows_block
+from lavender_ext.core.row_forms cimport damped_csr_t, panel_of, row_form_t, row_slack, row_step, set_impulse, stored_slack_t
 from lavender_ext.core.view cimport csr_t, generalized_t, rows_t
-from lavender_ext.sweep.pgs cimport relax_csr_block, relax_general_block
+
+
+cdef struct single_rows_t:      # A in compressed rows, if every block is one row with bounds
+    csr_t a
+
+
+ctypedef fused form_t:
+    csr_t
+    single_rows_t
+    damped_csr_t
+    stored_slack_t
+    generalized_t
+    rows_t
+
+
+cdef inline void relax_rows_block(const blocks_t* p, const row_form_t* form, int32_t i, double* lam, double* v) noexcept nogil:
+    """Update block i row by row, the rows of a friction component together."""
+    cdef int32_t first = p.ptr[i], panel = panel_of(form, i), component, row, k
+    cdef double friction_bound
+    cdef double slack[2]
+    cdef double impulse[2]
+    cdef friction_components_t components
+    # rows with bounds (2)
+    if is_rows(p, i):
+        for row in range(first, p.ptr[i + 1]):
+            impulse[0] = lam[row] - row_slack(form, p, panel, row, lam, v) * row_step(form, p, row)
+            if row_form_t is not damped_csr_t:          # SOR is for free rows.
+                impulse[0] = clip(impulse[0], p.lower[row], p.upper[row])
+            set_impulse(form, panel, row, impulse[0], lam, v)
+        return
+    # normal
+    impulse[0] = relax_normal(lam[first], row_slack(form, p, panel, first, lam, v), row_step(form, p, first))
+    set_impulse(form, panel, first, impulse[0], lam, v)
+    # friction components (3)
+    get_friction_components(p, i, &components)
+    for component in range(components.n):
+        row = first + components.first[component]
+        friction_bound = components.friction_coefficient[component] * lam[first]
+        for k in range(components.size[component]):
+            slack[k] = row_slack(form, p, panel, row + k, lam, v)
+        if row_form_t is generalized_t:
+            for k in range(components.size[component]):
+                impulse[k] = lam[row + k]
+            relax_tangents(impulse, slack, row_step(form, p, row), friction_bound, components.size[component])
+            for k in range(components.size[component]):
+                set_impulse(form, panel, row + k, impulse[k], lam, v)
+        else:
+            relax_tangents(lam + row, slack, row_step(form, p, row), friction_bound, components.size[component])
+
+
+cdef inline void relax_blocks(const blocks_t* p, const form_t* form, const int32_t* order, int32_t n, double* lam,
+                              double* v) noexcept nogil:
+    """Update the blocks order (n), or the first n blocks if single rows or stored slacks; v: velocities of the form, or NULL."""
+    cdef int32_t k, i
+    for k in range(n):
+        i = k if form_t is single_rows_t or form_t is stored_slack_t else order[k]
+        if form_t is rows_t:
+            relax_bodies_block(p, form, i, lam, v)
+        elif form_t is single_rows_t:
+            lam[i] = relax_row(lam[i], csr_dot(&form.a, i, lam) - p.b[i], p.step[i], p.lower[i], p.upper[i])
+        else:
+            relax_rows_block(p, form, i, lam, v)
 
 
 cdef void relax_matrix(const blocks_t* p, const csr_t* a, const int32_t* order, double* lam) noexcept nogil:
-    """Over A; no order: every block is one row, as it stands."""
-    cdef int32_t i
-    if order == NULL:                                   # without the lookups
-        for i in range(p.n_blocks):
-            lam[i] = relax_row(lam[i], csr_dot(a, i, lam) - p.b[i], p.step[i], p.lower[i], p.upper[i])
-        return
-    for i in range(p.n_blocks):
-        relax_csr_block(p, a, order[i], lam)
+    """Sweep over A in compressed rows."""
+    relax_blocks(p, a, order, p.n_blocks, lam, NULL)
 
 
-cdef void relax_bodies(const blocks_t* p, const rows_t* r, const int32_t* order, double* lam, double* v) noexcept nogil:
-    """Over bodies, v (n_bodies, 6) = M^-1 J^T lam."""
-    cdef int32_t i
-    for i in range(p.n_blocks):
-        relax_rows_block(p, r, order[i], lam, v)
+cdef void relax_single_rows(const blocks_t* p, const csr_t* a, double* lam) noexcept nogil:
+    """Sweep over A if every block is one row with bounds."""
+    relax_blocks(p, <const single_rows_t*>a, NULL, p.n_blocks, lam, NULL)
+
+
+cdef void relax_damped(const blocks_t* p, const csr_t* a, double omega, const int32_t* order, double* lam) noexcept nogil:
+    """Sweep over A with steps multiplied by omega (successive over-relaxation)."""
+    cdef damped_csr_t form = damped_csr_t(a, omega)
+    relax_blocks(p, &form, order, p.n_blocks, lam, NULL)
+
+
+cdef void relax_stored_slack(const blocks_t* p, const double* w, double omega, double* lam) noexcept nogil:
+    """Update all blocks with the slacks w (m) of before the sweep, and steps multiplied by omega (Jacobi)."""
+    cdef stored_slack_t form = stored_slack_t(w, omega)
+    relax_blocks(p, &form, NULL, p.n_blocks, lam, NULL)
+
+
+cdef void relax_bodies(const blocks_t* p, const rows_t* r, const int32_t* order, int32_t n, double* lam,
+                       double* v) noexcept nogil:
+    """Sweep over the blocks order (n) of bodies with the velocities v (n_bodies, 6) = M^-1 J^T lam."""
+    relax_blocks(p, r, order, n, lam, v)
+
+
+cdef void relax_bodies_in_sequence(const blocks_t* p, const rows_t* r, double* lam, double* v) noexcept nogil:
+    """Sweep over all blocks of bodies in the given order."""
+    cdef int32_t order[64]
+    cdef int32_t first, k, n
+    for first in range(0, p.n_blocks, 64):
+        n = min(64, p.n_blocks - first)
+        for k in range(n):
+            order[k] = first + k
+        relax_bodies(p, r, order, n, lam, v)
 
 
 cdef void relax_general(const blocks_t* p, const generalized_t* g, const int32_t* order, double* lam,
-                        double* u) noexcept nogil:
-    """Over J and M, u (nv) = Y^T lam."""
-    cdef int32_t i
-    for i in range(p.n_blocks):
-        relax_general_block(p, g, order[i], lam, u)
+                        double* v) noexcept nogil:
+    """Sweep over J and M with the whitened velocities v (nv) = Y^T lam."""
+    relax_blocks(p, g, order, p.n_blocks, lam, v)

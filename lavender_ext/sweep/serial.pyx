@@ -1,196 +1,285 @@
-"""Sweeps of Gauss-Seidel and Jacobi type, on the rows of A, on bodies, or on J and M.
+"""Sweeps of Gauss-Seidel and Jacobi type over the rows of A, over bodies, or over J and M.
 
-    pgs                   block i, then the next, each on w = A lam - b with the lam of now          (1)
-    sequential impulses   the same sweep on v = M^-1 J^T lam: w = J v + c lam - b, A never formed     (2)
-    block gauss seidel    as (1) or (2), each block solved exactly (local/gauss_seidel.pyx)
-    jacobi                all blocks on the w of before the sweep, each step times omega              (3)
-    sor                   lam_i <- lam_i - omega w_i / d_i on free rows                              (4)
+    pgs                   block after block, each with w = A lam - b of the current lam                (1)
+    sequential impulses   the same over v = M^-1 J^T lam: w = J v + c lam - b, A is never formed       (2)
+    block gauss seidel    (1) or (2) with each block solved exactly (local/gauss_seidel.pyx)
+    jacobi                all blocks with the w of before the sweep, and steps multiplied by omega     (3)
+    sor                   lam_i <- lam_i - omega w_i / d_i on free rows                                (4)
 
-Over J and M the sweeps of (1) run on u = Y^T lam: w = Y u + c lam - b. The update of one block is core/block.pxd (1)-(4)
-everywhere. Invariant of (2), on entry and after every block: v = M^-1 J^T lam to rounding.
+Over J and M the sweeps of (1) use u = Y^T lam: w = Y u + c lam - b. All methods use the update of a block of core/block.pxd
+(1)-(3). Invariant of (2), on entry and after every block: v = M^-1 J^T lam to rounding.
 """
+from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t, int64_t, uint64_t
 
 import numpy as np
 
-from lavender_ext.core.block cimport relax_normal, relax_row, relax_tangents
+from lavender_ext.core.block_types cimport blocks_t
 from lavender_ext.core.csr cimport csr_dot
-from lavender_ext.core.block_types cimport blocks_t, is_rows, get_friction_components, friction_components_t
+from lavender_ext.core.generalized cimport whitened_transpose_times
+from lavender_ext.core.order cimport GIVEN, SYMMETRIC, advance_order
 from lavender_ext.core.problem cimport Data
-from lavender_ext.judge.stopping_test cimport CONVERGED, RUNNING, StoppingTest
-from lavender_ext.local.gauss_seidel cimport solve_blocks
-from lavender_ext.sweep.levels cimport sweep_levels
-from lavender_ext.sweep.packed cimport move_impulses, room_of, sweep_records
-from lavender_ext.sweep.pgs cimport relax_bodies, relax_general, relax_matrix
-from lavender_ext.sweep.serial cimport (NOT_YET, READY, USELESS, WHOLE, context_t, form_velocity, is_packed, may_pack,
-                                        next_order, packing_t, safe_damping, sweeps_workspace_size, sweeps_start, sweeps_step)
+from lavender_ext.core.velocity cimport rows_velocity
+from lavender_ext.core.view cimport csr_t, view_t
+from lavender_ext.judge.stopping_test cimport (CONVERGED, RUNNING, STALLED, StoppingTest, begins_again, run_until_stop,
+                                               stopping_test_t)
+from lavender_ext.local.gauss_seidel cimport prepare_blocks, prepared_sizes, solve_blocks
+from lavender_ext.sweep.packed cimport (MAX_PACKED_BLOCKS, load_impulses, pack_order, packed_workspace_size_of, store_impulses,
+                                        sweep_records)
+from lavender_ext.sweep.pgs cimport (relax_bodies, relax_damped, relax_general, relax_matrix, relax_single_rows,
+                                     relax_stored_slack)
+from lavender_ext.sweep.serial cimport (ALL_SWEEPS, MIN_PACKED_BLOCKS, NOT_PACKED, NOT_WORTH_PACKING, PACKED, packing_t,
+                                        sweep_context_t, sweep_run_t)
 
 
-cdef void sweep(context_t* c, const blocks_t* p, bint exact, double* lam, bint first) noexcept nogil:
-    """One sweep over blocks p, those of `c` or with another law."""
-    next_order(c, first)
-    if WHOLE and exact:
-        c.fallbacks += solve_blocks(p, c.csr, c.rows, c.general, c.start, c.g, c.order, lam, c.v)
-    elif WHOLE and c.general != NULL:
+cdef enum:
+    MIN_SWEEPS_TO_PACK = 8      # sweeps of a run that packs its blocks; packing costs two to four sweeps
+    MIN_SWEEPS_TO_PACK_MANY = 16    # the same for single sweeps, and from MANY_BLOCKS on
+    MANY_BLOCKS = 4000          # The records of so many blocks do not fit the second-level cache.
+    RESTART_SWEEPS = 64         # sweeps of a stalled run after its restart from the best iterate
+
+
+cdef bint pack_long_run(sweep_context_t* c, const double* lam, int64_t sweeps) noexcept nogil:
+    """Pack the blocks if a run of this length pays for it; return whether they are packed."""
+    cdef packing_t* x = c.packing
+    if not ALL_SWEEPS or x == NULL:
+        return False
+    if x.status == NOT_PACKED and x.workspace != NULL and sweeps >= x.min_sweeps:
+        x.backwards = False
+        x.status = PACKED if pack_order(c.blocks, c.rows, c.order, x.single, x.workspace, lam, &x.packed) else NOT_WORTH_PACKING
+    return x.status == PACKED
+
+
+cdef void form_velocity(const sweep_context_t* c, const double* lam) noexcept nogil:
+    """Compute the velocities v of lam (m); there are none over A."""
+    if c.general != NULL:
+        whitened_transpose_times(c.general, lam, c.v)
+    elif c.n_v > 0:
+        rows_velocity(c.blocks, c.rows, lam, c.v)
+
+
+cdef inline void set_next_order(sweep_context_t* c, bint first) noexcept nogil:
+    """Reverse or shuffle the order for the next sweep; `first`: no sweep was before."""
+    advance_order(c.mode, first, c.order, 0, c.split, c.rng)
+    advance_order(c.mode, first, c.order, c.split, c.blocks.n_blocks, c.rng)
+    if c.packing != NULL and c.mode == SYMMETRIC and not first:
+        c.packing.backwards = not c.packing.backwards
+
+
+cdef double jacobi_damping(const blocks_t* p, const csr_t* a, double* scratch) noexcept nogil:
+    """Return min(1, 1.6 / max_i sum_j |A_ij| sqrt(s_i s_j)) with the steps s, a safe omega of Jacobi; scratch (m)."""
+    cdef double largest_sum = 0.0, row_sum
+    cdef int32_t i, q
+    for i in range(p.n_rows):
+        scratch[i] = sqrt(p.step[i])
+    for i in range(p.n_rows):
+        row_sum = 0.0
+        for q in range(a.indptr[i], a.indptr[i + 1]):
+            row_sum += fabs(a.data[q]) * scratch[a.indices[q]]
+        row_sum *= scratch[i]
+        if row_sum > largest_sum:
+            largest_sum = row_sum
+    return 1.6 / largest_sum if 1.6 < largest_sum else 1.0
+
+
+cdef bint can_pack(const sweep_run_t* x, const view_t* v) noexcept nogil:
+    """Return whether blocks may be packed: over bodies, in an order that does not change, or is reversed between single sweeps."""
+    cdef const sweep_context_t* c = &x.context
+    cdef bint single = x.packing.single
+    if v.r == NULL or c.exact or not (c.mode == GIVEN or (single and c.mode == SYMMETRIC)):
+        return False
+    if single and c.split != v.r.n_joints:
+        return False
+    return MIN_PACKED_BLOCKS <= v.p.n_blocks <= MAX_PACKED_BLOCKS
+
+
+cdef int32_t velocities_of(const view_t* v) noexcept nogil:
+    """Return the number of velocities that sweeps over v keep."""
+    return v.g.n if v.g != NULL else 6 * v.r.n_bodies if v.r != NULL else 0
+
+
+cdef int64_t sweeps_workspace_size(sweep_run_t* x, const view_t* v, int32_t* start) noexcept nogil:
+    """Return the number of doubles of workspace of a run over v, -1 if an index does not fit int32.
+
+    start (k) receives the first index of each prepared block; NULL if no block is solved exactly.
+    """
+    cdef sweep_context_t* c = &x.context
+    cdef double n = prepared_sizes(&v.p, start) + 1 if ALL_SWEEPS and start != NULL else 0.0
+    c.blocks, c.csr, c.rows, c.general, c.n_v = &v.p, v.a, v.r, v.g, velocities_of(v)
+    return c.n_v + 12 + <int64_t>n if n < 2147483647.0 else -1
+
+
+cdef void start_sweeps(sweep_run_t* x, const view_t* v, const int32_t* start, double* workspace) noexcept nogil:
+    """Start a run in workspace (`sweeps_workspace_size`, zero-initialised)."""
+    cdef sweep_context_t* c = &x.context
+    c.v = workspace
+    if ALL_SWEEPS and start != NULL:
+        c.start, c.prepared = start, workspace + c.n_v + 12
+        prepare_blocks(v, start, workspace + c.n_v + 12)
+    x.packing.min_sweeps = (MIN_SWEEPS_TO_PACK_MANY if x.packing.single or v.p.n_blocks >= MANY_BLOCKS
+                            else MIN_SWEEPS_TO_PACK)
+    if x.step_context == NULL:
+        x.step_context = c
+
+
+cdef int32_t run_sweeps(sweep_run_t* x, stopping_test_t* test, const view_t* v, const view_t* confirm, double* lam, int32_t n,
+                        double tol, int32_t* done) noexcept nogil:
+    """Run n sweeps, or fewer if a check stops them; write their number to `done` and return the status."""
+    cdef int32_t status, more
+    x.context.w = test.e                                # The stopping test does not need its errors between checks.
+    if test.total == 0:
+        form_velocity(&x.context, lam)
+    if x.packing.single:
+        pack_long_run(&x.context, lam, <int64_t>test.total + n)
+    status = run_until_stop(test, v, confirm, x.step, x.step_context, lam, n, tol, done)
+    while status == STALLED and x.forget != NULL and begins_again(test, RESTART_SWEEPS):
+        x.forget(x.step_context, lam)
+        status = run_until_stop(test, v, confirm, x.step, x.step_context, lam, n - done[0], tol, &more)
+        done[0] += more
+    return status
+
+
+cdef void sweep(sweep_context_t* c, const blocks_t* p, bint exact, double* lam, bint first) noexcept nogil:
+    """Run one sweep over blocks p, which are those of `c` or differ in their law; `first`: no sweep was before."""
+    cdef int32_t i
+    # all slacks before the sweep (3)
+    if c.method == JACOBI:
+        for i in range(p.n_rows):
+            c.w[i] = csr_dot(c.csr, i, lam) - p.b[i]
+        relax_stored_slack(p, c.w, c.omega, lam)
+        return
+    # order
+    set_next_order(c, first)
+    # blocks
+    if c.method == SOR:
+        relax_damped(p, c.csr, c.omega, c.order, lam)
+    elif ALL_SWEEPS and exact:
+        c.fallbacks += solve_blocks(p, c.csr, c.rows, c.general, c.start, c.prepared, c.order, lam, c.v)
+    elif ALL_SWEEPS and c.general != NULL:
         relax_general(p, c.general, c.order, lam, c.v)
+    elif c.csr != NULL and c.order == NULL:
+        relax_single_rows(p, c.csr, lam)
     elif c.csr != NULL:
         relax_matrix(p, c.csr, c.order, lam)
-    elif WHOLE and c.packing != NULL and c.packing.single and c.packing.status == READY:
-        sweep_levels(p, c.rows, &c.packing.packed, c.packing.backwards, lam, c.v)
+    elif ALL_SWEEPS and c.packing != NULL and c.packing.single and c.packing.status == PACKED:
+        sweep_records(p, c.rows, &c.packing.packed, 1, c.packing.backwards, lam, c.v)
     else:
-        relax_bodies(p, c.rows, c.order, lam, c.v)
+        relax_bodies(p, c.rows, c.order, p.n_blocks, lam, c.v)
 
 
 cdef void sweep_step(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:
-    """n sweeps of (1) or (2), over exact blocks or not; in pairs with the same bits."""
-    cdef context_t* c = <context_t*>context
+    """Run n sweeps; packed blocks give the same bits."""
+    cdef sweep_context_t* c = <sweep_context_t*>context
     cdef int32_t s
-    if is_packed(c, lam, n) and n >= c.packing.packed.stages:
-        move_impulses(c.blocks, c.order, &c.packing.packed, 0, lam)
-        sweep_records(c.blocks, c.rows, &c.packing.packed, n, lam, c.v)
-        move_impulses(c.blocks, c.order, &c.packing.packed, 1, lam)
+    if pack_long_run(c, lam, n) and n >= c.packing.packed.n_stages:
+        load_impulses(c.blocks, c.order, &c.packing.packed, lam)
+        sweep_records(c.blocks, c.rows, &c.packing.packed, n, False, lam, c.v)
+        store_impulses(c.blocks, c.order, &c.packing.packed, lam)
         return
     for s in range(n):
         sweep(c, c.blocks, c.exact, lam, first_sweep and s == 0)
 
 
-cdef void sor_step(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:
-    """n sweeps of (4) over free rows."""
-    cdef context_t* c = <context_t*>context
-    cdef const blocks_t* p = c.blocks
-    cdef int32_t s, i, q
-    for s in range(n):
-        next_order(c, first_sweep and s == 0)
-        for i in range(p.n_blocks):
-            for q in range(p.ptr[c.order[i]], p.ptr[c.order[i] + 1]):
-                lam[q] = lam[q] - c.omega * p.step[q] * (csr_dot(c.csr, q, lam) - p.b[q])
-
-
-cdef void jacobi_step(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:
-    """n sweeps of (3); w (m) is scratch."""
-    cdef context_t* c = <context_t*>context
-    cdef const blocks_t* p = c.blocks
-    cdef double* w = c.w
-    cdef int32_t _s, i, j, g, q
-    cdef double omega = c.omega
-    cdef friction_components_t part
-    for _s in range(n):
-        for i in range(p.n_rows):
-            w[i] = csr_dot(c.csr, i, lam) - p.b[i]
-        for i in range(p.n_blocks):
-            j = p.ptr[i]
-            if is_rows(p, i):
-                for q in range(j, p.ptr[i + 1]):
-                    lam[q] = relax_row(lam[q], w[q], omega * p.step[q], p.lower[q], p.upper[q])
-                continue
-            lam[j] = relax_normal(lam[j], w[j], omega * p.step[j])
-            get_friction_components(p, i, &part)
-            for g in range(part.n):
-                q = j + part.first[g]
-                relax_tangents(lam + q, w + q, omega * p.step[q], part.friction_coefficient[g] * lam[j], part.size[g])
-
-
-cpdef enum:                     # kinds, which Python names too
-    SWEEPS
-    SOR
-    JACOBI
-
-
 def damping(Data p):
-    """Of jacobi over the rows of A."""
-    cdef double[::1] root = np.empty(p.blocks.n_rows + 1)
-    return safe_damping(&p.blocks, &p.csr, &root[0])
+    """Return the omega of Jacobi over the rows of A."""
+    cdef double[::1] scratch = np.empty(p.blocks.n_rows + 1)
+    return jacobi_damping(&p.blocks, &p.csr, &scratch[0])
 
 
 cdef class Sweeps:
-    """Sweeps of a problem: its blocks in an order, and the velocities that they keep.
+    """Sweeps of a problem: its blocks in an order, and the velocities of its impulses.
 
     Parameters
     ----------
     p : Data
     order : (k,) int32
-        Turned round or shuffled in place, as `mode` says; empty: row by row, over single rows of A.
+        Reversed or shuffled in place, according to `mode`. Empty: row by row, over single rows of A.
     split, mode, rng
         As in `lavender.ordering.Order`.
-    kind, omega
-        SWEEPS, or SOR or JACOBI with their relaxation.
+    method, omega
+        SWEEPS, or SOR or JACOBI with their relaxation factor.
     exact : bool
-        Blocks are solved exactly.
+        Solve blocks exactly.
     before : Sweeps, optional
-        Of another problem: hands over the workspace of its pairs, and packs no more.
+        Sweeps of another problem. Its packing workspace is taken over, and it packs no more.
     """
 
-    def __init__(self, Data p, int32_t[::1] order, int split, int mode, uint64_t[::1] rng, int kind=SWEEPS, double omega=1.0,
+    def __init__(self, Data p, int32_t[::1] order, int split, int mode, uint64_t[::1] rng, int method=SWEEPS, double omega=1.0,
                  bint exact=False, Sweeps before=None):
-        self.x.step = sor_step if kind == SOR else jacobi_step if kind == JACOBI else sweep_step
-        self.x.c.omega = omega
-        self.lay(p, order, split, mode, rng, exact, exact, 0)
+        self.x.step = sweep_step
+        self.x.context.method, self.x.context.omega = method, omega
+        self.allocate(p, order, split, mode, rng, exact, exact, 0)
         if before is not None:
-            self.for_pairs, before.for_pairs = before.for_pairs, None
-            before.x.packing.status = USELESS
+            self.packing_workspace, before.packing_workspace = before.packing_workspace, None
+            before.x.packing.status = NOT_WORTH_PACKING
 
-    cdef double* lay(self, Data p, int32_t[::1] order, int split, int mode, uint64_t[::1] rng, bint exact, bint prepares,
-                     int64_t more) except NULL:
-        """Before the first sweep; workspace for so many numbers more. `prepares`: blocks, as some sweeps solve them exactly."""
-        cdef context_t* c = &self.x.c
-        cdef int32_t[::1] place = np.empty(p.blocks.n_blocks + 1, np.int32) if prepares else None
-        cdef int32_t* at = &place[0] if prepares else NULL
+    cdef double* allocate(self, Data p, int32_t[::1] order, int split, int mode, uint64_t[::1] rng, bint exact,
+                          bint prepares_blocks, int64_t extra) except NULL:
+        """Allocate the workspace, start the run, and return the address of `extra` additional doubles of workspace.
+
+        With `prepares_blocks`, blocks may be solved exactly.
+        """
+        cdef sweep_context_t* c = &self.x.context
+        cdef int32_t[::1] start = np.empty(p.blocks.n_blocks + 1, np.int32) if prepares_blocks else None
+        cdef int32_t* first = &start[0] if prepares_blocks else NULL
         cdef double[::1] workspace
         cdef int64_t n
         self.view = p.view()
         c.order = &order[0] if order.shape[0] else NULL
         c.split, c.mode, c.rng, c.exact = split, mode, &rng[0], exact
-        n = sweeps_workspace_size(&self.x, &self.view, at)
+        n = sweeps_workspace_size(&self.x, &self.view, first)
         if n < 0:
-            raise MemoryError("the prepared numbers of blocks do not fit 32-bit places")
-        self.workspace = workspace = np.zeros(n + more)
-        self.keep = p, order, rng, place
-        sweeps_start(&self.x, &self.view, at, &workspace[0])
-        if may_pack(&self.x, &self.view):
+            raise MemoryError("the prepared numbers of blocks do not fit 32-bit indices")
+        self.workspace = workspace = np.zeros(n + extra)
+        self.references = p, order, rng, start
+        start_sweeps(&self.x, &self.view, first, &workspace[0])
+        if can_pack(&self.x, &self.view):
             c.packing = &self.x.packing
         return &workspace[0] + n
 
     cdef double undone(self) noexcept:
-        """Blocks so far that fell back."""
-        return self.x.c.fallbacks
+        """Return the number of blocks so far that used the fallback."""
+        return self.x.context.fallbacks
 
     def run(self, StoppingTest watch, double[::1] lam, int n, double tol):
-        """`n` sweeps in place, or fewer where `watch` ends them, GIL released: (status, sweeps done, `undone`)."""
+        """Run `n` sweeps in place without the GIL, or fewer if `watch` stops them; return (status, sweeps done, `undone`)."""
         cdef int32_t status, done = 0
         cdef double before = self.undone()
         cdef double[::1] workspace
-        cdef packing_t* x = self.x.c.packing
+        cdef packing_t* x = self.x.context.packing
         if lam.shape[0] == 0:
             if tol > 0.0:
                 return CONVERGED, 0, 0
             return RUNNING, n, 0
-        if x != NULL and x.status == NOT_YET and x.workspace == NULL and n + (watch.state.total if x.single else 0) >= x.first:
-            if self.for_pairs is None or len(self.for_pairs) < room_of(&self.view.p, self.view.r):
-                self.for_pairs = np.empty(room_of(&self.view.p, self.view.r))
-            workspace = self.for_pairs
+        if (x != NULL and x.status == NOT_PACKED and x.workspace == NULL
+                and n + (watch.state.total if x.single else 0) >= x.min_sweeps):
+            if (self.packing_workspace is None
+                    or len(self.packing_workspace) < packed_workspace_size_of(&self.view.p, self.view.r)):
+                self.packing_workspace = np.empty(packed_workspace_size_of(&self.view.p, self.view.r))
+            workspace = self.packing_workspace
             x.workspace = &workspace[0]
         with nogil:
-            status = sweeps_step(&self.x, &watch.state, &watch.view, watch.confirm, &lam[0], n, tol, &done)
+            status = run_sweeps(&self.x, &watch.state, &watch.view, watch.confirm, &lam[0], n, tol, &done)
         return status, done, int(self.undone() - before)
 
     def start(self, const double[::1] lam):
-        """The velocities of an impulse (m,), where it is another than the last sweep left."""
+        """Compute the velocities of an impulse (m,) that is not the result of the last sweep."""
         if lam.shape[0]:
-            form_velocity(&self.x.c, &lam[0])
+            form_velocity(&self.x.context, &lam[0])
 
-    def alone(self):
-        """One block after the other from here on, with the same bits."""
-        self.x.c.packing = NULL
+    def disable_packing(self):
+        """Sweep over single blocks from now on, with the same bits."""
+        self.x.context.packing = NULL
 
     @property
     def velocity(self):
-        """(n + 2, 6) of bodies, then zeros."""
-        return self.workspace[:self.x.c.n_v + 12].reshape(-1, 6)
+        """(n_bodies + 2, 6) velocities of bodies, then zeros."""
+        return self.workspace[:self.x.context.n_v + 12].reshape(-1, 6)
 
     @property
-    def pairs(self):
-        """(records, stages); (0, 0) where one block is swept after the other."""
+    def records(self):
+        """(number of records, number of stages) of packed blocks, (0, 0) if blocks are not packed."""
         cdef packing_t* x = &self.x.packing
-        if x.status != READY:
+        if x.status != PACKED:
             return 0, 0
-        return x.packed.pairs, x.packed.stages
+        return x.packed.n_records, x.packed.n_stages

@@ -242,7 +242,7 @@ def test_the_chapter_names_functions_that_exist():
     for function, file in (
         ("prepare", "engine/substep.pyx"),
         ("finish", "engine/substep.pyx"),
-        ("relax_contact_block", "core/rows.pxd"),
+        ("relax_contact", "core/contact.pxd"),
     ):
         assert f" {function}(" in (ROOT / "lavender_ext" / file).read_text(encoding="utf-8")
         assert file in text

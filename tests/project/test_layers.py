@@ -18,7 +18,8 @@ ROOT = Path(__file__).resolve().parent.parent.parent
 KERNEL_LEVELS = [
     {"core"},
     {"factor", "judge", "local"},
-    {"derivative", "io", "newton", "pivot", "sweep", "velocity_newton"},
+    {"derivative", "io", "sweep", "velocity_newton"},
+    {"newton", "pivot"},
     {"accelerate", "engine"},
     {"driver", "host"},
     {"small"},

@@ -5,7 +5,6 @@ typedef struct core_view_csr_t csr_t;
 typedef struct core_view_rows_t rows_t;
 typedef struct core_view_generalized_t general_t;
 typedef struct judge_score_score_t score_t;
-typedef void (*sweep_t)(void *, double *, int32_t, int32_t);
 
 typedef struct where_t { /* A rejected array or count, and the index of the rejected entry. */
   const char *array;
@@ -49,10 +48,10 @@ struct lav_solver {
   uint64_t rng;
   struct core_view_view_t read; /* The problem for the judge. */
   struct judge_stopping_test_stopping_test_t stopping_test;
-  struct sweep_serial_sweeping_t swept;
+  struct sweep_serial_sweep_run_t swept;
   double deadline;  /* Time on the clock of the budget. */
 #ifndef LAV_SWEEPS_ONLY
-  struct accelerate_accelerated_sweep_data_t fast;
+  struct accelerate_accelerated_acceleration_t acceleration;
   struct core_view_view_t view; /* The problem for newton: rows of A if A was formed. */
   struct core_method_options_t newton_options;
   struct core_method_workspace_t drive;
@@ -72,7 +71,6 @@ enum { FREE_ROWS = 1, ROWS_ALONE, COULOMB_ALONE, EVERY_LAW }; /* Blocks that a m
 typedef struct method_t {
   int32_t forms, rolling, round; /* Bits 1 << form: supported forms, those with rolling friction, those with round cones. */
   int32_t blocks, patience;      /* patience: checks without progress before it stalls. */
-  sweep_t sweep;                 /* NULL if the method has no sweep. */
   int64_t (*workspace)(const lav_problem *, const lav_options *, int32_t n_v); /* Doubles in addition to the problem. */
   int32_t (*start)(lav_solver *);                                         /* Prepare the method for a new problem. */
   void (*step)(lav_solver *, const lav_budget *, lav_result *);           /* Continue from the present impulse. */

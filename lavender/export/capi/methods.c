@@ -12,13 +12,13 @@ static int32_t has_tangents(const blocks_t *p) {
 
 static int32_t restarts_of(const lav_solver *s) {
   if (s->options.method == LAV_ADMM) return s->factors;
-  return (int32_t)(is_accelerated(&s->options) ? accelerate_accelerated_undone_of(&s->fast) : s->swept.c.fallbacks);
+  return (int32_t)(is_accelerated(&s->options) ? accelerate_accelerated_undone_of(&s->acceleration) : s->swept.context.fallbacks);
 }
 #endif
 
 static int32_t start_sweeps(lav_solver *s) {
   const lav_options *o = &s->options;
-  struct sweep_serial_sweeping_t *x = &s->swept;
+  struct sweep_serial_sweep_run_t *x = &s->swept;
   int32_t *place = NULL;
   int64_t numbers, more = 0;
   double *workspace;
@@ -26,33 +26,36 @@ static int32_t start_sweeps(lav_solver *s) {
   const int32_t rubs = has_tangents(&s->p), is_cone = s->p.law == LAV_CONE && rubs;
   const int32_t memory = o->method == LAV_NNCG ? 0 : o->memory, convex = rubs && !is_cone ? o->convex : 0;
   x->packing.single = is_accelerated(o);
-  x->c.exact = o->method == LAV_BLOCK_GAUSS_SEIDEL;
+  x->context.exact = o->method == LAV_BLOCK_GAUSS_SEIDEL;
   if (x->packing.single) {
-    x->c.exact = o->sweep == LAV_BLOCK_SWEEP || (o->sweep == LAV_DEFAULT_SWEEP && is_cone);
+    x->context.exact = o->sweep == LAV_BLOCK_SWEEP || (o->sweep == LAV_DEFAULT_SWEEP && is_cone);
     more = accelerate_accelerated_accelerated_workspace_size(s->p.n_rows, s->n_v, memory);
   }
-  if (x->c.exact || (x->packing.single && convex > 0)) {
+  if (x->context.exact || (x->packing.single && convex > 0)) {
     place = TAKE(s, int32_t, s->p.n_blocks);
     if (s->is_short) return LAV_ERROR_WORKSPACE;
   }
 #endif
-  x->c.order = o->method == LAV_PGS && s->in_rows ? NULL : s->order;
-  x->c.split = s->split;
-  x->c.mode = s->mode;
-  x->c.rng = &s->rng;
-  x->c.omega = o->method == LAV_JACOBI && o->omega == 0.0 ? sweep_serial_safe_damping(&s->p, &s->a, s->stopping_test.e) : o->omega;
-  x->step = row_of(o->method)->sweep;
+  x->context.order = o->method == LAV_PGS && s->in_rows ? NULL : s->order;
+  x->context.split = s->split;
+  x->context.mode = s->mode;
+  x->context.rng = &s->rng;
+  x->context.omega = o->method == LAV_JACOBI && o->omega == 0.0 ? sweep_serial_jacobi_damping(&s->p, &s->a, s->stopping_test.e) : o->omega;
+  x->context.method = o->method == LAV_JACOBI                                     ? sweep_serial_JACOBI
+                      : o->method == LAV_SOR || o->method == LAV_GAUSS_SEIDEL ? sweep_serial_SOR
+                                                                              : sweep_serial_SWEEPS;
+  x->step = sweep_serial_sweep_step;
   numbers = sweep_serial_sweeps_workspace_size(x, &s->read, place);
   if (numbers < 0) return LAV_ERROR_COUNT;
   workspace = TAKE(s, double, numbers + more);
   if (s->is_short) return LAV_ERROR_WORKSPACE;
   memset(workspace, 0, (size_t)(numbers + more) * sizeof(double));
-  sweep_serial_sweeps_start(x, &s->read, place, workspace);
+  sweep_serial_start_sweeps(x, &s->read, place, workspace);
 #ifndef LAV_SWEEPS_ONLY
-  if (x->packing.single) accelerate_accelerated_accelerate(x, &s->fast, memory, convex, o->keeps, workspace + numbers);
-  if (sweep_serial_may_pack(x, &s->read)) {
-    x->c.packing = &x->packing;
-    x->packing.workspace = TAKE(s, double, sweep_packed_room_of(&s->p, &s->r));
+  if (x->packing.single) accelerate_accelerated_accelerate(x, &s->acceleration, memory, convex, o->keeps, workspace + numbers);
+  if (sweep_serial_can_pack(x, &s->read)) {
+    x->context.packing = &x->packing;
+    x->packing.workspace = TAKE(s, double, sweep_packed_packed_workspace_size_of(&s->p, &s->r));
   }
 #endif
   return s->is_short ? LAV_ERROR_WORKSPACE : LAV_OK;
@@ -75,7 +78,7 @@ static void run_sweeps(lav_solver *s, const lav_budget *budget, lav_result *out)
 #endif
   while (out->iterations < budget->iterations && status == judge_stopping_test_RUNNING) {
     if (n > budget->iterations - out->iterations) n = budget->iterations - out->iterations;
-    status = sweep_serial_sweeps_step(&s->swept, &s->stopping_test, &s->read, NULL, s->impulse, n, budget->tol, &done);
+    status = sweep_serial_run_sweeps(&s->swept, &s->stopping_test, &s->read, NULL, s->impulse, n, budget->tol, &done);
     out->iterations += done;
 #ifndef LAV_SWEEPS_ONLY
     if (s->is_broken) {
@@ -103,7 +106,7 @@ static void run_sweeps(lav_solver *s, const lav_budget *budget, lav_result *out)
   if (budget->tol > 0.0 && s->stopping_test.best_at >= 0 && out->outcome != LAV_CONVERGED) { /* The residual may have risen: return the best iterate. */
     if (see(s, &s->stopping_test.best, s->impulse, budget->tol) > budget->tol) {
       COPY(s->impulse, s->stopping_test.best.impulse, s->p.n_rows);
-      sweep_serial_form_velocity(&s->swept.c, s->impulse);
+      sweep_serial_form_velocity(&s->swept.context, s->impulse);
     }
   }
 }
@@ -282,7 +285,7 @@ static int32_t start_admm(lav_solver *s) {
   s->factor.dense = s->table + m * m;
   s->factors = 0;
   s->is_broken = !factor_shifted(s);
-  s->swept.of = s;
+  s->swept.step_context = s;
   s->swept.step = admm_step;
   return LAV_OK;
 }

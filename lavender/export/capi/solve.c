@@ -71,10 +71,10 @@ static void carry(lav_solver *s) {
 static int64_t sweeps_workspace_size(const lav_problem *q, const lav_options *o, int32_t n_v) {
   int64_t numbers = n_v + 76;
 #ifndef LAV_SWEEPS_ONLY
-  const int32_t fast = is_accelerated(o), packs = q->form == LAV_BODIES && q->n_blocks >= sweep_serial_FEWEST;
+  const int32_t fast = is_accelerated(o), packs = q->form == LAV_BODIES && q->n_blocks >= sweep_serial_MIN_PACKED_BLOCKS;
   const int32_t exact = o->method == LAV_BLOCK_GAUSS_SEIDEL || (fast && (o->sweep == LAV_BLOCK_SWEEP || q->law == LAV_CONE));
   if (!exact && packs)
-    numbers += sweep_packed_allocate_workspace(q->n_joints, joint_rows(q), q->n_blocks - q->n_joints, contact_rows(q), q->n_bodies);
+    numbers += sweep_packed_packed_workspace_size(q->n_joints, joint_rows(q), q->n_blocks - q->n_joints, contact_rows(q), q->n_bodies);
   if (exact || (fast && o->convex > 0)) numbers += 9 * (int64_t)q->n_rows + 26 * (int64_t)q->n_blocks;
   if (fast) numbers += accelerate_accelerated_accelerated_workspace_size(q->n_rows, n_v, o->method == LAV_NNCG ? 0 : o->memory);
 #else
@@ -126,21 +126,21 @@ static int64_t admm_workspace_size(const lav_problem *q, const lav_options *o, i
 static const method_t *row_of(int32_t method) {
   enum { A = 1 << LAV_MATRIX, B = 1 << LAV_BODIES, V = 1 << LAV_VELOCITIES, ALL = A | B | V };
   static const method_t table[LAV_ADMM + 1] = {
-    {0, 0, 0, 0, 0, NULL, NULL, NULL, NULL},
-    /* forms, with rolling friction, with round cones; blocks, patience; sweep; workspace, start, step */
-    {B, B, 0, COULOMB_ALONE, PATIENCE, sweep_serial_sweep_step, sweeps_workspace_size, start_sweeps, run_sweeps},
-    {A | V, A | V, 0, COULOMB_ALONE, PATIENCE, sweep_serial_sweep_step, sweeps_workspace_size, start_sweeps, run_sweeps},
-    {A, 0, 0, FREE_ROWS, PATIENCE, sweep_serial_sor_step, sweeps_workspace_size, start_sweeps, run_sweeps},
-    {A, 0, 0, FREE_ROWS, PATIENCE, sweep_serial_sor_step, sweeps_workspace_size, start_sweeps, run_sweeps},
-    {A, A, 0, COULOMB_ALONE, PATIENCE, sweep_serial_jacobi_step, sweeps_workspace_size, start_sweeps, run_sweeps},
+    {0, 0, 0, 0, 0, NULL, NULL, NULL},
+    /* forms, with rolling friction, with round cones; blocks, patience; workspace, start, step */
+    {B, B, 0, COULOMB_ALONE, PATIENCE, sweeps_workspace_size, start_sweeps, run_sweeps},
+    {A | V, A | V, 0, COULOMB_ALONE, PATIENCE, sweeps_workspace_size, start_sweeps, run_sweeps},
+    {A, 0, 0, FREE_ROWS, PATIENCE, sweeps_workspace_size, start_sweeps, run_sweeps},
+    {A, 0, 0, FREE_ROWS, PATIENCE, sweeps_workspace_size, start_sweeps, run_sweeps},
+    {A, A, 0, COULOMB_ALONE, PATIENCE, sweeps_workspace_size, start_sweeps, run_sweeps},
 #ifndef LAV_SWEEPS_ONLY
-    {ALL, ALL, A | V, EVERY_LAW, PATIENCE, sweep_serial_sweep_step, sweeps_workspace_size, start_sweeps, run_sweeps},
-    {ALL, ALL, 0, EVERY_LAW, LONG_PATIENCE, sweep_serial_sweep_step, sweeps_workspace_size, start_sweeps, run_sweeps},
-    {ALL, ALL, A | V, EVERY_LAW, LONG_PATIENCE, sweep_serial_sweep_step, sweeps_workspace_size, start_sweeps, run_sweeps},
-    {ALL, V, V, EVERY_LAW, PATIENCE, NULL, newton_workspace_size, start_newton, run_newton},
-    {A | B, 0, 0, ROWS_ALONE, PATIENCE, NULL, pivots_workspace_size, start_pivots, run_pivots},
-    {A | B, 0, 0, ROWS_ALONE, PATIENCE, NULL, pivots_workspace_size, start_pivots, run_pivots},
-    {A | B, A | B, A, EVERY_LAW, SPLIT_PATIENCE, NULL, admm_workspace_size, start_admm, run_sweeps},
+    {ALL, ALL, A | V, EVERY_LAW, PATIENCE, sweeps_workspace_size, start_sweeps, run_sweeps},
+    {ALL, ALL, 0, EVERY_LAW, LONG_PATIENCE, sweeps_workspace_size, start_sweeps, run_sweeps},
+    {ALL, ALL, A | V, EVERY_LAW, LONG_PATIENCE, sweeps_workspace_size, start_sweeps, run_sweeps},
+    {ALL, V, V, EVERY_LAW, PATIENCE, newton_workspace_size, start_newton, run_newton},
+    {A | B, 0, 0, ROWS_ALONE, PATIENCE, pivots_workspace_size, start_pivots, run_pivots},
+    {A | B, 0, 0, ROWS_ALONE, PATIENCE, pivots_workspace_size, start_pivots, run_pivots},
+    {A | B, A | B, A, EVERY_LAW, SPLIT_PATIENCE, admm_workspace_size, start_admm, run_sweeps},
 #endif
   };
   return table + method;

@@ -38,7 +38,15 @@ from threading import get_native_id
 from typing import Any
 
 #: Modules of lavender_ext that the page uses.
-MODULES = ("engine.arrays", "engine.substep", "host.memory", "judge.measure")
+MODULES = (
+    "core.order",
+    "engine.arrays",
+    "engine.substep",
+    "host.memory",
+    "judge.measure",
+    "sweep.packed",
+    "sweep.pgs",
+)
 #: Largest size of a finished module [bytes].
 MAX_MODULE_BYTES = 220_000
 
@@ -63,7 +71,15 @@ class Part:
 PARTS = {
     "lavender": Part(MODULES),
     "newton": Part(
-        ("engine.newton_substep", "judge.measure", "newton.solve", "newton.warm_start"), imports_memory=True
+        (
+            "core.order",
+            "engine.newton_substep",
+            "judge.measure",
+            "newton.solve",
+            "newton.warm_start",
+            "sweep.pgs",
+        ),
+        imports_memory=True,
     ),
 }
 EXTRACT_C: dict[str, Any] = runpy.run_path(str(Path(__file__).resolve().with_name("extract_c.py")))

@@ -101,7 +101,8 @@ PREDEFINED = frozenset(
     )
 )
 OPENING = ("if", "ifdef", "ifndef")
-MANGLED = re.compile(r"__pyx_(?:f|t|e|fuse_\d+)_(?=\d)")
+#: Beginning of a name of Cython: function, type, enum, or the variant of a function with fused types, such as `0_1`.
+MANGLED = re.compile(r"__pyx_(?:[fte]_|fuse_(\d+(?:_\d+)*)__pyx_f_)(?=\d)")
 
 
 class ExtractionError(Exception):
@@ -432,7 +433,7 @@ def _output_name(name: str, kept_names: frozenset[str]) -> str:
             parts.append(name[number.end() : end])
             at = end + 1
         if parts:
-            return "_".join([*parts[1:], name[at:]])
+            return "_".join([*parts[1:], name[at:], *filter(None, mangled.groups())])
     for prefix, form in (("__pyx_v_", "{}_"), ("__pyx_t_", "tmp_{}"), ("__pyx_L", "L{}")):
         if name.startswith(prefix):
             return form.format(name[len(prefix) :])

@@ -79,7 +79,7 @@ def test_checks_between_packed_sweeps_see_what_they_would(name, order, tol):
     pile = lattice_pile(300)
     both = [prepare_sweeps(pile, name, packs, order=order) for packs in (True, False)]
     a, b = (prepared.solve(tol=tol, max_iter=300) for prepared in both)
-    assert both[0].state.sweeps.pairs[0] > 0
+    assert both[0].state.sweeps.records[0] > 0
     assert (a.status, a.iterations, a.impulse.tobytes()) == (b.status, b.iterations, b.impulse.tobytes())
 
 
@@ -90,7 +90,7 @@ def test_a_new_problem_takes_over_the_room():
     state, start = prepared.state, np.zeros(problem.m)
     prepared.solve(replace(problem, b=problem.b + 0.01), tol=0.0, max_iter=20)
     # what was there before goes on one by one
-    assert state.sweeps.pairs == (0, 0)
+    assert state.sweeps.records == (0, 0)
     lam = start.copy()
     state.sweeps.start(lam)
     prepared.solver.run(state, lam, 20, 0.0)
@@ -116,7 +116,7 @@ def test_contacts_of_one_body_are_not_packed():
 def test_orders_that_change_and_exact_blocks_are_not_packed(name, options):
     prepared = prepare_sweeps(lattice_pile(300), name, **options)
     prepared.solve(tol=0.0, max_iter=40)
-    assert prepared.state.sweeps.pairs[0] == 0
+    assert prepared.state.sweeps.records[0] == 0
 
 
 @pytest.mark.parametrize("name", ["sequential_impulses", "nncg"])
